@@ -9,6 +9,7 @@ import math
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from scipy.signal import savgol_filter
 from torch import Tensor
@@ -17,24 +18,25 @@ from e2rl.metrics.catalogue import Batch, rate
 from e2rl.metrics.geometry import edge_parts_inside, velocity
 from e2rl.metrics.off_road import has_lines, inside_polygon, line_segments, near_lane, near_segments
 from e2rl.metrics.proximity import ego_path, route_completion
-from e2rl.scenes.boxes import corners, overlap
+from e2rl.scenes.boxes import corners, overlap, to_frame
 from e2rl.scenes.recording import CYCLIST, DT, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.sim.dynamics import wrap
 
 REAR_AXLE = 1.461 / 5.176  # of the length: nuPlan's vehicle, from its centre back to the rear axle
-STOPPED_EGO, STOPPED = 0.05, 0.005  # m/s: slower egos and others stand
-AHEAD, BEHIND = math.radians(20), math.radians(150)  # angle at the rear axle between heading and another's centre
+STOPPED = 0.05  # m/s: an ego or a track that is no faster stands at a collision
+AHEAD = math.radians(30)  # angle at the rear axle between the heading and another's centre
+BEHIND = math.radians(150)
 ALLOWED = {(PEDESTRIAN, CYCLIST): 0, (VEHICLE,): 0, (OTHER,): 1}  # at-fault collisions that leave a score above 0
 MAX_OUTSIDE = 0.3  # m that a corner may lie outside the drivable area
 ENDS_MEET = 0.5  # m between the end of a lane and the start of one that follows it
 WINDOW, AGAINST, FAR_AGAINST = 1.0, 2.0, 6.0  # s, and metres against the lane's direction in it: score 0.5, 0
 LEAST_TTC = 0.95  # s
 MOVING = 0.005  # m/s: an ego that is slower has no time to collision
-MIN_PROGRESS = 0.2  # of the recorded way
+MIN_PROGRESS = 0.2  # of the recorded distance
+PROGRESS_FLOOR = 2.0  # m: shorter distances count as this; minus this, driven backwards, is no progress at all
 MAX_OVERSPEED = 2.23  # m/s above the limit, throughout the rollout: score 0
-COMFORT = {  # bounds: m/s^2, m/s^2, rad/s, rad/s^2, m/s^3, m/s^3
+COMFORT = {  # bounds, which are excluded: m/s^2, rad/s, rad/s^2, m/s^3, m/s^3
     "longitudinal": (-4.05, 2.40),
-    "lateral": (-4.89, 4.89),
     "yaw_rate": (-0.95, 0.95),
     "yaw_accel": (-1.93, 1.93),
     "longitudinal_jerk": (-4.13, 4.13),
@@ -60,9 +62,9 @@ SCORES = (
     term("no_ego_at_fault_collisions", "nuPlan: no collision at fault"),
     term("drivable_area_compliance", "nuPlan: no corner outside the drivable area"),
     term("driving_direction_compliance", "nuPlan: not against the lane's direction"),
-    term("ego_is_making_progress", "nuPlan: a fifth of the recorded way or more"),
+    term("ego_is_making_progress", "nuPlan: a fifth of the recorded distance or more"),
     term("time_to_collision_within_bound", "nuPlan: time to collision of 0.95 s or more throughout"),
-    term("ego_progress_along_expert_route", "nuPlan: fraction of the recorded way"),
+    term("ego_progress_along_expert_route", "nuPlan: fraction of the recorded distance"),
     term("speed_limit_compliance", "nuPlan: speeding, by how much and how long"),
     term("ego_is_comfortable", "nuPlan: acceleration, jerk and yaw within bounds"),
 )
@@ -70,6 +72,7 @@ SCORES = (
 
 def nuplan_columns(batch: Batch) -> Batch:
     """The score, product of MULTIPLIERS times the mean of WEIGHTS, and its terms, each [B] in [0, 1]."""
+    batch = batch | {"track_speed": track_speed(batch)}
     places = places_of(batch)
     fault, new = at_fault(batch, places)
     progress = expert_progress(batch)
@@ -77,11 +80,11 @@ def nuplan_columns(batch: Batch) -> Batch:
         "no_ego_at_fault_collisions": collision_score(fault, batch["agent_type"]),
         "drivable_area_compliance": drivable_area(batch),
         "driving_direction_compliance": driving_direction(batch),
-        "ego_is_making_progress": (progress > MIN_PROGRESS).to(progress),
+        "ego_is_making_progress": (progress >= MIN_PROGRESS).to(progress),
         "time_to_collision_within_bound": time_to_collision(batch, places, fault, new),
         "ego_progress_along_expert_route": progress,
         "speed_limit_compliance": speed_limit(batch),
-        "ego_is_comfortable": comfort(batch["states"][:, :, 0]),
+        "ego_is_comfortable": comfort(batch["states"][:, :, 0], batch["size"][:, 0, 0]),
     }
     mean = sum(weight * found[name] for name, weight in WEIGHTS.items()) / sum(WEIGHTS.values())
     found["nuplan_score"] = mean * torch.stack([found[name] for name in MULTIPLIERS]).prod(0)
@@ -89,10 +92,16 @@ def nuplan_columns(batch: Batch) -> Batch:
     return {name: value.masked_fill(unknown, torch.nan) for name, value in found.items()}
 
 
+def track_speed(batch: Batch) -> Tensor:
+    """The magnitude of the velocity [B, T+1, N] m/s as nuPlan has it: objects have none."""
+    speed = batch["states"][..., 3].abs()
+    return speed.masked_fill((batch["agent_type"] == OTHER)[:, None], 0.0)
+
+
 class Places(NamedTuple):
     """Of the ego at each step, bool [B, T+1]."""
 
-    loose: Tensor  # its corners are not in one lane, or one and a next
+    loose: Tensor  # its corners are not in one lane, or in lanes that follow each other
     crossing: Tensor  # its rear axle is in several lanes
 
 
@@ -109,8 +118,30 @@ def places_of(batch: Batch) -> Places:
     inside = states.new_zeros(len(states) * each, chosen.shape[1])
     inside[point, slot[point // each, lane]] = 1.0
     inside = inside.view(*points.shape[:-1], -1)  # [B, T+1, 5, M] of the chosen lanes
-    within = (inside[..., :4, :].flatten(1, 2) @ linked(batch, chosen)).view(inside[..., :4, :].shape) > 0
-    return Places(~within.all(2).any(-1), inside[..., 4, :].sum(-1) > 1)
+    together = connected(corners_inside=inside[..., :4, :], follows=linked(batch, chosen))
+    return Places(loose=~together, crossing=inside[..., 4, :].sum(-1) > 1)
+
+
+def connected(corners_inside: Tensor, follows: Tensor) -> Tensor:
+    """Whether the corners of the ego lie in one lane, or in lanes that follow each other as the ego drives.
+
+    Some lane X is, or is followed by, a lane of each front corner, and is, or follows, a lane of each rear corner; and
+    the rear corners' own lanes are one, or one follows the other.
+
+    Args:
+        corners_inside: [B, T+1, 4, M], 1 where a corner (front left, rear left, rear right, front right) is in a lane.
+        follows: [B, M, M], 1 at [j, i] where lane j is lane i, or begins where lane i ends.
+
+    Returns:
+        Bool [B, T+1].
+    """
+    front_left, rear_left, rear_right, front_right = corners_inside.unbind(-2)
+    after_left_rear = rear_left @ follows.mT
+    after_right_rear = rear_right @ follows.mT
+    front = (front_left @ follows) * (front_right @ follows)
+    lane = (front * after_left_rear * after_right_rear).sum(-1) > 0
+    rear = (after_left_rear * rear_right + after_right_rear * rear_left).sum(-1) > 0
+    return lane & rear
 
 
 def rear_axle(states: Tensor, size: Tensor) -> Tensor:
@@ -158,8 +189,8 @@ def angle_at(axle: Tensor, heading: Tensor, centre: Tensor) -> Tensor:
 def at_fault(batch: Batch, places: Places) -> tuple[Tensor, Tensor]:
     """Bool [B, T+1, N] each: collisions at the ego's fault, and all, at the step at which an agent first meets the ego.
 
-    The ego is at fault if it moves and the other stands, if its front bumper meets the other, or if the other, not
-    behind it, meets it beside while the ego is not in one lane.
+    The ego is at fault if it moves and the other stands, as objects always do, if its front bumper meets the other, or
+    if the other, not behind it, meets it beside while the ego is not in one lane.
     """
     touching = batch["area"] > 0
     new = touching & (touching.long().cumsum(1) == 1)
@@ -168,7 +199,8 @@ def at_fault(batch: Batch, places: Places) -> tuple[Tensor, Tensor]:
     size, other_size = batch["size"][row, 0], batch["size"][row, agent]
     behind = angle_at(rear_axle(ego, size), ego[:, 2], other[:, :2]) > BEHIND
     front = edge_parts_inside(ego, size, other, other_size)[:, 3] > 0
-    moves, stands = ego[:, 3].abs() > STOPPED_EGO, other[:, 3].abs() <= STOPPED
+    moves = ego[:, 3].abs() > STOPPED
+    stands = batch["track_speed"][row, step, agent] <= STOPPED
     guilty = moves & (stands | (~behind & (front | places.loose[row, step])))
     fault = torch.zeros_like(new)
     fault[row, step, agent] = guilty
@@ -222,30 +254,52 @@ def time_to_collision(batch: Batch, places: Places, fault: Tensor, new: Tensor) 
 
     Others count while they are ahead, or beside an ego that is not in one lane or on a crossing, until they meet it.
     """
-    states, size = batch["states"], batch["size"]
+    states, size, speed = batch["states"], batch["size"], batch["track_speed"]
     ego, length = states[:, :, :1], size[:, None, :1]
     angle = angle_at(rear_axle(ego, length), ego[..., 2], states[..., :2])
     beside = (places.loose | places.crossing)[..., None] & (angle <= BEHIND)
-    seen = batch["valid"] & ~(new.cumsum(1) > 0) & ((angle < AHEAD) | beside) & (ego[..., 3].abs() > MOVING)
-    seen[..., 0] = False
-    reach = (size[:, :1] + size).norm(dim=-1)[:, None] + (ego[..., 3].abs() + states[..., 3].abs()) * LEAST_TTC
-    seen &= (states[..., :2] - ego[..., :2]).norm(dim=-1) < reach
-    row, step, agent = seen.nonzero(as_tuple=True)
-    ahead = torch.arange(DT, LEAST_TTC, DT, dtype=states.dtype)[:, None, None]  # [K, 1, 1] s
-
-    def after(track: Tensor) -> Tensor:
-        return torch.cat([track[:, :2] + ahead * velocity(track), track[:, 2:].expand(len(ahead), -1, -1)], -1)
-
-    boxes = after(states[row, step, 0]), size[row, 0], after(states[row, step, agent]), size[row, agent]
-    meets = torch.zeros(len(states), dtype=torch.bool).index_fill(0, row[overlap(*boxes).any(0)], True)
+    counted = batch["valid"] & ~(new.cumsum(1) > 0) & ((angle < AHEAD) | beside) & (speed[..., :1] > MOVING)
+    counted[..., 0] = False
+    reach = (size[:, :1] + size).norm(dim=-1)[:, None] + (speed[..., :1] + speed) * LEAST_TTC
+    counted &= (states[..., :2] - ego[..., :2]).norm(dim=-1) < reach
+    row, step, agent = counted.nonzero(as_tuple=True)
+    seconds = torch.arange(DT, LEAST_TTC, DT, dtype=states.dtype)[:, None]  # [K, 1]
+    touches = overlap(
+        first=projected(states[row, step, 0], speed[row, step, 0], seconds),
+        first_size=size[row, 0],
+        second=projected(states[row, step, agent], speed[row, step, agent], seconds),
+        second_size=size[row, agent],
+    )
+    meets = torch.zeros(len(states), dtype=torch.bool).index_fill(0, row[touches.any(0)], True)
     return (~meets & ~fault.any((1, 2))).to(states)
 
 
+def projected(states: Tensor, speed: Tensor, seconds: Tensor) -> Tensor:
+    """States [K, Q, 4] of tracks [Q, 4] that go on along their heading with speed [Q] m/s for seconds [K, 1].
+
+    nuPlan projects by the magnitude of the velocity, so one that reverses is projected forwards.
+    """
+    moving = torch.cat([states[:, :3], speed[:, None]], -1)
+    place = moving[:, :2] + seconds[..., None] * velocity(moving)
+    return torch.cat([place, moving[:, 2:].expand(len(seconds), -1, -1)], -1)
+
+
 def expert_progress(batch: Batch) -> Tensor:
-    """Fraction [B] of the recorded ego's path driven to the last step; 1 where it hardly moved."""
+    """min(1, max(d, f) / max(r, f)) [B] of d m driven along the r m that the recorded ego drove, f = PROGRESS_FLOOR.
+
+    0 where the ego ends more than f behind its start.
+    """
     last = torch.full_like(batch["stop"], batch["states"].shape[1] - 1)
-    way = ego_path(batch["states"], batch["valid"], last)
-    return route_completion(*way, batch["logged"], batch["logged_valid"]).nan_to_num(1.0)
+    path, count = ego_path(batch["states"], batch["valid"], last)
+    recorded, known = ego_path(batch["logged"], batch["logged_valid"], last)
+    fraction = route_completion(path, count, logged=batch["logged"], logged_valid=batch["logged_valid"])
+    pieces = torch.arange(1, recorded.shape[1]) < known[:, None]
+    distance = (recorded[:, 1:, :2] - recorded[:, :-1, :2]).norm(dim=-1).mul(pieces).sum(-1)
+    driven = fraction.nan_to_num(0.0) * distance
+    ratio = driven.clamp(min=PROGRESS_FLOOR) / distance.clamp(min=PROGRESS_FLOOR)
+    end = path[torch.arange(len(path)), (count - 1).clamp(min=0)]
+    back = to_frame(end[:, :2], recorded[:, 0])[:, 0] < -PROGRESS_FLOOR
+    return torch.where((driven == 0) & back, 0.0, ratio.clamp(max=1))
 
 
 def speed_limit(batch: Batch) -> Tensor:
@@ -259,25 +313,38 @@ def speed_limit(batch: Batch) -> Tensor:
     return (1 - over.sum(1) / (speed.shape[1] - 1) / MAX_OVERSPEED).clamp(min=0)
 
 
-def comfort(ego: Tensor) -> Tensor:
-    """1 [B] where the motion of ego [B, T+1, 4] stays within COMFORT, else 0.
+def comfort(ego: Tensor, length: Tensor) -> Tensor:
+    """1 [B] where the motion of ego [B, T+1, 4] of length [B] m stays within COMFORT, else 0.
 
-    Derivatives are Savitzky-Golay filters with the devkit's windows; acceleration is a step's change of speed, and
-    speed times yaw rate.
+    Accelerations are those of nuPlan's simulated ego. Its rear axle has a step's change of speed and none to the side,
+    which makes the total; the centre, d ahead, has d (w^2 + dw/dt) more along the vehicle, at yaw rate w. Each is
+    smoothed, then differentiated, by the devkit's Savitzky-Golay windows, and rounded as there.
     """
-    speed, heading = ego[..., 3], torch.cumsum(wrap(torch.nn.functional.pad(ego[..., 2].diff(dim=1), (1, 0))), 1)
-    change = torch.nn.functional.pad(torch.stack([speed.diff(dim=1), speed[:, 1:] * heading.diff(dim=1)]), (1, 0)) / DT
-    change[..., 0] = change[..., 1]
-    smooth = partial(savgol_filter, delta=DT, axis=-1)
-    window = partial(min, ego.shape[1])
-    lon, lat, size = (smooth(a.numpy(), window(8), 2) for a in (*change, torch.hypot(*change)))
-    found = {
-        "longitudinal": lon,
-        "lateral": lat,
-        "yaw_rate": smooth(heading.numpy(), window(5), 2, deriv=1),
-        "yaw_accel": smooth(heading.numpy(), window(5), 3, deriv=2),
-        "longitudinal_jerk": smooth(lon, window(15), 2, deriv=1),
-        "jerk": smooth(size, window(15), 2, deriv=1),
+    turns = wrap(ego[..., 2].diff(dim=1))
+    rear_axle = held_back(ego[..., 3].diff(dim=1) / DT)
+    yaw_rate = held_back(turns / DT)
+    yaw_accel = torch.nn.functional.pad(yaw_rate.diff(dim=1) / DT, (1, 0))
+    centre = rear_axle + REAR_AXLE * length[:, None] * (yaw_rate.square() + yaw_accel)
+    heading = torch.nn.functional.pad(turns.cumsum(1), (1, 0)).numpy()
+    longitudinal = smoothed(centre.numpy(), window=8, order=2)
+    total = smoothed(rear_axle.abs().numpy(), window=8, order=2)
+    motion = {
+        "longitudinal": longitudinal,
+        "yaw_rate": smoothed(heading, window=5, order=2, deriv=1),
+        "yaw_accel": smoothed(heading, window=5, order=3, deriv=2),
+        "longitudinal_jerk": smoothed(longitudinal, window=15, order=2, deriv=1),
+        "jerk": smoothed(total, window=15, order=2, deriv=1),
     }
-    fine = [(low <= found[name]) & (found[name] <= high) for name, (low, high) in COMFORT.items()]
-    return torch.stack([torch.from_numpy(each).all(-1) for each in fine]).all(0).to(ego)
+    within = [(low < motion[name]) & (motion[name] < high) for name, (low, high) in COMFORT.items()]
+    return torch.from_numpy(np.stack(within).all((0, 2))).to(ego)
+
+
+def held_back(change: Tensor) -> Tensor:
+    """Values [B, T+1] of steps [B, T]: that of the step before each state, and at the start that of the first step."""
+    return torch.cat([change[:, :1], change], 1)
+
+
+def smoothed(values: np.ndarray, window: int, order: int, deriv: int = 0) -> np.ndarray:
+    """A Savitzky-Golay filter of values [B, T+1] at steps of DT, or its derivative, to eight decimals."""
+    length = min(window, values.shape[-1])
+    return savgol_filter(values, length, order, deriv=deriv, delta=DT, axis=-1).round(8)

@@ -16,9 +16,13 @@ TERMS = (*MULTIPLIERS, *WEIGHTS)
 AWAY = course(0, 400, 0, 0)  # an agent that nobody meets
 
 
-def scores(*courses, lanes=None, limit=None, logged=None, **options):
-    """The terms of one rollout; lanes: [(points, width)], by default one along x of 4 m."""
+def scores(*courses, lanes=None, limit=None, logged=None, length=None, **options):
+    """The terms of one rollout; lanes: [(points, width)], by default one along x of 4 m; length: of the ego."""
     rollouts = scene(*courses, **options)
+    if length is not None:
+        size = rollouts.size.clone()
+        size[:, 0, 0] = length
+        rollouts = rollouts.replace(size=size)
     if lanes is not None:
         points = [torch.tensor(line, dtype=torch.float32) for line, _ in lanes]
         index = torch.cat([torch.full((len(line),), number) for number, line in enumerate(points)])
@@ -67,6 +71,28 @@ def test_whose_fault_a_collision_is(name):
     assert found["nuplan_score"] <= expected
 
 
+@pytest.mark.parametrize(("creep", "expected"), [(0.02, 0), (0.049, 0), (0.06, 1)])
+def test_a_track_of_at_most_0_05_m_per_s_stands(creep, expected):
+    """It touches the side of the ego, which passes in its lane: at fault if it stands, else beside within one lane."""
+    other = course(18, 3.4 + creep * 1.65, -math.pi / 2, creep)
+    found = scores(course(0, 0, 0, 10), other, limit=20)
+    assert found["no_ego_at_fault_collisions"] == expected
+
+
+def test_an_object_stands_whatever_its_speed():
+    """The same side is touched at 8 m/s: by a vehicle it is the vehicle's doing, by an object half the score is lost."""
+    ego, other = course(0, 0, 0, 10), course(8, 9.2, -math.pi / 2, 8)
+    assert scores(ego, other, kinds=[VEHICLE, VEHICLE], limit=20)["no_ego_at_fault_collisions"] == 1
+    assert scores(ego, other, kinds=[VEHICLE, OTHER], limit=20)["no_ego_at_fault_collisions"] == 0.5
+
+
+def test_two_objects_leave_nothing():
+    """max(0, 1 - 2 / (1 + 1))."""
+    objects = [course(30, 0, 0, 0), course(45, 0, 0, 0)]
+    found = scores(course(0, 0, 0, 12), *objects, kinds=[VEHICLE, OTHER, OTHER], limit=20)
+    assert found["no_ego_at_fault_collisions"] == 0
+
+
 def test_beside_it_is_the_ego_s_fault_where_it_is_in_two_lanes():
     """It drives on the border of two lanes; in one that is twice as wide it is not at fault."""
     ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
@@ -82,6 +108,20 @@ def test_lanes_that_follow_each_other_are_one():
     assert scores(ego, other, lanes=pieces)["no_ego_at_fault_collisions"] == 1
     gaps = [([[x, 2], [x + 6.3, 2]], 8) for x in range(-21, 200, 7)]
     assert scores(ego, other, lanes=gaps)["no_ego_at_fault_collisions"] == 0
+
+
+def test_a_short_lane_between_two_others_connects_them():
+    """Front corners in the lane after it, rear corners in the lane before it: one lane all the while."""
+    ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
+    pieces = [([[x, 2], [x + 3, 2]], 8) for x in range(-21, 200, 3)]
+    assert scores(ego, other, lanes=pieces)["no_ego_at_fault_collisions"] == 1
+
+
+def test_lanes_that_follow_each_other_are_not_one_against_their_direction():
+    """Pieces drawn the other way: where the ego is in two, the one ahead does not follow the one behind."""
+    ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
+    pieces = [([[x + 3, 2], [x, 2]], 8) for x in range(-21, 200, 3)]
+    assert scores(ego, other, lanes=pieces)["no_ego_at_fault_collisions"] == 0
 
 
 @pytest.mark.parametrize(("y", "expected"), [(1.0, 1), (1.25, 1), (1.35, 0), (-1.35, 0)])
@@ -107,6 +147,37 @@ def test_time_to_collision(gap, expected):
     assert scores(course(0, 0, 0, 10), ahead)["time_to_collision_within_bound"] == expected
 
 
+@pytest.mark.parametrize(("degrees", "expected"), [(0, 0), (21, 0), (29, 0), (31, 1)])
+def test_time_to_collision_looks_30_degrees_to_each_side_of_ahead(degrees, expected):
+    """One that is 8 m from the ego's rear axle drives across for a step at the velocity that would meet the ego's front
+    0.4 s later; the ego is in one lane."""
+    angle = math.radians(degrees)
+    axle = -1.461 / 5.176 * 4.8
+    x, y = axle + 8 * math.cos(angle), 8 * math.sin(angle)
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    heading = math.atan2(-y, 2.0 - x)
+    speed = math.hypot(y, 2.0 - x) / 0.4
+    other = track(x + 0 * time, y + 0 * time, heading + 0 * time, torch.where(time < 0.05, speed, 0.0))
+    standing = course(0, 0, 0, 0.01)
+    assert scores(standing, other)["time_to_collision_within_bound"] == expected
+
+
+def test_time_to_collision_projects_who_reverses_forwards():
+    """The devkit moves each by the magnitude of its velocity along its heading."""
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    away = torch.where(time < 0.05, -9.0, 0.0)
+    other = track(10 + 0 * time, 0 * time, math.pi + 0 * time, away)
+    assert scores(course(0, 0, 0, 0.01), other)["time_to_collision_within_bound"] == 0
+
+
+def test_time_to_collision_takes_objects_as_standing():
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    near = track(10 + 0 * time, 0 * time, math.pi + 0 * time, torch.where(time < 0.05, 9.0, 0.0))
+    ego = course(0, 0, 0, 0.01)
+    assert scores(ego, near, kinds=[VEHICLE, VEHICLE])["time_to_collision_within_bound"] == 0
+    assert scores(ego, near, kinds=[VEHICLE, OTHER])["time_to_collision_within_bound"] == 1
+
+
 def test_time_to_collision_looks_beside_in_two_lanes_alone():
     """One 6 m to the left, level with the ego's front and closing at 6.5 m/s, turns away before it is there."""
     time = torch.arange(81, dtype=torch.float64) * 0.1
@@ -118,10 +189,37 @@ def test_time_to_collision_looks_beside_in_two_lanes_alone():
 
 
 @pytest.mark.parametrize(("speed", "progress", "moving"), [(10, 1, 1), (12, 1, 1), (5, 0.5, 1), (1.9, 0.19, 0)])
-def test_progress_is_the_fraction_of_the_recorded_way(speed, progress, moving):
+def test_progress_is_the_fraction_of_the_recorded_distance(speed, progress, moving):
     found = scores(course(0, 0, 0, speed), AWAY, logged=course(0, 0, 0, 10))
     assert found["ego_progress_along_expert_route"] == pytest.approx(progress, abs=1e-6)
     assert found["ego_is_making_progress"] == moving
+
+
+@pytest.mark.parametrize(
+    ("recorded", "driven", "progress", "making"),
+    [
+        (0.9, 0.0, 1, 1),
+        (1.9, 0.0, 1, 1),
+        (4.0, 0.0, 0.5, 1),
+        (4.0, 3.0, 0.75, 1),
+        (9.0, 0.0, 2 / 9, 1),
+        (11.0, 0.0, 2 / 11, 0),
+    ],
+)
+def test_distances_below_2_m_count_as_2_m(recorded, driven, progress, making):
+    """min(1, max(driven, 2) / max(recorded, 2)); a fifth of it is progress."""
+    found = scores(course(0, 0, 0, driven / 8), AWAY, logged=course(0, 0, 0, recorded / 8))
+    assert found["ego_progress_along_expert_route"] == pytest.approx(progress, abs=1e-5)
+    assert found["ego_is_making_progress"] == making
+
+
+@pytest.mark.parametrize(("back", "expected"), [(1.9, 2 / 4), (2.1, 0)])
+def test_more_than_2_m_backwards_is_no_progress(back, expected):
+    """Of 4 m that were recorded."""
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    ego = track(-back * time / 8, 0 * time, 0 * time, -back / 8 + 0 * time)
+    found = scores(ego, AWAY, logged=course(0, 0, 0, 0.5))
+    assert found["ego_progress_along_expert_route"] == pytest.approx(expected, abs=1e-5)
 
 
 def test_where_the_recorded_ego_stands_progress_is_whole():
@@ -142,10 +240,11 @@ def test_speeding_is_unknown_without_limits():
 
 @pytest.mark.parametrize(
     ("accel", "turn", "expected"),
-    [(2.3, 0, 1), (2.5, 0, 0), (-3.9, 0, 1), (-4.2, 0, 0), (0, 0.45, 1), (0, 0.55, 0), (0, -0.55, 0)],
+    [(2.3, 0, 1), (2.5, 0, 0), (-3.9, 0, 1), (-4.2, 0, 0), (0, 0.55, 1), (0, -0.9, 1), (0, 0.97, 0), (0, -0.97, 0)],
 )
 def test_comfort_of_constant_motion(accel, turn, expected):
-    """Constant acceleration from 35 m/s, and constant turns at 9.5 m/s: at 0.45 rad/s that is 4.3 m/s^2."""
+    """Constant acceleration from 35 m/s, and constant turns at 9.5 m/s, whose lateral acceleration of 5.2 m/s^2 at 0.55
+    rad/s is above the devkit's bound of 4.89: its simulated ego has none, so it never counts."""
     speed = 35.0 if accel < 0 else 9.5
     states, valid = course(0, 0, 0, speed, accel=accel)
     time = torch.arange(len(states), dtype=torch.float64) * 0.1
@@ -155,6 +254,24 @@ def test_comfort_of_constant_motion(accel, turn, expected):
             radius * (turn * time).sin(), radius * (1 - (turn * time).cos()), turn * time, states[:, 3]
         )
     assert scores((states, valid), AWAY)["ego_is_comfortable"] == expected
+
+
+@pytest.mark.parametrize(("length", "expected"), [(10.0, 1), (11.0, 0)])
+def test_the_centre_s_acceleration_grows_with_its_distance_to_the_rear_axle(length, expected):
+    """d w^2 at 0.9 rad/s, d = 1.461 / 5.176 of the length: 2.29 and 2.52 m/s^2, bound 2.40."""
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    radius = 5.0 / 0.9
+    ego = track(radius * (0.9 * time).sin(), radius * (1 - (0.9 * time).cos()), 0.9 * time, 5.0 + 0 * time)
+    assert scores(ego, AWAY, length=length)["ego_is_comfortable"] == expected
+
+
+@pytest.mark.parametrize(("length", "expected"), [(1.0, 1), (4.8, 0)])
+def test_swaying_jerks_the_centre(length, expected):
+    """Heading 0.25 sin(2.5 t): 0.63 rad/s and 1.56 rad/s^2 are within bounds; the centre's d d^2w/dt^2, 3.9 m/s^3 times
+    d in m, is not for a car."""
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    ego = track(5 * time, 0 * time, 0.25 * (2.5 * time).sin(), 5.0 + 0 * time)
+    assert scores(ego, AWAY, length=length)["ego_is_comfortable"] == expected
 
 
 def test_a_jerk_is_uncomfortable_where_its_acceleration_is_not():
