@@ -24,6 +24,7 @@ SIZE = KNOTS + 2
 KNOT_STEPS = HORIZON // KNOTS
 ACCEL_SCALE = 1.0  # m/s^2 a unit of x
 OFFSET_SCALE, BEND_SCALE = 0.5, 0.15  # m a unit of x: end offset; half-way offset from the mean of now and the end
+LEAST_STRETCH = 0.3  # m of a vehicle's line per m of its route, at least: deep inside a bend
 LEAK = 0.05  # gradient that passes where the speed is held at 0
 # Weight of the squared second differences of fitted accelerations: what changes faster is noise of the recording.
 ROUGHNESS = 0.3
@@ -100,7 +101,7 @@ def _locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hin
     turn = wrap(states[..., 2] - heading)
     v = states[..., 3]
     kappa = (yaw_rate / v.clamp(min=1.0)).clamp(-0.25, 0.25)
-    d1 = torch.tan(turn.clamp(-1.0, 1.0)) * (1 - curvature * d).clamp(min=0.3)
+    d1 = torch.tan(turn.clamp(-1.0, 1.0)) * (1 - curvature * d).clamp(min=LEAST_STRETCH)
     d2 = (kappa - curvature).clamp(-0.1, 0.1)
     return LaneState(s, d, d1, d2, v, accel, states[..., 0], states[..., 1], states[..., 2], kappa)
 
@@ -186,7 +187,7 @@ def decode(
     xy, heading, curvature = interpolate(points, s, along)
     normal = torch.stack([-torch.sin(heading), torch.cos(heading)], -1)
     xy = xy + d[..., None] * normal
-    heading = heading + torch.atan(d1 / (1 - curvature * d).clamp(min=0.3))
+    heading = heading + torch.atan(d1 / (1 - curvature * d).clamp(min=LEAST_STRETCH))
     return LaneState(s, d, d1, d2, v, accel, xy[..., 0], xy[..., 1], heading, curvature + d2)
 
 

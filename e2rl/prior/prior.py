@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from e2rl.prior import free_space, lane_relative
 from e2rl.prior.bounds import BoundSettings, Obstacles, Rows, apply_cap, bounded
 from e2rl.prior.denoiser import Denoiser, DenoiserSettings, Encoding
+from e2rl.prior.driving import as_driven
 from e2rl.prior.features import edge_features, leaders_ahead, node_features
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, select
 from e2rl.prior.routes import RouteChoice, RoutedScene, route_scene, sample_route, start_state
@@ -201,19 +202,19 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> Plan:
-        """The motion that is executed: decoded and bounded, with standing vehicles held and routes ended."""
-
+        """The motion that is executed: decoded, `as_driven` and bounded; standing vehicles are held, routes end."""
         held, routed, state = ~context.active, context.routed, context.state
         held[:, 0] = False
 
         def decode(rows: Rows | None, cap: Tensor | None) -> LaneState:
             if rows is None:
-                return _held(self.decode(x0, context), state, held)
+                motion = as_driven(self.decode(x0, context), state, routed.has_lane)
+                return _held(motion, state, held)
             some = {name: getattr(routed, name)[rows][:, None] for name in ("points", "has_lane")}
             now = state.map(lambda value: value[rows][:, None])
             part = replace(context, routed=replace(routed, **some), state=now)
             assert cap is not None
-            motion = self.decode(x0[rows][:, None], part, cap[:, None])
+            motion = as_driven(self.decode(x0[rows][:, None], part, cap[:, None]), now, part.routed.has_lane)
             return _held(motion, now, held[rows][:, None]).map(lambda value: value[:, 0])
 
         motion = bounded(self.bounds, decode, state, context.obstacles)
@@ -227,7 +228,7 @@ def _held(motion: LaneState, state: LaneState, always: Tensor) -> LaneState:
     short = (motion.s[..., -1] - state.s) < HOLD_DISTANCE
     held = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
     zero = torch.zeros_like(held.v)
-    return select(((state.v < STANDING_SPEED) & short) | always, replace(held, v=zero, a=zero), motion)
+    return select(((state.v.abs() < STANDING_SPEED) & short) | always, replace(held, v=zero, a=zero), motion)
 
 
 def _leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tensor, known: Context | None) -> Leaders:

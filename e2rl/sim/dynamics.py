@@ -41,6 +41,11 @@ def yaw_rate_bound(speed: Tensor) -> Tensor:
     return torch.minimum(MAX_CURVATURE * speed, MAX_LATERAL / speed.clamp(min=1e-3))
 
 
+def turn_bound(speed: Tensor) -> Tensor:
+    """Largest |change of heading| [rad] in a step at speed [m/s], forwards or backwards."""
+    return yaw_rate_bound(speed.abs()) * DT
+
+
 def step(state: Tensor, action: Tensor) -> Tensor:
     """State [..., 4] after one DT of action [..., 2] = (acceleration m/s^2, yaw rate rad/s): `rollout` of one step."""
     x, y, heading, before = state.unbind(-1)
@@ -63,11 +68,25 @@ def rollout(start: Tensor, actions: Tensor) -> Tensor:
     v0 = start[..., 3:4]
     speed = bounded_speed(v0, actions[..., 0] * DT)
     before = torch.cat([v0.expand_as(speed[..., :1]), speed[..., :-1]], -1)
-    mean = (before + speed) / 2
-    bound = yaw_rate_bound(mean)
+    bound = yaw_rate_bound((before + speed) / 2)
     turn = torch.maximum(torch.minimum(actions[..., 1], bound), -bound) * DT
+    return steered(start, speed, turn)
+
+
+def steered(start: Tensor, speed: Tensor, turn: Tensor) -> Tensor:
+    """States [..., H, 4] at steps 1..H of a unicycle from start [..., 4].
+
+    Each step moves at the mean of the old and the new speed along the mean of the two headings.
+
+    Args:
+        start: [..., 4] states.
+        speed: [..., H] m/s, at steps 1..H.
+        turn: [..., H] rad, changes of heading in each step.
+    """
+    before = torch.cat([start[..., 3:4].expand_as(speed[..., :1]), speed[..., :-1]], -1)
     heading = start[..., 2:3] + turn.cumsum(-1)
-    along, middle = mean * DT, heading - turn / 2
+    along = (before + speed) / 2 * DT
+    middle = heading - turn / 2
     x = start[..., 0:1] + (along * middle.cos()).cumsum(-1)
     y = start[..., 1:2] + (along * middle.sin()).cumsum(-1)
     return torch.stack([x, y, wrap(heading), speed], -1)

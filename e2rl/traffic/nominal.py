@@ -155,10 +155,8 @@ class NominalTraffic(Traffic):
         return self.prior.encode(state.routed, state.lane, *now, ego_plan, known)
 
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
-        """Returns the current lane states: the ego's from its state and planned yaw rate, the others' from their plans.
-
-        Plans in free space have no route, so their arc lengths and offsets come from a projection.
-        """
+        """Returns the current lane states: the ego's from its state and planned yaw rate; the others' places on their
+        routes from their states, how they go on from their plans."""
         lane, routed = state.lane, state.routed
         yaw_rate = wrap(ego_plan[:, LOOK - 1, 2] - world.states[:, 0, 2]) / (LOOK * DT)
         ego = torch.zeros_like(routed.parked)
@@ -167,7 +165,8 @@ class NominalTraffic(Traffic):
         accel = torch.where(ego, world.accel[:, :1], lane.a)
         turning = torch.where(ego, yaw_rate[:, None], lane.kappa * lane.v)
         now = locate(world.states[:, : ego.shape[1]], accel, turning, routed.points, lane.s + ego * v / 2)
-        projected = {name: ego | ~routed.has_lane for name in ("s", "d", "d1", "d2")}
+        projected = {name: torch.ones_like(ego) for name in ("s", "d", "d1")}
+        projected["d2"] = ego | ~routed.has_lane
 
         def merged(name: str) -> Tensor:
             return torch.where(projected.get(name, ego), getattr(now, name), getattr(lane, name))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from e2rl.planners.path import STOP_GAP
 from e2rl.prior.bounds import Obstacles, Rows, apply_cap, bounded
+from e2rl.prior.driving import as_driven
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE, LaneState, decode, locate, select
 from e2rl.prior.prior import STANDING_SPEED, Prior
 from e2rl.prior.routes import RoutedScene, route_scene, start_state
@@ -21,6 +22,8 @@ from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders
 from e2rl.sim.mission import light_state_at, stop_line_distance
 from e2rl.sim.world import World
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity, steps_ahead
+
+PLACE = ("s", "d", "d1")  # of a lane state: where a vehicle is on its route
 
 
 class LogReplay(Traffic):
@@ -92,17 +95,20 @@ class IDM(Traffic):
         routed = state.routed
         vehicles = routed.route.shape[1]
         present = world.valid[:, :vehicles]
-        lane = _with_ego(state.lane, world, routed)
+        lane = located(state.lane, world, routed)
         wanted = self._wanted(routed, lane, world).clamp(min=self.bounds.floor)
         x = (wanted / ACCEL_SCALE)[..., None].expand(*lane.v.shape, KNOTS)
         x = torch.cat([x, x.new_zeros(*lane.v.shape, SIZE - KNOTS)], -1)
+        on_lane = torch.ones_like(routed.has_lane)  # who has none keeps straight on
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING_SPEED) | ~present
 
         def decoded(rows: Rows | None, cap: Tensor | None) -> LaneState:
             if rows is None:
-                return _held(decode(x, lane, routed.points), lane, frozen)
+                motion = as_driven(decode(x, lane, routed.points), lane, on_lane)
+                return _held(motion, lane, frozen)
             now = lane.map(lambda value: value[rows])
-            return _held(decode(*apply_cap(cap, x[rows], now), routed.points[rows]), now, frozen[rows])
+            motion = decode(*apply_cap(cap, x[rows], now), routed.points[rows])
+            return _held(as_driven(motion, now, on_lane[rows]), now, frozen[rows])
 
         obstacles = Obstacles(world.states, routed.size, world.valid)
         motion = bounded(self.bounds, decoded, lane, obstacles)
@@ -130,11 +136,14 @@ class IDM(Traffic):
         return torch.minimum(behind, halting)
 
 
-def _with_ego(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
-    """The lane states with the ego's simulated state."""
+def located(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
+    """The lane states where the vehicles are in the world; the ego as it is simulated, without a curvature."""
     accel = world.accel[:, :1]
-    now = locate(world.states[:, :1], accel, torch.zeros_like(accel), routed.points[:, :1])
-    return LaneState(**{name: torch.cat([getattr(now, name), value[:, 1:]], 1) for name, value in vars(lane).items()})
+    ego = locate(world.states[:, :1], accel, torch.zeros_like(accel), routed.points[:, :1])
+    others = world.states[:, 1 : lane.v.shape[1]]
+    there = locate(others, lane.a[:, 1:], (lane.kappa * lane.v)[:, 1:], routed.points[:, 1:], lane.s[:, 1:])
+    rest = {name: value[:, 1:] for name, value in vars(lane).items()} | {name: getattr(there, name) for name in PLACE}
+    return LaneState(**{name: torch.cat([getattr(ego, name), value], 1) for name, value in rest.items()})
 
 
 def _held(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:

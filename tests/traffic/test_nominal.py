@@ -58,7 +58,7 @@ def test_plans_continue_where_the_last_one_was_left():
 
 
 @pytest.mark.parametrize("free_space", [False, True])
-def test_the_ego_is_seen_as_it_drives_and_free_vehicles_beside_their_route(free_space):
+def test_everybody_is_seen_where_it_drives_and_goes_on_as_planned(free_space):
     scene = curved_scenes()
     on, world = nominal(), World.at_start(scene)
     turning = scene["logged"][:, 1 : HORIZON + 1, 0].clone()
@@ -70,8 +70,12 @@ def test_the_ego_is_seen_as_it_drives_and_free_vehicles_beside_their_route(free_
     assert seen.kappa[0, 0].item() == pytest.approx(0.2 / 8.0, rel=1e-3)
     start = on.prior.start(scene, state.routed.route)[1]
     torch.testing.assert_close(seen.d[:, 0], start.d[:, 0], rtol=0, atol=1e-3)
-    kept = seen.d[:, 1:6] - start.d[:, 1:6]
-    torch.testing.assert_close(kept, torch.full_like(kept, 0.0 if free_space else 0.25), rtol=0, atol=1e-3)
+    for name in ("s", "d", "d1"):
+        torch.testing.assert_close(getattr(seen, name)[:, 1:6], getattr(start, name)[:, 1:6], rtol=0, atol=1e-3)
+    kept = seen.d2[:, 1:6] - start.d2[:, 1:6]
+    if not free_space:
+        torch.testing.assert_close(kept, torch.full_like(kept, 0.25), rtol=0, atol=1e-3)
+    torch.testing.assert_close(seen.a[:, 1:], state.lane.a[:, 1:])
     torch.testing.assert_close(seen.x[:, 1:], state.lane.x[:, 1:])
 
 

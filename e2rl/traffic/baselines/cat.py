@@ -38,9 +38,11 @@ class CAT(OpenLoop):
     def replan(
         self, state: OpenLoopState, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[OpenLoopState, TrafficPlan]:
-        """Returns states and plans of the coming HORIZON steps; with strength all but the adversary replay."""
+        """Returns states and plans of the coming HORIZON steps; with strength all replay that have never been
+        adversaries: who has left its recording does not return to it."""
         state, plan = super().replan(state, world, ego_plan, react)
-        return replay_others(state, plan, world, state.held | (self.strength(state) <= 0)[:, None])
+        driven = state.held | state.released | (self.strength(state) <= 0)[:, None]
+        return replay_others(state, plan, world, driven)
 
     def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The nominal sample with the future of greatest overlap in its vehicle's row, which alone is held."""

@@ -31,10 +31,11 @@ EVERY = HORIZON // REPLAN_STEPS  # replans that a plan lasts
 
 @dataclass
 class OpenLoopState(BaselineState):
-    """held [B, V] bool: vehicles that drive the plan x [B, V, SIZE] whatever happens; begun [B, V]: lane states where
-    it begins."""
+    """held [B, V] bool: vehicles that drive the plan x [B, V, SIZE] whatever happens; released [B, V] bool: those that
+    did before; begun [B, V]: lane states where it begins."""
 
     held: Tensor
+    released: Tensor
     x: Tensor
     begun: LaneState
 
@@ -56,7 +57,8 @@ class OpenLoop(Baseline):
         """States of scenes [B] in which no vehicle is held."""
         state = super().reset(scenes, seed, eta)
         x = torch.zeros(*state.adversary.shape, SIZE, device=eta.device)
-        return OpenLoopState(**vars(state), held=state.adversary.clone(), x=x, begun=state.lane)
+        nobody = torch.zeros_like(state.adversary)
+        return OpenLoopState(**vars(state), held=nobody, released=nobody, x=x, begun=state.lane)
 
     def attack(self, now: Replan, context: Context) -> tuple[OpenLoopState, Tensor]:
         """Returns state and joint sample [G, V, SIZE]: a new scenario's where one is due; else nominal, but for those
@@ -70,9 +72,11 @@ class OpenLoop(Baseline):
         if not bool(due.any()):
             return state, x0
         made, rows = self.scenario(now, context, nominal), due[:, None]
+        held = torch.where(rows, made.held, state.held)
         state = replace(
             state,
-            held=torch.where(rows, made.held, state.held),
+            held=held,
+            released=(state.released | state.held) & ~held,
             adversary=torch.where(rows, made.adversary, state.adversary),
             path_kl=state.path_kl + torch.where(rows, made.path_kl, 0.0),
             x=torch.where(rows[..., None], made.x, state.x),
