@@ -37,8 +37,10 @@ def evaluate(run: Run) -> None:
     if asked.shard != WHOLE:
         print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")
         return
-    rows = record(*scored, folder, partial(egos.metric_rows, references=references(plan), **origin_of(run.folder)))
-    if asked.budget and then is None:
+    searched = bool(asked.budget) and then is None
+    about = {"references": references(plan), "searched": searched} | origin_of(run.folder)
+    rows = record(*scored, folder, partial(egos.metric_rows, **about))
+    if searched:
         save_budget(folder, plan, tries, *scored[:2])
     print("", *write_results(run, plan, rows), sep="\n")
     if then is not None:

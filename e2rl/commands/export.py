@@ -30,7 +30,7 @@ LIST = "exported.csv"
 
 def chosen_rows(run: Path, failures: int | None, every: bool, method: str | None) -> list[dict]:
     """Rows of rollouts.csv: its failures, first those that count, at most `failures`; or every rollout of it."""
-    rows = read_rows(run / TABLE)
+    rows = [row for row in read_rows(run / TABLE) if row["errored"] != 1]  # which have no file
     if method is not None:
         known = dict.fromkeys(row["method"] for row in rows)
         if method not in known:

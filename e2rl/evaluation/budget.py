@@ -6,8 +6,9 @@ families. What they find is told at several budgets by `report.budget`.
 
 import csv
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
 from e2rl.evaluation.protocol import HERE, Method, Part, Scored, Setup, Task, Work, extend, in_batches, score_all
-from e2rl.evaluation.summary import GROUP
 from e2rl.metrics.atlas import cell_of
+from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built, with_changes
@@ -29,9 +30,9 @@ from e2rl.search.search import Outcome, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family, Try, family_of
 
 TRIES_FILE = "tries.csv"
-TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "margin", "cell", "clean")
-EVENTS = ("cfr_preventable", "cfr_counted", "cfr")  # of a try
-SPENT = ("tries", "nfe", "seconds")  # a scene, of the search so far
+TOLD = ("scene_id", "location", "seed", "method", "ego_policy", "family", "margin", "cell", "clean", "raised")
+SPENT = ("tries", "nfe", "seconds")  # a scene that is still tried, of the search so far
+CLOSE = 1e-9  # of a budget: rounding
 
 
 @dataclass(frozen=True)
@@ -150,43 +151,109 @@ def spend(searches: Sequence[tuple], work: Work = HERE) -> list[tuple[Scored, li
     return all_spent
 
 
+@dataclass
+class Account:
+    """What a search has spent a scene, and what its tries cost.
+
+    Args:
+        budget: that may be spent a scene.
+        unit: of the budget, of SPENT.
+        cost: NFE and seconds of the last try of each family, or what they are said to be.
+        spent: so far, by SPENT.
+    """
+
+    budget: float
+    unit: str
+    cost: dict[str, tuple[float, float]]
+    spent: dict[str, float] = field(default_factory=lambda: dict.fromkeys(SPENT, 0.0))
+
+    def after(self, family: str, scenes: int) -> dict[str, float]:
+        """Returns what will be spent after one more try of a family, of so many scenes that are tried."""
+        each = dict(zip(SPENT, (1.0, *self.cost[family]), strict=True))
+        return {name: self.spent[name] + value / scenes for name, value in each.items()}
+
+    def affordable(self, tries: Sequence[Try], scenes: int) -> Sequence[Try]:
+        """Returns the first of some tries that fit into the rest of the budget by what they will cost; one at first."""
+        costs = [self.after(one.family, scenes)[self.unit] - self.spent[self.unit] for one in tries]
+        rest = (self.budget - self.spent[self.unit]) + CLOSE * self.budget
+        fitting = sum(total <= rest for total in accumulate(costs))
+        return tries[: fitting or int(self.spent["tries"] == 0)]
+
+    def charge(self, family: str, row: Mapping, scenes: int) -> bool:
+        """Returns whether a try was within the budget, or the first; then it is charged. One that errored costs what
+        the last did."""
+        if row["errored"] != 1:
+            self.cost[family] = row["nfe"], row["seconds"]
+        after = self.after(family, scenes)
+        if self.spent["tries"] and after[self.unit] > self.budget * (1 + CLOSE):
+            return False
+        self.spent = after
+        return True
+
+
 def spending(
     setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], budget: float, unit: str
 ) -> Generator[list[tuple[int, Part]], Scored, tuple[Scored, list[dict]]]:
-    """One search: yields the numbered parts of each round, is sent what they scored, and returns what it found, and its
-    tries in their order: round by round, the scenes of a round in an order of its own, so that a budget that ends
-    within a round is spent on scenes at random. A try that errors counts as one that comes nowhere near, and costs what
-    the last one of its family did, or is said to."""
+    """One search: yields the numbered parts of each round, is sent what they scored, and returns what it found within
+    the budget, and these tries in their order: round by round, the scenes of a round in an order of its own, so that a
+    budget that ends within a round is spent on scenes at random. A try that errors counts as one that comes nowhere
+    near."""
     search, told = plan.begin(setup, seed, scenes), list[dict]()
     found: Scored = ([], [], [])
-    cost = {family.name: (family.nfe, 0.0) for family in plan.families}  # of a try: NFE, seconds
-    generator = torch.Generator().manual_seed(seed)
-    spent = dict.fromkeys(SPENT, 0.0)
+    account = Account(budget, unit, {family.name: (family.nfe, 0.0) for family in plan.families})
+    generator, driven = torch.Generator().manual_seed(seed), 0
     with tqdm(total=budget, desc=f"{plan.name}: {unit} a scene", disable=None) as bar:
-        while spent[unit] < budget * (1 - 1e-9):
+        while active := len(search.active()):
             order = torch.randperm(len(scenes), generator=generator).tolist()
-            tries = sorted(search.ask(), key=lambda one: order[one.scene])
-            scored = yield list(enumerate(batches(setup, plan, seed, scenes, tries), sum(map(len, search.tries))))
-            extend(found, scored)
-            known = {(row["scene_id"], row["seed"]): row for row in scored[0]}
-            rows = [known.get((setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one))) for one in tries]
-            outcomes = []
-            for one, row in zip(tries, rows, strict=True):
-                margin, cell = -FARTHEST, ""  # of one that errored
-                if row:
-                    cost[one.family] = row["nfe"], row["seconds"]
-                    margin, cell = row["margin"], ", ".join(cell_of(row) or ())
-                each = 1.0, *cost[one.family]
-                spent = {name: spent[name] + value / len(scenes) for name, value in zip(SPENT, each, strict=True)}
-                outcomes.append(Outcome(margin, cell, each[1]))
-                if row:
-                    line = row | {"family": one.family, "cell": cell, "clean": row["cfr_clean"]} | spent
-                    told.append({name: line[name] for name in (*TOLD, *SPENT)})
-            search.tell(tries, outcomes)
-            if unit == "seconds" and not told:
-                break  # all errored, and nothing tells how long they would take
-            bar.update(min(spent[unit], budget) - bar.n)
+            asked = sorted(search.ask(), key=lambda one: order[one.scene])
+            outcomes = list[Outcome]()
+            while len(outcomes) < len(asked):
+                tries = account.affordable(asked[len(outcomes) :], active)
+                if not tries:
+                    return found, told
+                scored = yield list(enumerate(batches(setup, plan, seed, scenes, tries), driven))
+                driven += len(tries)
+                known = {(row["scene_id"], row["seed"]): row for row in scored[0]}
+                rows = [known[setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one)] for one in tries]
+                charged = list[Mapping]()
+                for one, row in zip(tries, rows, strict=True):
+                    if not account.charge(one.family, row, active):
+                        break
+                    charged.append(row)
+                    outcomes.append(outcome_of(row, account.cost[one.family][0]))
+                    told += [] if lost(row) else [told_of(row, one.family, outcomes[-1]) | account.spent]
+                extend(found, within(scored, charged))
+                timeless = unit == "seconds" and all(row["errored"] == 1 for row in found[0])
+                if len(charged) < len(tries) or timeless:  # nothing tells how long those would take that all errored
+                    return found, told
+                bar.update(min(account.spent[unit], budget) - bar.n)
+            search.tell(asked, outcomes)
+            if not asked:
+                break
     return found, told
+
+
+def outcome_of(row: Mapping, nfe: float) -> Outcome:
+    """Returns what became of the try of a row; one that errored came nowhere near."""
+    if row["errored"] == 1:
+        return Outcome(-FARTHEST, "", nfe, raised(row))
+    return Outcome(row["margin"], ", ".join(cell_of(row) or ()), nfe)
+
+
+def told_of(row: Mapping, family: str, outcome: Outcome) -> dict:
+    """Returns the line of tries.csv of a try, but for what was SPENT."""
+    clean = 0.0 if outcome.raised else row["cfr_clean"]
+    about = {"family": family, "margin": outcome.margin, "cell": outcome.cell, "clean": clean}
+    return {name: (row | about | {"raised": int(outcome.raised)})[name] for name in TOLD}
+
+
+def within(scored: Scored, charged: Sequence[Mapping]) -> Scored:
+    """Returns what the rollouts of the rows `charged` scored."""
+    rows, samples, errored = scored
+    kept = {(row["scene_id"], row["seed"]) for row in charged}
+    chosen = [k for k, row in enumerate(rows) if (row["scene_id"], row["seed"]) in kept]
+    entries = [entry for entry in errored if (entry["scene_id"], entry["seed"]) in kept]
+    return [rows[k] for k in chosen], [samples[k] for k in chosen], entries
 
 
 def batches(setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: Sequence[Try]) -> list[Part]:
@@ -236,17 +303,6 @@ def failures_of(file: Path, ego_name: str, plan: Plan, setup: Setup) -> list[Par
         drawn = families[name].draw(scene, number % TRIES, searches[seed].seed_of(scene), plan.settings.stratified)
         tries.setdefault(seed, []).append(drawn)
     return [part for seed, own in tries.items() for part in batches(setup, plan, seed, every, own)]
-
-
-def scene_rows(rows: Sequence[Mapping], events: Sequence[str] = EVENTS) -> list[dict]:
-    """A row for each search of each scene, from the rows of its tries: `events`, 1 where any try has one; seed: of the
-    search."""
-    found: dict[tuple, dict] = {}
-    for row in rows:
-        identity = {name: row[name] for name in (*GROUP, "scene_id", "location")} | {"seed": row["seed"] // TRIES}
-        one = found.setdefault(tuple(identity.values()), identity | dict.fromkeys(events, 0.0))
-        one |= {name: max(one[name], float(row[name])) for name in events}
-    return list(found.values())
 
 
 def write_tries(path: Path, told: Sequence[Mapping]) -> None:

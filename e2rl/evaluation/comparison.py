@@ -4,19 +4,25 @@ A search goes on by what it has found, so its tries are no pairs. Of a run with 
 try ends in a preventable failure, and has moved where the two searches share no way of failing (cell of the atlas).
 """
 
+import math
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from e2rl.evaluation.budget import TRIES_FILE, scene_rows
-from e2rl.evaluation.rollout_files import TABLE, cell, read_rows
+from e2rl.evaluation.budget import TRIES_FILE
+from e2rl.evaluation.rollout_files import TABLE, cell, read_run
+from e2rl.evaluation.summary import scene_rows
 from e2rl.metrics.atlas import cell_of
+from e2rl.metrics.catalogue import METRICS
+from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.failure_modes import Row, is_failure
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.statistics import paired_differences
 from e2rl.run.errors import InputError
 from e2rl.run.run import changed, read_provenance
+from e2rl.scenes.scene_list import SCENES, read_list
 from e2rl.search.tries import TRIES
 
 PAIR = ("method", "eta", "scene_id", "seed")
@@ -25,6 +31,7 @@ SHARED = (  # settings and inputs without which rollouts are no pairs
     *("scenes", "scene", "seeds", "eta", "methods", "variants", "tries", "budget", "budget_unit"),
     *("prior", "sim", "synthesizer", "search"),
 )
+SHOWN = 3  # rollouts that a message names
 LATER = 0.5  # s from which on a contact has moved: a replan
 RATES = {  # what is compared, and the columns of the tables
     **{"contacts": "cfr", "counted": "cfr_counted", "preventable": "cfr_preventable", "clean": "cfr_clean"},
@@ -42,35 +49,77 @@ class Driven(NamedTuple):
 
     @classmethod
     def read(cls, run: Path, ego: str | None = None) -> "Driven":
-        """The rollouts of a run's ego, None: of its only one; InputError where it is not there."""
-        rows = read_rows(run / TABLE)
+        """The rollouts of a run's ego, None: of its only one; InputError where it is not there, and where the run's
+        table lacks rollouts or holds values that no rollout has."""
+        rows = read_run(run)
+        check_values(run, rows)
         egos = list(dict.fromkeys(row["ego_policy"] for row in rows))
         if ego not in egos and (ego or len(egos) != 1):
             raise InputError(f"{run}: has the egos {', '.join(egos) or 'none'}; name one by --ego, or two by --egos")
         ego = ego or egos[0]
-        return cls(run, ego, [row for row in rows if row["ego_policy"] == ego], (run / TRIES_FILE).is_file())
+        driven = cls(run, ego, [row for row in rows if row["ego_policy"] == ego], (run / TRIES_FILE).is_file())
+        check_complete(driven)
+        return driven
 
     @property
     def unit(self) -> str:
         """What rates are of."""
         return "searches of a scene" if self.searched else "rollouts"
 
-    def rollouts(self) -> dict[tuple, list[dict]]:
-        """The rows of each PAIR: one, or of a search its tries."""
-        found: dict[tuple, list[dict]] = {}
+    def traffic(self) -> dict[tuple[str, float], list[dict]]:
+        """The rows of rollouts by method and intensity, errored ones, too."""
+        found: dict[tuple[str, float], list[dict]] = {}
         for row in self.rows:
+            found.setdefault((row["method"], row["eta"]), []).append(row)
+        return found
+
+    def rollouts(self) -> dict[tuple, list[dict]]:
+        """The rows of each PAIR: one, or of a search its tries; without those that the traffic lost."""
+        found: dict[tuple, list[dict]] = {}
+        for row in (row for row in self.rows if not lost(row)):
             key = (row["method"], row["eta"], row["scene_id"], row["seed"] // (TRIES if self.searched else 1))
             found.setdefault(key, []).append(row)
         return found
 
     def units(self) -> dict[tuple[str, float], list[dict]]:
-        """The rows that rates are of, by method and intensity: rollouts, or of a search its scenes, 1 where any try has
-        what is counted."""
-        found: dict[tuple[str, float], list[dict]] = {}
-        events = [column for column in RATES.values() if column != "progress"]
-        for row in scene_rows(self.rows, events) if self.searched else self.rows:
-            found.setdefault((row["method"], row["eta"]), []).append(row)
-        return found
+        """The rows that rates are of, by method and intensity: rollouts that the traffic did not lose, or of a search
+        its scenes, 1 where any try has what is counted."""
+        names = [column for column in RATES.values() if METRICS[column].event]
+        if self.searched:
+            return {key: scene_rows(rows, names) for key, rows in self.traffic().items()}
+        return {key: [row for row in rows if not lost(row)] for key, rows in self.traffic().items()}
+
+
+def check_values(run: Path, rows: Sequence[Row]) -> None:
+    """Raises InputError, naming it, for a value of RATES that no rollout has: a fraction outside of [0, 1], an infinite
+    or negative distance, a contact without a verdict; or where no rollout has a value."""
+    ended = [row for row in rows if row["errored"] != 1]
+    for column in RATES.values():
+        high = 1.0 if METRICS[column].fraction else sys.float_info.max
+        wrong = [row for row in ended if not (0 <= row[column] <= high or math.isnan(row[column]))]
+        unknown = [row for row in ended if row["cfr"] == 1 and math.isnan(row[column])]
+        mend = f"restore {TABLE}, or run evaluate.py again"
+        for row in (wrong or unknown)[:1]:
+            place = f"{row['scene_id']}, seed {row['seed']}"
+            raise InputError(f"{run / TABLE}: {column} of {place} is {cell(row[column]) or 'empty'}; {mend}")
+        if ended and all(math.isnan(row[column]) for row in ended):
+            raise InputError(f"{run / TABLE}: the column {column} is empty; {mend}")
+
+
+def check_complete(driven: Driven) -> None:
+    """Raises InputError, naming some, where scenes and seeds of the run are not in its table; of a search nothing is
+    known of scenes that it did not come to."""
+    settings = read_provenance(driven.run)["settings"]
+    if driven.searched or settings.get("failure") or not (driven.run / SCENES).is_file():
+        return
+    scenes = [settings["scene"]] if settings.get("scene") else [line.scene_id for line in read_list(driven.run)]
+    for (method, eta), rows in driven.traffic().items():
+        known = {(row["scene_id"], row["seed"]) for row in rows}
+        absent = [(scene, seed) for scene in scenes for seed in settings["seeds"] if (scene, seed) not in known]
+        if absent:
+            shown = ", ".join(f"{scene} seed {seed}" for scene, seed in absent[:SHOWN])
+            count = f"{len(absent)} of {len(scenes) * len(settings['seeds'])} rollouts of {method} η={eta:g}"
+            raise InputError(f"{driven.run / TABLE}: lacks {count} ({shown}); go on with resume={driven.run}")
 
 
 def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
@@ -120,13 +169,21 @@ def check_shared(first: Driven, second: Driven) -> None:
         raise InputError(f"{second.run}: no pairs with {first.run}, which has other {', '.join(told)}; {mend}")
 
 
+def nearness(row: Row) -> tuple[bool, float]:
+    """Sorts tries of a scene: the nearest to a preventable failure last, those that errored first."""
+    return row["margin"] == row["margin"], row["margin"]
+
+
 def pair_of(key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched: bool) -> dict[str, Any] | None:
     """Two rollouts of one PAIR of which one has failed, None: none has; of a search the tries that are nearest to a
     preventable failure. `change` is of CHANGES, `what` differs between two failures: verdict, side of the ego,
-    counterpart, time by LATER; of searches way. `preventable`: whether one is."""
-    first, second = (max(each, key=lambda row: row["margin"]) for each in (tries, others))
+    counterpart, time by LATER; of searches way; ending, where the planner raised in one of them. `preventable`: whether
+    one is."""
+    first, second = (max(each, key=nearness) for each in (tries, others))
     ways = [{cell_of(row) for row in each} - {None} for each in (tries, others)]
-    failed = [bool(each) for each in ways] if searched else [is_failure(first), is_failure(second)]
+    crashed = [any(map(raised, each)) for each in (tries, others)]
+    found = [bool(each) for each in ways] if searched else [is_failure(first), is_failure(second)]
+    failed = [one or other for one, other in zip(found, crashed, strict=True)]
     differs = {
         "verdict": any(cell(first[name]) != cell(second[name]) for name in ("counted", "at_fault", "preventable")),
         "side": first["contact_type"] != second["contact_type"],
@@ -134,7 +191,9 @@ def pair_of(key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched
         "time": abs(first["contact_time"] - second["contact_time"]) > LATER + 1e-9,
     }
     if searched:
-        differs = {"way": not ways[0] & ways[1]}
+        differs = {"way": all(ways) and not ways[0] & ways[1]}
+    if any(crashed):
+        differs = {"ending": crashed[0] != crashed[1], "way": searched and differs["way"]}
     what = [name for name, there in differs.items() if there] if all(failed) else []
     change = ("moved" if what else "same") if all(failed) else "gone" if failed[0] else "new"
     about = {"change": change, "what": what, "preventable": any(map(bool, ways)), **dict(zip(PAIR, key, strict=True))}

@@ -9,6 +9,7 @@ from types import NoneType
 from e2rl.evaluation.rollout_files import read_json
 from e2rl.evaluation.summary import GROUP, group_of
 from e2rl.metrics.atlas import CELL, Cell, atlas_of, cell_of
+from e2rl.metrics.errored import lost
 from e2rl.metrics.failure_modes import (
     FEATURES,
     Row,
@@ -63,7 +64,7 @@ def find_modes(rows: Sequence[dict]) -> dict:
     counts = [group_counts(group, rows, members) for group in groups]
     return {
         "failures": len(failures),
-        "rollouts": len(rows),
+        "rollouts": sum(not lost(row) for row in rows),
         "unknown": [column for column in FEATURES if failures and column not in used],
         "groups": counts,
         "modes": [describe(number, ours, counts) for number, ours in members.items()],
@@ -76,7 +77,7 @@ def group_counts(group: dict, rows: Sequence[Row], members: Mapping[int, Sequenc
     key = tuple(group.values())
     ours = {number: sum(group_of(row) == key for row in failures) for number, failures in members.items()}
     modes = sum(count > 0 for number, count in ours.items() if number != OTHER)
-    rollouts = sum(group_of(row) == key for row in rows)
+    rollouts = sum(group_of(row) == key and not lost(row) for row in rows)
     return group | {"rollouts": rollouts, "failures": sum(ours.values()), "modes": modes}
 
 

@@ -15,7 +15,9 @@ from e2rl.evaluation import rollout_files as files
 from e2rl.evaluation.modes import ATLAS_FILE, MODES_FILE, find_atlas, find_modes
 from e2rl.evaluation.summary import empty_rows, group_of, metric_rows
 from e2rl.metrics.catalogue import SOURCE
+from e2rl.metrics.errored import errored_row
 from e2rl.metrics.evasion import add_avoidable
+from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
@@ -32,7 +34,7 @@ from e2rl.traffic.traffic import Traffic
 
 SEEDS_APART = 1_000_003
 WHOLE = (0, 1)  # the only shard of a run
-# Rows and realism samples, one of each per rollout; and the entries of errored.json of rollouts that errored.
+# Rows and realism samples, one of each per rollout; and the entries of errored.json, whose rows know nothing else.
 Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
 
 
@@ -107,8 +109,9 @@ class Setup:
             rows += found
             samples += features
         about = dict(zip(SOURCE, self.source(method), strict=True)) | {"eta": float(method.eta)}
-        names = self.scenes.scene_id
-        lost = [about | {"scene_id": names[task.scene], "seed": task.seed} | why for task, why in errored]
+        names, places = self.scenes.scene_id, self.scenes.location
+        scene = [{"scene_id": names[task.scene], "location": places[task.scene]} for task, _ in errored]
+        lost = [about | each | {"seed": task.seed} | why for each, (task, why) in zip(scene, errored, strict=True)]
         return rows, samples, lost
 
 
@@ -225,7 +228,8 @@ def score_all(
         if not has_files(into, scored):
             reason = "rollouts that a worker wrote are not here"
             raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
-        yield scored
+        rows, samples, errored = scored
+        yield rows + list(map(errored_row, errored)), samples + [NO_SAMPLES] * len(errored), errored
 
 
 def extend(found: Scored, more: Scored) -> None:
@@ -252,10 +256,12 @@ def record(
     method of which all rollouts errored has a row too, without metrics. Raises InputError where no rollout could be
     scored.
     """
+    modes = find_modes(rows)
     if folder is not None:
         files.write_errored(folder / files.ERRORED_FILE, errored)
-    files.require_rows(rows, errored, folder)
-    modes, known = find_modes(rows), summarise(rows, samples)
+        files.write_rows(folder / files.TABLE, rows)
+    files.require_rows([row for row in rows if row.get("errored") != 1], errored, folder)
+    known = summarise(rows, samples)
     known += empty_rows(known, errored)
     result = [
         {"errored": count_reasons(why for why in errored if group_of(why) == group_of(row))} | row for row in known
@@ -263,6 +269,5 @@ def record(
     if folder is not None:
         files.write_json(folder / MODES_FILE, modes)
         files.write_json(folder / ATLAS_FILE, find_atlas(rows))
-        files.write_rows(folder / files.TABLE, rows)
         files.write_json(folder / files.METRICS_FILE, result)
     return result

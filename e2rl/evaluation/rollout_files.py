@@ -10,9 +10,11 @@ from pathlib import Path
 from types import NoneType
 from typing import IO, Any
 
-from e2rl.metrics.catalogue import SOURCE, WORDS, row_columns
+from e2rl.metrics.catalogue import LATER, SOURCE, WORDS, row_columns
+from e2rl.metrics.errored import errored_row
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, leads_into, misfit, open_regular, read_regular, write_atomically
+from e2rl.run.parts import PARTS
 from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.traffic.attempt import summary_of
 
@@ -27,8 +29,12 @@ METRICS_ROW = {  # what readers of metrics.json need
     "metrics": {...: {"mean": NUMBER, **INTERVAL}},
     "paired": {...: {...: {"difference": NUMBER, **INTERVAL}}},
 }
-SOMETIMES = {"errored": {...: int}, "stage": (str, NoneType), "n_trainings": int}
-TEXTS = (*SOURCE, "scene_id", "location", *WORDS)
+SOMETIMES = {"errored": {...: int}, "stage": (str, NoneType), "n_trainings": int, "headline": {...: (int, float)}}
+TEXTS = (*SOURCE, "scene_id", "location", *WORDS, *(name for name, value in LATER.items() if value == ""))
+ENTRY = {  # what readers of errored.json need
+    **dict.fromkeys((*SOURCE, "scene_id", "reason", "detail"), str),
+    **{"eta": (int, float), "seed": int},
+}
 
 
 def table_columns() -> tuple[str, ...]:
@@ -53,23 +59,45 @@ def cell(value: object) -> object:
 def read_rows(path: Path) -> list[dict]:
     """The rows of a rollouts.csv: text columns as text, seed and partner as int, all others as float (empty: NaN).
 
-    Raises InputError for a file that is no such table.
+    LATER columns, which tables of earlier versions lack, are filled. Raises InputError for a file that is no such
+    table.
     """
     path = Path(path)
     try:
         with opened(path) as file:
             rows = csv.DictReader(file, strict=True)
-            if missing := [name for name in table_columns() if name not in (rows.fieldnames or ())]:
-                raise ValueError(f"no column {missing[0]}")
-            found = [_row(rows.line_num, row) for row in islice(rows, MOST_ROWS + 1)]
+            missing = [name for name in table_columns() if name not in (rows.fieldnames or ())]
+            if wrong := [name for name in missing if name not in LATER]:
+                raise ValueError(f"no column {wrong[0]}")
+            later = {name: LATER[name] for name in missing}
+            found = [_row(rows.line_num, row) | later for row in islice(rows, MOST_ROWS + 1)]
         if len(found) > MOST_ROWS:
             raise ValueError(f"more than {MOST_ROWS:,} rows")
         return found
     except FileNotFoundError as error:
         mend = "give the folder of a run of evaluate.py; shards are merged first"
+        if (path.parent / PARTS).is_dir():
+            mend = (
+                f"the run is not finished; go on with it by e2rl evaluate resume={path.parent}; shards are merged first"
+            )
         raise InputError(f"{path}: no such table; {mend}") from error
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"{path}: damaged ({cause(error)}); run evaluate.py again to rewrite it") from error
+
+
+def read_run(run: Path) -> list[dict]:
+    """The rows of a run's rollouts.csv, and one for each rollout of its errored.json that the table lacks, as tables of
+    earlier versions do. Raises InputError where either is damaged."""
+    rows, file = read_rows(run / TABLE), run / ERRORED_FILE
+    entries = read_json(file, lambda found: misfit(found, [ENTRY]), printable=False) if file.is_file() else []
+    place = {row["scene_id"]: row["location"] for row in rows}
+    known = set(map(_identity, rows))
+    found = [errored_row({"location": place.get(entry["scene_id"], "")} | entry) for entry in entries]
+    return rows + [row for row in found if _identity(row) not in known]
+
+
+def _identity(row: dict) -> tuple:
+    return tuple(row[name] for name in (*SOURCE, "eta", "scene_id", "seed"))
 
 
 def opened(path: Path) -> IO[str]:
@@ -115,13 +143,19 @@ def read_metrics(path: Path) -> list[dict]:
     return [{key: nans(value) if key in ("metrics", "paired") else value for key, value in row.items()} for row in rows]
 
 
-def read_json(path: Path, wrong: Callable[[Any], str | None]) -> Any:
-    """The content of a JSON file of a run; raises InputError where it is none, or has something wrong."""
+def read_json(path: Path, wrong: Callable[[Any], str | None], printable: bool = True) -> Any:
+    """The content of a JSON file of a run; raises InputError where it is none, or has something wrong.
+
+    Args:
+        path: of the file.
+        wrong: says what is wrong with its content, if anything is.
+        printable: its texts hold no control characters, as those of a traceback do.
+    """
     try:
         found = json.loads(read_regular(path, MAX_JSON, path.parent), parse_int=_whole)
         if reason := wrong(found):
             raise ValueError(reason)
-        if odd := next(filter(UNPRINTABLE.search, _texts(found)), None):
+        if printable and (odd := next(filter(UNPRINTABLE.search, _texts(found)), None)):
             raise ValueError(f"{odd[:40]!r} holds control characters")
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read ({cause(error)}); give the folder of a finished run") from error
@@ -190,7 +224,7 @@ def add_errored(path: Path, number: int, errored: Sequence[dict]) -> None:
     write_errored(path, [*earlier, *errored])
 
 
-def require_rows(rows: Sequence[dict], errored: Sequence[dict], folder: Path | None) -> None:
+def require_rows(rows: Sequence, errored: Sequence[dict], folder: Path | None) -> None:
     """InputError where all rollouts errored."""
     if rows or not errored:
         return

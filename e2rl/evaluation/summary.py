@@ -6,10 +6,14 @@ from typing import Any
 
 from torch import Tensor
 
+from e2rl.evaluation.headline import headline
 from e2rl.metrics.catalogue import METRICS
+from e2rl.metrics.errored import lost, raised
+from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.statistics import DRAWS, REALISM_DRAWS, paired_differences, summarise
 from e2rl.run.endings import command_line
 from e2rl.run.run import git_commit
+from e2rl.search.tries import TRIES
 
 GROUP = ("dataset", "split", "method", "ego_policy", "eta")
 Key = tuple  # values of GROUP
@@ -35,9 +39,13 @@ def metric_rows(
     realism_draws: int = REALISM_DRAWS,
     egos: Sequence[tuple[str, str]] = (),
     references: Collection[str] | None = None,
+    searched: bool = False,
     **fields: Any,
 ) -> list[dict]:
     """Rows of metrics.json from the rows of rollouts and their realism samples (`features`).
+
+    Rollouts that the traffic lost take no part. Of tries of searches (`searched`) events are those of `scene_rows`, as
+    rates of tries are none of the planner.
 
     A row's `paired` compares it with every other method (or eta) on the same dataset, split and ego over the shared
     (scene, seed); a method there with several etas is named method@eta. egos: pairs of egos of which the first is also
@@ -47,7 +55,8 @@ def metric_rows(
     """
     groups: dict[Key, list[int]] = {}
     for index, row in enumerate(rows):
-        groups.setdefault(group_of(row), []).append(index)
+        if not lost(row):
+            groups.setdefault(group_of(row), []).append(index)
     members = {key: ([rows[i] for i in index], [features[i] for i in index]) for key, index in groups.items()}
     result = []
     for key, ours in members.items():
@@ -61,19 +70,55 @@ def metric_rows(
             other = (*key[:3], second, key[4])
             if first == key[3] and other in members:
                 paired[f"ego {second}"] = paired_differences(*ours, *members[other], draws, 0, relative=True)
-        scenes, seeds = ({row[name] for row in ours[0]} for name in ("scene_id", "seed"))
         metrics = summarise(*ours, draws, realism_draws)
-        result.append(metric_row(key, len(scenes), len(seeds), len(ours[0]), metrics, paired=paired, **fields))
+        if searched:
+            metrics |= scene_metrics(ours[0], draws)
+        scenes = {row["scene_id"] for row in ours[0]}
+        seeds = {row["seed"] // (TRIES if searched else 1) for row in ours[0]}
+        about = {"searched": searched, "headline": headline(ours[0], searched)._asdict()}
+        counts = len(scenes), len(seeds), len(ours[0])
+        result.append(metric_row(key, *counts, metrics, paired=paired, **about, **fields))
     return result
+
+
+def events() -> list[str]:
+    """Returns the names of the metrics that happen to the ego in a rollout or not."""
+    return [name for name, metric in METRICS.items() if metric.event]
+
+
+def scene_rows(rows: Sequence[Mapping], names: Collection[str] | None = None) -> list[dict]:
+    """A row for each search of each scene, from the rows of its tries: `names`, 1 where any try has the event, NaN
+    where none knows it; whether the planner raised; seed: of the search. Tries that the traffic lost take no part."""
+    names = [name for name in (events() if names is None else names) if name != "errored"]
+    found: dict[tuple, dict] = {}
+    for row in (row for row in rows if not lost(row)):
+        identity = {name: row[name] for name in (*GROUP, "scene_id", "location")} | {"seed": row["seed"] // TRIES}
+        scene = found.setdefault(tuple(identity.values()), identity | dict.fromkeys(names, math.nan) | {"errored": 0.0})
+        for name in names:
+            value = METRICS[name].raised if raised(row) else float(row.get(METRICS[name].source, math.nan))
+            known = [each for each in (scene[name], value) if not math.isnan(each)]
+            scene[name] = max(known, default=math.nan)
+        scene["errored"] = max(scene["errored"], float(raised(row)))
+    return list(found.values())
+
+
+def scene_metrics(rows: Sequence[Mapping], draws: int) -> dict[str, dict[str, float]]:
+    """Returns the events of the scenes of tries as `summarise` gives them; rates per kilometre are not known."""
+    scenes = scene_rows(rows)
+    found = summarise(scenes, [NO_SAMPLES] * len(scenes), draws, realism_draws=0)
+    nothing = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
+    per_distance = {name: nothing for name, metric in METRICS.items() if metric.per}
+    return {name: found[name] for name in events()} | per_distance
 
 
 def empty_rows(known: Sequence[dict], errored: Sequence[dict]) -> list[dict]:
     """Rows of metrics.json of the groups of which every rollout errored: no metric is known. known: the rows of the
     others, of which the first lends the fields that all have."""
-    present, lost = set(map(group_of, known)), dict.fromkeys(map(group_of, errored))
+    present = set(map(group_of, known))
+    absent = dict.fromkeys(map(group_of, errored))
     nothing = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
     shared = {name: known[0][name] for name in ("git", "command", "stage") if known and name in known[0]}
-    return [metric_row(key, 0, 0, 0, dict.fromkeys(METRICS, nothing), **shared) for key in lost if key not in present]
+    return [metric_row(key, 0, 0, 0, dict.fromkeys(METRICS, nothing), **shared) for key in absent if key not in present]
 
 
 def _method_name(key: Key, keys: Collection[Key]) -> str:

@@ -106,7 +106,8 @@ class PlannerTrials:
         jobs = [(f"{number}", (setup, method, tasks)) for number, (_, method, tasks) in enumerate(self.failures)]
         for scored in score_all(jobs, work, lambda job: len(job[1][2])):
             extend(found, scored)
-        rows, _, errored = found
+        every, _, errored = found
+        rows = [row for row in every if row["errored"] != 1]
         metrics = driving(rows)
         driven = [*self.methods, *(method for _, method, _ in self.failures)]
         for method, eta in dict.fromkeys((each.name, each.eta) for each in driven):
@@ -153,8 +154,9 @@ class AttackTrials:
         """Returns the metrics of a method; InputError where no rollout has a score."""
         setup = replace(self.setup, evasions=False)  # no trial is judged by them
         rows, samples, errored = drive_all([setup], [method], self.seeds, Work(processes=self.processes))
-        require_rows(rows, errored, None)
-        found = summarise(rows, samples, realism_draws=0)
+        ended = [k for k, row in enumerate(rows) if row["errored"] != 1]
+        require_rows(ended, errored, None)
+        found = summarise([rows[k] for k in ended], [samples[k] for k in ended], realism_draws=0)
         metrics = {name: found[name]["mean"] for name in MEASURED}
-        metrics["errored"] = len(errored) / (len(rows) + len(errored))
+        metrics["errored"] = len(errored) / len(rows)
         return metrics | {f"{name}_{end}": found[name][end] for name in SOUGHT for end in ("low", "high")}

@@ -63,7 +63,7 @@ class BeforeAfter:
         """Write the tries of a stage, their rollouts and their atlas into a folder."""
         work = replace(work, into=folder / ROLLOUTS)
         found, tries = search_all([setup], [plan], self.budget, "nfe", self.seeds[:1], work)
-        record(*found, folder, metric_rows)
+        record(*found, folder, partial(metric_rows, searched=True))
         write_tries(folder / TRIES_FILE, tries)
 
     def atlases(self) -> tuple[dict, dict] | None:

@@ -3,6 +3,7 @@
 from e2rl.metrics import (  # noqa: F401
     contact,
     displacement,
+    errored,
     evasion,
     failure_features,
     failure_modes,

@@ -3,6 +3,7 @@
 A metric is declared beside the function that computes it, by `columns`, or in any module by one call of `register`.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -33,6 +34,8 @@ class Metric:
     samples: str = ""  # of a metric that `metrics.realism` computes from pooled samples: those that it needs
     per_collision: bool = False  # known for collisions only: paired differences compare each group's own collisions
     cost: bool = False  # of the computation: a difference in it is not marked as significant
+    event: bool = False  # happens to the ego in a rollout or not; of a search: in a scene, in any of its tries
+    raised: float = math.nan  # value of a rollout in which the planner raised (`metrics.errored`); NaN: it knows none
     tables: str = ""  # closed-loop tables (`metrics=...` of evaluate.py) that show it, such as "main egos"; or new ones
 
     @property
@@ -42,9 +45,10 @@ class Metric:
 
 
 rate = partial(Metric, fraction=True)  # a metric in [0, 1]
+event = partial(rate, event=True)
 TABLES = ("main", "traffic", "adversaries", "methods", "egos", "public")  # of the package
 ORDER = (  # of columns in every table (docs/method.md, section 10); others follow as they are declared
-    *("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "cfr_adv", "cfr_vru", "cfr_bg", "avoidable"),
+    *("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "errored", "cfr_adv", "cfr_vru", "cfr_bg", "avoidable"),
     *("front", "side", "rear", "rir", "preventable", "counted", "at_fault"),
     *("relvel", "contact_time", "min_dtc", "ttc_c", "macc", "progress"),
     *("aor_step", "aor_any", "real", "real_adv", "real_norm", "transport", "seconds_per_rollout", "nfe"),
@@ -55,6 +59,9 @@ EVENTS: list[str] = []  # columns of a row after its metrics: what happened, and
 WORDS: dict[str, tuple[str, ...]] = {}  # columns that hold one of these words, or "" where the computed index is -1
 SOURCE = ("dataset", "split", "method", "ego_policy")  # columns of a row of a run
 IDENTITY = ("scene_id", "location", "seed", "eta")  # columns of a row before its metrics
+LATER: dict[str, float | str] = {  # last columns of a row: what rows of earlier versions, which lack them, know of them
+    **{"errored": math.nan, "raised_by": "", "error": ""}  # whether, by whom ("ego", "traffic"), and with what message
+}
 OPEN_LOOP_STAGE, META_STAGE, SPREAD_STAGE = "open loop", "meta-metric", "spread"
 STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own
 
@@ -124,7 +131,8 @@ def table_metrics(table: str) -> tuple[Metric, ...]:
 
 
 def row_columns() -> tuple[str, ...]:
-    """Columns of a row: its identity, its metrics, then events and what metrics are weighted or divided by."""
+    """Columns of a row: its identity, its metrics, events, what metrics are weighted or divided by, and LATER ones."""
     metrics = METRICS.values()
     weights = [name for metric in metrics for name in (metric.weight, metric.per) if name]
-    return tuple(dict.fromkeys((*IDENTITY, *(metric.source for metric in metrics), *EVENTS, *weights)))
+    columns = (*IDENTITY, *(metric.source for metric in metrics), *EVENTS, *weights)
+    return (*dict.fromkeys(name for name in columns if name not in LATER), *LATER)

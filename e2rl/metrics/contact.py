@@ -7,7 +7,7 @@ contact counts at steps >= 1. `stop` is the step of the ego's first contact with
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import Batch, Metric, columns, rate
+from e2rl.metrics.catalogue import Batch, Metric, columns, event, rate
 from e2rl.metrics.geometry import edge_distances, edge_parts_inside, pair_overlap, velocity
 from e2rl.metrics.realism import MOVING
 from e2rl.scenes.boxes import separation
@@ -99,15 +99,15 @@ def kinds_at_stop(batch: Batch) -> Tensor:
 
 
 @columns(
-    rate("cfr", "ego hits any vehicle", tables="main traffic adversaries methods egos public"),
-    rate("cfr_adv", "ego hits an adversary", tables="main adversaries methods"),
-    rate("cfr_vru", "ego hits a pedestrian or cyclist", tables="main public"),
-    rate("front", "first contact at the ego's front", tables="main adversaries egos"),
-    rate("side", "first contact at the ego's side", tables="main adversaries egos"),
-    rate("rear", "first contact at the ego's rear", tables="main adversaries egos"),
-    rate("front_any", "ego's front in contact at first contact", tables="egos"),
-    rate("side_any", "ego's side in contact at first contact", tables="egos"),
-    rate("rear_any", "ego's rear in contact at first contact", tables="egos"),
+    event("cfr", "ego hits any vehicle", raised=1.0, tables="main traffic adversaries methods egos public"),
+    event("cfr_adv", "ego hits an adversary", tables="main adversaries methods"),
+    event("cfr_vru", "ego hits a pedestrian or cyclist", tables="main public"),
+    event("front", "first contact at the ego's front", tables="main adversaries egos"),
+    event("side", "first contact at the ego's side", tables="main adversaries egos"),
+    event("rear", "first contact at the ego's rear", tables="main adversaries egos"),
+    event("front_any", "ego's front in contact at first contact", tables="egos"),
+    event("side_any", "ego's side in contact at first contact", tables="egos"),
+    event("rear_any", "ego's rear in contact at first contact", tables="egos"),
     rate("rir", "rear impacts per collision", per_collision=True, tables="main adversaries methods"),
     Metric(
         "relvel",

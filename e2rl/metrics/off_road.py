@@ -7,7 +7,7 @@ Distances are exact, from point to segment; a grid of buckets keeps the work nea
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import Batch, columns, rate
+from e2rl.metrics.catalogue import Batch, columns, event, rate
 from e2rl.metrics.contact import steps_until
 from e2rl.metrics.geometry import candidates, from_segment
 
@@ -98,7 +98,7 @@ def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:
         tables="main traffic adversaries methods public",
     ),
     rate("aor_any", "off the road, of rollouts", tables="main traffic methods"),
-    rate("ego_off_road", "ego leaves the road", tables="main egos public"),
+    event("ego_off_road", "ego leaves the road", tables="main egos public"),
     events=("aor_vehicle_steps", "aor_left_out"),
 )
 def off_road_columns(batch: Batch) -> Batch:

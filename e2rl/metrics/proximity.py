@@ -20,7 +20,7 @@ SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 LEAST_WAY = 1.0  # m: of a shorter recorded way no fraction is known
 STANDING = 0.5  # m/s at the start frame
 MOVED = 2.0  # m from the start position
-per_km = partial(Metric, unit="1/km", per="driven_km", tables="egos")
+per_km = partial(Metric, unit="1/km", per="driven_km", raised=1.0, tables="egos")
 
 
 @columns(
@@ -28,7 +28,7 @@ per_km = partial(Metric, unit="1/km", per="driven_km", tables="egos")
     Metric("ttc_c", "time-to-collision cost, adversaries", tables="main adversaries methods"),
     Metric("ttc_c_all", "time-to-collision cost, all agents"),
     Metric("macc", "ego's mean |acceleration|", unit="m/s²", tables="main egos public"),
-    Metric("progress", "distance that the ego drives", unit="m", tables="main egos public"),
+    Metric("progress", "distance that the ego drives", unit="m", raised=0.0, tables="main egos public"),
     rate("route_completion", "fraction of the recorded ego's path driven until contact", tables="public"),
     per_km("failures_per_km", "`cfr`, of all that the ego drives", column="cfr"),
     per_km("counted_per_km", "the same of `cfr_counted`", column="cfr_counted"),

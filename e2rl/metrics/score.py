@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import COMPUTE, IDENTITY, METRICS, SOURCE, WORDS, Batch, Metric, columns, row_columns
+from e2rl.metrics.catalogue import COMPUTE, IDENTITY, LATER, METRICS, SOURCE, WORDS, Batch, Metric, columns, row_columns
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
 from e2rl.metrics.verdicts import clean, judge
@@ -91,5 +91,5 @@ def plain_rows(found: dict[str, Tensor | list], count: int) -> list[dict]:
     lists = {name: value.tolist() if isinstance(value, Tensor) else value for name, value in found.items()}
     for name, words in WORDS.items():
         lists[name] = [words[index] if index >= 0 else "" for index in lists[name]]
-    unknown = dict.fromkeys(row_columns(), math.nan)
+    unknown = dict.fromkeys(row_columns(), math.nan) | LATER | {"errored": 0.0}
     return [unknown | {name: values[index] for name, values in lists.items()} for index in range(count)]

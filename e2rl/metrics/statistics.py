@@ -15,6 +15,7 @@ as well as places, independently of them: a rollout counts as often as its place
 pigeonhole bootstrap, Owen 2007). Few trainings still understate how much they vary.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -23,6 +24,7 @@ from scipy.special import betaincinv
 from torch import Tensor
 
 from e2rl.metrics.catalogue import METRICS, Metric
+from e2rl.metrics.errored import raised
 from e2rl.metrics.realism import Samples, realism
 
 DRAWS = 1000
@@ -143,8 +145,10 @@ def row_metrics() -> list[Metric]:
 def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor, Tensor]:
     """Totals and weights [R, M] float64 of the rows' metrics, whose sums' quotient is the mean; NaN where unknown.
 
-    The total of a metric is its value times its weight; of a metric `per` another column, just its value.
+    The total of a metric is its value times its weight; of a metric `per` another column, just its value. Where the
+    planner raised, a metric has the value that it declares for that, over a distance of 0.
     """
+    errored = torch.tensor([raised(row) for row in rows], dtype=torch.bool)
 
     def column(name: str) -> Tensor:
         return torch.tensor([float(row.get(name, torch.nan)) for row in rows], dtype=torch.float64)
@@ -152,7 +156,11 @@ def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor
     totals, weights = [], []
     for metric in metrics:
         value, divisor = column(metric.source), metric.per or metric.weight
-        weights.append(column(divisor) if divisor else torch.ones_like(value))
+        weight = column(divisor) if divisor else torch.ones_like(value)
+        if not math.isnan(metric.raised):
+            value = value.masked_fill(errored, metric.raised)
+            weight = weight.masked_fill(errored, 0.0 if metric.per else 1.0)
+        weights.append(weight)
         totals.append(value if metric.per else value * weights[-1])
     return torch.stack(totals, 1), torch.stack(weights, 1)
 

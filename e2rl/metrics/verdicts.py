@@ -16,7 +16,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import Batch, declare, rate
+from e2rl.metrics.catalogue import Batch, declare, event, rate
 from e2rl.metrics.contact import FRONT, REAR
 from e2rl.metrics.drivers import DRIVERS, HumanDriver
 from e2rl.metrics.preventable import (
@@ -179,10 +179,11 @@ def ego_path_boxes(states: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
 
 _MOST = "main adversaries methods egos"
 _of_collisions = partial(rate, per_collision=True)
+failure = partial(event, raised=1.0)
 declare(
-    rate("cfr_counted", "a failure that counts: preventable, or the ego's fault", tables=f"{_MOST} public"),
-    rate("cfr_preventable", "a failure that a competent driver prevents", tables=f"{_MOST} public"),
-    rate("cfr_clean", "a clean failure: preventable, and nobody else did wrong", tables=f"{_MOST} public"),
+    failure("cfr_counted", "a failure that counts: preventable, or the ego's fault", tables=f"{_MOST} public"),
+    failure("cfr_preventable", "a failure that a competent driver prevents", tables=f"{_MOST} public"),
+    failure("cfr_clean", "a clean failure: preventable, and nobody else did wrong", tables=f"{_MOST} public"),
     _of_collisions("counted", "collisions that count", tables="main adversaries"),
     _of_collisions("at_fault", "ego's fault, per collision", tables=f"{_MOST} public"),
     _of_collisions("preventable", "prevented by UN R157's careful and competent driver", tables=_MOST),

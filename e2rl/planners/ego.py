@@ -4,7 +4,8 @@ A user's planner is a class and a YAML file in conf/ego with its `_target_` and 
 examples/). It overrides `plan`, and `act` tracks the plan; or `act`, which maps observations to actions.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch
@@ -34,6 +35,7 @@ STRAYS = (
     "ego will be 0.1 s from now: its states are of the scene's frame, the first of them 0.1 s ahead"
 )
 WILD = f"an action that is not finite, or above {LARGEST:g}"
+BY_EGO = "raised by the ego"  # note on what its code raises
 
 
 class Ego(Extension):
@@ -95,15 +97,23 @@ def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
     return dynamics.inverse(torch.stack([state, aimed], -2))[..., 0, :]
 
 
-class PlannerError(Exception):
-    """A planner has no plan for scenes of its batch; rows: why, by row of the batch, empty where it is not known which.
+class RowsError(Exception):
+    """Rollouts of a batch end; rows: why, by row of the batch, empty where it is not known which.
 
-    The rollouts of these rows end; the others of the batch are driven anew without them.
+    The others of the batch are driven anew without them.
     """
 
     def __init__(self, message: str, rows: Mapping[int, str] | None = None) -> None:
         super().__init__(message)
         self.rows = dict(rows or {})
+
+
+class PlannerError(RowsError):
+    """A planner has no plan for scenes of its batch."""
+
+
+class TrafficNotFinite(RowsError):
+    """An ego was asked about vehicles whose states are NaN or infinite."""
 
 
 class Undrivable(PlannerError):
@@ -112,6 +122,10 @@ class Undrivable(PlannerError):
 
 class PlannerExited(PlannerError):
     """A planner called sys.exit."""
+
+
+class WrongPlan(PlannerError):
+    """A planner that has driven before returned something else than a tensor of the shape asked for."""
 
 
 class NotFinite(ArithmeticError):
@@ -143,14 +157,26 @@ def strays(now: Tensor, first: Tensor) -> Tensor:
     return away.any(-1) | (turned & moves)
 
 
-def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str) -> Tensor:
-    """What `plan` or `act` of an ego returned; raises InputError where it is no tensor of floats of this shape, and
-    NotFinite where it is not finite."""
+def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str, begins: bool) -> Tensor:
+    """Returns what `plan` or `act` of an ego returned.
+
+    Args:
+        given: what was returned.
+        shape: that it should have.
+        ego, method: who returned it.
+        begins: it is the first answer, so that a wrong shape is a mistake of the code and not of a situation.
+
+    Raises:
+        InputError: the first answer is no tensor of floats of this shape.
+        WrongPlan: a later one is not.
+        NotFinite: it is not finite.
+    """
     floats = isinstance(given, Tensor) and given.is_floating_point()
     if not floats or tuple(given.shape) != shape:
         found = f"{given.dtype} {list(given.shape)}" if hasattr(given, "shape") else type(given).__name__
         mend = "" if isinstance(given, Tensor) else "; torch.as_tensor makes one of an array"
-        raise InputError(
+        kind = InputError if begins else WrongPlan
+        raise kind(
             f"{type(ego).__name__}.{method}: returns {type(given).__module__.partition('.')[0]} {found}, expected a "
             f"tensor of floats {list(shape)}{mend} (docs/how-to/planner.md)"
         )
@@ -176,6 +202,23 @@ def ask(ego: Ego, method: str, world: World, *given: Tensor, scene: TensorDictBa
         raise PlannerExited(f"it called sys.exit({error.code!r})") from error
 
 
+@contextmanager
+def answering(world: World) -> Iterator[None]:
+    """Notes on what is raised within that it is the ego's, which is asked about a world.
+
+    Raises TrafficNotFinite instead where the other vehicles of that world are NaN or infinite: no ego can answer then.
+    """
+    try:
+        yield
+    except Exception as error:
+        known = world.states[:, 1:].isfinite().all(-1) | ~world.valid[:, 1:]
+        if rows := (~known).any(1).nonzero()[:, 0].tolist():
+            why = "a vehicle of the traffic is NaN or infinite"
+            raise TrafficNotFinite(why, dict.fromkeys(rows, why)) from error
+        error.add_note(BY_EGO)
+        raise
+
+
 class EgoPlanner(TensorDictModuleBase):
     """Writes the plan of an Ego in a DrivingEnv with `agents=True`: ("ego", "plan") [B, PLAN_STEPS, 4].
 
@@ -197,7 +240,9 @@ class EgoPlanner(TensorDictModuleBase):
         self._shown: TensorDictBase | None = None  # the scenes as a planner from outside sees them
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict["ego", "plan"] = self.plan(World.of(tensordict, self.scene))[:, 1:]
+        world = World.of(tensordict, self.scene)
+        with answering(world):
+            tensordict["ego", "plan"] = self.plan(world)[:, 1:]
         return tensordict
 
     def plan(self, world: World) -> Tensor:
@@ -209,7 +254,8 @@ class EgoPlanner(TensorDictModuleBase):
         due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
         if bool(due.any()):
             now = world.states[:, 0]
-            fresh = checked(self._ask("plan", world), (len(now), PLAN_STEPS, 4), self.ego, "plan").to(now)
+            answer, begins = self._ask("plan", world), bool((world.step == 0).all())
+            fresh = checked(answer, (len(now), PLAN_STEPS, 4), self.ego, "plan", begins).to(now)
             self._refuse(due & ~drivable(now, fresh), JUMPS)
             self._refuse(due & strays(now, fresh[:, 0]), STRAYS)
             fresh = torch.cat([world.states[:, :1], fresh], 1)
@@ -235,9 +281,11 @@ class EgoPolicy(EgoPlanner):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         world = World.of(tensordict, self.scene)
-        plan = self.plan(world)
-        action = checked(self._ask("act", world, tensordict["observation"], plan), (len(plan), 2), self.ego, "act")
-        self._refuse((action.abs() > LARGEST).any(1), WILD)
+        with answering(world):
+            plan = self.plan(world)
+            answer, begins = self._ask("act", world, tensordict["observation"], plan), bool((world.step == 0).all())
+            action = checked(answer, (len(plan), 2), self.ego, "act", begins)
+            self._refuse((action.abs() > LARGEST).any(1), WILD)
         tensordict["action"] = action.clamp(self.bounds.low, self.bounds.high)
         tensordict["ego", "plan"] = plan[:, 1:]
         return tensordict

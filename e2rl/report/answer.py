@@ -15,7 +15,8 @@ from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.metrics.atlas import CELL
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report.comparison_tables import by_ego
-from e2rl.report.tables import UNKNOWN, closed_loop, number, plural
+from e2rl.report.headline import plural, traffic_name
+from e2rl.report.tables import UNKNOWN, closed_loop, number
 
 LINES, NARROWEST, WIDEST = 25, 80, 100
 WEAKNESSES, MOST_ROWS, MOST_CELLS = 3, 10, 7  # lines of failure modes; rows of a comparison, of an atlas
@@ -311,10 +312,6 @@ def per_cent(value: float) -> str:
 def traffic(row: dict) -> str:
     """Such as `attacked by e2 at η=2` or `in nominal traffic`."""
     return f"attacked by {traffic_name(row)}" if row["eta"] else f"in {row['method']} traffic"
-
-
-def traffic_name(row: dict) -> str:
-    return f"{row['method']} at η={row['eta']:g}" if row["eta"] else row["method"]
 
 
 def wrapped(text: str, indent: str = "") -> list[str]:

@@ -12,8 +12,9 @@ from e2rl.evaluation.comparison import CHANGES, PAIR, RATES, Driven, compared
 from e2rl.evaluation.rollout_files import cell, own_folder, write_json
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import Row, is_failure, mode_name
-from e2rl.report.answer import FEW, traffic_name, wrapped
+from e2rl.report.answer import FEW, wrapped
 from e2rl.report.failure_tracks import replay_data
+from e2rl.report.headline import traffic_name
 from e2rl.report.html import ASSETS, COLUMNS, page
 from e2rl.report.tables import difference_cell
 from e2rl.run.endings import ending

@@ -5,8 +5,8 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from e2rl.evaluation.budget import EVENTS, scene_rows
 from e2rl.evaluation.ego_set import EgoSet
+from e2rl.evaluation.summary import scene_rows
 from e2rl.metrics.catalogue import METRICS, table_metrics
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.report.tables import (
@@ -25,6 +25,7 @@ from e2rl.report.tables import (
 )
 from e2rl.run.files import csv_text, write_atomically
 
+EVENTS = ("cfr_preventable", "cfr_counted", "cfr")  # of scenes
 METHODS, EGOS = "methods", "egos"  # tables of the catalogue, and names of the files
 Terms = Mapping[str, tuple[str, str]]  # by method: what it knows of the ego and owes it, "" for nothing to say
 TRAININGS = (
@@ -32,9 +33,9 @@ TRAININGS = (
     "with few trainings are too narrow rather than too wide."
 )
 SEARCHED = (
-    "Scenes with a try that ends in a contact (`cfr`), in one that counts, in a preventable one. Each search of a scene"
-    " counts once. 95% intervals by place and, of several trainings of one policy, by training. Differences are of the"
-    " same scenes; a star: the interval leaves out 0."
+    "Scenes with a try that ends in a contact (`cfr`), in one that counts, in a preventable one, or in which the "
+    "planner raised. Each search of a scene counts once. 95% intervals by place and, of several trainings of one "
+    "policy, by training. Differences are of the same scenes; a star: the interval leaves out 0."
 )
 UP, PROGRESS, ROUGHNESS = 0.01, 0.97, 1.25  # fraction of rollouts; of the planner's; of the recorded egos'
 

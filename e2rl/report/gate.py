@@ -2,7 +2,7 @@
 
 The 95% interval decides, not the estimate: a rule holds where the whole interval does, fails where none of it does.
 The status is 0 where all hold, 1 where one fails, 3 where none fails and rollouts are too few, 2 for bad input
-(docs/how-to/compare.md).
+(docs/how-to/compare.md). A rollout in which the planner raised has failed.
 """
 
 import argparse
@@ -17,10 +17,13 @@ from typing import Any
 from scipy.optimize import brentq
 
 from e2rl.evaluation.comparison import RATES, Driven, check_shared, difference
+from e2rl.evaluation.headline import headline
 from e2rl.evaluation.rollout_files import write_json
-from e2rl.metrics.catalogue import METRICS
+from e2rl.metrics.catalogue import METRICS, Metric
+from e2rl.metrics.errored import raised
 from e2rl.metrics.realism import NO_SAMPLES
-from e2rl.metrics.statistics import LEAST, cluster_index, exact_interval, summarise
+from e2rl.metrics.statistics import LEAST, Row, cluster_index, exact_interval, summarise
+from e2rl.report.headline import errored_lines, headline_text, traffic_name
 from e2rl.report.tables import estimate
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
@@ -42,7 +45,8 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
             change against `former`.
 
     Raises:
-        InputError: it is no rule, names no or several traffic, or what the run does not know.
+        InputError: it is no rule, its limit is none of its rate, it names no or several traffic, or what the run does
+            not know.
     """
     rule = RULE.fullmatch(text.replace(" ", ""))
     if rule is None or (rule["limit"][0] in "+-" and former is None):
@@ -51,9 +55,10 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
             f"a change, 'preventable<=+0.02'; rates: {', '.join(RATES)}"
         )
     limit, metric, change = float(rule["limit"]), METRICS[RATES[rule["rate"]]], rule["limit"][0] in "+-"
-    rows = traffic_of(rule, driven)
+    check_limit(text, limit, metric, change)
+    key, rows = traffic_of(rule, driven)
     if change and former is not None:
-        found = difference(rows, traffic_of(rule, former))[metric.name]
+        found = difference(rows, traffic_of(rule, former)[1])[metric.name]
     else:
         found = summarise(rows, [NO_SAMPLES] * len(rows), realism_draws=0)[metric.name]
     if not (count := int(found["n"])):
@@ -64,6 +69,8 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
     outcome, more = PASSED if holds else FAILED if broken else UNDECIDED, None
     told = estimate(metric, dict(zip(("mean", "low", "high"), ends, strict=True)), "mean", "+" if change else "")
     reason = f"{text}: found {told} {metric.unit or ('points' if change else '%')}, {count} {driven.unit}"
+    crashed = sum(map(raised, rows))
+    reason += f", in {crashed} of them the planner raised" if crashed else ""
     if outcome == UNDECIDED:
         places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))[1]
         factor = growth(ends, limit, places, metric.fraction and not change)
@@ -71,13 +78,32 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
         advice = f"about {more} more, at further places" if more else "no number decides, the estimate is at the limit"
         advice += f" ({places} places, an interval needs {LEAST})" if places < LEAST else ""
         reason = f"{advice}; {reason}"
+    every = driven.traffic()[key]
+    reason += f"; {headline_text(headline(every, driven.searched), driven.ego, traffic_name(every[0]))}"
     about = {"rule": text, "outcome": outcome, "reason": f"{outcome}: {reason}", "more": more, "unit": driven.unit}
-    return about | {"value": value, "low": low, "high": high, "n": count}
+    values = {"value": value, "low": low, "high": high, "n": count}
+    return about | values | traffic_facts(every, driven.searched)
 
 
-def traffic_of(rule: re.Match, driven: Driven) -> list[dict]:
-    """The rows of the traffic that a rule names, or of the only attack; InputError for none or several."""
-    units = {f"{method}@{eta:g}": rows for (method, eta), rows in driven.units().items()}
+def traffic_facts(rows: Sequence[Row], searched: bool) -> dict[str, Any]:
+    """The headline of rows of rollouts in one traffic, and each of them that errored, for files."""
+    names = ("scene_id", "seed", "method", "eta", "raised_by", "error")
+    errored = [{name: row[name] for name in names} for row in rows if row["errored"] == 1]
+    return {"headline": headline(rows, searched)._asdict(), "errored": errored}
+
+
+def check_limit(text: str, limit: float, metric: Metric, change: bool) -> None:
+    """Raises InputError for a limit that no value of a metric, or change of it, can reach."""
+    low, high = (-1.0 if change else 0.0), (1.0 if metric.fraction else math.inf)
+    if not low <= limit <= high and (metric.fraction or not change):
+        span = f"from {low:g} to {high:g}" if metric.fraction else "of 0 or more"
+        mend = ", such as 0.05 for 5%" if metric.fraction else ""
+        raise InputError(f"{text}: {limit:g} is no {metric.name}; write a number {span}{mend}")
+
+
+def traffic_of(rule: re.Match, driven: Driven) -> tuple[tuple[str, float], list[dict]]:
+    """The traffic that a rule names, or the only attack, and its units; InputError for none or several."""
+    units = {f"{method}@{eta:g}": ((method, eta), rows) for (method, eta), rows in driven.units().items()}
     found = [name for name in units if rule["method"] in (name, name.rpartition("@")[0])]
     if rule["method"] is None:
         found = [name for name in units if not name.endswith("@0")] or list(units)
@@ -116,7 +142,7 @@ def junit(results: Sequence[Mapping[str, Any]], run: str) -> bytes:
         case = ET.SubElement(suite, "testcase", classname=run, name=each["rule"])
         if each["outcome"] in KINDS:
             ET.SubElement(case, KINDS[each["outcome"]], message=each["reason"], type=each["outcome"])
-        ET.SubElement(case, "system-out").text = each["reason"]
+        ET.SubElement(case, "system-out").text = "\n".join([each["reason"], *each["told"]])
     root = ET.Element("testsuites")
     root.append(suite)
     return ET.tostring(root, "utf-8", xml_declaration=True)
@@ -140,9 +166,10 @@ def main(arguments: list[str] | None = None) -> None:
             if not any(re.search("=[+-]", text) for text in options.rules):
                 raise InputError("--against: no rule is on a change; write one as 'counted<=+0.02'")
         results = [judged(text, driven, former) for text in options.rules]
+        told = errored_lines(driven.rows, named=0)
         if options.junit is not None:
-            write_atomically(options.junit, junit(results, str(options.run)))
+            write_atomically(options.junit, junit([each | {"told": told} for each in results], str(options.run)))
         if options.json is not None:
             write_json(options.json, results)
-        print(*(each["reason"] for each in results), sep="\n")
+        print(*(each["reason"] for each in results), *told, sep="\n")
     sys.exit(next(status for outcome, status in STATUS.items() if outcome in {each["outcome"] for each in results}))

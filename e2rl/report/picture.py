@@ -201,7 +201,8 @@ def intensity_figure(sweep: Sequence[Failure]) -> Figure:
 
 def intensity_sweep(folder: Path) -> list[Failure]:
     """Returns the rollouts of `best_sweep` of a run's folder."""
-    return [Failure.read(folder, row) for row in best_sweep(read_rows(Path(folder) / TABLE))]
+    rows = [row for row in read_rows(Path(folder) / TABLE) if row["errored"] != 1]
+    return [Failure.read(folder, row) for row in best_sweep(rows)]
 
 
 def best_sweep(rows: Sequence[dict]) -> list[dict]:

@@ -14,6 +14,7 @@ from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, SPREAD_STAGE, STAGES, Metric, table_metrics
 from e2rl.metrics.failure_modes import LEAST, MANY
+from e2rl.report.headline import plural
 from e2rl.run.files import write_atomically
 
 UNKNOWN = "–"
@@ -128,10 +129,6 @@ def known_metrics(group: Sequence[dict], metrics: Iterable[Metric]) -> list[Metr
 def closed_loop(rows: Sequence[dict]) -> list[dict]:
     """The rows of rollouts, without those of the stages that measure the prior."""
     return [row for row in rows if row.get("stage") not in STAGES]
-
-
-def plural(count: int, word: str) -> str:
-    return f"{count} {word}{'' if count == 1 else 's'}"
 
 
 def origin(row: dict) -> str:

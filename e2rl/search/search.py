@@ -17,6 +17,7 @@ from e2rl.search.portfolio import Portfolio
 from e2rl.search.tries import Family, Try
 
 ROUND = 24  # tries that a round of few scenes has at least: its batches cost much the same with one try as with several
+RAISES = 3  # tries of a scene, in all of which the planner raised, after which no more are spent on it
 NEAR = 0.15  # of a failure, that a contact counts which the competent driver nearly prevents
 
 
@@ -33,13 +34,22 @@ class SearchSettings:
     climb: bool = setting()
 
 
+RAISED = "raised"  # a kind of failure beside the cells of the atlas
+
+
 class Outcome(NamedTuple):
     """What became of a try: margin (`metrics.margin`); cell of the atlas, "" unless the failure is preventable; nfe:
-    what it cost."""
+    what it cost; raised: the planner raised, which is a failure of its own kind."""
 
     margin: float
     cell: str
     nfe: float
+    raised: bool = False
+
+    @property
+    def kind(self) -> str:
+        """The way of failing; "" for none."""
+        return RAISED if self.raised else self.cell
 
 
 @dataclass
@@ -64,11 +74,13 @@ class Search(Extension):
     def ask(self) -> list[Try]:
         """The next tries, to be told in this order: one of every scene until it has `cover` of them, then of those
         families in those scenes that are worth the most: as many as there are scenes, or `growth` of the tries so far,
-        but no more than a quarter of what could be chosen; ROUND at least."""
-        worth = self._portfolio.worth(self._generator)
-        found = self.settings.bandit & torch.tensor([self._found(scene) for scene in range(len(self.numbers))])
-        worth = torch.where(found[:, None], self.settings.again * worth, worth)
-        uncovered = self.settings.cover - min(len(tries) for tries in self.tries)
+        but no more than a quarter of what could be chosen; ROUND at least. None of scenes that are not `active`."""
+        worth, active = self._portfolio.worth(self._generator), self.active()
+        if not active:
+            return []
+        found = self.settings.bandit & torch.tensor([self._found(scene) for scene in active])
+        worth = torch.where(found[:, None], self.settings.again * worth[active], worth[active])
+        uncovered = self.settings.cover - min(len(self.tries[scene]) for scene in active)
         if uncovered > 0:
             each = worth.topk(min(-(-ROUND // len(worth)), uncovered, len(self.families)), dim=1).indices
             chosen = [(scene, family) for scene, families in enumerate(each.tolist()) for family in families]
@@ -78,26 +90,35 @@ class Search(Extension):
             best = worth.flatten().topk(size).indices.sort().values
             chosen = [divmod(pair, worth.shape[1]) for pair in best.tolist()]
         number = [count(len(tries)) for tries in self.tries]  # of the next try of each scene
-        return [self._draw(scene, family, next(number[scene])) for scene, family in chosen]
+        pairs = [(active[position], family) for position, family in chosen]
+        return [self._draw(scene, family, next(number[scene])) for scene, family in pairs]
+
+    def active(self) -> list[int]:
+        """Returns the scenes that tries are spent on: not those in which the planner always raised, RAISES times."""
+
+        def hopeless(outcomes: Sequence[Outcome]) -> bool:
+            return len(outcomes) >= RAISES and all(outcome.raised for outcome in outcomes)
+
+        return [scene for scene, outcomes in enumerate(self.outcomes) if not hopeless(outcomes)]
 
     def tell(self, tries: Sequence[Try], outcomes: Sequence[Outcome]) -> None:
         """What became of tries that were asked for."""
         names = [family.name for family in self._portfolio.families]
         for one, outcome in zip(tries, outcomes, strict=True):
             known = self._found(one.scene)
-            new = bool(outcome.cell) and (not known or outcome.cell not in self.cells)
+            new = bool(outcome.kind) and (not known or outcome.kind not in self.cells)
             climbs = self.settings.climb and not known
             reward = 1.0 if new else climbs * NEAR * min(max(outcome.margin, 0.0), 1.0)
             margin = outcome.margin if self.settings.climb else 0.0
             self._portfolio.tell(one.scene, names.index(one.family), reward, margin, outcome.nfe)
             if new and not known:  # from now on other failures of this scene are searched for
                 self._portfolio.forget(one.scene)
-            self.cells |= {outcome.cell} if outcome.cell else set()
+            self.cells |= {outcome.kind} if outcome.kind else set()
             self.tries[one.scene].append(one)
             self.outcomes[one.scene].append(outcome)
 
     def _found(self, scene: int) -> bool:
-        return any(outcome.cell for outcome in self.outcomes[scene])
+        return any(outcome.kind for outcome in self.outcomes[scene])
 
     def _draw(self, scene: int, family: int, number: int) -> Try:
         """The next try of a family in a scene, the scene's `number`-th."""

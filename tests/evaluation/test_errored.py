@@ -61,13 +61,19 @@ def run(ego, folder=None, batch=64, processes=1, count=4):
 def test_the_others_are_scored_and_the_count_stands_everywhere(tmp_path, name, processes):
     (fault, detail), reason = FAULTS[name], f"raised {name}"
     (row,) = run(Fails(8.0, fault), tmp_path, 4, processes)
-    assert row["n_rollouts"] == 6 and row["errored"] == {reason: 2} and row["n_scenes"] == 3
+    assert row["n_rollouts"] == 8 and row["errored"] == {reason: 2} and row["n_scenes"] == 4
+    assert row["metrics"]["errored"]["mean"] == 0.25 and row["metrics"]["real"]["n"] == 6
+    assert row["metrics"]["cfr_preventable"]["mean"] >= 0.25, "to raise is to fail"
     assert read_metrics(tmp_path / METRICS_FILE)[0]["errored"] == {reason: 2}
     assert f"2 rollouts without a score ({reason})" in metric_tables([row])[0].caption
     entries = json.loads((tmp_path / ERRORED_FILE).read_text())
     assert {(entry["scene_id"], entry["seed"]) for entry in entries} == {(scene_set().scene_id[2], k) for k in (0, 1)}
     assert all(re.search(detail, entry["traceback"]) for entry in entries)
-    assert len(read_rows(tmp_path / TABLE)) == 6 == len(list((tmp_path / ROLLOUTS).glob("*.npz")))
+    rows = read_rows(tmp_path / TABLE)
+    assert len(rows) == 8 and len(list((tmp_path / ROLLOUTS).glob("*.npz"))) == 6
+    ends = {(row["scene_id"], row["seed"], row["raised_by"]) for row in rows if row["errored"] == 1}
+    assert ends == {(scene_set().scene_id[2], seed, "ego") for seed in (0, 1)}
+    assert all(re.search(detail, row["error"]) for row in rows if row["errored"] == 1)
     (whole,) = run(IDMEgo(), tmp_path, 4, processes)
     assert whole["errored"] == {} and whole["n_rollouts"] == 8 and not (tmp_path / ERRORED_FILE).exists()
 

@@ -94,7 +94,8 @@ def test_what_goes_wrong_in_a_scene_costs_that_scene(tmp_path, name):
     ego = ExternalEgo(wrong_planner(tmp_path, 3.5, **wrong), timeout=0.3 if name == "hangs" else 5.0)
     (row,) = run(ego, tmp_path)
     (entry,) = json.loads((tmp_path / ERRORED_FILE).read_text())
-    assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 3
+    assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 4 and entry["raised_by"] == "ego"
+    assert row["metrics"]["errored"]["mean"] == 0.25
     assert entry["scene_id"] == scene_set().scene_id[BAD]
     assert re.search(detail, entry["detail"]), entry["detail"]
 
@@ -102,7 +103,7 @@ def test_what_goes_wrong_in_a_scene_costs_that_scene(tmp_path, name):
 def test_it_is_restarted_as_often_as_allowed(tmp_path):
     command = wrong_planner(tmp_path, 3.5, act="os._exit(3)")
     (row,) = run(ExternalEgo(command, restarts=1))
-    assert row["n_rollouts"] == 3 and len(list((tmp_path / "marks").iterdir())) == 2
+    assert row["metrics"]["errored"]["mean"] == 0.25 and len(list((tmp_path / "marks").iterdir())) == 2
     with pytest.raises(InputError, match="4 raised PlannerDied .its process ended with status 3"):
         run(ExternalEgo(command, restarts=0), tmp_path)
     details = [entry["detail"] for entry in json.loads((tmp_path / ERRORED_FILE).read_text())]

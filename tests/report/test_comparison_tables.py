@@ -2,8 +2,8 @@
 
 import pytest
 
-from e2rl.evaluation.budget import scene_rows
 from e2rl.evaluation.ego_set import EgoSet
+from e2rl.evaluation.summary import scene_rows
 from e2rl.report.comparison_tables import searched_table
 from e2rl.search.tries import TRIES
 

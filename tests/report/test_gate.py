@@ -7,6 +7,8 @@ import xml.etree.ElementTree as ET
 import pytest
 from scipy.stats import binom
 
+from e2rl.evaluation.budget import TRIES_FILE
+from e2rl.metrics.errored import errored_row
 from e2rl.metrics.statistics import LEAST, Z, exact_interval
 from e2rl.report.gate import growth, main
 from tests.evaluation.constructed_runs import row_of, run_of
@@ -152,3 +154,103 @@ def test_the_files_for_continuous_integration_hold_what_was_decided(tmp_path, ca
     assert [each["outcome"] for each in results] == ["passed", "failed", "not enough rollouts"]
     assert [case.get("name") for case in suite] == rules == [each["rule"] for each in results]
     assert all(each["value"] == 0.4 and each["low"] < 0.4 < each["high"] for each in results)
+
+
+def errored(scene, raised_by="ego", **values):
+    """A row of a rollout that errored."""
+    entry = row_of(scene) | {"reason": "raised RuntimeError", "detail": f"no\nway {scene}", "raised_by": raised_by}
+    return errored_row(entry) | values
+
+
+@pytest.mark.parametrize(
+    ("rule", "status"),
+    [("contacts<=0.3", 1), ("counted<=0.3", 1), ("preventable<=0.3", 1), ("clean<=0.3", 1), ("progress>=25", 1)],
+)
+def test_a_planner_that_raises_fails_whatever_is_gated(tmp_path, capsys, rule, status):
+    """40 of 80 rollouts: without the planner's errors none fails and each drives 30 m or more."""
+    driven = [row_of(k, progress=30.0 + k % 7) for k in range(40)]
+    assert gate(capsys, run_of(tmp_path / "driven", driven), rule)[0] == 0
+    run = run_of(tmp_path / "raised", driven + [errored(40 + k) for k in range(40)])
+    found, said = gate(capsys, run, rule, "--json", tmp_path / "gate.json", "--junit", tmp_path / "gate.xml")
+    assert found == status and "in 40 of them the planner raised" in said
+    texts = said, (tmp_path / "gate.json").read_text(), (tmp_path / "gate.xml").read_text()
+    for text in texts:
+        assert all(f"scene_{k}" in text and f"RuntimeError: no way {k}" in text for k in range(40, 80))
+    (result,) = json.loads(texts[1])
+    assert result["n"] == 80 and len(result["errored"]) == result["headline"]["raised"] == 40
+
+
+def test_what_the_traffic_raised_is_named_and_counts_neither_way(tmp_path, capsys):
+    driven = [row_of(k, hit=k < 8) for k in range(80)]
+    run = run_of(tmp_path, driven + [errored(80 + k, "traffic") for k in range(40)])
+    _, said = gate(capsys, run, "contacts<=0.3", "--json", tmp_path / "gate.json")
+    (result,) = json.loads((tmp_path / "gate.json").read_text())
+    assert (result["n"], result["value"]) == (80, 0.1) and len(result["errored"]) == 40
+    assert "The traffic raised in 40 of 120 rollouts, left out" in said and "scene_119" in said
+
+
+def test_the_errored_rollouts_of_an_earlier_version_s_run_count_as_the_planner_s(tmp_path, capsys):
+    """Whose table has no row for them."""
+    run = run_of(tmp_path, [row_of(k) for k in range(40)])
+    lines = (run / "rollouts.csv").read_text().splitlines()
+    (run / "rollouts.csv").write_text("\n".join(line.rsplit(",", 3)[0] for line in lines))
+    assert gate(capsys, run, "preventable<=0.3")[0] == 0
+    entries = [row_of(40 + k) | {"reason": "raised KeyError", "detail": "x", "traceback": "a\nb"} for k in range(40)]
+    names = ("dataset", "split", "method", "ego_policy", "eta", "scene_id", "seed", "reason", "detail", "traceback")
+    (run / "errored.json").write_text(json.dumps([{name: entry[name] for name in names} for entry in entries]))
+    status, said = gate(capsys, run, "preventable<=0.3")
+    assert status == 1 and "80 rollouts, in 40 of them the planner raised" in said
+
+
+@pytest.mark.parametrize("limit", ["5", "1.01", "41.7", "100", "00002"])
+@pytest.mark.parametrize("rate", ["contacts", "preventable", "counted", "clean"])
+def test_a_limit_that_no_fraction_reaches_is_refused(tmp_path, capsys, rate, limit):
+    status, said = gate(capsys, run_with(tmp_path, 100, 40), f"{rate}<={limit}")
+    assert status == 2 and "write a number from 0 to 1, such as 0.05 for 5%" in said
+
+
+@pytest.mark.parametrize("rule", ["contacts<=+1.5", "contacts>=-2", "contacts<=nan", "contacts<=inf", "contacts<=1e-2"])
+def test_what_is_no_limit_is_refused(tmp_path, capsys, rule):
+    before = run_with(tmp_path / "before", 40, 4)
+    assert gate(capsys, run_with(tmp_path / "after", 40, 4), rule, "--against", before)[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"cfr": -1.0}, "cfr of scene_3, seed 0 is -1"),
+        ({"cfr_preventable": math.inf}, "cfr_preventable of scene_3, seed 0 is inf"),
+        ({"cfr_clean": 7.0}, "cfr_clean of scene_3, seed 0 is 7"),
+        ({"progress": -1.0}, "progress of scene_3, seed 0 is -1"),
+        ({"progress": math.inf}, "progress of scene_3, seed 0 is inf"),
+        ({"cfr": 1.0, "cfr_counted": math.nan}, "cfr_counted of scene_3, seed 0 is empty"),
+    ],
+)
+def test_values_that_no_rollout_has_are_errors(tmp_path, capsys, values, said):
+    run = run_of(tmp_path, [row_of(k, **(values if k == 3 else {})) for k in range(20)])
+    status, text = gate(capsys, run, "preventable<=0.5")
+    assert status == 2 and said in text
+
+
+@pytest.mark.parametrize("searched", [False, True])
+@pytest.mark.parametrize("column", ["cfr", "cfr_counted", "cfr_preventable", "cfr_clean", "progress"])
+def test_an_empty_column_is_an_error_and_no_zero(tmp_path, capsys, column, searched):
+    run = run_of(tmp_path, [row_of(k, **{column: math.nan}) for k in range(20)])
+    if searched:
+        (run / TRIES_FILE).write_text("")
+    status, text = gate(capsys, run, "preventable<=0.5")
+    assert status == 2 and f"the column {column} is empty" in text
+
+
+def test_a_run_without_all_of_its_rollouts_is_refused(tmp_path, capsys):
+    rows = [row_of(k, seed) for k in range(12) for seed in (0, 1)]
+    (tmp_path / "scenes.csv").write_text("scene_id\n" + "\n".join(f"scene_{k}" for k in range(12)))
+    assert gate(capsys, run_of(tmp_path, rows), "preventable<=0.9")[0] in (0, 3)
+    status, said = gate(capsys, run_of(tmp_path, rows[:-3]), "preventable<=0.9")
+    assert (
+        status == 2 and "lacks 3 of 24 rollouts of e2 η=2 (scene_10 seed 1, scene_11 seed 0, scene_11 seed 1)" in said
+    )
+    (tmp_path / "rollouts.csv").unlink()
+    (tmp_path / "parts").mkdir()
+    status, said = gate(capsys, tmp_path, "preventable<=0.9")
+    assert status == 2 and f"go on with it by e2rl evaluate resume={tmp_path}" in said
