@@ -1,6 +1,6 @@
 """The lane graph of a recording (networkx), route candidates of a vehicle on it, and who drives against its lanes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 
 import networkx as nx
@@ -10,6 +10,7 @@ from scipy.ndimage import convolve1d
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from e2rl.scenes.links import adjacent, drivable_exits
 from e2rl.scenes.paths import arc_length, points_at, resample, tangent_angle, wrap
 from e2rl.scenes.recording import Lane
 from e2rl.scenes.route import SPACING
@@ -21,8 +22,8 @@ BUCKET = 20.0  # m to which distances on the start lane are rounded up, so that 
 SMOOTHING, SMOOTHED_ENDS = 1.3, 6  # vertices: standard deviation of the filter, odd extension beyond the ends
 FILTER = np.exp(-0.5 / (SMOOTHING * SMOOTHING) * np.arange(-5, 6) ** 2)  # of a Gaussian, to four standard deviations
 FILTER /= FILTER.sum()
-JOIN_GAP, JOIN_ANGLE, JOIN_HEIGHT = 1.5, 0.6, 2.0  # where connectivity is inferred: m, rad, m
 SAME_GAP = 1.2  # m: routes closer than this at all probes are one
+OVERLAP = 2.0  # m at most from the end of a lane to the point of the next one that lies ahead of it
 PROBES = np.array([2, 8, 16, 28, 45])  # vertices ahead of the vehicle where routes are compared
 
 
@@ -43,51 +44,28 @@ class Route:
     vehicle_s: float = 0.0
 
 
-def plausible_width(width: float) -> float:
-    """A recorded lane width, or 3.7 m where it is outside 2.5-6 m: half of Waymo's connectors have 0, some 90 m."""
-    return float(width) if 2.5 <= width <= 6.0 else 3.7
-
-
-def infer_exits(lanes: dict[str, Lane]) -> dict[str, list[str]]:
-    """Successors by geometry, for files without connectivity.
-
-    A lane follows where another ends, in nearly the same direction and, where heights are known, on the same level.
-    """
-    if not lanes:
-        return {}
-    ids = list(lanes)
-    angle = {name: tangent_angle(resample(lane.points, 1.0)) for name, lane in lanes.items()}
-    tree = cKDTree(np.array([lane.points[0] for lane in lanes.values()]))
-
-    def follows(name: str, other: str) -> bool:
-        end, start = lanes[name].heights, lanes[other].heights
-        level = end is None or start is None or abs(start[0] - end[-1]) < JOIN_HEIGHT
-        return other != name and level and abs(wrap(angle[other][0] - angle[name][-1])) < JOIN_ANGLE
-
-    near = {name: [ids[j] for j in tree.query_ball_point(lane.points[-1], JOIN_GAP)] for name, lane in lanes.items()}
-    return {name: [other for other in others if follows(name, other)] for name, others in near.items()}
-
-
 class LaneGraph:
     """Lanes of at least 0.5 m, connected, with a nearest-lane index.
 
     `graph` is the networkx DiGraph (nodes: lane ids; edges: successors); `line` and `arc` are a lane's centreline with
-    points every 1 m and its length; `points`, `heading`, `lane_of` are the points of all centrelines, in order.
+    points every 1 m and its length; `points`, `heading`, `lane_of` are the points of all centrelines, in order;
+    `repairs`: what was left out of the recorded links and neighbours or inferred, by a phrase in the plural.
     """
 
     def __init__(self, lanes: dict[str, Lane]):
-        """lanes: by id; their connectivity is inferred where no lane has exits."""
-        self.lanes = {
+        """lanes: by id; geometry decides which of their links and neighbours are kept (e2rl/scenes/links.py)."""
+        long = {
             name: lane for name, lane in lanes.items() if len(lane.points) >= 2 and arc_length(lane.points)[-1] >= 0.5
         }
+        self.line = {name: resample(lane.points, 1.0) for name, lane in long.items()}
+        exits, links = drivable_exits(long)
+        neighboured, neighbours = adjacent(long, self.line)
+        self.lanes = {name: replace(lane, exits=exits[name]) for name, lane in neighboured.items()}
+        self.repairs = links + neighbours
         self.ids = list(self.lanes)
-        exits = {name: lane.exits for name, lane in self.lanes.items()}
-        if not any(exits.values()):
-            exits = infer_exits(self.lanes)
         self.graph = nx.DiGraph()
         self.graph.add_nodes_from(self.ids)
-        self.graph.add_edges_from((a, b) for a, nexts in exits.items() for b in nexts if b in self.lanes and b != a)
-        self.line = {name: resample(lane.points, 1.0) for name, lane in self.lanes.items()}
+        self.graph.add_edges_from((name, other) for name, nexts in exits.items() for other in nexts)
         self.arc = {name: float(arc_length(line)[-1]) for name, line in self.line.items()}
         counts = [len(line) for line in self.line.values()]
         self.points = np.concatenate([np.zeros((0, 2)), *self.line.values()])
@@ -172,7 +150,7 @@ class LaneGraph:
         lengths [lanes + 1] where the lanes begin and the last one ends."""
         key = tuple(lanes)
         if key not in self.path_of:
-            line = np.concatenate([self.line[name] for name in lanes])
+            line = _joined([self.line[name] for name in lanes])
             keep = np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 0.05])
             line = line[keep] if keep.sum() >= 2 else line
             self.path_of[key] = line, arc_length(line), np.cumsum([0.0, *(self.arc[name] for name in lanes)])
@@ -214,6 +192,19 @@ class LaneGraph:
                 if len(found) == count:
                     return found
         return found
+
+
+def _joined(lines: list[np.ndarray]) -> np.ndarray:
+    """The points of polylines one after another; where one begins before the end of the last, without what lies
+    behind that end, so that the path never turns back."""
+    parts = lines[:1]
+    for line in lines[1:]:
+        last = parts[-1][-1]
+        ahead = (line - last) @ (last - parts[-1][-2]) > 0
+        first = min(int(ahead.argmax()), len(line) - 2)
+        overlaps = first > 1 and np.linalg.norm(line[first] - last) < OVERLAP
+        parts.append(line[first:] if overlaps else line)
+    return np.concatenate(parts)
 
 
 def smooth_vertices(points: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ from e2rl.scenes.versions import MARK, RECORDED, check_versions, version_of
 
 OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
 NO_VERSION = "without such a version"  # or it is invalid, where the log itself makes scenes, too
-VERSION = 5  # of the scene builder: raise it when the same recording would make another scene
+VERSION = 6  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
 NO_MATTER = "path", "cache", "cache_gb", "workers"  # settings that do not change the scenes

@@ -7,7 +7,7 @@ import pytest
 import torch
 from shapely.geometry import LineString, Point
 
-from e2rl.scenes.lane_graph import LaneGraph, against_lanes, infer_exits
+from e2rl.scenes.lane_graph import LaneGraph, against_lanes
 from e2rl.scenes.log_route import MARGIN, route_from_log
 from e2rl.scenes.recording import Lane
 from e2rl.scenes.route import SPACING
@@ -84,25 +84,13 @@ def test_a_roundabout_is_left_and_a_ring_does_not_end():
     assert ends == ["out", "out"] or ends == ["out"]
 
 
-def test_connectivity_is_inferred_from_geometry_and_heights():
-    def flat(a, b, height):
-        return Lane(np.array([a, b], float), heights=np.full(2, height))
-
-    found = infer_exits(
-        {
-            "a": flat([0, 0], [50, 0], 5.0),
-            "b": flat([50.5, 0.3], [90, 0], 5.5),
-            "back": flat([50, 0], [0, 0], 5.0),
-            "bridge": flat([50, 0], [100, 10], 12.0),
-            "far": flat([54, 0], [90, 0], 5.0),
-            "side": flat([50, 0], [50, 50], 5.0),
-        }
-    )
-    assert found["a"] == ["b"] and found["bridge"] == [] and found["back"] == []
-    no_heights = infer_exits({"a": Lane(np.array([[0.0, 0], [50, 0]])), "b": flat([50, 0], [90, 0], 40.0)})
-    assert no_heights["a"] == ["b"]
-    doubled = {"a": Lane(np.array([[0.0, 5], [0, 50], [0, 50]])), "b": Lane(np.array([[0.0, 50], [0, 50], [0, 90]]))}
-    assert infer_exits(doubled) == {"a": ["b"], "b": []}
+def test_a_lane_that_begins_before_the_last_one_ends_does_not_turn_the_route_back():
+    overlapping = {
+        "a": Lane(np.array([[0.0, 0], [100, 0]]), exits=["b"]),
+        "b": Lane(np.array([[96.0, 0.3], [400, 0.3]])),
+    }
+    (route,) = LaneGraph(overlapping).candidates(np.array([60.0, 0.0]), 0.0, 8.0, 1, 150)
+    assert (np.diff(route.points[:, 0]) > 1.5).all() and np.abs(np.diff(route.points[:, 1])).max() < 0.3
 
 
 def lane_change() -> np.ndarray:
