@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 from torchrl.record.loggers import CSVLogger, TensorboardLogger, WandbLogger
@@ -36,9 +37,12 @@ class RunLogger:
             raise InputError(f"metrics {', '.join(wrong)}: begin each with {'/, '.join(GROUPS)}/")
         if self._logger is None:
             return
-        for name, value in metrics.items():
-            if not math.isnan(value):
-                self._logger.log_scalar(name, float(value), step=step)
+        known = {name: float(value) for name, value in metrics.items() if not math.isnan(value)}
+        if isinstance(self._logger, WandbLogger):
+            self._write_row(known, step)
+        else:
+            for name, value in known.items():
+                self._logger.log_scalar(name, value, step=step)
         if choices:
             path = self._folder / CHOICES
             earlier = lines_before(path, step) if path.is_file() else []
@@ -51,8 +55,8 @@ class RunLogger:
             import wandb
 
             moving = path.suffix == ".gif"
-            shown = wandb.Video(str(path), format="gif") if moving else wandb.Image(str(path))
-            self._logger.experiment.log({name: shown}, step=step)
+            media = wandb.Video(str(path), format="gif") if moving else wandb.Image(str(path))
+            self._write_row({name: media}, step)
         elif isinstance(self._logger, TensorboardLogger):
             from tensorboard.compat.proto.summary_pb2 import Summary
 
@@ -60,6 +64,15 @@ class RunLogger:
                 given = {"width": image.width, "height": image.height, "colorspace": 3}
             value = Summary.Value(tag=name, image=Summary.Image(encoded_image_string=path.read_bytes(), **given))
             self._logger.experiment.file_writer.add_summary(Summary(value=[value]), step)
+
+    def _write_row(self, values: Mapping[str, Any], step: int) -> None:
+        """Add values to wandb's row of a step. It stays open until a later step, or the end, writes it.
+
+        wandb's own step has to be told. By default TorchRL counts steps of each group beside it, and wandb takes every
+        number for a row of its own, so that a picture of step 1 comes to a row that is written already, and is lost.
+        """
+        assert isinstance(self._logger, WandbLogger)
+        self._logger.log_metrics(dict(values), step=step, override_global_step=True)
 
     def forget(self, step: int) -> None:
         """Remove the scalars of a step and of later ones from the CSV files, and a line that was cut off: a resumed run

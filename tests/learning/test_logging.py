@@ -1,9 +1,17 @@
-"""Scalars land in a file each, in the known groups, and go on after a resume."""
+"""Scalars and media land where they belong, in the known groups, and go on after a resume."""
+
+import json
+import math
+import struct
 
 import pytest
+from PIL import Image
 
 from e2rl.learning.logging import RunLogger
 from e2rl.run.errors import InputError
+
+WANDB_HEADER, LEVELDB_BLOCK = 7, 1 << 15  # bytes
+FRAGMENT = struct.Struct("<IHB")
 
 
 def test_unknown_groups_and_kinds_are_refused(tmp_path):
@@ -25,3 +33,57 @@ def test_what_a_resumed_run_logs_again_is_not_doubled(tmp_path):
     scalars = tmp_path / "logs" / "scalars"
     assert (scalars / "train" / "loss.csv").read_text().split() == ["0,0.5", "1,0.25"]
     assert (scalars / "time" / "improve.csv").read_text().split() == ["0,2.0", "1,3.0"]
+
+
+def test_wandb_has_scalars_and_media_of_a_step_in_one_row(tmp_path, monkeypatch):
+    """Two rounds, each with pictures after its scalars, read back from the file of the offline run."""
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    picture, video = tmp_path / "choices.png", tmp_path / "attack.gif"
+    Image.new("RGB", (8, 8)).save(picture)
+    Image.new("RGB", (8, 8)).save(video, save_all=True, append_images=[Image.new("RGB", (8, 8), "red")])
+    logger = RunLogger("wandb", tmp_path)
+    for number in range(2):
+        logger.log({"train/return": 1.5 + number, "time/improve": 2.0, "train/unknown": math.nan}, number)
+        logger.show("curriculum/choices", picture, number)
+        logger.show("synthesizer/video_1", video, number)
+    logger.close()
+    (file,) = tmp_path.rglob("run-*.wandb")
+    rows = history(file)
+    assert [row["_step"] for row in rows] == [0, 1]
+    assert [row["train/return"] for row in rows] == [1.5, 2.5]
+    assert all("train/unknown" not in row for row in rows)
+    media = [row[f"{name}/path"] for row in rows for name in ("curriculum/choices", "synthesizer/video_1")]
+    assert len(set(media)) == 4
+    assert all((file.parent / "files" / path).is_file() for path in media)
+
+
+def history(file):
+    """The rows {name: value} of an offline run. Its file is a log of LevelDB, whose records are messages of wandb's."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    rows = []
+    for content in leveldb_records(file.read_bytes()[WANDB_HEADER:]):
+        record = Record.FromString(content)
+        if record.WhichOneof("record_type") == "history":
+            items = record.history.item
+            rows.append({"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items})
+    return rows
+
+
+def leveldb_records(content):
+    """Records of a LevelDB log: fragments of crc, length and kind (1 whole, 2 first, 3 middle, 4 last), none of which
+    crosses a block. The first block has a header of WANDB_HEADER bytes."""
+    at, record = 0, b""
+    while at + FRAGMENT.size <= len(content):
+        left = LEVELDB_BLOCK - (at + WANDB_HEADER) % LEVELDB_BLOCK
+        if left < FRAGMENT.size:
+            at += left
+            continue
+        _, length, kind = FRAGMENT.unpack_from(content, at)
+        at += FRAGMENT.size
+        record += content[at : at + length]
+        at += length
+        if kind in (1, 4):
+            yield record
+            record = b""

@@ -80,7 +80,7 @@ def test_a_track_of_at_most_0_05_m_per_s_stands(creep, expected):
 
 
 def test_an_object_stands_whatever_its_speed():
-    """The same side is touched at 8 m/s: by a vehicle it is the vehicle's doing, by an object half the score is lost."""
+    """The same side is touched at 8 m/s: a vehicle did that by itself, an object costs half the score."""
     ego, other = course(0, 0, 0, 10), course(8, 9.2, -math.pi / 2, 8)
     assert scores(ego, other, kinds=[VEHICLE, VEHICLE], limit=20)["no_ego_at_fault_collisions"] == 1
     assert scores(ego, other, kinds=[VEHICLE, OTHER], limit=20)["no_ego_at_fault_collisions"] == 0.5
