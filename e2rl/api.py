@@ -171,13 +171,15 @@ def make_sb3_env(num_envs: int = 16, **settings: Any) -> Any:
     return library("e2rl.learning.sb3", "make_sb3_env", "gym").SB3Env(make_gym_env(num_envs, **settings))
 
 
-def save_policy(policy: Any, path: str | Path) -> Path:
+def save_policy(policy: Any, path: str | Path, env: Any = None) -> Path:
     """Writes POLICY.onnx, or POLICY.pt of TorchScript, for ego=policy_file; returns its path.
 
-    policy: a Stable-Baselines3 model trained here, or a module of such a map (docs/observation.md).
+    Args:
+        policy: a Stable-Baselines3 model trained here, or a module of such a map (docs/observation.md).
+        env: of a model that was loaded: the VecNormalize that was saved with it (docs/how-to/gym.md).
     """
     if not isinstance(policy, torch.nn.Module):
-        policy = library("e2rl.learning.sb3", "save_policy", "gym").Deterministic(policy)
+        policy = library("e2rl.learning.sb3", "save_policy", "gym").Deterministic(policy, env)
     write_policy(policy, Path(path))
     return Path(path)
 

@@ -1,7 +1,7 @@
 """The environment of `e2rl.make_env` by gymnasium's interfaces: a batch of scenes, or one (extra `gym`)."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypedDict
 
 import gymnasium
 import numpy as np
@@ -16,6 +16,15 @@ from torchrl.envs import TransformedEnv
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 Info = dict[str, Any]
+
+
+class Driving(TypedDict):
+    """What actions of -1 and 1 do, which a policy's file needs. Plain values: action spaces carry them into a saved
+    model of Stable-Baselines3."""
+
+    low: list[float]  # m/s^2, rad/s
+    high: list[float]
+    steps: int  # of an episode
 
 
 def in_units(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -37,6 +46,8 @@ class DrivingVectorEnv(VectorEnv):
         self.bounds = torch.stack([space.low, space.high])
         self.single_observation_space = Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
+        self.driving = Driving(low=space.low.tolist(), high=space.high.tolist(), steps=env.horizon)
+        self.single_action_space.driving = self.driving
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -79,7 +90,7 @@ class DrivingGymEnv(gymnasium.Env):
     def __init__(self, env: TransformedEnv) -> None:
         self._batch = DrivingVectorEnv(env)
         self.bounds, self.observation_space = self._batch.bounds, self._batch.single_observation_space
-        self.action_space = self._batch.single_action_space
+        self.action_space, self.driving = self._batch.single_action_space, self._batch.driving
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         super().reset(seed=seed)

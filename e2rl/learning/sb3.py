@@ -2,14 +2,17 @@
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium.wrappers import TransformAction
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from torch import Tensor, nn
 
-from e2rl.learning.gym_env import DrivingVectorEnv, in_units, row_of
+from e2rl.learning.gym_env import Driving, DrivingVectorEnv, in_units, row_of
 from e2rl.run.errors import InputError
+from e2rl.sim.observation import ELAPSED, OBSERVATION_SIZE
 
 
 class SB3Env(VecEnv):
@@ -53,23 +56,129 @@ class SB3Env(VecEnv):
 
 
 class Deterministic(nn.Module):
-    """What `model.predict(observation, deterministic=True)` returns, in m/s^2 and rad/s."""
+    """What `model.predict(observation, deterministic=True)` returns for e2rl's observation, in m/s^2 and rad/s.
 
-    def __init__(self, model: BaseAlgorithm) -> None:
-        """Raises InputError for a model without an environment of e2rl, which has the bounds."""
+    The statistics of every VecNormalize of its environment come along.
+    """
+
+    def __init__(self, model: BaseAlgorithm, env: VecEnv | None = None) -> None:
+        """
+        Args:
+            model: as trained, or loaded without an environment.
+            env: of a loaded model, its VecNormalize included; None: it had none.
+
+        Raises:
+            InputError: another observation, action or normalisation than the model was trained with.
+        """
         super().__init__()
-        env, normal = model.get_env(), model.get_vec_normalize_env()
-        if env is None or not env.has_attr("bounds"):
-            raise InputError("the model has no environment of e2rl: load it with env=e2rl.make_sb3_env(...)")
-        self.low, self.high = env.get_attr("bounds")[0]
+        check_spaces(model)
+        driving = driving_of(model, env)
+        self.low, self.high = torch.tensor(driving["low"]), torch.tensor(driving["high"])
         self.policy = type(model.policy)(**model.policy._get_constructor_parameters())  # a copy on the CPU
         self.policy.load_state_dict(model.policy.state_dict())
-        self.mean, self.scale, self.clip = torch.zeros(1), torch.ones(1), torch.inf
-        if normal is not None and normal.norm_obs:
-            known: Any = normal.obs_rms
-            self.mean, self.scale = (torch.tensor(x).float() for x in (known.mean, (known.var + normal.epsilon) ** 0.5))
-            self.clip = normal.clip_obs
+        trained_in = env if env is not None else model.get_env()
+        self.normalisers = normalisers_of(trained_in)
+        check_wrappers(trained_in)
+        in_training = trained_in is model.get_env() is not None and model._last_obs is not None
+        if not in_training:
+            check_last_observation(model, self.normalisers, steps=driving["steps"])
 
     def forward(self, observation: Tensor) -> Tensor:
-        seen = ((observation - self.mean) / self.scale).clamp(-self.clip, self.clip)
-        return in_units(self.policy._predict(seen, deterministic=True), self.low, self.high)
+        for mean, scale, clip in self.normalisers:
+            observation = ((observation - mean) / scale).clamp(-clip, clip)
+        action = self.policy._predict(observation, deterministic=True)
+        return in_units(action, self.low, self.high)
+
+
+def check_spaces(model: BaseAlgorithm) -> None:
+    """Raises InputError where a model maps other numbers than e2rl's observation to two in [-1, 1]."""
+    shape = model.observation_space.shape
+    if shape != (OBSERVATION_SIZE,):
+        raise InputError(
+            f"the model observes {list(shape or ())} numbers, not the {OBSERVATION_SIZE} of a moment: as an ego it "
+            "gets no stacked or added ones; train it without that wrapper"
+        )
+    low, high = (np.asarray(getattr(model.action_space, name)) for name in ("low", "high"))
+    if not ((low == -1).all() and (high == 1).all()):
+        raise InputError(
+            f"the model's actions lie in [{low.min():g}, {high.max():g}], those of e2rl in [-1, 1]: train it without "
+            "the wrapper that rescales them"
+        )
+
+
+def driving_of(model: BaseAlgorithm, env: VecEnv | None) -> Driving:
+    """What the model was trained to drive: its action space tells, else an environment.
+
+    Raises InputError where an environment has other bounds, or nothing tells them.
+    """
+    trained = getattr(model.action_space, "driving", None)
+    source = env if env is not None else model.get_env()
+    if source is None or not source.has_attr("driving"):
+        if trained is None:
+            raise InputError(
+                "the model has no environment of e2rl, which has the bounds: pass env=e2rl.make_sb3_env(1)"
+            )
+        return trained
+    present = source.get_attr("driving")[0]
+    if trained is not None and bounds_line(trained) != bounds_line(present):
+        raise InputError(
+            f"the model was trained with actions from {bounds_line(trained)}, its environment has those from "
+            f"{bounds_line(present)}: load it without one, by load(FILE), or give the environment the same "
+            "max_acceleration, max_braking and max_yaw_rate"
+        )
+    return present if trained is None else trained
+
+
+def bounds_line(driving: Driving) -> str:
+    """The bounds of the actions in words."""
+    accelerations, yaw_rates = zip(driving["low"], driving["high"], strict=True)
+    return f"{accelerations[0]:g} to {accelerations[1]:g} m/s^2 and {yaw_rates[0]:g} to {yaw_rates[1]:g} rad/s"
+
+
+def normalisers_of(env: VecEnv | None) -> list[tuple[Tensor, Tensor, float]]:
+    """Mean, scale and clip of each VecNormalize of an environment, the first that an observation meets first."""
+    normalisers: list[tuple[Tensor, Tensor, float]] = []
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecNormalize) and env.norm_obs:
+            statistics: Any = env.obs_rms
+            mean = torch.tensor(statistics.mean).float()
+            scale = torch.tensor((statistics.var + env.epsilon) ** 0.5).float()
+            normalisers.insert(0, (mean, scale, float(env.clip_obs)))
+        env = env.venv
+    return normalisers
+
+
+def check_wrappers(env: VecEnv | None) -> None:
+    """Raises InputError where gymnasium's wrappers change observations or actions of an environment."""
+    if env is None:
+        return
+    if any(any(env.env_is_wrapped(kind)) for kind in (gymnasium.ObservationWrapper, TransformAction)):
+        raise InputError(
+            "a wrapper of gymnasium changes the model's observations or actions, and the policy's file would not have "
+            "it: normalise by VecNormalize of Stable-Baselines3, which is saved, or pass a module of the whole map"
+        )
+
+
+def check_last_observation(model: BaseAlgorithm, normalisers: list[tuple[Tensor, Tensor, float]], steps: int) -> None:
+    """Raises InputError where the last observation that a model holds was not normalised by these.
+
+    Undone, it has e2rl's elapsed fraction of the episode: one of k / steps.
+    """
+    if model.num_timesteps == 0:
+        return
+    if model._last_obs is None:
+        raise InputError(
+            "a model that was loaded with an environment does not tell whether it was trained under VecNormalize: load "
+            "it without one, and pass the VecNormalize, if it had any: save_policy(PPO.load(FILE), POLICY, env=ENV)"
+        )
+    elapsed = torch.as_tensor(np.asarray(model._last_obs), dtype=torch.float64)[:, ELAPSED]
+    for mean, scale, _ in reversed(normalisers):
+        elapsed = elapsed * scale[ELAPSED] + mean[ELAPSED]
+    step = elapsed * steps
+    whole = (step - step.round()).abs() < 0.01
+    if not bool((whole & (step > -0.5) & (step < steps + 0.5)).all()):
+        missing = "with other statistics than those of env" if normalisers else "with normalised observations"
+        raise InputError(
+            f"the model was trained {missing}: pass the VecNormalize that was saved with it, "
+            "env=VecNormalize.load(FILE, e2rl.make_sb3_env(1))"
+        )
