@@ -34,7 +34,7 @@ from e2rl.prior.prior import Prior
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
 from e2rl.run.config import library, load_choice, with_changes
-from e2rl.run.settings import check_range
+from e2rl.run.settings import check_choice, check_range
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
@@ -131,7 +131,7 @@ def make_env(
     method: str | Traffic = "e2",
     eta: float | Sequence[float] = (0.0, 1.0),
     hold: int = 1,
-    seed: int = 0,
+    seed: int | None = None,
     compile: bool | str = "auto",
     **sim: Any,
 ) -> TransformedEnv:
@@ -142,6 +142,8 @@ def make_env(
         method: the traffic, or the name of a file in conf/synthesizer, on the bundled prior.
         eta: adversarial intensity, 0 to 3, or several, of which one is drawn.
         hold: steps of 0.1 s that an action lasts.
+        seed: of the scenes and attacks that are drawn, until `set_seed` or `reset(seed=...)`; None: others in each
+            environment and process.
         compile: as in conf/evaluate.yaml, for the whole process.
         sim: settings of conf/sim/default.yaml, such as reward={"contact": -30.0}.
     """
@@ -158,12 +160,19 @@ def make_env(
     return TransformedEnv(base, AdversarialSynthesizer(pool, draw, traffic))
 
 
-def make_gym_env(num_envs: int | None = None, **settings: Any) -> Any:
-    """Returns a gymnasium.Env of one scene, or with num_envs a VectorEnv, one batch. settings: of make_env."""
+def make_gym_env(num_envs: int | None = None, autoreset: str = "same_step", **settings: Any) -> Any:
+    """Returns a gymnasium.Env of one scene, or with num_envs a VectorEnv, one batch.
+
+    Args:
+        autoreset: when an environment of a batch begins anew: in the `same_step` as it ends, or in the `next_step`,
+            whose action is ignored, as gymnasium's wrappers of a batch's observations want it.
+        settings: of make_env.
+    """
     module = library("e2rl.learning.gym_env", "make_gym_env", "gym")
+    check_choice("autoreset", autoreset, module.AUTORESET)
     if num_envs is None:
         return module.DrivingGymEnv(make_env(1, **settings))
-    return module.DrivingVectorEnv(make_env(num_envs, **settings))
+    return module.DrivingVectorEnv(make_env(num_envs, **settings), module.AUTORESET[autoreset])
 
 
 def make_sb3_env(num_envs: int = 16, **settings: Any) -> Any:

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from e2rl.run.errors import InputError
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 Info = dict[str, Any]
@@ -32,17 +33,19 @@ def in_units(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return action.clamp(0.0, 1.0) * high - action.clamp(-1.0, 0.0) * low
 
 
+AUTORESET = {"same_step": AutoresetMode.SAME_STEP, "next_step": AutoresetMode.NEXT_STEP}
+
+
 class DrivingVectorEnv(VectorEnv):
-    """B scenes as one batch; what ends is reset in the same step.
+    """B scenes as one batch.
 
     Observations [B, OBSERVATION_SIZE], actions [B, 2] in [-1, 1] of bounds [2, 2] (low, high; m/s^2, rad/s). The info
     has arrays [B]: the metrics of DrivingEnv, scene (its id) and eta; of those that end they are in final_info.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-
-    def __init__(self, env: TransformedEnv) -> None:
+    def __init__(self, env: TransformedEnv, autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:
         self.env, self.num_envs, space = env, env.batch_size[0], env.action_spec_unbatched.space
+        self.metadata = {"autoreset_mode": autoreset_mode}
         self.bounds = torch.stack([space.low, space.high])
         self.single_observation_space = Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
@@ -50,6 +53,11 @@ class DrivingVectorEnv(VectorEnv):
         self.single_action_space.driving = self.driving
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        """Raises InputError: TorchRL's GymWrapper alone asks for it, and cannot carry the scenes' ids of the info."""
+        raise InputError("GymWrapper: e2rl.make_env(NUM_ENVS) is this batch as an environment of TorchRL; use that")
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         """New episodes; options: scene: id or position of the scene of all. InputError for one that is not there."""
@@ -61,6 +69,7 @@ class DrivingVectorEnv(VectorEnv):
         if scene is not None:
             synthesizer.draw.probability = every * (synthesizer.pool.scene_index == self.env.scenes.index(scene))
         self._now = self.env.reset()
+        self._ended = np.zeros(self.num_envs, dtype=bool)
         synthesizer.draw.probability = every
         return self._shown(self._now)
 
@@ -70,11 +79,35 @@ class DrivingVectorEnv(VectorEnv):
         stepped, self._now = self.env.step_and_maybe_reset(self._now)
         last = stepped["next"]
         reward, terminated, truncated = (last[key][:, 0].numpy() for key in ("reward", "terminated", "truncated"))
-        (seen, info), done = self._shown(self._now), terminated | truncated
+        if self.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP:
+            return self._begun_in_next_step(last, reward, terminated, truncated)
+        observation, info = self._shown(self._now)
+        done = terminated | truncated
         if done.any():
-            info |= dict(zip(("final_obs", "final_info"), self._shown(last), strict=True))
+            info["final_obs"], info["final_info"] = self._shown(last)
             info |= {"_final_obs": done, "_final_info": done}
-        return seen, reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
+
+    def _begun_in_next_step(
+        self, last: TensorDictBase, reward: np.ndarray, terminated: np.ndarray, truncated: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+        """What a step returns where an environment that ended begins with the step after it.
+
+        The batch, which has no pause, began it at once and drove a step, so it begins anew.
+        """
+        begins = self._ended
+        if begins.any():
+            self._now["_reset"] = torch.from_numpy(begins)[:, None]
+            self._now = self.env.reset(self._now)
+        reward, terminated, truncated = (
+            np.where(begins, np.zeros_like(values), values) for values in (reward, terminated, truncated)
+        )
+        self._ended = terminated | truncated
+        observation, info = self._shown(self._now)
+        last_observation, last_info = self._shown(last)
+        observation[self._ended] = last_observation[self._ended]
+        info = {name: np.where(self._ended, last_info[name], values) for name, values in info.items()}
+        return observation, reward, terminated, truncated, info
 
     def _shown(self, found: TensorDictBase) -> tuple[np.ndarray, Info]:
         """Observation and info."""

@@ -1,6 +1,7 @@
 """The update of a learned ego: PPO and behaviour cloning on episodes collected in the round's pool."""
 
 import copy
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -50,11 +51,22 @@ class CollectSettings:
 class RowDraw:
     """Draws pool rows by probability [R], with a generator of its own."""
 
-    def __init__(self, probability: Tensor, seed: int = 0) -> None:
-        self.probability, self.generator = probability, torch.Generator().manual_seed(seed)
+    def __init__(self, probability: Tensor, seed: int | None = 0) -> None:
+        """seed: None, of the system's entropy, anew in every process that a copy draws in until somebody seeds it."""
+        self.probability = probability
+        self.generator = torch.Generator()
+        self._process = os.getpid()
+        self._entropy = None
+        if seed is None:
+            self._entropy = self.generator.seed()
+        else:
+            self.generator.manual_seed(seed)
 
     def __call__(self, count: int) -> Tensor:
         """Rows [count]."""
+        if self._process != os.getpid() and self._entropy == self.generator.initial_seed():
+            self._process = os.getpid()
+            self._entropy = self.generator.seed()
         return torch.multinomial(self.probability, count, replacement=True, generator=self.generator)
 
 

@@ -22,6 +22,11 @@ class SB3Env(VecEnv):
         self.batch = batch
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
 
+    @property
+    def autoreset_mode(self) -> Any:
+        """Raises InputError, as the batch's does."""
+        return self.batch.autoreset_mode
+
     def reset(self) -> np.ndarray:
         observation, info = self.batch.reset(seed=self._seeds[0], options=self._options[0])
         self.reset_infos = [row_of(info, row) for row in range(self.num_envs)]

@@ -1,11 +1,16 @@
 """gymnasium sees the same episodes as TorchRL, by interfaces that pass both checkers."""
 
+import multiprocessing
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.wrappers import vector
+from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 import e2rl
@@ -20,6 +25,12 @@ SPEED = 0  # of the observation
 def given():
     """Three scenes with recorded traffic."""
     return {"scenes": e2rl.load_scenes("bundled", 3), "method": "replay", "eta": 0.0, "compile": False}
+
+
+@pytest.fixture(scope="module")
+def bundled():
+    """All bundled test scenes, so that two draws of several are hardly ever alike."""
+    return {"scenes": e2rl.load_scenes("bundled"), "method": "replay", "eta": 0.0, "compile": False}
 
 
 def actions(batch, seed=0):
@@ -86,6 +97,85 @@ def test_a_seed_decides_the_episodes_in_attacked_traffic(given):
 
     (ours, scenes), (again, same), (_, others) = driven(1), driven(1), driven(3)
     assert all(map(np.array_equal, ours, again)) and scenes == same != others
+
+
+def test_environments_without_a_seed_drive_in_other_scenes(bundled):
+    """As workers of one function, and as one environment that is copied into several processes."""
+    batches = [e2rl.make_gym_env(8, **bundled) for _ in range(2)]
+    first, second = (batch.reset()[1]["scene"].tolist() for batch in batches)
+    assert first != second
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        (copied,) = pool.map(scenes_of, [batches[0]])
+    assert copied != batches[0].reset()[1]["scene"].tolist()
+
+
+def test_environments_with_a_seed_drive_in_the_same_scenes(bundled):
+    """In other processes, too; `reset(seed=...)` decides over the seed of the making."""
+    seeded = [e2rl.make_gym_env(8, **bundled, seed=seed) for seed in (4, 4, 5)]
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        (copied,) = pool.map(scenes_of, [seeded[0]])
+    first, second, other = (env.reset()[1]["scene"].tolist() for env in seeded)
+    assert copied == first == second != other
+    unseeded = e2rl.make_gym_env(8, **bundled)
+    chosen = unseeded.reset(seed=9)[1]["scene"].tolist()
+    assert chosen == seeded[2].reset(seed=9)[1]["scene"].tolist()
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        (copied,) = pool.map(scenes_of, [unseeded])
+    assert copied == unseeded.reset()[1]["scene"].tolist()
+
+
+def scenes_of(env):
+    """Of the next episodes."""
+    return env.reset()[1]["scene"].tolist()
+
+
+@pytest.mark.parametrize("kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")])
+def test_gymnasium_s_own_batches_drive_in_scenes_of_their_own(bundled, kind):
+    """Every environment by a seed of its own, the same again by the same seed."""
+    workers = kind([lambda: e2rl.make_gym_env(**bundled)] * 6)
+    try:
+        unseeded, _ = workers.reset()
+        first, second, other = (workers.reset(seed=seed)[0] for seed in (1, 1, 40))
+    finally:
+        workers.close()
+    assert len(np.unique(unseeded, axis=0)) > 1
+    assert len(np.unique(first, axis=0)) > 1
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, other)
+
+
+def test_in_the_next_step_an_episode_begins_whatever_is_done(given):
+    """As in gymnasium's own batches: its action is ignored, it has no reward, and nothing is final."""
+    env = e2rl.make_gym_env(4, autoreset="next_step", **given)
+    env.reset(seed=5)
+    begins = np.zeros(4, dtype=bool)
+    episodes = 0
+    for step in range(100):
+        observation, reward, terminated, truncated, info = env.step(actions(4, step))
+        assert (observation[begins, ELAPSED] == 0).all() and (observation[~begins, ELAPSED] > 0).all()
+        assert not (terminated | truncated)[begins].any() and not reward[begins].any()
+        assert "final_obs" not in info
+        begins = terminated | truncated
+        assert not info["off_road"][~begins].any()
+        episodes += begins.sum()
+    assert episodes > 4
+
+
+def test_gymnasium_normalises_the_observations_of_a_batch(given):
+    env = vector.NormalizeObservation(e2rl.make_gym_env(3, autoreset="next_step", **given))
+    env.reset(seed=0)
+    for step in range(40):
+        observation = env.step(actions(3, step))[0]
+    assert np.abs(observation).max() < 20 and env.obs_rms.count > 100
+    with pytest.raises(InputError, match="autoreset=never"):
+        e2rl.make_gym_env(3, autoreset="never", **given)
+
+
+def test_torchrl_is_pointed_to_its_own_environment(given):
+    for batch in (e2rl.make_gym_env(3, **given), e2rl.make_sb3_env(3, **given)):
+        with pytest.raises(InputError, match=r"e2rl.make_env\(NUM_ENVS\)"):
+            GymWrapper(batch)
+    check_env_specs(GymWrapper(e2rl.make_gym_env(**given)))
 
 
 def test_actions_are_scaled_about_keeping_speed_and_heading(given):
