@@ -1,7 +1,6 @@
 """`e2rl export RUN_DIR --to FORMAT`: failures of a run in the format of another tool (docs/export.md)."""
 
 import argparse
-import csv
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from e2rl.report.export.scene_files import episodes_of
 from e2rl.run.config import library
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.files import written_whole
+from e2rl.run.files import csv_text, write_atomically, written_whole
 
 FORMATS = {  # modules of e2rl.report.export; what a module imports is in the extra of the format's name
     "commonroad": "commonroad_writer",
@@ -50,12 +49,14 @@ def export(episodes: Iterator[Episode], write: Callable[..., Iterator], out: Pat
     """Write episodes by the `write` of a format into a new folder, with a list of the files and their facts."""
     if out.exists():
         raise InputError(f"{out}: is there already; remove it, or pass another folder with --out")
-    with written_whole(out) as folder, (folder / LIST).open("w", newline="") as file:
-        writer = csv.DictWriter(file, ("file", *FACTS, "adversaries"), restval="", lineterminator="\n")
-        writer.writeheader()
+    columns = ("file", *FACTS, "adversaries")
+    with written_whole(out) as folder:
+        lines = []
         for episode, path in write(episodes, folder, open_ego):
             facts = episode.facts | {"adversaries": " ".join(map(str, episode.facts["adversaries"]))}
-            writer.writerow({"file": str(path.relative_to(folder))} | facts)
+            facts["file"] = str(path.relative_to(folder))
+            lines.append([facts.get(column, "") for column in columns])
+        write_atomically(folder / LIST, csv_text([columns, *lines]))
 
 
 def main(arguments: list[str] | None = None) -> None:

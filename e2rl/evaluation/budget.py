@@ -24,7 +24,7 @@ from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built, with_changes
 from e2rl.run.errors import InputError
-from e2rl.run.files import csv_text, write_atomically
+from e2rl.run.files import CsvReader, csv_text, write_atomically
 from e2rl.run.settings import settings_of
 from e2rl.search.search import Outcome, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family, Try, family_of
@@ -283,10 +283,10 @@ def failures_of(file: Path, ego_name: str, plan: Plan, setup: Setup) -> list[Par
         with file.open(newline="", encoding="utf-8") as lines:
             rows = [
                 (row["scene_id"], int(row["seed"]), row["family"])
-                for row in csv.DictReader(lines)
+                for row in CsvReader(lines)
                 if (row["method"], row["ego_policy"]) == (plan.name, ego_name) and float(row["margin"]) >= 0
             ]
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, csv.Error) as error:
         raise InputError(f"{file}: no table of a search's tries ({error!r}); name the folder of a search") from None
     if not rows:
         raise InputError(f"{file}: no try of {plan.name} hits {ego_name}; name a search against it")

@@ -13,7 +13,7 @@ from typing import IO, Any
 from e2rl.metrics.catalogue import LATER, SOURCE, WORDS, row_columns
 from e2rl.metrics.errored import errored_row
 from e2rl.run.errors import InputError
-from e2rl.run.files import csv_text, leads_into, misfit, open_regular, read_regular, write_atomically
+from e2rl.run.files import CsvReader, csv_text, leads_into, misfit, open_regular, read_regular, write_atomically
 from e2rl.run.parts import PARTS
 from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.traffic.attempt import summary_of
@@ -65,7 +65,7 @@ def read_rows(path: Path) -> list[dict]:
     path = Path(path)
     try:
         with opened(path) as file:
-            rows = csv.DictReader(file, strict=True)
+            rows = CsvReader(file)
             missing = [name for name in table_columns() if name not in (rows.fieldnames or ())]
             if wrong := [name for name in missing if name not in LATER]:
                 raise ValueError(f"no column {wrong[0]}")
@@ -126,8 +126,13 @@ def _row(line: int, row: dict[str, Any]) -> dict:
 
 
 def write_json(path: Path, content: object) -> None:
-    """Write metrics.json, modes.json, atlas.json, ...: NaN and infinite numbers become null (strict JSON)."""
-    write_atomically(path, json.dumps(nulls(content), indent=1, allow_nan=False))
+    """Write metrics.json, modes.json, atlas.json, ..., as `json_text` has it."""
+    write_atomically(path, json_text(content))
+
+
+def json_text(content: object) -> str:
+    """Returns the content as strict JSON: NaN and infinite numbers are null."""
+    return json.dumps(nulls(content), indent=1, allow_nan=False)
 
 
 def read_metrics(path: Path) -> list[dict]:

@@ -3,15 +3,14 @@
 docs/how-to/planner.md has these field by field. All numbers have 4 bytes, little-endian.
 """
 
-import os
 import shlex
-import signal
+import shutil
 import socket
 import struct
 import subprocess
+import sys
 import tempfile
 import time
-from functools import partial
 from multiprocessing.util import Finalize
 
 import numpy as np
@@ -19,8 +18,8 @@ import torch
 from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, PlannerError
+from e2rl.run import process_tree
 from e2rl.run.errors import InputError
-from e2rl.run.processes import die_with_parent
 from e2rl.scenes.recording import DT
 from e2rl.sim.mission import Mission, light_state_at, mission_of
 from e2rl.sim.world import World
@@ -122,7 +121,7 @@ def _bytes(words: Tensor) -> bytes:
 STDERR = 2  # file descriptor
 PAUSE = 0.02  # s between two attempts to connect
 ANSWERS = 5.0  # s in which a planner that runs takes a connection
-GRACE = 1.0  # s between SIGTERM and SIGKILL
+GRACE = 1.0  # s that a connection, or the end of a process, may take
 Process = subprocess.Popen[bytes]
 
 
@@ -206,15 +205,17 @@ class PlannerLink:
 
 
 def start(command: str, address: str) -> Process:
-    """The process of a command, which is given the address to listen at; on Linux it dies with this one."""
+    """The process of a command, which is given the address to listen at.
+
+    On Linux it ends with this process, with all that it has started (`e2rl.run.process_tree`). Raises InputError where
+    there is no such program.
+    """
     try:
-        return subprocess.Popen(
-            [*shlex.split(command), address],
-            stdin=subprocess.DEVNULL,
-            stdout=STDERR,
-            start_new_session=True,  # Ctrl-C is for e2rl, which ends the planner
-            preexec_fn=partial(die_with_parent, os.getpid()),
-        )
+        words = [*shlex.split(command), address]
+        if shutil.which(words[0]) is None:
+            raise FileNotFoundError(f"no program {words[0]}")
+        guard = [sys.executable, "-I", "-S", process_tree.__file__]
+        return subprocess.Popen([*guard, *words], stdin=subprocess.PIPE, stdout=STDERR, start_new_session=True)
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         raise InputError(f"ego.command={command}: cannot be started: {error}") from error
 
@@ -254,12 +255,12 @@ def close(connection: socket.socket | None, process: Process | None) -> None:
     """Close a connection and end the planner's process, and those that it started."""
     if connection is not None:
         connection.close()
-    if process is None or process.poll() is not None:
+    if process is None:
         return
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        os.killpg(process.pid, number)
-        try:
-            process.wait(GRACE)
-            return
-        except subprocess.TimeoutExpired:
-            continue
+    process.terminate()
+    try:
+        process.wait(process_tree.GRACE + process_tree.PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+    if process.stdin is not None:
+        process.stdin.close()

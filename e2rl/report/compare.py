@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.evaluation.comparison import CHANGES, PAIR, RATES, Driven, compared
-from e2rl.evaluation.rollout_files import cell, own_folder, write_json
+from e2rl.evaluation.rollout_files import cell, json_text, own_folder
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import Row, is_failure, mode_name
 from e2rl.report.answer import FEW, wrapped
@@ -19,7 +19,7 @@ from e2rl.report.html import ASSETS, COLUMNS, page
 from e2rl.report.tables import difference_cell
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.files import csv_text, write_atomically
+from e2rl.run.files import csv_text, write_atomically, write_beside
 from e2rl.run.run import read_provenance
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_name
 
@@ -47,11 +47,11 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
     content = {**about, "told": told, "pairs": rows[: len(changed)], **replays}
     scripts = [*(ASSETS / f"{name}.js" for name in SCRIPTS), FOLDER / "compare.js"]
     write_atomically(path, page(FOLDER / PAGE, " against ".join(names[::-1]), scripts, content))
-    write_json(path.with_suffix(".json"), about)
+    write_beside(path, ".json", json_text(about))
     columns = [*PAIR, "change", "what", *(f"{name}_{side}" for side in SIDES for name in (*FACTS, "file"))]
     flat = [row | {f"{name}_{side}": cell(row[side][name]) for side in SIDES for name in row[side]} for row in rows]
     lines = [[" ".join(row[name]) if name == "what" else row[name] for name in columns] for row in flat]
-    write_atomically(path.with_suffix(".csv"), csv_text([columns, *lines]))
+    write_beside(path, ".csv", csv_text([columns, *lines]))
     ends = [f"Watch both: {path}", f"All pairs: {path.with_suffix('.csv')} and .json"]
     return [line for text in (f"{names[1]} against {names[0]}:", *told, *ends) for line in wrapped(text, "  ")]
 

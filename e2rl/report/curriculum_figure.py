@@ -19,6 +19,7 @@ from e2rl.evaluation.rollout_files import MOST_ROWS, cause, opened
 from e2rl.report import drawing
 from e2rl.report.drawing import new_figure, save_figure
 from e2rl.run.errors import InputError
+from e2rl.run.files import CsvReader
 from e2rl.traffic.traffic import TEMPLATES
 
 CHOICES, PICTURE = "curriculum.csv", "curriculum.png"  # of a run's folder
@@ -77,7 +78,7 @@ def read_choices(path: Path) -> list[Choice]:
     """The columns NEEDED of a curriculum.csv, finite numbers but for the template; InputError where it is none."""
     try:
         with opened(path) as file:
-            rows = list(islice(csv.DictReader(file, strict=True), MOST_ROWS))
+            rows = list(islice(CsvReader(file), MOST_ROWS))
         if not {row[TEXT] for row in rows} <= set(TEMPLATES):
             raise ValueError("a template")
         numbers = [{name: float(row[name]) for name in NEEDED if name != TEXT} for row in rows]

@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 from PIL import Image
 
-from e2rl.run.files import write_atomically
+from e2rl.run.files import write_atomically, write_beside
 from e2rl.sim.rollout_file import Road
 
 Colour = str | tuple[str, float]  # of matplotlib: a name, or a name with its opacity
@@ -171,4 +171,4 @@ def save_figure(path: Path, figure: Figure) -> None:
     """Write a figure as PNG and, beside it, as PDF: vectors with their fonts. The same figure makes the same bytes."""
     write_atomically(path, partial(image_of(figure).save, format="PNG", optimize=True))
     with rc_context({"pdf.fonttype": 42}):  # TrueType, which journals ask for
-        write_atomically(path.with_suffix(".pdf"), partial(figure.savefig, format="pdf", metadata=UNDATED))
+        write_beside(path, ".pdf", partial(figure.savefig, format="pdf", metadata=UNDATED))

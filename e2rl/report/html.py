@@ -18,7 +18,7 @@ from typing import Any
 from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.methods import SEARCH
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, read_metrics, read_rows
+from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, own_folder, read_metrics, read_rows
 from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import is_failure
@@ -28,7 +28,7 @@ from e2rl.report.tables import Table, closed_loop, column_names, metric_tables, 
 from e2rl.run.config import assigned
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.files import csv_text, write_atomically
+from e2rl.run.files import csv_text, write_atomically, write_beside
 from e2rl.run.trust import CONFIG, read_yaml
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_key, rollout_name
 
@@ -72,8 +72,8 @@ def write_report(
     tables = [*metric_tables(metrics), *mode_tables(modes)] if tables is None else tables
     content = page_content(run, metrics, modes, methods) | {"tables": [vars(table) for table in tables]}
     content |= add_replays(run, content.pop("rows"), content["failures"], replays)
-    path = path or run / PAGE
-    write_atomically(path.with_suffix(".csv"), failure_list(content, path.name))
+    path = path or own_folder(run, PAGE)
+    write_beside(path, ".csv", failure_list(content, path.name))
     scripts = sorted(ASSETS.glob("*.js"), key=lambda script: script.stem == "page")  # which uses all others
     title = f"Failures of {', '.join(dict.fromkeys(group['ego'] for group in content['groups']))}"
     write_atomically(path, page(ASSETS / "page.html", title, scripts, content))

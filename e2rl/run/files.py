@@ -12,6 +12,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import stat
 import sys
@@ -22,6 +23,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any
 
 import numpy as np
@@ -40,6 +42,13 @@ WAIT = 5  # s that another run's workers have to end
 LOGGER = "wandb"
 HASH = "sha256"  # key in the header of a file of weights
 SEAL = "sha256.json"  # of a sealed folder: {file: hash}
+MODE = 0o644  # permissions of a new file
+ANY_WRITE = 0o222  # permissions to write
+MOST_LINKS = 40  # that lead to one file, as on Linux
+DESCRIPTOR = re.compile(r"/(?:dev|proc/(?P<process>\d+)(?:/task/\d+)?)/fd/(?P<number>\d+)")
+FORMULA = re.compile(r"'*(\s*[=+\-@\uff1d\uff0b\uff0d\uff20]|[\t\r\n])")  # what a spreadsheet may run; full-width too
+NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+ESTIMATE = re.compile(rf"{NUMBER}(?: \[{NUMBER}, {NUMBER}\])?\*?(?: \(\d+\))?")  # +2.1 [+0.4, +3.9]* (12)
 DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
 
 
@@ -99,19 +108,126 @@ def leads_into(path: Path, folder: Path) -> bool:
 
 
 def csv_text(rows: Iterable[Iterable]) -> str:
-    """Rows of values as CSV."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
+    """Returns rows of values as CSV, for `CsvReader`.
+
+    A spreadsheet runs a text that begins as a formula does. Names come from strangers' data, so such a text begins with
+    an apostrophe instead. Numbers stay as they are.
+    """
+    lines: list[str] = []
+    ending = "\r\n"  # so that cells with either are quoted
+    writer = csv.writer(SimpleNamespace(write=lines.append), lineterminator=ending)
+    writer.writerows([escaped_cell(value) if isinstance(value, str) else value for value in row] for row in rows)
+    return "".join(f"{line.removesuffix(ending)}\n" for line in lines)
+
+
+def escaped_cell(text: str) -> str:
+    """Returns the text as a cell that no spreadsheet runs; `plain_cell` gives the text back."""
+    return f"'{text}" if FORMULA.match(text) and not ESTIMATE.fullmatch(text) else text
+
+
+def plain_cell(text: str) -> str:
+    """Returns the text of a cell of `escaped_cell`."""
+    return text[1:] if text.startswith("'") and FORMULA.match(text) else text
+
+
+class CsvReader(csv.DictReader):
+    """The rows of a CSV file that `csv_text` wrote, by their heads; csv.Error where it is damaged."""
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        super().__init__(lines, strict=True)
+
+    @property
+    def fieldnames(self) -> list[str] | None:  # type: ignore[override]
+        names = super().fieldnames
+        return None if names is None else [plain_cell(name) for name in names]
+
+    def __next__(self) -> dict[str, Any]:
+        row = super().__next__()
+        return {key: plain_cell(value) if isinstance(value, str) else value for key, value in row.items()}
 
 
 def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
-    """Write a file under a temporary name beside `path`, then rename it, so that no reader meets half a file.
+    """Write a file under a temporary name beside it, then rename it, so that no reader meets half a file.
 
-    content: the bytes or text of the file, or a function that writes the file whose path it is given. Missing parent
-    folders are made. Raises OSError, naming `path`, where it cannot be written; nothing is left behind then.
+    A link is followed: what it leads to is replaced. A device, a pipe and an open file of this process (/dev/stdout)
+    are written through. Missing parent folders are made.
+
+    Args:
+        content: the bytes or text of the file, or a function that writes the file whose path it is given.
+
+    Raises:
+        OSError: where it cannot be written, a folder, a socket and a read-only file among them. It names `path`, and
+            nothing is left behind.
     """
     path = Path(path)
+    try:
+        if is_stream(path):
+            _write_through(path, content)
+        else:
+            _replace(Path(os.path.realpath(path)), content)
+    except OSError as error:
+        if error.errno is not None:
+            error.filename = str(path)
+        raise
+
+
+def is_stream(path: Path) -> bool:
+    """Returns whether a path is a device, a pipe or an open file of this process, beside which nothing is written.
+
+    Raises:
+        OSError: for a folder, a socket, a disk, and a loop of links.
+    """
+    if descriptor_of(path) is not None:
+        return True
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        return False
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if stat.S_ISSOCK(mode) or stat.S_ISBLK(mode):
+        kind = "a socket" if stat.S_ISSOCK(mode) else "a disk"
+        raise PermissionError(errno.EPERM, f"{kind}, not a file", str(path))
+    return not stat.S_ISREG(mode)
+
+
+def descriptor_of(path: Path) -> int | None:
+    """Returns the number of the open file of this process that a path such as /dev/stdout names; None: it names none.
+
+    Where that is a file, it is not to be replaced, since more follows in it.
+    """
+    folder, name = os.path.split(os.path.abspath(path))
+    for _ in range(MOST_LINKS):
+        folder = os.path.realpath(folder)
+        place = os.path.join(folder, name)
+        opened = DESCRIPTOR.fullmatch(place)
+        if opened and opened["process"] in (None, str(os.getpid())):
+            return int(opened["number"])
+        if not os.path.islink(place):
+            return None
+        folder, name = os.path.split(os.path.join(folder, os.readlink(place)))
+    return None
+
+
+def _write_through(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
+    """Write into a stream, after what this process has printed."""
+    if callable(content):
+        with tempfile.TemporaryDirectory() as folder:
+            part = Path(folder, "content")
+            content(part)
+            content = part.read_bytes()
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        stream.flush()
+    number = descriptor_of(path)
+    with open(os.open(path, os.O_WRONLY) if number is None else os.dup(number), "wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def _replace(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
+    """Write a regular file, which keeps its permissions, or a new one."""
+    mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else MODE
+    if path.exists() and not (mode & ANY_WRITE and os.access(path, os.W_OK)):
+        raise PermissionError(errno.EACCES, "read-only", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
@@ -121,19 +237,31 @@ def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]
             content(part)
         else:
             part.write_bytes(content.encode() if isinstance(content, str) else content)
-        part.chmod(0o644)
+        part.chmod(mode)
         part.replace(path)
-    except BaseException as error:
+    except BaseException:
         part.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno is not None:
-            error.filename = str(path)
         raise
+
+
+def write_beside(path: Path, suffix: str, content: bytes | str | Callable[[Path], object]) -> None:
+    """Write a file of the name of `path` with another suffix; nothing where `path` is a stream.
+
+    Raises:
+        OSError: where it cannot be written, and for a link out of its folder, which nobody has named.
+    """
+    if is_stream(path):
+        return
+    beside = path.with_suffix(suffix)
+    if not leads_into(beside, beside.parent):
+        raise PermissionError(errno.EPERM, "a link out of its folder", str(beside))
+    write_atomically(beside, content)
 
 
 @contextmanager
 def written_whole(folder: Path) -> Iterator[Path]:
     """An empty folder under a temporary name beside `folder`, renamed to it where the block ends well, else removed."""
-    folder = Path(folder)
+    folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".part"))
     try:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import csv_text, read_regular
+from e2rl.run.files import CsvReader, csv_text, read_regular
 from e2rl.scenes.scene import SceneSet
 
 SCENES = "scenes.csv"  # of a run's folder
@@ -60,7 +60,7 @@ def read_list(path: str | Path) -> list[Listed]:
     file = Path(path) / SCENES if Path(path).is_dir() else Path(path)
     try:
         content = io.StringIO(read_regular(file).decode("utf-8-sig"), newline="")
-        rows = csv.DictReader(content, strict=True)
+        rows = CsvReader(content)
         if "scene_id" not in (rows.fieldnames or ()):
             raise InputError(f"scenes={file}: no column scene_id; give the {SCENES} of a run, or a table with one")
         found = dict.fromkeys(_line(file, rows.line_num, row) for row in rows)

@@ -1,15 +1,23 @@
 """A file appears whole or not at all; weights read back are those written, and an altered file is noticed."""
 
+import csv
 import hashlib
+import io
 import json
 import multiprocessing
 import os
 import random
+import socket
+import subprocess
+import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from safetensors.torch import save
 
 from e2rl.run import files
@@ -17,12 +25,15 @@ from e2rl.run.errors import InputError
 from e2rl.run.files import (
     HASH,
     SEAL,
+    CsvReader,
     alone_in,
     altered,
+    csv_text,
     locked,
     read_weights,
     weight_bytes,
     write_atomically,
+    write_beside,
     written_whole,
 )
 
@@ -42,6 +53,148 @@ def test_what_fails_on_the_way_leaves_the_old_file_and_no_other(tmp_path, monkey
     with pytest.raises(OSError, match="disk full"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old" and list(path.parent.iterdir()) == [path]
+
+
+def by_path(text):
+    """The content of a file as a function that writes it."""
+    return lambda path: path.write_text(text)
+
+
+@pytest.mark.parametrize("content", ["new", b"new", by_path("new")])
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path, content):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "file").write_text("old")
+    (tmp_path / "far" / "file").chmod(0o600)
+    (tmp_path / "second").symlink_to(tmp_path / "far" / "file")
+    (tmp_path / "first").symlink_to("second")
+    write_atomically(tmp_path / "first", content)
+    assert (tmp_path / "first").is_symlink() and (tmp_path / "second").is_symlink()
+    assert (tmp_path / "far" / "file").read_text() == "new"
+    assert (tmp_path / "far" / "file").stat().st_mode & 0o777 == 0o600
+    assert [path.name for path in (tmp_path / "far").iterdir()] == ["file"]
+
+
+def test_a_link_to_nothing_yet_makes_what_it_leads_to(tmp_path):
+    (tmp_path / "link").symlink_to("new/file")
+    write_atomically(tmp_path / "link", "text")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "new" / "file").read_text() == "text"
+
+
+@pytest.mark.parametrize("content", ["new", by_path("new")])
+def test_a_device_is_written_through_and_nothing_beside_it(tmp_path, content):
+    """Another node of /dev/null, so that a mistake does not replace the machine's."""
+    device = tmp_path / "null.png"
+    try:
+        os.mknod(device, 0o600 | 0o020000, os.makedev(1, 3))
+        device.write_bytes(b"")
+    except OSError:
+        pytest.skip("needs a user who can make a device")
+    (tmp_path / "link.png").symlink_to(device)
+    for path in (device, tmp_path / "link.png"):
+        write_atomically(path, content)
+        write_beside(path, ".pdf", content)
+    assert device.is_char_device()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.png", "null.png"]
+
+
+@pytest.mark.parametrize("content", ["new", by_path("new")])
+def test_a_pipe_is_written_through(tmp_path, content):
+    os.mkfifo(tmp_path / "pipe")
+    read = []
+    reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_text()))
+    reader.start()
+    write_atomically(tmp_path / "pipe", content)
+    reader.join(20)
+    assert read == ["new"] and (tmp_path / "pipe").is_fifo()
+
+
+PRINTS = """
+import sys
+from pathlib import Path
+from e2rl.run.files import write_atomically
+print("before")
+write_atomically(Path(sys.argv[1]), "content\\n")
+print("after")
+"""
+
+
+@pytest.mark.parametrize("name", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"])
+@pytest.mark.parametrize("into", ["file", "pipe", "socket"])
+def test_standard_output_is_written_in_turn_whatever_it_is(tmp_path, name, into):
+    """An output that is a file is not replaced, or what is printed next would be lost."""
+    (tmp_path / "link").symlink_to("/dev/stdout")
+    command = [sys.executable, "-c", PRINTS, str(tmp_path / "link") if name == "link" else name]
+    if into == "pipe":
+        said = subprocess.run(command, stdout=subprocess.PIPE, check=True, timeout=60).stdout
+    elif into == "file":
+        with (tmp_path / "out").open("wb") as file:
+            subprocess.run(command, stdout=file, check=True, timeout=60)
+        said = (tmp_path / "out").read_bytes()
+    else:
+        here, there = socket.socketpair()
+        with here, there:
+            subprocess.run(command, stdout=there, check=True, timeout=60)
+            said = here.recv(1000)
+    assert said == b"before\ncontent\nafter\n"
+
+
+@pytest.mark.parametrize("kind", ["folder", "socket", "read-only", "loop", "link to a folder"])
+def test_what_is_no_file_is_refused_by_its_name_and_stays(tmp_path, kind):
+    path = tmp_path / "target"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "socket":
+        server = socket.socket(socket.AF_UNIX)
+        server.bind(str(path))
+        server.close()
+    elif kind == "read-only":
+        path.write_text("old")
+        path.chmod(0o444)
+    else:
+        path.symlink_to(path if kind == "loop" else tmp_path)
+    before = path.lstat()
+    with pytest.raises(OSError) as refused:
+        write_atomically(path, "new")
+    assert refused.value.filename == str(path)
+    assert path.lstat() == before and [each.name for each in tmp_path.iterdir()] == ["target"]
+
+
+def test_what_comes_beside_a_file_follows_no_link_out_of_its_folder(tmp_path):
+    """A stranger's run may hold one, and the user has named the file alone."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "user").write_text("a user's")
+    (tmp_path / "run" / "page.csv").symlink_to(tmp_path / "user")
+    with pytest.raises(PermissionError, match="a link out of its folder"):
+        write_beside(tmp_path / "run" / "page.html", ".csv", "new")
+    assert (tmp_path / "user").read_text() == "a user's"
+
+
+# --- CSV
+
+FORMULAS = ["=1+1", "+1+1", "-1+1", "@SUM(A1)", "\t=1", "\r=1", " =1", "\uff1d1", '=HYPERLINK("http://x","y")', "'=1"]
+NUMBERS = ["-1", "+2.5", "-3e-5", "-.5", "+2.1 [+0.4, +3.9]*", "-2.1 [-4.0, -0.2]* (12)"]
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_no_cell_begins_as_a_formula(text):
+    ((cell,),) = csv.reader(io.StringIO(csv_text([[text]]), newline=""))
+    assert cell == f"'{text}"
+
+
+def test_numbers_and_other_words_stay_as_they_are():
+    values = [*NUMBERS, -1.5, 7, "", "scene-1", "a=b", "'quoted'", "\u2013"]
+    assert next(csv.reader([csv_text([values])])) == list(map(str, values))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.text(st.sampled_from("'=+-@\t\r\n ,\"1e.a\uff1d"), max_size=6), min_size=1, max_size=3))
+def test_cells_are_read_as_they_were(texts):
+    rows = CsvReader(io.StringIO(csv_text([["=head", *texts], ["x", *texts]]), newline=""))
+    assert list(rows.fieldnames) == ["=head", *texts]
+    assert next(rows) == dict(zip(["=head", *texts], ["x", *texts], strict=True))
+
+
+# --- folders
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path):
