@@ -1,135 +1,153 @@
 """ASAM OpenDRIVE 1.7 of an episode's lanes, by scenariogeneration: a road with one lane for each lane.
 
-A road's reference line is the lane's centreline, fitted by clothoids. Links follow the lane graph as far as OpenDRIVE
-can say it: a lane between two others is a connecting road of a junction where one of these forks or merges.
+A road's reference line is the lane's centreline, fitted by clothoids. Roads and junctions are those of road_plan.py.
 """
 
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import networkx as nx
 import numpy as np
 from pyclothoids import Clothoid
 from scenariogeneration import xodr
 
 from e2rl.report.export.episode import Episode
-from e2rl.scenes.paths import resample, tangent_angle
+from e2rl.report.export.road_plan import RoadPlan, Span, road_plan
+from e2rl.scenes.paths import arc_length, resample, tangent_angle
 from e2rl.scenes.recording import Lane
 
 FIT = 0.05  # m that the reference line may lie beside the centreline
 SHORT = 2.0  # m: pieces up to this length are fitted as they are
+SEAM = 0.2  # m: points of the next lane that are nearer to the end of the one before are left out
 LANE = -1  # the only lane of a road, right of the (offset) reference line
-
-Link = tuple[str, str]
-End = tuple[int | None, int | None]  # of a road: the road and the junction that it is linked with, None for none
 
 
 def write_roads(episode: Episode, path: Path) -> None:
-    """Write the lanes of an episode; userData of the header tell the scene's origin and how many links are left out."""
+    """Write the lanes of an episode; userData of the header tells the scene's origin."""
     root = road_network(episode).get_element()
     header = root.find("header")
     (west, south), (east, north) = (edge(episode.rollout.lane_points, axis=0) for edge in (np.min, np.max))
     for name, side in {"north": north, "south": south, "east": east, "west": west}.items():
         header.set(name, f"{side:.3f}")
-    known = {"links_left_out": str(left_out(episode.lanes))}
     if episode.origin is not None:
-        known["origin"] = " ".join(f"{part:.0f}" for part in episode.origin)
-    for code, value in known.items():
-        ElementTree.SubElement(header, "userData", {"code": code, "value": value})
+        origin = " ".join(f"{part:.0f}" for part in episode.origin)
+        ElementTree.SubElement(header, "userData", {"code": "origin", "value": origin})
+    for element in root.iterfind("road"):
+        add_lane_speeds(element)
     ElementTree.indent(root)
     ElementTree.ElementTree(root).write(path, "utf-8", xml_declaration=True)
 
 
 def road_network(episode: Episode) -> Any:
-    """The xodr.OpenDrive of an episode; road n + 1 is lane n."""
-    made = xodr.OpenDrive(episode.rollout.location or episode.rollout.scene_id, revMinor="7")
-    number = {name: index for index, name in enumerate(episode.lanes, 1)}
-    plain, connecting = links(episode.lanes)
-    junctions = junctions_of(connecting)
-    junction_of = {name: index for index, names in enumerate(junctions, 1) for name in names}
-    precedes = {b: a for a, b in plain} | {name: before for name, (before, _) in connecting.items()}
-    follows = dict(plain) | {name: after for name, (_, after) in connecting.items()}
-    into = {before: junction_of[name] for name, (before, _) in connecting.items()}
-    out_of = {after: junction_of[name] for name, (_, after) in connecting.items()}
-    for name, lane in episode.lanes.items():
-        begin = number.get(precedes.get(name, "")), out_of.get(name)
-        end = number.get(follows.get(name, "")), into.get(name)
-        made.add_road(road(lane, number[name], junction_of.get(name, -1), begin, end, name))
-    for index, names in enumerate(junctions, 1):
+    """Returns the xodr.OpenDrive of an episode; roads are named after their lanes."""
+    network = xodr.OpenDrive(episode.rollout.location or episode.rollout.scene_id, revMinor="7")
+    plan = road_plan(episode.lanes)
+    number = {name: index for index, name in enumerate(plan.roads, 1)}
+    for name in plan.roads:
+        network.add_road(road(episode.lanes, plan, name, number))
+    for index, names in enumerate(plan.junctions, 1):
         junction = xodr.Junction(f"junction {index}", index)
         for name in names:
-            connection = xodr.Connection(number[connecting[name][0]], number[name], xodr.ContactPoint.start)
+            before, _ = plan.connecting[name]
+            connection = xodr.Connection(number[before], number[name], xodr.ContactPoint.start)
             connection.add_lanelink(LANE, LANE)
             junction.add_connection(connection)
-        made.add_junction(junction)
-    return made
+        network.add_junction(junction)
+    return network
 
 
-def links(lanes: dict[str, Lane]) -> tuple[list[Link], dict[str, Link]]:
-    """Links that OpenDRIVE can say: pairs of lanes of which one follows the other and both have no further link there;
-    and {connecting lane: (the lane before it, the lane after it)}.
+def road(lanes: dict[str, Lane], plan: RoadPlan, name: str, number: dict[str, int]) -> Any:
+    """Returns the xodr.Road called `name`, with limits and widths from where each of its lanes begins.
 
-    A connecting lane has one lane before and one after it, neither of them connecting, of which one has further links
-    at that end. An end belongs to a junction only where all its links are connecting lanes.
+    Args:
+        lanes: by id.
+        plan: the roads.
+        name: of a road of the plan.
+        number: the id in the file by road.
     """
-    graph = nx.DiGraph()
-    graph.add_nodes_from(lanes)
-    graph.add_edges_from((name, other) for name, lane in lanes.items() for other in lane.exits)
-    ends = {name: (list(graph.predecessors(name)), list(graph.successors(name))) for name in lanes}
-    between = {
-        name: (before[0], after[0])
-        for name, (before, after) in ends.items()
-        if len(before) == len(after) == 1 and (len(ends[before[0]][1]) > 1 or len(ends[after[0]][0]) > 1)
-    }
-    found = len(between) + 1
-    while len(between) < found:  # until every end of a junction is one of junctions alone
-        found = len(between)
-        between = {
-            name: (before, after)
-            for name, (before, after) in between.items()
-            if before not in between
-            and after not in between
-            and all(other in between for other in (*ends[before][1], *ends[after][0]))
-        }
-    plain = [
-        (a, b)
-        for a, b in graph.edges
-        if len(ends[a][1]) == len(ends[b][0]) == 1 and a not in between and b not in between
-    ]
-    return plain, between
+    spans = plan.roads[name]
+    places = [span_places(lanes[span.lane], span) for span in spans]
+    joined = np.concatenate(joined_places(places))
+    pieces = geometries(joined[:, :2], joined[:, 2])
+    plan_view = xodr.PlanView()
+    for geometry, x, y, heading in pieces:
+        plan_view.add_fixed_geometry(geometry, x, y, heading)
+    scale = sum(piece.length for piece, *_ in pieces) / sum(span.end - span.begin for span in spans)
+    starts = scale * np.cumsum([0.0] + [span.end - span.begin for span in spans[:-1]])
+    driving = xodr.Lane(a=lanes[spans[0].lane].width)
+    section = xodr.LaneSection(0, xodr.Lane()).add_right_lane(driving)
+    profile = xodr.Lanes().add_lanesection(section)
+    junction = next((index for index, names in enumerate(plan.junctions, 1) if name in names), -1)
+    element = xodr.Road(number[name], plan_view, profile, road_type=junction, name=", ".join(s.lane for s in spans))
+    for start, span in zip(starts.tolist(), spans, strict=True):
+        lane = lanes[span.lane]
+        profile.add_laneoffset(xodr.LaneOffset(s=start, a=lane.width / 2))
+        if start > 0:
+            driving.add_lane_width(a=lane.width, soffset=start)
+        if lane.speed_limit > 0:
+            limit = round(lane.speed_limit, 3)
+            element.add_type(xodr.RoadType.town, s=start, speed=limit, speed_unit="m/s")
+        elif start > 0:
+            element.add_type(xodr.RoadType.town, s=start)
+    add_links(element, driving, plan, name, number)
+    return element
 
 
-def junctions_of(connecting: dict[str, Link]) -> list[list[str]]:
-    """The connecting lanes of each junction: those that share an end with each other."""
-    graph = nx.Graph()
-    for lane, (before, after) in connecting.items():
-        graph.add_edges_from([(("lane", lane), ("end", before)), (("lane", lane), ("start", after))])
-    parts = nx.connected_components(graph)
-    return sorted(sorted(name for kind, name in part if kind == "lane") for part in parts)
+def add_links(element: Any, driving: Any, plan: RoadPlan, name: str, number: dict[str, int]) -> None:
+    """Link a road and its lane with what comes before and after it.
+
+    Args:
+        element: the xodr.Road.
+        driving: its xodr.Lane.
+        plan: the roads.
+        name: of the road in the plan.
+        number: the id in the file by road.
+    """
+    before, after = plan.connecting.get(name, (None, None))
+    before = before or next((a for a, b in plan.plain if b == name), None)
+    after = after or next((b for a, b in plan.plain if a == name), None)
+    if before is not None:
+        element.add_predecessor(xodr.ElementType.road, number[before], xodr.ContactPoint.end)
+        driving.add_link("predecessor", LANE)
+    if after is not None:
+        element.add_successor(xodr.ElementType.road, number[after], xodr.ContactPoint.start)
+        driving.add_link("successor", LANE)
+    for index, names in enumerate(plan.junctions, 1):
+        ends = [plan.connecting[other] for other in names]
+        if name in (b for _, b in ends):
+            element.add_predecessor(xodr.ElementType.junction, index)
+        if name in (a for a, _ in ends):
+            element.add_successor(xodr.ElementType.junction, index)
 
 
-def road(lane: Lane, number: int, junction: int, before: End, after: End, name: str) -> Any:
-    """The xodr.Road of a lane."""
-    plan = xodr.PlanView()
-    for geometry, x, y, heading in geometries(lane.points, tangent_angle(lane.points)):
-        plan.add_fixed_geometry(geometry, x, y, heading)
-    centre, driving = xodr.Lane(), xodr.Lane(a=lane.width)
-    section = xodr.LaneSection(0, centre).add_right_lane(driving)
-    lanes = xodr.Lanes().add_lanesection(section).add_laneoffset(xodr.LaneOffset(a=lane.width / 2))
-    made = xodr.Road(number, plan, lanes, road_type=junction, name=name)
-    if lane.speed_limit > 0:
-        made.add_type(xodr.RoadType.town, speed=round(lane.speed_limit, 3), speed_unit="m/s")
-    for side, link, contact, (other, through) in (
-        ("predecessor", made.add_predecessor, xodr.ContactPoint.end, before),
-        ("successor", made.add_successor, xodr.ContactPoint.start, after),
-    ):
-        if through is not None:
-            link(xodr.ElementType.junction, through)
-        elif other is not None:
-            link(xodr.ElementType.road, other, contact)
-            driving.add_link(side, LANE)
-    return made
+def add_lane_speeds(element: ElementTree.Element) -> None:
+    """Repeat the limits of a road's types in its lane: some tools read the one, some the other."""
+    lane = element.find("lanes/laneSection/right/lane")
+    assert lane is not None
+    for kind in element.iterfind("type"):
+        speed = kind.find("speed")
+        if speed is not None:
+            limit = {"sOffset": kind.attrib["s"], "max": speed.attrib["max"], "unit": speed.attrib["unit"]}
+            ElementTree.SubElement(lane, "speed", limit)
+
+
+def span_places(lane: Lane, span: Span) -> np.ndarray:
+    """Returns x, y [m] and direction [rad], [P, 3], of a part of a lane's centreline."""
+    arc = arc_length(lane.points)
+    inside = (arc > span.begin) & (arc < span.end)
+    at = np.concatenate([[span.begin], arc[inside], [span.end]])
+    columns = [*lane.points.T, np.unwrap(tangent_angle(lane.points))]
+    return np.stack([np.interp(at, arc, column) for column in columns], 1)
+
+
+def joined_places(parts: list[np.ndarray]) -> list[np.ndarray]:
+    """Returns parts [P, 3] of one line without the points of each that lie at the end of the part before it."""
+    joined = parts[:1]
+    for part in parts[1:]:
+        away = np.linalg.norm(part[:, :2] - joined[-1][-1, :2], axis=1) > SEAM
+        first = min(int(away.argmax()), len(part) - 1)
+        joined.append(part[first:])
+    return joined
 
 
 def geometries(points: np.ndarray, angle: np.ndarray) -> list[tuple[Any, float, float, float]]:
@@ -149,9 +167,3 @@ def geometries(points: np.ndarray, angle: np.ndarray) -> list[tuple[Any, float, 
     if max(abs(curve.KappaStart), abs(curve.KappaEnd)) < 1e-6:
         return [(xodr.Line(curve.length), x0, y0, float(angle[0]))]
     return [(xodr.Spiral(curve.KappaStart, curve.KappaEnd, curve.length), x0, y0, float(angle[0]))]
-
-
-def left_out(lanes: dict[str, Lane]) -> int:
-    """How many links of the lane graph OpenDRIVE does not say."""
-    plain, connecting = links(lanes)
-    return sum(len(lane.exits) for lane in lanes.values()) - len(plain) - 2 * len(connecting)

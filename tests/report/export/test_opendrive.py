@@ -1,46 +1,17 @@
-"""OpenDRIVE: which links of the lane graph it says, and roads that lie where the lanes do."""
+"""OpenDRIVE: roads that lie where the lanes do, with their widths, limits and links."""
 
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
-from e2rl.report.export.opendrive import FIT, junctions_of, left_out, links  # noqa: E402
+from e2rl.report.export.opendrive import FIT, add_lane_speeds, road  # noqa: E402
+from e2rl.report.export.road_plan import road_plan  # noqa: E402
 from e2rl.scenes.paths import resample, tangent_angle  # noqa: E402
 from e2rl.scenes.recording import Lane  # noqa: E402
 from tests.report.export.small_run import exported  # noqa: E402
-
-
-def graph(**exits: str) -> dict[str, Lane]:
-    return {name: Lane(np.zeros((2, 2)), exits=list(others)) for name, others in exits.items()}
-
-
-def test_a_crossing_s_connectors_are_one_junction_and_a_fork_without_connectors_is_left_out():
-    lanes = graph(a="xy", b="z", x="c", y="d", z="d", c="", d="e", e="")
-    plain, connecting = links(lanes)
-    assert connecting == {"x": ("a", "c"), "y": ("a", "d"), "z": ("b", "d")} and plain == [("d", "e")]
-    assert junctions_of(connecting) == [["x", "y", "z"]] and left_out(lanes) == 0
-    lanes = graph(a="xc", x="b", b="", c="")  # one way on has a connector, the other has none
-    assert links(lanes) == ([("x", "b")], {}) and left_out(lanes) == 2
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.sets(st.tuples(st.sampled_from("abcdefgh"), st.sampled_from("abcdefgh")), max_size=14))
-def test_said_links_are_links_and_every_end_has_at_most_one_partner(pairs):
-    lanes = graph(**{name: "".join(b for a, b in sorted(pairs) if a == name != b) for name in "abcdefgh"})
-    plain, connecting = links(lanes)
-    said = plain + [link for name, (before, after) in connecting.items() for link in ((before, name), (name, after))]
-    assert len(said) == len(set(said)) and all(b in lanes[a].exits for a, b in said)
-    index = {name: number for number, names in enumerate(junctions_of(connecting)) for name in names}
-    for name in lanes:  # a road's end is linked with one road or one junction
-        into = {index[lane] for lane, (before, _) in connecting.items() if before == name}
-        out_of = {index[lane] for lane, (_, after) in connecting.items() if after == name}
-        assert len(into) + sum(a == name for a, _ in plain) <= 1 and len(out_of) + sum(b == name for _, b in plain) <= 1
-        assert not (name in connecting and (into or out_of))
 
 
 @pytest.fixture(scope="module")
@@ -71,21 +42,56 @@ def test_reference_lines_are_the_centrelines(roads):
     arc = np.linspace(-np.pi / 2, 0, 16)
     left = np.concatenate([np.stack([100 + 20 * np.cos(arc), 20 + 20 * np.sin(arc)], 1), [[120.0, 320.0]]])
     lanes = {"in": [[0, 0], [100, 0]], "on": [[100, 0], [400, 0]], "left": left, "near": [[0, 3.5], [100, 3.5]]}
-    assert [road.get("name") for road in root.iterfind("road")] == list(lanes)
-    for road in root.iterfind("road"):
-        points = resample(np.array(lanes[road.get("name")], float), 1.0) - [28, 0]
-        line = drawn(road)
+    names = [road.get("name") for road in root.iterfind("road")]
+    assert names == ["in", "on", "left", "near", "on", "left"]  # the last two connect `in` with the others
+    for name, corners in lanes.items():
+        points = resample(np.array(corners, float), 1.0) - [28, 0]
+        line = np.concatenate([drawn(road) for road in root.iterfind("road") if road.get("name") == name])
         beside = np.linalg.norm(points[:, None] - line[None], axis=-1).min(1)
-        assert beside.max() < 1.5 * FIT and abs(float(road.get("length")) - len(points) + 1) < 1
-        heading = tangent_angle(points)[0]
-        assert abs(float(road.find("planView/geometry").get("hdg")) - heading) < 0.05
+        assert beside.max() < 1.5 * FIT
+        lengths = [float(road.get("length")) for road in root.iterfind("road") if road.get("name") == name]
+        assert abs(sum(lengths) - len(points) + 1) < 1
+        whole = next(road for road in reversed(root.findall("road")) if road.get("name") == name)
+        assert abs(float(whole.find("planView/geometry").get("hdg")) - tangent_angle(points)[0]) < 0.05
 
 
-def test_a_road_has_its_lane_s_width_around_the_line_and_its_limit(roads):
+def test_a_road_has_its_lane_s_width_around_the_line_and_its_limit_twice(roads):
     for road in roads[0].iterfind("road"):
-        width = float(road.find("lanes/laneSection/right/lane/width").get("a"))
+        lane = road.find("lanes/laneSection/right/lane")
+        width = float(lane.find("width").get("a"))
         assert width == pytest.approx(3.6, abs=1e-5) == 2 * float(road.find("lanes/laneOffset").get("a"))
+        assert lane.find("speed").get("max") == road.find("type/speed").get("max")
+        assert lane.find("speed").get("unit") == "m/s"
     assert {float(road.find("type/speed").get("max")) for road in roads[0].iterfind("road")} == {20, 13.889}
+
+
+def test_a_turn_in_two_pieces_changes_width_and_limit_where_the_second_begins():
+    arc = np.linspace(0, np.pi / 2, 25)
+    turn = np.stack([50 + 15 * np.sin(arc), 15 - 15 * np.cos(arc)], 1)
+    second = turn[9:] + [0.05, 0.0]  # begins a little beside the end of the first
+    lanes = {
+        "in": Lane(np.array([[0.0, 0.0], [50.0, 0.0]]), 3.5, 10.0, ["t", "on"]),
+        "t": Lane(turn[:10], 3.0, 5.0, ["u"]),
+        "u": Lane(second, 3.2, 0.0, ["up"]),
+        "on": Lane(np.array([[50.0, 0.0], [90.0, 0.0]]), 3.5, 10.0),
+        "side": Lane(np.array([[65.0, -20.0], [65.0, 15.0]]), 3.5, 10.0, ["up"]),
+        "up": Lane(np.array([[65.0, 15.0], [65.0, 90.0]]), 3.5, 10.0),
+    }
+    plan = road_plan(lanes)
+    element = road(lanes, plan, "t", {name: index for index, name in enumerate(plan.roads, 1)}).get_element()
+    add_lane_speeds(element)
+    line = drawn(element)
+    beside = np.linalg.norm(np.concatenate([turn[:10], second])[:, None] - line[None], axis=-1).min(1)
+    assert element.get("name") == "t, u" and beside.max() < 0.1
+    lane = element.find("lanes/laneSection/right/lane")
+    widths = [(float(each.get("sOffset")), float(each.get("a"))) for each in lane.iterfind("width")]
+    (_, first), (start, other) = widths
+    assert (first, other) == (3.0, 3.2) and start == pytest.approx(15 * arc[9], abs=0.1)
+    offsets = [float(each.get("a")) for each in element.iterfind("lanes/laneOffset")]
+    assert offsets == [1.5, 1.6]
+    limits = [kind.find("speed") for kind in element.iterfind("type")]
+    assert limits[0].get("max") == lane.find("speed").get("max") == "5.0"
+    assert limits[1] is None  # the second has no known limit
 
 
 def test_the_file_follows_the_standard_s_schema(roads):
@@ -95,4 +101,4 @@ def test_the_file_follows_the_standard_s_schema(roads):
     schema = Path(scenariogeneration.__file__).parents[1] / "schemas" / "opendrive_17_core.xsd"
     etree.XMLSchema(etree.parse(str(schema))).assertValid(etree.parse(str(roads[1])))
     known = {item.get("code"): item.get("value") for item in roads[0].iterfind("header/userData")}
-    assert known == {"links_left_out": "2", "origin": "28 0"}
+    assert known == {"origin": "28 0"}
