@@ -132,7 +132,7 @@ def _walk(alone: nx.DiGraph, first: str) -> Iterator[str]:
 def through_chains(
     graph: nx.DiGraph, chain_of: dict[str, Chain], links: list[tuple[Chain, Chain]], short: list[Chain]
 ) -> set[Chain]:
-    """Returns the `short` chains that are connecting roads as they are: from a lane that forks to one where lanes merge.
+    """Returns those `short` chains that are connecting roads as they are: from a lane that forks to one that merges.
 
     The lane before such a chain and the one after it stay whole at that end. So where these two are linked directly,
     and neither could be cut, the chains from the one before are no connecting roads.

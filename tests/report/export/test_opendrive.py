@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
-from e2rl.report.export.opendrive import FIT, add_lane_speeds, road  # noqa: E402
+from e2rl.report.export import opendrive  # noqa: E402
+from e2rl.report.export.opendrive import FIT, add_lane_speeds  # noqa: E402
 from e2rl.report.export.road_plan import road_plan  # noqa: E402
 from e2rl.scenes.paths import resample, tangent_angle  # noqa: E402
 from e2rl.scenes.recording import Lane  # noqa: E402
@@ -78,7 +79,7 @@ def test_a_turn_in_two_pieces_changes_width_and_limit_where_the_second_begins():
         "up": Lane(np.array([[65.0, 15.0], [65.0, 90.0]]), 3.5, 10.0),
     }
     plan = road_plan(lanes)
-    element = road(lanes, plan, "t", {name: index for index, name in enumerate(plan.roads, 1)}).get_element()
+    element = opendrive.road(lanes, plan, "t", {name: index for index, name in enumerate(plan.roads, 1)}).get_element()
     add_lane_speeds(element)
     line = drawn(element)
     beside = np.linalg.norm(np.concatenate([turn[:10], second])[:, None] - line[None], axis=-1).min(1)
