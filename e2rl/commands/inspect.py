@@ -30,10 +30,12 @@ COLOURS = {"vehicle": drawing.BACKGROUND, "pedestrian": drawing.VULNERABLE, "cyc
 LIGHTS = {LIGHT_UNKNOWN: drawing.MUTED, LIGHT_RED: "#d62828", LIGHT_YELLOW: "#f2b705", LIGHT_GREEN: "#2a9d4a"}
 LEGEND = {"ego": drawing.EGO, "vehicle": drawing.BACKGROUND, "pedestrian, cyclist": drawing.VULNERABLE}
 MOVES = 0.5  # m/s
+MOST_LIMITS = 8  # values of speed limits that are told
 TENTHS = ("median length of vehicles, m", "speed of the ego at the start, m/s", "km of lanes")  # told to one decimal
 
 
 Counts = dict[str, float]  # of one scene, by what a line of the report says
+LIMIT = "limit: "  # of a scene's route vertices by the speed limit there, which one line of the report tells together
 
 
 def content(scene: dict[str, np.ndarray]) -> Counts:
@@ -54,7 +56,27 @@ def content(scene: dict[str, np.ndarray]) -> Counts:
         "% of routes with a speed limit": 100 * (scene["route_limit"][scene["route_valid"]] > 0).mean(),
         "drivable polygons": len(np.unique(scene["drivable_index"])),
         "traffic lights": len(scene["light_points"]),
+        **limits_of(scene),
     }
+
+
+def limits_of(scene: dict[str, np.ndarray]) -> Counts:
+    """Returns how many vertices of routes in a scene have each speed limit, by LIMIT and its km/h."""
+    limits = np.round(3.6 * scene["route_limit"][scene["route_valid"]]).astype(int)
+    return {f"{LIMIT}{value}": int(count) for value, count in zip(*np.unique(limits, return_counts=True), strict=True)}
+
+
+def limits_line(contents: Sequence[Counts]) -> str:
+    """Returns the line of the speed limits on the routes of all scenes, the most frequent ones first."""
+    total: Counter[str] = Counter()
+    for counts in contents:
+        total.update({name.removeprefix(LIMIT): count for name, count in counts.items() if name.startswith(LIMIT)})
+    values = [
+        f"{'unknown' if value == '0' else value} {100 * count / total.total():.0f}%"
+        for value, count in total.most_common(MOST_LIMITS)
+    ]
+    more = len(total) - len(values)
+    return "limits       km/h on the routes: " + ", ".join(values) + (f", and {more} others" if more else "")
 
 
 def report(source: Source, rows: Sequence[Row], contents: Sequence[Counts]) -> list[str]:
@@ -72,8 +94,8 @@ def report(source: Source, rows: Sequence[Row], contents: Sequence[Counts]) -> l
     lines += [f"mended       {count} {phrase}" for phrase, count in repairs.most_common()]
     if contents:
         about = "of the agents that take part, those present at the start frame"
-        lines.append(f"in a scene   median (least to most); {about}")
-    for name in contents[0] if contents else ():
+        lines += [limits_line(contents), f"in a scene   median (least to most); {about}"]
+    for name in [name for name in contents[0] if not name.startswith(LIMIT)] if contents else ():
         values = [float(counts[name]) for counts in contents]
         digits = 1 if name in TENTHS else 0
         middle, low, high = (f"{value:.{digits}f}" for value in (np.median(values), min(values), max(values)))

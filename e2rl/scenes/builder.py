@@ -12,6 +12,7 @@ from e2rl.run.settings import configured, setting
 from e2rl.scenes import boxes
 from e2rl.scenes.drivable_area import DrivableArea
 from e2rl.scenes.lane_graph import BEHIND, LaneGraph, Route
+from e2rl.scenes.limits import known_limits
 from e2rl.scenes.links import plausible_width
 from e2rl.scenes.log_route import route_from_log
 from e2rl.scenes.paths import wrap
@@ -62,8 +63,9 @@ class SceneBuilder:
         check(extent(recording) | motion(recording), recording.scene_id)
         self.valid = drop_jumps(recording.states, recording.valid)
         self.valid[:, recording.ego] = recording.valid[:, recording.ego]  # without the ego there is no scene
-        self.graph = LaneGraph(recording.lanes)
-        self.repairs += self.graph.repairs
+        lanes, limits = known_limits(recording)
+        self.graph = LaneGraph(lanes)
+        self.repairs += limits + self.graph.repairs
         if not self.graph.ids:
             raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
         check(map_fit(recording, self.graph), recording.scene_id)

@@ -18,18 +18,7 @@ import numpy as np
 from e2rl.run.errors import InputError
 from e2rl.scenes.log_files import LogFiles, bounded_memory
 from e2rl.scenes.plausibility import check
-from e2rl.scenes.recording import (
-    CYCLIST,
-    DT,
-    HISTORY,
-    LIGHT_UNKNOWN,
-    LIGHTS,
-    OTHER,
-    PEDESTRIAN,
-    VEHICLE,
-    Lane,
-    Recording,
-)
+from e2rl.scenes.recording import CYCLIST, DT, HISTORY, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, light_colour
 from e2rl.scenes.smoothing import resample_uniform
 
 TYPES = {  # by the name of an ObstacleType
@@ -230,6 +219,6 @@ def _lights(network: Any, lanes: dict[str, Lane], steps: np.ndarray) -> dict[str
         light = network.find_traffic_light_by_id(*lanelet.traffic_lights) if len(lanelet.traffic_lights) == 1 else None
         if light is None or not light.active or light.traffic_light_cycle is None:
             continue
-        cycle = [LIGHTS.get(light.get_state_at_time_step(int(step)).value.upper(), LIGHT_UNKNOWN) for step in steps]
+        cycle = [light_colour(light.get_state_at_time_step(int(step)).value) for step in steps]
         lights |= {str(lane): np.array(cycle, np.int8) for lane in lanelet.successor if str(lane) in lanes}
     return lights

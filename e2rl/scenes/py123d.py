@@ -20,12 +20,12 @@ from e2rl.scenes.recording import (
     CYCLIST,
     DT,
     LIGHT_UNKNOWN,
-    LIGHTS,
     OTHER,
     PEDESTRIAN,
     VEHICLE,
     Lane,
     Recording,
+    light_colour,
     same_way,
 )
 from e2rl.scenes.smoothing import resample_uniform, speeds
@@ -144,7 +144,7 @@ def _frames(scene: Any) -> list[Frame]:
                 shape = (place.x, place.y, place.yaw, flat.length, flat.width)
                 agents[other.attributes.track_token] = (TYPES.get(kind, OTHER), *shape)
         lights = scene.get_traffic_light_detections_at_iteration(step) or ()
-        states = {str(light.lane_id): LIGHTS.get(light.status.name, LIGHT_UNKNOWN) for light in lights}
+        states = {str(light.lane_id): light_colour(light.status.name) for light in lights}
         found.append(Frame(boxes.timestamp.time_us / 1e6, agents, states))
     return found
 

@@ -11,11 +11,12 @@ from e2rl.run.errors import InputError
 VEHICLE, PEDESTRIAN, CYCLIST, OTHER = range(4)
 AGENT_TYPES = ("vehicle", "pedestrian", "cyclist", "other")
 LIGHT_UNKNOWN, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN = range(4)
-LIGHTS = {  # by the upper-case names in logs
+COLOURS = {  # by the words in the names of logs; of several, such as "red yellow", the first here
     **dict.fromkeys(("RED", "REDYELLOW", "STOP"), LIGHT_RED),
-    **dict.fromkeys(("YELLOW", "CAUTION"), LIGHT_YELLOW),
+    **dict.fromkeys(("YELLOW", "AMBER", "CAUTION"), LIGHT_YELLOW),
     **dict.fromkeys(("GREEN", "GO"), LIGHT_GREEN),
 }
+NO_SIGNAL = {"FLASHING", "BLINKING", "OFF", "INACTIVE"}  # words of lights that let nobody wait for another colour
 DT = 0.1  # s, the time step of every recording, scene and simulation
 HISTORY = 10  # frames of history before a start frame that is chosen here
 MAX_NAME = 128  # characters of the name of a scene, a place or a data set
@@ -36,6 +37,18 @@ class Lane:
     left: list[str] = field(default_factory=list)
     right: list[str] = field(default_factory=list)
     heights: np.ndarray | None = None
+
+
+def light_colour(name: object, otherwise: int = LIGHT_UNKNOWN) -> int:
+    """Returns the state of a light that a log calls `name`, `otherwise` where that tells none.
+
+    LANE_STATE_ARROW_STOP, TRAFFIC_LIGHT_RED and redYellow are red. A light that flashes or is off is LIGHT_UNKNOWN:
+    yellow means care and red a stop sign there, and neither turns green.
+    """
+    words = set(str(name).upper().replace("-", "_").replace(" ", "_").split("_"))
+    if words & NO_SIGNAL:
+        return LIGHT_UNKNOWN
+    return next((state for word, state in COLOURS.items() if word in words), otherwise)
 
 
 def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[str]:

@@ -18,11 +18,12 @@ from e2rl.run.files import read_regular
 from e2rl.scenes.log_files import MAX_BYTES, LogFiles
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.plausibility import check
-from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_UNKNOWN, LIGHTS, Lane, Recording
+from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_UNKNOWN, Lane, Recording, light_colour
 from e2rl.scenes.smoothing import resample_uniform
 
 TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
 OBSTACLES = ("UNSET", "TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT", "TRAFFIC_LIGHT", "BUILDING", "GROUND")
+LIMIT_UNITS = {"speed_limit_kmh": 1 / 3.6, "speed_limit_mps": 1.0, "speed_limit_mph": 0.44704}  # key: m/s
 TYPES |= dict.fromkeys(OBSTACLES, TYPES["OTHER"])  # MetaDrive's further names of tracks
 
 
@@ -154,7 +155,7 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
         lanes[str(key)] = Lane(
             points=line[:, :2],
             width=_median(width.sum(-1)) if width.ndim == 2 and len(width) else 0.0,
-            speed_limit=float(feature.get("speed_limit_kmh") or 0.0) / 3.6,
+            speed_limit=_speed_limit(feature),
             exits=[str(other) for other in feature.get("exit_lanes", ())],
             left=_ids(feature.get("left_neighbor", ())),
             right=_ids(feature.get("right_neighbor", ())),
@@ -163,6 +164,29 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
         if len(feature.get("polygon", ())) >= 3:
             drivable.append(np.array(feature["polygon"], float)[:, :2])
     return lanes, drivable
+
+
+def _speed_limit(feature: dict) -> float:
+    """The limit [m/s] of a lane in the first unit that tells one, 0 for none; of several, the lowest.
+
+    Converters write numbers, texts and lists of either, and none for lanes whose limit they do not know.
+    """
+    for key, factor in LIMIT_UNITS.items():
+        recorded = feature.get(key)
+        numbers = [_number(value) for value in (recorded if np.ndim(recorded) else [recorded])]
+        known = [value for value in numbers if 0 < value < np.inf]
+        if known:
+            return min(known) * factor
+    return 0.0
+
+
+def _number(value: object) -> float:
+    """The number that a value is or that a text begins with, NaN for none."""
+    words = str(value).split() or [""]
+    try:
+        return float(words[0])
+    except ValueError:
+        return float("nan")
 
 
 def _median(values: np.ndarray) -> float:
@@ -188,7 +212,7 @@ def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: 
         states, last = np.zeros(len(seconds), np.int8), LIGHT_UNKNOWN
         given = list(light["state"].get("object_state", ()))[: len(seconds)]
         for frame, state in enumerate(given):  # LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
-            last = states[frame] = LIGHTS.get(str(state).rsplit("_", 1)[-1], last)
+            last = states[frame] = light_colour(state, otherwise=last)
         states[len(given) :] = last
         lights[lane] = states[now]
     return lights

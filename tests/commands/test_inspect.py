@@ -46,6 +46,9 @@ def test_a_data_set_is_counted_and_what_is_left_out_has_its_reason(folder, tmp_p
     assert number(text, "lanes") == "4 (4 to 4)" and number(text, "traffic lights") == "0 (0 to 1)"
     assert number(text, "speed of the ego at the start, m/s") == "8.0 (8.0 to 8.0)"
     assert number(text, "distance driven by the ego, m") == "64 (64 to 64)"
+    limits = number(text, "limits").removeprefix("km/h on the routes: ").split(", ")
+    assert sorted(limit.split(" ")[0] for limit in limits) == ["50", "72"]
+    assert sum(int(limit.split(" ")[1].strip("%")) for limit in limits) == 100
     assert number(text, "% of lanes with a successor") == "25 (25 to 25)"  # `in` alone goes on
 
 

@@ -145,6 +145,47 @@ def test_lights_keep_their_last_known_state():
     assert all(len(light) == FRAMES for light in recording.lights.values())
 
 
+@pytest.mark.parametrize(
+    ("limit", "expected"),
+    [
+        ({"speed_limit_kmh": 36}, 10.0),
+        ({"speed_limit_mps": 10.0}, 10.0),
+        ({"speed_limit_mph": 25.0}, 11.176),
+        ({"speed_limit_kmh": None, "speed_limit_mps": 10.0}, 10.0),
+        ({"speed_limit_kmh": 0, "speed_limit_mph": "25 mph"}, 11.176),
+        ({"speed_limit_kmh": "36"}, 10.0),
+        ({"speed_limit_kmh": ["none", 72, "36"]}, 10.0),
+        ({"speed_limit_kmh": np.array([36.0, np.nan])}, 10.0),
+        *(({"speed_limit_kmh": value}, 0.0) for value in (None, -1.0, "", "none", [], np.inf, np.nan)),
+        ({}, 0.0),
+    ],
+)
+def test_a_limit_is_read_in_every_unit_and_form(limit, expected):
+    lanes = fork()
+    del lanes["on"]["speed_limit_kmh"]
+    lanes["on"] |= limit
+    (recording,) = read(description(lanes=lanes))
+    assert np.isclose(recording.lanes["on"].speed_limit, expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "colour"),
+    [
+        *(("LANE_STATE_" + name, LIGHT_UNKNOWN) for name in ("FLASHING_STOP", "FLASHING_CAUTION")),
+        *(("LANE_STATE_ARROW_" + name, colour) for name, colour in (("STOP", LIGHT_RED), ("GO", LIGHT_GREEN))),
+        ("LANE_STATE_ARROW_CAUTION", LIGHT_YELLOW),
+        ("TRAFFIC_LIGHT_OFF", LIGHT_UNKNOWN),
+        *(("TRAFFIC_LIGHT_" + name, colour) for name, colour in (("YELLOW", LIGHT_YELLOW), ("RED", LIGHT_RED))),
+        *((name, LIGHT_RED) for name in ("red_yellow", "redYellow")),
+    ],
+)
+def test_a_light_that_flashes_binds_nobody_and_arrows_are_their_colours(name, colour):
+    """After a solid red, which does not go on."""
+    states = {"on": {"state": {"object_state": ["LANE_STATE_STOP", name]}}}
+    (recording,) = read(description() | {"dynamic_map_states": states})
+    assert recording.lights["on"][0] == LIGHT_RED and (recording.lights["on"][1:] == colour).all()
+
+
 def test_skipped_time_stamps_move_start_frame_and_lights():
     scene = description(ts=np.where(ALL > 4, ALL + 2, ALL) * 0.1 + 77.0)
     tracks = scene["tracks"]["ego"]["state"]

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from e2rl.evaluation.rollout_files import cell
 from e2rl.run.errors import InputError
-from e2rl.scenes.builder import BuildSettings, build_scene
+from e2rl.scenes.builder import BuildSettings, SceneBuilder
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.recording import Lane, Recording
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, Rollout
@@ -81,7 +81,8 @@ class Episode:
 def recorded_episode(run: Path, row: Mapping, recording: Recording, build: BuildSettings) -> Episode:
     """The episode of a row of rollouts.csv in the scene that a recording makes; InputError where it is another one."""
     bare = rollout_episode(run, row)
-    scene, graph = build_scene(recording, build), LaneGraph(recording.lanes)
+    builder = SceneBuilder(recording, build)
+    scene, graph = builder.scene(recording), builder.graph
     rollout = bare.rollout
     same = len(graph.points) == len(rollout.lane_points) and len(scene["logged"]) == bare.steps + 1
     origin = np.round(graph.points[0] - rollout.lane_points[0]) if same else np.zeros(2)
