@@ -52,7 +52,7 @@ def main(frames: str = "640", file: str = "actor.safetensors", **settings) -> No
     """Train a new actor and write it; settings: of e2rl.make_env."""
     torch.manual_seed(0)
     network = e2rl.make_ego("actor").network
-    ppo(TransformedEnv(e2rl.make_env(BATCH, hold=2, **settings), RewardSum()), network, int(frames))
+    ppo(TransformedEnv(e2rl.make_env(BATCH, hold=2, seed=0, **settings), RewardSum()), network, int(frames))
     network.save(Path(file))
     print(f"measure it by: python evaluate.py ego=actor ego.checkpoint={file}")
 

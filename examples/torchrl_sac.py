@@ -50,7 +50,7 @@ def note(monitor: TextIO, batch: TensorDictBase) -> None:
 def main(steps: str = "100000", file: str = "sac.onnx", num_envs: int = 64, **settings) -> None:
     """Train a new policy and write it; settings: of e2rl.make_env."""
     torch.manual_seed(0)
-    env = TransformedEnv(e2rl.make_env(num_envs, hold=HOLD, **settings), RewardSum())
+    env = TransformedEnv(e2rl.make_env(num_envs, hold=HOLD, seed=0, **settings), RewardSum())
     spec = env.action_spec_unbatched
     policy = Policy(spec.space.low, spec.space.high)
     seen = TensorDictModule(policy.layers, ["observation"], ["loc", "scale"])

@@ -40,6 +40,7 @@ def run_command(
         begun: makes the run of a configuration.
         alone: no other process may be at work in the run's folder.
     """
+    sys.argv[1:] = map(with_path, sys.argv[1:])
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):
         print(help_text(name, arguments))
@@ -71,6 +72,20 @@ def run_command(
             command()
         except HydraException as error:
             raise InputError(told(name, arguments, str(error))) from error
+
+
+def with_path(argument: str) -> str:
+    """A command line's KEY=PATH as Hydra reads it: ~ is the home folder, and what its grammar has no place for, such as
+    letters beyond ASCII, is quoted. Anything else as it is."""
+    option, _, value = argument.partition("=")
+    if not value or option.startswith("-") or value[0] in "[{'\"":
+        return argument
+    if value.startswith("~"):
+        value = str(Path(value).expanduser())
+    elif value.isascii():
+        return argument
+    quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+    return f"{option}='{quoted}'"
 
 
 def end_log() -> None:

@@ -113,9 +113,10 @@ class Source(Extension, ABC):
         """Returns `path`; raises InputError where it is not set or not there."""
         if not self.path:
             raise InputError(f"data.path is not set; pass data.path=FOLDER_OR_ZIP of {self.holds}")
-        if not Path(self.path).exists():
+        path = Path(self.path).expanduser()
+        if not path.exists():
             raise InputError(f"data.path={self.path}: no such file or folder; pass one that holds {self.holds}")
-        return Path(self.path)
+        return path
 
     def recordings(self) -> Iterator[Recording]:
         """Yields all recordings, one for each scene, read in this process."""

@@ -16,13 +16,17 @@ from e2rl.sim.rollout_file import Road, Rollout
 
 TEXTS = ("scene_id", "location", "dataset", "split", "method", "ego_policy")
 MAP = ("lane_points", "lane_index", "lane_width", "drivable_points", "drivable_index")
+PADDING = dict.fromkeys(("lane_index", "drivable_index", "ran_light", "routes", "targets"), -1) | dict.fromkeys(
+    ("evasion", "driver"), torch.nan
+)  # where it is not 0
 
 
 class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` and `split` are fields, not methods
     """B rollouts of N agents, the ego first, over T steps of DT; step 0 is the start. Everything lies on the CPU.
 
     Indexing and `torch.cat` work as for tensors: `rollouts[mask]`, `rollouts[3]` (without the leading B). What is None
-    is not known. Vehicles have the rows 0 .. V-1.
+    is not known. Vehicles have the rows 0 .. V-1. `torch.cat` pads maps and tracks to the largest, and does not know
+    what one of them does not.
     """
 
     states: Tensor  # [B, T+1, N, 4]: x, y [m], heading [rad], speed [m/s]
@@ -160,6 +164,47 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
             driver=_known_track(row.driver),
             **plans,
         )
+
+
+_tensorclass_function = Rollouts.__torch_function__
+
+
+def _torch_function(
+    cls: type[Rollouts], func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+) -> Any:
+    """A tensor's function of Rollouts, `torch.cat` of those that differ in size or in what is known among them."""
+    kwargs = dict(kwargs or {})
+    if func is torch.cat:
+        parts = aligned(args[0] if args else kwargs.pop("tensors"))
+        args = (parts, *args[1:])
+    return _tensorclass_function(func, types, args, kwargs)
+
+
+Rollouts.__torch_function__ = classmethod(_torch_function)  # type: ignore[assignment]
+
+
+def aligned(parts: Sequence[Rollouts]) -> list[Rollouts]:
+    """Rollouts whose tensors have the same sizes but for B, padded, and that know the same."""
+    columns: dict[str, list[Any]] = {}
+    for name in Rollouts.__dataclass_fields__:
+        values = [getattr(part, name) for part in parts]
+        if any(value is None for value in values):
+            columns[name] = [None] * len(parts)
+        elif name not in (*TEXTS, "batch_size"):
+            columns[name] = padded(values, fill=PADDING.get(name, 0))
+    return [
+        part.replace(**{name: column[index] for name, column in columns.items()}) for index, part in enumerate(parts)
+    ]
+
+
+def padded(values: Sequence[Tensor], fill: float) -> list[Tensor]:
+    """Tensors [B, ...] with the largest sizes among them in all dims but the first."""
+    shape = [max(sizes) for sizes in zip(*(value.shape[1:] for value in values), strict=True)]
+    results = []
+    for value in values:
+        room = [end for size, most in zip(value.shape[1:], shape, strict=True) for end in (most - size, 0)]
+        results.append(torch.nn.functional.pad(value, room[::-1], value=fill) if any(room) else value)
+    return results
 
 
 def road_of(scene: Rollouts | TensorDictBase) -> Road:

@@ -158,7 +158,7 @@ class SpeedSource(Source):
         return hash_files(sorted(self.root().glob("*.txt")))
 
 
-def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path):
+def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path, monkeypatch):
     (tmp_path / "a.txt").write_text("5.0")
     (tmp_path / "b.txt").write_text("9.0")
     config = {"_target_": "tests.scenes.test_source.SpeedSource", "path": str(tmp_path), "lane_width": 3.0}
@@ -173,6 +173,8 @@ def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path)
     assert (load_scenes(config | {"lane_width": 4.0}).scenes["lane_width"] == 4.0).all()
     (tmp_path / "c.txt").write_text("1.0")
     assert len(load_scenes(config)) == 6
+    monkeypatch.setenv("HOME", str(tmp_path.parent))
+    assert len(load_scenes(config | {"path": f"~/{tmp_path.name}"})) == 6
     with pytest.raises(InputError, match="no such file or folder; pass one that holds text files"):
         load_scenes(config | {"path": "nowhere"})
     with pytest.raises(InputError, match="data.lane_width=wide"):

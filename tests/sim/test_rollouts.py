@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from e2rl.metrics.score import score_rollouts
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import VEHICLE
 from e2rl.sim.rollout_file import Failure, Rollout
@@ -59,6 +60,25 @@ def test_rollouts_read_back_are_those_written_padded_where_others_are_longer(tmp
     torch.testing.assert_close(both.states[1, :41, :7], short.states[1], equal_nan=True, rtol=0, atol=0)
     for rows in (read[1:3], torch.cat([read[1:2], read[2:3]]), read[torch.tensor([False, True, True, False])]):
         assert list(rows.scene_id) == ["scene_0", "scene_1"] and torch.equal(rows.valid, read.valid[1:3])
+
+
+def test_rollouts_of_other_maps_and_sizes_are_joined_and_score_as_before():
+    """What one of them does not know, all together do not."""
+    small = random_rollouts(2, seed=3, vehicles=4, others=1)
+    large = random_rollouts(3, seed=5, vehicles=7, others=2)
+    line = torch.tensor([[-50.0, 0.0], [0.0, 1.0], [50.0, 0.0]]).expand(2, -1, -1)
+    small = small.replace(
+        lane_points=line, lane_index=torch.zeros(2, 3, dtype=torch.int64), lane_width=torch.full((2, 1), 4.0), nfe=None
+    )
+    joined = torch.cat([small, large])
+    assert joined.nfe is None
+    assert joined.lane_index[0, 3:].eq(-1).all()
+    assert not joined.valid[:2, :, small.valid.shape[2] :].any()
+    rows = score_rollouts(joined)[0]
+    apart = score_rollouts(small)[0] + score_rollouts(large)[0]
+    for row, alone in zip(rows, apart, strict=True):
+        row["nfe"] = alone["nfe"]
+        assert row == pytest.approx(alone, nan_ok=True, abs=1e-9)
 
 
 def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_left_out(tmp_path, rollouts):
