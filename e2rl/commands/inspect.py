@@ -150,10 +150,11 @@ def open_source(path: Path, data: str | None, workers: int) -> tuple[str, Source
     raise InputError("; ".join(dict.fromkeys(refusals)))
 
 
-def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Counts], Row]:
+def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Counts], Row | None]:
     """Returns all rows of a source without their scenes, the counts of its scenes, and the row to draw.
 
-    That is the scene `chosen`, by default the first. Raises InputError where there is no such scene.
+    That is the scene `chosen`, by default the first; None where no log makes a scene. Raises InputError where there is
+    no such scene.
     """
     rows, contents, drawn = [], [], None
     with closing(source.rows()) as found:
@@ -162,10 +163,9 @@ def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Counts]
             if row.scene is not None:
                 contents.append(content(row.scene))
                 drawn = row if drawn is None and chosen in (None, row.scene_id) else drawn
-    if drawn is None:
-        names = [row.scene_id for row in rows if not row.reason][:1]
-        example = f"such as {names[0]}" if names else f"but none is left: {rows[0].reason}"
-        raise InputError(f"--scene={chosen}: name a scene of {source.path}, {example}")
+    if drawn is None and contents:
+        example = next(row.scene_id for row in rows if not row.reason)
+        raise InputError(f"--scene={chosen}: name a scene of {source.path}, such as {example}")
     return rows, contents, drawn
 
 
@@ -200,9 +200,11 @@ def main(arguments: list[str] | None = None) -> None:
         name, source = open_source(options.path, options.data, options.workers)
         rows, contents, drawn = inspect(source, options.scene)
         print(f"data         {name}, {options.path}", *report(source, rows, contents), sep="\n")
+        if drawn is None:
+            raise InputError(f"{options.path}: no log makes a scene, the first for this reason: {rows[0].reason}")
         if options.apart:
             print(check_apart(rows, source, open_source(options.apart, name, options.workers)[1]))
         assert drawn.scene is not None
-        scene, title = drawn.scene, f"{drawn.scene_id}   {drawn.location}"
-        save_figure(options.out, picture(scene, title, options.metres))
+        title = f"{drawn.scene_id}   {drawn.location}"
+        save_figure(options.out, picture(drawn.scene, title, options.metres))
         print(f"drawn        {drawn.scene_id}: {options.out}")

@@ -26,6 +26,7 @@ MEASURED = (*SOUGHT, "aor_step", "cfr_bg", "real", "real_adv", "nfe")
 ERRORED = 0.01  # fraction of rollouts that may error
 NOMINAL = "nominal"  # after a metric's name: its value in the traffic that the budget is held against
 DRIVING = ("collision", "comfort", "progress")
+COLLISIONS = ("cfr", "cfr_vru", "cfr_object", "ego_off_road")  # columns of which one is a collision
 
 
 @configured("tune", "tuning.planner")
@@ -120,10 +121,7 @@ class PlannerTrials:
 
 def driving(rows: Sequence[Mapping]) -> dict[str, float]:
     """Returns the means of DRIVING over the rollouts that know them."""
-    values = [
-        (float(row["cfr"] == 1 or row["cfr_vru"] == 1 or row["ego_off_road"] == 1), row["macc"], row["progress"])
-        for row in rows
-    ]
+    values = [(float(any(row.get(name) == 1 for name in COLLISIONS)), row["macc"], row["progress"]) for row in rows]
     means = torch.tensor(values, dtype=torch.float64).view(-1, len(DRIVING)).nanmean(0)
     return dict(zip(DRIVING, means.tolist(), strict=True))
 

@@ -48,7 +48,8 @@ rate = partial(Metric, fraction=True)  # a metric in [0, 1]
 event = partial(rate, event=True)
 TABLES = ("main", "traffic", "adversaries", "methods", "egos", "public")  # of the package
 ORDER = (  # of columns in every table (docs/method.md, section 10); others follow as they are declared
-    *("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "errored", "cfr_adv", "cfr_vru", "cfr_bg", "avoidable"),
+    *("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "errored", "cfr_adv", "cfr_vru"),
+    *("cfr_object", "cfr_bg", "avoidable"),
     *("front", "side", "rear", "rir", "preventable", "counted", "at_fault"),
     *("relvel", "contact_time", "min_dtc", "ttc_c", "macc", "progress"),
     *("aor_step", "aor_any", "real", "real_adv", "real_norm", "transport", "seconds_per_rollout", "nfe"),
@@ -60,7 +61,8 @@ WORDS: dict[str, tuple[str, ...]] = {}  # columns that hold one of these words, 
 SOURCE = ("dataset", "split", "method", "ego_policy")  # columns of a row of a run
 IDENTITY = ("scene_id", "location", "seed", "eta")  # columns of a row before its metrics
 LATER: dict[str, float | str] = {  # last columns of a row: what rows of earlier versions, which lack them, know of them
-    **{"errored": math.nan, "raised_by": "", "error": ""}  # whether, by whom ("ego", "traffic"), and with what message
+    **{"errored": math.nan, "raised_by": "", "error": ""},  # whether, by whom ("ego", "traffic"), and with what message
+    "cfr_object": math.nan,
 }
 OPEN_LOOP_STAGE, META_STAGE, SPREAD_STAGE = "open loop", "meta-metric", "spread"
 STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own

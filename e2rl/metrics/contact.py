@@ -11,7 +11,7 @@ from e2rl.metrics.catalogue import Batch, Metric, columns, event, rate
 from e2rl.metrics.geometry import edge_distances, edge_parts_inside, pair_overlap, velocity
 from e2rl.metrics.realism import MOVING
 from e2rl.scenes.boxes import separation
-from e2rl.scenes.recording import DT, VEHICLE
+from e2rl.scenes.recording import CYCLIST, DT, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.sim.dynamics import wrap
 
 FRONT, SIDE, REAR = 0, 1, 2
@@ -102,6 +102,7 @@ def kinds_at_stop(batch: Batch) -> Tensor:
     event("cfr", "ego hits any vehicle", raised=1.0, tables="main traffic adversaries methods egos public"),
     event("cfr_adv", "ego hits an adversary", tables="main adversaries methods"),
     event("cfr_vru", "ego hits a pedestrian or cyclist", tables="main public"),
+    event("cfr_object", "ego hits an object, such as a cone"),
     event("front", "first contact at the ego's front", tables="main adversaries egos"),
     event("side", "first contact at the ego's side", tables="main adversaries egos"),
     event("rear", "first contact at the ego's rear", tables="main adversaries egos"),
@@ -141,9 +142,13 @@ def contact_columns(batch: Batch) -> Batch:
     row = torch.arange(len(states))
     before = velocity(states[row, batch["before"]])
     relative = (before[:, 0] - before[row, batch["partner"].clamp(min=0)]).norm(dim=-1)
-    vulnerable = (batch["area"] > 0) & (batch["agent_type"] != VEHICLE)[:, None]
+    until, touches = steps_until(stop, states.shape[1])[..., None], batch["area"] > 0
+    kind = batch["agent_type"][:, None]
+    vulnerable = touches & until & ((kind == PEDESTRIAN) | (kind == CYCLIST))
+    objects = touches & until & (kind == OTHER)
     return found | {
-        "cfr_vru": (vulnerable.any(-1) & steps_until(stop, states.shape[1])).any(-1).to(states.dtype),
+        "cfr_vru": vulnerable.any((1, 2)).to(states.dtype),
+        "cfr_object": objects.any((1, 2)).to(states.dtype),
         "rir": found["rear"].masked_fill(~hit, torch.nan),
         "relvel": relative.masked_fill(~hit, torch.nan),
         "contact_step": step,

@@ -17,7 +17,7 @@ from e2rl.scenes.links import plausible_width
 from e2rl.scenes.log_route import route_from_log
 from e2rl.scenes.paths import wrap
 from e2rl.scenes.plausibility import check, extent, map_fit, motion
-from e2rl.scenes.recording import VEHICLE, Recording
+from e2rl.scenes.recording import AGENT_WORDS, VEHICLE, Recording
 from e2rl.scenes.route import SPACING, project
 from e2rl.scenes.smoothing import PAST, causal_past, causal_state, drop_jumps, smooth
 
@@ -62,7 +62,8 @@ class SceneBuilder:
         self.repairs = Counter(recording.repairs)
         check(extent(recording) | motion(recording), recording.scene_id)
         self.valid = drop_jumps(recording.states, recording.valid)
-        self.valid[:, recording.ego] = recording.valid[:, recording.ego]  # without the ego there is no scene
+        egos = [recording.ego, *recording.egos.values()]
+        self.valid[:, egos] = recording.valid[:, egos]  # without the ego there is no scene
         lanes, limits = known_limits(recording)
         self.graph = LaneGraph(lanes)
         self.repairs += limits + self.graph.repairs
@@ -278,9 +279,14 @@ def _joined(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([np.zeros((0, 2)), *parts]), index
 
 
-def ego_overlaps(scene: TensorDict) -> bool:
-    """Whether the ego's box overlaps another vehicle's at the start frame."""
-    others = scene["valid"] & (scene["agent_type"] == VEHICLE)
+def ego_overlaps(scene: TensorDict) -> str:
+    """Returns what the ego's box overlaps at the start frame, in words and vehicles first; "" for nobody.
+
+    Args:
+        scene: one scene (e2rl/scenes/scene.py).
+    """
+    others = scene["valid"].clone()
     others[0] = False
     pose, size = scene["start"].double(), scene["size"].double()
-    return bool((boxes.overlap(pose[:1], size[:1], pose, size) & others).any())
+    overlap = boxes.overlap(pose[:1], size[:1], pose, size) & others
+    return AGENT_WORDS[int(scene["agent_type"][overlap].min())] if overlap.any() else ""

@@ -2,12 +2,13 @@
 
 The ego is the obstacle that stands where a planning problem starts. Most scenarios have none there, since their authors
 took the vehicle out to plan for it: then the ego is the vehicle, recorded at the start frame, that moves for the most
-frames, of several the one that drives farthest.
+simulated steps, of several the one that drives farthest. Of a long scenario, which makes several scenes, each has an
+ego of its own.
 """
 
 import io
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from math import inf, isfinite
 from types import SimpleNamespace
 from typing import Any
@@ -26,11 +27,15 @@ TYPES = {  # by the name of an ObstacleType
     **dict.fromkeys(["priorityVehicle", "parkedVehicle"], VEHICLE),
     **{"bicycle": CYCLIST, "pedestrian": PEDESTRIAN},
 }
-FOR_OTHERS = {"sidewalk", "crosswalk", "bicycleLane", "busStop", "border", "parking", "restricted_area"}  # LaneletType
+PAVED = {"shoulder", "busLane"}  # LaneletTypes on which a car does not drive, though it could
+FOR_OTHERS = {*PAVED, "sidewalk", "crosswalk", "bicycleLane", "busStop", "border", "parking"}
+FOR_OTHERS |= {"restricted", "restricted_area"}
+CARS = {"vehicle", "car"}  # RoadUsers
 MOVES, NEAR = 0.5, 1.0  # m/s, m: a vehicle that moves; from a planning problem's start
 NUMBERS = {"x", "y", "z", "exact", "intervalStart", "intervalEnd", "length", "width", "radius", "orientation"}
 MAX_DEPTH, LARGEST_ANGLE = 32, 1000.0  # elements; rad
 DURATION = (0.01, 1.0)  # s, of a time step
+STEPS = 80  # simulated steps of a scene, by default
 
 
 @dataclass
@@ -46,21 +51,31 @@ class CommonRoadSource(LogFiles):
     extra = "commonroad"
 
     def read(self, log: str) -> Iterator[Recording]:
-        start = min(self.starts or (HISTORY,))
         with bounded_memory():
-            recording = read_scenario(self.content(log), start)
-        if len(recording.states) - self.build.steps // 2 >= start:
+            recording = read_scenario(self.content(log), self.starts, self.build.steps)
+        if len(recording.states) - self.build.steps // 2 >= min(self.starts or (HISTORY,)):
             yield recording
 
 
-def read_scenario(content: bytes, start: int = HISTORY) -> Recording:
-    """Returns the recording in an XML file at 10 Hz, with an ego that is there at frame `start` where there is one."""
+def read_scenario(content: bytes, starts: Sequence[int] | None = None, steps: int = STEPS) -> Recording:
+    """Returns the recording in an XML file at 10 Hz, with an ego for each window that has a vehicle at its start.
+
+    Args:
+        content: of the file.
+        starts: start frames of the windows; None: those of `Recording.windows`.
+        steps: simulated steps of a scene.
+    """
     # beside commonroad-io's reader of protobuf, which needs a protobuf of its own
     from commonroad.common.reader.file_reader_xml import XMLFileReader
 
     _check_content(content)
     scenario, problems = XMLFileReader(io.BytesIO(content)).open()
-    return _recording(scenario, list(problems.planning_problem_dict.values()), start)
+    recording, begun = _recording(scenario, list(problems.planning_problem_dict.values()))
+    present = recording.valid & (recording.agent_type == VEHICLE)
+    for start in recording.start_frames(starts, steps) or [HISTORY]:
+        span = slice(min(start, len(present) - 1), start + steps + 1)
+        recording.egos[start] = _ego(recording.states[span], present[span], begun)
+    return replace(recording, ego=next((ego for ego in recording.egos.values() if ego >= 0), -1))
 
 
 def _check_content(content: bytes) -> None:
@@ -92,7 +107,8 @@ def _check_content(content: bytes) -> None:
     parser.Parse(content, True)
 
 
-def _recording(scenario: Any, problems: list, start: int) -> Recording:
+def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
+    """Returns the recording, still without an ego, and the tracks that begin where a planning problem does."""
     if not DURATION[0] <= scenario.dt <= DURATION[1]:
         raise InputError(f"timeStepSize={scenario.dt:g}: expected {DURATION[0]} to {DURATION[1]} s; repair it")
     obstacles = [*scenario.dynamic_obstacles, *scenario.static_obstacles]
@@ -115,7 +131,7 @@ def _recording(scenario: Any, problems: list, start: int) -> Recording:
     states, valid = resample_uniform(states, valid, np.arange(count) * scenario.dt)
     lanes, drivable = _map(scenario.lanelet_network)
     steps_at = first + np.round(np.arange(len(states)) * DT / scenario.dt).astype(int)
-    return Recording(
+    recording = Recording(
         scene_id=name,
         location=f"{scenario.scenario_id.country_id}_{scenario.scenario_id.map_name}",
         dataset="commonroad",
@@ -123,12 +139,13 @@ def _recording(scenario: Any, problems: list, start: int) -> Recording:
         valid=valid,
         size=np.array([size for size, _ in boxes]),
         agent_type=kinds,
-        ego=_ego(states, valid & (kinds == VEHICLE), [track for track in started if track is not None], start),
+        ego=-1,
         lanes=lanes,
         drivable=drivable,
         lights=_lights(scenario.lanelet_network, lanes, steps_at),
         current=None,
     )
+    return recording, [track for track in started if track is not None]
 
 
 def _states(obstacle: Any) -> list:
@@ -167,26 +184,35 @@ def _started(begin: Any, states: np.ndarray, valid: np.ndarray, first: int) -> i
     return int(away.argmin()) if away.min() < NEAR else None
 
 
-def _ego(states: np.ndarray, present: np.ndarray, started: list[int], start: int) -> int:
-    """The ego's track, of vehicles `present` [F, A]; -1 where none is there at the start frame.
+def _ego(states: np.ndarray, present: np.ndarray, begun: list[int]) -> int:
+    """Returns the ego's track in a window; -1 where no vehicle is there at its start.
 
-    One of `started`, else the vehicle that moves for the most frames, of several the one that drives farthest.
+    One of `begun`, else the vehicle that moves for the most frames, of several the one that drives farthest.
+
+    Args:
+        states: [F, A, 4] from the start frame on.
+        present: [F, A] bool, the vehicles that are there.
+        begun: tracks that begin where a planning problem does.
     """
-    there = present[min(start, len(present) - 1)]
-    chosen = [track for track in started if there[track]]
+    there = present[0]
+    chosen = [track for track in begun if there[track]]
     if chosen or not there.any():
         return chosen[0] if chosen else -1
-    speed = states[..., 3] * present
+    speed = np.abs(states[..., 3]) * present
     return int(np.lexsort((speed.sum(0), (speed > MOVES).sum(0) * there, there))[-1])
 
 
 def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
-    """Lanes for motor vehicles by lanelet id, and their polygons."""
+    """Lanes for cars by lanelet id, and the polygons of what they could drive on."""
     lanes, drivable = {}, []
     for lanelet in network.lanelets:
-        if FOR_OTHERS & {kind.value for kind in lanelet.lanelet_type or ()}:
-            continue
+        kinds = FOR_OTHERS & {kind.value for kind in lanelet.lanelet_type or ()}
+        users = {user.value for user in (*(lanelet.user_one_way or ()), *(lanelet.user_bidirectional or ()))}
         left, right = lanelet.left_vertices[:, :2], lanelet.right_vertices[:, :2]
+        if kinds <= PAVED:
+            drivable.append(np.concatenate([left, right[::-1]]))
+        if kinds or (users and not users & CARS):
+            continue
         lanes[str(lanelet.lanelet_id)] = Lane(
             points=lanelet.center_vertices[:, :2],
             width=float(np.median(np.linalg.norm(left - right, axis=1))),
@@ -195,7 +221,6 @@ def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
             left=[str(lanelet.adj_left)] if lanelet.adj_left_same_direction else [],
             right=[str(lanelet.adj_right)] if lanelet.adj_right_same_direction else [],
         )
-        drivable.append(np.concatenate([left, right[::-1]]))
     return lanes, drivable
 
 

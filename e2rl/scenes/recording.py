@@ -10,6 +10,7 @@ from e2rl.run.errors import InputError
 
 VEHICLE, PEDESTRIAN, CYCLIST, OTHER = range(4)
 AGENT_TYPES = ("vehicle", "pedestrian", "cyclist", "other")
+AGENT_WORDS = ("a vehicle", "a pedestrian", "a cyclist", "an object")  # in sentences
 LIGHT_UNKNOWN, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN = range(4)
 COLOURS = {  # by the words in the names of logs; of several, such as "red yellow", the first here
     **dict.fromkeys(("RED", "REDYELLOW", "STOP"), LIGHT_RED),
@@ -19,6 +20,7 @@ COLOURS = {  # by the words in the names of logs; of several, such as "red yello
 NO_SIGNAL = {"FLASHING", "BLINKING", "OFF", "INACTIVE"}  # words of lights that let nobody wait for another colour
 DT = 0.1  # s, the time step of every recording, scene and simulation
 HISTORY = 10  # frames of history before a start frame that is chosen here
+MOVED_START = "start frames moved to where enough past and future are recorded"
 MAX_NAME = 128  # characters of the name of a scene, a place or a data set
 
 
@@ -67,6 +69,7 @@ class Recording:
     states [F, A, 4]: x, y [m], heading [rad], speed [m/s]; valid [F, A]; size [A, 2]: length, width [m];
     agent_type [A]; ego: index of the ego's track; lights: lane id -> [F] light state; drivable: polygons [P, 2];
     current: the start frame, with at least one frame of history before it; None where the log names none;
+    egos: the ego's track by start frame, where it is not the same for all (-1: nobody is there);
     repairs: how often reading mended something, by a phrase in the plural, such as "headings turned round".
     """
 
@@ -83,23 +86,58 @@ class Recording:
     lights: dict[str, np.ndarray] = field(default_factory=dict)
     current: int | None = HISTORY
     repairs: Counter[str] = field(default_factory=Counter)
+    egos: dict[int, int] = field(default_factory=dict)
 
-    def windows(self, starts: Sequence[int] | None, steps: int) -> Iterator["Recording"]:
-        """Yields the recordings of `steps` simulated steps that this log makes, with ids of the form `id@start`.
+    def start_frames(self, starts: Sequence[int] | None, steps: int) -> list[int]:
+        """Returns the start frames of `windows`; none where the log is too short for them.
 
-        One from each of `starts` that leaves at least half of the steps recorded. Default: the log's own start frame,
-        or, where it names none, as many windows as fit one after another (at least one).
+        Args:
+            starts: those that are asked for, of which each must leave half of the steps recorded; None: the log's own,
+                or, where it names none, as many as fit one after another (at least one).
+            steps: simulated steps of a scene.
         """
         frames = len(self.states)
         if starts:
-            starts = [start for start in starts if start <= frames - steps // 2]
-        else:
-            starts = range(HISTORY, frames - steps, steps + HISTORY + 1) if self.current is None else ()
-            if len(starts) < 2:
-                yield replace(self, current=HISTORY) if self.current is None else self
-                return
-        for start in starts:
-            yield replace(self, current=start, scene_id=f"{self.scene_id}@{start}")
+            return [start for start in starts if start <= frames - steps // 2]
+        if self.current is not None:
+            return [self._own_start(steps)]
+        return list(range(HISTORY, frames - steps, steps + HISTORY + 1)) or [HISTORY]
+
+    def windows(self, starts: Sequence[int] | None, steps: int) -> Iterator["Recording"]:
+        """Yields the recordings of `steps` simulated steps that this log makes.
+
+        Those of several, or of `starts`, have ids of the form `id@start`. A start frame of the log's own that leaves
+        too little past or future is moved, which counts as a repair.
+
+        Args:
+            starts, steps: see `start_frames`.
+        """
+        frames = self.start_frames(starts, steps)
+        repairs = Counter(self.repairs)
+        repairs[MOVED_START] += not starts and self.current is not None and frames != [self.current]
+        for start in frames:
+            name = f"{self.scene_id}@{start}" if starts or len(frames) > 1 else self.scene_id
+            ego = self.egos.get(start, self.ego)
+            yield replace(self, current=start, scene_id=name, ego=ego, repairs=+repairs)
+
+    def _own_start(self, steps: int) -> int:
+        """Returns the log's own start frame, or the first with enough past and future where it has not.
+
+        Enough are HISTORY frames with the ego before it, and half of the steps after it.
+        """
+        assert self.current is not None
+        last = len(self.states) - steps // 2
+        if HISTORY <= self.current <= last or not 0 <= self.ego < self.valid.shape[1]:
+            return self.current
+        absent = np.cumsum(~self.valid[:, self.ego])
+        before = np.concatenate([np.zeros(HISTORY + 1, int), absent])[: len(absent)]
+        enough = np.flatnonzero((absent == before)[: last + 1])
+        enough = enough[enough >= HISTORY]
+        return int(enough[0]) if len(enough) else self.current
+
+    def has_ego(self) -> bool:
+        """Returns whether the ego is recorded at the start frame."""
+        return 0 <= self.ego < self.valid.shape[1] and bool(self.valid[self.current, self.ego])
 
     def validate_names(self) -> "Recording":
         """Returns self; raises InputError for a name that is no short text: files, tables and messages hold it."""

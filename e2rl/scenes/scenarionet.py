@@ -25,6 +25,14 @@ TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
 OBSTACLES = ("UNSET", "TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT", "TRAFFIC_LIGHT", "BUILDING", "GROUND")
 LIMIT_UNITS = {"speed_limit_kmh": 1 / 3.6, "speed_limit_mps": 1.0, "speed_limit_mph": 0.44704}  # key: m/s
 TYPES |= dict.fromkeys(OBSTACLES, TYPES["OTHER"])  # MetaDrive's further names of tracks
+SIZES = {  # m: usual length and width by a track's type, for those that say none
+    "VEHICLE": (4.6, 1.9),
+    "PEDESTRIAN": (0.7, 0.7),
+    "CYCLIST": (1.8, 0.7),
+    "TRAFFIC_CONE": (0.4, 0.4),
+    "TRAFFIC_BARRIER": (2.0, 0.5),
+}
+SMALL = (0.7, 0.7)  # m: of every other type
 
 
 @dataclass
@@ -81,7 +89,7 @@ def recording_of(data: dict, location: str = "") -> Recording:
     if len(set(keys)) < len(keys):
         twice = next(key for key, count in Counter(keys).items() if count > 1)
         raise InputError(f"two of its tracks have the id {twice!r}; give each its own")
-    states, valid, size = _tracks(tracks)
+    states, valid, size, repairs = _tracks(tracks)
     frames, scene_id = len(states), _text(data.get("id") or metadata.get("scenario_id"))
     ts = np.asarray(metadata.get("ts", np.arange(frames) * DT), float)
     if len(ts) != frames:
@@ -105,6 +113,7 @@ def recording_of(data: dict, location: str = "") -> Recording:
         drivable=drivable,
         lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)),
         current=None if current is None else int(round(seconds[int(current)] / DT)),
+        repairs=repairs,
     )
 
 
@@ -120,12 +129,16 @@ def _type(key: object, name: object) -> int:
     return TYPES[name]
 
 
-def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States [F, A, 4], valid [F, A] and size [A, 2] of tracks; raises InputError where a valid state is not finite."""
+def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray, Counter[str]]:
+    """States [F, A, 4], valid [F, A], size [A, 2] and repairs of tracks.
+
+    Raises InputError where a valid state is not finite.
+    """
     frames = len(next(iter(tracks.values()))["state"]["position"])
     check({"states": frames * len(tracks)}, "of this log")
     states, valid = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool)
     size = np.ones((len(tracks), 2))
+    repairs: Counter[str] = Counter()
     for index, (key, track) in enumerate(tracks.items()):
         state = track["state"]
         known = np.asarray(state["valid"]).astype(bool).reshape(-1)
@@ -136,11 +149,36 @@ def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if bad.any():
             raise InputError(f"track {key} is NaN or infinite at frame {bad.argmax()}, where it is marked valid")
         if known.any():
-            size[index] = [_median(np.asarray(state[key]).reshape(-1)[known]) for key in ("length", "width")]
+            recorded = _recorded_size(track, known)
+            repairs["missing sizes, for which the usual one of the type is taken"] += recorded is None
+            size[index] = SIZES.get(track["type"], SMALL) if recorded is None else recorded
         if track["type"] == "VEHICLE":  # some logs swap length and width
             size[index] = sorted(size[index], reverse=True)
     states[~valid] = 0.0
-    return states, valid, size
+    return states, valid, size, +repairs
+
+
+def _recorded_size(track: dict, known: np.ndarray) -> list[float] | None:
+    """Returns the median length and width [m] that a track says; None where it says none that is positive.
+
+    Each comes from the first of these that has it: `length` and `width`, or the first two columns of `size`, of the
+    state (a value, or one a frame) or of the metadata.
+
+    Args:
+        track: of a ScenarioDescription.
+        known: [F] bool, the frames at which it is there.
+    """
+    size: list[float] = []
+    for column, name in enumerate(("length", "width")):
+        for part in (track["state"], track.get("metadata") or {}):
+            both = np.atleast_2d(np.asarray(part.get("size"), float))[:, column : column + 1]
+            values = np.asarray(part.get(name, both), float).reshape(-1)
+            values = values[known] if len(values) == len(known) else values
+            values = values[np.isfinite(values) & (values > 0)]
+            if len(values):
+                size.append(_median(values))
+                break
+    return size if len(size) == 2 else None
 
 
 def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:

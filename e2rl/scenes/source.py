@@ -16,7 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -30,15 +30,17 @@ from e2rl.run.files import cache_folder
 from e2rl.run.processes import interrupts_held, without_main, worker_pool
 from e2rl.run.settings import check_range, check_settings, file_values, setting, settings_of
 from e2rl.scenes.builder import BuildSettings, SceneBuilder, ego_overlaps
-from e2rl.scenes.recording import Recording
+from e2rl.scenes.recording import MAX_NAME, Recording
 from e2rl.scenes.scene import SceneSet, validate
 from e2rl.scenes.scene_cache import Index, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
 from e2rl.scenes.versions import MARK, RECORDED, check_versions, version_of
 
-OVERLAP, TOO_SHORT = "ego overlaps a vehicle at the start", "too short for a start frame"  # why scenes are left out
+OVERLAP = "ego overlaps a vehicle at the start"  # why scenes are left out
+TOO_SHORT = "too short for a start frame"
+NO_EGO = "nobody to be the ego at the start"
 NO_VERSION = "without such a version"  # or it is invalid, where the log itself makes scenes, too
-VERSION = 6  # of the scene builder: raise it when the same recording would make another scene
+VERSION = 8  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
 NO_MATTER = "path", "cache", "cache_gb", "workers"  # settings that do not change the scenes
@@ -47,7 +49,8 @@ NO_MATTER = "path", "cache", "cache_gb", "workers"  # settings that do not chang
 class Row(NamedTuple):
     """What one recording made: a scene's arrays, or the reason why there is none.
 
-    repairs: what was mended in its tracks and map; they stand with the first recording of a log alone.
+    usual: whether sound data have such recordings, too; repairs: what was mended in its tracks and map; they stand with
+    the first recording of a log alone.
     """
 
     scene_id: str
@@ -55,6 +58,7 @@ class Row(NamedTuple):
     dataset: str = ""
     scene: dict[str, np.ndarray] | None = None
     reason: str = ""
+    usual: bool = False
     repairs: Counter[str] = Counter()  # never changed in place
 
 
@@ -185,25 +189,29 @@ class Source(Extension, ABC):
             if isinstance(error.__cause__, ImportError):  # no log can be read
                 raise
             return [Row(log, reason=str(error))]
-        return rows or [Row(log, reason=TOO_SHORT if RECORDED in self.versions else NO_VERSION)]
+        short = f"{TOO_SHORT} and half of data.build.steps={self.build.steps}, which may be set lower"
+        return rows or [Row(log, reason=short if RECORDED in self.versions else NO_VERSION, usual=True)]
 
     def _rows(self, log: str, windows: list[Recording]) -> Iterator[Row]:
         """Yields what recordings of the same tracks and map make."""
         builder = None
         for window in windows:
             row = Row(window.scene_id, window.location, window.dataset)
+            if len(windows) > 1 and not window.has_ego():
+                yield row._replace(reason=NO_EGO, usual=True)
+                continue
             try:
-                builder = builder or SceneBuilder(window, self.build)
-                if window is windows[0]:
+                if builder is None:
+                    builder = SceneBuilder(window, self.build)
                     row = row._replace(repairs=builder.repairs)
                 scene = builder.scene(window)
                 validate(scene, window.scene_id)
             except InputError as error:
                 beside = RECORDED in self.versions and any(f"{MARK}{name}" in row.scene_id for name in self.versions)
-                yield row._replace(reason=NO_VERSION if beside else _naming(log, error))
+                yield row._replace(reason=NO_VERSION if beside else _naming(log, error), usual=beside)
                 continue
-            if ego_overlaps(scene):
-                yield row._replace(reason=OVERLAP)
+            if overlapped := ego_overlaps(scene):
+                yield row._replace(reason=OVERLAP.replace("a vehicle", overlapped), usual=True)
             else:
                 yield row._replace(scene={key: value.numpy() for key, value in scene.items()})
 
@@ -211,23 +219,30 @@ class Source(Extension, ABC):
         """Yields what the logs make, in their order, of which `most` scenes are asked for (None: all).
 
         `workers` processes build, never far ahead of what is asked for; this one where there is work for one, or for
-        FEW scenes.
+        FEW scenes. Where logs share ids of scenes, those of all but the first name their log.
         """
         logs = self.logs()
         show = partial(tqdm, desc="building scenes", total=len(logs), unit="log", disable=None)
+        known: set[str] = set()
+        with closing(self._rows_of_logs(logs, most)) as rows_of_logs:
+            for log, rows in zip(logs, show(rows_of_logs), strict=False):
+                yield from _told_apart(log, rows, known)
+
+    def _rows_of_logs(self, logs: list[str], most: int | None) -> Generator[list[Row]]:
+        """Yields what each log makes; most: see `rows`."""
         if min(self.workers, len(logs)) <= 1 or (most is not None and most <= FEW):
-            yield from (row for rows in show(map(self._rows_of, logs)) for row in rows)
+            yield from map(self._rows_of, logs)
             return
         own = type(self).__module__ == "__main__"  # then the workers need the script that defines it
         try:
             with worker_pool(self.workers, "spawn") as pool:
                 coming = iter(logs)
                 waiting: deque[Future[list[Row]]] = deque()
-                for _ in show(logs):
+                for _ in logs:
                     with interrupts_held(), nullcontext() if own else without_main():
                         ahead = islice(coming, AHEAD * self.workers - len(waiting))
                         waiting.extend(pool.submit(self._rows_of, log) for log in ahead)
-                    yield from waiting.popleft().result()
+                    yield waiting.popleft().result()
         except BrokenProcessPool as error:
             raise InputError(
                 f"data.workers={self.workers}: a process that builds scenes was killed, perhaps for lack of memory, or "
@@ -248,7 +263,7 @@ class Source(Extension, ABC):
                     yield row.scene
                     if len(index.scene_id) == most:
                         break
-                elif row.reason in (OVERLAP, TOO_SHORT, NO_VERSION):
+                elif row.usual:
                     index.dropped[row.reason] += 1
                 elif self.skip_invalid:
                     index.dropped["invalid"] += 1
@@ -302,6 +317,36 @@ def source_of(data: Mapping) -> Source:
     if not issubclass(kind, Source):
         raise InputError(f"data={target}: is no e2rl.scenes.source.Source; subclass it, and define logs() and read()")
     return settings_of(kind, {key: value for key, value in data.items() if key != "_target_"}, "data")
+
+
+def _told_apart(log: str, rows: list[Row], known: set[str]) -> Iterator[Row]:
+    """Yields the rows of a log with ids that no earlier scene has: ID:FILE or ID:FILE@START where theirs are taken.
+
+    Args:
+        log: its name.
+        rows: what it makes.
+        known: ids of the scenes so far, to which theirs are added.
+    """
+    scene_ids = [row.scene_id for row in rows if row.scene is not None]
+    mark = "" if known.isdisjoint(scene_ids) else f":{Path(log).stem}"
+    for row in rows:
+        if row.scene is not None:
+            marks = chain([mark, f":{Path(log).with_suffix('')}"], map(f"{mark}:{{}}".format, count(2)))
+            scene_id = next(filter(partial(_is_free, known=known), (_marked(row.scene_id, each) for each in marks)))
+            known.add(scene_id)
+            row = row._replace(scene_id=scene_id)
+        yield row
+
+
+def _is_free(scene_id: str, known: set[str]) -> bool:
+    """Returns whether an id can be a scene's, and none of `known` is."""
+    return scene_id not in known and scene_id.isprintable() and len(scene_id) <= MAX_NAME
+
+
+def _marked(scene_id: str, mark: str) -> str:
+    """Returns the id of a scene with a mark behind that of its log, before the start frame of a window."""
+    name, at, start = scene_id.rpartition("@")
+    return f"{name}{mark}{at}{start}" if at else f"{scene_id}{mark}"
 
 
 def _naming(log: str, error: InputError) -> str:

@@ -74,10 +74,12 @@ def unparked(recording: Recording) -> Recording:
     lines = [resample(lane.points, 1.0) for lane in recording.lanes.values() if len(lane.points) > 1]
     beside = cKDTree(np.concatenate([np.zeros((0, 2)), *lines])).query(np.where(stands[:, None], low, 0.0))[0] > BESIDE
     keep = ~(stands & beside & (recording.agent_type == VEHICLE))
-    keep[recording.ego] = True
+    keep[[recording.ego, *recording.egos.values()]] = True
     tracks = {name: getattr(recording, name)[:, keep] for name in ("states", "valid")}
     of = {name: getattr(recording, name)[keep] for name in ("size", "agent_type")}
-    return replace(recording, **tracks, **of, ego=int(keep[: recording.ego].sum()))
+    place = np.cumsum(keep) - 1
+    egos = {start: int(place[ego]) if ego >= 0 else -1 for start, ego in recording.egos.items()}
+    return replace(recording, **tracks, **of, ego=int(place[recording.ego]), egos=egos)
 
 
 def turned(recording: Recording) -> Recording:
@@ -115,7 +117,7 @@ def other_ego(recording: Recording) -> Recording | None:
     whole = recording.valid.all(0) & (recording.agent_type == VEHICLE)
     whole[recording.ego] = False
     driven = np.linalg.norm(recording.states[-1, :, :2] - recording.states[0, :, :2], axis=-1) * whole
-    return replace(recording, ego=int(driven.argmax())) if driven.max() > MOVES else None
+    return replace(recording, ego=int(driven.argmax()), egos={}) if driven.max() > MOVES else None
 
 
 VERSIONS: dict[str, Callable[[Recording], Recording | None]] = {

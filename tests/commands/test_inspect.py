@@ -78,6 +78,15 @@ def test_what_is_not_there_ends_with_one_line_and_writes_nothing(folder, tmp_pat
     assert not (tmp_path / "x.png").exists()
 
 
+def test_where_no_log_makes_a_scene_the_reasons_are_told(tmp_path, capsys):
+    folder = write_folder(tmp_path / "x", [description({"ego": straight(20, 0, 8), "7": straight(23, 0.5, 8)})])
+    with pytest.raises(SystemExit):
+        run(folder, "--out", tmp_path / "x.png", capsys=capsys)
+    shown = capsys.readouterr()
+    assert number(shown.out, "left out") == "1" and "1 x ego overlaps a vehicle at the start" in shown.out
+    assert "no log makes a scene" in shown.err and "None" not in shown.err
+
+
 def test_two_data_sets_are_apart_where_they_share_no_place(tmp_path, capsys):
     """As a split into training and test scenes must be; what has no place cannot be told."""
     index = "file,location_group\none/sd_00.pkl,a\none/sd_01.pkl,b\n"

@@ -113,6 +113,12 @@ def test_pedestrians_count_apart_and_do_not_end_the_rollout():
     assert (result["cfr_vru"], result["cfr"], result["partner"]) == (1, 1, 2)
 
 
+@pytest.mark.parametrize(("kind", "vru", "thing"), [(1, 1, 0), (2, 1, 0), (3, 0, 1)])
+def test_an_object_is_no_pedestrian_or_cyclist(kind, vru, thing):
+    result = row(course(0, 0, 0, 10), course(30, 0, 0, 0), kinds=[0, kind])
+    assert (result["cfr_vru"], result["cfr_object"], result["cfr"]) == (vru, thing, 0)
+
+
 def test_background_pairs_leave_out_those_that_overlap_at_the_start_and_what_comes_after_the_ego_s_contact():
     ego, far = course(0, 0, 0, 0), course(0, 100, 0, 0)
     meeting = course(30, 100, math.pi, 10)

@@ -80,7 +80,8 @@ def score(file):
     heading = ego[:-1, 2] + np.arctan2(np.sin(turn), np.cos(turn)) / 2
     found = {
         "cfr": np.nan if unknown else float(hit),
-        "cfr_vru": float(((area * ~vehicle)[1 : stop + 1] > 0).any()),
+        "cfr_vru": float(((area * np.isin(file["agent_type"], ("pedestrian", "cyclist")))[1 : stop + 1] > 0).any()),
+        "cfr_object": float(((area * (file["agent_type"] == "other"))[1 : stop + 1] > 0).any()),
         "contact_step": float(stop) if hit else np.nan,
         "partner": float((area * vehicle)[stop].argmax()) if hit else -1.0,
         "min_dtc": 0.0 if hit else gap.min() if np.isfinite(gap).any() else np.nan,

@@ -164,8 +164,9 @@ def test_overlap_with_the_ego_is_seen_and_only_that():
     aside = np.stack([20 + 0.8 * ALL + 3.5, np.full(FRAMES, 2.1)], 1)
     assert not ego_overlaps(build({"ego": straight(20, 0, 8), "a": track(aside, -0.4, 8.0)}))
     assert ego_overlaps(build({"ego": straight(20, 0, 8), "a": track(aside, 0.4, 8.0)}))
-    walker = straight(21, 0, 8, kind="PEDESTRIAN", size=(0.5, 0.5))
-    assert not ego_overlaps(build({"ego": straight(20, 0, 8), "p": walker}))
+    for kind, word in (("PEDESTRIAN", "a pedestrian"), ("CYCLIST", "a cyclist"), ("TRAFFIC_CONE", "an object")):
+        other = {"p": straight(21, 0, 8, kind=kind, size=(0.5, 0.5)), "far": straight(60, 0, 8, kind=kind)}
+        assert ego_overlaps(build({"ego": straight(20, 0, 8)} | other)) == word
 
 
 @pytest.mark.parametrize(

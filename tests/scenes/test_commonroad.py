@@ -12,6 +12,9 @@ pytest.importorskip("commonroad", reason="data=commonroad needs the extra common
 from e2rl.scenes.commonroad import CommonRoadSource, read_scenario
 from tests.scenes.descriptions import recordings_in
 
+LANELETS_FOR_OTHERS = {"sidewalk", "crosswalk", "bicycleLane", "busStop", "border", "parking", "restricted", "shoulder"}
+LANELETS_FOR_OTHERS |= {"busLane", "restricted_area"}
+
 
 def exact(name: str, value: float) -> str:
     return f"<{name}><exact>{value}</exact></{name}>"
@@ -131,6 +134,36 @@ def test_the_ego_is_who_starts_where_the_planning_problem_does_else_who_moves_lo
     assert read_scenario(scenario(gone)).ego == 1  # who is there at the start frame
     with pytest.raises(InputError, match="no ego"):
         read_scenario(scenario([obstacle(12, -5, 1, 91, 0.1, kind="pedestrian")])).validate_log()
+
+
+def test_every_window_of_a_long_scenario_has_an_ego_that_is_there():
+    """Cars come and go; in the third window nobody has come yet, in the last one nobody moves but the bicycle."""
+
+    def present(number: int, begin: int, end: int, speed: float = 6.0) -> str:
+        text = obstacle(number, 0, speed, end - begin, 0.1)
+        return re.sub(r"<time><exact>(\d+)", lambda found: f"<time><exact>{int(found[1]) + begin}", text)
+
+    cars = [present(10, 0, 150), present(11, 5, 90), present(12, 80, 190, 9.0), present(13, 250, 400)]
+    (*windows,) = recordings_in(CommonRoadSource, scenario(cars), "made.xml")
+    assert [window.current for window in windows] == [10, 101, 192, 283]
+    assert [window.scene_id for window in windows] == [f"DEU_Made-7_1_T-1@{start}" for start in (10, 101, 192, 283)]
+    assert [window.ego for window in windows] == [0, 2, -1, 3]
+    assert [window.has_ego() for window in windows] == [True, True, False, True]
+
+
+@pytest.mark.parametrize("kind", sorted(LANELETS_FOR_OTHERS))
+def test_lanelets_for_others_are_no_lanes_and_paved_ones_are_drivable(kind):
+    text = scenario().replace(b"<laneletType>sidewalk", f"<laneletType>{kind}".encode())
+    recording = read_scenario(text)
+    assert set(recording.lanes) == {"1", "2", "3", "4"}
+    assert len(recording.drivable) == 4 + (kind in ("shoulder", "busLane"))
+
+
+@pytest.mark.parametrize(("users", "lanes"), [("", 5), ("vehicle", 5), ("car", 5), ("bus", 4), ("pedestrian", 4)])
+def test_whom_a_lanelet_is_for_decides(users, lanes):
+    use = f"<userOneWay>{users}</userOneWay>" if users else ""
+    text = scenario().replace(b"<laneletType>sidewalk</laneletType>", f"<laneletType>urban</laneletType>{use}".encode())
+    assert len(read_scenario(text).lanes) == lanes
 
 
 def turned(text: bytes, angle: bytes) -> bytes:

@@ -211,6 +211,60 @@ def test_start_frames():
     assert [r.current for r in read(long)] == [10, 101, 192]
 
 
+def long_description(**metadata) -> dict:
+    """27.3 s, in which the ego waits three times where it began."""
+    scene = description(ts=np.arange(273) * 0.1, **metadata)
+    for agent in scene["tracks"].values():
+        agent["state"] = {key: np.concatenate([value] * 3) for key, value in agent["state"].items()}
+    return scene
+
+
+@pytest.mark.parametrize(("named", "start"), [(0, 10), (3, 10), (9, 10), (10, 10), (40, 40), (233, 233), (250, 10)])
+def test_a_start_frame_with_too_little_past_or_future_is_moved_and_that_is_counted(named, start):
+    (recording,) = read(long_description(current_time_index=named))
+    assert recording.current == start and recording.scene_id == "fork"
+    assert sum(recording.repairs.values()) == (named != start)
+
+
+def test_a_moved_start_frame_is_where_the_ego_has_been_for_a_second():
+    scene = long_description(current_time_index=0)
+    scene["tracks"]["ego"]["state"]["valid"] = np.arange(273) >= 25
+    (recording,) = read(scene)
+    assert recording.current == 35
+
+
+@pytest.mark.parametrize("form", ["columns", "three numbers", "metadata", "scalars", "metadata size"])
+def test_sizes_are_read_wherever_converters_write_them(form):
+    scene = description()
+    for agent in scene["tracks"].values():
+        state = agent["state"]
+        length, width = float(state.pop("length")[0]), float(state.pop("width")[0])
+        if form == "columns":
+            state["size"] = np.tile([length, width, 1.5], (FRAMES, 1))
+        elif form == "three numbers":
+            state["size"] = [length, width, 1.5]
+        elif form == "scalars":
+            state |= {"length": length, "width": width}
+        else:
+            agent["metadata"] = {"length": length, "width": width} if form == "metadata" else {"size": [length, width]}
+    (recording,) = read(scene)
+    assert recording.size.tolist() == [[4.5, 1.9], [4.5, 1.9], [0.6, 0.6]] and not recording.repairs
+
+
+@pytest.mark.parametrize("value", [None, 0.0, np.nan])
+def test_a_size_that_is_missing_or_not_positive_is_the_usual_one_of_the_type(value):
+    kinds = {"VEHICLE": (4.6, 1.9), "TRAFFIC_CONE": (0.4, 0.4), "TRAFFIC_BARRIER": (2.0, 0.5), "PEDESTRIAN": (0.7, 0.7)}
+    others = {kind: straight(50 + 10 * number, -6, 0, kind=kind) for number, kind in enumerate(kinds)}
+    for agent in others.values():
+        for name in ("length", "width"):
+            agent["state"].pop(name)
+            if value is not None:
+                agent["state"][name] = np.full(FRAMES, value)
+    (recording,) = read(description({"ego": straight(20, 0, 8)} | others))
+    assert recording.validate_log().size[1:].tolist() == [list(size) for size in kinds.values()]
+    assert sum(recording.repairs.values()) == len(kinds)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

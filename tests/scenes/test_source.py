@@ -136,6 +136,32 @@ def test_overlaps_with_the_ego_and_logs_too_short_are_dropped_and_counted(tmp_pa
         load_scenes(data_config(folder, tmp_path / "cache"), starts=[80])
 
 
+def test_what_overlaps_the_ego_is_counted_by_its_kind(tmp_path):
+    ego = straight(20, 0, 8)
+    kinds = {"PEDESTRIAN": "a pedestrian", "CYCLIST": "a cyclist", "TRAFFIC_CONE": "an object"}
+    close = [description({"ego": ego, "7": straight(29, 0.5, 0, kind=kind, size=(0.6, 0.6))}) for kind in kinds]
+    folder = write_folder(tmp_path / "x", [*close, *scenes_of(1)])
+    found = load_scenes(data_config(folder, tmp_path / "cache"))
+    assert found.dropped == {f"ego overlaps {word} at the start": 1 for word in kinds.values()}
+
+
+def test_equal_ids_are_told_apart_by_file_whatever_number_of_scenes_is_asked_for(tmp_path):
+    same_ids = [scene | {"id": "same"} for scene in scenes_of(3)]
+    folder = write_folder(tmp_path / "x", same_ids)
+    config = data_config(folder, tmp_path / "cache")
+    assert load_scenes(config, 2).scene_id == ["same", "same:sd_01"]
+    assert load_scenes(config).scene_id == ["same", "same:sd_01", "same:sd_02"]
+    windows = load_scenes(config, starts=[10, 20]).scene_id
+    assert windows == [f"same{mark}@{start}" for mark in ("", ":sd_01", ":sd_02") for start in (10, 20)]
+    (folder / "b").mkdir()
+    (folder / "sd_02.pkl").rename(folder / "b" / "sd_01.pkl")
+    assert load_scenes(config).scene_id == ["same", "same:sd_00", "same:sd_01"]
+    (folder / "c").mkdir()
+    (folder / "b" / "sd_01.pkl").rename(folder / "c" / "sd_01.pkl")
+    (folder / "b" / "sd_01.pkl").write_bytes((folder / "sd_01.pkl").read_bytes())
+    assert load_scenes(config).scene_id == ["same", "same:sd_01", "same:sd_00", "same:sd_01:2"]
+
+
 @dataclass
 class SpeedSource(Source):
     """An outside source: each *.txt file below `path` holds the speed of a car on a straight road."""
