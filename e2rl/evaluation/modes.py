@@ -86,6 +86,8 @@ def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
     and its most typical rollout. Fractions and means are over the members that know the value, None without any."""
     keys = [group_of(row) for row in members]
     by_group = [keys.count(tuple(group[name] for name in GROUP)) for group in groups]
+    counting = [key for key, row in zip(keys, members, strict=True) if row.get("counted") == 1]
+    counts = [counting.count(tuple(group[name] for name in GROUP)) for group in groups]
     total = sum(group["failures"] for group in groups)
     typical = members[medoid(members)]
     return {
@@ -95,8 +97,8 @@ def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
         "fraction": len(members) / total,
         "groups": [
             {"method": group["method"], "ego_policy": group["ego_policy"], "eta": group["eta"], "count": count}
-            | {"fraction": count / group["failures"] if group["failures"] else None}
-            for group, count in zip(groups, by_group, strict=True)
+            | {"fraction": count / group["failures"] if group["failures"] else None, "counted": counted}
+            for group, count, counted in zip(groups, by_group, counts, strict=True)
         ],
         **{name: known_mean(members, name) for name in (*VERDICTS, *MEANS)},
         "typical": {name: typical[name] for name in TYPICAL} | {"file": rollout_name(typical)},

@@ -15,11 +15,12 @@ from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.metrics.atlas import CELL
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report.comparison_tables import by_ego
-from e2rl.report.headline import plural, traffic_name
+from e2rl.report.headline import errored_lines, plural, row_headline, traffic_name, unit_of
 from e2rl.report.tables import UNKNOWN, closed_loop, number
 
 LINES, NARROWEST, WIDEST = 25, 80, 100
 WEAKNESSES, MOST_ROWS, MOST_CELLS = 3, 10, 7  # lines of failure modes; rows of a comparison, of an atlas
+HEADLINES = 3  # of traffic and egos
 KINDS = {"preventable": "cfr_preventable", "clean": "cfr_clean", "count": "cfr_counted"}  # of failures, the first leads
 COUNTS = (
     "preventable: a careful and competent driver would have had none; clean: besides, nobody else did wrong; count: "
@@ -39,8 +40,9 @@ def answer_lines(
     folder: Path | None = None,
     report: Path | None = None,
     notes: Sequence[str] = (),
+    rollouts: Sequence[dict] = (),
 ) -> list[str]:
-    """Returns the lines that say what an evaluation found.
+    """Returns the lines that say what an evaluation found: the headline of each traffic first.
 
     One attack on one ego is told in sentences. Several egos, methods or intensities have a table of one row each.
 
@@ -50,11 +52,13 @@ def answer_lines(
         folder: of the run, which holds tables.md.
         report: the failure report, where one was written.
         notes: further lines, such as the scenes that were left out.
+        rollouts: of rollouts.csv, of which those that errored are named.
     """
     driven = [row for row in closed_loop(rows) if row["n_rollouts"]]
     nominal = [row for row in driven if not row["eta"]]
     attacks = [row for row in driven if row["eta"]]
-    lines: list[str] = []
+    first = sorted(driven, key=lambda row: not row["eta"])[:HEADLINES]  # attacks before nominal traffic
+    lines = [line for text in (*map(row_headline, first), *errored_lines(rollouts)) for line in wrapped(text, "  ")]
     if len({row["ego"] for row in driven}) == 1 and len(attacks) <= 1 and len(nominal) <= 1:
         lines += told(attacks[0] if attacks else nominal[0], nominal[0] if attacks and nominal else None)
     elif driven:
@@ -127,7 +131,10 @@ def atlas_lines(before: Mapping, after: Mapping) -> list[str]:
 
 def told(row: dict, nominal: dict | None) -> list[str]:
     """Sentences about one row of metrics.json, beside the nominal traffic where that was driven."""
-    found = f"{row['ego']} was hit in {of(row, 'cfr')} {'attacked ' if row['eta'] else ''}rollouts ({rate(row, 'cfr')})"
+    if row.get("searched"):
+        return [line for text in searched(row, nominal) for line in wrapped(text, "  ")]
+    kind = "attacked rollouts" if row["eta"] else "rollouts"
+    found = f"{row['ego']} {ended(row)} in {of(row, 'cfr')} {kind} ({rate(row, 'cfr')})"
     per_km = value(row, "counted_per_km")
     rates = "" if per_km == UNKNOWN else f"Failures that count per 1,000 km driven: {per_km}"
     sentences = [f"{found}.", verdict(row), rates and f"{rates}."]
@@ -136,6 +143,19 @@ def told(row: dict, nominal: dict | None) -> list[str]:
         sentences += [rates and f"{rates} attacked, {value(nominal, 'counted_per_km')} nominal."]
         sentences += [effect(row, nominal), cost(row, nominal)]
     return [line for sentence in sentences for line in wrapped(sentence, "  ")]
+
+
+def searched(row: dict, nominal: dict | None) -> list[str]:
+    """Sentences about the tries of a search, of which there are numbers and no rates."""
+    hits = row["metrics"].get("counted", {}).get("n", 0)
+    sentences = [f"Tries end in {hits} contacts. {verdict(row)}" if hits else "No try ends in a contact."]
+    return [*sentences, cost(row, nominal)] if nominal else sentences
+
+
+def ended(row: dict) -> str:
+    """What a rollout that counts in `cfr` has come to."""
+    crashed = tally(row, "errored")
+    return f"was hit ({tally(row, 'cfr') - crashed}) or raised ({crashed})" if crashed else "was hit"
 
 
 def verdict(row: dict) -> str:
@@ -147,8 +167,8 @@ def verdict(row: dict) -> str:
     search = f" A search found a way out of {tally(row, 'avoidable')} of {avoidable}." if avoidable else ""
     preventable, fault = tally(row, "preventable"), tally(row, "at_fault")
     text = f"A careful and competent driver would have prevented {preventable or 'none'} of the {hits}"
-    if preventable:
-        text += f" ({tally(row, 'cfr_clean')} clean: nobody else did wrong)"
+    if preventable and not row.get("searched"):
+        text += f" ({tally(row, 'cfr_clean') - tally(row, 'errored')} clean: nobody else did wrong)"
     blame = f"the ego was at fault in {fault}" if fault else "the ego was never at fault"
     return f"{text}; {blame}. So {found or 'none'} count{'s' if found == 1 else ''}.{search}"
 
@@ -196,9 +216,11 @@ def compared(rows: Sequence[dict]) -> list[str]:
     ego, name = ranked[0]
     best = cells[ranked[0]]
     most = "fails most" if best["metrics"]["cfr"]["mean"] else "does not fail, not even"
-    lead = f"{ego} {most} in the traffic of {name}: hit in {of(best, 'cfr')} rollouts"
+    hits, crashed = f"{of(best, 'cfr')} {unit_of(best)}", tally(best, "errored")
+    hits = f"hit or raised in {hits}" if crashed else f"hit in {hits}"
+    lead = f"{ego} {most} in the traffic of {name}: {hits}"
     if several:
-        lead = f"{ego} fails least: it was hit in {of(best, 'cfr')} rollouts {traffic(best)}"
+        lead = f"{ego} fails least: it {'' if crashed else 'was '}{hits} {traffic(best)}"
     kinds = [f"{of(best, metric).partition(' ')[0]} {kind}" for kind, metric in KINDS.items()]
     lead += f", of them {kinds[0]}, {kinds[1]}; {kinds[2]}."
     table = [["ego", "traffic", "hit", *KINDS, "realism", "count per 1,000 km"]]
@@ -214,20 +236,32 @@ def compared(rows: Sequence[dict]) -> list[str]:
 
 
 def weaknesses(modes: Mapping | None) -> list[str]:
-    """The failure modes with the most failures that count, a line each; where none counts, the most frequent ones."""
-    found = [mode for mode in (modes["modes"] if modes else ()) if mode["mode"] != OTHER]
-    if modes is None or not found:
+    """The failure modes with the most failures that count, a line each; where none counts, the most frequent ones.
+
+    They are of the attacks, where there are any, and not of nominal traffic.
+    """
+    groups = modes["groups"] if modes else []
+    attacks = [place for place, group in enumerate(groups) if group["eta"]]
+    chosen = attacks or list(range(len(groups)))
+    total = sum(groups[place]["failures"] for place in chosen)
+    if modes is None or not total:
         return []
-    counts = {mode["mode"]: round((mode["counted"] or 0) * mode["count"]) for mode in found}
-    any_counts = any(counts.values())
-    chosen = [mode for mode in found if counts[mode["mode"]] or not any_counts]
-    chosen.sort(key=lambda mode: (-counts[mode["mode"]], -mode["count"], mode["mode"]))
+    count, counted = (
+        {mode["mode"]: sum(mode["groups"][place][name] for place in chosen) for mode in modes["modes"]}
+        for name in ("count", "counted")
+    )
+    any_counts = any(counted.values())
+    found = [mode for mode in modes["modes"] if mode["mode"] != OTHER and count[mode["mode"]]]
+    found = [mode for mode in found if counted[mode["mode"]] or not any_counts]
+    found.sort(key=lambda mode: (-counted[mode["mode"]], -count[mode["mode"]], mode["mode"]))
+    if not found:
+        return wrapped(f"No weakness stands out: {sum(counted.values())} failures that count are each of another kind.")
     lines = [
         f"Weaknesses, {'most failures that count first' if any_counts else 'although none of the failures counts'}:"
     ]
-    for place, mode in enumerate(chosen[:WEAKNESSES], 1):
-        text = f"{place}. {mode['name']} ({mode['count']} of {plural(modes['failures'], 'failure')}"
-        lines += wrapped(f"{text}, {counts[mode['mode']]} count)" if any_counts else f"{text})", "   ")
+    for place, mode in enumerate(found[:WEAKNESSES], 1):
+        text = f"{place}. {mode['name']} ({count[mode['mode']]} of {plural(total, 'failure')}"
+        lines += wrapped(f"{text}, {counted[mode['mode']]} count)" if any_counts else f"{text})", "   ")
     return lines
 
 

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.evaluation.comparison import CHANGES, PAIR, RATES, Driven, compared
+from e2rl.evaluation.headline import headline
 from e2rl.evaluation.rollout_files import cell, json_text, own_folder
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import Row, is_failure, mode_name
 from e2rl.report.answer import FEW, wrapped
 from e2rl.report.failure_tracks import replay_data
-from e2rl.report.headline import traffic_name
+from e2rl.report.headline import errored_lines, headline_text, traffic_name
 from e2rl.report.html import ASSETS, COLUMNS, page
 from e2rl.report.tables import difference_cell
 from e2rl.run.endings import ending
@@ -38,17 +39,18 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
     groups, pairs = compared(first, second)
     names = [f"{one.ego} of {one.run}" if first.ego == second.ego else one.ego for one in (first, second)]
     rows = [pair | {side: facts(pair[side]) for side in SIDES} for pair in pairs]
-    told = [*sentences(groups, first.searched), *notes(first, second, groups)]
+    told = [*headlines(names, (first, second)), *sentences(groups, first.searched), *notes(first, second, groups)]
     changed = [pair for pair in pairs if pair["change"] != "same"]
     runs = first.run, second.run
-    shown = changed[:MOST] if all((run / ROLLOUTS).is_dir() for run in runs) else []
+    ended = [pair for pair in changed if all(pair[side]["errored"] != 1 for side in SIDES)]  # which have files
+    shown = ended[:MOST] if all((run / ROLLOUTS).is_dir() for run in runs) else []
     about = {"names": names, "runs": [*map(str, runs)], "groups": groups, "pairs": rows}
     replays = replay_data(replayed(runs, shown), 2 * len(shown))
     content = {**about, "told": told, "pairs": rows[: len(changed)], **replays}
     scripts = [*(ASSETS / f"{name}.js" for name in SCRIPTS), FOLDER / "compare.js"]
     write_atomically(path, page(FOLDER / PAGE, " against ".join(names[::-1]), scripts, content))
     write_beside(path, ".json", json_text(about))
-    columns = [*PAIR, "change", "what", *(f"{name}_{side}" for side in SIDES for name in (*FACTS, "file"))]
+    columns = [*PAIR, "change", "what", *(f"{name}_{side}" for side in SIDES for name in (*FACTS, "file", "error"))]
     flat = [row | {f"{name}_{side}": cell(row[side][name]) for side in SIDES for name in row[side]} for row in rows]
     lines = [[" ".join(row[name]) if name == "what" else row[name] for name in columns] for row in flat]
     write_beside(path, ".csv", csv_text([columns, *lines]))
@@ -60,7 +62,16 @@ def facts(row: Row) -> dict[str, Any]:
     """What the page knows of a rollout: FACTS, its file, whether it has a `contact`, and in words what happens."""
     values = {name: round(row[name], 4) if isinstance(row[name], float) else row[name] for name in FACTS}
     hit = is_failure(row)
-    return {**values, "file": rollout_name(row), "contact": hit, "named": mode_name([row]) if hit else "no contact"}
+    named = mode_name([row]) if hit else f"raised {row['error']}" if row["errored"] == 1 else "no contact"
+    return {**values, "file": rollout_name(row), "contact": hit, "error": row["error"], "named": named}
+
+
+def headlines(names: Sequence[str], sides: Sequence[Driven]) -> Iterator[str]:
+    """The headline of both in each traffic, and what errored."""
+    for name, driven in zip(names, sides, strict=True):
+        for rows in driven.traffic().values():
+            yield headline_text(headline(rows, driven.searched), name, traffic_name(rows[0]))
+        yield from (f"{name}: {line}" for line in errored_lines(driven.rows))
 
 
 def sentences(groups: Sequence[Mapping], searched: bool) -> Iterator[str]:
@@ -69,7 +80,7 @@ def sentences(groups: Sequence[Mapping], searched: bool) -> Iterator[str]:
         (new, gone, moved, same), counts = (group[name] for name in CHANGES), group["preventable"]
         text = f"{traffic_name(dict(group))}, {group['of']} {group['unit']}: "
         if searched:
-            text += f"preventable failures in {gone + moved + same} before, in {new + moved + same} after: "
+            text += f"failures in {gone + moved + same} before, in {new + moved + same} after: "
             yield f"{text}{new} new, {gone} gone, {moved} moved to other ways, {same} the same way."
         else:
             text += f"{new} failures are new ({counts['new']} preventable), "

@@ -21,6 +21,7 @@ from e2rl.report.tables import (
     heading,
     known_metrics,
     mean_cell,
+    notes_on,
     origin,
 )
 from e2rl.run.files import csv_text, write_atomically
@@ -92,7 +93,8 @@ def tables_of(
     the `references` {name: its key in a row's `paired`} where there are some."""
     metrics, labelled = known_metrics(group, table_metrics(table)), list(zip(labels, group, strict=True))
     means = [[*cells, *(mean_cell(metric, row) for metric in metrics)] for cells, row in labelled]
-    found = [Table(f"{caption.strip().rstrip('.')}.", [*head, *map(heading, metrics)], means, title)]
+    caption = " ".join(filter(None, (f"{caption.strip().rstrip('.')}.", notes_on(group))))
+    found = [Table(caption, [*head, *map(heading, metrics)], means, title)]
     pairs = [
         [*cells, name, *(difference_cell(metric, row["paired"][key].get(metric.name)) for metric in metrics)]
         for name, key in references.items()

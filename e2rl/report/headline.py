@@ -7,7 +7,7 @@ from e2rl.evaluation.headline import Headline
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.metrics.errored import lost, raised
 
-NAMED = 4  # rollouts of one message that a summary names
+NAMED, MESSAGES = 4, 3  # rollouts of a message, and messages, that a summary names
 
 
 def plural(count: int, word: str) -> str:
@@ -33,6 +33,20 @@ def headline_text(found: Headline, ego: str, traffic: str) -> str:
     return f"{text}."
 
 
+def unit_of(row: Mapping[str, Any], count: int = 2) -> str:
+    """What the rates of events of a row of metrics.json are of, for so many of them."""
+    if not row.get("searched"):
+        return "rollout" if count == 1 else "rollouts"
+    if row["n_seeds"] > 1:
+        return "searches of a scene"
+    return "scene" if count == 1 else "scenes"
+
+
+def row_headline(row: Mapping[str, Any]) -> str:
+    """The headline of a row of metrics.json, "" where it has none."""
+    return headline_text(Headline(**row["headline"]), row["ego"], traffic_name(row)) if row.get("headline") else ""
+
+
 def errored_lines(rows: Sequence[Mapping[str, Any]], named: int = NAMED) -> list[str]:
     """What errored, a sentence for each message: how many rollouts, whose they are, and `named` of them.
 
@@ -52,7 +66,8 @@ def errored_lines(rows: Sequence[Mapping[str, Any]], named: int = NAMED) -> list
         if total:
             count = f"{total} of {plural(len(rows), 'rollout')}"
             lines.append(f"{text.format(count)}:")
-        for message, own in groups.items():
+        ranked = sorted(groups.items(), key=lambda item: -len(item[1]))
+        for message, own in ranked[: MESSAGES if named else None]:
             shown = own[: named or len(own)]
             names = "; ".join(f"{row['scene_id']} seed {row['seed']} {traffic_name(row)}" for row in shown)
             rest = len(own) - len(shown)

@@ -7,6 +7,7 @@ collisions over realism. Everything is inside the file: no script, font or pictu
 import argparse
 import html
 import json
+import math
 import os
 import re
 import shlex
@@ -16,14 +17,17 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.evaluation.budget import TRIES_FILE
+from e2rl.evaluation.headline import headline
 from e2rl.evaluation.methods import SEARCH
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, own_folder, read_metrics, read_rows
+from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, own_folder, read_metrics, read_run
 from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
+from e2rl.metrics.errored import raised
 from e2rl.metrics.failure_modes import is_failure
-from e2rl.report.answer import of, rate
+from e2rl.report.answer import FEW, of, rate
 from e2rl.report.failure_tracks import replay_data
+from e2rl.report.headline import errored_lines, headline_text, traffic_name, unit_of
 from e2rl.report.tables import Table, closed_loop, column_names, metric_tables, mode_tables
 from e2rl.run.config import assigned
 from e2rl.run.endings import ending
@@ -36,6 +40,7 @@ PAGE = "failures.html"
 REPLAYS = 300  # in the page at most
 ASSETS = Path(__file__).parents[1] / "assets" / "report"
 GROUP = ("ego_policy", "method", "eta")
+ENDINGS = ("errored", "raised_by", "error")  # of rollouts.csv, the last in failures.csv
 COLUMNS = (  # of rollouts.csv, in failures.csv and in the page's index and facts
     *("scene_id", "location", *GROUP, "seed", "contact_time", "counted", "at_fault", "preventable", "cfr_clean"),
     *("duty", "contact_type", "partner", "relvel", "approach", "ego_manoeuvre", "partner_manoeuvre"),
@@ -44,7 +49,7 @@ COLUMNS = (  # of rollouts.csv, in failures.csv and in the page's index and fact
 PLOTTED = ("cfr", "cfr_counted", "real", "real_adv")
 AGAIN = "Drive it again"
 MEASURED = ("before", f"before/{SEARCH}", "after", f"after/{SEARCH}")  # folders of a training
-RATES = ("cfr", "cfr_counted", "cfr_preventable")  # in the page's first lines
+RATES = ("cfr", "cfr_counted", "cfr_preventable")  # of a group, in words
 
 
 def write_report(
@@ -82,14 +87,19 @@ def write_report(
 
 def failure_list(content: Mapping[str, Any], page_name: str) -> str:
     """failures.csv: a line for each failure of the data block: its name, COLUMNS, its mode in words, the link to it in
-    the page, and the command that drives it again."""
+    the page, the command that drives it again, and ENDINGS; then one for each rollout that errored, which has no mode,
+    link or command."""
     again = content["commands"].get(AGAIN, "")
-    lines = (
+    lines = [
         [entry["key"], *(cell(entry[name]) for name in COLUMNS), content["modes"].get(entry["mode"], "")]
-        + [f"{page_name}#failure={entry['key']}", again.replace("@NAME@", entry["key"])]
+        + [f"{page_name}#failure={entry['key']}", again.replace("@NAME@", entry["key"]), 0, "", ""]
         for entry in content["failures"]
-    )
-    return csv_text([["failure", *COLUMNS, "mode", "link", "again"], *lines])
+    ]
+    lines += [
+        [entry["key"], *(cell(entry[name]) for name in COLUMNS), "", "", "", 1, entry["raised_by"], entry["error"]]
+        for entry in content["errored"]
+    ]
+    return csv_text([["failure", *COLUMNS, "mode", "link", "again", *ENDINGS], *lines])
 
 
 def page(body: Path, title: str, scripts: Sequence[Path], content: Mapping[str, Any]) -> str:
@@ -113,24 +123,32 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
     if wrong := [name for name in methods if name not in known]:
         raise InputError(f"--method {wrong[0]}: not in {run / TABLE}; choose among {', '.join(known)}")
     labels = zip(modes["groups"], column_names(modes["groups"]), strict=True)
+    every, searched = read_run(run), (run / TRIES_FILE).is_file()
     groups = {
-        group_key(group): {"ego": group["ego_policy"], "label": label, "rates": rates(group, metrics)}
+        group_key(group): {"ego": group["ego_policy"], "label": label}
+        | {"rates": rates(group, metrics), "summary": summary(group, metrics, every, searched)}
         | {name: group[name] for name in ("method", "eta", "rollouts", "failures")}
         for group, label in labels
         if not methods or group["method"] in methods
     }
-    rows = [row for row in read_rows(run / TABLE) if is_failure(row) and group_key(row) in groups]
+    rows = [row for row in every if is_failure(row) and group_key(row) in groups]
+    worst = worst_keys(rows)
+    errored = [row for row in every if row["errored"] == 1 and group_key(row) in groups]
     names = {mode["mode"]: mode["name"] for mode in modes["modes"]}
     typical = {mode["typical"]["file"] for mode in modes["modes"]}
     cells, places = atlas_places(rows)
     return {
         "run": {name: metrics[0][name] for name in ("dataset", "split", "n_scenes", "git", "command")}
-        | {"stage": metrics[0].get("stage"), "tries": (run / TRIES_FILE).is_file()},
+        | {"stage": metrics[0].get("stage")},
         "commands": commands(run, "~" in "".join(map(rollout_key, rows))),
         "groups": list(groups.values()),
         "modes": names,
         "cells": [dict(zip(CELL, cell, strict=True)) for cell in cells],
-        "failures": [failure(row, names, typical) | place for row, place in zip(rows, places, strict=True)],
+        "failures": [
+            failure(row, names, typical) | place | {"worst": rollout_key(row) in worst}
+            for row, place in zip(rows, places, strict=True)
+        ],
+        "errored": [{name: row[name] for name in (*COLUMNS, *ENDINGS)} | {"key": rollout_key(row)} for row in errored],
         "rows": rows,
         "points": [plotted(row) for row in closed_loop(metrics)],
         "about": {metric.name: metric.about for metric in METRICS.values()},
@@ -145,7 +163,42 @@ def rates(group: Mapping, metrics: Sequence[dict]) -> dict[str, str]:
     """The RATES of a group of modes.json in words; {} where metrics.json knows the group in a pool only."""
     own = [row for row in closed_loop(metrics) if group_key(row | {"ego_policy": row["ego"]}) == group_key(group)]
     known = [(row, name) for row in own for name in RATES if row["metrics"].get(name, {}).get("n")]
-    return {name: f"{of(row, name)} rollouts ({rate(row, name)})" for row, name in known}
+    return {name: f"{of(row, name)} {unit_of(row)} ({rate(row, name)})" for row, name in known}
+
+
+def summary(group: Mapping, metrics: Sequence[dict], rows: Sequence[dict], searched: bool) -> list[str]:
+    """The page's first lines about a group of modes.json: its headline, then its rates and what to know of them.
+
+    Args:
+        group: ego, method and intensity.
+        metrics: of metrics.json.
+        rows: of all rollouts of the run.
+        searched: they are tries.
+    """
+    own = [row for row in rows if group_key(row) == group_key(group)]
+    known, crashed = rates(group, metrics), any(map(raised, own))
+    lines = [headline_text(headline(own, searched), group["ego_policy"], traffic_name(group))]
+    if "cfr" in known:
+        lines.append(f"It was hit{' or raised' if crashed else ''} in {known['cfr']}.")
+    if "cfr_counted" in known:
+        lines.append(f"{known['cfr_counted']} count: its fault, or a competent driver prevents it.")
+    lines += [] if "interval" in known.get("cfr", "interval") else [FEW]
+    lines += ["Tries go where failures are: rates of tries are no rates of the planner."] if searched else []
+    return lines + errored_lines(own)
+
+
+def worst_keys(rows: Sequence[Mapping]) -> set[str]:
+    """Names of the worst failure of each ego, method and intensity: one that counts where any does, first preventable
+    ones, of these the one with the highest impact speed."""
+
+    def severity(row: Mapping) -> tuple[bool, bool, float]:
+        speed = 0.0 if math.isnan(row["relvel"]) else row["relvel"]
+        return row["counted"] == 1, row["preventable"] == 1, speed
+
+    groups: dict[tuple, list[Mapping]] = {}
+    for row in rows:
+        groups.setdefault(group_key(row), []).append(row)
+    return {rollout_key(max(own, key=severity)) for own in groups.values()}
 
 
 def commands(run: Path, quoted: bool) -> dict[str, str]:
@@ -175,8 +228,8 @@ def atlas_places(rows: Sequence[Mapping]) -> tuple[list[Cell], list[dict[str, in
     cells = sorted({cell for cell in found if cell})
     order = sorted(range(len(rows)), key=lambda position: by_likelihood(rows[position]))
     ranks = {position: rank for rank, position in enumerate(order)}
-    number = {cell: position for position, cell in enumerate(cells)}
-    return cells, [{"cell": number[cell] if cell else None, "rank": ranks[at]} for at, cell in enumerate(found)]
+    position_of = {cell: position for position, cell in enumerate(cells)}
+    return cells, [{"cell": position_of[cell] if cell else None, "rank": ranks[at]} for at, cell in enumerate(found)]
 
 
 def plotted(row: Mapping) -> dict[str, Any]:
@@ -194,8 +247,8 @@ def add_replays(run: Path, rows: Sequence[dict], index: Sequence[dict], count: i
 
 
 def replay_order(index: Sequence[Mapping]) -> list[int]:
-    """Positions of failures in the order in which they get a replay: the typical ones, the likeliest of each cell of
-    the atlas in each traffic, then in turn one of each mode of each method."""
+    """Positions of failures in the order in which they get a replay: the worst of each traffic, the typical ones, the
+    likeliest of each cell of the atlas in each traffic, then in turn one of each mode of each method."""
     seen: Counter[tuple] = Counter()
 
     def turn(position: int, name: str) -> int:
@@ -208,7 +261,8 @@ def replay_order(index: Sequence[Mapping]) -> list[int]:
 
     def place(position: int) -> tuple:
         likeliest = index[position]["cell"] is not None and of_cell[position] == 1
-        return not index[position]["typical"], not likeliest, of_mode[position], position
+        entry = index[position]
+        return not entry["worst"], not entry["typical"], not likeliest, of_mode[position], position
 
     return sorted(range(len(index)), key=place)
 

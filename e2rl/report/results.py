@@ -7,6 +7,7 @@ from e2rl.evaluation.ego_set import recorded_acceleration
 from e2rl.evaluation.methods import ALL, EvaluationSettings, caption, terms_by_method
 from e2rl.evaluation.modes import MODES_FILE, read_modes
 from e2rl.evaluation.plan import Evaluation
+from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.metrics.evasion import search_effort
 from e2rl.report.answer import answer_lines
 from e2rl.report.comparison_tables import EGOS, METHODS, guard_table, method_tables, planner_tables, save_compared
@@ -42,9 +43,11 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
         save_figure(folder / "intensity.png", intensity_figure(intensity_sweep(folder)))
     if asked.figure == "curves":
         save_curves(folder, points_of_rows(rows))
-    shown = asked.report and asked.save_rollouts and modes["failures"]
+    rollouts = read_rows(folder / TABLE)
+    failed = modes["failures"] or any(row["errored"] == 1 for row in rollouts)
+    shown = asked.report and asked.save_rollouts and failed
     page = write_report(folder, rows, modes, tables) if shown else None
-    return answer_lines(rows, modes, folder, page, notes)
+    return answer_lines(rows, modes, folder, page, notes, rollouts)
 
 
 def references(plan: Evaluation) -> tuple[str, ...] | None:

@@ -97,6 +97,7 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
     counted = COUNTED.get(group[0].get("stage", ""))
     caption = f"{origin(group[0])}. {counts(group, names)} "
     caption += f"{MEANS.partition(';')[0]}; {counted}" if counted else MEANS
+    caption += f" {notes_on(group)}" if notes_on(group) else ""
     caption += f" {settings.rstrip('.')}." if settings else ""
     caption += f" Not computable here: {', '.join(unknown)}." if unknown else ""
     rows = [[heading(metric), *(mean_cell(metric, row) for row in group)] for metric in known]
@@ -148,6 +149,24 @@ def counts(group: Sequence[dict], names: Sequence[str], per: str = "method") -> 
     if len(set(texts)) == 1:
         return f"{texts[0]} per {per}."
     return "; ".join(f"{name}: {text}" for name, text in zip(names, texts, strict=True)) + "."
+
+
+def notes_on(group: Sequence[dict]) -> str:
+    """What the rates of rows of metrics.json are of, where planners raised or scenes were searched."""
+    notes = []
+    if any(row["metrics"].get("errored", {}).get("mean", 0.0) > 0 for row in group):
+        failures = [name for name, metric in METRICS.items() if metric.raised == 1 and name != "errored"]
+        notes.append(
+            f"A rollout in which the planner raised (errored) is a failure in {', '.join(failures)}, has a progress of "
+            "0, and is not in the denominators of the others; one that the traffic lost is in none."
+        )
+    if any(row.get("searched") for row in group):
+        events = ", ".join(name for name, metric in METRICS.items() if metric.event)
+        notes.append(
+            f"Tries go where failures are, so their rates are none of the planner: {events} are of searches of a scene "
+            "(n), in any of its tries; the other columns are of tries."
+        )
+    return " ".join(notes)
 
 
 def column_names(group: Sequence[Mapping]) -> list[str]:

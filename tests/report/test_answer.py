@@ -26,11 +26,20 @@ def row(method="nominal", eta=0.0, ego="lane_graph", cfr=0.0, n=12):
     return about | {"method": method, "ego": ego, "eta": eta, "errored": {"lost": 2}, "metrics": metrics}
 
 
-def mode(number, name, count, counted):
-    return {"mode": number, "name": name, "count": count, "counted": counted}
+def mode(number, name, count, counted, nominal=0):
+    """A mode of failures under an attack, of which `counted` count, and of `nominal` ones in nominal traffic, all of
+    which do."""
+    groups = [{"count": nominal, "counted": nominal}, {"count": count, "counted": counted}]
+    return {"mode": number, "name": name, "groups": groups}
 
 
-MODES = {"failures": 8, "modes": [mode(1, "rear", 4, 0.0), mode(2, "oncoming", 2, 1.0), mode(0, "other", 2, 1.0)]}
+def modes_of(*modes):
+    failures = [sum(mode["groups"][place]["count"] for mode in modes) for place in (0, 1)]
+    groups = [{"eta": eta, "failures": count} for eta, count in zip((0.0, 2.0), failures, strict=True)]
+    return {"failures": sum(failures), "groups": groups, "modes": list(modes)}
+
+
+MODES = modes_of(mode(1, "rear", 4, 0), mode(2, "oncoming", 2, 2), mode(0, "other", 2, 2))
 
 
 def test_an_attack_is_told_with_its_numbers_and_the_weaknesses_that_count():
@@ -96,7 +105,7 @@ def test_the_ways_before_and_after_training_stand_side_by_side(tmp_path):
 @pytest.mark.parametrize("width", [80, 100])
 def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
     monkeypatch.setenv("COLUMNS", str(width))
-    long = {"failures": 900, "modes": [mode(k, "crossing from the right, " * 6, 300, 1.0) for k in (1, 2, 3)]}
+    long = modes_of(*(mode(k, "crossing from the right, " * 6, 300, 300) for k in (1, 2, 3)))
     egos = [row(method, eta, ego, 0.5, 9999) for ego in "uvwxyz" for method, eta in (("n", 0.0), ("ctg_adv", 2.5))]
     notes = ["12 scenes left out: the ego overlaps another vehicle at the start of the recording."] * 4
     pairs = [row(f"a_long_name_of_a_method_{k}", 1.0, cfr=0.5) for k in range(9)]
@@ -115,3 +124,45 @@ def test_preventable_failures_decide_then_clean_ones_then_those_that_count():
     lines = answer_lines(rows)
     assert [line.split()[0] for line in lines if " of 12)" in line] == ["clean", "same", "few", "hits"]
     assert "rollouts, of them 4 preventable, 2 clean; 6 count." in " ".join(lines[:2])
+
+
+def headed(found, **values):
+    """A row of a search with a headline."""
+    about = {"scenes": 12, "preventable": 5, "raised": 0, "failed": 5, "ways": 8, "searches": 1}
+    metrics = found["metrics"] | {"counted": value(0.5, 31), "at_fault": value(0.25, 31)}
+    headline = about | {"tries": 4.25, "nfe": 630.4} | values
+    return found | {"searched": True, "headline": headline, "metrics": metrics, "errored": {}}
+
+
+def test_a_search_is_told_by_its_scenes_and_none_of_its_tries_rates():
+    lines = answer_lines([row(cfr=1 / 12), headed(row("search", 2.0, cfr=5 / 12))], MODES)
+    text = " ".join(" ".join(lines).split())
+    said = (
+        "lane_graph under search at η=2: preventable failures in 5 of 12 scenes, in 8 ways, within 4.2 tries (630 NFE)"
+    )
+    assert text.startswith(said) and "%" not in text.partition("What it costs")[0] and "per 1,000 km" not in text
+
+
+def test_nominal_failures_are_not_among_those_of_an_attack():
+    found = modes_of(mode(1, "rear", 4, 1, nominal=3), mode(2, "oncoming", 0, 0, nominal=5))
+    text = " ".join(answer_lines([row(cfr=8 / 12), row("e2", 2.0, cfr=4 / 12)], found))
+    assert "rear (4 of 4 failures, 1 count)" in text and "oncoming" not in text
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [(3, "No weakness stands out: 3 failures that count"), (0, "although none of the failures counts")],
+)
+def test_what_counts_is_not_denied(other, said):
+    found = modes_of(mode(1, "rear", 4, 0), mode(0, "other", 5, other))
+    assert said in " ".join(answer_lines([row("e2", 2.0, cfr=9 / 12)], found))
+
+
+def test_rollouts_in_which_the_planner_raised_are_failures_and_named():
+    crashed = row("e2", 2.0, cfr=9 / 12)
+    crashed["metrics"]["errored"] = value(0.5)
+    about = {"method": "e2", "eta": 2.0, "seed": 0, "errored": 1.0, "raised_by": "ego", "error": "KeyError: lane"}
+    rollouts = [about | {"scene_id": f"place_{k}"} for k in range(6)]
+    text = " ".join(" ".join(answer_lines([crashed], rollouts=rollouts)).split())
+    assert "was hit (3) or raised (6) in 9 of 12 attacked rollouts" in text
+    assert "KeyError: lane (6): place_0 seed 0 e2 at η=2;" in text and "and 2 more in errored.json" in text

@@ -183,8 +183,8 @@ def test_a_link_opens_at_its_failure_from_a_folder_and_from_a_server(run, page):
                     page, f"return page.player.failure.key === {rollout_key(row)!r} && page.player.replay !== null"
                 )
                 assert page.current_url == page.find_element("css selector", "#copies input").get_attribute("value")
-                first = page.find_element("id", "summary").text.partition(".")[0]
-                assert f"In {row['method']} η=2 it was hit in" in first  # the traffic of the failure
+                first = page.find_element("css selector", "#summary strong").text
+                assert f"under {row['method']} at η=2: preventable" in first  # the traffic of the failure
                 assert not page.find_element("id", "lost").is_displayed()
         page.get(f"{base}#failure=none")
         wait_for(page, "return !document.getElementById('lost').hidden")

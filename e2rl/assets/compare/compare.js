@@ -24,11 +24,12 @@ class Duo extends Player {
     this.buildCurves();
     this.prepareScrubber();
     this.views.forEach(({ scene, badge, verdict }, k) => {
-      const { contact, contact_type: type, contact_time: seconds, min_dtc: nearest, progress } = pair[SIDES[k]];
+      const { contact, error, contact_type: type, contact_time: seconds, min_dtc: nearest, progress } = pair[SIDES[k]];
       badge.textContent = contact ? `${type} contact at ${fixed(seconds)} s` : "no contact";
       scene.hidden = badge.hidden = !this.replay;
       showVerdict(verdict, pair[SIDES[k]], replays[k]);
       if (!contact) verdict.textContent = `No contact. Nearest ${fixed(nearest)} m, driven ${fixed(progress)} m.`;
+      if (error) verdict.textContent = `The planner raised: ${error}`;
     });
     this.seek(0);
   }
@@ -69,7 +70,9 @@ const placeOf = ({ scene_id: scene, seed, method, eta }) => `${scene}, seed ${se
 
 class Comparison {
   constructor(data) {
-    data.pairs.forEach((pair, number) => {
+    const driven = data.pairs.filter((pair) => SIDES.every((side) => !pair[side].error)); // others have no file
+    for (const pair of data.pairs) pair.replays = [];
+    driven.forEach((pair, number) => {
       pair.replays = [2 * number, 2 * number + 1].filter((index) => index < data.replays.length);
     });
     document.getElementById("told").append(...data.told.map((text) => element("li", {}, text)));
@@ -87,7 +90,8 @@ class Comparison {
   show(pairs) {
     this.pairs = pairs;
     this.buttons = pairs.map((pair) => {
-      const text = `${placeOf(pair)}; ${verdictOf(failed(pair))}`;
+      const verdict = failed(pair).error ? "a failure of the planner" : verdictOf(failed(pair));
+      const text = `${placeOf(pair)}; ${verdict}`;
       const lines = [element("strong", {}, titleOf(pair)), element("small", {}, text)];
       const button = element("button", { type: "button", class: "pair" }, ...lines);
       button.addEventListener("click", () => {

@@ -85,28 +85,25 @@ class Page {
     const atlas = groupByCell(failures, this.report.cells);
     showAtlas(document.getElementById("atlas"), atlas, (failure) => this.open(failure));
     document.getElementById("player").hidden = !failures.length;
-    if (failures.length) this.open(this.modes[0].typical);
+    if (failures.length) this.open(failures.find(({ worst }) => worst) ?? this.modes[0].typical);
+    showErrored(this.report.errored.filter((rollout) => isOf(rollout, group)));
   }
 
   /** The first lines: how often the planner fails in one traffic; rates of several are not pooled. */
-  summarise(failures, { label, rates, rollouts }) {
-    const named = this.modes.filter(({ mode, counted }) => mode !== OTHER && counted > 0).length;
-    const { dataset, split, n_scenes: scenes, stage, tries } = this.report.run;
-    const found = new Set(failures.filter(({ preventable }) => preventable === 1).map((failure) => failure.scene_id));
-    const hit = rates.cfr ?? `${failures.length} of ${rollouts} rollouts`;
-    const lines = [
-      rates.cfr_counted && `${rates.cfr_counted} count: its fault, or a competent driver prevents it.`,
-      rates.cfr_preventable && `Preventable: ${rates.cfr_preventable}, in ${found.size} of ${scenes} scenes.`,
-      !hit.includes("interval") && "No intervals: they need scenes of at least ten places.",
-      tries && "Tries go where failures are: rates of tries are no rates of the planner.",
-      `${dataset}/${split}, ${scenes} scenes.`,
-    ];
-    const first = element("strong", {}, `In ${label} it was hit in ${hit}.`);
-    document.getElementById("summary").replaceChildren(first, ` ${lines.filter(Boolean).join(" ")}`);
+  summarise(failures, { summary: [headline, ...lines] }) {
+    const { dataset, split, n_scenes: scenes, stage } = this.report.run;
+    lines.push(`${dataset}/${split}, ${scenes} scenes.`);
+    document.getElementById("summary").replaceChildren(element("strong", {}, headline), ` ${lines.join(" ")}`);
     document.getElementById("stage").textContent = stage ? `, ${stage} training` : "";
-    document.getElementById("modes-title").textContent = failures.length
-      ? `Its ${named} weakness${named === 1 ? "" : "es"}`
-      : "No failure found";
+    document.getElementById("modes-title").textContent = this.modesTitle(failures);
+  }
+
+  /** What the list of modes is called; a mode of which no failure counts is no weakness. */
+  modesTitle(failures) {
+    const named = this.modes.filter(({ mode, counted }) => mode !== OTHER && counted > 0).length;
+    if (!failures.length) return "No contact found";
+    if (named) return `Its ${named} weakness${named === 1 ? "" : "es"}`;
+    return this.modes.some(({ counted }) => counted > 0) ? "No weakness stands out" : "None of its failures counts";
   }
 
   /** Show the typical case of a mode, and its failures in the index. */
@@ -128,6 +125,17 @@ class Page {
     markCell(document.getElementById("atlas"), failure);
     this.player.show(failure, capital(modeName(failure.mode, this.report.modes)));
   }
+}
+
+/** The list of rollouts that errored, where there are any. */
+function showErrored(rollouts) {
+  const rows = rollouts.map(({ scene_id: scene, seed, raised_by: by, error }) => {
+    const whose = by === "traffic" ? "the traffic's, left out" : "the planner's, a failure";
+    return element("tr", {}, ...[scene, String(seed), error, whose].map((text) => element("td", {}, text)));
+  });
+  document.getElementById("errored").hidden = !rows.length;
+  document.getElementById("errored-title").textContent = plural(rows.length, "rollout") + " without an end";
+  document.getElementById("errored-rows").replaceChildren(...rows);
 }
 
 const isOf = (failure, { ego, method, eta }) =>

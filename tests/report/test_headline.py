@@ -1,0 +1,131 @@
+"""The headline: counted once from the rows, and the same number wherever a reader meets it."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+from e2rl.evaluation.headline import headline
+from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_metrics, read_rows
+from e2rl.metrics.errored import errored_row
+from e2rl.report.headline import errored_lines, headline_text
+from e2rl.search.tries import TRIES
+from tests.evaluation.constructed_runs import row_of
+from tests.scripts import ROOT
+
+PLANNER = """
+from e2rl.planners.lane_graph_planner import LaneGraphEgo
+
+
+class Fragile(LaneGraphEgo):
+    def plan(self, world):
+        if bool(((world.scene["start"][:, 0, 3] - 10.45).abs() < 0.01).any() and (world.step > 20).any()):
+            raise RuntimeError("no feasible trajectory")
+        return super().plan(world)
+"""
+SMALL = ["num_scenes=4", "seeds=[0]", "tries=3", "processes=1", "data.workers=1", "compile=false"]
+
+
+def errored(scene, seed=0, raised_by="ego", detail="lane"):
+    return errored_row(row_of(scene, seed) | {"reason": "raised KeyError", "detail": detail, "raised_by": raised_by})
+
+
+def test_scenes_count_once_however_often_they_fail_and_errors_stand_apart():
+    rows = [row_of(0, seed, hit=True) for seed in range(3)] + [row_of(1), row_of(2, hit={"cfr_preventable": 0.0})]
+    rows += [errored(2, 1), errored(3), errored(4, raised_by="traffic"), row_of(5, hit={"approach": "rear"})]
+    found = headline(rows, searched=False)
+    assert (found.scenes, found.preventable, found.raised, found.failed) == (5, 2, 2, 4)
+    assert found.ways == 2 and "2 of 5 scenes" in headline_text(found, "a", "e2")
+
+
+def test_tries_are_counted_a_scene_and_search():
+    rows = [row_of(scene, seed * TRIES + k, nfe=100.0) for scene in range(4) for seed in range(2) for k in range(3)]
+    found = headline(rows + [errored(0, 3)], searched=True)
+    assert (found.searches, found.tries, found.nfe) == (2, 25 / 8, 300.0)
+
+
+@pytest.mark.parametrize("named", [0, 2])
+def test_every_errored_rollout_is_named_or_counted(named):
+    rows = [row_of(k) for k in range(5)] + [errored(k, 1, detail=f"lane {k % 3}") for k in range(9)]
+    text = " ".join(errored_lines(rows, named))
+    assert "The planner raised in 9 of 14 rollouts" in text
+    for k in range(9):
+        assert (f"scene_{k} seed 1" in text) == (not named or k < 6)
+    assert text.count("and 1 more in errored.json") == (3 if named else 0)
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory):
+    """The folder of a small search against a planner that raises in one scene, and what the command printed."""
+    folder = tmp_path_factory.mktemp("answered")
+    (folder / "planners_of_mine.py").write_text(PLANNER)
+    settings = (ROOT / "conf" / "ego" / "lane_graph.yaml").read_text()
+    (folder / "conf" / "ego").mkdir(parents=True)
+    own = settings.replace("e2rl.planners.lane_graph_planner.LaneGraphEgo", "planners_of_mine.Fragile")
+    (folder / "conf" / "ego" / "fragile.yaml").write_text(own)
+    run = folder / "run"
+    command = [sys.executable, str(ROOT / "evaluate.py"), "--config-dir", str(folder / "conf"), "ego=fragile", *SMALL]
+    path = os.pathsep.join([str(ROOT), str(folder)])
+    done = subprocess.run(
+        [*command, f"hydra.run.dir={run}"],
+        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    return run, done.stdout
+
+
+def cli(*arguments):
+    """What a command of e2rl prints."""
+    done = subprocess.run([sys.executable, "-m", "e2rl.commands.cli", *map(str, arguments)], capture_output=True)
+    return done.stdout.decode()
+
+
+@pytest.mark.slow
+def test_screen_page_rows_json_gate_and_comparison_say_the_same(answered, tmp_path):
+    run, said = answered
+    rows = [row for row in read_rows(run / TABLE) if row["method"] == "search"]
+    scenes = {row["scene_id"] for row in rows}
+    preventable = {row["scene_id"] for row in rows if row["cfr_preventable"] == 1}
+    raised = {row["scene_id"] for row in rows if row["errored"] == 1}
+    assert len(scenes) == 4 and raised == {"arterial_015_0280"} and len(rows) <= 3 * 4
+    sentence = headline_text(headline(rows, searched=True), "fragile", "search at η=2")
+    assert f"preventable failures in {len(preventable)} of 4 scenes" in sentence
+    assert f"in {len(raised)} the planner raised, in {len(preventable | raised)} either" in sentence
+    (metrics,) = [row for row in read_metrics(run / METRICS_FILE) if row["method"] == "search"]
+    assert metrics["headline"] == headline(rows, searched=True)._asdict()
+    rate = metrics["metrics"]["cfr_preventable"]
+    assert (rate["n"], round(rate["mean"] * 4)) == (4, len(preventable | raised))
+    page = (run / "failures.html").read_text()
+    (group,) = [group for group in json.loads(data_of(page))["groups"] if group["method"] == "search"]
+    assert group["summary"][0] == sentence
+    gated = cli("gate", run, "search:preventable<=1", "--json", tmp_path / "gate.json")
+    (rule,) = json.loads((tmp_path / "gate.json").read_text())
+    assert rule["headline"] == metrics["headline"] and rule["value"] == rate["mean"]
+    compared = cli("compare", run, run, "--out", tmp_path / "compare.html")
+    for text in (said, gated, compared.replace(f"fragile of {run}", "fragile")):
+        assert sentence in " ".join(text.split())
+
+
+def data_of(page: str) -> str:
+    return re.search(r'<script type="application/json" id="report">(.*?)</script>', page, re.DOTALL)[1]
+
+
+@pytest.mark.slow
+def test_a_planner_that_raises_is_named_everywhere(answered, tmp_path):
+    run, said = answered
+    names = ("arterial_015_0280", "RuntimeError: no feasible trajectory")
+    cli("gate", run, "search:contacts<=0.1", "--json", tmp_path / "gate.json", "--junit", tmp_path / "gate.xml")
+    compared = cli("compare", run, run, "--out", tmp_path / "compare.html")
+    with (run / "failures.csv").open(newline="") as file:
+        listed = [row for row in csv.DictReader(file) if row["errored"] == "1"]
+    assert listed and all((row["scene_id"], row["error"]) == names for row in listed)
+    files = [run / "failures.html", *(tmp_path / name for name in ("gate.json", "gate.xml", "compare.html"))]
+    for text in (said, compared, *(file.read_text() for file in files)):
+        assert all(name in " ".join(text.split()) for name in names)
