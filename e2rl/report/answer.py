@@ -178,7 +178,8 @@ def effect(row: dict, nominal: dict) -> str:
     found = (row["paired"].get(nominal["method"]) or {}).get("cfr")
     if not found or math.isnan(found["difference"]):
         return ""
-    text = f"Attack minus nominal: {100 * found['difference']:+.0f} points of collisions over the same scenes and seeds"
+    kind = "failures" if tally(row, "errored") or tally(nominal, "errored") else "collisions"
+    text = f"Attack minus nominal: {100 * found['difference']:+.0f} points of {kind} over the same scenes and seeds"
     if math.isnan(found["low"]):
         return f"{text}."
     return f"{text} (95% interval {100 * found['low']:+.0f} to {100 * found['high']:+.0f})."

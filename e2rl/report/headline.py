@@ -7,7 +7,7 @@ from e2rl.evaluation.headline import Headline
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.metrics.errored import lost, raised
 
-NAMED, MESSAGES = 4, 3  # rollouts of a message, and messages, that a summary names
+NAMED, MESSAGES = 12, 3  # scenes of a message, and messages, that a summary names
 
 
 def plural(count: int, word: str) -> str:
@@ -48,29 +48,36 @@ def row_headline(row: Mapping[str, Any]) -> str:
 
 
 def errored_lines(rows: Sequence[Mapping[str, Any]], named: int = NAMED) -> list[str]:
-    """What errored, a sentence for each message: how many rollouts, whose they are, and `named` of them.
+    """What errored: how many rollouts, whose they are, and a line for each message and traffic with its scenes.
 
     Args:
         rows: of all rollouts.
-        named: so many of each message; 0: all.
+        named: so many scenes of each line, and MESSAGES of the messages; 0: all.
     """
     lines = []
-    for errs, text in (
-        (raised, "The planner raised in {}, its failures"),
-        (lost, "The traffic raised in {}, left out"),
-    ):
-        groups: dict[str, list[Mapping[str, Any]]] = {}
+    kinds = {"The planner raised in {}, its failures": raised, "The traffic raised in {}, left out": lost}
+    for text, errs in kinds.items():
+        groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
         for row in filter(errs, rows):
-            groups.setdefault(row["error"], []).append(row)
+            groups.setdefault((row["error"], traffic_name(row)), []).append(row)
         total = sum(map(len, groups.values()))
-        if total:
-            count = f"{total} of {plural(len(rows), 'rollout')}"
-            lines.append(f"{text.format(count)}:")
+        lines += [text.format(f"{total} of {plural(len(rows), 'rollout')}") + ":"] if total else []
         ranked = sorted(groups.items(), key=lambda item: -len(item[1]))
-        for message, own in ranked[: MESSAGES if named else None]:
-            shown = own[: named or len(own)]
-            names = "; ".join(f"{row['scene_id']} seed {row['seed']} {traffic_name(row)}" for row in shown)
-            rest = len(own) - len(shown)
-            more = f"; and {rest} more in {ERRORED_FILE}" if rest else ""
-            lines.append(f"{message} ({len(own)}): {names}{more}")
+        for (message, traffic), own in ranked[: MESSAGES if named else None]:
+            lines.append(f"{message} ({len(own)} under {traffic}): {scenes_text(own, named)}")
+        if rest := len(ranked[MESSAGES:] if named else ()):
+            lines.append(f"and {plural(rest, 'other message')} in {ERRORED_FILE}")
     return lines
+
+
+def scenes_text(rows: Sequence[Mapping[str, Any]], named: int) -> str:
+    """The scenes of rows with the seeds of each, such as `a (seeds 0, 1), b (seed 0)`; named: so many, 0: all."""
+    seeds: dict[str, list[int]] = {}
+    for row in rows:
+        seeds.setdefault(row["scene_id"], []).append(row["seed"])
+    texts = []
+    for scene, own in list(seeds.items())[: named or None]:
+        shown = ", ".join(map(str, own[: named or None]))
+        texts.append(f"{scene} ({'seed' if len(own) == 1 else 'seeds'} {shown}{', ...' * (0 < named < len(own))})")
+    rest = len(seeds) - len(texts)
+    return ", ".join(texts) + (f" and {plural(rest, 'other scene')} in {ERRORED_FILE}" if rest else "")

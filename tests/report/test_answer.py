@@ -165,4 +165,4 @@ def test_rollouts_in_which_the_planner_raised_are_failures_and_named():
     rollouts = [about | {"scene_id": f"place_{k}"} for k in range(6)]
     text = " ".join(" ".join(answer_lines([crashed], rollouts=rollouts)).split())
     assert "was hit (3) or raised (6) in 9 of 12 attacked rollouts" in text
-    assert "KeyError: lane (6): place_0 seed 0 e2 at η=2;" in text and "and 2 more in errored.json" in text
+    assert "KeyError: lane (6 under e2 at η=2): place_0 (seed 0), place_1 (seed 0)" in text

@@ -50,12 +50,13 @@ def test_tries_are_counted_a_scene_and_search():
 
 @pytest.mark.parametrize("named", [0, 2])
 def test_every_errored_rollout_is_named_or_counted(named):
-    rows = [row_of(k) for k in range(5)] + [errored(k, 1, detail=f"lane {k % 3}") for k in range(9)]
+    rows = [row_of(k) for k in range(5)] + [errored(k // 2, k % 2, detail=f"lane {k % 8 // 2}") for k in range(24)]
     text = " ".join(errored_lines(rows, named))
-    assert "The planner raised in 9 of 14 rollouts" in text
-    for k in range(9):
-        assert (f"scene_{k} seed 1" in text) == (not named or k < 6)
-    assert text.count("and 1 more in errored.json") == (3 if named else 0)
+    assert "The planner raised in 24 of 29 rollouts" in text
+    for k in range(12):
+        assert (f"scene_{k} (seeds 0, 1)" in text) == (not named or k in (0, 1, 2, 4, 5, 6))
+    assert text.count("and 1 other scene in errored.json") == (3 if named else 0)
+    assert ("and 1 other message in errored.json" in text) == bool(named)
 
 
 @pytest.fixture(scope="module")
