@@ -199,7 +199,7 @@ def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, present: Tens
 def touched_columns(batch: Batch, touched: Tensor) -> Batch:
     """Fraction of the traffic that moves, in the rollout or its log, that is touched [B, N] by another vehicle."""
     pairs = (("states", "valid"), ("logged", "logged_valid"))
-    fastest = [(batch[track][..., 3] * batch[valid]).amax(1) for track, valid in pairs]
+    fastest = [(batch[track][..., 3].abs() * batch[valid]).amax(1) for track, valid in pairs]
     moving = batch["traffic"] & (torch.maximum(*fastest) > MOVING)
     number = moving.sum(-1)
     fraction = (touched & moving).sum(-1).to(batch["states"].dtype) / number  # 0 / 0 is NaN

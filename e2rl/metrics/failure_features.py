@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.catalogue import Batch, columns
+from e2rl.metrics.geometry import travel_heading
+from e2rl.metrics.sideways import ALIGNED, lane_headings
 from e2rl.metrics.verdicts import ego_path_boxes
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import DT
@@ -31,10 +33,7 @@ STANDING = 0.5  # m/s, never exceeded in the window
 SPEEDING = 1.0  # m/s^2 of mean acceleration over the last second
 TURNING = math.radians(25)  # change of heading over the window
 SIDEWAYS = 0.5  # m/s of mean motion across the lane's direction over the window
-ALIGNED = math.pi / 4  # headings that differ by less run in the same direction
 LANE_EVERY = 4  # steps between looks at the lanes
-LANE_REACH = 4.0  # m to the lane that runs a vehicle's way; farther, its own first heading stands for it
-LANE_ANGLE = 4.0  # m/rad: of lanes that overlap, the one that runs as the vehicle does is preferred
 
 
 @columns(
@@ -49,11 +48,12 @@ def failure_columns(batch: Batch) -> Batch:
     speeds = batch["states"].new_full((len(hit), 2), torch.nan)
     if hit.any():
         window, known, size = last_seconds(batch)
-        manoeuvres = manoeuvre(window, known, lane_headings(batch, window))
+        manoeuvres = manoeuvre(window, known, lane_headings(batch, window, LANE_EVERY))
         stands = manoeuvres[:, 1] == STANDS
-        words["approach"][hit] = approach(window, size, stands)
+        came, went = batch["moved_into"][hit].unbind(1)
+        words["approach"][hit] = approach(window, size, stands, came & ~went)
         words["ego_manoeuvre"][hit], words["partner_manoeuvre"][hit] = manoeuvres.unbind(-1)
-        speeds[hit] = window[:, -1, :, 3]
+        speeds[hit] = window[:, -1, :, 3].abs()
     return words | {"ego_speed": speeds[:, 0], "partner_speed": speeds[:, 1]}
 
 
@@ -80,7 +80,7 @@ def manoeuvre(window: Tensor, known: Tensor, lanes: Tensor) -> Tensor:
     """
     speed, heading = window[..., 3].abs(), window[..., 2]
     turn = wrap(heading[:, 1:] - heading[:, :-1]).sum(1)
-    across = (speed * DT * (heading - lanes).sin())[:, 1:]
+    across = (speed * DT * (travel_heading(window) - lanes).sin())[:, 1:]
     steps = torch.arange(1, WINDOW + 1, device=window.device)
     across = (across * (steps > WINDOW - known[:, None])[..., None]).sum(1) / (known.clamp(min=1)[:, None] * DT)
     across = across.masked_fill((across * turn < 0) & (turn.abs() > TURNING / 2), 0.0)
@@ -93,37 +93,9 @@ def manoeuvre(window: Tensor, known: Tensor, lanes: Tensor) -> Tensor:
     return result.masked_fill(speed.amax(1) < STANDING, STANDS)
 
 
-def lane_headings(batch: Batch, window: Tensor) -> Tensor:
-    """Heading [C, W, P] [rad] of each vehicle's lane, looked up every LANE_EVERY steps: the nearest one, with a price
-    on the angle to the vehicle's heading, of those within ALIGNED and LANE_REACH of it. Where there is none, the
-    vehicle's heading at the window's start."""
-    points, index = batch["lane_points"][batch["hit"]], batch["lane_index"][batch["hit"]]
-    own, moments = window[:, :1, :, 2], window[:, ::LANE_EVERY]
-    if points.shape[1] < 2:
-        return own.expand(window.shape[:3])
-    along = lane_directions(points, index)
-    place, heading = moments.flatten(1, 2)[..., :2], moments.flatten(1, 2)[..., 2]
-    off = torch.cdist(place, points, compute_mode="donot_use_mm_for_euclid_dist")
-    angle = wrap(along[:, None] - heading[..., None]).abs()
-    possible = (angle < ALIGNED) & (off < LANE_REACH) & (index >= 0)[:, None]
-    price, chosen = (off + LANE_ANGLE * angle).masked_fill(~possible, torch.inf).min(-1)
-    found = along.gather(1, chosen).view(moments.shape[:3])
-    found = torch.where(price.view_as(found).isfinite(), found, own)
-    return found.repeat_interleave(LANE_EVERY, 1)[:, : window.shape[1]]
-
-
-def lane_directions(points: Tensor, index: Tensor) -> Tensor:
-    """Direction [C, M] [rad] of lanes at their points [C, M, 2], from the point before to the point after on the same
-    lane (index [C, M])."""
-    joined = (index[:, 1:] == index[:, :-1])[..., None]
-    change = (points[:, 1:] - points[:, :-1]) * joined
-    none = torch.zeros_like(points[:, :1])
-    both = torch.cat([change, none], 1) + torch.cat([none, change], 1)
-    return torch.atan2(both[..., 1], both[..., 0])
-
-
-def approach(window: Tensor, size: Tensor, stands: Tensor) -> Tensor:
-    """Index [C] into APPROACHES, from window [C, W, P, 4] and sizes [C, P, 2]; stands [C]: the partner does.
+def approach(window: Tensor, size: Tensor, stands: Tensor, entered: Tensor) -> Tensor:
+    """Index [C] into APPROACHES, from window [C, W, P, 4] and sizes [C, P, 2]; stands [C]: the partner does; entered
+    [C]: it is the ego that moved sideways into its partner, which then does not cut in.
 
     Headings are compared two seconds before the contact, positions one second before it. Vehicles run in the same
     direction where their headings agree, or where one is on the other's way and agrees with it there (a bend). Of such
@@ -131,15 +103,17 @@ def approach(window: Tensor, size: Tensor, stands: Tensor) -> Tensor:
     beside or behind, whatever its heading.
     """
     early, late = 0, -1 - LATE
-    relative = wrap(window[:, early, 1, 2] - window[:, early, 0, 2])
+    way = travel_heading(window)
+    relative = wrap(way[:, early, 1] - way[:, early, 0])
     ego, other = window[:, :, 0], window[:, :, 1]
     (first, follows, side), (second, _, later_side) = (on_way(ego, other, size, step) for step in (early, late))
     _, followed, _ = on_way(other, ego, size.flip(1), early)
-    place = to_frame(other[:, late, :2], ego[:, late])
-    angle = other[:, late, 2] - ego[:, late, 2]
+    facing = torch.stack([*ego[:, late, :2].unbind(-1), way[:, late, 0]], -1)
+    place = to_frame(other[:, late, :2], facing)
+    angle = way[:, late, 1] - way[:, late, 0]
     reach = (size[:, 0, 0] + size[:, 1, 0] * angle.cos().abs() + size[:, 1, 1] * angle.sin().abs()) / 2
     same = (relative.abs() < ALIGNED) | follows | followed | stands
-    enters = ~(first & second) & ~stands
+    enters = ~(first & second) & ~stands & ~entered
     from_right = torch.where(first, later_side, side) < 0
     ahead = torch.where(enters, CUT_IN + from_right.long(), AHEAD)
     beside = BESIDE + (place[:, 1] < 0).long()
@@ -157,5 +131,6 @@ def on_way(ego: Tensor, other: Tensor, size: Tensor, step: int) -> tuple[Tensor,
     touches = (separation(other[:, None], size[:, None, 1], boxes, sizes) <= 0).any(-1)
     nearest = (way[..., :2] - other[:, None, :2]).norm(dim=-1).argmin(-1)
     pose = way[torch.arange(len(way), device=way.device), nearest]
-    runs_along = wrap(other[:, 2] - pose[:, 2]).abs() < ALIGNED
+    pose = torch.cat([pose[:, :2], travel_heading(pose)[:, None]], -1)
+    runs_along = wrap(travel_heading(other) - pose[:, 2]).abs() < ALIGNED
     return touches, touches & runs_along, to_frame(other[:, :2], pose)[:, 1]

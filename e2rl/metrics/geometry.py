@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from e2rl.scenes.boxes import corners, overlap, to_frame
+from e2rl.sim.dynamics import wrap
+from e2rl.sim.neighbours import STANDING
 
 EDGES = ("left", "rear", "right", "front")  # edge i runs from corner i to corner i + 1 of scenes.boxes.corners
 MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
@@ -17,6 +19,12 @@ MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
 def velocity(states: Tensor) -> Tensor:
     """Velocity vectors [..., 2] [m/s] of states [..., 4]: the speed along the heading."""
     return states[..., 3:4] * torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
+
+
+def travel_heading(states: Tensor) -> Tensor:
+    """Direction [...] [rad] in which vehicles of states [..., 4] move: against their heading where they reverse."""
+    heading, speed = states[..., 2], states[..., 3]
+    return torch.where(speed < -STANDING, wrap(heading + torch.pi), heading)
 
 
 def pair_overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor, possible: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.drivers import DRIVERS, Driver, Observation, no_conflict
+from e2rl.metrics.geometry import travel_heading
 from e2rl.run.fused import fused
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import DT
@@ -61,7 +62,8 @@ def poses(states: Tensor, s: Tensor) -> Tensor:
     first, second = (states.gather(1, index[..., None].expand(-1, -1, 4)) for index in (after - 1, after))
     heading = first[..., 2] + fraction[..., 0] * wrap(second[..., 2] - first[..., 2])
     beyond = (s - length[:, -1:]).clamp(min=0)[..., None]
-    ahead = torch.stack([heading.cos(), heading.sin()], -1)
+    onwards = travel_heading(states[:, -1:])
+    ahead = torch.stack([onwards.cos(), onwards.sin()], -1)
     return torch.cat([torch.lerp(first[..., :2], second[..., :2], fraction) + beyond * ahead, heading[..., None]], -1)
 
 
@@ -96,8 +98,9 @@ def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tens
 
     It reacts to each of the others as if that were alone, and brakes for the one that asks most.
     """
-    recorded = states[..., 3].diff(dim=1) / DT
-    speed, s = states[:, 0, 3], torch.zeros_like(states[:, 0, 3])
+    along = states[..., 3].abs()  # the way has no backwards
+    recorded = along.diff(dim=1) / DT
+    speed, s = along[:, 0], torch.zeros_like(along[:, 0])
     acceleration, reacted = torch.zeros_like(speed), torch.zeros_like(speed, dtype=torch.bool)
     memory = no_conflict(others.rear[0])
     length = size[:, :1].expand_as(others.rear[0])
@@ -222,8 +225,9 @@ def _follows(leader: Tensor, others: Tracks, touched: Tensor, index: Tensor) -> 
     row = torch.arange(len(index), device=index.device)
     step = touched[row, :, index].int().argmax(1)
     other, ahead = others.states[row, step, index], leader[row, step]
-    behind = to_frame(other[:, :2], ahead)[:, 0] < 0
-    return behind & ((other[:, 2] - ahead[:, 2]).cos() > SAME_WAY)
+    onwards = travel_heading(ahead)
+    behind = to_frame(other[:, :2], torch.cat([ahead[:, :2], onwards[:, None]], -1))[:, 0] < 0
+    return behind & ((travel_heading(other) - onwards).cos() > SAME_WAY)
 
 
 def preventions(collision: Collision, drivers: dict[str, Driver] = DRIVERS) -> dict[str, Prevention]:

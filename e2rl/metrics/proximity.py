@@ -149,7 +149,7 @@ def standing_columns(batch: Batch) -> Batch:
     states = batch["states"]
     counted = batch["traffic"] & batch["logged_valid"].all(1)
     parked = counted & batch["parked"]
-    standing = counted & ~batch["parked"] & (states[:, 0, :, 3] < STANDING)
+    standing = counted & ~batch["parked"] & (states[:, 0, :, 3].abs() < STANDING)
     now, log = moved(states, batch["valid"]), moved(batch["logged"], batch["logged_valid"])
     found = {
         "parked_moved": (parked & now).sum(-1) / parked.sum(-1),

@@ -8,6 +8,7 @@ from torch import Tensor
 from e2rl.metrics.catalogue import COMPUTE, IDENTITY, LATER, METRICS, SOURCE, WORDS, Batch, Metric, columns, row_columns
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
+from e2rl.metrics.sideways import moved_into
 from e2rl.metrics.verdicts import clean, judge
 from e2rl.sim.rollouts import Rollouts
 
@@ -68,6 +69,7 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     traffic = batch["simulated"].clone()
     traffic[:, 0] = False
     batch = batch | {"traffic": traffic} | first_contact(batch)
+    batch["moved_into"] = moved_into(batch)
     verdicts, driver = judge(batch)
     batch, result = batch | verdicts | {"driver": driver}, verdicts
     for name, compute in COMPUTE.items():

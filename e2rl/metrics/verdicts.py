@@ -5,9 +5,12 @@ Nobody prevents by braking what comes to an ego that stands. A verdict on a part
 it would have driven differently towards another ego. A clean failure is preventable and not replayed, its partner broke
 no duty, no other vehicles hit each other, and nobody left the road.
 
+Where a vehicle moved sideways into the other (`sideways`), that decides whose fault it is. A standing partner that the
+ego touches only because its recorded heading turned makes no failure that counts.
+
 The partner broke the first of these duties that applies: it ran into the ego from behind; it had crossed a stop line at
 red; it drove against its lane; it crossed the ego's path, or came into it, leaving less than a careful and competent
-driver needs to brake.
+driver needs to brake. It broke none of the first and the last two where the ego moved into it.
 """
 
 import math
@@ -19,6 +22,7 @@ from torch import Tensor
 from e2rl.metrics.catalogue import Batch, declare, event, rate
 from e2rl.metrics.contact import FRONT, REAR
 from e2rl.metrics.drivers import DRIVERS, HumanDriver
+from e2rl.metrics.geometry import travel_heading
 from e2rl.metrics.preventable import (
     CREEPING,
     Collision,
@@ -60,10 +64,11 @@ def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor,
     states = held(collision.states, collision.present)[row[:, None], :, pair]  # [B, 2, T+1, 4]
     size = collision.size[row[:, None], pair]
     ego, other = states.unbind(1)
+    way, ahead = travel_heading(ego), travel_heading(other)
     stop = collision.stop
     before = (stop - 1).clamp(min=0)
     turned = torch.stack([_turn(track, stop) for track in (ego, other)])
-    angle = wrap(other[row, before, 2] - ego[row, before, 2])
+    angle = wrap(ahead[row, before] - way[row, before])
     entered, safe = _entry(ego, other, size, stop)
     crosses, oncoming = angle.abs() > SAME_WAY, angle.abs() > ONCOMING
     unsafe = entered & (~safe | (oncoming & struck))  # a driver who stands cannot lose the speed of who comes
@@ -75,7 +80,7 @@ def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor,
     result = torch.where(unsafe & crosses & priority, RIGHT_OF_WAY, result)
     result = torch.where(_against(other, stop, lanes), WRONG_WAY, result)
     result = torch.where((red >= 0) & (stop - red <= LIGHT_STEPS) & (red <= stop), LIGHT, result)
-    faster = other[row, before, 3] * angle.cos() > ego[row, before, 3]
+    faster = other[row, before, 3].abs() * angle.cos() > ego[row, before, 3].abs()
     return torch.where(rear & (angle.abs() < torch.pi / 3) & faster, REAR_END, result)
 
 
@@ -95,7 +100,7 @@ def _entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> tuple[Tens
     steps = torch.arange(ego.shape[1], device=stop.device)
     last = torch.where(outside & (steps <= stop[:, None]), steps, -1).amax(1, keepdim=True)
     gap = along.rear[..., 0].T - driven_length(ego) - size[:, :1, 0] / 2
-    safe = gap >= HumanDriver().stopping_gap(ego[..., 3] - along.speed[..., 0].T).clamp(min=0.0)
+    safe = gap >= HumanDriver().stopping_gap(ego[..., 3].abs() - along.speed[..., 0].T).clamp(min=0.0)
     since = (steps > last) & (steps <= (stop[:, None]).maximum(last + 1))
     return last[:, 0] >= 0, (safe & since).any(1)
 
@@ -105,25 +110,51 @@ def _against(track: Tensor, stop: Tensor, lanes: tuple[Tensor, Tensor]) -> Tenso
     row = torch.arange(len(stop), device=stop.device)[:, None]
     window = (stop[:, None] - torch.arange(1, WRONG_STEPS + 1, device=stop.device)).clamp(min=0)
     states = track[row, window]
-    against = against_lanes(*lanes, states[..., :2], states[..., 2, None])[..., 0]
+    against = against_lanes(*lanes, states[..., :2], travel_heading(states)[..., None])[..., 0]
     return against.float().mean(-1) >= 0.5
 
 
 def at_fault(batch: Batch, struck: Tensor) -> Tensor:
     """Whether the ego is at fault [B]: 1 or 0, NaN without contact.
 
-    It is if it moves and either its partner has stood for STOOD steps, or its front hits a partner that moves and did
-    not cut in: that entered the ego's path more than a second before the contact. It is not where a competent driver
-    who stands would be struck all the same: struck [B]. An ego that stands is, if it has stood for STOOD steps in the
-    way of a lane that the partner comes along.
+    It is if it moves and its partner has stood for STOOD steps. Else, where the ego moved sideways into its partner or
+    that into the ego, it is if the ego did. Else it is if it moves and its leading edge (the front, of an ego that
+    reverses the rear) hits a partner that moves and did not cut in: that entered the ego's path more than a second
+    before the contact. It is not where a competent driver who stands would be struck all the same: struck [B]. An ego
+    that stands is, if it has stood for STOOD steps in the way of a lane that the partner comes along. Nobody is where
+    the partner stands and has only turned on the spot.
     """
     row, partner = torch.arange(len(batch["states"])), batch["partner"].clamp(min=0)
     speed = batch["states"][row, batch["before"], :, 3].abs()
     moves, partner_moves = speed[:, 0] > STANDING, speed[row, partner] > STANDING
-    runs_into = (batch["kind"] == FRONT) & partner_moves & ~cuts_in(batch) & ~struck
-    fault = moves & (stood(batch, partner) | runs_into)
+    leads = batch["kind"] == leading_edge(batch)
+    runs_into = leads & partner_moves & ~cuts_in(batch) & ~struck
+    moved, _ = batch["moved_into"].unbind(1)
+    runs_into = torch.where(batch["moved_into"].any(1), moved, runs_into)
+    fault = moves & (stood(batch, partner) | runs_into) & ~turned_on_the_spot(batch)
     fault = fault | (~moves & stood(batch, torch.zeros_like(partner)) & blocks(batch, partner))
     return fault.to(speed.dtype).masked_fill(~batch["hit"], torch.nan)
+
+
+def leading_edge(batch: Batch) -> Tensor:
+    """Index [B] into KINDS of the edge with which the ego leads: REAR where it reverses."""
+    row = torch.arange(len(batch["states"]), device=batch["states"].device)
+    reverses = batch["states"][row, batch["before"], 0, 3] < -STANDING
+    return torch.where(reverses, REAR, FRONT)
+
+
+def turned_on_the_spot(batch: Batch) -> Tensor:
+    """Bool [B]: the partner stands, and the ego would not touch it if it had kept the heading with which it halted (or
+    is first known)."""
+    states, stop = batch["states"], batch["stop"]
+    row, partner = torch.arange(len(stop), device=stop.device), batch["partner"].clamp(min=0)
+    track, known = states[row, :, partner], batch["valid"][row, :, partner]
+    steps = torch.arange(states.shape[1], device=stop.device)
+    moves = (track[..., 3].abs() > STANDING) | ~known
+    since = torch.where(moves & (steps < stop[:, None]), steps + 1, 0).amax(1)
+    held = torch.cat([track[row, stop, :2], track[row, since, 2:3], track[row, stop, 3:]], -1)
+    apart = separation(states[row, stop, 0], batch["size"][:, 0], held, batch["size"][row, partner]) > 0
+    return batch["hit"] & (since < stop) & ~moves[row, stop] & apart
 
 
 def stood(batch: Batch, agent: Tensor) -> Tensor:
@@ -139,12 +170,13 @@ def blocks(batch: Batch, partner: Tensor) -> Tensor:
     """Bool [B]: the ego is on a lane that runs as the partner [B] drives, and across its own heading."""
     row = torch.arange(len(partner), device=partner.device)
     ego, other = (batch["states"][row, batch["before"], agent] for agent in (torch.zeros_like(partner), partner))
-    across = wrap(other[:, 2] - ego[:, 2]).sin().abs() > math.sin(SAME_WAY)
+    onwards = travel_heading(other)
+    across = wrap(onwards - ego[:, 2]).sin().abs() > math.sin(SAME_WAY)
     points, line = batch["lane_points"], batch["lane_index"]
     begin, step = points[:, :-1], points.diff(dim=1)
     along = ((ego[:, None, :2] - begin) * step).sum(-1) / step.square().sum(-1).clamp(min=1e-9)
     gap = (begin + along.clamp(0, 1)[..., None] * step - ego[:, None, :2]).norm(dim=-1)
-    turn = wrap(torch.atan2(step[..., 1], step[..., 0]) - other[:, None, 2])
+    turn = wrap(torch.atan2(step[..., 1], step[..., 0]) - onwards[:, None])
     on_it = (line[:, 1:] == line[:, :-1]) & (line[:, 1:] >= 0) & (gap <= LANE_HALF) & (turn.abs() < SAME_WAY)
     return across & on_it.any(1)
 
@@ -169,7 +201,8 @@ def cuts_in(batch: Batch) -> Tensor:
 def ego_path_boxes(states: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
     """Boxes [B, W+1, 4] and sizes [B, W+1, 2] of an ego at states [B, W, 4] and of the strip ahead of the last one."""
     last = states[:, -1:]
-    direction = torch.stack([last[..., 2].cos(), last[..., 2].sin()], -1)
+    onwards = travel_heading(last)
+    direction = torch.stack([onwards.cos(), onwards.sin()], -1)
     shift = (size[:, :1] + AHEAD)[..., None] / 2
     strip = torch.cat([last[..., :2] + shift * direction, last[..., 2:]], -1)
     strip_size = torch.stack([torch.full_like(size[:, 0], AHEAD), size[:, 1]], -1)[:, None]
@@ -232,15 +265,21 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Preven
     row, ran = torch.arange(len(collision.stop)), batch.get("ran_light")
     red = torch.full_like(collision.stop, -1) if ran is None else ran[hit][row, collision.partner]
     lanes, result = (batch["lane_points"][hit], batch["lane_index"][hit]), preventions(collision)
-    duty = duties(collision, batch["kind"][hit] == REAR, red, lanes, result["human"].struck)
+    leads = leading_edge(batch)[hit]
+    trailing = batch["kind"][hit] == torch.where(leads == FRONT, REAR, FRONT)
+    duty = duties(collision, trailing, red, lanes, result["human"].struck)
+    ego_moved, partner_moved = batch["moved_into"][hit].unbind(1)
+    kept_its_way = ego_moved & ~partner_moved & (duty != LIGHT) & (duty != WRONG_WAY)
+    duty = duty.masked_fill(kept_its_way, NONE)
     dtype = batch["states"].dtype
     speed = batch["states"][hit][row, batch["before"][hit], :, 3].abs()
     moves, partner_moves = speed[:, 0] > CREEPING, speed[row, collision.partner] > STANDING
-    found = {f"preventable_{name}": (value.avoided & moves).to(dtype) for name, value in result.items()}
+    counts = moves & ~turned_on_the_spot(batch)[hit]
+    found = {f"preventable_{name}": (value.avoided & counts).to(dtype) for name, value in result.items()}
     human = result["human"]
     found["preventable"] = found.pop("preventable_human")
     found["preventable_chain"] = found["preventable"] * (human.followers > 0)
-    found["replayed"] = found["preventable"] * (partner_moves & (batch["kind"][hit] != FRONT))
+    found["replayed"] = found["preventable"] * (partner_moves & (batch["kind"][hit] != leads))
     return found, duty, human
 
 
