@@ -1,6 +1,7 @@
 """Off the road: a vehicle's centre outside every drivable polygon and far from every lane (docs/method.md, section 10).
 
-On the road means inside a drivable polygon (even-odd rule) or within half the lane's width + 1.0 m of its centreline.
+On the road means inside a drivable polygon (even-odd rule), in the seam between two of them, or within half the lane's
+width + 1.0 m of its centreline.
 Distances are exact, from point to segment; a grid of buckets keeps the work near the number of points.
 """
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from e2rl.metrics.catalogue import Batch, columns, event, rate
 from e2rl.metrics.contact import steps_until
 from e2rl.metrics.geometry import candidates, from_segment
+from e2rl.scenes.drivable_area import SEAM
 
 MARGIN = 1.0  # m beyond half the lane width
 LANE_CELL = 8.0  # m, grid of the lanes' segments
@@ -77,6 +79,17 @@ def inside_polygon(points: Tensor, rollout: Tensor, polygon_points: Tensor, poly
     return torch.zeros(len(points), dtype=torch.bool).index_fill(0, key[count % 2 == 1] // polygons, True)
 
 
+def in_seam(points: Tensor, rollout: Tensor, polygon_points: Tensor, polygon_index: Tensor) -> Tensor:
+    """Bool [n]: points [n, 2] of rollouts [n] within SEAM of the borders of two polygons or more.
+
+    polygon_points [B, D, 2], polygon_index [B, D] (-1 padding). Many maps draw polygons that adjoin with a gap.
+    """
+    owner, polygon, ends = line_segments(polygon_points, polygon_index, closed=True)
+    point, segment = near_segments(points, rollout, owner, ends, ends.new_full(owner.shape, SEAM))
+    pairs = torch.stack([point, polygon[segment]], 1).unique(dim=0)
+    return torch.bincount(pairs[:, 0], minlength=len(points)) > 1
+
+
 def has_lines(index: Tensor) -> Tensor:
     """Bool [B]: some line of index [B, M] has at least two points."""
     return ((index[:, 1:] >= 0) & (index[:, 1:] == index[:, :-1])).any(-1)
@@ -84,9 +97,11 @@ def has_lines(index: Tensor) -> Tensor:
 
 def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:
     """Bool [n]: points [n, 2] of rollouts [n] int64 are on the road of the batch's maps."""
+    polygons = batch["drivable_points"], batch["drivable_index"]
     near = near_lane(points, rollout, batch["lane_points"], batch["lane_index"], batch["lane_width"])
-    rest = (~near).nonzero()[:, 0]
-    near[rest] = inside_polygon(points[rest], rollout[rest], batch["drivable_points"], batch["drivable_index"])
+    for holds in (inside_polygon, in_seam):
+        rest = (~near).nonzero()[:, 0]
+        near[rest] = holds(points[rest], rollout[rest], *polygons)
     return near
 
 

@@ -10,13 +10,14 @@ from e2rl.run.fused import fused
 from e2rl.scenes.lane_cover import CELL, FAR, RADIUS, TILE, LaneCover
 
 DENSE = 0.5  # m at most between the points of a polygon's border
+SEAM = 0.2  # m from the borders of two polygons within which what lies between them is theirs
 
 
 class DrivableArea:
     """The drivable area of a log, of which scenes have fields.
 
     A point is off the road when it lies outside every polygon and farther than half the width + MARGIN from every lane
-    centreline.
+    centreline. Polygons that adjoin with a seam, as many maps draw them, are one: cells within SEAM of two are inside.
     """
 
     def __init__(self, lines: list[np.ndarray], widths: np.ndarray, polygons: list[np.ndarray]) -> None:
@@ -33,8 +34,11 @@ class DrivableArea:
         corner = center - (cells - 1) / 2 * CELL
         x, y = corner[:, None] + np.arange(cells) * CELL
         field = self.lanes.beyond(origin, corner, cells)
+        near = np.zeros(field.shape, np.int16)  # polygons whose border is within SEAM
         for polygon in self.polygons:
-            _lower(field, x, y, polygon - origin)
+            _lower(field, near, x, y, polygon - origin)
+        seam = near > 1
+        field[seam] = np.minimum(field[seam], -SEAM)
         return field.astype(np.float16), corner
 
 
@@ -45,13 +49,14 @@ def _near(x: np.ndarray, y: np.ndarray, points: np.ndarray, reach: float) -> tup
     return rows, columns
 
 
-def _lower(field: np.ndarray, x: np.ndarray, y: np.ndarray, ring: np.ndarray) -> None:
-    """Lower the field [G, G] of cells at x [G], y [G] to the distance beyond a polygon [P, 2], in place.
+def _lower(field: np.ndarray, near: np.ndarray, x: np.ndarray, y: np.ndarray, ring: np.ndarray) -> None:
+    """Lower the field [G, G] of cells at x [G], y [G] to the distance beyond a polygon [P, 2], and count in `near`
+    [G, G] the cells within SEAM of its border, both in place.
 
     The distance from a tile's middle bounds that of its cells, so cells outside which cannot change are not searched.
     """
     rows, columns = _near(x, y, ring, FAR)
-    part, x, y = field[rows, columns], x[rows], y[columns]
+    part, count, x, y = field[rows, columns], near[rows, columns], x[rows], y[columns]
     if not part.size:
         return
     tree, cell = cKDTree(dense := _dense(ring)), np.stack(np.meshgrid(x, y, indexing="ij"), -1)
@@ -62,6 +67,7 @@ def _lower(field: np.ndarray, x: np.ndarray, y: np.ndarray, ring: np.ndarray) ->
     change = inside | (least < part)
     border = _border_distance(dense, tree, cell[change])
     part[change] = np.minimum(part[change], np.where(inside[change], -border, border))
+    count[change] += border <= SEAM
 
 
 def _dense(ring: np.ndarray) -> np.ndarray:

@@ -49,7 +49,8 @@ class LaneGraph:
 
     `graph` is the networkx DiGraph (nodes: lane ids; edges: successors); `line` and `arc` are a lane's centreline with
     points every 1 m and its length; `points`, `heading`, `lane_of` are the points of all centrelines, in order;
-    `repairs`: what was left out of the recorded links and neighbours or inferred, by a phrase in the plural.
+    `named_beside`: the neighbours that the map names, which need not be adjacent; `repairs`: what was left out of the
+    recorded links and neighbours or inferred, by a phrase in the plural.
     """
 
     def __init__(self, lanes: dict[str, Lane]):
@@ -62,6 +63,7 @@ class LaneGraph:
         neighboured, neighbours = adjacent(long, self.line)
         self.lanes = {name: replace(lane, exits=exits[name]) for name, lane in neighboured.items()}
         self.repairs = links + neighbours
+        self.named_beside = {name: {*lane.left, *lane.right} for name, lane in long.items()}
         self.ids = list(self.lanes)
         self.graph = nx.DiGraph()
         self.graph.add_nodes_from(self.ids)

@@ -23,6 +23,7 @@ CROWD = 100_000  # pairs of vehicles at one place at one moment, of which all ar
 TWIN = 0.5  # m between the centres of vehicles that are one
 LANE_RADIUS, LANE_ANGLE, LANES = 3.0, 0.6, 8  # m, rad, neighbours: a vehicle on a lane
 PARALLEL, BESIDE = 0.2, (1.5, 20.0)  # rad, m: lanes side by side
+VERGE = 2.0  # m that may lie between the borders of lanes that adjoin
 SAMPLES = 300  # lane points at most whose neighbours are looked at
 
 # Of a measure the least and the most; what it is, and how a log outside of it is mended.
@@ -200,17 +201,38 @@ def map_fit(recording: Recording, graph: LaneGraph) -> dict[str, float]:
 
 
 def lane_spacing(graph: LaneGraph) -> float:
-    """Median distance [m] from points of a lane, evenly chosen, to the nearest parallel lane beside (NaN: none)."""
+    """Median distance [m] from points of a lane, evenly chosen, to the nearest lane that adjoins (NaN: none).
+
+    Roads lie as far apart as they do, and so do the carriageways of one with grass between them: of parallel lanes only
+    those tell a map's unit that share a border (`_adjoin`), or that the map names neighbours.
+    """
     chosen = np.unique(np.linspace(0, len(graph.points) - 1, SAMPLES).astype(int))
     place, direction = graph.points @ [1, 1j], np.exp(1j * graph.heading)
-    nearest = np.full(len(chosen), inf)
+    width = np.array([lane.width if lane.width > 0 else np.nan for lane in graph.lanes.values()])
+    nearest, named = np.full(len(chosen), inf), graph.named_beside
     for row, point in enumerate(chosen):  # one by one: a map may have all its points at one place
         other = np.array(graph.tree.query_ball_point(graph.points[point], BESIDE[1]), dtype=int)
         turn = direction[point].conj()
-        away, parallel = (place[other] - place[point]) * turn, np.abs((direction[other] * turn).real) > np.cos(PARALLEL)
+        away, along = (place[other] - place[point]) * turn, (direction[other] * turn).real
         across = np.abs(away.imag)
-        nearest[row] = across[parallel & (np.abs(away.real) < 1.0) & (across > BESIDE[0])].min(initial=inf)
+        beside = (np.abs(along) > np.cos(PARALLEL)) & (np.abs(away.real) < 1.0) & (across > BESIDE[0])
+        lane, neighbour = graph.lane_of[point], graph.lane_of[other[beside]]
+        room = (width[lane] + width[neighbour]) / 2
+        adjoin = _adjoin(across[beside], room, same=along[beside] > 0)
+        beside_it = named.get(graph.ids[lane], ())
+        adjoin |= np.array([graph.ids[index] in beside_it for index in neighbour], bool)
+        nearest[row] = across[beside][adjoin].min(initial=inf)
     return _median(nearest[nearest < inf])
+
+
+def _adjoin(apart: np.ndarray, room: np.ndarray, same: np.ndarray) -> np.ndarray:
+    """Whether parallel lanes [Q] `apart` m from each other share a border.
+
+    Their recorded widths say so, which make them `room` m apart. Where these are unknown (NaN), lanes in the same
+    direction do, and oncoming ones where they lie as near as lanes do in metres.
+    """
+    unknown = same | (apart <= LIMITS["lane_spacing"][1])
+    return np.where(np.isnan(room), unknown, apart < room + VERGE)
 
 
 def _median(values: np.ndarray) -> float:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.metrics.off_road import inside_polygon, near_lane
+from e2rl.metrics.off_road import in_seam, inside_polygon, near_lane
 from tests.metrics.random_rollouts import random_map
 from tests.metrics.test_contact import course, row
 
@@ -74,3 +74,12 @@ def test_the_ego_leaves_the_road_or_not_and_is_unknown_where_it_starts_beside_it
     leaves, stays, beside = course(0, 0, 0.5, 10), course(0, 0, 0, 10), course(0, 40, 0, 10)
     assert (row(leaves, other)["ego_off_road"], row(stays, other)["ego_off_road"]) == (1, 0)
     assert np.isnan(row(beside, other)["ego_off_road"])
+
+
+@pytest.mark.parametrize(("gap", "on"), [(0.0, True), (1e-6, True), (0.05, True), (0.3, True), (1.0, False)])
+def test_a_seam_between_polygons_is_theirs_and_an_outer_border_is_none(gap, on):
+    square = torch.tensor([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]], dtype=torch.float64)
+    polygons = torch.cat([square, square + torch.tensor([10.0 + gap, 0.0])])[None]
+    index = torch.arange(2).repeat_interleave(4)[None]
+    points = torch.tensor([[10.0 + gap / 2, 5.0], [-0.1, 5.0], [5.0, 10.1]], dtype=torch.float64)
+    assert in_seam(points, torch.zeros(3, dtype=torch.long), polygons, index).tolist() == [on, False, False]

@@ -77,3 +77,27 @@ def test_points_may_name_the_row_of_their_field():
     field, origin, row = torch.randn(3, 12, 12).half(), torch.randn(3, 2), torch.tensor([2, 0, 2, 1])
     points = 12 * torch.rand(4, 7, 2)
     assert torch.equal(off_road(points, field, origin, row), off_road(points, field[row], origin[row]))
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-6, 0.05, 0.3])
+def test_a_seam_between_polygons_is_inside_and_their_outer_border_stays(gap):
+    """Wherever the seam lies on the grid."""
+    for shift in (0.0, 0.25, 0.5):
+        squares = [
+            np.array([[x, -8.0], [x + 10 - gap, -8], [x + 10 - gap, 8], [x, 8]]) + [gap / 2 + shift, 0.3]
+            for x in (-20.0, -10.0, 0.0, 10.0)
+        ]
+        field, origin = DrivableArea([], np.zeros(0), squares).field(np.zeros(2), np.zeros(2), 61)
+        x = torch.arange(-19.0, 19.0, 0.01)
+        along = torch.stack([x, torch.zeros_like(x)], -1)
+        assert (off_road(along[None], torch.tensor(field)[None], torch.tensor(origin)[None].float()) < 0).all()
+        outside = torch.stack([x, torch.full_like(x, 9.3)], -1)  # 1 m beyond
+        beyond = off_road(outside[None], torch.tensor(field)[None], torch.tensor(origin)[None].float())
+        assert torch.allclose(beyond, torch.ones_like(beyond), atol=0.02)
+
+
+def test_a_gap_wider_than_a_seam_stays_outside():
+    squares = [np.array([[x, -8.0], [x + 8, -8], [x + 8, 8], [x, 8]]) for x in (-10.0, 2.0)]
+    field, origin = DrivableArea([], np.zeros(0), squares).field(np.zeros(2), np.zeros(2), 61)
+    gap = torch.zeros(1, 1, 2)
+    assert off_road(gap, torch.tensor(field)[None], torch.tensor(origin)[None].float()).item() == pytest.approx(2.0)

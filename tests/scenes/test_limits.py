@@ -18,7 +18,8 @@ STRAIGHT = np.array([[-100.0, 0], [100, 0]])
 
 
 def limits(*lanes: tuple[np.ndarray, float], speed: float) -> tuple[list[float], list[int]]:
-    """The limits [km/h] that are left of lanes (points, km/h) on which a car drives at `speed` m/s; how many are not."""
+    """What is left of the limits [km/h] of lanes on which a car drives at `speed` m/s, and the numbers of those that
+    are not."""
     states = np.zeros((91, 1, 4))
     states[:, 0, 0], states[:, 0, 3] = 0.1 * speed * np.arange(91), speed
     recording = Recording(

@@ -181,6 +181,29 @@ def test_the_same_traffic_elsewhere_and_turned_is_as_plausible(genuine):
         assert ours[name] == pytest.approx(value, rel=0.05, abs=0.02, nan_ok=True), name
 
 
+def apart(distance: float, *, oncoming: bool = False, width: float = 0.0, named: bool = False) -> float:
+    """The spacing of two lanes of 400 m `distance` m from each other."""
+    ends = [[400.0, distance], [0.0, distance]] if oncoming else [[0.0, distance], [400.0, distance]]
+    lines = {
+        "0": Lane(np.array([[0.0, 0.0], [400.0, 0.0]]), width, left=["1"] if named else []),
+        "1": Lane(np.array(ends), width),
+    }
+    return lane_spacing(LaneGraph(lines))
+
+
+def test_roads_and_carriageways_apart_tell_no_unit():
+    assert np.isnan(apart(12.0, oncoming=True)) and np.isnan(apart(12.0, oncoming=True, width=3.7))
+    assert np.isnan(apart(15.0, width=3.5)), "two streets in one direction"
+
+
+@pytest.mark.parametrize("foot", [1.0, 3.28])
+def test_lanes_that_adjoin_tell_the_unit(foot):
+    """A map in feet is seen where its lanes are named, or are as wide as they lie apart, or run beside each other."""
+    assert apart(3.5 * foot) == pytest.approx(3.5 * foot)
+    assert apart(3.5 * foot, width=3.5 * foot, oncoming=True) == pytest.approx(3.5 * foot)
+    assert apart(3.5 * foot, width=3.5, named=True) == pytest.approx(3.5 * foot)
+
+
 @pytest.mark.parametrize("apart", [3.0, 4.5])
 def test_lanes_side_by_side_lie_as_far_apart_as_they_do(apart):
     lines = {str(k): Lane(np.array([[0.0, k * apart], [400.0, k * apart]])) for k in range(3)}
