@@ -17,7 +17,7 @@ from e2rl.run.files import hash_files
 from e2rl.scenes.log_files import bounded_memory, check_file
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, same_way
-from e2rl.scenes.smoothing import resample_uniform, speeds
+from e2rl.scenes.smoothing import resample_uniform, signed_speed, speeds
 from e2rl.scenes.source import Source
 
 FILES = ("scenario_*.parquet", "annotations*.feather")
@@ -104,7 +104,7 @@ def _scenario(path: Path) -> Recording:
         for state in track.object_states:
             if valid[state.timestep, index]:
                 raise InputError(f"track {track.track_id} is recorded twice at step {state.timestep}; leave one out")
-            speed = np.hypot(*state.velocity)
+            speed = float(signed_speed(np.array(state.velocity), np.array(state.heading)))
             states[state.timestep, index] = [*state.position, state.heading, speed]
             valid[state.timestep, index] = True
     kinds = [track.object_type.value for track in tracks]
@@ -155,11 +155,12 @@ def _sensor_log(path: Path) -> Recording:
     states[:, 0, :2], states[:, 0, 2] = (place + AHEAD * turn[..., 0])[:, :2], _heading(turn[..., 0])
     valid[frame, track + 1], valid[:, 0] = True, True
     seconds = (stamps - stamps[0]) / 1e9
-    states[..., 3] = speeds(states[..., :2], valid, seconds)
+    states, valid = resample_uniform(states, valid, seconds)
+    states[..., 3] = speeds(states, valid)
     size = np.stack([EGO_SIZE, *table[["length_m", "width_m"]].to_numpy(float)[first]])
     kinds = ["regular_vehicle", *table["category"].to_numpy()[first]]
     code = _files(path)[-1].stem.split("____")[-1].split("_")[0]
-    arrays = (*resample_uniform(states, valid, seconds), size, _types(kinds))
+    arrays = (states, valid, size, _types(kinds))
     return Recording(path.parent.name, CITIES.get(code, code), "argoverse2", *arrays, 0, {}, current=None)
 
 

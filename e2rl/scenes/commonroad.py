@@ -20,7 +20,7 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.log_files import LogFiles, bounded_memory
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import CYCLIST, DT, HISTORY, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, light_colour
-from e2rl.scenes.smoothing import resample_uniform
+from e2rl.scenes.smoothing import FRAME_STEPS, latest_frames, resample_uniform
 
 TYPES = {  # by the name of an ObstacleType
     **dict.fromkeys(["car", "truck", "bus", "motorcycle", "taxi", "vehicle"], VEHICLE),
@@ -34,7 +34,6 @@ CARS = {"vehicle", "car"}  # RoadUsers
 MOVES, NEAR = 0.5, 1.0  # m/s, m: a vehicle that moves; from a planning problem's start
 NUMBERS = {"x", "y", "z", "exact", "intervalStart", "intervalEnd", "length", "width", "radius", "orientation"}
 MAX_DEPTH, LARGEST_ANGLE = 32, 1000.0  # elements; rad
-DURATION = (0.01, 1.0)  # s, of a time step
 STEPS = 80  # simulated steps of a scene, by default
 
 
@@ -109,8 +108,9 @@ def _check_content(content: bytes) -> None:
 
 def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
     """Returns the recording, still without an ego, and the tracks that begin where a planning problem does."""
-    if not DURATION[0] <= scenario.dt <= DURATION[1]:
-        raise InputError(f"timeStepSize={scenario.dt:g}: expected {DURATION[0]} to {DURATION[1]} s; repair it")
+    low, high = FRAME_STEPS
+    if not low <= scenario.dt <= high:
+        raise InputError(f"timeStepSize={scenario.dt:g}: expected {low:g} to {high:g} s; repair it")
     obstacles = [*scenario.dynamic_obstacles, *scenario.static_obstacles]
     tracks = [_states(obstacle) for obstacle in scenario.dynamic_obstacles]
     if not tracks:
@@ -128,9 +128,10 @@ def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
             states[at, index], valid[at, index] = _state(state, boxes[index][1]), True
     kinds = np.array([TYPES.get(obstacle.obstacle_type.value, OTHER) for obstacle in obstacles])
     started = [_started(problem.initial_state, states, valid, first) for problem in problems]
-    states, valid = resample_uniform(states, valid, np.arange(count) * scenario.dt)
+    seconds = np.arange(count) * scenario.dt
+    states, valid = resample_uniform(states, valid, seconds)
     lanes, drivable = _map(scenario.lanelet_network)
-    steps_at = first + np.round(np.arange(len(states)) * DT / scenario.dt).astype(int)
+    steps_at = first + latest_frames(seconds, len(states))
     recording = Recording(
         scene_id=name,
         location=f"{scenario.scenario_id.country_id}_{scenario.scenario_id.map_name}",
@@ -163,7 +164,8 @@ def _state(state: Any, offset: np.ndarray) -> list[float]:
     cos, sin = np.cos(state.orientation), np.sin(state.orientation)
     x, y = state.position[:2] + np.array([[cos, -sin], [sin, cos]]) @ offset
     given = vars(state)  # of some kinds of state velocity_y is a second component, of others only derived
-    speed = np.hypot(given.get("velocity") or 0.0, given.get("velocity_y") or 0.0)
+    along = given.get("velocity") or 0.0
+    speed = np.copysign(np.hypot(along, given.get("velocity_y") or 0.0), along)
     return [x, y, state.orientation, float(speed)]
 
 

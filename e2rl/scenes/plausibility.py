@@ -108,13 +108,14 @@ def _extremes(sizes: np.ndarray, name: str) -> dict[str, float]:
 
 def displacements(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """All displacements [K, 2] m, overlapping ones included, of vehicles that are recorded for FRAMES frames on end and
-    drive; the pose [K, 3] in its middle, the mean recorded speed [K] m/s, and the track [K] whose it is."""
+    drive; the pose [K, 3] in its middle, the mean recorded speed [K] m/s without its sign, and the track [K] whose it
+    is."""
     states, valid = recording.states, recording.valid
     count = len(states) - FRAMES
     if count < 1:
         return np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int)
     known = np.logical_and.reduce([valid[k : count + k] for k in range(FRAMES + 1)])
-    speed = np.mean([states[k : count + k, :, 3] for k in range(FRAMES + 1)], axis=0)
+    speed = np.mean([np.abs(states[k : count + k, :, 3]) for k in range(FRAMES + 1)], axis=0)
     moved = states[FRAMES:, :, :2] - states[:count, :, :2]
     drives = (np.linalg.norm(moved, axis=-1) > MOVED) | (speed > DRIVES)
     chosen = known & drives & (recording.agent_type == VEHICLE)

@@ -28,7 +28,7 @@ from e2rl.scenes.recording import (
     light_colour,
     same_way,
 )
-from e2rl.scenes.smoothing import resample_uniform, speeds
+from e2rl.scenes.smoothing import latest_frames, resample_uniform, speeds
 from e2rl.scenes.source import Source
 
 SYNC = "sync.arrow"  # every log's folder holds one
@@ -175,11 +175,11 @@ def _recording(scene_id: str, frames: list[Frame]) -> Recording:
             sizes[index].append((length, width))
     seconds = np.array([frame.time for frame in frames])
     seconds -= seconds[0]
-    states[..., 3] = speeds(states[..., :2], valid, seconds)
     lanes = dict.fromkeys(lane for frame in frames for lane in frame.lights)
     lights = {lane: np.array([frame.lights.get(lane, LIGHT_UNKNOWN) for frame in frames]) for lane in lanes}
     states, valid = resample_uniform(states, valid, seconds)
-    latest = np.searchsorted(seconds, DT * np.arange(len(states)) + DT / 5, side="right") - 1
+    states[..., 3] = speeds(states, valid)
+    latest = latest_frames(seconds, len(states))
     size = np.array([np.median(found, axis=0) for found in sizes])
     recording = Recording(scene_id, "", "", states, valid, size, types, 0, {}, current=None)
     recording.lights = {lane: values[latest] for lane, values in lights.items()}

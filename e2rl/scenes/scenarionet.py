@@ -19,7 +19,7 @@ from e2rl.scenes.log_files import MAX_BYTES, LogFiles
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_UNKNOWN, Lane, Recording, light_colour
-from e2rl.scenes.smoothing import resample_uniform
+from e2rl.scenes.smoothing import latest_frames, resample_uniform, signed_speed
 
 TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
 OBSTACLES = ("UNSET", "TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT", "TRAFFIC_LIGHT", "BUILDING", "GROUND")
@@ -143,7 +143,7 @@ def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray, Counter[s
         state = track["state"]
         known = np.asarray(state["valid"]).astype(bool).reshape(-1)
         states[:, index, :2], states[:, index, 2] = np.asarray(state["position"])[:, :2], state["heading"]
-        states[:, index, 3] = np.linalg.norm(np.asarray(state["velocity"])[:, :2], axis=1)
+        states[:, index, 3] = signed_speed(np.asarray(state["velocity"], float)[:, :2], states[:, index, 2])
         valid[:, index] = known
         bad = known & ~np.isfinite(states[:, index]).all(-1)
         if bad.any():
@@ -241,7 +241,7 @@ def _ids(items: Iterable) -> list[str]:
 def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: int) -> dict[str, np.ndarray]:
     """Light states [frames] at 10 Hz by the lane they control, from states stamped `seconds`; where a state is unknown,
     the last known one goes on."""
-    now = np.searchsorted(seconds, np.arange(frames) * DT + DT / 2) - 1
+    now = latest_frames(seconds, frames)
     lights = {}
     for key, light in dynamic.items():
         lane = str(light.get("lane", key))

@@ -14,47 +14,147 @@ WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order
 CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
 PAST = CAUSAL_WINDOW - 1  # frames of that history
 MAX_TURN, MAX_STEP = 1.0, 5.0  # rad, m from one frame to the next; more is a jump
-MAX_GAP = 0.55  # s between time stamps that interpolation bridges (2 Hz annotations)
+FRAME_STEPS = (0.005, 1.25)  # s, median step of a log: 200 to 0.8 Hz
+LONGEST_PAUSE = 60.0  # s from one frame of a log to the next
+MAX_GAP = 0.55  # s without any frame of the log that interpolation bridges (2 Hz annotations)
+NEAR = 0.02  # s from a grid frame to the frame that stands for it
+ON_GRID = 1e-3  # s from a grid frame at which a frame is this grid frame
+REGULAR = 0.1  # quantile of a track's steps below which none may lie for it to be annotated at a lower rate
+FLIP = 2.0  # rad from one frame to the next, which no vehicle turns
 TOP_SPEED = 45.0  # m/s; recorded speeds beyond it are glitches
 
 
 def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tracks [F, A, 4] and valid [F, A] stamped ts [F] s, interpolated on a grid of DT from ts[0] on.
+    """Returns tracks [G, A, 4] on a grid of DT from ts[0] on, and where they are valid [G, A].
 
-    A grid frame is valid where the frames before and after it are, at most MAX_GAP apart; a frame within 20 ms of it
-    suffices. Raises InputError for time stamps that do not increase or are not in seconds.
+    A grid frame is interpolated between the track's own valid frames before and after it, so that
+    invalid rows never count, and is valid where `_bridged` allows this. Where it does not, as at the
+    ends of a track, the log's frame nearest to the grid frame may still be a valid one of the track
+    within NEAR: then it is extrapolated from there. Elsewhere the states are 0.
+
+    Args:
+        states: of the log's frames [F, A, 4]: x, y [m], heading [rad], speed [m/s].
+        valid: where they are recorded [F, A].
+        ts: their time stamps [F] s, ascending; frames of one time stamp become one.
+
+    Raises:
+        InputError: time stamps that descend, or are not in seconds.
     """
-    step = np.diff(ts)
-    if not (np.isfinite(ts).all() and (step > 0).all() and 0.01 < np.median(step) < 1.0 and step.max() < 60.0):
-        median = f"median step {np.median(step):g}"
-        raise InputError(f"time stamps do not increase in seconds ({median}); repair metadata.ts")
+    states, valid, ts = _merge_equal_stamps(states, valid, ts)
+    step = np.diff(ts) if len(ts) > 1 else np.array([np.nan])
+    median, in_order = float(np.median(step)), bool((step > 0).all())
+    if not (in_order and FRAME_STEPS[0] <= median <= FRAME_STEPS[1] and step.max() < LONGEST_PAUSE):
+        raise InputError(f"time stamps do not increase in seconds (median step {median:g}); repair metadata.ts")
     ts = ts - ts[0]
-    count = int(round(ts[-1] / DT)) + 1
+    grid = np.arange(int((ts[-1] + NEAR) / DT) + 1) * DT
+    latest, earliest = _valid_until(valid), _valid_from(valid)
+    before = latest[np.searchsorted(ts, grid + ON_GRID, side="right")]
+    after = earliest[np.searchsorted(ts, grid - ON_GRID)]
+    between = _bridged(before, after, valid, ts)
+    nearest = latest_frames(ts, len(grid))[:, None]
+    offset = grid[:, None] - ts[nearest]
+    near = (np.abs(offset) <= NEAR) & np.take_along_axis(valid, nearest, axis=0)
+    inner = np.where(offset > 0, latest[nearest[:, 0]], earliest[nearest[:, 0] + 1])
+    inner = np.where(_bridged(np.minimum(inner, nearest), np.maximum(inner, nearest), valid, ts), inner, nearest)
+    before = np.where(between, before, np.minimum(inner, nearest))
+    after = np.where(between, after, np.maximum(inner, nearest))
+    out = _interpolate(states, ts, grid, before, after)
+    known = between | near
+    return np.where(known[..., None], out, 0.0), known
+
+
+def _merge_equal_stamps(
+    states: np.ndarray, valid: np.ndarray, ts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States, valid and time stamps without repeated stamps; of a track the last valid frame at a stamp is kept."""
+    repeated = np.flatnonzero(np.diff(ts) == 0)
+    if not len(repeated):
+        return states, valid, ts
+    states, valid = states.copy(), valid.copy()
+    for frame in repeated:
+        kept = valid[frame] & ~valid[frame + 1]
+        states[frame + 1, kept], valid[frame + 1, kept] = states[frame, kept], True
+    return np.delete(states, repeated, axis=0), np.delete(valid, repeated, axis=0), np.delete(ts, repeated)
+
+
+def _valid_until(valid: np.ndarray) -> np.ndarray:
+    """The last valid frame of each track before the frames 0 .. F [F + 1, A], -1 for none."""
+    frame = np.where(valid, np.arange(len(valid))[:, None], -1)
+    return np.maximum.accumulate(np.pad(frame, ((1, 0), (0, 0)), constant_values=-1), axis=0)
+
+
+def _valid_from(valid: np.ndarray) -> np.ndarray:
+    """The first valid frame of each track from the frames 0 .. F on [F + 1, A], F for none."""
+    return len(valid) - 1 - _valid_until(valid[::-1])[::-1]
+
+
+def _bridged(before: np.ndarray, after: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> np.ndarray:
+    """Whether two successive valid frames [G, A] of a track are near enough to interpolate between them.
+
+    Frames between them that the log has, but not the track, say that it was not seen: then they may lie DT apart, as no
+    log at 10 Hz would know better, or as far as the track is annotated at most (every fifth frame, say). Frames that
+    the whole log lacks say nothing: MAX_GAP. Both may be a step and a half of a slow log or track, at most
+    FRAME_STEPS[1].
+    """
+    exists = (before >= 0) & (after < len(ts))
+    before, after = np.where(exists, before, 0), np.where(exists, after, 0)
+    gap = ts[after] - ts[before]
+    step = np.diff(ts)
+    own = np.full(valid.shape[1], np.median(step))
+    for agent in np.flatnonzero(valid.sum(0) > 2):
+        own[agent] = np.quantile(np.diff(ts[valid[:, agent]]), REGULAR)
+    sparse = np.where(own > 1.5 * np.median(step), 1.5 * np.minimum(own, FRAME_STEPS[1]), 0.0)
+    lacking = max(MAX_GAP, 1.5 * float(np.median(step)))
+    most = np.where(after - before <= 1, np.maximum(lacking, sparse), np.maximum(DT, sparse))
+    return exists & (gap <= most + ON_GRID)
+
+
+def _interpolate(
+    states: np.ndarray, ts: np.ndarray, grid: np.ndarray, before: np.ndarray, after: np.ndarray
+) -> np.ndarray:
+    """States [G, A, 4] at the times grid [G] on the lines through two frames [G, A] each, that may be one.
+
+    Headings turn the short way; a heading that flips is the nearer frame's.
+    """
+    agent = np.arange(states.shape[1])
+    first, last = states[before, agent], states[after, agent]
+    span = ts[after] - ts[before]
+    weight = np.where(span > 0, (grid[:, None] - ts[before]) / np.where(span > 0, span, 1.0), 0.0)
+    out = first + weight[..., None] * (last - first)
+    turn = wrap(last[..., 2] - first[..., 2])
+    turning = np.where(np.abs(turn) > FLIP, np.round(np.clip(weight, 0, 1)), weight)
+    out[..., 2] = first[..., 2] + turning * turn
+    return out
+
+
+def latest_frames(ts: np.ndarray, count: int) -> np.ndarray:
+    """The log's frames [count] that hold at the grid times 0, DT, ...: the nearest within NEAR, else the last before.
+
+    ts: the time stamps [F] s of the log's frames, ascending from 0 on.
+    """
     grid = np.arange(count) * DT
-    if count == len(ts) and np.abs(ts - grid).max() < 0.02:
-        return states, valid
-    right = np.clip(np.searchsorted(ts, grid - 1e-6), 1, len(ts) - 1)
-    left = right - 1
-    weight = np.clip((grid - ts[left]) / np.maximum(ts[right] - ts[left], 1e-6), 0, 1)[:, None]
-    near_left, near_right = (grid - ts[left] < 0.02)[:, None], (ts[right] - grid < 0.02)[:, None]
-    weight = np.where(near_left & ~valid[right], 0.0, np.where(near_right & ~valid[left], 1.0, weight))
-    turn = wrap(states[right, :, 2] - states[left, :, 2])
-    out = states[left] + weight[..., None] * (states[right] - states[left])
-    out[..., 2] = states[left, :, 2] + weight * turn
-    bridged = (ts[right] - ts[left] < MAX_GAP)[:, None] | near_left | near_right
-    return out, (valid[left] | near_right) & (valid[right] | near_left) & bridged
+    before = np.maximum(np.searchsorted(ts, grid + ON_GRID, side="right") - 1, 0)
+    after = np.minimum(before + 1, len(ts) - 1)
+    ahead = ts[after] - grid
+    return np.where((ahead <= NEAR) & (ahead < grid - ts[before] - 1e-6), after, before)
 
 
-def speeds(position: np.ndarray, valid: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """Speeds [F, A] m/s: the length of the mean of the velocities to the frames before and after, where these are
-    recorded; 0 for a track of one frame."""
-    velocity = np.diff(position, axis=0) / np.diff(seconds)[:, None, None]
+def signed_speed(velocity: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """Speeds [...] m/s of velocities [..., 2], negative where these point backwards of a heading [...] rad."""
+    along = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
+    return np.where(along < 0, -1.0, 1.0) * np.linalg.norm(velocity, axis=-1)
+
+
+def speeds(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Signed speeds [F, A] m/s of tracks [F, A, 4] at 10 Hz, from the mean of the velocities to the frames before and
+    after, where these are recorded; 0 for a track of one frame."""
+    velocity = np.diff(states[..., :2], axis=0) / DT
     known = (valid[1:] & valid[:-1])[..., None]
-    total, count = np.zeros_like(position), np.zeros((*valid.shape, 1))
+    total, count = np.zeros((*valid.shape, 2)), np.zeros((*valid.shape, 1))
     for side in (slice(None, -1), slice(1, None)):
         total[side] += velocity * known
         count[side] += known
-    return np.linalg.norm(total / np.maximum(count, 1), axis=-1)
+    return signed_speed(total / np.maximum(count, 1), states[..., 2])
 
 
 def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
