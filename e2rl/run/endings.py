@@ -1,17 +1,18 @@
 """How a command ends that cannot go on: one line on stderr says why and how to go on; no process is left behind."""
 
 import errno
-import multiprocessing
+import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
 from e2rl.run.errors import InputError
+from e2rl.run.process_tree import descendants, kill_descendants
 
 WRITING = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EEXIST, errno.ENAMETOOLONG),
@@ -51,36 +52,35 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
 
     heeded = [each for each in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(each) is not signal.SIG_IGN]
     before = {number: signal.signal(number, interrupt) for number in heeded}
+    others = descendants(os.getpid())
     try:
         yield
+        sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         if arrived or isinstance(error, KeyboardInterrupt):
             number = signal.Signals(arrived[0] if arrived else signal.SIGINT)
-            _end(f"\ninterrupted ({number.name}); go on with: {go_on()}", 128 + number)
+            _end(f"\ninterrupted ({number.name}); go on with: {go_on()}", 128 + number, others)
         if isinstance(error, InputError):
-            _end(f"error: {' '.join(str(error).split())}", 2)
+            _end(f"error: {' '.join(str(error).split())}", 2, others)
+        if isinstance(error, BrokenPipeError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the end of python complains, too
+            _end(f"\nerror: nobody reads the output any more; go on with: {go_on()}", 1, others)
         failed = error.__cause__ if isinstance(error.__cause__, OSError) else error  # of logging that is set up
         if isinstance(failed, OSError) and failed.errno in WRITING:
             where = failed.filename or "a file"
             reason = f"{where}: cannot be written ({failed.strerror}); what was written before is whole"
-            _end(f"\nerror: {reason}. Mend that, then go on with: {go_on()}", 1)
+            _end(f"\nerror: {reason}. Mend that, then go on with: {go_on()}", 1, others)
         memory = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
         if memory or (isinstance(error, RuntimeError) and any(words in str(error) for words in MEMORY)):
             reason = "out of memory; what was written before is whole"
-            _end(f"\nerror: {reason}. Free memory, or use fewer processes, then go on with: {go_on()}", 1)
+            _end(f"\nerror: {reason}. Free memory, or use fewer processes, then go on with: {go_on()}", 1, others)
         raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-def kill_workers(others: set | None = None) -> None:
-    """Kill the worker processes of this process, but for `others`."""
-    for child in set(multiprocessing.active_children()) - (others or set()):
-        child.kill()
-
-
-def _end(message: str, status: int) -> NoReturn:
-    kill_workers()
+def _end(message: str, status: int, others: Collection[int]) -> NoReturn:
+    kill_descendants(others)
     print(message, file=sys.stderr)
     sys.exit(status)

@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from e2rl.run.endings import kill_workers
 from e2rl.run.errors import InputError
+from e2rl.run.process_tree import adopting, descendants, kill_descendants
 from e2rl.run.ray_workers import RayWorkers
 
 PR_SET_PDEATHSIG = 1  # of prctl(2)
@@ -112,18 +112,20 @@ def worker_pool(
 ) -> Iterator[ProcessPoolExecutor]:
     """A pool of processes of one thread each, started by `method` (fork or spawn), which call begin(*arguments) first.
 
-    Left by an exception, KeyboardInterrupt included, it kills its workers instead of waiting for them.
+    Left by an exception, KeyboardInterrupt included, it kills its workers instead of waiting for them, with what these
+    have started, such as the programs of a planner.
     """
-    others = set(multiprocessing.active_children())
+    others = descendants(os.getpid())
     given = (os.getpid(), begin, arguments)
     pool = ProcessPoolExecutor(processes, multiprocessing.get_context(method), _begin, given)
-    try:
-        yield pool
-    except BaseException:
-        kill_workers(others)
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
-    pool.shutdown(cancel_futures=True)
+    with adopting():
+        try:
+            yield pool
+        except BaseException:
+            kill_descendants(others)
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        pool.shutdown(cancel_futures=True)
 
 
 def _begin(parent: int, begin: Callable[..., object] | None, arguments: tuple) -> None:

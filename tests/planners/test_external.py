@@ -11,6 +11,8 @@ import subprocess
 import sys
 import time
 from functools import partial
+from itertools import product
+from pathlib import Path
 
 import pytest
 import torch
@@ -151,6 +153,77 @@ def test_no_process_is_left(tmp_path, how):
         time.sleep(0.02)
     assert running.exitcode == {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}[how]
     assert not any(map(alive, planners))
+
+
+def starting(folder):
+    """The statements of a planner that starts two programs, one in a session of its own, and hangs."""
+    (folder / "children").mkdir()
+    return "; ".join(
+        [
+            "import subprocess",
+            "sleep = [sys.executable, '-S', '-c', 'import time; time.sleep(100)']",
+            "pids = [subprocess.Popen(sleep, start_new_session=alone).pid for alone in (False, True)]",
+            f"[Path({str(folder / 'children')!r}, str(pid)).touch() for pid in pids]",
+            "time.sleep(100)",
+        ]
+    )
+
+
+class Starter(SameLaw):
+    """An Ego that starts programs in the process that drives it, and hangs."""
+
+    def __init__(self, statements):
+        super().__init__(5)
+        self.statements = statements
+
+    def plan(self, world):
+        exec(self.statements, {"sys": sys, "time": time, "Path": Path})
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "how"),
+    [("external", "SIGKILL"), *product(["external", "inside"], ["SIGINT", "SIGTERM", "a worker is killed"])],
+)
+def test_nothing_is_left_of_what_planners_started(tmp_path, how, kind):
+    """Two workers wait for planners that hang; SIGKILL ends the command's own process."""
+    statements = starting(tmp_path)
+    ego = Starter(statements)
+    if kind == "external":
+        ego = ExternalEgo(wrong_planner(tmp_path, 0.0, act=statements), timeout=100.0)
+
+    def command():
+        os.setsid()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with ending(lambda: "do it again"):
+            run(ego, processes=2, batch=2)
+
+    running = multiprocessing.get_context("fork").Process(target=command)
+    running.start()
+    children, begin = tmp_path / "children", time.monotonic()
+    while len(list(children.iterdir())) < 4 and time.monotonic() - begin < 30:
+        time.sleep(0.02)
+    started = [int(mark.name) for mark in children.iterdir()]
+    assert len(started) == 4 and all(map(alive, started))
+    time.sleep(0.2)
+    if how == "SIGINT":
+        os.killpg(running.pid, signal.SIGINT)
+    elif how == "a worker is killed":
+        os.kill(max(workers_of(running.pid)), signal.SIGKILL)
+    else:
+        os.kill(running.pid, getattr(signal, how))
+    running.join(20)
+    while any(map(alive, started)) and time.monotonic() - begin < 60:
+        time.sleep(0.02)
+    assert running.exitcode == {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}.get(how, 2)
+    assert not any(map(alive, started))
+
+
+def workers_of(process):
+    """The processes that were forked by another."""
+    named = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    return [int(child) for child in named]
 
 
 def test_messages_hold_the_world_field_by_field():
