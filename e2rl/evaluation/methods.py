@@ -14,7 +14,7 @@ from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.checkpoint import load_prior
 from e2rl.prior.prior import Prior
 from e2rl.prior.sde import SamplerSettings
-from e2rl.run.config import built, choices, load_choice, machine_of, with_changes
+from e2rl.run.config import built, check_list, choices, load_choice, machine_of, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.processes import Processes, RayWorkers, cores
 from e2rl.run.settings import check_choice, check_settings, setting, settings_of
@@ -27,6 +27,7 @@ SEARCH = "search"  # the method whose tries are drawn from families
 FEW = 640.0  # NFE a scene: a rollout of CCDiff
 VARIED = ("prior", "synthesizer", "search")  # groups that the variants of a table may change
 ALL = "all"  # metrics
+LISTS = ("methods", "eta", "seeds", "compare", "budget", "shard")
 
 
 # --- objects
@@ -127,6 +128,8 @@ class EvaluationSettings:
 def evaluation_settings(config: DictConfig) -> EvaluationSettings:
     """Returns what a configuration asks for; InputError for what cannot be run."""
     given = {field.name: config[field.name] for field in fields(EvaluationSettings)}
+    for name in LISTS:
+        check_list(name, given[name])
     given |= {name: as_list(given[name]) for name in ("eta", "seeds", "compare", "budget")}
     given |= {"methods": rows_of(config)} | _budget(config)
     settings = settings_of(EvaluationSettings, given | {"shard": config.shard or WHOLE})

@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.run.config import choices, load_config
+from e2rl.run.config import as_a_list, choices, load_config
 from e2rl.run.endings import ending, program
 from e2rl.run.errors import InputError
 from e2rl.run.files import alone_in
@@ -157,6 +157,8 @@ def told(name: str, arguments: Sequence[str], said: str) -> str:
         near = [DATA[file]] if group == "data" and file in DATA else get_close_matches(file, known, 1, 0.5)
         own = f"one of your own is FOLDER/{group}/{file}.yaml, with --config-dir FOLDER"
         return _told(f"{group}={file}", [f"{group}={each}" for each in near], f"of {', '.join(known)}; {own}")
+    if found := re.search("Ambiguous value for argument '(.+?)=(.*?)'", said):
+        return f"{found[1]}={found[2]}: {as_a_list(found[1], found[2])}; a sweep, a run for each, is -m"
     if found := re.search("Could not override '(.+?)'", said):
         groups = () if any(_further(arguments)) else _groups(name)
         config = load_config(name, [argument for argument in arguments if argument.split("=")[0] in groups])

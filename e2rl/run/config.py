@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from e2rl.run.errors import InputError
+from e2rl.run.extras import how_to_install
 from e2rl.run.settings import conf_folder, setting, settings_of
 
 CHOICE = re.compile(r"[\w+-][\w.+-]*(/[\w+-][\w.+-]*)*")  # a file's name in a group
@@ -135,10 +136,23 @@ def check_device(key: str, device: str) -> None:
         raise InputError(f"{key}={device}: {str(error).splitlines()[0]}; use {key}=cpu or cuda") from error
 
 
+def check_list(key: str, value: Any) -> None:
+    """Raises InputError for a text of several values, where the values of `key` are a list."""
+    if isinstance(value, str) and "," in value:
+        raise InputError(f"{key}={value}: {as_a_list(key, value)}")
+
+
+def as_a_list(key: str, value: str) -> str:
+    """Returns how to write several values that commas part; a name with spaces is one."""
+    values = ",".join(part.strip() for part in value.split(","))
+    return f"several values are a list, '{key}=[{values}]'"
+
+
 def set_up(config: DictConfig) -> None:
     """Import the plugins; set the threads, the device and the seeds of torch, numpy and python. Raises InputError for a
     plugin or device that is not there, and a size that is impossible."""
     machine_of(config)
+    check_list("plugins", config.plugins)
     import_plugins(config.plugins, "plugins: ")
     torch.set_num_threads(config.threads)
     check_device("device", config.device)
@@ -153,8 +167,7 @@ def library(name: str, where: str, extra: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        mend = f"install e2rl with its extra: pip install 'e2rl[{extra}]'"
-        raise InputError(f"{where}: {name} cannot be imported ({error}); {mend}") from error
+        raise InputError(f"{where}: {name} cannot be imported ({error}); {how_to_install(extra)}") from error
 
 
 def import_plugins(names: Sequence[str], option: str) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from e2rl.run.errors import InputError
+from e2rl.run.extras import how_to_install
 from e2rl.run.files import hash_files
 from e2rl.run.fused import is_on, switch
 
@@ -38,7 +39,7 @@ class RayWorkers:
 
     def __post_init__(self) -> None:
         if find_spec("ray") is None:
-            raise InputError("launcher=ray: Ray is not installed; install e2rl with its extra: pip install 'e2rl[ray]'")
+            raise InputError(f"launcher=ray: Ray is not installed; {how_to_install('ray')}")
 
     @contextmanager
     def tasks(self, function: Callable[[Any], bytes], jobs: Sequence) -> Iterator[Callable[[int], Future]]:

@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 from e2rl.run.config import Extension
 from e2rl.run.errors import InputError
+from e2rl.run.extras import how_to_install
 from e2rl.run.files import cache_folder
 from e2rl.run.processes import interrupts_held, without_main, worker_pool
 from e2rl.run.settings import check_range, check_settings, file_values, setting, settings_of
@@ -173,7 +174,7 @@ class Source(Extension, ABC):
         except ImportError as error:
             if not self.extra:
                 raise
-            mend = f"install e2rl with its extra: pip install 'e2rl[{self.extra}]'"
+            mend = how_to_install(self.extra)
             raise InputError(f"{log}: a library of its reader cannot be imported ({error}); {mend}") from error
         except Exception as error:  # damaged files raise anything
             if not self.mend:

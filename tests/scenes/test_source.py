@@ -265,7 +265,7 @@ class Unread(Mended):
 def test_a_library_that_is_missing_ends_the_load_whatever_may_be_skipped(tmp_path):
     (tmp_path / "a.txt").write_text("5.0")
     (tmp_path / "b.txt").write_text("5.0")
-    with pytest.raises(InputError, match=r"a\.txt: a library of its reader .* pip install 'e2rl\[files\]'"):
+    with pytest.raises(InputError, match=r"a\.txt: a library of its reader .* pip install -e '.*\[files\]'"):
         Unread(str(tmp_path), cache=str(tmp_path), workers=1, skip_invalid=True).load()
 
 
