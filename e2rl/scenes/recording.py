@@ -53,6 +53,22 @@ def light_colour(name: object, otherwise: int = LIGHT_UNKNOWN) -> int:
     return next((state for word, state in COLOURS.items() if word in words), otherwise)
 
 
+ARRAYS = (  # fields of a Recording: name, kinds of numbers, columns, in words
+    ("states", "f", 4, "a float array [frames, agents, 4]"),
+    ("size", "fiu", 2, "an array [agents, 2] of lengths and widths"),
+    ("agent_type", "iu", 0, "an integer array [agents]"),
+)
+FIELDS = (  # further ones: name, classes, in words
+    ("ego", int | np.integer, "the index of a track"),
+    ("current", int | np.integer | None, "a frame, or None"),
+    ("lanes", Mapping, "a dict of Lane objects"),
+    ("lights", Mapping, "a dict of arrays"),
+    ("drivable", list | tuple, "a list of arrays"),
+    ("repairs", Mapping, "a Counter"),
+    ("egos", Mapping, "a dict of frames and tracks"),
+)
+
+
 def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[str]:
     """Returns the id of a lane's neighbour, if it is one of `lanes` and no oncoming one, which maps name as well."""
     other = lanes.get(str(neighbour))
@@ -150,6 +166,62 @@ class Recording:
         if not self.scene_id:
             raise InputError("it has no id; give it one")
         return self
+
+    def validate_fields(self) -> "Recording":
+        """Returns self; raises InputError naming the scene and a field that is of another kind, type or shape."""
+        frames, agents = self.valid.shape if isinstance(self.valid, np.ndarray) and self.valid.ndim == 2 else (-1, -1)
+        shape = f"{frames} frames, {agents} agents"
+        if agents < 0 or self.valid.dtype != bool:
+            raise self._wrong("valid", self.valid, "a bool array [frames, agents]")
+        for name, kinds, columns, text in ARRAYS:
+            value = getattr(self, name)
+            sizes = (frames, agents, columns) if name == "states" else (agents, columns)[: 1 + (columns > 0)]
+            if not isinstance(value, np.ndarray) or value.dtype.kind not in kinds or value.shape != sizes:
+                raise self._wrong(name, value, f"{text}, as valid is of {shape}")
+        if not ((self.agent_type >= VEHICLE) & (self.agent_type <= OTHER)).all():
+            raise self._wrong("agent_type", self.agent_type, f"numbers from {VEHICLE} to {OTHER}")
+        for name, kinds, text in FIELDS:
+            value = getattr(self, name)
+            if not isinstance(value, kinds) or isinstance(value, bool):
+                raise self._wrong(name, value, text)
+        self._validate_map(frames)
+        return self
+
+    def _validate_map(self, frames: int) -> None:
+        """Raises InputError for lanes, polygons and lights that are of another kind, type or length."""
+        for name, lane in self.lanes.items():
+            if not isinstance(name, str) or not isinstance(lane, Lane):
+                raise self._wrong("lanes", {name: lane}, "a Lane by a text each")
+            for part in ("points", "heights"):
+                value = getattr(lane, part)
+                if not isinstance(value, np.ndarray) and not (part == "heights" and value is None):
+                    raise self._wrong(f"lanes[{name!r}].{part}", value, "an array")
+            for part in ("width", "speed_limit"):
+                if not isinstance(getattr(lane, part), int | float | np.number):
+                    raise self._wrong(f"lanes[{name!r}].{part}", getattr(lane, part), "a number")
+            for part in ("exits", "left", "right"):
+                value = getattr(lane, part)
+                if not isinstance(value, list | tuple) or not all(isinstance(other, str) for other in value):
+                    raise self._wrong(f"lanes[{name!r}].{part}", value, "a list of ids of lanes, which are texts")
+        for ring in self.drivable:
+            if not isinstance(ring, np.ndarray):
+                raise self._wrong("drivable", ring, "a list of arrays [points, 2]")
+        for name, light in self.lights.items():
+            known = isinstance(light, np.ndarray) and light.dtype.kind in "iu" and light.shape == (frames,)
+            if name not in self.lanes or not known:
+                raise self._wrong(
+                    f"lights[{name!r}]", light, f"an integer array of {frames} states, by the id of a lane"
+                )
+
+    def _wrong(self, name: str, value: object, expected: str) -> InputError:
+        """Returns the error of a field that is not what is expected."""
+        array = isinstance(value, np.ndarray)
+        kind = (
+            f"{value.dtype} {list(value.shape)}"
+            if array
+            else f"{type(value).__name__} {' '.join(ascii(value).split())[:40]}"
+        )
+        return InputError(f"scene {self.scene_id!r}: its {name} is {kind}; expected {expected}")
 
     def validate_log(self) -> "Recording":
         """Returns self; raises InputError naming the scene where tracks, ego or lanes cannot make a scene."""

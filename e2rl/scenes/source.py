@@ -2,7 +2,7 @@
 
 A source is one dataclass and one YAML file in conf/data, whose `_target_` names the class; an outside package adds its
 own in the same way. The class says which logs there are and reads one log. `Source` does the rest: start frames,
-parallel building, a cache keyed by content, and the count of what is left out.
+parallel building, a cache keyed by content and by the code of the class, and the count of what is left out.
 """
 
 import hashlib
@@ -10,7 +10,7 @@ import json
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, nullcontext
@@ -31,6 +31,7 @@ from e2rl.run.files import cache_folder
 from e2rl.run.processes import interrupts_held, without_main, worker_pool
 from e2rl.run.settings import check_range, check_settings, file_values, setting, settings_of
 from e2rl.scenes.builder import BuildSettings, SceneBuilder, ego_overlaps
+from e2rl.scenes.reader_code import code_hash, failed_line
 from e2rl.scenes.recording import MAX_NAME, Recording
 from e2rl.scenes.scene import SceneSet, validate
 from e2rl.scenes.scene_cache import Index, cached, uncached
@@ -86,10 +87,15 @@ class Source(Extension, ABC):
     workers: int = default_of("workers")
     build: BuildSettings = field(default_factory=BuildSettings)
 
+    code: ClassVar[str | None] = None  # hash of the code that defines the class, as it was when it was imported
     has_splits: ClassVar[bool] = False  # whether `split` chooses among the recordings
     holds: ClassVar[str] = "recorded logs"  # what `path` holds, for messages
     mend: ClassVar[str] = ""  # what to do with a damaged log; "": any error of `read` but InputError is the class's own
     extra: ClassVar[str] = ""  # of e2rl, with the library that `read` imports
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.code = code_hash(cls)
 
     def __post_init__(self) -> None:
         if isinstance(self.build, Mapping):
@@ -125,7 +131,7 @@ class Source(Extension, ABC):
 
     def recordings(self) -> Iterator[Recording]:
         """Yields all recordings, one for each scene, read in this process."""
-        for log in self.logs():
+        for log in self.log_names():
             for windows in self._windows(log):
                 yield from windows
 
@@ -136,8 +142,8 @@ class Source(Extension, ABC):
         """
         if type(self).__module__ == "__mp_main__":  # a worker that imports its script anew would wait for its parent
             raise InputError('a script that defines its own source needs `if __name__ == "__main__":` around its calls')
-        content = self.fingerprint()
-        if content is None:
+        content = self._called("fingerprint", self.fingerprint)
+        if content is None or self.code is None:
             return uncached(partial(self._built, most))
         folder = Path(self.cache) if self.cache else cache_folder()
         every = folder / self._file(content, None)
@@ -147,22 +153,55 @@ class Source(Extension, ABC):
             scenes = cached(folder / self._file(content, most), partial(self._built, most), self.cache_gb)
         return replace(scenes, files=hashlib.sha256(content).hexdigest())
 
+    def log_names(self) -> list[str]:
+        """Returns `logs`, checked; raises InputError where it fails, or returns anything else than a list of texts."""
+        names = self._called("logs", self.logs)
+        if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+            wrong = type(names).__name__ if not isinstance(names, list | tuple) else "other than texts"
+            raise InputError(f"{type(self).__name__}.logs returns {wrong}; return a list of the names of logs")
+        return list(names)
+
+    def _called(self, name: str, method: Callable[[], Any]) -> Any:
+        """Returns what a method of the class does; InputError, with the line, where a user's code raises."""
+        try:
+            return method()
+        except InputError:
+            raise
+        except Exception as error:
+            line = failed_line(type(self), error.__traceback__)
+            if not line:
+                raise
+            raise InputError(
+                f"{type(self).__name__}.{name} failed at {line}: {_cause(error)}; mend it there"
+            ) from error
+
     def _file(self, content: bytes, most: int | None) -> str:
         """Returns the name of the cache file of the first `most` scenes."""
         settings = asdict(self) | {"split": self.split_name, "source": type(self).__qualname__}
         settings = {key: value for key, value in settings.items() if key not in NO_MATTER}
-        about = json.dumps([VERSION, settings, most], sort_keys=True).encode()
+        about = json.dumps([VERSION, self.code, settings, most], sort_keys=True, default=str).encode()
         return f"scenes-{hashlib.sha256(about + content).hexdigest()}.map"
 
     def _windows(self, log: str) -> Iterator[list[Recording]]:
         """Yields the recordings that one log makes, those of the same tracks and map together."""
         with self.named(log):
-            for recording in self.read(log):
-                recording.validate_names()
+            for recording in self._read(log):
+                recording.validate_names().validate_fields()
                 if len(self.versions) > 1:  # all are of one place, or else of one log
                     recording = replace(recording, location=recording.location or recording.scene_id)
                 for version in filter(None, (version_of(recording, name) for name in self.versions)):
                     yield list(version.windows(self.starts, self.build.steps))
+
+    def _read(self, log: str) -> Iterator[Recording]:
+        """Yields `read`; raises InputError where that is anything else than recordings."""
+        recordings, mend = self.read(log), "yield e2rl.scenes.recording.Recording objects"
+        name = f"{type(self).__name__}.read"
+        if not isinstance(recordings, Iterable):
+            raise InputError(f"{name} returns {type(recordings).__name__}; {mend}")
+        for recording in recordings:
+            if not isinstance(recording, Recording):
+                raise InputError(f"{name} yields {type(recording).__name__}; {mend}")
+            yield recording
 
     @contextmanager
     def named(self, log: str) -> Iterator[None]:
@@ -176,11 +215,15 @@ class Source(Extension, ABC):
                 raise
             mend = how_to_install(self.extra)
             raise InputError(f"{log}: a library of its reader cannot be imported ({error}); {mend}") from error
-        except Exception as error:  # damaged files raise anything
-            if not self.mend:
+        except (Exception, SystemExit) as error:  # damaged files raise anything, and so do mistakes in a class
+            line = failed_line(type(self), error.__traceback__)
+            if self.mend:
+                at = f" at {line}" if line else ""
+                raise InputError(f"{log}: is none of {self.holds}: {_cause(error)}{at}; {self.mend}") from error
+            if not line:
                 raise
-            reason = f"{type(error).__name__} {str(error).partition(chr(10))[0]}"
-            raise InputError(f"{log}: is none of {self.holds}: {reason}; {self.mend}") from error
+            name = f"{type(self).__name__}.read"
+            raise InputError(f"{log}: {name} failed at {line}: {_cause(error)}; mend it there") from error
 
     def _rows_of(self, log: str) -> list[Row]:
         """Returns what the recordings of one log make."""
@@ -222,7 +265,7 @@ class Source(Extension, ABC):
         `workers` processes build, never far ahead of what is asked for; this one where there is work for one, or for
         FEW scenes. Where logs share ids of scenes, those of all but the first name their log.
         """
-        logs = self.logs()
+        logs = self.log_names()
         show = partial(tqdm, desc="building scenes", total=len(logs), unit="log", disable=None)
         known: set[str] = set()
         with closing(self._rows_of_logs(logs, most)) as rows_of_logs:
@@ -348,6 +391,11 @@ def _marked(scene_id: str, mark: str) -> str:
     """Returns the id of a scene with a mark behind that of its log, before the start frame of a window."""
     name, at, start = scene_id.rpartition("@")
     return f"{name}{mark}{at}{start}" if at else f"{scene_id}{mark}"
+
+
+def _cause(error: BaseException) -> str:
+    """Returns the type and the first line of an exception."""
+    return f"{type(error).__name__} {str(error).partition(chr(10))[0]}"
 
 
 def _naming(log: str, error: InputError) -> str:

@@ -1,7 +1,9 @@
 """From configurations to scene sets: what is cached is what was built, what is left out is counted."""
 
+import importlib
 import os
 import pickle
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -248,9 +250,11 @@ class Mended(Torn):
 
 def test_what_reading_a_log_raises_is_told_where_the_source_knows_what_to_do(tmp_path):
     (tmp_path / "a.txt").write_text("5.0")
-    with pytest.raises(ZeroDivisionError):  # a mistake in the class, with its traceback
+    with pytest.raises(
+        InputError, match=r"^a\.txt: Torn\.read failed at .*test_source\.py:\d+: ZeroDivisionError of a"
+    ):
         Torn(str(tmp_path), cache=str(tmp_path), workers=1).load()
-    told = r"a\.txt: is none of text files: ZeroDivisionError of a file; write it again \(data\.skip_invalid"
+    told = r"a\.txt: is none of text files: ZeroDivisionError of a file at .*; write it again \(data\.skip_invalid"
     with pytest.raises(InputError, match=told):
         Mended(str(tmp_path), cache=str(tmp_path), workers=1).load()
 
@@ -267,6 +271,141 @@ def test_a_library_that_is_missing_ends_the_load_whatever_may_be_skipped(tmp_pat
     (tmp_path / "b.txt").write_text("5.0")
     with pytest.raises(InputError, match=r"a\.txt: a library of its reader .* pip install -e '.*\[files\]'"):
         Unread(str(tmp_path), cache=str(tmp_path), workers=1, skip_invalid=True).load()
+
+
+WRONG = {  # a field of a recording of 200 frames and one car: what a mistaken reader may yield, and what is said
+    "states": ([None, [[0.0]], np.zeros((200, 1, 3)), np.zeros((200, 1, 4), int)], "a float array"),
+    "valid": ([None, np.ones((200, 1)), np.ones(200, bool)], "a bool array"),
+    "size": ([None, [4.5, 1.9], np.ones((2, 2)), np.array([["4", "2"]])], "an array"),
+    "agent_type": ([None, [0], np.zeros(1), np.zeros(2, int), np.full(1, 7)], "an integer array|numbers from 0 to 3"),
+    "ego": ([None, "0", 0.0, True], "the index of a track"),
+    "current": (["10", 10.0], "a frame, or None"),
+    "lanes": ([None, [], {1: Lane(np.zeros((2, 2)))}, {"a": np.zeros((2, 2))}], "a dict of|a Lane by"),
+    "drivable": ([None, np.zeros((3, 2)), [[[0, 0], [1, 1]]]], "a list of arrays"),
+    "lights": (
+        [None, {"road": [1] * 200}, {"road": np.ones(9, int)}, {"no lane": np.ones(200, int)}],
+        "a dict|an integer array",
+    ),
+    "repairs": ([None, 3], "a Counter"),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, (values, _) in WRONG.items() for value in values])
+def test_a_field_of_another_kind_type_or_shape_is_named_with_its_log(tmp_path, name, value):
+    class Wrong(SpeedSource):
+        def read(self, log):
+            yield replace(next(SpeedSource.read(self, log)), **{name: value})
+
+    (tmp_path / "a.txt").write_text("5.0")
+    with pytest.raises(InputError, match=rf"^a\.txt: scene 'a\.txt': its {name}.* is .*expected ({WRONG[name][1]})"):
+        Wrong(str(tmp_path), cache=str(tmp_path), workers=1).load()
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [("points", [[0, 0], [9, 0]]), ("width", None), ("exits", [1]), ("left", "road"), ("heights", [0])],
+)
+def test_a_field_of_a_lane_is_named_with_its_log(tmp_path, part, value):
+    class Wrong(SpeedSource):
+        def read(self, log):
+            yield replace(next(SpeedSource.read(self, log)), lanes={"a": Lane(np.zeros((2, 2)))})
+
+    (tmp_path / "a.txt").write_text("5.0")
+    lane_of = Lane(np.array([[0.0, 0], [900, 0]]))
+    setattr(lane_of, part, value)
+    Wrong.read = lambda self, log: iter([replace(next(SpeedSource.read(self, log)), lanes={"a": lane_of})])
+    with pytest.raises(InputError, match=rf"^a\.txt: scene 'a\.txt': its lanes\['a'\]\.{part} is "):
+        Wrong(str(tmp_path), cache=str(tmp_path), workers=1).load()
+
+
+@pytest.mark.parametrize(
+    ("method", "result", "message"),
+    [
+        ("read", None, r"^a\.txt: Wrong\.read returns NoneType; yield"),
+        ("read", [None], r"^a\.txt: Wrong\.read yields NoneType; yield"),
+        ("read", [{}], r"^a\.txt: Wrong\.read yields dict; yield"),
+        ("logs", None, r"^Wrong\.logs returns NoneType; return a list"),
+        ("logs", [3], r"^Wrong\.logs returns other than texts; return a list"),
+    ],
+)
+def test_methods_of_a_reader_that_return_anything_else_are_named(tmp_path, method, result, message):
+    (tmp_path / "a.txt").write_text("5.0")
+    wrong = type("Wrong", (SpeedSource,), {method: lambda *_: result})
+    with pytest.raises(InputError, match=message):
+        wrong(str(tmp_path), cache=str(tmp_path), workers=1).load()
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), SystemExit(3), RecursionError(), IndexError("of a list")])
+@pytest.mark.parametrize("method", ["read", "logs", "fingerprint"])
+def test_what_a_reader_raises_has_the_line_that_raised_it(tmp_path, method, error):
+    if isinstance(error, SystemExit) and method != "read":
+        pytest.skip("only reading is done in processes that must not end")
+
+    def fails(*_):
+        raise error
+
+    (tmp_path / "a.txt").write_text("5.0")
+    wrong = type("Wrong", (SpeedSource,), {method: fails})
+    with pytest.raises(InputError, match=rf"Wrong\.{method} failed at .*test_source\.py:\d+: {type(error).__name__}"):
+        wrong(str(tmp_path), cache=str(tmp_path), workers=1).load()
+
+
+READER = """
+from dataclasses import dataclass
+import numpy as np
+from my_reader.{helper} import SPEED
+from tests.scenes.test_source import SpeedSource
+@dataclass
+class Reader(SpeedSource):
+    def read(self, log):
+        for recording in SpeedSource.read(self, log):
+            recording.states[..., 0] *= SPEED / 5.0
+            recording.states[..., 3] = SPEED
+            yield recording
+"""
+
+
+@pytest.mark.parametrize("edited", ["reader.py", "direct.py", "deep/table.py", "deep/__init__.py"])
+def test_an_edited_reader_or_what_it_imports_invalidates_its_cache(tmp_path, monkeypatch, edited):
+    package, logs = tmp_path / "code" / "my_reader", tmp_path / "logs"
+    (package / "deep").mkdir(parents=True)
+    logs.mkdir()
+    (logs / "a.txt").write_text("5.0")
+    contents = {
+        "__init__.py": "",
+        "reader.py": READER.format(helper="direct"),
+        "direct.py": "from .deep.table import SPEED",
+        "deep/table.py": "SPEED = 5.0",
+        "deep/__init__.py": "",
+        "beside.py": "",
+    }
+    monkeypatch.syspath_prepend(str(tmp_path / "code"))
+    monkeypatch.setattr("sys.dont_write_bytecode", True)
+
+    def speed() -> float:
+        for name, text in contents.items():
+            (package / name).write_text(text)
+        for name in [name for name in sys.modules if name.partition(".")[0] == "my_reader"]:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        config = {"_target_": "my_reader.reader.Reader", "path": str(logs), "workers": 1, "cache": str(tmp_path / "c")}
+        scenes = load_scenes(config | {"build": {"field_cells": 32}}).scenes
+        return scenes["start"][0, 0, 3].item()
+
+    assert speed() == pytest.approx(5.0, abs=1e-3)
+    contents["beside.py"] = "nobody imports this"
+    assert speed() == pytest.approx(5.0, abs=1e-3) and len(list((tmp_path / "c").glob("*.map"))) == 1
+    contents[edited] += "\n# another line\n"
+    assert speed() == pytest.approx(5.0, abs=1e-3) and len(list((tmp_path / "c").glob("*.map"))) == 2
+    contents["deep/table.py"] = "SPEED = 9.0"
+    assert speed() == pytest.approx(9.0, abs=1e-3)
+
+
+def test_a_reader_in_no_file_is_not_cached(tmp_path):
+    (tmp_path / "a.txt").write_text("5.0")
+    typed = type("Typed", (SpeedSource,), {"__module__": "nowhere"})
+    assert typed.code is None and len(typed(str(tmp_path), cache=str(tmp_path / "c"), workers=1).load()) == 2
+    assert not (tmp_path / "c").exists()
 
 
 def test_split_chooses_only_where_a_source_has_splits(tmp_path):

@@ -1,0 +1,141 @@
+"""The code of a data source: the modules that its class comes from, and what a user's ones import from beside them.
+
+The cache of scenes is keyed by it, so that an edited reader does not get the scenes of the old one; and messages name
+the line of it that failed.
+"""
+
+import ast
+import hashlib
+import sys
+from collections.abc import Iterator
+from importlib.machinery import PathFinder
+from importlib.util import resolve_name
+from pathlib import Path
+from types import TracebackType
+
+PACKAGE = "e2rl"
+INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
+
+
+def code_hash(kind: type) -> str | None:
+    """Returns the SHA-256 of a class's code; None where it is in no file, as in an interactive session.
+
+    Of the package's own modules it holds those in which the class and its bases are defined: what these call is
+    covered by the version of the scene builder. Of others it also holds all that they import, at whatever depth, from
+    the folder in which their top-level module or package lies.
+
+    Args:
+        kind: a class; its bases from the standard library do not count.
+    """
+    names = dict.fromkeys(each.__module__ for each in kind.__mro__ if not _is_standard(each.__module__))
+    files: dict[str, Path | None] = {}
+    for name in names:
+        files[name] = _loaded_file(name)
+        if not _is_own(name):
+            files |= _imported_files(name, files[name])
+    if not all(file and file.is_file() for file in files.values()):
+        return None
+    digest = hashlib.sha256()
+    for name, file in sorted(files.items()):
+        assert file is not None
+        digest.update(name.encode() + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def failed_line(kind: type, trace: TracebackType | None) -> str:
+    """Returns "file:line" of the last call of a traceback that is in a user's code; "" where there is none.
+
+    Args:
+        kind: the class that was called, to whose folder the code belongs.
+        trace: of the exception.
+    """
+    names = [each.__module__ for each in kind.__mro__ if not _is_standard(each.__module__)]
+    files = [(name, _loaded_file(name)) for name in names if not _is_own(name)]
+    folders = [_folder(name, file) for name, file in files if file]
+    known = {str(file) for _, file in files}
+    line = ""
+    while trace is not None:
+        name, trace_line = trace.tb_frame.f_code.co_filename, trace.tb_lineno
+        path = Path(name)
+        beside = any(path.is_relative_to(folder) and not _is_installed(path, folder) for folder in folders)
+        module = trace.tb_frame.f_globals.get("__name__", "")
+        interactive = name.startswith("<") and not _is_own(module) and not _is_standard(module)
+        if (beside and not _is_own(module)) or name in known or interactive:
+            line = f"{name}:{trace_line}"
+        trace = trace.tb_next
+    return line
+
+
+def _is_own(module: str) -> bool:
+    return module.partition(".")[0] == PACKAGE
+
+
+def _is_standard(module: str) -> bool:
+    return module.partition(".")[0] in sys.stdlib_module_names and module != "__main__"
+
+
+def _is_installed(path: Path, folder: Path) -> bool:
+    """Returns whether a file below a folder belongs to a library that is installed there."""
+    return bool(INSTALLED & set(path.relative_to(folder).parts))
+
+
+def _loaded_file(module: str) -> Path | None:
+    """Returns the file of a module that is imported."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return Path(file).resolve() if file else None
+
+
+def _folder(module: str, file: Path) -> Path:
+    """Returns the folder in which the top-level module or package of a module lies; of a library, the package."""
+    depth = module.count(".") + (file.name == "__init__.py")
+    folder = file.parents[depth]
+    return file.parents[max(depth - 1, 0)] if folder.name in INSTALLED else folder
+
+
+def _imported_files(module: str, file: Path | None) -> dict[str, Path | None]:
+    """Returns the files, by module, that a module imports from its folder, and what these import from it."""
+    if file is None:
+        return {}
+    folder = _folder(module, file)
+    found: dict[str, Path | None] = {module: file}
+    waiting = [(module, file)]
+    while waiting:
+        name, path = waiting.pop()
+        if path.suffix != ".py":
+            continue
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        for imported, place in _located(_imports(path, package)):
+            inside = place.is_relative_to(folder) and not _is_installed(place, folder)
+            if imported not in found and inside and not _is_own(imported):
+                found[imported] = place
+                waiting.append((imported, place))
+    return found
+
+
+def _imports(file: Path, package: str) -> Iterator[str]:
+    """Yields the dotted names that a file may import, from anywhere in it."""
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            name = resolve_name(base, package) if node.level else base
+            yield from (name, *(f"{name}.{alias.name}" for alias in node.names))
+
+
+def _located(names: Iterator[str]) -> Iterator[tuple[str, Path]]:
+    """Yields the modules that dotted names stand for, with the packages around them, and their files."""
+    for name in names:
+        if _is_standard(name):
+            continue
+        parts, folders = name.split("."), None
+        for depth in range(len(parts)):
+            part = ".".join(parts[: depth + 1])
+            spec = getattr(sys.modules.get(part), "__spec__", None) or PathFinder.find_spec(part, folders)
+            if spec is None:
+                break
+            if spec.has_location and spec.origin:
+                yield spec.name, Path(spec.origin).resolve()
+            folders = spec.submodule_search_locations
+            if folders is None:
+                break
