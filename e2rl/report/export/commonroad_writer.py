@@ -5,6 +5,7 @@ since a CommonRoad trajectory has no gaps. Late agents have a late initial state
 it, while the format's schema admits only obstacles that are there from the start.
 """
 
+import logging
 import re
 from collections.abc import Iterable, Iterator
 from itertools import count, groupby
@@ -22,6 +23,7 @@ from commonroad.geometry.occupancy.rect_occupancy import RectOccupancy
 from commonroad.planning.goal import GoalRegion
 from commonroad.planning.planning_problem import PlanningProblem, PlanningProblemSet
 from commonroad.prediction.prediction import TrajectoryPrediction
+from commonroad.scenario.intersection import IncomingGroup, Intersection
 from commonroad.scenario.lanelet import Lanelet, LaneletType
 from commonroad.scenario.obstacle import DynamicObstacle, ObstacleType
 from commonroad.scenario.scenario import Scenario, Tag
@@ -38,13 +40,16 @@ from commonroad.scenario.trajectory import Trajectory
 from lxml import etree
 
 from e2rl.report.export.episode import LONG, Episode
-from e2rl.scenes.paths import shift_left, tangent_angle, wrap
-from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW
+from e2rl.report.export.road_plan import RoadPlan, road_plan
+from e2rl.scenes.paths import arc_length, shift_left, tangent_angle, wrap
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW, Lane
 
+logging.getLogger(XMLFileWriter.__module__).setLevel(logging.ERROR)  # it warns of every successor that 2020a names so
 TYPES = {"vehicle": "CAR", "pedestrian": "PEDESTRIAN", "cyclist": "BICYCLE", "other": "UNKNOWN"}  # of ObstacleType
 LIGHTS = {LIGHT_RED: "RED", LIGHT_YELLOW: "YELLOW", LIGHT_GREEN: "GREEN", LIGHT_UNKNOWN: "INACTIVE"}
 GOAL_LENGTH, GOAL_WIDTH = 10.0, 4.0  # m
 STRAIGHT = 0.5  # rad that a lane may turn and still lead straight on
+TURN = 60.0  # m at the beginning of a lane that say where it turns
 MOST_CHARACTERS = 40  # of a map's name
 
 
@@ -68,8 +73,10 @@ def scenario(episode: Episode, number: int, open_ego: bool) -> tuple[Any, Any]:
     made = Scenario(episode.rollout.dt, name)
     ids = count(len(episode.rollout.size) + 1)
     made.add_objects(lanelets(episode, ids))
-    signs, lights = speed_limits(episode, made, ids), traffic_lights(episode, made, ids)
-    made.add_objects(signs + lights)
+    plan = road_plan(episode.lanes)
+    made.add_objects(speed_limits(episode, made, ids))
+    made.add_objects(traffic_lights(episode, plan, made, ids))
+    made.add_objects(intersections(episode, plan, made, ids))
     made.add_objects(obstacles(episode, ids, open_ego))
     if episode.origin is not None:
         shift = episode.origin.tolist()
@@ -85,7 +92,8 @@ def lanelets(episode: Episode, ids: Iterator[int]) -> list:
     number = {name: next(ids) for name in episode.lanes}
     entries, made = episode.entries(), []
     for name, lane in episode.lanes.items():
-        left, right = next(iter(lane.left), None), next(iter(lane.right), None)
+        left = beside(episode.lanes, name, "left", "right")
+        right = beside(episode.lanes, name, "right", "left")
         made.append(
             Lanelet(
                 left_vertices=shift_left(lane.points, lane.width / 2),
@@ -104,6 +112,13 @@ def lanelets(episode: Episode, ids: Iterator[int]) -> list:
     return made
 
 
+def beside(lanes: dict[str, Lane], name: str, side: str, other_side: str) -> str | None:
+    """Returns the lane on a side, if this one is the first on the other side of it: tools follow both ways."""
+    other = next(iter(getattr(lanes[name], side)), None)
+    mutual = other is not None and next(iter(getattr(lanes[other], other_side)), None) == name
+    return other if mutual else None
+
+
 def speed_limits(episode: Episode, made: Any, ids: Iterator[int]) -> list:
     """A virtual sign for each speed limit; lanelets refer to theirs."""
     signs = {}
@@ -118,7 +133,7 @@ def speed_limits(episode: Episode, made: Any, ids: Iterator[int]) -> list:
     return list(signs.values())
 
 
-def traffic_lights(episode: Episode, made: Any, ids: Iterator[int]) -> list:
+def traffic_lights(episode: Episode, plan: RoadPlan, made: Any, ids: Iterator[int]) -> list:
     """A light at the end of each lanelet before one with a light; where it leads to several, one for each direction."""
     number = dict(zip(episode.lanes, made.lanelet_network.lanelets, strict=True))
     found = []
@@ -128,7 +143,7 @@ def traffic_lights(episode: Episode, made: Any, ids: Iterator[int]) -> list:
             if other in episode.lights:
                 groups.setdefault(tuple(episode.lights[other].tolist()), []).append(other)
         for states, others in groups.items():
-            turns = {"ALL"} if len(others) == len(lane.exits) else {turn(episode, other) for other in others}
+            turns = {"ALL"} if len(others) == len(lane.exits) else {turn(episode, plan, other) for other in others}
             for direction in map(TrafficLightDirection.__getitem__, sorted(turns)):
                 light = TrafficLight(next(ids), lane.points[-1], cycle(states), direction=direction)
                 number[name].add_traffic_light_to_lanelet(light.traffic_light_id)
@@ -142,11 +157,57 @@ def cycle(states: Iterable[int]) -> Any:
     return TrafficLightCycle([TrafficLightCycleElement(state, length) for state, length in runs])
 
 
-def turn(episode: Episode, name: str) -> str:
-    """The direction in which a lane leads."""
-    angle = tangent_angle(episode.lanes[name].points)
-    turned = float(wrap(angle[-1] - angle[0]))
+def turn(episode: Episode, plan: RoadPlan, name: str) -> str:
+    """Returns the direction in which a lane, or the connecting road that it begins, leads: LEFT, STRAIGHT or RIGHT."""
+    names = [span.lane for span in plan.roads.get(name, ())] if name in plan.connecting else [name]
+    last = episode.lanes[names[-1]].points
+    near = arc_length(last) <= TURN
+    begin = tangent_angle(episode.lanes[name].points)[0]
+    turned = float(wrap(tangent_angle(last)[near][-1] - begin))
     return "STRAIGHT" if abs(turned) < STRAIGHT else "LEFT" if turned > 0 else "RIGHT"
+
+
+def intersections(episode: Episode, plan: RoadPlan, made: Any, ids: Iterator[int]) -> list:
+    """Returns an intersection for each junction with a light, or where a lane of one of several roads forks.
+
+    commonroad-sumo takes a light before a fork only where an intersection says which way each lanelet leads.
+    """
+    number = dict(zip(episode.lanes, (lanelet.lanelet_id for lanelet in made.lanelet_network.lanelets), strict=True))
+    crossings = []
+    for junction in plan.junctions:
+        entering = list(dict.fromkeys(plan.connecting[road][0] for road in junction))
+        groups = side_by_side(episode.lanes, entering)
+        exits = {name: episode.lanes[name].exits for name in entering}
+        lit = any(other in episode.lights for others in exits.values() for other in others)
+        forks = any(len(others) > 1 for others in exits.values())
+        if not lit and (len(groups) < 2 or not forks):
+            continue
+        incomings = []
+        for group in groups:
+            ways: dict[str, set[int]] = {"LEFT": set(), "STRAIGHT": set(), "RIGHT": set()}
+            for other in (other for name in group for other in exits[name]):
+                ways[turn(episode, plan, other)].add(number[other])
+            incoming = IncomingGroup(
+                next(ids),
+                incoming_lanelets={number[name] for name in group},
+                outgoing_right=ways["RIGHT"],
+                outgoing_straight=ways["STRAIGHT"],
+                outgoing_left=ways["LEFT"],
+            )
+            incomings.append(incoming)
+        crossings.append(Intersection(next(ids), incomings))
+    return crossings
+
+
+def side_by_side(lanes: dict[str, Lane], names: list[str]) -> list[list[str]]:
+    """Returns the lanes `names` in groups of neighbours."""
+    groups: list[list[str]] = []
+    for name in names:
+        near = {beside(lanes, name, "left", "right"), beside(lanes, name, "right", "left")}
+        touching = [group for group in groups if near & set(group)]
+        groups = [group for group in groups if group not in touching]
+        groups.append([other for group in touching for other in group] + [name])
+    return groups
 
 
 # --- agents

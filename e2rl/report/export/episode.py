@@ -141,7 +141,7 @@ def _linked(graph: LaneGraph, name: str, lane: Lane) -> Lane:
 def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
     """(row, states [PAST, 4]) of the vehicles before the start, oldest first, as traffic and ego were told them.
 
-    The speed is that of the displacement to the next frame.
+    The speed is that of the displacement to the next frame, negative where that leads backwards.
     """
     if episode.scene is None:
         return
@@ -154,5 +154,6 @@ def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
         cos, sin = heading.cos(), heading.sin()
         pose = torch.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turned], -1)
         moved = torch.cat([pose[1:], start[row, None, :3]])[:, :2] - pose[:, :2]
-        speed = moved.norm(dim=-1, keepdim=True) / episode.rollout.dt
+        forwards = (moved * torch.stack([pose[:, 2].cos(), pose[:, 2].sin()], -1)).sum(-1, keepdim=True) >= 0
+        speed = moved.norm(dim=-1, keepdim=True) / episode.rollout.dt * (2.0 * forwards - 1.0)
         yield row, torch.cat([pose, speed], -1).numpy()

@@ -5,6 +5,7 @@ so the start is frame 10 as in Waymo's files.
 """
 
 import pickle
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from e2rl.scenes.smoothing import PAST
 
 VERSION = "MetaDrive v0.3.0.1"  # of the format
 SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
+MOVES = 1.0  # m that an object moves at least that counts as moving in ScenarioNet
 PROTOCOL = 4  # of pickle, which every Python 3 reads
 HEIGHT = {"vehicle": 1.6, "cyclist": 1.75, "pedestrian": 1.75, "other": 1.0}  # m; rollouts hold none
 LIGHTS = {
@@ -47,7 +49,10 @@ def description(episode: Episode) -> dict[str, Any]:
     frames = history + episode.steps + 1
     known, scene_id = {row: states for row, states in past_of(episode)}, episode.path.stem
     tracks = {str(row): track(episode, row, history, known.get(row)) for row in episode.agents}
+    objects = {name: object_summary(name, entry) for name, entry in tracks.items()}
+    lights = {name: light(episode, name, history) for name in episode.lights}
     metadata: dict[str, Any] = {
+        "id": scene_id,
         "scenario_id": scene_id,
         "dataset": "e2rl",
         "source_file": episode.path.name,
@@ -58,7 +63,9 @@ def description(episode: Episode) -> dict[str, Any]:
         "track_length": frames,
         "sdc_id": "0",
         "sdc_track_index": 0,
-        "object_summary": {name: object_summary(name, entry) for name, entry in tracks.items()},
+        "object_summary": objects,
+        "number_summary": number_summary(objects, lights, len(episode.lanes)),
+        "map_height_diff": 0.0,  # beside the numbers: the filter of overpasses looks here
         "e2rl": episode.facts,
     }
     if episode.origin is not None:
@@ -69,7 +76,7 @@ def description(episode: Episode) -> dict[str, Any]:
         "length": frames,
         "metadata": metadata,
         "tracks": tracks,
-        "dynamic_map_states": {name: light(episode, name, history) for name in episode.lights},
+        "dynamic_map_states": lights,
         "map_features": map_features(episode),
     }
 
@@ -119,6 +126,31 @@ def object_summary(name: str, entry: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def number_summary(objects: dict[str, dict], lights: dict[str, dict], lanes: int) -> dict[str, Any]:
+    """Returns what ScenarioNet's filters know of a scenario: how many there are of everything.
+
+    Args:
+        objects: the summary of each track.
+        lights: dynamic_map_states.
+        lanes: number of map features.
+    """
+    moving = [entry["type"] for entry in objects.values() if entry["moving_distance"] > MOVES]
+    states = Counter(state for entry in lights.values() for state in entry["state"]["object_state"])
+    types = Counter(entry["type"] for entry in objects.values())
+    return {
+        "num_objects": len(objects),
+        "object_types": sorted(types),
+        "num_objects_each_type": dict(types),
+        "num_moving_objects": len(moving),
+        "num_moving_objects_each_type": dict(Counter(moving)),
+        "num_traffic_lights": len(lights),
+        "num_traffic_light_types": sorted(states),
+        "num_traffic_light_each_step": dict(states),
+        "num_map_features": lanes,
+        "map_height_diff": 0.0,
+    }
+
+
 def light(episode: Episode, name: str, history: int) -> dict[str, Any]:
     """The light that lets into a lane; unknown before the recording begins."""
     past = episode.light_past[name][-history:] if history else np.zeros(0, int)
@@ -138,7 +170,7 @@ def map_features(episode: Episode) -> dict[str, dict[str, Any]]:
     return {
         name: {
             "type": "LANE_SURFACE_STREET",
-            "polyline": lane.points,
+            "polyline": np.pad(lane.points, ((0, 0), (0, 1))),  # z is 0: MetaDrive and ScenarioNet expect [P, 3]
             "width": np.full((len(lane.points), 2), lane.width / 2),
             "entry_lanes": entries[name],
             "exit_lanes": list(lane.exits),

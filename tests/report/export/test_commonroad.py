@@ -1,6 +1,8 @@
 """CommonRoad: commonroad-io's reader gets back every state, and the schema holds."""
 
 import copy
+import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,10 @@ import commonroad  # noqa: E402
 from commonroad.common.reader.file_reader_xml import XMLFileReader  # noqa: E402
 from lxml import etree  # noqa: E402
 
+from e2rl.evaluation.rollout_files import TABLE, read_rows  # noqa: E402
+from e2rl.report.export.commonroad_writer import beside, obstacles, side_by_side  # noqa: E402
+from e2rl.report.export.episode import rollout_episode  # noqa: E402
+from e2rl.scenes.recording import Lane  # noqa: E402
 from tests.report.export.small_run import CUT_IN, GAPS, LATE, exported, rollout_of  # noqa: E402
 
 SCHEMA = Path(commonroad.__file__).parent / "common" / "xml_definition_files" / "XML_commonRoad_XSD.xsd"
@@ -74,6 +80,27 @@ def test_lanelets_lights_and_limits_come_back(scenarios):
     np.testing.assert_allclose(sorted(limit), [50 / 3.6, 20], rtol=1e-4)
 
 
+def test_lights_before_a_fork_belong_to_an_intersection_that_says_where_each_way_leads(scenarios):
+    network = scenarios[0][0].lanelet_network
+    lanes = {tuple(np.round(lane.center_vertices[-1] + [28, 0], 1).tolist()): lane for lane in network.lanelets}
+    before, on, left = (lanes[end].lanelet_id for end in ((100, 0), (400, 0), (120, 320)))
+    (intersection,) = network.intersections
+    (incoming,) = intersection.incomings
+    assert incoming.incoming_lanelets == {before}
+    assert incoming.outgoing_straight == {on}
+    assert incoming.outgoing_left == {left}
+    assert not incoming.outgoing_right
+
+
+def test_neighbours_are_mutual():
+    points = np.array([[0.0, 0.0], [50.0, 0.0]])
+    lanes = {"a": Lane(points, left=["b"]), "b": Lane(points + [0, 3], right=["c"]), "c": Lane(points - [0, 3])}
+    assert beside(lanes, "a", "left", "right") is None
+    lanes["b"].right.insert(0, "a")
+    assert beside(lanes, "a", "left", "right") == "b" and beside(lanes, "b", "right", "left") == "a"
+    assert side_by_side(lanes, ["a", "c", "b"]) == [["c"], ["a", "b"]]
+
+
 def test_the_mission_leads_from_the_start_to_where_the_recording_ends(run, scenarios):
     (problem,) = scenarios[0][1].planning_problem_dict.values()
     rollout = rollout_of(run, 0)
@@ -86,3 +113,12 @@ def test_an_open_ego_is_a_planning_problem_only(run, tmp_path):
     scenario, problems = XMLFileReader(str(exported(run, tmp_path / "out", "commonroad", "--open-ego")[0])).open()
     numbers = {obstacle.obstacle_id for obstacle in scenario.dynamic_obstacles}
     assert 1 not in numbers and CUT_IN + 1 in numbers and len(problems.planning_problem_dict) == 1
+
+
+def test_who_reverses_has_a_negative_velocity(run):
+    episode = rollout_episode(run, read_rows(run / TABLE)[0])
+    states = episode.rollout.states.copy()
+    states[:, 0, 3] = -2.0
+    backing = replace(episode, rollout=replace(episode.rollout, states=states))
+    ego = obstacles(backing, itertools.count(1000), False)[0]
+    assert [state.velocity for state in states_of(ego)] == [-2.0] * len(states)

@@ -1,12 +1,19 @@
 """ScenarioNet: the project's own reader gets back what was driven, where, and by what light."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from tensordict import TensorDict
 
+from e2rl.evaluation.rollout_files import TABLE, read_rows
+from e2rl.report.export.episode import past_of, rollout_episode
+from e2rl.report.export.scenarionet_writer import MAPPING, SUMMARY, description
 from e2rl.scenes.recording import AGENT_TYPES, LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.scenarionet import ScenarioNetSource
+from e2rl.scenes.smoothing import PAST
 from tests.report.export.small_run import CUT_IN, exported, rollout_of
 
 
@@ -58,3 +65,42 @@ def test_descriptions_are_plain_and_zero_where_nobody_is(folder):
                 assert len(values) == made["length"] and not np.any(values[~track["state"]["valid"]])
         facts = made["metadata"]["e2rl"]
         assert facts["scene_id"] in made["id"] and facts["adversaries"] == [CUT_IN]
+
+
+def test_the_summary_counts_what_filters_ask_for(run, folder):
+    summary = pickle.loads((folder / SUMMARY).read_bytes())
+    assert list(summary) == list(pickle.loads((folder / MAPPING).read_bytes()))
+    for index, (name, facts) in enumerate(summary.items()):
+        made = pickle.loads((folder / name).read_bytes())
+        rollout, numbers = rollout_of(run, index), facts["number_summary"]
+        types = rollout.agent_type[rollout.valid.any(0)].tolist()
+        assert facts["id"] == made["id"]
+        assert numbers["num_objects"] == len(types) == sum(numbers["num_objects_each_type"].values())
+        assert numbers["num_objects_each_type"]["VEHICLE"] == types.count("vehicle")
+        assert numbers["num_moving_objects"] == len(types) - 1  # all but the box
+        assert "OTHER" not in numbers["num_moving_objects_each_type"]
+        assert numbers["num_traffic_lights"] == 2
+        states = {"LANE_STATE_STOP": 40, "LANE_STATE_GO": 91 + 51}
+        assert numbers["num_traffic_light_each_step"] == states
+        assert numbers["num_map_features"] == len(made["map_features"])
+        assert facts["map_height_diff"] == numbers["map_height_diff"] == 0
+
+
+def test_polylines_have_three_coordinates(folder):
+    for path in folder.glob("sd_*.pkl"):
+        lanes = pickle.loads(path.read_bytes())["map_features"].values()
+        assert all(lane["polyline"].shape[1] == 3 and not lane["polyline"][:, 2].any() for lane in lanes)
+
+
+def test_who_reverses_has_a_velocity_against_the_heading(run):
+    episode = rollout_episode(run, read_rows(run / TABLE)[0])
+    states = episode.rollout.states.copy()
+    states[:, 0, 2:] = [0.5, -2.0]
+    backing = replace(episode, rollout=replace(episode.rollout, states=states))
+    velocity = description(backing)["tracks"]["0"]["state"]["velocity"]
+    np.testing.assert_allclose(velocity, [[-2 * np.cos(0.5), -2 * np.sin(0.5)]] * len(velocity), atol=1e-6)
+    past = torch.zeros(1, PAST, 3)
+    past[0, :, 0] = 0.2 * torch.arange(1, PAST + 1)  # 2 m/s backwards
+    scene = TensorDict({"start": torch.tensor([[1.0, 2.0, 0.5, -2.0]]), "past": past}, [])
+    ((_, before),) = past_of(replace(episode, scene=scene))
+    np.testing.assert_allclose(before[:, 3], -2.0, rtol=1e-5)
