@@ -32,7 +32,9 @@ from e2rl.run.files import write_atomically
 PASSED, FAILED, UNDECIDED = "passed", "failed", "not enough rollouts"
 STATUS = {FAILED: 1, UNDECIDED: 3, PASSED: 0}  # of the command, the first that applies
 KINDS = {FAILED: "failure", UNDECIDED: "error"}  # of JUnit
-RULE = re.compile(rf"(?:(?P<method>[^:<>=]+):)?(?P<rate>{'|'.join(RATES)})(?P<sign><=|>=)(?P<limit>[+-]?\d*\.?\d+)")
+RULE = re.compile(  # names of methods may hold spaces
+    rf"(?:(?P<method>[^:<>=]+?)\s*:)?\s*(?P<rate>{'|'.join(RATES)})\s*(?P<sign><=|>=)\s*(?P<limit>[+-]?\d*\.?\d+)"
+)
 MOST, NEAR = 1e9, 1e-4  # places; distance to a limit within which no number of them decides
 
 
@@ -48,7 +50,7 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
         InputError: it is no rule, its limit is none of its rate, it names no or several traffic, or what the run does
             not know.
     """
-    rule = RULE.fullmatch(text.replace(" ", ""))
+    rule = RULE.fullmatch(text.strip())
     if rule is None or (rule["limit"][0] in "+-" and former is None):
         raise InputError(
             f"{text!r}: no rule; write [METHOD:]RATE<=LIMIT or >=, such as 'preventable<=0.05', or with --against RUN "

@@ -128,6 +128,7 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
         group_key(group): {"ego": group["ego_policy"], "label": label}
         | {"rates": rates(group, metrics), "summary": summary(group, metrics, every, searched)}
         | {name: group[name] for name in ("method", "eta", "rollouts", "failures")}
+        | {"raised": sum(raised(row) for row in every if group_key(row) == group_key(group))}
         for group, label in labels
         if not methods or group["method"] in methods
     }
@@ -181,10 +182,11 @@ def summary(group: Mapping, metrics: Sequence[dict], rows: Sequence[dict], searc
     if "cfr" in known:
         lines.append(f"It was hit{' or raised' if crashed else ''} in {known['cfr']}.")
     if "cfr_counted" in known:
-        lines.append(f"{known['cfr_counted']} count: its fault, or a competent driver prevents it.")
+        reasons = f"its fault, or a competent driver prevents it{', or it raised' if crashed else ''}"
+        lines.append(f"It has a failure that counts in {known['cfr_counted']}: {reasons}.")
     lines += [] if "interval" in known.get("cfr", "interval") else [FEW]
     lines += ["Tries go where failures are: rates of tries are no rates of the planner."] if searched else []
-    return lines + errored_lines(own)
+    return [*lines, *(f"{line.rstrip(':')}." for line in errored_lines(own) if line.endswith(":"))]
 
 
 def worst_keys(rows: Sequence[Mapping]) -> set[str]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from e2rl.planners.ego import Ego, answering, ask, from_outside
+from e2rl.planners.ego import PLAN_STEPS, Ego, answering, ask, checked, from_outside
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
@@ -245,7 +245,9 @@ class Lookahead:
         now = world
         for number, after in enumerate(ends.tolist()):
             with answering(now):
-                pieces.append(ask(self.ego, "plan", now, scene=world.scene)[:, : self.period])
+                answer = ask(self.ego, "plan", now, scene=world.scene)
+                plan = checked(answer, (len(now.step), PLAN_STEPS, 4), self.ego, "plan", begins=False)
+            pieces.append(plan[:, : self.period])
             ego, others = pieces[-1][:, -1:], planned[:, 1:, min(after, HORIZON) - 1]
             now = replace(now, step=world.step + after, states=torch.cat([ego, others, moved[:, :, number]], 1))
         return torch.cat(pieces, 1)[:, :HORIZON]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 from e2rl.evaluation.budget import Plan, build_plans, failures_of, search_all, spend, write_tries
 from e2rl.evaluation.protocol import Method, Setup, Work
@@ -11,7 +12,7 @@ from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
-from e2rl.search.search import Search, SearchSettings
+from e2rl.search.search import RAISES, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
@@ -60,6 +61,44 @@ def test_a_budget_of_tries_is_spent_and_not_exceeded(setup, plan):
     assert spent[-1] == pytest.approx(4.0) and spent == sorted(spent)
     assert all(row["seed"] // TRIES == 3 and row["method"] == "search" for row in told)
     assert len({(row["scene_id"], row["seed"]) for row in told}) == len(told)
+
+
+@pytest.mark.parametrize(("unit", "budget"), [("tries", 2.4), ("nfe", 90.0), ("nfe", 333.0)])
+def test_what_is_returned_is_within_the_budget(setup, plan, unit, budget):
+    """Rows, samples and lines of tries; one more try would exceed it."""
+    ((scored, told),) = spend([(setup, plan, 3, range(3), budget, unit)])
+    rows, samples, _ = scored
+    assert len(rows) == len(samples) == len(told) > 0
+    cost = {"tries": [1.0] * len(rows), "nfe": [row["nfe"] for row in rows]}[unit]
+    assert sum(cost) / 3 == pytest.approx(told[-1][unit]) and told[-1][unit] <= budget * (1 + 1e-9)
+    assert (sum(cost) + 2 * max(cost)) / 3 > budget or unit == "nfe"
+
+
+class Crashes(IDMEgo):
+    """Raises at once, where the ego of a scene starts at one of the speeds."""
+
+    def __init__(self, speeds):
+        super().__init__()
+        self.speeds = speeds
+
+    def plan(self, world):
+        if bool(torch.isin(world.scene["start"][:, 0, 3], torch.tensor(self.speeds)).any()):
+            raise KeyError("lane")
+        return super().plan(world)
+
+
+def test_a_planner_that_always_raises_does_not_use_up_the_budget(plan):
+    own = setup_of()
+    own.scenes.scenes["start"][:, 0, 3] = torch.tensor([6.0, 7.0, 8.0])
+    (((rows, _, errored), told),) = spend(
+        [(replace(own, ego=Crashes([6.0, 7.0, 8.0])), plan, 3, range(3), 50.0, "tries")]
+    )
+    assert RAISES * 3 <= len(rows) == len(errored) == len(told) <= (RAISES + len(plan.families)) * 3
+    (((rows, _, _), told),) = spend([(replace(own, ego=Crashes([7.0])), plan, 3, range(3), 8.0, "tries")])
+    names = [row["scene_id"] for row in rows]
+    crashed = own.scenes.scene_id[1]
+    assert names.count(crashed) <= RAISES + len(plan.families) < len(names) / 2
+    assert all(bool(row["raised"]) == (row["scene_id"] == crashed) for row in told)
 
 
 def test_a_budget_that_ends_within_a_round_goes_to_scenes_at_random(setup, plan):

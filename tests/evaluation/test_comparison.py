@@ -6,6 +6,7 @@ import pytest
 
 from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.comparison import CHANGES, Driven, compared
+from e2rl.metrics.errored import errored_row
 from e2rl.run.errors import InputError
 from e2rl.search.tries import TRIES
 from tests.evaluation.constructed_runs import row_of, run_of
@@ -124,3 +125,20 @@ def test_a_search_shows_its_failure_or_what_came_nearest(tmp_path):
     nearest = [row_of(0, seed=number, margin=margin) for number, margin in enumerate((-9.0, -0.5, -3.0))]
     _, (pair,) = changes_of(tmp_path, nearest, tries(0, False, False, True), searched=True)
     assert pair["first"]["seed"] == 1 and pair["second"]["seed"] == 2
+
+
+def raised(scene, seed=0, by="ego"):
+    return errored_row(row_of(scene, seed) | {"reason": "raised KeyError", "detail": "lane", "raised_by": by})
+
+
+@pytest.mark.parametrize("searched", [False, True])
+def test_a_planner_that_raises_is_a_failure_of_its_own_kind(tmp_path, searched):
+    first = [row_of(0), raised(1), raised(2), row_of(3, hit=True), raised(4, by="traffic")]
+    second = [raised(0), row_of(1), raised(2), raised(3), row_of(4)]
+    (group,), pairs = changes_of(tmp_path, first, second, searched)
+    found = {pair["scene_id"]: (pair["change"], pair["what"]) for pair in pairs}
+    assert found == {
+        **{"scene_0": ("new", []), "scene_1": ("gone", []), "scene_2": ("same", []), "scene_3": ("moved", ["ending"])}
+    }
+    assert group["of"] == 4, "what the traffic lost is no pair"
+    assert group["differences"]["contacts"]["difference"] == 0

@@ -36,6 +36,42 @@ class Fails(IDMEgo):
         return plan
 
 
+class Short(Fails):
+    """Plans too few steps from the third step on."""
+
+    def plan(self, world):
+        bad = (world.scene["start"][:, 0, 3] - self.speed).abs() < 1e-6
+        plan = IDMEgo.plan(self, world)
+        return plan[:, :10] if bad.any() and (world.step > 2).any() else plan
+
+
+class Wild(Fails):
+    """Acts NaN."""
+
+    def act(self, world, observation, plan):
+        action = super().act(world, observation, plan)
+        return action.where(((world.scene["start"][:, 0, 3] - self.speed).abs() > 1e-6)[:, None], torch.nan)
+
+
+class Dissolves(LogReplay):
+    """Its vehicles become NaN where the ego of a scene starts at 8 m/s."""
+
+    def replan(self, state, world, ego_plan):
+        state, plan = super().replan(state, world, ego_plan)
+        bad = (world.scene["start"][:, 0, 3] - 8.0).abs() < 1e-6
+        plan.states[bad, 1:] = torch.nan
+        return state, plan
+
+
+class Refuses(LogReplay):
+    """Raises where the ego of a scene starts at 8 m/s."""
+
+    def replan(self, state, world, ego_plan):
+        if bool(((world.scene["start"][:, 0, 3] - 8.0).abs() < 1e-6).any()):
+            raise KeyError("route")
+        return super().replan(state, world, ego_plan)
+
+
 NO_WAY = ZeroDivisionError("no way out")
 FAULTS = {
     "ZeroDivisionError": (NO_WAY, "no way out"),
@@ -101,3 +137,33 @@ def test_what_ended_in_a_training_is_kept_by_round_and_not_doubled_by_a_resumed_
     for number, reasons in ((0, "ab"), (1, ""), (2, "c"), (1, "d")):
         add_errored(path, number, [{"round": number, "reason": reason} for reason in reasons])
     assert [entry["reason"] for entry in json.loads(path.read_text())] == ["a", "b", "d"]
+
+
+@pytest.mark.parametrize(
+    ("ego", "traffic", "blamed"),
+    [
+        (Short(8.0, 0.0), LogReplay(), "ego"),
+        (Wild(8.0, 0.0), LogReplay(), "ego"),
+        (Fails(8.0, NO_WAY), LogReplay(), "ego"),
+        (IDMEgo(), Dissolves(), "traffic"),
+        (Fails(8.0, NO_WAY), Refuses(), "ego"),
+        (IDMEgo(), Refuses(), "traffic"),
+    ],
+)
+def test_whose_error_it_is(tmp_path, ego, traffic, blamed):
+    """An ego that cannot answer about vehicles that are NaN is not to blame; it is asked before the traffic."""
+    setup = Setup(scene_set(), ego, "e", SimSettings(), 4)
+    (row,) = run_protocol(setup, [Method("m", traffic)], [0], tmp_path)
+    (errored,) = [row for row in read_rows(tmp_path / TABLE) if row["errored"] == 1]
+    assert (errored["scene_id"], errored["raised_by"]) == (scene_set().scene_id[2], blamed)
+    assert row["n_rollouts"] == (4 if blamed == "ego" else 3)
+    assert row["metrics"]["errored"]["mean"] == (0.25 if blamed == "ego" else 0.0)
+
+
+def test_a_wrong_shape_from_the_first_plan_on_is_a_mistake_of_the_code(tmp_path):
+    class Always(IDMEgo):
+        def plan(self, world):
+            return super().plan(world)[:, :10]
+
+    with pytest.raises(InputError, match=r"Always.plan: returns torch torch.float32 \[8, 10, 4\], expected"):
+        run(Always(), tmp_path)

@@ -254,3 +254,11 @@ def test_a_run_without_all_of_its_rollouts_is_refused(tmp_path, capsys):
     (tmp_path / "parts").mkdir()
     status, said = gate(capsys, tmp_path, "preventable<=0.9")
     assert status == 2 and f"go on with it by e2rl evaluate resume={tmp_path}" in said
+
+
+@pytest.mark.parametrize(
+    "rule", ["no anchoring:contacts<=0.2", " no anchoring : contacts <= 0.2 ", "no anchoring@2:contacts<=.2"]
+)
+def test_a_method_s_name_may_hold_spaces(tmp_path, capsys, rule):
+    run = run_of(tmp_path, [row_of(k, method=method) for k in range(40) for method in ("e2", "no anchoring")])
+    assert gate(capsys, run, rule)[0] == 0

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from e2rl.metrics.margin import PREVENTED
-from e2rl.search.search import ROUND, Outcome, Search, SearchSettings
+from e2rl.search.search import RAISES, ROUND, Outcome, Search, SearchSettings
 from e2rl.search.tries import Family
 
 FAMILIES = [Family(name, "e2", {"moment": (1.0, 5.0)}) for name in ("good", "poor", "idle")]
@@ -100,3 +100,27 @@ def test_it_finds_more_scenes_than_chance_at_equal_cost():
 
     learnt, blind = (sum(found(bandit, seed) for seed in range(5)) for bandit in (True, False))
     assert learnt > 1.2 * blind
+
+
+def crashing(scenes, rounds=30):
+    """A search against a planner that always raises in some of 12 scenes and never fails in the others."""
+    search = search_of(scenes=12)
+    for _ in range(rounds):
+        tries = search.ask()
+        search.tell(tries, [Outcome(-2.0, "", 100.0, one.scene in scenes) for one in tries])
+    return search
+
+
+def test_no_more_tries_are_spent_where_the_planner_always_raises():
+    search = crashing({2, 5, 7})
+    assert search.active() == [0, 1, 3, 4, 6, 8, 9, 10, 11]
+    assert all(RAISES <= len(search.tries[scene]) < RAISES + len(FAMILIES) for scene in (2, 5, 7))
+    assert min(len(search.tries[scene]) for scene in search.active()) > 3 * RAISES
+    assert crashing(range(12)).ask() == []
+
+
+def test_a_planner_that_raises_has_failed_in_a_way_of_its_own():
+    search = search_of(scenes=2, settings=replace(PLAIN, cover=1))
+    tries = search.ask()
+    search.tell(tries, [Outcome(-30.0, "", 100.0, True) for _ in tries])
+    assert search.cells == {"raised"} and all(search._found(scene) for scene in (0, 1))

@@ -60,7 +60,10 @@ class Page {
     this.planner.querySelector("select").value = ego;
     this.groups = this.report.groups.filter((group) => group.ego === ego);
     document.getElementById("ego-name").textContent = ego;
-    const options = this.groups.map(({ label, failures }) => `${label} (${plural(failures, "failure")})`);
+    const options = this.groups.map(({ label, failures, raised }) => {
+      const found = [plural(failures, "contact"), raised && `${raised} raised`].filter(Boolean);
+      return `${label} (${found.join(", ")})`;
+    });
     this.traffic
       .querySelector("select")
       .replaceChildren(...options.map((text, value) => element("option", { value }, text)));
