@@ -133,7 +133,8 @@ def find_atlas(rows: Sequence[dict]) -> dict:
     """The content of atlas.json from all rows of a run: an atlas for each ego, method and intensity."""
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
-        groups.setdefault(group_of(row), []).append(row)
+        if not lost(row):
+            groups.setdefault(group_of(row), []).append(row)
     return {"groups": [dict(zip(GROUP, key, strict=True)) | group_atlas(ours) for key, ours in groups.items()]}
 
 

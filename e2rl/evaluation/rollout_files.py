@@ -233,5 +233,7 @@ def require_rows(rows: Sequence, errored: Sequence[dict], folder: Path | None) -
     """InputError where all rollouts errored."""
     if rows or not errored:
         return
+    first = f", as in {errored[0]['scene_id']}, seed {errored[0]['seed']}" if "scene_id" in errored[0] else ""
     where = f"; {folder / ERRORED_FILE} has the tracebacks" if folder is not None else ""
-    raise InputError(f"no rollout could be scored: {summary_of(errored)}{where}; mend the planner or the traffic")
+    said = f"{summary_of(errored)}{first}{where}"
+    raise InputError(f"no rollout could be scored: {said}; mend the planner or the traffic")

@@ -90,7 +90,8 @@ def compared_answer(
     if pairs:
         old, new = max(pairs, key=lambda pair: pair[1]["eta"])
         lines += wrapped(
-            f"After training, {new['ego']} was hit in {of(new, 'cfr')} rollouts {traffic(new)} ({rate(new, 'cfr')}); "
+            f"After training, {new['ego']} {ended(new)} in {of(new, 'cfr')} rollouts {traffic(new)} "
+            f"({rate(new, 'cfr')}); "
             f"before it in {of(old, 'cfr')} ({rate(old, 'cfr')})."
         )
         kinds = {"hit": "cfr", **{kind: KINDS[kind] for kind in ("preventable", "count")}, "progress [m]": "progress"}

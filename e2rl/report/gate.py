@@ -57,8 +57,10 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
             f"a change, 'preventable<=+0.02'; rates: {', '.join(RATES)}"
         )
     limit, metric, change = float(rule["limit"]), METRICS[RATES[rule["rate"]]], rule["limit"][0] in "+-"
-    check_limit(text, limit, metric, change)
+    check_limit(text, rule["rate"], limit, metric, change)
     key, rows = traffic_of(rule, driven)
+    if not rows:
+        raise InputError(f"{text}: the traffic raised in all of its rollouts in {driven.run}; mend the traffic")
     if change and former is not None:
         found = difference(rows, traffic_of(rule, former)[1])[metric.name]
     else:
@@ -94,13 +96,13 @@ def traffic_facts(rows: Sequence[Row], searched: bool) -> dict[str, Any]:
     return {"headline": headline(rows, searched)._asdict(), "errored": errored}
 
 
-def check_limit(text: str, limit: float, metric: Metric, change: bool) -> None:
-    """Raises InputError for a limit that no value of a metric, or change of it, can reach."""
+def check_limit(text: str, name: str, limit: float, metric: Metric, change: bool) -> None:
+    """Raises InputError for a limit that no value of a rate of this name and metric, or change of it, can reach."""
     low, high = (-1.0 if change else 0.0), (1.0 if metric.fraction else math.inf)
     if not low <= limit <= high and (metric.fraction or not change):
         span = f"from {low:g} to {high:g}" if metric.fraction else "of 0 or more"
         mend = ", such as 0.05 for 5%" if metric.fraction else ""
-        raise InputError(f"{text}: {limit:g} is no {metric.name}; write a number {span}{mend}")
+        raise InputError(f"{text}: {name} cannot be {limit:g}; write a number {span}{mend}")
 
 
 def traffic_of(rule: re.Match, driven: Driven) -> tuple[tuple[str, float], list[dict]]:

@@ -126,7 +126,7 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
     every, searched = read_run(run), (run / TRIES_FILE).is_file()
     groups = {
         group_key(group): {"ego": group["ego_policy"], "label": label}
-        | {"rates": rates(group, metrics), "summary": summary(group, metrics, every, searched)}
+        | {"rates": rates(group, metrics, searched), "summary": summary(group, metrics, every, searched)}
         | {name: group[name] for name in ("method", "eta", "rollouts", "failures")}
         | {"raised": sum(raised(row) for row in every if group_key(row) == group_key(group))}
         for group, label in labels
@@ -160,9 +160,11 @@ def group_key(row: Mapping) -> tuple:
     return tuple(row[name] for name in GROUP)
 
 
-def rates(group: Mapping, metrics: Sequence[dict]) -> dict[str, str]:
-    """The RATES of a group of modes.json in words; {} where metrics.json knows the group in a pool only."""
+def rates(group: Mapping, metrics: Sequence[dict], searched: bool) -> dict[str, str]:
+    """The RATES of a group of modes.json in words; {} where metrics.json knows the group in a pool only, or knows rates
+    of its tries, as earlier versions wrote them."""
     own = [row for row in closed_loop(metrics) if group_key(row | {"ego_policy": row["ego"]}) == group_key(group)]
+    own = [row for row in own if row.get("searched", False) == searched]
     known = [(row, name) for row in own for name in RATES if row["metrics"].get(name, {}).get("n")]
     return {name: f"{of(row, name)} {unit_of(row)} ({rate(row, name)})" for row, name in known}
 
@@ -177,7 +179,7 @@ def summary(group: Mapping, metrics: Sequence[dict], rows: Sequence[dict], searc
         searched: they are tries.
     """
     own = [row for row in rows if group_key(row) == group_key(group)]
-    known, crashed = rates(group, metrics), any(map(raised, own))
+    known, crashed = rates(group, metrics, searched), any(map(raised, own))
     lines = [headline_text(headline(own, searched), group["ego_policy"], traffic_name(group))]
     if "cfr" in known:
         lines.append(f"It was hit{' or raised' if crashed else ''} in {known['cfr']}.")

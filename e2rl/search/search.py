@@ -4,6 +4,7 @@ First cover, then refine: tries are drawn from the families of a portfolio, stra
 something new.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -90,16 +91,22 @@ class Search(Extension):
             best = worth.flatten().topk(size).indices.sort().values
             chosen = [divmod(pair, worth.shape[1]) for pair in best.tolist()]
         number = [count(len(tries)) for tries in self.tries]  # of the next try of each scene
-        pairs = [(active[position], family) for position, family in chosen]
-        return [self._draw(scene, family, next(number[scene])) for scene, family in pairs]
+        rest = [self._rest(scene) for scene in range(len(self.numbers))]
+        drawn = []
+        for scene, family in ((active[position], family) for position, family in chosen):
+            if rest[scene] > 0:
+                drawn.append(self._draw(scene, family, next(number[scene])))
+                rest[scene] -= 1
+        return drawn
 
     def active(self) -> list[int]:
         """Returns the scenes that tries are spent on: not those in which the planner always raised, RAISES times."""
+        return [scene for scene in range(len(self.numbers)) if self._rest(scene) > 0]
 
-        def hopeless(outcomes: Sequence[Outcome]) -> bool:
-            return len(outcomes) >= RAISES and all(outcome.raised for outcome in outcomes)
-
-        return [scene for scene, outcomes in enumerate(self.outcomes) if not hopeless(outcomes)]
+    def _rest(self, scene: int) -> float:
+        """How many more tries may be spent on a scene."""
+        outcomes = self.outcomes[scene]
+        return RAISES - len(outcomes) if outcomes and all(each.raised for each in outcomes) else math.inf
 
     def tell(self, tries: Sequence[Try], outcomes: Sequence[Outcome]) -> None:
         """What became of tries that were asked for."""

@@ -262,3 +262,9 @@ def test_a_run_without_all_of_its_rollouts_is_refused(tmp_path, capsys):
 def test_a_method_s_name_may_hold_spaces(tmp_path, capsys, rule):
     run = run_of(tmp_path, [row_of(k, method=method) for k in range(40) for method in ("e2", "no anchoring")])
     assert gate(capsys, run, rule)[0] == 0
+
+
+def test_where_the_traffic_lost_every_rollout_nothing_passes(tmp_path, capsys):
+    run = run_of(tmp_path, [errored(k, "traffic") for k in range(40)] + [row_of(k, method="b") for k in range(40)])
+    status, said = gate(capsys, run, "e2:contacts<=0.9")
+    assert status == 2 and "the traffic raised in all of its rollouts" in said
