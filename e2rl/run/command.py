@@ -5,7 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from difflib import get_close_matches
 from itertools import count
@@ -15,10 +15,11 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from e2rl.run.config import as_a_list, choices, load_config
-from e2rl.run.endings import ending, program
+from e2rl.run.endings import REFUSED, ending, program
 from e2rl.run.errors import InputError
 from e2rl.run.files import alone_in
 from e2rl.run.run import Run, how_to_go_on
@@ -33,7 +34,9 @@ def run_command(
     begun: Callable[[DictConfig, Sequence[str]], Run] = Run.of,
     alone: bool = True,
 ) -> None:
-    """Do the work of a command that Hydra configures by conf/<name>.yaml.
+    """Do the work of a command that Hydra configures by conf/<name>.yaml; with -m, a sweep, in a run for each job.
+
+    A sweep goes on after a job that is refused for bad input, names it at the end, and ends with status 2.
 
     Args:
         may_change: keys that may be others when a run is resumed.
@@ -47,12 +50,13 @@ def run_command(
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors arrive here as they are
 
+    sweep = Sweep()
     OmegaConf.register_new_resolver("new_folder", new_folder, replace=True, use_cache=True)
 
     @hydra.main(version_base="1.3", config_path=str(conf_folder().resolve()), config_name=name)
     def command(config: DictConfig) -> None:
         try:
-            with ending(lambda: how_to_go_on(config)):
+            with sweep.job(), ending(lambda: how_to_go_on(config)):
                 check_keys(config, name)
                 run = begun(config, may_change)
                 if not alone:
@@ -72,6 +76,34 @@ def run_command(
             command()
         except HydraException as error:
             raise InputError(told(name, arguments, str(error))) from error
+        sweep.end()
+
+
+class Sweep:
+    """The jobs of a command: one, or with -m several."""
+
+    def __init__(self) -> None:
+        self._jobs: list[str] = []
+        self._refused: list[str] = []
+
+    @contextmanager
+    def job(self) -> Iterator[None]:
+        """A job in the block, which may be refused where it is one of several."""
+        hydra = HydraConfig.get()
+        name = " ".join(hydra.overrides.task)
+        self._jobs.append(name)
+        try:
+            yield
+        except SystemExit as error:
+            if hydra.mode != RunMode.MULTIRUN or error.code != REFUSED:
+                raise
+            self._refused.append(name)
+
+    def end(self) -> None:
+        """Raises InputError that names the refused jobs, where there are any."""
+        if self._refused:
+            names = "; ".join(self._refused)
+            raise InputError(f"{len(self._refused)} of {len(self._jobs)} jobs of the sweep were refused: {names}")
 
 
 def with_path(argument: str) -> str:

@@ -18,6 +18,7 @@ WRITING = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EEXIST, errno.ENAMETOOLONG),
     *(errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.ELOOP),
 }
+REFUSED = 2  # status of a command that bad input ends
 MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # in what torch raises, of a GPU's memory, too
 
 
@@ -61,7 +62,7 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
             number = signal.Signals(arrived[0] if arrived else signal.SIGINT)
             _end(f"\ninterrupted ({number.name}); go on with: {go_on()}", 128 + number, others)
         if isinstance(error, InputError):
-            _end(f"error: {' '.join(str(error).split())}", 2, others)
+            _end(f"error: {' '.join(str(error).split())}", REFUSED, others)
         if isinstance(error, BrokenPipeError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the end of python complains, too
             _end(f"\nerror: nobody reads the output any more; go on with: {go_on()}", 1, others)
