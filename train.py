@@ -45,17 +45,13 @@ def evolve(task: Run) -> None:
     """Harden an ego: measure it, train it for `rounds` rounds, measure it again."""
     config, folder, done = task.config, task.folder, rounds_done(task.config.resume)
     progress = build_progress(config, done)
-    progress.say(
-        f"{task.choices['ego']} against {config.synthesizer.name}: measure, {config.rounds} rounds, measure again"
-    )
-    with progress.phase("begin"):
-        prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
-        traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
-        scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-        run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
-        measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
-        task.begin({"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)})
-        logger.forget(load_checkpoint(config.resume, run) if done else 0)
+    prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
+    traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
+    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
+    run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
+    measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
+    task.begin({"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)})
+    logger.forget(load_checkpoint(config.resume, run) if done else 0)
     progress.say(f"{len(scenes)} scenes to train on, {len(measure.setup.scenes)} to measure on, in {folder}")
     if (task.choices["data"], task.choices["experiment"]) == ("bundled", "harden"):
         progress.say("these are the bundled scenes: experiment=harden is for logs of your own (data=, data.path=)")
@@ -114,6 +110,17 @@ def losses_line(row: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:.4f}" for name, value in row.items() if value == value)  # NaN: none held out
 
 
+def purpose(task: Run) -> str:
+    """What a stage does, in a line."""
+    config, data = task.config, task.choices["data"]
+    if config.stage.name != "evolution":
+        return f"Trains {config.stage.name} on {data} logs, into {task.folder}."
+    return (
+        f"Hardens {task.choices['ego']} against {config.synthesizer.name} in {data} scenes: measures it, trains it for "
+        f"{config.rounds} rounds, and measures it again, into {task.folder}."
+    )
+
+
 STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate, "bits": train_bits}
 
 
@@ -123,8 +130,10 @@ def train(task: Run) -> None:
     if started_by_torchrun() and config.stage.name != "prior":
         raise InputError(f"torchrun: stage={config.stage.name} runs in one process, started with python")
     set_up(config)
-    prepare_fused(config)
     check_training(config)
+    if not follows():
+        print(purpose(task), flush=True)
+    prepare_fused(config)
     STAGES[config.stage.name](task)
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
 from e2rl.evaluation.protocol import HERE, Method, Part, Scored, Setup, Task, Work, extend, in_batches, score_all
@@ -26,6 +25,7 @@ from e2rl.run.config import built, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.files import CsvReader, csv_text, write_atomically
 from e2rl.run.settings import settings_of
+from e2rl.run.terminal import Bar
 from e2rl.search.search import Outcome, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family, Try, family_of
 
@@ -202,7 +202,7 @@ def spending(
     found: Scored = ([], [], [])
     account = Account(budget, unit, {family.name: (family.nfe, 0.0) for family in plan.families})
     generator, driven = torch.Generator().manual_seed(seed), 0
-    with tqdm(total=budget, desc=f"{plan.name}: {unit} a scene", disable=None) as bar:
+    with Bar(total=budget, desc=f"{plan.name}: {unit} a scene") as bar:
         while active := len(search.active()):
             order = torch.randperm(len(scenes), generator=generator).tolist()
             asked = sorted(search.ask(), key=lambda one: order[one.scene])

@@ -10,7 +10,6 @@ from functools import partial
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from tqdm import tqdm
 
 from e2rl.evaluation.protocol import Method, Setup, Task
 from e2rl.evaluation.summary import metric_row
@@ -31,6 +30,7 @@ from e2rl.metrics.realism import kinematic_samples, split_half
 from e2rl.metrics.statistics import LEVELS, bootstrap_draws, cluster_index, interval, resampled_means
 from e2rl.prior.routes import take_route
 from e2rl.run.parts import NO_PARTS, Parts
+from e2rl.run.terminal import Bar
 from e2rl.scenes.recording import VEHICLE
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.rollouts import Rollouts
@@ -126,7 +126,7 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
     """
     scenes, rows = setup.scenes, []
     seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
-    with tqdm(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout", disable=None) as bar:
+    with Bar(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout") as bar:
         for number, (method, count) in enumerate(zip(methods, seeds, strict=True)):
             name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts, "with errored"]
             done, errored, state = parts.load(name, identity) or (0, [], None)

@@ -1,6 +1,6 @@
 """What an evaluation does, built from its configuration: every ego under every method in every scene and seed."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,8 +71,9 @@ def begin(run: Run) -> Evaluation:
     run, and for inputs that changed since the run began."""
     config = run.config
     set_up(config)
-    prepare_fused(config)
     asked, egos = evaluation_settings(config), build_egos(config, run.choices["ego"])
+    print(purpose(run, asked, list(egos.egos)), flush=True)
+    prepare_fused(config)
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     methods = [] if asked.budget else build_methods(config, prior)
     searches = build_plans(config, prior) if asked.budget else []
@@ -82,3 +83,18 @@ def begin(run: Run) -> Evaluation:
     setup = Setup(scenes, ego, name, build_sim(config), config.batch, config.device)
     run.begin({"scenes": listed(scenes)})
     return Evaluation(asked, egos, prior, origin, methods, searches, setup, only)
+
+
+def purpose(run: Run, asked: EvaluationSettings, egos: Sequence[str]) -> str:
+    """Returns what a run does, in a line."""
+    config = run.config
+    if config.failure is not None:
+        return f"Drives the failure {config.failure} again, into {run.folder}."
+    count = "" if asked.num_scenes is None else f"the first {asked.num_scenes} "
+    scenes = f"{count}{run.choices['data']} scenes" if config.scene is None else f"scene {config.scene}"
+    often = f"{', '.join(f'{value:g}' for value in asked.budget)} {asked.budget_unit} a scene and seed"
+    often = often if asked.budget else "once a scene and seed"
+    return (
+        f"Drives {', '.join(egos)} in {scenes} against {', '.join(asked.methods)}, "
+        f"seeds {', '.join(map(str, asked.seeds))}, {often}, into {run.folder}."
+    )

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from e2rl.evaluation import rollout_files as files
 from e2rl.evaluation.modes import ATLAS_FILE, MODES_FILE, find_atlas, find_modes
@@ -23,6 +22,7 @@ from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.processes import Processes, in_processes
+from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
 from e2rl.search.tries import Try
 from e2rl.sim.env import SimSettings
@@ -183,7 +183,7 @@ def drive_all(setups: Sequence[Setup], methods: Sequence[Method], seeds: Sequenc
     jobs = [(f"rollouts-{number:06}", part) for number, part in parts][work.shard[0] :: work.shard[1]]
     found: Scored = ([], [], [])
     total = sum(len(batch) for _, (_, _, batch) in jobs)
-    with tqdm(total=total, desc="rollouts", unit="rollout", disable=None) as bar:
+    with Bar(total=total, desc="rollouts", unit="rollout") as bar:
 
         def done(job: Job) -> None:
             _, (setup, method, batch) = job

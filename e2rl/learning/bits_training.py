@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from tqdm import tqdm
 
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.supervised import Epochs, stage_settings
@@ -24,6 +23,7 @@ from e2rl.planners.reference import LAST_ACTION
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run, origin_of
 from e2rl.run.settings import configured, setting
+from e2rl.run.terminal import Bar
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.scenes.scene import SceneSet
@@ -100,7 +100,7 @@ def windows(scenes: SceneSet, seed: int, disturbed: Sequence[float] = DISTURBED)
     moved = (logged - logged[:, :1]).norm(dim=-1).masked_fill(~every["logged_valid"][:, :, :vehicles], 0).amax(1)
     moving = every["valid"][:, :vehicles] & ~every["parked"][:, :vehicles] & (every["route_log"] >= 0)
     rows, parts = (moving & (moved > MOVES)).nonzero(), []
-    for scene, vehicle in tqdm([part.unbind(1) for part in rows.split(CHUNK) if len(part)], "windows", disable=None):
+    for scene, vehicle in Bar([part.unbind(1) for part in rows.split(CHUNK) if len(part)], "windows"):
         own = as_ego(every, scene, vehicle)
         for step in range(0, own["logged"].shape[1] - PLAN_STEPS, EVERY):
             exact = world_at(own, step)

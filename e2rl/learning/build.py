@@ -1,7 +1,7 @@
-"""Builds the parts of an evolution from a run's configuration, and says how long it takes."""
+"""Builds the parts of an evolution from a run's configuration, and says how long the rest takes."""
 
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
-from tqdm import tqdm
 
 from e2rl.evaluation.budget import methods_at, portfolio_plan
 from e2rl.evaluation.methods import SEARCH, as_list, build_prior, build_sim, build_traffic, processes_of
@@ -26,9 +25,9 @@ from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built, check_device, load_choice, resolved
 from e2rl.run.errors import InputError
-from e2rl.run.processes import cores
 from e2rl.run.ray_workers import RayWorkers
 from e2rl.run.settings import setting, settings_of
+from e2rl.run.terminal import Bar, duration
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes, source_of
 from e2rl.scenes.versions import RECORDED
@@ -161,16 +160,12 @@ def build_measure(
     return BeforeAfter(*given, search, options.budget)
 
 
-ROLLOUT, TRY = 0.7, 150.0  # s on one core of a rollout that is measured and scored; NFE of a try of a search
-FRAMES = 7_000  # simulated steps a second that are collected and learned from
-BEGIN = 20.0  # s to read what a run begins with
-
-
 class Progress:
-    """The phases of a training: (kind, expected seconds), in order. Phases of one kind take about equally long."""
+    """The phases of a training, by their kinds, in order. Phases of one kind take about equally long."""
 
-    def __init__(self, phases: Sequence[tuple[str, float]]) -> None:
-        self._phases = list(phases)
+    def __init__(self, kinds: Sequence[str]) -> None:
+        """kinds: of the phases of which one of its kind has to be over before its length is known."""
+        self._kinds = list(kinds)
         self._spent: dict[str, list[float]] = defaultdict(list)
 
     @contextmanager
@@ -181,39 +176,25 @@ class Progress:
         self._spent[kind].append(time.monotonic() - begin)
 
     def left(self) -> str:
-        """Returns the time left in words: "about 12 min left", "done"."""
-        done = {kind: len(seconds) for kind, seconds in self._spent.items()}
-        seconds = 0.0
-        for kind, guess in self._phases:
-            if done.get(kind, 0) > 0:
-                done[kind] -= 1
-                continue
-            known = self._spent[kind]
-            seconds += sum(known) / len(known) if known else guess
-        return f"about {duration(seconds)} left" if seconds else "done"
+        """Returns the time left in words, "about 12 min left", by what phases of this run have taken.
+
+        "" where nothing is left, and where no phase of a kind that is to come is over.
+        """
+        coming = Counter(self._kinds)
+        coming.subtract({kind: len(seconds) for kind, seconds in self._spent.items()})
+        rest = {kind: count for kind, count in coming.items() if count > 0}
+        if not rest or not all(self._spent[kind] for kind in rest):
+            return ""
+        means = {kind: sum(self._spent[kind]) / len(self._spent[kind]) for kind in rest}
+        return f"about {duration(sum(count * means[kind] for kind, count in rest.items()))} left"
 
     def say(self, text: str) -> None:
-        """Print a line with the time left, above any progress bar."""
-        with tqdm.external_write_mode():
-            print(f"{text}; {self.left()}", flush=True)
-
-
-def duration(seconds: float) -> str:
-    """A duration in its two largest sensible units."""
-    minutes = round(seconds / 60)
-    if minutes < 1:
-        return f"{max(round(seconds), 1)} s"
-    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+        """Print a line with the time left, where it is known, above any progress bar."""
+        with Bar.external_write_mode():
+            print("; ".join(filter(None, [text, self.left()])), flush=True)
 
 
 def build_progress(config: DictConfig, done: int = 0) -> Progress:
-    """The phases of an evolution of which so many rounds are done, by what they take on one core of 2020."""
-    measured, collect = measure_settings(config), config.learner.get("collect", {})
-    rollouts = measured.scenes * (len(measured.seeds) * (1 + len(measured.eta)) + measured.budget / TRY)
-    workers = processes_of(config)
-    seconds = ROLLOUT * rollouts / (workers if isinstance(workers, int) else cores())
-    frames = collect.get("batch", 0) * collect.get("steps", 0) * collect.get("hold", 1) * collect.get("iterations", 0)
-    each = frames / FRAMES or ROLLOUT * config.learner.round.scenes
-    before = [] if done else [("measurement", seconds)]
-    rounds = [("round", each)] * (config.rounds - done)
-    return Progress([("begin", BEGIN), *before, *rounds, ("measurement", seconds)])
+    """The phases of an evolution of which so many rounds are done."""
+    before = [] if done else ["measurement"]
+    return Progress([*before, *["round"] * (config.rounds - done), "measurement"])

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from tqdm import tqdm
 
 from e2rl.evaluation.methods import build_ego, build_sim
 from e2rl.learning.cloning import NOISE, CloningLoss, demonstrations_of
@@ -27,6 +26,7 @@ from e2rl.planners.network import WEIGHTS, ActorCritic
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from e2rl.run.settings import configured, setting
+from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
@@ -64,7 +64,7 @@ def recorded_demonstrations(scenes: SceneSet, sim: SimSettings, seed: int, drive
     exact = PoolDriver(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch)
     free = PoolDriver(scenes, replace(sim, replay_ego=False), batch)
     todo = [(rows, number) for number in range(drives + 1) for rows in filled_batches(len(pool), batch)]
-    for rows, number in tqdm(todo, "demonstrations", unit="batch", leave=False, disable=None):
+    for rows, number in Bar(todo, "demonstrations", unit="batch", leave=False):
         driver, label = (free, "intended") if number else (exact, "executed")
         frames = driver.drive(ReplayEgo(), pool, rows, _bursts(len(rows), generator) if number else None)
         action = frames[label][:, :, None]

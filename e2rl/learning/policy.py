@@ -15,7 +15,6 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
-from tqdm import tqdm
 
 from e2rl.learning.driving import OUTCOME_KEYS, Episodes, finished_episodes
 from e2rl.learning.experts import Experts
@@ -29,6 +28,7 @@ from e2rl.planners.ego import Ego, EgoPlanner
 from e2rl.run.config import built
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting, settings_of
+from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
@@ -182,7 +182,7 @@ class PolicyImprovement(Improvement):
         self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.fraction)
         self._collector.reset()
         outcomes, rows, collecting, begun = [], [], 0.0, self.frames
-        bar = tqdm(range(self.settings.iterations), "collect and update", unit="batch", leave=False, disable=None)
+        bar = Bar(range(self.settings.iterations), "collect and update", unit="batch", leave=False)
         for _ in bar:
             begin = time.perf_counter()
             data = self.collected()

@@ -10,7 +10,6 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.run_checkpoint import generator_states, restore_generators
@@ -18,6 +17,7 @@ from e2rl.run.config import resolved
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.settings import Settings, settings_of
+from e2rl.run.terminal import Bar
 
 STATE, PROGRESS = "turns", ("history", "best", "chosen")  # a part of the run; what it holds of a training
 MAX_GRAD_NORM = 1.0
@@ -70,7 +70,7 @@ class Supervised(ABC):
         begun = len(self.history)
         if logger is not None and self.writes:
             logger.forget(begun)
-        for number in (bar := tqdm(range(begun, turns), name, turns, initial=begun, unit="turn", disable=None)):
+        for number in (bar := Bar(range(begun, turns), name, turns, initial=begun, unit="turn")):
             row = self.turn()
             if self.best is None or not row["held_out_loss"] >= self.best["held_out_loss"]:
                 self.best = row | {"turn": float(number)}

@@ -4,7 +4,6 @@ It reads the rows of metrics.json, and the contents of modes.json and atlas.json
 """
 
 import math
-import shutil
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,8 +16,9 @@ from e2rl.metrics.catalogue import METRICS
 from e2rl.report.comparison_tables import by_ego
 from e2rl.report.headline import errored_lines, plural, row_headline, traffic_name, unit_of
 from e2rl.report.tables import UNKNOWN, closed_loop, number
+from e2rl.run.terminal import column_groups, terminal_width
 
-LINES, NARROWEST, WIDEST = 25, 80, 100
+LINES = 25
 WEAKNESSES, MOST_ROWS, MOST_CELLS = 3, 10, 7  # lines of failure modes; rows of a comparison, of an atlas
 HEADLINES = 3  # of traffic and egos
 KINDS = {"preventable": "cfr_preventable", "clean": "cfr_clean", "count": "cfr_counted"}  # of failures, the first leads
@@ -27,11 +27,6 @@ COUNTS = (
     "preventable, or the ego's fault."
 )
 FEW = "No intervals: they need scenes of at least ten places."
-
-
-def terminal_width() -> int:
-    """Returns the columns of the terminal, between 80 and 100; 100 where the output is no terminal."""
-    return min(max(shutil.get_terminal_size((WIDEST, 24)).columns, NARROWEST), WIDEST)
 
 
 def answer_lines(
@@ -356,14 +351,25 @@ def wrapped(text: str, indent: str = "") -> list[str]:
 
 
 def columns(table: Sequence[Sequence[str]]) -> list[str]:
-    """Aligned rows of text; the last columns are left out, and then the first is cut, where they are too wide."""
-    sizes, width = [max(map(len, column)) for column in zip(*table, strict=True)], terminal_width()
-    while len(sizes) > 3 and sum(sizes) + 2 * (len(sizes) - 1) > width:
-        sizes.pop()
-    sizes[0] = max(8, min(sizes[0], width - sum(sizes[1:]) - 2 * (len(sizes) - 1)))
-    lines = []
-    for first, *others in table:
-        name = first if len(first) <= sizes[0] else f"{first[: sizes[0] - 1]}…"
-        cells = [text.rjust(size) for text, size in zip(others, sizes[1:], strict=False)]
-        lines.append("  ".join([name.ljust(sizes[0]), *cells]).rstrip()[:width])
+    """Returns aligned rows of text that fit the terminal; table: the heads, which may be wrapped, then rows.
+
+    Columns that find no room stand beneath, beside the first column again, which is cut where it is too wide.
+    """
+    width, body = terminal_width(), list(zip(*table, strict=True))
+    sizes = [max(max(map(len, cells), default=0), *map(len, head.split() or [""])) for head, *cells in body]
+    sizes[0] = min(sizes[0], max(width // 3, width - sum(sizes[1:]) - 2 * (len(sizes) - 1)))
+    lines: list[str] = []
+    for place in column_groups(sizes, width):
+        heads = [textwrap.wrap(table[0][column], sizes[column]) for column in place]
+        height = max(map(len, heads))
+        rows = list(zip(*([""] * (height - len(head)) + head for head in heads), strict=True))
+        rows += [tuple(row[column] for column in place) for row in table[1:]]
+        lines += [aligned(row, [sizes[column] for column in place]) for row in rows]
     return lines
+
+
+def aligned(row: Sequence[str], sizes: Sequence[int]) -> str:
+    """Returns a line: the first cell on the left of its column, the others on the right."""
+    first = row[0] if len(row[0]) <= sizes[0] else f"{row[0][: sizes[0] - 1]}…"
+    cells = [text.rjust(size) for text, size in zip(row[1:], sizes[1:], strict=True)]
+    return "  ".join([first.ljust(sizes[0]), *cells]).rstrip()

@@ -16,6 +16,7 @@ from e2rl.metrics.catalogue import META_STAGE, METRICS, OPEN_LOOP_STAGE, SPREAD_
 from e2rl.metrics.failure_modes import LEAST, MANY
 from e2rl.report.headline import plural
 from e2rl.run.files import write_atomically
+from e2rl.run.terminal import column_groups, terminal_width
 
 UNKNOWN = "–"
 COUNTED = {  # what the count (n) of a stage's cells counts, and how its metrics are computed
@@ -48,10 +49,19 @@ class Table:
         return tabulate(self.rows, self.head, kind, disable_numparse=True, colalign=align)
 
     def text(self) -> str:
-        """For a terminal: aligned columns, the caption above."""
-        grid = self.grid("simple")
-        caption = textwrap.fill(self.caption, max(len(grid.partition("\n")[0]), 60))
-        return "\n".join([*([self.title] if self.title else []), caption, grid])
+        """For a terminal: aligned columns, the caption above; columns that find no room stand beneath."""
+        width = terminal_width()
+        caption = textwrap.fill(self.caption, width)
+        grids = [part.grid("simple") for part in self.parts(width)]
+        return "\n".join([*([self.title] if self.title else []), caption, "\n\n".join(grids)])
+
+    def parts(self, width: int) -> list["Table"]:
+        """Returns tables of at most `width`: the first column, and as many of the others as fit, one at least."""
+        widths = [max(map(len, cells)) for cells in zip(self.head, *self.rows, strict=True)]
+        return [Table("", *self._chosen(group)) for group in column_groups(widths, width)]
+
+    def _chosen(self, columns: Sequence[int]) -> tuple[list[str], list[list[str]]]:
+        return [self.head[each] for each in columns], [[row[each] for each in columns] for row in self.rows]
 
     def markdown(self) -> str:
         """A Markdown table, its caption beneath."""

@@ -30,6 +30,7 @@ from e2rl.run.extras import how_to_install
 from e2rl.run.files import cache_folder
 from e2rl.run.processes import interrupts_held, without_main, worker_pool
 from e2rl.run.settings import check_range, check_settings, file_values, setting, settings_of
+from e2rl.run.terminal import Bar
 from e2rl.scenes.builder import BuildSettings, SceneBuilder, ego_overlaps
 from e2rl.scenes.reader_code import code_hash, failed_line
 from e2rl.scenes.recording import MAX_NAME, Recording
@@ -266,7 +267,7 @@ class Source(Extension, ABC):
         FEW scenes. Where logs share ids of scenes, those of all but the first name their log.
         """
         logs = self.log_names()
-        show = partial(tqdm, desc="building scenes", total=len(logs), unit="log", disable=None)
+        show = partial(Bar, desc="building scenes", total=len(logs), unit="log")
         known: set[str] = set()
         with closing(self._rows_of_logs(logs, most)) as rows_of_logs:
             for log, rows in zip(logs, show(rows_of_logs), strict=False):

@@ -3,7 +3,6 @@
 import sys
 
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from e2rl.metrics import preventable
 from e2rl.planners import lane_graph_planner, reference
@@ -14,6 +13,7 @@ from e2rl.prior.sde import SamplerSettings, fused_controlled_step, fused_step
 from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, check_compiler, has_compiler, switch
 from e2rl.run.processes import cores, in_processes
+from e2rl.run.terminal import Bar
 from e2rl.scenes import drivable_area, route
 from e2rl.sim import leaders, observation, step
 from e2rl.traffic.e2 import anchoring, control, foresight, interception, kernels
@@ -48,7 +48,7 @@ def prepare_fused(config: DictConfig) -> None:
     elif on and missing:
         check_compiler("compile")
         done = in_processes(Fused.compile, missing, cores(), lambda each: 1.0)
-        for _ in tqdm(done, "compiling", len(missing), unit="function", disable=None):
+        for _ in Bar(done, "compiling", len(missing), unit="function"):
             pass
     if asked == "auto":
         config.compile = on

@@ -92,15 +92,22 @@ def test_groups_that_do_not_fit_are_refused_at_the_start(override, what):
         built(config_of(*override, *POLICY))
 
 
-def test_the_time_left_is_known_at_once_and_follows_what_phases_take(monkeypatch):
-    now, said = [0.0], []
+def test_the_time_left_is_told_once_each_kind_of_phase_was_measured(monkeypatch):
+    now, left = [0.0], []
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     progress = build_progress(load_config("train", ["rounds=2"]))
-    for kind, seconds in (("begin", 5), ("measurement", 600), ("round", 60), ("round", 10), ("measurement", 10)):
+    for kind, seconds in (("measurement", 600), ("round", 60), ("round", 10), ("measurement", 10)):
+        left.append(progress.left())
         with progress.phase(kind):
             now[0] += seconds
-        said.append(progress.left())
-    assert said[2:] == ["about 11 min left", "about 10 min left", "done"], "as long as those of its kind took"
+    assert left == ["", "", "about 11 min left", "about 10 min left"] and progress.left() == ""
+
+
+def test_a_run_that_goes_on_has_measured_nothing_yet():
+    progress = build_progress(load_config("train", ["rounds=2"]), done=1)
+    with progress.phase("round"):
+        pass
+    assert progress.left() == ""
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
-from tqdm import tqdm
 
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.prior_training.distributed import ALONE, Processes
@@ -37,6 +36,7 @@ from e2rl.prior.routes import candidate_features, start_of
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.settings import configured, setting
+from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
 
 HELD_OUT = 8  # one in HELD_OUT places is held out for validation
@@ -134,7 +134,7 @@ class PriorTraining(Supervised):
         """Train up to step `until`; returns the running means of the loss's terms."""
         running: dict[str, float] = {}
         self.prior.train()
-        for _ in (bar := tqdm(range(self.done, until), "steps", unit="step", leave=False, disable=None)):
+        for _ in (bar := Bar(range(self.done, until), "steps", unit="step", leave=False)):
             batch = augment(self.windows[self.pick()].to(self.device), self.generator)
             terms = self.update(batch, draw(batch, self.generator))
             if self.done % 20 == 0:
@@ -234,7 +234,7 @@ def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingS
         return float("nan")
     generator = torch.Generator().manual_seed(settings.seed)
     optimiser = torch.optim.AdamW(prior.route_choice.parameters(), 3e-3, weight_decay=0.05)
-    for _ in tqdm(range(settings.route_steps), "route choice", disable=None):
+    for _ in Bar(range(settings.route_steps), "route choice"):
         pick = torch.randint(len(label), (512,), generator=generator).to(device)
         sample = features[pick]
         sample = sample + 0.05 * torch.randn(sample.shape, generator=generator).to(device)

@@ -3,12 +3,12 @@
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from tqdm import tqdm
 
 from e2rl.prior import free_space, lane_relative
 from e2rl.prior.features import edge_features, leaders_ahead, node_features
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, locate
 from e2rl.prior.routes import RoutedScene, route_scene
+from e2rl.run.terminal import Bar
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.sim.dynamics import wrap
@@ -33,7 +33,7 @@ def derivative(values: Tensor, valid: Tensor) -> Tensor:
 def make_windows(scenes: TensorDictBase, chunk: int = 32) -> TensorDict:
     """Windows [W] of scenes [S] (see `_window` for the keys), without empty ones."""
     parts = []
-    for scene in tqdm(scenes.split(chunk), "training windows", disable=None):
+    for scene in Bar(scenes.split(chunk), "training windows"):
         vehicles = scene["route_log"].shape[1]
         routed = route_scene(scene, scene["route_log"].clamp(min=0))
         logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]

@@ -1,0 +1,73 @@
+"""What a command shows while it works: a bar on a terminal, a line now and then in a file."""
+
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from tqdm import tqdm
+
+NARROWEST, WIDEST = 60, 100  # columns
+FIRST, EVERY = 10.0, 30.0  # s until the first line, and between lines
+
+
+def terminal_width() -> int:
+    """Returns the columns of the terminal, between 60 and 100; 100 where the output is no terminal."""
+    return min(max(shutil.get_terminal_size((WIDEST, 24)).columns, NARROWEST), WIDEST)
+
+
+def column_groups(sizes: Sequence[int], width: int) -> list[list[int]]:
+    """Returns the columns that stand side by side, in groups of at most `width`: the first, and some of the others."""
+    groups = [[0]]
+    for column in range(1, len(sizes)):
+        if len(groups[-1]) > 1 and sum(sizes[each] + 2 for each in groups[-1]) + sizes[column] > width:
+            groups.append([0])
+        groups[-1].append(column)
+    return groups
+
+
+def duration(seconds: float) -> str:
+    """Returns a duration in its two largest sensible units."""
+    minutes = round(seconds / 60)
+    if minutes < 1:
+        return f"{max(round(seconds), 1)} s"
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+class Bar(tqdm):
+    """A progress bar on stderr; where that is no terminal, a line after 10 s, and then every 30 s, if work is done.
+
+    A line says how long the rest takes at the pace so far.
+    """
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        """Takes what tqdm takes."""
+        self.as_lines = not sys.stderr.isatty()
+        self._line_due = time.monotonic() + FIRST
+        super().__init__(*args, **settings)
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+        """Show the state: draw the bar, or write a line where one is due."""
+        if not self.as_lines:
+            return super().display(msg, pos)
+        if self.n and time.monotonic() >= self._line_due:
+            self._line_due = time.monotonic() + EVERY
+            self.fp.write(f"{self.line()}\n")
+            self.fp.flush()
+        return True
+
+    def line(self) -> str:
+        """Returns the state in words."""
+        elapsed = self._time() - self.start_t
+        text = f"{self.desc.removesuffix(': ')}: {self.n:g}"
+        if not self.total:
+            return f"{text} after {duration(elapsed)}"
+        left = elapsed * (self.total - self.n) / self.n
+        text += f" of {self.total:g} after {duration(elapsed)}"
+        return text + (f", about {duration(left)} left" if left > 0 else "")
+
+    def close(self) -> None:
+        """End the bar; lines need no end."""
+        self.disable = self.disable or self.as_lines
+        super().close()
