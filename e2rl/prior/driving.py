@@ -12,7 +12,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import LEAST_STRETCH, LaneState, select
 from e2rl.scenes.recording import DT
-from e2rl.sim.dynamics import steered, turn_bound, wrap
+from e2rl.sim.dynamics import rolling_back, steered, turn_bound, wrap
 
 ALONG_LINE = ("s", "d", "d1", "d2", "heading", "kappa")  # what is looked up where the vehicle is on its line
 TINY = 1e-6  # m: a shorter piece of a line is none
@@ -28,12 +28,16 @@ def as_driven(motion: LaneState, state: LaneState, on_lane: Tensor) -> LaneState
 
     Returns:
         Fields [..., H]; speed and acceleration are those of the plan, all else is that of the place on the planned line
-        that is reached by then. Turns are bounded by curvature and lateral acceleration.
+        that is reached by then. Turns are bounded by curvature and lateral acceleration. Who reverses rolls to a halt
+        before it drives as planned.
     """
+    times = DT * torch.arange(1, motion.v.shape[-1] + 1, device=motion.v.device)
+    back = rolling_back(state.v[..., None], times)
+    motion = replace(motion, v=torch.where(back < 0, back, motion.v))
     before = torch.cat([state.v[..., None], motion.v[..., :-1]], -1)
     driven = ((before + motion.v) / 2 * DT).cumsum(-1)
     placed = _placed(motion, state, driven, on_lane)
-    placed = select(state.v < 0, motion, placed)  # who rolls backwards comes to a halt as planned
+    placed = select(state.v < 0, motion, placed)  # there is no line behind the vehicle
     headings = torch.cat([state.heading[..., None], placed.heading], -1)
     bound = turn_bound((before + motion.v) / 2)
     turn = torch.maximum(torch.minimum(wrap(headings.diff(dim=-1)), bound), -bound)

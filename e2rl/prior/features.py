@@ -30,7 +30,7 @@ def node_features(routed: RoutedScene, state: LaneState, followed: Leaders, step
     estimated [B] bool: the states are a causal observer's estimates (a recording's start) instead of exact ones
     (simulated later on); how far the present speed and acceleration can be trusted depends on it.
     """
-    v = state.v
+    v = state.v.clamp(min=0)  # who reverses is to halt: it is seen as if it stood
     length, width = routed.size[:, : v.shape[1]].unbind(-1)
     at = (state.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
     limit = routed.limit.gather(-1, at[..., None])[..., 0]
@@ -48,7 +48,7 @@ def node_features(routed: RoutedScene, state: LaneState, followed: Leaders, step
     speed = [(v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3, estimated[:, None].float().expand_as(v)]
     features = [*motion, *speed_limit, *_route_features(routed, state), *lead, idm / 2]
     features += [*_light_features(routed, state, step), *kind, (gap < FREE_GAP).float(), need, *speed]
-    return torch.stack([*features, *past_features(routed.past, v, estimated)], -1)
+    return torch.stack([*features, *past_features(routed.past, state.v, estimated)], -1)
 
 
 def _route_features(routed: RoutedScene, state: LaneState) -> list[Tensor]:

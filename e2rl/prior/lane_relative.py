@@ -16,7 +16,7 @@ from torch import Tensor
 from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate, project, tangents
-from e2rl.sim.dynamics import wrap
+from e2rl.sim.dynamics import at_least, wrap
 
 HORIZON = 50  # steps of DT
 KNOTS = 10
@@ -100,7 +100,7 @@ def _locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hin
     heading, curvature = (value[..., 0] for value in interpolate(points, s[..., None])[1:])
     turn = wrap(states[..., 2] - heading)
     v = states[..., 3]
-    kappa = (yaw_rate / v.clamp(min=1.0)).clamp(-0.25, 0.25)
+    kappa = (yaw_rate / at_least(v, 1.0)).clamp(-0.25, 0.25)
     d1 = torch.tan(turn.clamp(-1.0, 1.0)) * (1 - curvature * d).clamp(min=LEAST_STRETCH)
     d2 = (kappa - curvature).clamp(-0.1, 0.1)
     return LaneState(s, d, d1, d2, v, accel, states[..., 0], states[..., 1], states[..., 2], kappa)

@@ -177,7 +177,7 @@ def candidate_features(scene: TensorDictBase, now: Moment) -> Tensor:
     vehicles = now.states.shape[1]
     points, length = scene["route_points"][:, :vehicles], scene["route_length"][:, :vehicles]
     s, d, heading = (value[..., 0] for value in project(now.states[:, :, None, None, :2], points))
-    v = now.states[..., 3][..., None].expand_as(s)
+    v = now.states[..., 3].clamp(min=0)[..., None].expand_as(s)
     at = s[..., None] + torch.tensor((0.0, *TURN_AT), device=s.device)
     angle = interpolate(points, at)[1]
     turn = wrap(angle[..., 1:] - angle[..., :1])

@@ -1,8 +1,9 @@
 """Unicycle motion with actions (acceleration, yaw rate), forwards and backwards, whole horizons at once.
 
-A state is (x [m], y [m], heading [rad], speed [m/s]); a step lasts DT and moves at the mean of the old and the new
-speed along the mean of the two headings. Speeds are clamped to [0, MAX_SPEED], yaw rates by curvature and lateral
-acceleration (`yaw_rate_bound`).
+A state is (x [m], y [m], heading [rad], speed [m/s], negative in reverse); a step lasts DT and moves at the mean of the
+old and the new speed along the mean of the two headings. Speeds are clamped to [0, MAX_SPEED], yaw rates by curvature
+and lateral acceleration (`yaw_rate_bound`). Nobody begins to reverse here; who does at the start comes to a halt
+(`rolling_back`).
 """
 
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from e2rl.scenes.recording import DT
 MAX_SPEED = 40.0  # m/s
 MAX_LATERAL = 8.0  # m/s^2, about the grip of tyres
 MAX_CURVATURE = 0.3  # 1/m, path of a car's centre at full steering lock
+HALTING = 3.0  # m/s^2 with which who reverses comes to a halt, at least
 
 
 def constant_velocity(states: Tensor, times: Tensor) -> Tensor:
@@ -46,13 +48,18 @@ def turn_bound(speed: Tensor) -> Tensor:
     return yaw_rate_bound(speed.abs()) * DT
 
 
+def rolling_back(speed: Tensor, time: Tensor | float) -> Tensor:
+    """Lowest speed [...] m/s after `time` s of vehicles at speed [...]: 0, but of those that reverse, which halt."""
+    return (speed + HALTING * time).clamp(max=0)
+
+
 def step(state: Tensor, action: Tensor) -> Tensor:
     """State [..., 4] after one DT of action [..., 2] = (acceleration m/s^2, yaw rate rad/s): `rollout` of one step."""
     x, y, heading, before = state.unbind(-1)
     acceleration, yaw_rate = action.unbind(-1)
-    speed = (before + acceleration * DT).clamp(0.0, MAX_SPEED)
+    speed = torch.maximum(before + acceleration * DT, rolling_back(before, DT)).clamp(max=MAX_SPEED)
     mean = (before + speed) / 2
-    bound = yaw_rate_bound(mean)
+    bound = yaw_rate_bound(mean.abs())
     turn = torch.clamp(yaw_rate, -bound, bound) * DT
     heading = heading + turn
     along, middle = mean * DT, heading - turn / 2
@@ -62,13 +69,14 @@ def step(state: Tensor, action: Tensor) -> Tensor:
 def rollout(start: Tensor, actions: Tensor) -> Tensor:
     """States [..., H, 4] at steps 1..H from start [..., 4] under actions [..., H, 2], without a loop over time.
 
-    The speed recursion v' = clip(v + a DT, 0, MAX_SPEED) is a composition of shifted clips, which are closed under
+    The speed recursion v' = clip(v + a DT, low, MAX_SPEED) is a composition of shifted clips, which are closed under
     composition: a parallel scan of log2 H levels. Headings and positions are cumulative sums.
     """
     v0 = start[..., 3:4]
-    speed = bounded_speed(v0, actions[..., 0] * DT)
+    times = DT * torch.arange(1, actions.shape[-2] + 1, device=v0.device, dtype=v0.dtype)
+    speed = bounded_speed(v0, actions[..., 0] * DT, rolling_back(v0, times))
     before = torch.cat([v0.expand_as(speed[..., :1]), speed[..., :-1]], -1)
-    bound = yaw_rate_bound((before + speed) / 2)
+    bound = yaw_rate_bound(((before + speed) / 2).abs())
     turn = torch.maximum(torch.minimum(actions[..., 1], bound), -bound) * DT
     return steered(start, speed, turn)
 
@@ -92,15 +100,17 @@ def steered(start: Tensor, speed: Tensor, turn: Tensor) -> Tensor:
     return torch.stack([x, y, wrap(heading), speed], -1)
 
 
-def bounded_speed(v0: Tensor, change: Tensor, low: float = 0.0, high: float = MAX_SPEED) -> Tensor:
+def bounded_speed(v0: Tensor, change: Tensor, low: Tensor | float = 0.0, high: float = MAX_SPEED) -> Tensor:
     """Speeds [..., H] of v' = clip(v + change, low, high) from v0 [..., 1] under change [..., H]; exact, parallel in H.
+    low: one for all, or [..., H].
 
     Each step maps v to clip(v + c, l, h); after clip(v + c1, l1, h1) it is clip(v + c1 + c2, clip(l1 + c2, l2, h2),
     clip(h1 + c2, l2, h2)) (Hillis and Steele's scan over these triples).
     """
     shape = torch.broadcast_shapes(v0.shape[:-1], change.shape[:-1])
     change = change.expand(*shape, change.shape[-1])
-    lo, hi = torch.full_like(change, low), torch.full_like(change, high)
+    lo = low.expand_as(change) if isinstance(low, Tensor) else torch.full_like(change, low)
+    hi = torch.full_like(change, high)
     horizon, width = change.shape[-1], 1
     while width < horizon:
         c, low_then, high_then = change[..., width:], lo[..., width:], hi[..., width:]
@@ -134,7 +144,12 @@ class Arc(NamedTuple):
 
 def curvature_of(turn_rate: Tensor, speed: Tensor) -> Tensor:
     """Path curvature [...] 1/m of vehicles that turn with turn_rate [...] rad/s at speed [...] m/s."""
-    return (turn_rate / speed.clamp(min=SLOW)).clamp(-SHARPEST, SHARPEST)
+    return (turn_rate / at_least(speed, SLOW)).clamp(-SHARPEST, SHARPEST)
+
+
+def at_least(speed: Tensor, least: float) -> Tensor:
+    """Speeds [...] m/s, forwards or backwards, of `least` at least."""
+    return torch.where(speed < 0, speed.clamp(max=-least), speed.clamp(min=least))
 
 
 def along_arc(
@@ -143,7 +158,7 @@ def along_arc(
     """States [..., T, 4] and metres driven [..., T] at times [..., T] s ahead of states [..., 4].
 
     The acceleration [...] is held for `hold` s, never beyond a halt; the curvature [...] for the distance that the
-    present speed drives in `turn` s; then speed and heading stay.
+    present speed drives in `turn` s; then speed and heading stay. In reverse metres are negative.
     """
     x, y, heading, v = (value[..., None] for value in states.unbind(-1))
     arc = Arc(*(value[..., None] for value in arc))
@@ -157,11 +172,14 @@ def arc_places(
     """`along_arc` of x, y, heading, speed, accelerations, curvatures and times that broadcast: these four then, and the
     metres driven."""
     accel, curvature = arc
+    sign = torch.where(v < 0, -1.0, 1.0)
+    v, accel = v * sign, accel * sign
     halt = torch.where(accel < 0, v / (-accel).clamp(min=1e-6), torch.inf)
     held = torch.minimum(times.clamp(max=hold), halt)
     speed = (v + accel * held).clamp(min=0)
     driven = (v + speed) / 2 * held + speed * (times - held)
     bent = driven if turn == torch.inf else torch.minimum(driven, turn * v.clamp(min=SLOW))
+    driven, bent, speed = driven * sign, bent * sign, speed * sign
     angle = curvature * bent
     chord, middle, end = bent * torch.sinc(angle / (2 * torch.pi)), heading + angle / 2, heading + angle
     x, y = x + chord * middle.cos(), y + chord * middle.sin()

@@ -175,7 +175,7 @@ def idm_acceleration(
     a, b, n = driver.acceleration, driver.braking, driver.exponent
     interaction = (desired_gap(speed, leader_speed, driver) / gap.clamp(min=0.1)) ** 2
     if not improved:
-        return a * (1 - (speed / desired_speed) ** n - interaction)
-    below = a * (1 - (speed / desired_speed).clamp(max=1) ** n)
+        return a * (1 - (speed / desired_speed).clamp(min=0) ** n - interaction)
+    below = a * (1 - (speed / desired_speed).clamp(0, 1) ** n)
     above = -b * (1 - (desired_speed / speed.clamp(min=1e-3)).clamp(max=1) ** (a * n / b))
     return torch.where(speed > desired_speed, above, below) - a * interaction

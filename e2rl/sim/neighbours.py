@@ -84,9 +84,9 @@ def own_fault(
     """Bool [B]: the ego overlaps an agent while it moves, and either that agent has stood (a vehicle: for STOOD steps;
     another: at all) or it moves and lies across the ego's front edge.
 
-    By the step alone, these are the rules of metrics/verdicts.py but for cut-ins and for an ego that stands across a
-    lane. The edge is that of the least overlap along the ego's axes, which near its corners may differ from the one
-    that touched first.
+    By the step alone, these are the rules of metrics/verdicts.py but for cut-ins, for who moved sideways into whom, and
+    for an ego that stands across a lane. Of an ego that reverses the front is its rear. The edge is that of the least
+    overlap along the ego's axes, which near its corners may differ from the one that touched first.
 
     Args:
         speed: [B] m/s, of the ego before the contact.
@@ -103,7 +103,7 @@ def own_fault(
     turn = turn.abs()
     extent = torch.stack([(turn * half).sum(1), (turn.flip(1) * half).sum(1)], 1)
     ahead, across = (position.abs() - static.size / 2 - extent).unbind(1)
-    front = (position[:, 0] > 0) & (ahead > across)
+    front = ((position[:, 0] > 0) == (speed >= -STANDING)) & (ahead > across)
     vehicle = static.vehicle.gather(1, partner[:, None])[:, 0]
     moves, stood = standing(tracks, static.row, before, partner + 1, vehicle)
     return some(hit) & (speed.abs() > STANDING) & (stood | (front & moves))

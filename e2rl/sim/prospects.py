@@ -68,7 +68,7 @@ def manoeuvres(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: T
     """x, y, cosine and sine of the direction [4, B, T, C] of egos [B, 4] in their own frames; C: accelerations x
     offsets."""
     plan = manoeuvres_on(state.device)
-    distance = travelled(state[:, 3:], plan.accel, plan.moment)  # [B, T A]
+    distance = travelled(state[:, 3:].clamp(min=0), plan.accel, plan.moment)  # [B, T A]
     x, y, heading, *_ = look_along(static, pose.s[:, None] + distance)
     turned = heading - state[:, 2:3]
     places = *seen_from(state, rotation, x, y), turned.cos(), turned.sin()

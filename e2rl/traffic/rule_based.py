@@ -41,7 +41,7 @@ class LogReplay(Traffic):
 
 
 class ConstantVelocity(Traffic):
-    """Start heading and start speed are kept; parked vehicles stay parked, and no vehicle leaves."""
+    """Start heading and start speed are kept, in reverse too; parked vehicles stay parked, and no vehicle leaves."""
 
     stochastic = False
 
@@ -65,7 +65,8 @@ class IDMState:
 @configured("synthesizer/idm")
 @dataclass(eq=False, repr=False)
 class IDM(Traffic):
-    """Car-following on the nearest route candidate, within the prior's bounds; standing vehicles stay."""
+    """Car-following on the nearest route candidate, within the prior's bounds. Vehicles that stand or reverse at the
+    start come to a halt and stay."""
 
     prior: Prior
     headway: float = setting()
@@ -99,16 +100,14 @@ class IDM(Traffic):
         wanted = self._wanted(routed, lane, world).clamp(min=self.bounds.floor)
         x = (wanted / ACCEL_SCALE)[..., None].expand(*lane.v.shape, KNOTS)
         x = torch.cat([x, x.new_zeros(*lane.v.shape, SIZE - KNOTS)], -1)
-        on_lane = torch.ones_like(routed.has_lane)  # who has none keeps straight on
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING_SPEED) | ~present
 
         def decoded(rows: Rows | None, cap: Tensor | None) -> LaneState:
             if rows is None:
-                motion = as_driven(decode(x, lane, routed.points), lane, on_lane)
-                return _held(motion, lane, frozen)
+                return _driven(decode(x, lane, routed.points), lane, frozen)
             now = lane.map(lambda value: value[rows])
             motion = decode(*apply_cap(cap, x[rows], now), routed.points[rows])
-            return _held(as_driven(motion, now, on_lane[rows]), now, frozen[rows])
+            return _driven(motion, now, frozen[rows])
 
         obstacles = Obstacles(world.states, routed.size, world.valid)
         motion = bounded(self.bounds, decoded, lane, obstacles)
@@ -146,8 +145,10 @@ def located(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
     return LaneState(**{name: torch.cat([getattr(ego, name), value], 1) for name, value in rest.items()})
 
 
-def _held(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:
-    """The motion [B, V, HORIZON] with frozen [B, V] vehicles at standstill."""
+def _driven(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:
+    """The motion [B, V, HORIZON] `as_driven`, with frozen [B, V] vehicles at standstill, once they do not reverse."""
     still = lane.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
     zero = torch.zeros_like(still.v)
-    return select(frozen, replace(still, v=zero, a=zero), motion)
+    motion = select(frozen, replace(still, v=zero, a=zero), motion)
+    on_lane = torch.ones_like(frozen)  # who has none keeps straight on
+    return select(frozen & (lane.v >= 0), motion, as_driven(motion, lane, on_lane))

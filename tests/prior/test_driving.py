@@ -95,3 +95,13 @@ def test_a_jump_of_the_heading_is_driven_as_a_turn_at_the_steering_s_limit():
     plan.heading = plan.heading - 0.8
     _, speed, _, change = steps_of(state, as_driven(plan, state, ON_LANE))
     assert change[:, 0].abs().max() <= turn_bound(speed[:, 0]).max() + 1e-5
+
+
+def test_who_reverses_rolls_to_a_halt_and_then_drives_as_planned():
+    state = random_state(routes(0.0), torch.Generator().manual_seed(2), speed=(-2.0, -2.0))
+    driven = as_driven(lane_relative.decode(torch.zeros(COUNT, SIZE), state, routes(0.0)), state, ON_LANE)
+    step, speed, heading, _ = steps_of(state, driven)
+    expected = DT * speed[..., None] * torch.stack([heading.cos(), heading.sin()], -1)
+    torch.testing.assert_close(step, expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(driven.v[:, :6], -2.0 + 0.3 * torch.arange(1, 7).expand(COUNT, 6))
+    assert (driven.v[:, 6:] >= 0).all()

@@ -45,6 +45,25 @@ def test_rollout_equals_recursion_with_clipped_speeds():
     assert (torch.stack(speeds, 1) == 0).any(), "the case must reach the bound it is about"
 
 
+@pytest.mark.parametrize(("acceleration", "distance"), [(0.0, -(2.0**2) / 6), (-5.0, -(2.0**2) / 6), (4.0, -0.5)])
+def test_who_reverses_comes_to_a_halt_however_it_is_told_to_go_on(acceleration, distance):
+    """From 2 m/s in reverse at 3 m/s^2, or as hard as it is told to; then it stands, or drives on."""
+    start, actions = torch.tensor([0.0, 0.0, 0.0, -2.0]), torch.tensor([acceleration, 0.0]).expand(10, 2)
+    states = dynamics.rollout(start, actions)
+    state = start
+    for expected in states:
+        state = dynamics.step(state, actions[0])
+        torch.testing.assert_close(state, expected)
+    assert states[:, 0].min().item() == pytest.approx(distance, abs=0.03)
+    assert states[-1, 3].item() == pytest.approx(max(0.0, acceleration * 1.0 - 2.0), abs=1e-5)
+
+
+def test_who_reverses_turns_within_the_steering_s_limits():
+    """A path's curvature times the metres driven, which are negative."""
+    state = dynamics.step(torch.tensor([0.0, 0.0, 0.0, -5.0]), torch.tensor([0.0, 9.0]))
+    assert state[2].item() == pytest.approx(dynamics.MAX_CURVATURE * 0.485, abs=1e-4)
+
+
 def test_turns_respect_curvature_and_lateral_acceleration():
     start, actions = random_case(seed=1)
     states = torch.cat([start[:, None], dynamics.rollout(start, 10 * actions)], 1)
@@ -97,6 +116,23 @@ def test_an_arc_is_the_unicycle_s_motion_at_constant_acceleration_and_curvature(
     torch.testing.assert_close(arc, dynamics.rollout(states, actions), rtol=0, atol=0.02)
     assert driven[-1].item() == pytest.approx(9.0**2 / 6, abs=1e-4), "to the halt, never backwards"
     assert (driven.diff() >= 0).all() and (arc[31:, 3] == 0).all()
+
+
+@pytest.mark.parametrize("accel", [-2.0, 0.0, 1.5])
+def test_an_arc_in_reverse_is_the_arc_forwards_of_who_looks_the_other_way(accel):
+    times = DT * torch.arange(1, 51)
+    ways = [dict(hold=1.0, turn=2.0), {}]
+    for way in ways:
+        back, metres = along_arc(
+            torch.tensor([1.0, 2.0, 0.3, -4.0]), Arc(torch.tensor(-accel), torch.tensor(0.05)), times, **way
+        )
+        facing = torch.tensor([1.0, 2.0, 0.3 + math.pi, 4.0])
+        ahead, driven = along_arc(facing, Arc(torch.tensor(accel), torch.tensor(-0.05)), times, **way)
+        torch.testing.assert_close(back[:, :2], ahead[:, :2], rtol=0, atol=1e-4)
+        torch.testing.assert_close(metres, -driven)
+        torch.testing.assert_close(back[:, 3], -ahead[:, 3])
+        assert dynamics.wrap(back[:, 2] + math.pi - ahead[:, 2]).abs().max() < 1e-5
+    assert dynamics.curvature_of(torch.tensor(-0.2), torch.tensor(-4.0)).item() == pytest.approx(0.05)
 
 
 def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():

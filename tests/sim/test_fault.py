@@ -35,6 +35,10 @@ def judged(ego, others, since=0, vehicle=True, steps=40):
         ((0.0, 1.9), 5.0, 0.0, True),  # beside, and standing
         ((3.8, 0.0), 0.05, 3.0, False),  # the ego stands
         ((4.5, 0.0), 5.0, 3.0, False),  # no contact
+        ((-3.8, 0.0), -2.0, -1.0, True),  # behind an ego that reverses
+        ((3.8, 0.0), -2.0, 3.0, False),  # at its trailing front
+        ((3.8, 0.0), 5.0, -2.0, True),  # ahead, and reversing
+        ((0.0, 1.9), 5.0, -2.0, False),  # beside, and reversing: it does not stand
     ],
 )
 def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):

@@ -79,6 +79,16 @@ def test_everybody_is_seen_where_it_drives_and_goes_on_as_planned(free_space):
     torch.testing.assert_close(seen.x[:, 1:], state.lane.x[:, 1:])
 
 
+def test_who_reverses_at_the_start_halts_and_every_step_is_as_long_as_its_speed():
+    scene_set = scenes(2, steps=40)
+    scene_set.scenes["start"][:, 1, 3] = -3.0
+    track = drive(scene_set, nominal(), 0.0).states[:, :, 1]
+    step = track[..., :2].diff(dim=1).norm(dim=-1)
+    torch.testing.assert_close(step, 0.1 * (track[:, 1:, 3] + track[:, :-1, 3]).abs() / 2, rtol=0, atol=1e-3)
+    torch.testing.assert_close(track[:, :10, 3], (-3.0 + 0.3 * torch.arange(10)).expand(2, 10))
+    assert (track[:, 10:, 3] >= -1e-5).all()
+
+
 class Liar(Ego):
     """Drives as EGO does, and announces a plan that leaves its own, by 50 m after 5 s."""
 

@@ -60,6 +60,20 @@ def test_everybody_goes_straight_on_for_the_whole_rollout_and_nobody_leaves():
     assert rollouts.valid[:, :, 1:6].all() and (rollouts.states[:, :, 5, 3] == 0).all()
 
 
+def test_who_reverses_goes_on_at_constant_velocity_and_halts_under_idm():
+    """3 m/s backwards: 12 m in 4 s, or 1.5 m at 3 m/s^2; every step as long as its speed makes it."""
+    scene_set = scenes(2, steps=40)
+    scene_set.scenes["start"][:, 1, 3] = -3.0
+    scene_set.scenes["logged"][:, 0] = scene_set.scenes["start"]
+    back = drive(scene_set, ConstantVelocity(), 0.0).states[:, :, 1]
+    assert (back[:, -1, :2] - back[:, 0, :2]).norm(dim=-1).tolist() == pytest.approx([12.0, 12.0], abs=1e-3)
+    halts = drive(scene_set, idm(), 0.0).states[:, :, 1]
+    way = halts[..., :2].diff(dim=1)
+    along = way[..., 0] * halts[:, :1, 2].cos() + way[..., 1] * halts[:, :1, 2].sin()
+    torch.testing.assert_close(along, (halts[:, 1:, 3] + halts[:, :-1, 3]) / 2 * DT, rtol=0, atol=2e-3)
+    assert along.sum(1).tolist() == pytest.approx([-1.5, -1.5], abs=0.02) and (halts[:, 11:, 3] == 0).all()
+
+
 NO_BOUNDS = BoundSettings(meeting=False, curve=False)
 HEADWAY, STANDSTILL_GAP = 1.5, 2.0
 LIMIT, LENGTH = 15.0, 4.5
