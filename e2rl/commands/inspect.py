@@ -46,6 +46,8 @@ def content(scene: dict[str, np.ndarray]) -> Counts:
     agents = {f"{name}s": (present & (kinds == kind)).sum() for kind, name in enumerate(AGENT_TYPES)}
     return agents | {
         "vehicles that move, beside the ego": (vehicles & (scene["start"][:, 3] > MOVES))[1:].sum(),
+        "vehicles that appear later, near": (scene["logged_valid"].any(0) & ~present & (kinds == VEHICLE)).sum(),
+        "vehicles near that none drives": scene["left_out"],
         "median length of vehicles, m": np.median(scene["size"][vehicles, 0]),
         "speed of the ego at the start, m/s": scene["start"][0, 3],
         "distance driven by the ego, m": np.linalg.norm(np.diff(ego, axis=0), axis=1).sum(),

@@ -63,6 +63,7 @@ IDENTITY = ("scene_id", "location", "seed", "eta")  # columns of a row before it
 LATER: dict[str, float | str] = {  # last columns of a row: what rows of earlier versions, which lack them, know of them
     **{"errored": math.nan, "raised_by": "", "error": ""},  # whether, by whom ("ego", "traffic"), and with what message
     "cfr_object": math.nan,
+    "left_out": math.nan,  # vehicles that come near in the recording and are neither driven nor replayed
 }
 OPEN_LOOP_STAGE, META_STAGE, SPREAD_STAGE = "open loop", "meta-metric", "spread"
 STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own

@@ -18,6 +18,7 @@ FRONT, SIDE, REAR = 0, 1, 2
 KINDS = ("front", "side", "rear")
 EDGE_KIND = (SIDE, REAR, SIDE, FRONT)  # of geometry.EDGES
 BISECTIONS = 20
+GAP = 5  # steps of absence, as of one that is hidden, after which an agent appears anew
 
 
 def steps_until(stop: Tensor, length: int) -> Tensor:
@@ -40,6 +41,7 @@ def first_contact(batch: Batch) -> Batch:
     possible = valid & valid[..., :1]
     possible[..., 0] = False
     area = pair_overlap(states[:, :, :1], size[:, None, :1], states, size[:, None], possible)
+    area = area * ~since_birth(area > 0, valid)
     vehicle_area = area * (batch["agent_type"] == VEHICLE)[:, None]
     overlaps = (vehicle_area > 0).any(-1)
     hit = overlaps[:, 1:].any(-1) & ~overlaps[:, 0]
@@ -52,6 +54,31 @@ def first_contact(batch: Batch) -> Batch:
         kind[hit] = contact_kind(*boxes_at_contact(states[hit], size[hit], partner[hit], before[hit], stop[hit]))
     contact = {"area": area, "start_overlap": overlaps[:, 0], "hit": hit, "stop": stop, "touching": at_stop > 0}
     return contact | {"partner": partner, "kind": kind, "before": before}
+
+
+def since_birth(overlap: Tensor, valid: Tensor) -> Tensor:
+    """Returns the steps [B, T+1, N] bool at which agents overlap the ego as they have since they appeared.
+
+    Whoever appears within the ego, at the start or after more than GAP steps of absence, touches it only after they
+    have been apart once. Agents of the first step are there from before, and not counted here.
+
+    Args:
+        overlap: [B, T+1, N] bool, agents that overlap the ego.
+        valid: [B, T+1, N] bool, agents that are there.
+    """
+    born = torch.zeros_like(overlap)
+    rows, agents = overlap.any(1).nonzero(as_tuple=True)
+    if not len(rows):
+        return born
+    overlaps, there = overlap[rows, :, agents], valid[rows, :, agents]
+    steps = torch.arange(overlap.shape[1], device=overlap.device)
+    seen = torch.where(there, steps, -GAP - 1).cummax(1).values
+    before = torch.nn.functional.pad(seen[:, :-1], (1, 0), value=0)
+    appears = there & (steps - before > GAP + 1)
+    birth = torch.where(appears, steps, -1).cummax(1).values
+    apart = torch.where(there & ~overlaps, steps, -2).cummax(1).values
+    born[rows, :, agents] = overlaps & (birth >= 0) & (apart < birth)
+    return born
 
 
 def boxes_at_contact(

@@ -29,9 +29,11 @@ CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
     ),
 )
 def recorded_columns(batch: Batch) -> Batch:
-    """What the rollout itself recorded, where known: the control's transport, wall time, network evaluations."""
+    """What the rollout itself recorded, where known: the control's transport, wall time, network evaluations, and who
+    is not there."""
     names = ("transport_adversary", "transport_others", "transport_anchor", "seconds", "nfe")
     known = {name: batch[name].to(batch["states"].dtype) for name in names if name in batch}
+    known |= {name: batch[name] for name in ("left_out",) if name in batch}
     return known | ({"transport": known[names[0]] + known[names[1]]} if names[0] in known else {})
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from tensordict import TensorDict
 
 from e2rl.run.errors import InputError
@@ -23,6 +24,7 @@ from e2rl.scenes.smoothing import PAST, causal_past, causal_state, drop_jumps, s
 
 Arrays = dict[str, np.ndarray]
 STANDING = 0.5  # m/s
+MOVES, NEAR = 2.0, 10.0  # m: from where it was, of a vehicle that moves; between paths of centres that come near
 FIT = 2.0  # m: mean distance of a recorded future from a candidate that still counts as the route driven
 PASSED = 1.0  # m behind the vehicle's centre beyond which a stop line no longer counts
 MAX_EXITS, MAX_LIGHTS = 6, 2  # successors of a lane, lights of a route that a scene keeps
@@ -86,9 +88,11 @@ class SceneBuilder:
         scene |= _routes(scene, self.graph, origin, lights, self.settings)
         scene |= _lights(recording, frame, origin, self.settings.steps)
         scene |= _map(self.graph, self.drivable, scene, origin, self.settings)
+        left_out = scene.pop("left_out")
         tensors = {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in scene.items()}
         doubles = {key: value.float() for key, value in tensors.items() if value.dtype == torch.float64}
-        return TensorDict(tensors | doubles, batch_size=[])
+        numbers = {"left_out": torch.tensor(int(left_out))}
+        return TensorDict(tensors | doubles | numbers, batch_size=[])
 
 
 def _agents(
@@ -100,7 +104,7 @@ def _agents(
     start = np.where(valid[frame, :, None], start, 0.0)
     origin = np.round(start[recording.ego, :2])
     shift = np.array([*origin, 0.0, 0.0])
-    tracks = _participants(recording, frame, states, valid, settings)
+    tracks, left_out = _participants(recording, frame, states, valid, settings)
     rows = np.flatnonzero(tracks >= 0)
     chosen, cars = tracks[rows], rows[rows < settings.vehicles]
     frames = frame + np.arange(settings.steps + 1)
@@ -125,6 +129,7 @@ def _agents(
         "logged": padded(logged.swapaxes(0, 1)).swapaxes(0, 1),
         "logged_valid": padded(known.T).T,
         "past": np.zeros((settings.vehicles, PAST, 3)),
+        "left_out": np.array(left_out),
     }
     past = causal_past(recording.states[:, tracks[cars]], valid[:, tracks[cars]], frame, start[tracks[cars], 3])
     scene["past"][cars] = past
@@ -133,23 +138,66 @@ def _agents(
 
 def _participants(
     recording: Recording, frame: int, states: np.ndarray, valid: np.ndarray, settings: BuildSettings
-) -> np.ndarray:
-    """The track of each agent [N], -1 for padding: the ego, the vehicles nearest to it at the start frame, then the
-    other agents that come nearest to it."""
+) -> tuple[np.ndarray, int]:
+    """Returns the track of each agent [N], -1 for padding, and how many vehicles that come near no traffic drives.
+
+    Rows of vehicles hold the ego, the vehicles at the start frame by their distance, then those that appear later and
+    come near, which only a replay shows. Where the rows do not suffice, vehicles that stand leave theirs to those that
+    move, first those farthest from the ego's path; of those that move, the ones whose paths come near it are taken
+    first, the nearest of them at the start. Other agents follow, those that come nearest to the ego.
+
+    Args:
+        recording: of the log.
+        frame: the start frame.
+        states, valid: the smoothed tracks.
+        settings: how many agents of which kind there are.
+    """
     ego, vehicle = recording.ego, recording.agent_type == VEHICLE
-    distance = np.linalg.norm(states[:, :, :2] - states[:, [ego], :2], axis=-1)
-    now = np.where(valid[frame] & vehicle, distance[frame], np.inf)
-    now[ego] = -1.0
-    cars = np.argsort(now, kind="stable")[: settings.vehicles]
     span = slice(frame, frame + settings.steps + 1)
-    nearest = np.where(valid[span] & valid[span, [ego]], distance[span], np.inf).min(0, initial=np.inf)
-    nearest[vehicle] = nearest[ego] = np.inf
+    distance = np.linalg.norm(states[span, :, :2] - states[span, [ego], :2], axis=-1)
+    path_distance, moves = _approach(states[span], valid[span], vehicle, ego)
+    present = valid[frame] & vehicle
+    start_distance = np.where(present, distance[0], np.inf)
+    start_distance[ego] = path_distance[ego] = -1.0
+    moves[ego] = True
+    beyond = np.argsort(np.argsort(start_distance, kind="stable")) >= settings.vehicles
+    near = vehicle & (path_distance < NEAR)
+    rank = np.where(moves, start_distance, path_distance)
+    priority = np.lexsort((rank, ~near, beyond & ~moves, ~moves, ~present))
+    cars = priority[: min(settings.vehicles, present.sum())]
+    cars = cars[np.argsort(start_distance[cars], kind="stable")]
+    late = np.flatnonzero(near & ~present)
+    late = late[np.argsort(path_distance[late], kind="stable")][: settings.vehicles - len(cars)]
+    nearest = np.where(valid[span] & valid[span, [ego]], distance, np.inf).min(0, initial=np.inf)
+    nearest[vehicle] = np.inf
     others = np.argsort(nearest, kind="stable")[: settings.others]
+    others = others[np.isfinite(nearest[others])]
     tracks = np.full(settings.vehicles + settings.others, -1)
-    cars, others = cars[np.isfinite(now[cars])], others[np.isfinite(nearest[others])]
     tracks[: len(cars)] = cars
+    tracks[len(cars) : len(cars) + len(late)] = late
     tracks[settings.vehicles : settings.vehicles + len(others)] = others
-    return tracks
+    near[cars] = False
+    return tracks, int(near.sum())
+
+
+def _approach(states: np.ndarray, valid: np.ndarray, vehicle: np.ndarray, ego: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns how near the path of each vehicle comes to the ego's [A] m, at whatever times, and whether it moves [A].
+
+    Args:
+        states, valid: [F, A, 4], [F, A], from the start frame on.
+        vehicle: [A] bool; other agents are infinitely far, and do not move.
+        ego: its track.
+    """
+    path_distance, moves = np.full(len(vehicle), np.inf), np.zeros(len(vehicle), bool)
+    known = valid & vehicle
+    frame, track = known.nonzero()
+    points = states[frame, track, :2]
+    path = states[valid[:, ego], ego, :2]
+    if len(path) and len(points):
+        np.minimum.at(path_distance, track, cKDTree(path).query(points)[0])
+    first = states[known.argmax(0), np.arange(len(vehicle)), :2]
+    moves[track[np.linalg.norm(points - first[track], axis=-1) > MOVES]] = True
+    return path_distance, moves
 
 
 def _routes(

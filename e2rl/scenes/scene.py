@@ -1,7 +1,8 @@
 """The Scene: a TensorDict of one situation, padded and masked, and the SceneSet that holds many.
 
-Shapes (leading batch omitted): N agents = V vehicles (the ego first) + others; T simulated steps; R route candidates of
-P vertices; S lights; M, D map points; L lanes. Positions are relative to the scene's origin, in m; angles in rad.
+Shapes (leading batch omitted): N agents = V vehicles (the ego first; those that are not `valid` appear later, and only
+a replay shows them) + others; T simulated steps; R route candidates of P vertices; S lights; M, D map points; L lanes.
+Positions are relative to the scene's origin, in m; angles in rad.
 
 | key | shape | |
 | --- | --- | --- |
@@ -21,6 +22,7 @@ P vertices; S lights; M, D map points; L lanes. Positions are relative to the sc
 | lane_exits, lane_left, lane_right | [L, 6], [L], [L] | lane indices, -1 none |
 | drivable_points, drivable_index | [D, 2], [D] | polygons |
 | field, field_origin | [G, G] float16, [2] | m beyond the drivable border (< 0 inside) at 1 m cells |
+| left_out | [] int64 | vehicles that come near the ego's path and no traffic drives; a replay may show them |
 | scene_index | [] int64 | index in its SceneSet |
 """
 
@@ -37,6 +39,7 @@ from torch import Tensor
 from e2rl.run.errors import InputError
 
 KEYS_BY_DIMS = {  # number of dims of one scene: keys
+    0: "left_out",
     1: "start_accel start_yaw_rate valid parked agent_type route_log field_origin "
     "lane_index lane_width lane_left lane_right drivable_index",
     2: "start size logged_valid route_length route_open route_valid route_recorded field "

@@ -55,6 +55,7 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
     speed_limit: Tensor | None = None  # [B, T+1] m/s: of the ego's mission where it is, 0 unknown
     routes: Tensor | None = None  # [B, V] int64: route candidates followed, -1 none
     contact: Tensor | None = None  # [B] bool: the ego touched a vehicle
+    left_out: Tensor | None = None  # [B] int64: vehicles that come near in the recording and are not there
     transport_adversary: Tensor | None = None  # [B]: path KL of the control
     transport_others: Tensor | None = None  # [B]
     transport_anchor: Tensor | None = None  # [B]: anchor jump
@@ -89,6 +90,9 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
         simulated = start & slots & (kind == VEHICLE)
         simulated[:, 0] &= not replays_ego
         names = {"scene_id": scenes.scene_id, "location": scenes.location}
+        if (left_out := scene.get("left_out", None)) is not None:  # scenes made by hand may lack it
+            late = ~start & slots & (kind == VEHICLE) & valid.any(1)
+            known["left_out"] = left_out - late.sum(-1)
         return cls(
             states=states,
             valid=valid,

@@ -76,9 +76,13 @@ CASES = {
         [course(0, 0, 0, 10), course(43.0, -24.0, math.pi / 2, 6)],
         {"contact_type": "front", "at_fault": 0},
     ),
-    "one that appears": (
+    "one that appears within the ego, and drives out of it": (
         [course(0, 0, 0, 0), course(-2.0, 0, 0, 3, appears=20)],
-        {"contact_step": 20, "contact_type": "front", "relvel": 3},
+        {"cfr": 0, "contact_type": ""},
+    ),
+    "one that appears before the ego": (
+        [course(0, 0, 0, 10), course(30, 0, 0, 0, appears=20)],
+        {"cfr": 1, "contact_type": "front"},
     ),
     "one that crosses between two replans: steps 31 and 32 alone": (
         [course(0, 0, 0, 0), course(1.9, -108.5, math.pi / 2, 34)],
@@ -111,6 +115,30 @@ def test_an_ego_that_overlaps_at_the_start_has_no_collision_metrics():
 def test_pedestrians_count_apart_and_do_not_end_the_rollout():
     result = row(course(0, 0, 0, 10), course(30, 0, 0, 0), course(60, 0, 0, 0), kinds=[0, 1, 0])
     assert (result["cfr_vru"], result["cfr"], result["partner"]) == (1, 1, 2)
+
+
+def hidden(states, steps: range):
+    """A course that is absent at some steps."""
+    valid = states[1].clone()
+    valid[list(steps)] = False
+    return states[0], valid
+
+
+@pytest.mark.parametrize(("absent", "hit"), [(range(23, 26), 1), (range(20, 40), 0)])
+def test_who_comes_back_within_the_ego_touches_it_only_if_it_was_hidden_for_a_moment(absent, hit):
+    """The boxes meet from step 25 on, at 10 m/s."""
+    assert row(course(0, 0, 0, 10), hidden(course(30, 0, 0, 0), absent))["cfr"] == hit
+
+
+@pytest.mark.parametrize("kind", [1, 2, 3])
+def test_a_pedestrian_that_appears_within_the_ego_touches_it_after_they_were_apart_once(kind):
+    walker = course(0, -0.5, math.pi / 2, 1, appears=10)
+    found = row(course(0, 0, 0, 0), walker, kinds=[0, kind])
+    assert found["cfr_vru"] == found["cfr_object"] == 0
+    states, valid = walker
+    states = torch.cat([states[:41], states[:40].flip(0)])  # and comes back
+    found = row(course(0, 0, 0, 0), (states, valid), kinds=[0, kind])
+    assert found["cfr_vru"] + found["cfr_object"] == 1
 
 
 @pytest.mark.parametrize(("kind", "vru", "thing"), [(1, 1, 0), (2, 1, 0), (3, 0, 1)])

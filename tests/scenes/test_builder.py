@@ -101,6 +101,35 @@ def test_the_nearest_take_part_the_ego_first():
     assert scene["logged_valid"][:, 4:].any(0).all() and scene["valid"].tolist() == [True] * 6 + [False]
 
 
+def crossing(start_y: float, **options) -> dict:
+    """A car that crosses the ego's path at x = 60 at 6 m/s."""
+    y = start_y + 0.6 * ALL
+    return track(np.stack([np.full(FRAMES, 60.0), y], 1), np.pi / 2, 6.0, **options)
+
+
+def test_cars_that_stand_leave_their_rows_to_those_that_move():
+    """Those farthest from the ego's path first; where the rows suffice, nobody is left out."""
+    stands = {f"p{k}": straight(24 + 6.0 * k, -8 - k, 0) for k in range(6)}
+    settings = BuildSettings(field_cells=64, vehicles=6, others=0)
+    scene = build({"ego": straight(20, 0, 8), "x": crossing(-40)} | stands, settings=settings)
+    moving = scene["valid"] & (scene["start"][:, 3] > 1)
+    assert moving.sum() == 2 and scene["valid"].all()
+    assert sorted(scene["start"][~moving, 1].tolist()) == pytest.approx([-11, -10, -9, -8])
+    assert scene["left_out"] == 0  # the others stand more than 10 m from the ego's path
+    assert build({"ego": straight(20, 0, 8), "x": crossing(-40)} | stands)["valid"].sum() == 8
+
+
+def test_who_appears_later_and_comes_near_is_replayed_and_counted():
+    late = {"x": crossing(-30, valid=ALL > 30), "far": straight(0, 60, 8, valid=ALL > 30)}
+    scene = build({"ego": straight(20, 0, 8), "7": straight(50, 3.5, 6)} | late)
+    assert scene["valid"].sum() == 2 and scene["left_out"] == 1
+    assert scene["logged_valid"].any(0).nonzero()[:, 0].tolist() == [0, 1, 2]
+    assert scene["logged_valid"][:, 2].nonzero()[0] == 21 and scene["route_log"][2] == -1
+    assert not scene["start"][2].any() and not scene["parked"][2]
+    crowded = build({"ego": straight(20, 0, 8)} | late, settings=BuildSettings(field_cells=64, vehicles=2))
+    assert crowded["left_out"] == 1 and crowded["logged_valid"][:, 1].any()
+
+
 def test_the_way_driven_is_found_and_is_the_mission():
     scene = build({"ego": left_turn(), "7": straight(50, 3.5, 6), "p": straight(70, 0, 8)})
     assert scene["route_valid"][0].sum() == 3  # on, left, and the lane beside
