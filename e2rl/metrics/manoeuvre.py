@@ -11,7 +11,7 @@ from e2rl.planners.path import RoutePath
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
-from e2rl.scenes.route import interpolate, project
+from e2rl.scenes.route import BEHIND, interpolate, project, project_track
 from e2rl.sim import dynamics
 from e2rl.sim.env import SimSettings
 from e2rl.sim.mission import mission_of
@@ -131,7 +131,7 @@ class EvasionScene(TensorClass):
         others = states[row[:, None], step, 1:].masked_fill(~present[..., None], AWAY)[:, :, ever]
         agents = {"ego_size": scene["size"][:, 0], "others": others, "other_size": scene["size"][:, 1:][:, ever]}
         road = {"field": scene["field"], "origin": scene["field_origin"], "routes": scene["route_points"][:, 0]}
-        s = project(start[:, None, :2], mission.points)[0][:, 0]
+        s = project_track(states[:, :, 0, :2], mission.points, valid[:, :, 0], start=BEHIND)[0][row, moment]
         road |= {"mission": mission.points, "s": s, "end": mission.end}
         return EvasionScene(start=start, inside=inside, **agents, **road, batch_size=[len(states)])
 

@@ -18,7 +18,7 @@ from e2rl.metrics.catalogue import META_STAGE, STAGES, Metric
 from e2rl.scenes.boxes import corners, signed_distance
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT, LIGHT_RED
-from e2rl.scenes.route import project
+from e2rl.scenes.route import BEHIND, project_track
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.mission import light_state_at
 
@@ -136,7 +136,11 @@ def runs_red_light(
     """
     if not state.shape[-1] or not (light >= 0).any():
         return torch.zeros(len(track), dtype=torch.bool, device=track.device)
-    front = project(track[..., :2], route)[0][:, :, None] + size[:, None, :1] / 2 - light_s[:, None]
+    front = (
+        project_track(track[..., :2], route, known, start=BEHIND)[0][:, :, None]
+        + size[:, None, :1] / 2
+        - light_s[:, None]
+    )
     light = light[:, None].expand(*state.shape[:2], -1)  # [M, T, K]: each step is a row of its own in the look-up
     first = torch.zeros_like(light[..., 0]).flatten()
     red = light_state_at(state.flatten(0, 1)[:, None], light.flatten(0, 1), first).view(light.shape) == LIGHT_RED

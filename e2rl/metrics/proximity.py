@@ -14,6 +14,7 @@ from e2rl.metrics.contact import steps_until
 from e2rl.metrics.geometry import velocity
 from e2rl.scenes.boxes import distance
 from e2rl.scenes.recording import DT
+from e2rl.scenes.route import WINDOW
 from e2rl.sim.dynamics import closest_approach_cost, wrap
 
 SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
@@ -101,23 +102,55 @@ def progress(path: Tensor, count: Tensor) -> Tensor:
 def route_completion(path: Tensor, count: Tensor, logged: Tensor, logged_valid: Tensor) -> Tensor:
     """Fraction [B] in [0, 1] of the recorded ego's path that lies behind the ego at the end of its path.
 
-    path [B, T+1, 4] of `count` [B] states; logged [B, T+1, N, 4], logged_valid [B, T+1, N]: the recording. The end is
-    projected onto the nearest piece of the recorded way, as MetaDrive does. NaN where the ego is in no step, or where
-    the recorded way is shorter than LEAST_WAY.
+    path [B, T+1, 4] of `count` [B] states; logged [B, T+1, N, 4], logged_valid [B, T+1, N]: the recording. The ego is
+    projected onto the nearest piece of the recorded way, as MetaDrive does. Where that jumps, as at a crossing of the
+    way with itself, it is followed from the start on instead. NaN where the ego is in no step, or where the recorded
+    way is shorter than LEAST_WAY.
     """
     steps = torch.full_like(count, logged.shape[1] - 1)
     recorded, known = ego_path(logged, logged_valid, steps)
     piece = torch.arange(recorded.shape[1] - 1, device=path.device) < (known - 1)[:, None]
-    start, along = recorded[:, :-1, :2], recorded[:, 1:, :2] - recorded[:, :-1, :2]
-    length = along.norm(dim=-1) * piece
-    row = torch.arange(len(path), device=path.device)
-    offset = path[row, (count - 1).clamp(min=0), None, :2] - start
-    fraction = ((offset * along).sum(-1) / length.square().clamp(min=1e-12)).clamp(0, 1)
-    gap = (offset - fraction[..., None] * along).norm(dim=-1).masked_fill(~piece, torch.inf)
-    nearest = gap.argmin(-1)
+    length = recorded[..., :2].diff(dim=1).norm(dim=-1) * piece
+    end = length.cumsum(-1)
+    place = _place_on(path[..., :2], count, recorded[..., :2], piece, torch.stack([end - length, end], -1))
     whole = length.sum(-1)
-    behind = length.cumsum(-1)[row, nearest] - ((1 - fraction) * length)[row, nearest]
-    return (behind / whole).clamp(max=1).masked_fill((count == 0) | (whole < LEAST_WAY), torch.nan)
+    return (place / whole).clamp(max=1).masked_fill((count == 0) | (whole < LEAST_WAY), torch.nan)
+
+
+def _place_on(points: Tensor, count: Tensor, way: Tensor, piece: Tensor, ends: Tensor) -> Tensor:
+    """Metres [B] along ways [B, P, 2] at which the last of `count` [B] points [B, T, 2] is.
+
+    piece [B, P-1]: which pieces are part of the way; ends [B, P-1, 2] m: along it, where they begin and end.
+    """
+    start, along = way[:, None, :-1], (way[:, 1:] - way[:, :-1])[:, None]
+    offset = points[:, :, None] - start
+    fraction = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)).clamp(0, 1)
+    gap = (offset - fraction[..., None] * along).norm(dim=-1).masked_fill(~piece[:, None], torch.inf)
+    place = ends[:, None, :, 0] + fraction * (ends[..., 1] - ends[..., 0])[:, None]
+    nearest = place.gather(2, gap.argmin(-1, keepdim=True))[..., 0]
+
+    moved = torch.nn.functional.pad(points.diff(dim=1).norm(dim=-1), (1, 0))
+    inside = torch.arange(points.shape[1], device=points.device) < count[:, None]
+    before = torch.nn.functional.pad(nearest[:, :-1], (1, 0))
+    rows = ((((nearest - before).abs() - moved) > WINDOW) & inside).any(1).nonzero()[:, 0]
+    if len(rows):
+        nearest[rows] = _followed(place[rows], gap[rows], ends[rows], moved[rows])
+    return nearest.gather(1, (count - 1).clamp(min=0)[:, None])[:, 0]
+
+
+def _followed(place: Tensor, gap: Tensor, ends: Tensor, moved: Tensor) -> Tensor:
+    """Metres [R, T] along ways at which points are, one after another from the ways' starts on.
+
+    place, gap [R, T, P]: of each point on each piece, metres along the way and beside it; ends [R, P, 2]: metres at
+    which the pieces begin and end; moved [R, T] m since the point before.
+    """
+    places = [torch.zeros_like(moved[:, 0])]
+    for step in range(moved.shape[1]):
+        hint = (places[-1] + moved[:, step])[:, None]
+        far = (ends[..., 1] < hint - WINDOW) | (ends[..., 0] > hint + WINDOW)
+        index = gap[:, step].masked_fill(far, torch.inf).argmin(1, keepdim=True)
+        places.append(place[:, step].gather(1, index)[:, 0])
+    return torch.stack(places[1:], 1)
 
 
 def moved(states: Tensor, valid: Tensor) -> Tensor:

@@ -44,14 +44,15 @@ class ObservingEgo(Ego):
         static, expected = static_scene(world.scene, mission_of(world.scene)), expected_states(world)
         horizon = world.scene["logged"].shape[1] - 1
         state, present, action = world.states[:, 0], world.valid[:, 0], world.ego_action()
-        pieces = []
+        pieces, place = [], world.mission_s
         for done in range(0, PLAN_STEPS, HOLD):
-            ego = placed_ego(static.mission, world.step + done, state, action, present, present)
+            ego = placed_ego(static.mission, world.step + done, state, action, present, present, place)
             seen = features(static, ego, others_at(world, expected, done), ego.step / horizon)
             action = self.decide(seen)
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
             state, action = driven[:, -1], dynamics.inverse(last_two)[:, 0]
+            place = ego.pose.s + DT * driven[..., 3].sum(1)
             pieces.append(driven)
         return torch.cat(pieces, 1)
 

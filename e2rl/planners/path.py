@@ -28,10 +28,11 @@ class RoutePath:
     offset * exp(-a^2 / 3.5^2) of STRIVE's planner (Rempe et al. 2022) starts with a kink that no car can drive.
     """
 
-    def __init__(self, state: Tensor, route: Tensor) -> None:
-        """state [..., 4], route [..., P, 2]."""
+    def __init__(self, state: Tensor, route: Tensor, place: Tensor | None = None) -> None:
+        """state [..., 4], route [..., P, 2]; place [...]: arc length [m] near which the vehicles are, where known."""
         self.route = route
-        s, d, heading = (value[..., 0] for value in project(state[..., None, :2], route))
+        hint = None if place is None else place[..., None]
+        s, d, heading = (value[..., 0] for value in project(state[..., None, :2], route, hint))
         self.s, self.d, self.turned = s, d, wrap(state[..., 2] - heading)
         self.length = return_length(state[..., 3])
         self.residual = torch.zeros_like(state[..., :2])
@@ -77,7 +78,7 @@ class MissionPath(RoutePath):
 
     def __init__(self, world: World) -> None:
         self.world, self.mission = world, mission_of(world.scene)
-        super().__init__(world.states[:, 0], self.mission.points)
+        super().__init__(world.states[:, 0], self.mission.points, world.mission_s)
 
     def speed_caps(self, desired: float, braking: float = BRAKING, limits: bool = True, lights: bool = True) -> Tensor:
         """Squares [B, HORIZON / SPACING] of the highest speeds every SPACING metres ahead; read them by `look_up`.

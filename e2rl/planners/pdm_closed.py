@@ -27,7 +27,7 @@ from e2rl.scenes.route import project
 from e2rl.sim import dynamics
 from e2rl.sim.dynamics import constant_velocity, wrap
 from e2rl.sim.leaders import IDMParameters, idm_acceleration
-from e2rl.sim.mission import limit_at, mission_of
+from e2rl.sim.mission import limit_at
 from e2rl.sim.world import World
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the speed limit; of proposals that score alike the first is driven
@@ -159,9 +159,11 @@ def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tens
 
 def progress(world: World, scored: Tensor, allowed: Tensor) -> Tensor:
     """Metres along the mission of scored [B, P, T, 4], as a fraction [B, P] of the farthest of those allowed [B, P]."""
-    ends = torch.cat([world.states[:, :1], scored[:, :, -1]], 1)[..., :2]
-    s = project(ends, mission_of(world.scene).points)[0]
-    distance = (s[:, 1:] - s[:, :1]).clamp(min=0)
+    path = MissionPath(world)
+    driven = torch.cat([world.states[:, None, :1, :2].expand_as(scored[:, :, :1, :2]), scored[..., :2]], 2)
+    length = driven.diff(dim=2).norm(dim=-1).sum(-1)
+    s = project(scored[:, :, -1, :2], path.route, path.s[:, None] + length)[0]
+    distance = (s - path.s[:, None]).clamp(min=0)
     farthest = (distance * allowed).amax(1, keepdim=True)
     relative = (distance / farthest.clamp(min=LEAST_PROGRESS)).clamp(max=1)
     return torch.where(farthest > LEAST_PROGRESS, relative, 1.0)

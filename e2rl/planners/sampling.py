@@ -100,7 +100,9 @@ class ScoringEgo(Weights, Ego):
     def rated(self, world: World, states: Tensor) -> Tensor:
         """Costs [B, C] of driving along any states [B, C, PLAN_STEPS, 4], which lead where they end."""
         path = MissionPath(world)
-        end, shift, _ = project(states[:, :, -1, :2], path.route)
+        driven = torch.cat([world.states[:, None, :1, :2].expand_as(states[:, :, :1, :2]), states[..., :2]], 2)
+        length = driven.diff(dim=2).norm(dim=-1).sum(-1)
+        end, shift, _ = project(states[:, :, -1, :2], path.route, path.s[:, None] + length)
         return self.costs(world, Candidates(states, end - path.s[:, None], shift))
 
     def _chunks(self, world: World) -> list[World]:
@@ -112,7 +114,8 @@ class ScoringEgo(Weights, Ego):
 def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> World:
     """Scenes rows [b] of a World with these keys of the scene, without plans and routes."""
     now = (getattr(world, key)[rows] for key in ("step", *AGENT_KEYS))
-    return World(world.scene.select(*keys)[rows], *now)
+    mission_s = None if world.mission_s is None else world.mission_s[rows]
+    return World(world.scene.select(*keys)[rows], *now, mission_s=mission_s)
 
 
 def ranked_actions(ego: ScoringEgo, world: World, count: int, hold: int) -> tuple[Tensor, Tensor]:

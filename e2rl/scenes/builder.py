@@ -12,14 +12,14 @@ from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting
 from e2rl.scenes import boxes
 from e2rl.scenes.drivable_area import DrivableArea
-from e2rl.scenes.lane_graph import BEHIND, LaneGraph, Route
+from e2rl.scenes.lane_graph import LaneGraph, Route
 from e2rl.scenes.limits import known_limits
 from e2rl.scenes.links import plausible_width
 from e2rl.scenes.log_route import route_from_log
 from e2rl.scenes.paths import wrap
 from e2rl.scenes.plausibility import check, extent, map_fit, motion
 from e2rl.scenes.recording import AGENT_WORDS, VEHICLE, Recording
-from e2rl.scenes.route import SPACING, project
+from e2rl.scenes.route import BEHIND, SPACING, project, project_track
 from e2rl.scenes.smoothing import PAST, causal_past, causal_state, drop_jumps, smooth
 
 Arrays = dict[str, np.ndarray]
@@ -271,7 +271,7 @@ def _driven(scene: Arrays, routes: Arrays) -> np.ndarray:
         torch.from_numpy(value)[valid]
         for value in (routes["route_points"], routes["route_length"], ~routes["route_open"])
     )
-    s, d, heading = project(track[..., :2].contiguous(), points)
+    s, d, heading = project_track(track[..., :2].contiguous(), points, known=known[car], start=BEHIND)
     over = (s - length[:, None]).clamp(min=0) * closed[:, None]
     weight = known[car].double()
     distance = (d.abs() + 2.0 * wrap(heading - track[..., 2]).abs() + over) * weight

@@ -13,11 +13,11 @@ from torch import Tensor
 from e2rl.scenes.links import adjacent, drivable_exits
 from e2rl.scenes.paths import arc_length, points_at, resample, tangent_angle, wrap
 from e2rl.scenes.recording import Lane
-from e2rl.scenes.route import SPACING
+from e2rl.scenes.route import BEHIND, SPACING
 
 START_RADIUS, START_ANGLE = 5.0, 0.8  # m, rad: lanes this close may be a vehicle's own
 MAX_START_LANES, MAX_BRANCHES = 6, 4
-BEHIND, AHEAD = 20.0, 300.0  # m of route behind and ahead of the vehicle
+AHEAD = 300.0  # m of route ahead of the vehicle
 BUCKET = 20.0  # m to which distances on the start lane are rounded up, so that vehicles share a search
 SMOOTHING, SMOOTHED_ENDS = 1.3, 6  # vertices: standard deviation of the filter, odd extension beyond the ends
 FILTER = np.exp(-0.5 / (SMOOTHING * SMOOTHING) * np.arange(-5, 6) ** 2)  # of a Gaussian, to four standard deviations

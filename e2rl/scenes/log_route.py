@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from e2rl.scenes.lane_graph import BEHIND, LaneGraph, Route, smooth_vertices
+from e2rl.scenes.lane_graph import LaneGraph, Route, smooth_vertices
 from e2rl.scenes.paths import arc_length, points_at, tangent_angle
-from e2rl.scenes.route import SPACING
+from e2rl.scenes.route import BEHIND, SPACING
 
 MARGIN = 10.0  # m after the recording that stay usable where no lane goes on
 JOIN = 10.0  # m over which the route passes from the recording to the lane that goes on

@@ -12,6 +12,7 @@ from e2rl.run.fused import fused, is_on
 
 SPACING = 2.0  # m of arc length between vertices
 WINDOW = 20.0  # m on either side of an expected arc length
+BEHIND = 20.0  # m of a route, at most, that lie behind the vehicle that it was made for
 
 
 def _take(route: Tensor, index: Tensor) -> Tensor:
@@ -77,6 +78,57 @@ def _project(points: Tensor, route: Tensor, hint: Tensor | None, window: float) 
 def project_rows(points: Tensor, route: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`project` of points [R, K, 2] on routes [R, P, 2]."""
     return _project(points, route, None, WINDOW)
+
+
+def project_track(
+    points: Tensor, route: Tensor, known: Tensor | None = None, start: float | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`project` of points [Q, T, 2] that a vehicle passes one after another, continuous along routes [Q, P, 2].
+
+    Where a route crosses or repeats itself, the nearest place may be one that the vehicle comes to later or has long
+    passed: a track whose places jump is followed from point to point instead.
+
+    Args:
+        points: positions [m].
+        route: one route for each track.
+        known: bool [Q, T], whether a point is known; others are where the last known one is. Default: all.
+        start: arc length [m] near which a track whose first point is known begins. Default: unknown.
+
+    Returns:
+        Arc length s [m], offset d [m] and the route's heading [rad], each [Q, T].
+    """
+    if known is not None:
+        points = _filled(points, known)
+    s, d, heading = project(points, route)
+    moved = points.diff(dim=1).norm(dim=-1)
+    lost = ((s.diff(dim=1).abs() - moved) > WINDOW).any(1)
+    if start is not None and points.shape[1]:
+        away = (s[:, 0] - start).abs() > WINDOW
+        lost = lost | (away if known is None else away & known[:, 0])
+    rows = lost.nonzero()[:, 0]
+    if not len(rows):
+        return s, d, heading
+    place = torch.full_like(s[rows, 0], start) if start is not None else s[rows, 0]
+    if start is not None and known is not None:
+        place = torch.where(known[rows, 0], place, s[rows, 0])
+    poses = []
+    for frame in range(points.shape[1]):
+        hint = place if frame == 0 else place + moved[rows, frame - 1]
+        pose = project(points[rows, frame : frame + 1], route[rows], hint[:, None])
+        place = pose[0][:, 0]
+        poses.append(torch.stack(pose, -1))
+    fresh = torch.cat(poses, 1).unbind(-1)
+    s, d, heading = (old.index_copy(0, rows, new) for old, new in zip((s, d, heading), fresh, strict=True))
+    return s, d, heading
+
+
+def _filled(points: Tensor, known: Tensor) -> Tensor:
+    """Points [Q, T, 2] with the last known one, or before that the first, in the place of those unknown."""
+    frame = torch.arange(known.shape[1], device=known.device).expand_as(known)
+    last = torch.where(known, frame, -1).cummax(1).values
+    first = known.int().argmax(1, keepdim=True)
+    index = torch.where(last < 0, first, last)
+    return points.gather(1, index[..., None].expand_as(points))
 
 
 def onto_segments(

@@ -12,7 +12,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.mission import Mission, mission_of
+from e2rl.sim.mission import Mission, mission_of, start_place
 from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, features, placed_ego
 from e2rl.sim.reward import check_weights
 from e2rl.sim.static import static_scene, write_rows
@@ -91,7 +91,8 @@ class DrivingEnv(EnvBase):
         mission, start = mission_of(self.scene), self.scene["start"][:, 0]
         self._static = static_scene(self.scene, mission)
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
-        self._ego = placed_ego(mission, flags.long(), start, torch.zeros_like(start[:, :2]), flags, flags)
+        action, place = torch.zeros_like(start[:, :2]), start_place(mission, start)
+        self._ego = placed_ego(mission, flags.long(), start, action, flags, flags, place)
         self._features = torch.zeros(batch_size, width, device=device)  # as last observed
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
@@ -155,7 +156,7 @@ class DrivingEnv(EnvBase):
         for mine, first, later in zip(own, start, driven, strict=True):
             known = torch.where(begins[..., None] if first.ndim > 2 else begins, first, later)
             now.append(torch.cat([mine[:, None], known[:, 1:]], 1))
-        return World(self.scene, ego.step, *now)
+        return World(self.scene, ego.step, *now, mission_s=ego.pose.s)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
         batch = self.batch_size[0]
@@ -197,7 +198,8 @@ class DrivingEnv(EnvBase):
         on_road = off_road(start, self.scene["field"], self.scene["field_origin"])[index, 0] <= 0
         action = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
         flags = torch.ones_like(on_road), on_road
-        fresh = placed_ego(mission, torch.zeros_like(index), scene["start"][:, 0], action, *flags)
+        state = scene["start"][:, 0]
+        fresh = placed_ego(mission, torch.zeros_like(index), state, action, *flags, start_place(mission, state))
 
         self._ego = self._ego.merged(fresh, lambda old, new: old.index_copy(0, index, new))
         return fresh

@@ -86,8 +86,8 @@ def ahead_of(
 
 def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Tensor) -> tuple[Tensor, ...]:
     """Pairs (scene, vehicle, agent, moment, index of the nearest vertex; each [Q]) of present agents xy [B, M, T, 2]
-    within room [B, V, M] m of the vehicle's route and not behind it. A route continues straight beyond its last
-    vertex."""
+    within room [B, V, M] m of the vehicle's route and not behind it. Where the route comes by an agent more than once,
+    the first time counts. A route continues straight beyond its last vertex."""
     vehicles, count = points.shape[1:3]
     moments = xy.shape[2]
     stretches = _stretches(points)  # [B, V, C, 2, STRETCH + 1]
@@ -101,15 +101,27 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     some = near_some(low, high, *ends_at, to_come, flat, far) > 0
     b, v, m = (counts.repeat_interleave(moments, -1) & some).nonzero(as_tuple=True)
     there, within = flat[b, m], far[b, v, m]
-    near = _near(low[b, v], high[b, v], there[:, None], within[:, None])
+    near = _near(low[b, v], high[b, v], there[:, None], within[:, None]) & (to_come[b, v] > 0)
     near[:, -1] |= _beyond(ends_at[0][b, v], ends_at[1][b, v], there, within)
     pair, stretch = near.nonzero(as_tuple=True)
     gap = stretches[b[pair], v[pair], stretch] - flat[b, m][pair][..., None]
-    nearest, within = gap.square().sum(1).min(-1)
+    nearest, index = gap.square().sum(1).min(-1)
     table = nearest.new_full(near.shape, torch.inf).index_put((pair, stretch), nearest)
-    vertex = torch.zeros_like(table, dtype=torch.long).index_put((pair, stretch), STRETCH * stretch + within)
-    vertex = vertex.gather(1, table.argmin(1, keepdim=True))[:, 0].clamp(max=count - 1)
+    vertex = torch.zeros_like(table, dtype=torch.long).index_put((pair, stretch), STRETCH * stretch + index)
+    chosen = _first_passage(table, within.square())
+    vertex = vertex.gather(1, chosen[:, None])[:, 0].clamp(max=count - 1)
     return b, v, m // moments, m % moments, vertex
+
+
+def _first_passage(squared: Tensor, reach: Tensor) -> Tensor:
+    """Index [Q] of the first stretch that is nearer to an agent than the next one is, and within reach; without any,
+    of the nearest.
+
+    squared [Q, C], reach [Q]: squared distances.
+    """
+    after = torch.nn.functional.pad(squared[:, 1:], (0, 1), value=torch.inf)
+    passes = (squared <= after) & (squared <= reach[:, None])
+    return torch.where(passes.any(1), passes.int().argmax(1), squared.argmin(1))
 
 
 @fused("B V C 2", "B V C 2", "B V 2", "B V 2", "B V C", "B Q 2", "B V Q")

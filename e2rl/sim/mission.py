@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.scenes.recording import LIGHT_RED, LIGHT_UNKNOWN, LIGHT_YELLOW
-from e2rl.scenes.route import SPACING
+from e2rl.scenes.route import BEHIND, SPACING, project
 
 
 def light_state_at(light_state: Tensor, light: Tensor, step: Tensor) -> Tensor:
@@ -81,6 +81,12 @@ def mission_of(scene: TensorDictBase) -> Mission:
 
     end = of("route_length").masked_fill(~of("route_open"), torch.inf)
     return Mission(of("route_points"), of("route_limit"), end, of("route_light"), of("route_light_s"))
+
+
+def start_place(mission: Mission, state: Tensor) -> Tensor:
+    """Arc length [B] m of egos at their start states [B, 4] on their missions, which begin at most BEHIND m before."""
+    hint = torch.full_like(state[:, :1], BEHIND)
+    return project(state[:, None, :2], mission.points, hint)[0][:, 0]
 
 
 def limit_at(mission: Mission, s: Tensor) -> Tensor:

@@ -58,10 +58,20 @@ class EgoState(NamedTuple):
 
 
 def placed_ego(
-    mission: Mission, step: Tensor, state: Tensor, action: Tensor, present: Tensor, on_road: Tensor
+    mission: Mission,
+    step: Tensor,
+    state: Tensor,
+    action: Tensor,
+    present: Tensor,
+    on_road: Tensor,
+    place: Tensor | None,
 ) -> EgoState:
-    """The egos of B scenes at states [B, 4], projected on their missions, from which progress counts."""
-    pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points)))
+    """The egos of B scenes at states [B, 4], projected on their missions, from which progress counts.
+
+    place [B]: arc length [m] near which they are, None where it is unknown.
+    """
+    hint = None if place is None else place[:, None]
+    pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points, hint)))
     return EgoState(step, state, action, pose, present, on_road, pose.s)
 
 

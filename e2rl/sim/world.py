@@ -10,6 +10,7 @@ from torch import Tensor
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
+from e2rl.sim.mission import mission_of, start_place
 
 AGENT_KEYS = ("states", "valid", "accel", "turn_rate")  # of World, of the environment's `agents`, and of Agents
 START_KEYS = ("start", "valid", "start_accel", "start_yaw_rate")  # of a scene: the same at its start
@@ -22,7 +23,8 @@ class World:
     scene: Scene TensorDict [B]; step [B] int64: simulated steps since the start frame; states [B, N, 4]: x, y [m],
     heading [rad], speed [m/s]; valid [B, N]: present now; accel [B, N] m/s^2 and turn_rate [B, N] rad/s: over the last
     step, the ego's as executed; route [B, V] int64: the route candidates that the vehicles follow; plan [B, V, H, 4]:
-    their planned states at the coming steps (of both, None: unknown).
+    their planned states at the coming steps; mission_s [B] m: arc length of the ego on its mission, as followed since
+    the start (of these, None: unknown).
     """
 
     scene: TensorDictBase
@@ -33,20 +35,24 @@ class World:
     turn_rate: Tensor
     route: Tensor | None = None
     plan: Tensor | None = None
+    mission_s: Tensor | None = None
 
     @classmethod
     def at_start(cls, scene: TensorDictBase) -> "World":
         """Scenes [B] at their start frames."""
         step = torch.zeros(scene.batch_size[0], dtype=torch.int64, device=scene["start"].device)
         states, valid, accel, turn_rate = (scene[key] for key in START_KEYS)
-        return cls(scene, step, states, valid, accel, turn_rate, scene["route_log"])
+        mission_s = start_place(mission_of(scene), states[:, 0])
+        return cls(scene, step, states, valid, accel, turn_rate, scene["route_log"], mission_s=mission_s)
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
         """The World that a DrivingEnv with `agents=True` reports in a TensorDict [B]; scene: `DrivingEnv.scene`."""
         states, valid, accel, turn_rate = (tensordict["agents"][key] for key in AGENT_KEYS)
         plan = tensordict.get(("traffic", "plan"), None)
-        return cls(scene, tensordict["timestep"][:, 0], states, valid, accel, turn_rate, plan=plan)
+        mission_s = start_place(mission_of(scene), scene["start"][:, 0]) + tensordict["metrics", "progress"][:, 0]
+        step = tensordict["timestep"][:, 0]
+        return cls(scene, step, states, valid, accel, turn_rate, plan=plan, mission_s=mission_s)
 
     def shown(self, scene: TensorDictBase | None = None) -> "World":
         """A copy for code from outside the package: changes to it have no effect, and it holds nothing of the future.
@@ -61,7 +67,7 @@ class World:
         scene["size"] = torch.where(there[..., None], self.scene["size"], 1.0)
         scene["agent_type"] = self.scene["agent_type"] * there
         now = (getattr(self, key).clone() for key in ("step", *AGENT_KEYS))
-        return World(scene, *now)
+        return World(scene, *now, mission_s=None if self.mission_s is None else self.mission_s.clone())
 
     def ego_action(self) -> Tensor:
         """The egos' last executed acceleration and yaw rate [B, 2]."""

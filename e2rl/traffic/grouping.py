@@ -144,7 +144,9 @@ def crop_world(world: World, group: Group) -> World:
     agents = torch.cat([torch.arange(group.vehicles), width + torch.arange(group.others)]).to(rows.device)
     states, valid, accel = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
     scene = cast(TensorDictBase, SceneRows(world.scene, group))
-    return World(scene, world.step[rows], states, valid, accel, world.turn_rate[rows][:, agents])
+    mission_s = None if world.mission_s is None else world.mission_s[rows]
+    turn_rate = world.turn_rate[rows][:, agents]
+    return World(scene, world.step[rows], states, valid, accel, turn_rate, mission_s=mission_s)
 
 
 def crop_state(value: Any, group: Group, width: int, axes: int | None = 1) -> Any:

@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from e2rl.planners.ego import Ego, EgoPolicy
 from e2rl.prior.routes import take_route
-from e2rl.scenes.route import SPACING, project
+from e2rl.scenes.route import BEHIND, SPACING, project_track
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import Mission, mission_of, ran_red
@@ -75,15 +75,16 @@ def _driven(steps: TensorDictBase, scene: TensorDictBase, log: PlanLog) -> dict[
         "adversaries": torch.nn.functional.pad(log.acted, (0, tracks["states"].shape[2] - route.shape[1])),
         "routes": route,
         "ran_light": red_lights(tracks, scene, route),
-        "speed_limit": limits(tracks["states"][:, :, 0, :2], mission_of(scene)),
+        "speed_limit": limits(tracks["states"][:, :, 0, :2], tracks["valid"][:, :, 0], mission_of(scene)),
         **log.transport(),
         "contact": steps["next", "metrics", "contact"].any(1)[:, 0],
     }
 
 
-def limits(points: Tensor, mission: Mission) -> Tensor:
-    """Speed limit [B, K] [m/s] at the place of a mission that is nearest to points [B, K, 2]; 0 unknown."""
-    s, _, _ = project(points, mission.points)
+def limits(points: Tensor, known: Tensor, mission: Mission) -> Tensor:
+    """Speed limit [B, K] [m/s] along missions at the places of egos at points [B, K, 2], the last known one where they
+    are unknown; 0 unknown."""
+    s, _, _ = project_track(points, mission.points, known, start=BEHIND)
     return mission.limit.gather(1, (s / SPACING).long().clamp(0, mission.limit.shape[1] - 1))
 
 
@@ -94,7 +95,8 @@ def red_lights(tracks: dict[str, Tensor], scene: TensorDictBase, route: Tensor) 
     b, v = (scene["valid"][:, : route.shape[1]] & (route >= 0) & (lights >= 0).any(-1)).nonzero(as_tuple=True)
     if len(b):
         chosen = b, v, route[b, v]
-        s, _, _ = project(tracks["states"][b, :, v, :2], scene["route_points"][chosen])
+        seen = tracks["valid"][b, :, v]
+        s, _, _ = project_track(tracks["states"][b, :, v, :2], scene["route_points"][chosen], seen, start=BEHIND)
         front = (s + scene["size"][b, v, :1] / 2).cummax(1).values
         front = front.masked_fill(~tracks["valid"][b, :, v], -torch.inf)
         result[b, v] = ran_red(scene["light_state"][b], lights[b, v], scene["route_light_s"][chosen], front)

@@ -249,5 +249,7 @@ class Lookahead:
                 plan = checked(answer, (len(now.step), PLAN_STEPS, 4), self.ego, "plan", begins=False)
             pieces.append(plan[:, : self.period])
             ego, others = pieces[-1][:, -1:], planned[:, 1:, min(after, HORIZON) - 1]
-            now = replace(now, step=world.step + after, states=torch.cat([ego, others, moved[:, :, number]], 1))
+            place = None if now.mission_s is None else now.mission_s + DT * pieces[-1][..., 3].sum(1)
+            states = torch.cat([ego, others, moved[:, :, number]], 1)
+            now = replace(now, step=world.step + after, states=states, mission_s=place)
         return torch.cat(pieces, 1)[:, :HORIZON]

@@ -15,6 +15,7 @@ from e2rl.metrics.proximity import (
     standing_columns,
 )
 from e2rl.metrics.score import score_rollouts
+from tests.loops import loop, track
 from tests.metrics.test_contact import course, row, scene
 
 
@@ -79,6 +80,16 @@ def test_a_bent_way_counts_by_its_length_and_a_standing_ego_has_none():
     found = route_completion(bent[None], torch.tensor([21]), bent[None, :, None], gone)
     assert found.item() == pytest.approx(0.5, abs=1e-6), "of the way that is recorded"
     assert math.isnan(completion(course(0, 0, 0, 5), course(0, 0, 0, 0.1)))
+
+
+@pytest.mark.parametrize("steps", [5, 24, 26, 60, 81])
+def test_the_share_of_a_way_that_crosses_itself_is_what_was_driven(steps):
+    """The crossing is passed at the steps 15 and 82; near it, the nearest piece is of the other passage."""
+    recorded = track(loop(), 20.0, 25.0, steps=90)[None].double()
+    ego = recorded + torch.tensor([0.3, -0.3, 0, 0])
+    everywhere = torch.ones(1, 91, 1, dtype=torch.bool)
+    found = route_completion(ego, torch.tensor([steps + 1]), recorded[:, :, None], everywhere)
+    assert found.item() == pytest.approx(steps / 90, abs=0.01)
 
 
 PARKED_STAYS, PARKED_MOVES, STANDS, STARTS, STARTS_IN_LOG, DRIVES, LATE = range(1, 8)

@@ -6,9 +6,12 @@ import pytest
 import torch
 
 from e2rl.planners.path import STOP_GAP, MissionPath, RoutePath, fading, look_up
-from e2rl.sim.dynamics import inverse
+from e2rl.sim.dynamics import inverse, wrap
+from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.world import World
+from tests.loops import loop_scenes
 from tests.planners.planners import world_of, worlds
-from tests.synthetic import make_scenes
+from tests.synthetic import BACK, make_scenes
 
 
 def arc_route(radius=40.0, points=60):
@@ -94,3 +97,17 @@ def test_caps_slow_down_for_curves():
     caps = MissionPath(worlds(scenes)[1]).speed_caps(20.0, limits=False)[0]
     assert torch.allclose(caps[32:44].min(), torch.tensor(3.0 * 20), rtol=0.05)
     assert caps[15] < 399 and abs(caps[-5] - 400) < 1e-2
+
+
+def test_the_path_stays_on_its_part_of_a_mission_that_crosses_itself():
+    """Also where an environment reports the World in a TensorDict."""
+    scenes = loop_scenes(speed=12.0)
+    env = DrivingEnv(scenes, SimSettings(replay_ego=True), 1, agents=True)
+    frame = env.reset()
+    for step in range(1, 81):
+        frame = env.step(frame.set("action", torch.zeros(1, 2)))["next"]
+        for world in (env.world(), World.of(frame, env.scene)):
+            path = MissionPath(world)
+            assert path.s.item() == pytest.approx(BACK + 1.2 * step, abs=0.5)
+            ahead = path.at(torch.linspace(0, 20, 11)[None])[0]
+            assert wrap(ahead[:, 2].diff()).abs().max() < 0.2

@@ -4,7 +4,9 @@ import pytest
 import torch
 from shapely.geometry import LineString, Point
 
-from e2rl.scenes.route import SPACING, interpolate, project
+from e2rl.scenes.paths import wrap
+from e2rl.scenes.route import SPACING, interpolate, project, project_track
+from tests.loops import CROSSING, loop, track
 
 
 def wavy(seed: int, count: int = 60) -> torch.Tensor:
@@ -83,3 +85,24 @@ def test_interpolation_differentiates():
     small = 1e-4
     forward, _, _ = interpolate(route, s.detach() + small)
     assert slope.allclose((forward - points.detach()).sum(-1) / small, atol=1e-6)
+
+
+@pytest.mark.parametrize("begin", [20.0, CROSSING[0] - 3])
+def test_a_track_is_followed_across_the_crossing_of_a_loop(begin):
+    """The nearest place alone jumps by the length of the loop, in both directions."""
+    states = track(loop(), begin, 25.0)
+    for points in (states[:, :2], states[:, :2] + torch.tensor([0.3, -0.4])):
+        s, d, heading = (value[0] for value in project_track(points[None], loop()[None], start=begin))
+        assert (s - begin - 2.5 * torch.arange(81)).abs().max() < 0.6
+        assert d.abs().max() < 0.6 and wrap(heading - states[:, 2]).abs().max() < 0.1
+
+
+def test_a_gap_in_a_track_is_no_jump_and_what_does_not_jump_is_projected():
+    states = track(loop(), 20.0, 25.0)
+    known = torch.ones(1, 81, dtype=torch.bool)
+    known[0, 30:40] = False
+    points = torch.where(known[0, :, None], states[:, :2], 0.0)[None]
+    s = project_track(points, loop()[None], known, start=20.0)[0][0]
+    assert (s - 20 - 2.5 * torch.arange(81))[known[0]].abs().max() < 0.6
+    short = states[None, :8, :2]
+    assert torch.equal(project_track(short, loop()[None])[0], project(short, loop()[None])[0])

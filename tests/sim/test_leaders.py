@@ -5,6 +5,7 @@ import torch
 
 from e2rl.scenes.route import project
 from e2rl.sim.leaders import FREE_GAP, GATE_MARGIN, IDMParameters, Leaders, desired_gap, idm_acceleration, leaders
+from tests.loops import CROSSING, loop, track
 from tests.prior.small import arc
 
 LENGTH, WIDTH = 4.0, 2.0
@@ -28,6 +29,16 @@ def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
     gap, speed, _ = lead([(0, 0, 0, 9), (20, 2.0, torch.pi / 2, 5)])
     assert gap.item() == pytest.approx(20 - LENGTH / 2 - WIDTH / 2, abs=1e-4)
     assert speed.item() == pytest.approx(0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("s", "gap"), [(20.0, CROSSING[0] - 20), (100.0, CROSSING[1] - 100)])
+def test_who_stands_at_the_crossing_of_a_loop_leads_at_the_first_passage_to_come(s, gap):
+    """Even where it is nearer to the other passage, or to one that lies behind."""
+    for x, y in ((35.3, 0.0), (35.0, 0.3), (35.2, -0.2)):
+        ego = torch.cat([track(loop(), s, 8.0, 0)[0], torch.tensor([x, y, 0.0, 0.0])]).view(1, 2, 4)
+        size, present = torch.tensor([LENGTH, WIDTH]).expand(1, 2, 2), torch.ones(1, 2, dtype=torch.bool)
+        found = leaders(torch.tensor([[s]]), loop()[None, None], ego[:, :, None], size, present)
+        assert found.index.item() == 1 and abs(found.gap.item() - gap + LENGTH / 2 + 1.5) < 1.0
 
 
 def all_pairs(s, points, agents, size, present, d, free_gap):
