@@ -17,7 +17,7 @@ from e2rl.run.files import hash_files
 from e2rl.scenes.log_files import bounded_memory, check_file
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import CYCLIST, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, same_way
-from e2rl.scenes.smoothing import resample_uniform, signed_speed, speeds
+from e2rl.scenes.smoothing import resample_heights, resample_uniform, signed_speed, speeds
 from e2rl.scenes.source import Source
 
 FILES = ("scenario_*.parquet", "annotations*.feather")
@@ -150,18 +150,23 @@ def _sensor_log(path: Path) -> Recording:
     axis = _forward(*table[["qw", "qx", "qy", "qz"]].to_numpy(float).T)
     states = np.zeros((len(stamps), len(names) + 1, 4))
     valid = np.zeros(states.shape[:2], bool)
-    states[frame, track + 1, :2] = (np.einsum("kij,kj->ki", turn[frame], boxes) + place[frame])[:, :2]
+    position = np.einsum("kij,kj->ki", turn[frame], boxes) + place[frame]
+    states[frame, track + 1, :2] = position[:, :2]
+    heights = np.repeat(place[:, 2:], states.shape[1], axis=1)
+    heights[frame, track + 1] = position[:, 2]
     states[frame, track + 1, 2] = _heading(np.einsum("kij,kj->ki", turn[frame], axis))
     states[:, 0, :2], states[:, 0, 2] = (place + AHEAD * turn[..., 0])[:, :2], _heading(turn[..., 0])
     valid[frame, track + 1], valid[:, 0] = True, True
     seconds = (stamps - stamps[0]) / 1e9
+    heights = resample_heights(heights, valid, seconds)
     states, valid = resample_uniform(states, valid, seconds)
     states[..., 3] = speeds(states, valid)
     size = np.stack([EGO_SIZE, *table[["length_m", "width_m"]].to_numpy(float)[first]])
     kinds = ["regular_vehicle", *table["category"].to_numpy()[first]]
     code = _files(path)[-1].stem.split("____")[-1].split("_")[0]
     arrays = (states, valid, size, _types(kinds))
-    return Recording(path.parent.name, CITIES.get(code, code), "argoverse2", *arrays, 0, {}, current=None)
+    place_name = CITIES.get(code, code)
+    return Recording(path.parent.name, place_name, "argoverse2", *arrays, 0, {}, current=None, heights=heights)
 
 
 def _types(kinds: list[str]) -> np.ndarray:
@@ -190,7 +195,7 @@ def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
         left, right = segment.left_lane_boundary.xyz, segment.right_lane_boundary.xyz
         points, width = compute_midpoint_line(left, right, MID_POINTS)
         exits = [str(other) for other in segment.successors]
-        lanes[key] = Lane(points[:, :2], float(width), exits=exits)
+        lanes[key] = Lane(points[:, :2], float(width), exits=exits, heights=points[:, 2])
     for key, lane in lanes.items():
         lane.left = same_way(lanes, lane, segments[key].left_neighbor_id)
         lane.right = same_way(lanes, lane, segments[key].right_neighbor_id)

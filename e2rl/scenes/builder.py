@@ -13,6 +13,7 @@ from e2rl.run.settings import configured, setting
 from e2rl.scenes import boxes
 from e2rl.scenes.drivable_area import DrivableArea
 from e2rl.scenes.lane_graph import LaneGraph, Route
+from e2rl.scenes.levels import Levels
 from e2rl.scenes.limits import known_limits
 from e2rl.scenes.links import plausible_width
 from e2rl.scenes.log_route import route_from_log
@@ -27,6 +28,7 @@ STANDING = 0.5  # m/s
 MOVES, NEAR = 2.0, 10.0  # m: from where it was, of a vehicle that moves; between paths of centres that come near
 FIT = 2.0  # m: mean distance of a recorded future from a candidate that still counts as the route driven
 PASSED = 1.0  # m behind the vehicle's centre beyond which a stop line no longer counts
+OTHER_LEVEL = "agents on another level than the ego, on a bridge or below one, left out"
 MAX_EXITS, MAX_LIGHTS = 6, 2  # successors of a lane, lights of a route that a scene keeps
 
 
@@ -72,6 +74,10 @@ class SceneBuilder:
         if not self.graph.ids:
             raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
         check(map_fit(recording, self.graph), recording.scene_id)
+        self.levels = Levels(recording, self.graph, self.valid)
+        self.elsewhere = {recording.ego: self.levels.elsewhere(recording.ego)}
+        self.repairs[OTHER_LEVEL] += int(self.elsewhere[recording.ego].sum())
+        self.repairs = +self.repairs
         self.states = smooth(recording.states, self.valid)
         widths = np.array([plausible_width(lane.width) for lane in self.graph.lanes.values()])
         rings = [ring for ring in recording.drivable if len(ring) >= 3]
@@ -83,7 +89,10 @@ class SceneBuilder:
         no start."""
         frame = recording.validate_start().current
         assert frame is not None
-        scene, origin = _agents(recording, frame, self.states, self.valid, self.settings)
+        if recording.ego not in self.elsewhere:
+            self.elsewhere[recording.ego] = self.levels.elsewhere(recording.ego)
+        valid = self.valid & ~self.elsewhere[recording.ego]
+        scene, origin = _agents(recording, frame, self.states, valid, self.settings)
         lights = {name: index for index, name in enumerate(recording.lights)}
         scene |= _routes(scene, self.graph, origin, lights, self.settings)
         scene |= _lights(recording, frame, origin, self.settings.steps)

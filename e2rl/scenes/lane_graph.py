@@ -65,6 +65,7 @@ class LaneGraph:
         self.repairs = links + neighbours
         self.named_beside = {name: {*lane.left, *lane.right} for name, lane in long.items()}
         self.ids = list(self.lanes)
+        self.number = {name: index for index, name in enumerate(self.ids)}
         self.graph = nx.DiGraph()
         self.graph.add_nodes_from(self.ids)
         self.graph.add_edges_from((name, other) for name, nexts in exits.items() for other in nexts)
@@ -79,9 +80,16 @@ class LaneGraph:
         self.branches_of: dict[tuple[str, float, float], list[list[str]]] = {}
         self.path_of: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
-    def near_lanes(self, position: np.ndarray, heading: float) -> list[tuple[str, float]]:
-        """(lane, arc length of its nearest point) of the lanes near a pose, best first, each once."""
+    def near_lanes(
+        self, position: np.ndarray, heading: float, away: np.ndarray | None = None
+    ) -> list[tuple[str, float]]:
+        """(lane, arc length of its nearest point) of the lanes near a pose, best first, each once.
+
+        away: bool [P], points of the graph that are on another level.
+        """
         near = np.array(self.tree.query_ball_point(position, START_RADIUS), dtype=int)
+        if away is not None:
+            near = near[~away[near]]
         angle = np.abs(wrap(self.heading[near] - heading))
         near, angle = near[angle < START_ANGLE], angle[angle < START_ANGLE]
         distance = np.linalg.norm(self.points[near] - position, axis=1)

@@ -29,7 +29,7 @@ class Lane:
     """One lane's centreline, in driving direction.
 
     points [P, 2] m; width m (0 or NaN: unknown); speed_limit m/s (0: unknown); exits, left, right: ids of successor and
-    neighbour lanes; heights [P] m or None (tells the levels of bridges apart where connectivity is inferred).
+    neighbour lanes; heights [P] m or None (tells the levels of bridges apart).
     """
 
     points: np.ndarray
@@ -66,6 +66,7 @@ FIELDS = (  # further ones: name, classes, in words
     ("drivable", list | tuple, "a list of arrays"),
     ("repairs", Mapping, "a Counter"),
     ("egos", Mapping, "a dict of frames and tracks"),
+    ("heights", np.ndarray | None, "an array [frames, agents], or None"),
 )
 
 
@@ -86,6 +87,7 @@ class Recording:
     agent_type [A]; ego: index of the ego's track; lights: lane id -> [F] light state; drivable: polygons [P, 2];
     current: the start frame, with at least one frame of history before it; None where the log names none;
     egos: the ego's track by start frame, where it is not the same for all (-1: nobody is there);
+    heights [F, A] m or None: of the tracks, which tell who is on a bridge (e2rl/scenes/levels.py);
     repairs: how often reading mended something, by a phrase in the plural, such as "headings turned round".
     """
 
@@ -103,6 +105,7 @@ class Recording:
     current: int | None = HISTORY
     repairs: Counter[str] = field(default_factory=Counter)
     egos: dict[int, int] = field(default_factory=dict)
+    heights: np.ndarray | None = None
 
     def start_frames(self, starts: Sequence[int] | None, steps: int) -> list[int]:
         """Returns the start frames of `windows`; none where the log is too short for them.

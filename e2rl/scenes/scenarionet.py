@@ -19,7 +19,7 @@ from e2rl.scenes.log_files import MAX_BYTES, LogFiles
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_UNKNOWN, Lane, Recording, light_colour
-from e2rl.scenes.smoothing import latest_frames, resample_uniform, signed_speed
+from e2rl.scenes.smoothing import latest_frames, resample_heights, resample_uniform, signed_speed
 
 TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
 OBSTACLES = ("UNSET", "TRAFFIC_CONE", "TRAFFIC_BARRIER", "TRAFFIC_OBJECT", "TRAFFIC_LIGHT", "BUILDING", "GROUND")
@@ -95,6 +95,7 @@ def recording_of(data: dict, location: str = "") -> Recording:
     if len(ts) != frames:
         raise InputError(f"{len(ts)} time stamps for {frames} frames; repair metadata.ts")
     check({"states": (ts.max() - ts.min()) / DT * len(keys)}, scene_id)  # of the grid, whose size they give
+    heights = resample_heights(_heights(tracks, valid), valid, ts)
     states, valid = resample_uniform(states, valid, ts)
     seconds, current = ts - ts[0], metadata.get("current_time_index")
     if current is not None and not (np.isreal(current) and 0 <= current < frames and current == int(current)):
@@ -114,6 +115,7 @@ def recording_of(data: dict, location: str = "") -> Recording:
         lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)),
         current=None if current is None else int(round(seconds[int(current)] / DT)),
         repairs=repairs,
+        heights=heights,
     )
 
 
@@ -156,6 +158,16 @@ def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray, Counter[s
             size[index] = sorted(size[index], reverse=True)
     states[~valid] = 0.0
     return states, valid, size, +repairs
+
+
+def _heights(tracks: dict, valid: np.ndarray) -> np.ndarray:
+    """Heights [F, A] m of tracks that are valid [F, A]; NaN where they are unknown."""
+    heights = np.full(valid.shape, np.nan)
+    for index, track in enumerate(tracks.values()):
+        position = np.asarray(track["state"]["position"], float)
+        if position.shape[1] > 2:
+            heights[:, index] = position[:, 2]
+    return heights
 
 
 def _recorded_size(track: dict, known: np.ndarray) -> list[float] | None:

@@ -63,6 +63,22 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     return np.where(known[..., None], out, 0.0), known
 
 
+def resample_heights(heights: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> np.ndarray | None:
+    """Returns heights [G, A] m of tracks on the grid of `resample_uniform`; None where the log knows none.
+
+    Args:
+        heights: of the log's frames [F, A] m; all alike, or not finite, where the log has none.
+        valid: where the tracks are recorded [F, A].
+        ts: time stamps [F] s.
+    """
+    known = heights[valid]
+    if not len(known) or not np.isfinite(known).all() or np.ptp(known) == 0:
+        return None
+    states = np.zeros((*heights.shape, 4))
+    states[..., 0] = np.where(valid, heights, 0.0)
+    return resample_uniform(states, valid, ts)[0][..., 0]
+
+
 def _merge_equal_stamps(
     states: np.ndarray, valid: np.ndarray, ts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -50,7 +50,9 @@ class World:
         """The World that a DrivingEnv with `agents=True` reports in a TensorDict [B]; scene: `DrivingEnv.scene`."""
         states, valid, accel, turn_rate = (tensordict["agents"][key] for key in AGENT_KEYS)
         plan = tensordict.get(("traffic", "plan"), None)
-        mission_s = start_place(mission_of(scene), scene["start"][:, 0]) + tensordict["metrics", "progress"][:, 0]
+        progress, mission_s = tensordict.get(("metrics", "progress"), None), None  # collected frames may have none
+        if progress is not None:
+            mission_s = start_place(mission_of(scene), scene["start"][:, 0]) + progress[:, 0]
         step = tensordict["timestep"][:, 0]
         return cls(scene, step, states, valid, accel, turn_rate, plan=plan, mission_s=mission_s)
 

@@ -1,0 +1,112 @@
+"""Who is on another level than the ego: on a bridge above its road, or in a tunnel below it.
+
+Simulation and verdicts are flat, so whoever crosses the ego's way above or below would touch it. Where a log has
+heights, agents whose ways come near the ego's on other levels alone are found here, and left out of its scenes.
+"""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from e2rl.scenes.lane_graph import LaneGraph
+from e2rl.scenes.paths import arc_length
+from e2rl.scenes.recording import VEHICLE, Recording
+
+LEVEL = 3.5  # m between what is on different levels: bridges leave 4 m or more to what passes below
+NEAR = 6.0  # m at most between ways that meet
+AHEAD = 150.0  # m of lanes beyond what an agent drove where it may yet come to
+STRIDE = 3  # frames between the places of a track that are compared
+ON_LANE, UNEVEN = 3.0, 1.5  # m: of a vehicle on a lane; deviation of heights beyond which lanes tell none
+
+
+class Levels:
+    """Heights of the tracks and lanes of a log.
+
+    lane_height [P] m: at the points of a LaneGraph, in the tracks' heights; NaN where it is unknown.
+    """
+
+    def __init__(self, recording: Recording, graph: LaneGraph, valid: np.ndarray) -> None:
+        """valid [F, A]: frames of the tracks that count."""
+        self.recording, self.graph, self.valid = recording, graph, valid
+        self.lane_height = np.full(len(graph.points), np.nan)
+        if recording.heights is not None:
+            heights = [_at_points(graph, name) for name in graph.ids]
+            self.lane_height = self._levelled(np.concatenate(heights))
+
+    def _levelled(self, height: np.ndarray) -> np.ndarray:
+        """Lane heights [P] on the scale of the tracks, which may be of boxes' middles; NaN where the two disagree."""
+        recording = self.recording
+        assert recording.heights is not None
+        frame, agent = (self.valid & (recording.agent_type == VEHICLE)).nonzero()
+        frame, agent = frame[::STRIDE], agent[::STRIDE]
+        distance, nearest = self.graph.tree.query(recording.states[frame, agent, :2])
+        offset = (recording.heights[frame, agent] - height[nearest])[distance < ON_LANE]
+        offset = offset[np.isfinite(offset)]
+        if not len(offset) or np.median(np.abs(offset - np.median(offset))) > UNEVEN:
+            return np.full_like(height, np.nan)
+        return height + np.median(offset)
+
+    def elsewhere(self, ego: int) -> np.ndarray:
+        """Bool [A]: agents whose ways come near that of the track `ego`, and nowhere on its level."""
+        other = np.zeros(self.valid.shape[1], bool)
+        heights = self.recording.heights
+        if heights is None or not self.valid[:, ego].any():
+            return other
+        path, height = self.way(ego)
+        tree, states = cKDTree(path), self.recording.states
+        for agent in np.flatnonzero(self.valid.any(0)):
+            frames = np.flatnonzero(self.valid[:, agent])[::STRIDE]
+            _, nearest = tree.query(states[frames, agent, :2])
+            if agent == ego or not (np.abs(heights[frames, agent] - height[nearest]) > LEVEL).any():
+                continue
+            points, own = self.way(agent)
+            close = tree.query_ball_point(points, NEAR)
+            index = np.repeat(np.arange(len(points)), [len(near) for near in close])
+            apart = np.abs(own[index] - height[np.concatenate([*close, []]).astype(int)])
+            other[agent] = len(apart) > 0 and bool((apart > LEVEL).all())
+        return other
+
+    def way(self, agent: int) -> tuple[np.ndarray, np.ndarray]:
+        """Places [Q, 2] m that an agent drove, and may yet drive along the lanes from its first one, and their heights
+        [Q] m; where a lane's is unknown, that of the agent."""
+        recording, graph = self.recording, self.graph
+        assert recording.heights is not None
+        frames = np.flatnonzero(self.valid[:, agent])
+        track, height = recording.states[frames, agent], recording.heights[frames, agent]
+        places, heights = [track[::STRIDE, :2]], [height[::STRIDE]]
+        if recording.agent_type[agent] == VEHICLE:
+            reach = arc_length(track[:, :2])[-1] + AHEAD
+            starts = [name for name, _ in self.near_lanes(track[0, :2], track[0, 2], height[0])]
+            for name in _reached(graph, starts, reach):
+                rows = slice(*graph.first_point[[graph.number[name], graph.number[name] + 1]])
+                lane = self.lane_height[rows]
+                places.append(graph.points[rows])
+                heights.append(np.where(np.isnan(lane), height[0], lane))
+        return np.concatenate(places), np.concatenate(heights)
+
+    def near_lanes(self, position: np.ndarray, heading: float, height: float) -> list[tuple[str, float]]:
+        """`LaneGraph.near_lanes` without those on another level than `height` m."""
+        away = np.abs(self.lane_height - height) > LEVEL
+        return self.graph.near_lanes(position, heading, away)
+
+
+def _at_points(graph: LaneGraph, name: str) -> np.ndarray:
+    """Heights [P] m at the points of a lane's line, NaN where they are unknown."""
+    lane, line = graph.lanes[name], graph.line[name]
+    if lane.heights is None:
+        return np.full(len(line), np.nan)
+    arc = arc_length(lane.points)
+    return np.interp(np.linspace(0, arc[-1], len(line)), arc, lane.heights)
+
+
+def _reached(graph: LaneGraph, starts: list[str], reach: float) -> list[str]:
+    """Lanes that begin at most `reach` m after the beginnings of `starts`."""
+    begin = dict.fromkeys(starts, 0.0)
+    waiting = list(starts)
+    while waiting:
+        name = waiting.pop(0)
+        end = begin[name] + graph.arc[name]
+        for other in graph.graph.successors(name) if end < reach else ():
+            if end < begin.get(other, np.inf):
+                begin[other] = end
+                waiting.append(other)
+    return list(begin)

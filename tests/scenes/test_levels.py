@@ -1,0 +1,75 @@
+"""Who is above or below the ego's road is left out where heights tell, and nobody else is."""
+
+import numpy as np
+import pytest
+
+from e2rl.scenes.builder import OTHER_LEVEL, BuildSettings, SceneBuilder
+from e2rl.scenes.scenarionet import recording_of
+from tests.scenes.descriptions import ALL, description, lane, straight, track
+
+SETTINGS = BuildSettings(field_cells=32)
+MAST = 50.0  # m, x of the road that crosses
+
+
+def crossing(y: float, speed: float, height: float, **options) -> dict:
+    """A vehicle towards +y at x = MAST, at `y` m at frame 0, at a height."""
+    car = track(np.stack([np.full(len(ALL), MAST), y + 0.1 * speed * ALL], 1), np.pi / 2, speed, **options)
+    car["state"]["position"][:, 2] = height
+    return car
+
+
+def lanes(height: float, known: bool = True) -> dict:
+    """A road along x at height 0 and one across it along y at a height; flat lanes where heights are not known."""
+    roads = {
+        "low": lane([[-100, 0], [300, 0]]),
+        "beside": lane([[-100, 3.5], [300, 3.5]]),
+        "high": lane([[MAST, -250], [MAST, 250]]),
+    }
+    roads["high"]["polyline"][:, 2] = height if known else 0.0
+    return roads
+
+
+def built(height: float, *, y: float = -40.0, known: bool = True, lift: float = 0.0) -> tuple[int, int]:
+    """How many agents are present at the start beside the ego, and how many are left out as on another level."""
+    tracks = {"ego": straight(0, 0, 8), "beside": straight(-20, 3.5, 8), "crossing": crossing(y, 10.0, height)}
+    for each in tracks.values():
+        each["state"]["position"][:, 2] += lift
+    roads = lanes(height, known)
+    recording = recording_of(description(tracks, roads))
+    builder = SceneBuilder(recording, SETTINGS)
+    return int(builder.scene(recording)["valid"].sum()) - 1, builder.repairs[OTHER_LEVEL]
+
+
+@pytest.mark.parametrize("lift", [0.0, 0.8, 300.0])
+def test_who_crosses_the_ego_s_road_on_a_bridge_or_below_one_is_left_out(lift):
+    """Whether heights are of the ground or of the middles of boxes, and wherever zero is."""
+    assert built(7.0, lift=lift) == (1, 1)
+    assert built(-6.0, lift=lift) == (1, 1)
+    assert built(0.0, lift=lift) == (2, 0)
+    assert built(1.5, lift=lift) == (2, 0), "a slope, or a tall box"
+
+
+def test_a_lane_tells_who_would_cross_although_nobody_has_yet():
+    """The car ends 60 m before the ego's road, towards which its lane leads above."""
+    assert built(7.0, y=-150.0) == (1, 1)
+    assert built(0.0, y=-150.0) == (2, 0)
+
+
+def test_heights_of_tracks_suffice_and_without_any_nobody_is_left_out():
+    assert built(7.0, known=False) == (1, 1)
+    recording = recording_of(
+        description({"ego": straight(0, 0, 8), "crossing": crossing(-40.0, 10.0, 0.0)}, lanes(7.0))
+    )
+    assert recording.heights is None and not SceneBuilder(recording, SETTINGS).repairs
+
+
+def test_a_hill_is_no_bridge():
+    """The car ahead is 10 m higher than the ego now, and on the same road."""
+    roads = {"up": lane([[-100, 0], [0, 0], [100, 0], [300, 0]])}
+    roads["up"]["polyline"][:, 2] = [-10, 0, 10, 30]
+    tracks = {"ego": straight(0, 0, 8), "ahead": straight(100, 0, 8)}
+    for each in tracks.values():
+        each["state"]["position"][:, 2] = 0.1 * each["state"]["position"][:, 0]
+    recording = recording_of(description(tracks, roads))
+    builder = SceneBuilder(recording, SETTINGS)
+    assert builder.scene(recording)["valid"].sum() == 2 and not builder.repairs[OTHER_LEVEL]
