@@ -45,7 +45,7 @@ def content(scene: dict[str, np.ndarray]) -> Counts:
     beside = (scene["lane_left"] >= 0) | (scene["lane_right"] >= 0)
     agents = {f"{name}s": (present & (kinds == kind)).sum() for kind, name in enumerate(AGENT_TYPES)}
     return agents | {
-        "vehicles that move, beside the ego": (vehicles & (scene["start"][:, 3] > MOVES))[1:].sum(),
+        "vehicles that move, beside the ego": (vehicles & (abs(scene["start"][:, 3]) > MOVES))[1:].sum(),
         "vehicles that appear later, near": (scene["logged_valid"].any(0) & ~present & (kinds == VEHICLE)).sum(),
         "vehicles near that none drives": scene["left_out"],
         "median length of vehicles, m": np.median(scene["size"][vehicles, 0]),

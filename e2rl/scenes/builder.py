@@ -1,7 +1,7 @@
 """From a Recording to a Scene: who takes part, from which start state, on which routes, on which map."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting
 from e2rl.scenes import boxes
 from e2rl.scenes.drivable_area import DrivableArea
+from e2rl.scenes.headings import hold_headings, mend_headings
 from e2rl.scenes.lane_graph import LaneGraph, Route
 from e2rl.scenes.levels import Levels
 from e2rl.scenes.limits import known_limits
@@ -64,10 +65,15 @@ class SceneBuilder:
         """Raises InputError for what `build_scene` does, the start frame apart."""
         recording.validate_log()
         self.repairs = Counter(recording.repairs)
-        check(extent(recording) | motion(recording), recording.scene_id)
+        check(extent(recording), recording.scene_id)
         self.valid = drop_jumps(recording.states, recording.valid)
         egos = [recording.ego, *recording.egos.values()]
         self.valid[:, egos] = recording.valid[:, egos]  # without the ego there is no scene
+        self.mended, turned = mend_headings(recording.states, recording.valid, recording.agent_type)
+        recording = replace(recording, states=self.mended)
+        check(motion(recording), recording.scene_id)
+        held, count = hold_headings(self.mended, self.valid, recording.agent_type)
+        self.repairs += Counter(turned) + Counter({"headings held while standing": count})
         lanes, limits = known_limits(recording)
         self.graph = LaneGraph(lanes)
         self.repairs += limits + self.graph.repairs
@@ -78,7 +84,7 @@ class SceneBuilder:
         self.elsewhere = {recording.ego: self.levels.elsewhere(recording.ego)}
         self.repairs[OTHER_LEVEL] += int(self.elsewhere[recording.ego].sum())
         self.repairs = +self.repairs
-        self.states = smooth(recording.states, self.valid)
+        self.states = smooth(held, self.valid)
         widths = np.array([plausible_width(lane.width) for lane in self.graph.lanes.values()])
         rings = [ring for ring in recording.drivable if len(ring) >= 3]
         self.drivable = DrivableArea(list(self.graph.line.values()), widths, rings)
@@ -92,7 +98,9 @@ class SceneBuilder:
         if recording.ego not in self.elsewhere:
             self.elsewhere[recording.ego] = self.levels.elsewhere(recording.ego)
         valid = self.valid & ~self.elsewhere[recording.ego]
-        scene, origin = _agents(recording, frame, self.states, valid, self.settings)
+        # what stands is held by what was recorded of it until the start frame
+        held, _ = hold_headings(self.mended[: frame + 1], self.valid[: frame + 1], recording.agent_type)
+        scene, origin = _agents(replace(recording, states=held), frame, self.states, valid, self.settings)
         lights = {name: index for index, name in enumerate(recording.lights)}
         scene |= _routes(scene, self.graph, origin, lights, self.settings)
         scene |= _lights(recording, frame, origin, self.settings.steps)
@@ -108,7 +116,7 @@ def _agents(
     recording: Recording, frame: int, states: np.ndarray, valid: np.ndarray, settings: BuildSettings
 ) -> tuple[Arrays, np.ndarray]:
     """Start states, past and recorded future of the agents that take part, and the scene's origin [2]; states, valid:
-    the smoothed tracks."""
+    the smoothed tracks; recording: its tracks until the start frame."""
     start, accel, yaw_rate = causal_state(recording.states, valid, frame)
     start = np.where(valid[frame, :, None], start, 0.0)
     origin = np.round(start[recording.ego, :2])
@@ -232,11 +240,11 @@ def _routes(
         if not scene["valid"][row]:
             continue
         position = np.array([x, y]) + origin
-        found = graph.candidates(position, heading, speed, settings.routes, settings.vertices)
+        found = graph.candidates(position, heading, max(speed, 0.0), settings.routes, settings.vertices)
         for index, route in enumerate(found):
             _write_route(out, (row, index), route, origin, lights)
-        scene["parked"][row] = speed < STANDING
-        standing += [(row, route) for route in found if speed < STANDING]
+        scene["parked"][row] = abs(speed) < STANDING
+        standing += [(row, route) for route in found if abs(speed) < STANDING]
     if standing:
         rows, routes = map(list, zip(*standing, strict=True))
         scene["parked"][np.array(rows)[_on_lane(graph, routes, scene["start"][rows, :2] + origin)]] = False

@@ -129,6 +129,7 @@ def motion(recording: Recording) -> dict[str, float]:
     distance, ego = np.linalg.norm(moved, axis=-1), track == recording.ego
     ratio, far = (speed * FRAMES * DT + 0.05) / (distance + 0.05), distance > MOVED
     turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
+    turned = np.where(distance < BACKWARDS * FRAMES * DT, np.minimum(turned, pi - turned), turned)  # it may reverse
     size = recording.size[recording.valid.any(0) & (recording.agent_type == VEHICLE)]
     return {
         "vehicle_length": float(np.median(size[:, 0])),
@@ -159,16 +160,13 @@ def _together(recording: Recording, tracks: np.ndarray) -> float:
 
 
 def _worst(distance: np.ndarray, turned: np.ndarray, ratio: np.ndarray, track: np.ndarray) -> dict[str, float]:
-    """The largest deviations of one vehicle, of those that drive DRIVEN m: of its heading and of its speeds.
-
-    A slow vehicle may drive backwards.
-    """
+    """The largest deviations of one vehicle, of those that drive DRIVEN m: of its heading and of its speeds."""
     drives = np.bincount(track, distance) / FRAMES > DRIVEN if len(track) else np.zeros(0, bool)
     turn, factor, moved = (_medians(values, track) for values in (turned, np.abs(np.log(ratio)), distance))
     fast = moved > BACKWARDS * FRAMES * DT
     return {
         "track_direction": _largest(turn[drives & fast]),
-        "slow_direction": _largest(np.minimum(turn, np.pi - turn)[drives & ~fast]),
+        "slow_direction": _largest(turn[drives & ~fast]),
         "track_speed": float(np.exp(_largest(factor[drives]))),
     }
 

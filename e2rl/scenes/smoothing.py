@@ -13,7 +13,7 @@ from e2rl.scenes.recording import DT
 WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order
 CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
 PAST = CAUSAL_WINDOW - 1  # frames of that history
-MAX_TURN, MAX_STEP = 1.0, 5.0  # rad, m from one frame to the next; more is a jump
+MAX_STEP = 5.0  # m from one frame to the next; more is a jump
 FRAME_STEPS = (0.005, 1.25)  # s, median step of a log: 200 to 0.8 Hz
 LONGEST_PAUSE = 60.0  # s from one frame of a log to the next
 MAX_GAP = 0.55  # s without any frame of the log that interpolation bridges (2 Hz annotations)
@@ -22,6 +22,8 @@ ON_GRID = 1e-3  # s from a grid frame at which a frame is this grid frame
 REGULAR = 0.1  # quantile of a track's steps below which none may lie for it to be annotated at a lower rate
 FLIP = 2.0  # rad from one frame to the next, which no vehicle turns
 TOP_SPEED = 45.0  # m/s; recorded speeds beyond it are glitches
+REVERSES, LATELY = 0.25, 5  # m/s, frames: slower motion backwards is noise, of 4 sd where positions jitter by 2 cm
+REVERSED = 0.5  # m: what drives less far backwards does not reverse
 
 
 def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -174,24 +176,22 @@ def speeds(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """valid [F, A] without the frames that jumps (over MAX_TURN or MAX_STEP in a frame) divide from a track's longest
-    run.
+    """valid [F, A] without the frames that jumps (over MAX_STEP in a frame) divide from a track's longest run.
 
     A run beyond a jump is kept where it fits the frames kept before it: a glitch of a few frames costs these frames
-    only, a heading that flips for good costs the shorter side.
+    only. A heading costs none: `mend_headings` mends it.
     """
     valid = valid.copy()
-    jump = np.abs(wrap(np.diff(states[..., 2], axis=0))) > MAX_TURN
-    jump |= np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1) > MAX_STEP
+    jump = np.linalg.norm(np.diff(states[..., :2], axis=0), axis=-1) > MAX_STEP
     jump &= valid[1:] & valid[:-1]
     for agent in np.flatnonzero(jump.any(0)):
         run = np.concatenate([[0], np.cumsum(jump[:, agent])])
-        valid[:, agent] = _consistent(states[:, agent], valid[:, agent], run)
+        valid[:, agent] = _consistent(states[:, agent, :2], valid[:, agent], run)
     return valid
 
 
 def _consistent(track: np.ndarray, valid: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Frames [F] of one track [F, 4] in its longest run (run [F]: number of jumps so far) and the runs that fit it."""
+    """Frames [F] of one track [F, 2] in its longest run (run [F]: number of jumps so far) and the runs that fit it."""
     count = np.bincount(run[valid])
     longest = count.argmax()
     keep = valid & (run == longest)
@@ -202,14 +202,14 @@ def _consistent(track: np.ndarray, valid: np.ndarray, run: np.ndarray) -> np.nda
             if not len(frames):
                 continue
             change = track[frames[inner]] - track[edge]
-            if abs(wrap(change[2])) <= MAX_TURN and np.hypot(*change[:2]) <= MAX_STEP * abs(frames[inner] - edge):
+            if np.hypot(*change) <= MAX_STEP * abs(frames[inner] - edge):
                 keep[frames] = True
                 edge = frames[outer]
     return keep
 
 
 def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Tracks [F, A, 4] with smoothed positions, and the speed along the heading from their derivative.
+    """Tracks [F, A, 4] with smoothed positions, and the signed speed along the heading from their derivative.
 
     Savitzky-Golay per contiguous run of frames; a run shorter than WINDOW takes the longest odd window that it can. At
     both ends of a run the polynomials of its first and its last window go on.
@@ -222,9 +222,42 @@ def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
         runs = agent[windows == window], start[windows == window], end[windows == window]
         for order, into in ((0, out[..., :2]), (1, velocity)):
             _fit_runs(states[..., :2], *runs, window, order, into)
-    along = velocity[..., 0] * np.cos(states[..., 2]) + velocity[..., 1] * np.sin(states[..., 2])
-    out[..., 3] = np.clip(np.where(np.isnan(along), states[..., 3], along), 0.0, TOP_SPEED)
+    unit = np.stack([np.cos(states[..., 2]), np.sin(states[..., 2])], -1)
+    along = (velocity * unit).sum(-1)
+    fitted = ~np.isnan(along)
+    along = np.where(fitted, along, states[..., 3])
+    around = _mean_velocity(states[..., :2], valid, back=LATELY // 2, ahead=LATELY // 2)
+    out[..., 3] = _signed(along, ~fitted | ((around * unit).sum(-1) < -REVERSES))
+    _stop_short_reversing(out[..., 3], valid)
     return out
+
+
+def _stop_short_reversing(speed: np.ndarray, valid: np.ndarray) -> None:
+    """Set speeds [F, A] to 0, in place, where a track drives backwards for less than REVERSED m: it is noise."""
+    backwards = valid & (speed < 0)
+    for agent in np.flatnonzero(backwards.any(0)):
+        edges = np.flatnonzero(np.diff(np.pad(backwards[:, agent], 1)))
+        for first, last in edges.reshape(-1, 2):
+            if -speed[first:last, agent].sum() * DT < REVERSED:
+                speed[first:last, agent] = 0.0
+
+
+def _mean_velocity(position: np.ndarray, valid: np.ndarray, back: int, ahead: int) -> np.ndarray:
+    """Mean velocities [F, A, 2] m/s of tracks [F, A, 2] from `back` frames before to `ahead` frames after, of what is
+    recorded there; 0 where nothing is."""
+    known = (valid[1:] & valid[:-1])[..., None]
+    step = np.where(known, np.diff(position, axis=0), 0.0)
+    total = np.cumsum(np.concatenate([np.zeros_like(position[:1]), step]), axis=0)
+    count = np.cumsum(np.concatenate([np.zeros((1, valid.shape[1], 1)), known]), axis=0)
+    frame = np.arange(len(valid))
+    first, last = np.maximum(frame - back, 0), np.minimum(frame + ahead, len(valid) - 1)
+    return (total[last] - total[first]) / np.maximum((count[last] - count[first]) * DT, DT)
+
+
+def _signed(along: np.ndarray, backwards: np.ndarray) -> np.ndarray:
+    """Speeds m/s along headings, at most TOP_SPEED: what is slower than REVERSES or not `backwards` reverses not."""
+    speed = np.clip(along, -TOP_SPEED, TOP_SPEED)
+    return np.where((speed > -REVERSES) | ~backwards, np.maximum(speed, 0.0), speed)
 
 
 def _fit_runs(
@@ -252,7 +285,7 @@ def polynomial_weights(window: int, order: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """State [A, 4], acceleration [A] and yaw rate [A] at `frame` from the frames up to it only.
+    """State [A, 4] with a signed speed, acceleration [A] and yaw rate [A] at `frame` from the frames up to it only.
 
     Least squares over the contiguous frames that end at `frame`, at most CAUSAL_WINDOW: quadratic in position (linear
     below five frames), linear in heading. The heading itself is the recorded one.
@@ -268,11 +301,12 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     turn = _fit(basis, known, turned[..., None], quadratic=np.zeros_like(count, bool))
     angle = states[frame, :, 2]
     unit = np.stack([np.cos(angle), np.sin(angle)], -1)
-    speed = np.clip((position[:, 1] * unit).sum(-1), 0.0, TOP_SPEED)
+    lately = _mean_velocity(states[first : frame + 1, :, :2], known > 0, back=LATELY - 1, ahead=0)[-1]
+    speed = _signed((position[:, 1] * unit).sum(-1), (lately * unit).sum(-1) < -REVERSES)
     accel = np.clip(2 * (position[:, 2] * unit).sum(-1), -6.0, 4.0)
     single = count < 2
-    speed = np.where(single, np.clip(states[frame, :, 3], 0.0, TOP_SPEED), speed)
-    accel, yaw_rate = np.where(single | (speed < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
+    speed = np.where(single, _signed(states[frame, :, 3], single), speed)
+    accel, yaw_rate = np.where(single | (np.abs(speed) < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
     fitted = states[frame, :, :2] + position[:, 0]
     return np.concatenate([fitted, angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
 

@@ -12,6 +12,7 @@ from e2rl.scenes.recording import PEDESTRIAN, VEHICLE
 from e2rl.scenes.route import project
 from e2rl.scenes.scenarionet import ScenarioNetSource, recording_of
 from e2rl.scenes.scene import KEYS, validate
+from e2rl.scenes.smoothing import TOP_SPEED
 from e2rl.sim.mission import mission_of
 from tests.scenes.descriptions import ALL, FRAMES, description, fork, lane, straight, track
 
@@ -78,6 +79,38 @@ def test_the_start_sees_nothing_of_the_future():
     for key in ("start", "start_accel", "start_yaw_rate", "valid", "parked", "route_points", "route_valid"):
         assert torch.equal(scene[key], changed[key]), key
     assert not torch.equal(scene["logged"], changed["logged"])
+
+
+def test_the_start_of_what_stands_sees_nothing_of_the_future():
+    wobble = np.random.default_rng(0).normal(0, 0.1, FRAMES)
+    parked = track([[60, 3.5]], wobble, 0.0)
+    other = track([[60, 3.5]], np.where(ALL > 10, 0.5 + wobble, wobble), 0.0)
+    ego = straight(20, 0, 8)
+    scene, changed = build({"ego": ego, "7": parked}), build({"ego": ego, "7": other})
+    assert torch.equal(scene["start"], changed["start"]) and torch.equal(scene["past"], changed["past"])
+    assert len(scene["logged"][:, 1, 2].unique()) == 1, "it never turns"
+
+
+def test_headings_are_mended_counted_and_drop_nobody():
+    flipped = straight(20, 0, 8)
+    flipped["state"]["heading"][8:12] = np.pi
+    tracks = {
+        "ego": flipped,
+        "back": track(np.stack([30 + 0.9 * ALL, np.full(FRAMES, 3.5)], 1), np.pi, -9.0),
+        "spins": track([[60, -5]], 0.08 * ALL, 0.0),
+        "reverses": track(np.stack([90 - 0.2 * ALL, np.full(FRAMES, -5.0)], 1), 0.0, -2.0),
+        "spiked": straight(50, 0, 8),
+    }
+    tracks["spiked"]["state"]["heading"][[30, 60]] = 1.3
+    builder = SceneBuilder(recorded(tracks), SETTINGS)
+    scene = builder.scene(recorded(tracks))
+    assert builder.repairs["headings turned round"] == 2
+    assert builder.repairs["headings held while standing"] == builder.repairs["heading spikes"] == 1
+    assert scene["start"][0].tolist() == pytest.approx([0, 0, 0, 8], abs=1e-4)
+    assert scene["logged_valid"][:, :5].all() and scene["logged"][:, :5, 2].abs().max() < 0.1
+    row = {float(x): row for row, x in enumerate(scene["start"][:5, 0].round())}
+    assert scene["logged"][:, row[60.0], 3].allclose(torch.tensor(-2.0), atol=1e-4)
+    assert scene["start"][row[60.0], 3] == pytest.approx(-2.0, abs=1e-4)
 
 
 def test_the_log_ends_where_the_recording_does():
@@ -228,7 +261,8 @@ def test_recorded_scenes_keep_the_schema_and_their_parked_cars_stay(recorded_sce
     parked = moved = 0
     for index, scene in enumerate(recorded_scenes):
         validate(scene, str(index))
-        assert torch.isfinite(scene["logged"]).all() and (scene["logged"][..., 3] >= 0).all()
+        assert torch.isfinite(scene["logged"]).all() and (scene["logged"][..., 3].abs() <= TOP_SPEED).all()
+        assert scene["start"][0, 3] >= 0, "no ego of these logs reverses"
         stay = scene["parked"] & scene["valid"]
         seen = scene["logged_valid"][:, stay] & scene["logged_valid"][:1, stay]
         way = (scene["logged"][:, stay, :2] - scene["logged"][:1, stay, :2]).norm(dim=-1)
