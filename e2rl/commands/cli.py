@@ -9,6 +9,7 @@ from importlib import import_module
 from importlib.metadata import version
 
 COMMANDS = {  # module, and what the command does
+    "try": ("e2rl.commands.try_planner", "how a planner class of your own fails, without a YAML file"),
     "evaluate": ("e2rl.scripts.evaluate", "how often, and how, an ego fails in attacked traffic"),
     "train": ("e2rl.scripts.train", "improve a policy on the failures that are found; train a prior"),
     "tune": ("e2rl.commands.tune", "tune the parameters of an adversary or a planner"),
@@ -26,6 +27,7 @@ COMMANDS = {  # module, and what the command does
     "skeleton": ("e2rl.report.skeleton_figure", "the figure of risks, skeleton and chain"),
 }
 EXAMPLES = """examples:
+  e2rl try LOGS --planner my_planner.py:MyPlanner --scenes 12
   e2rl evaluate num_scenes=12                    the lane-graph planner on twelve bundled scenes
   e2rl evaluate ego=idm eta=[1,2] metrics=all    another ego, two intensities, all tables
   e2rl report runs/evaluate/DATE/TIME            watch its failures

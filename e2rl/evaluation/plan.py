@@ -20,6 +20,8 @@ from e2rl.scenes.source import load_scenes
 from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.traffic.fusing import prepare_fused
 
+CLASS = "class"  # the file of conf/ego for a class by its name alone
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -71,7 +73,7 @@ def begin(run: Run) -> Evaluation:
     run, and for inputs that changed since the run began."""
     config = run.config
     set_up(config)
-    asked, egos = evaluation_settings(config), build_egos(config, run.choices["ego"])
+    asked, egos = evaluation_settings(config), build_egos(config, ego_name(config.ego, run.choices["ego"]))
     print(purpose(run, asked, list(egos.egos)), flush=True)
     prepare_fused(config)
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
@@ -83,6 +85,11 @@ def begin(run: Run) -> Evaluation:
     setup = Setup(scenes, ego, name, build_sim(config), config.batch, config.device)
     run.begin({"scenes": listed(scenes)})
     return Evaluation(asked, egos, prior, origin, methods, searches, setup, only)
+
+
+def ego_name(ego: Mapping[str, Any], choice: str) -> str:
+    """Returns the name of an ego in tables and files: its file in conf/ego, or its class where it has none."""
+    return str(ego["_target_"]).rpartition(".")[2] if choice == CLASS else choice
 
 
 def purpose(run: Run, asked: EvaluationSettings, egos: Sequence[str]) -> str:

@@ -12,6 +12,8 @@ import torch
 
 import e2rl
 from e2rl.scenes.recording import DT
+from e2rl.traffic.e2.potentials import SAMPLED_STEPS, PotentialSettings
+from tests.traffic.e2.test_potentials import situation
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -110,3 +112,32 @@ def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leade
     assert torch.equal(out.states[others], logged[others])
     calm = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic, eta=0.0)
     assert not calm.adversaries.any()
+
+
+def test_the_objective_is_least_in_front_of_the_target(monkeypatch):
+    """The gradient moves the adversary alone, and vanishes where it wants to be."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    from my_stack.cut_in_front import CutInFront
+
+    objective = CutInFront(**vars(PotentialSettings()), ahead=6.0)
+    values = []
+    for x in (6.0, 10.0, 20.0):
+        states, context = situation((x, 0.0, 0.0, 10.0), targets=[(1, 0)])
+        sampled = states[:, :, SAMPLED_STEPS].clone().requires_grad_()
+        value = objective.adversarial(sampled, context, 0.5)
+        (gradient,) = torch.autograd.grad(value.sum(), sampled)
+        assert gradient[0, 0].abs().sum() == 0 and value[0, 0] == 0
+        values.append(value[0, 1].item())
+    assert values == pytest.approx([0.0, 2.0, 7.0], abs=2e-3)  # in units of 2 m
+
+
+@pytest.mark.slow
+def test_an_objective_of_one_s_own_steers_e2_elsewhere(tmp_path):
+    """The same coalition and noise, and other paths of its members."""
+    small = ["methods=[e2,cut_in_front]", "num_scenes=2", "data.split=tune", "seeds=[0]", "processes=1"]
+    run("evaluate.py", tmp_path / "run", *small, "report=false")
+    with open(tmp_path / "run" / "rollouts.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["method"] for row in rows} == {"e2", "cut_in_front"} and {row["errored"] for row in rows} <= {"0", ""}
+    by_method = [[row["path_kl"] for row in rows if row["method"] == name] for name in ("e2", "cut_in_front")]
+    assert by_method[0] != by_method[1]

@@ -23,14 +23,7 @@ from e2rl.run.fused import fused
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.kernels import pulled
-from e2rl.traffic.e2.potentials import (
-    SAMPLED_STEPS,
-    PotentialContext,
-    PotentialSettings,
-    adversarial_potential,
-    annealed_temperature,
-    feasibility_potential,
-)
+from e2rl.traffic.e2.potentials import SAMPLED_STEPS, PotentialContext, PotentialSettings, annealed_temperature
 
 MIN_ALPHA = 0.05
 TINY = 1e-12  # keeps a clip of 0, which is no shift at all, from 0 / 0
@@ -171,10 +164,10 @@ class SparseControl:
             states = self.prior.decode(x0, context, steps=SAMPLED_STEPS).states()
             if self.has_coalition:
                 temperature = annealed_temperature(level, self.potentials)
-                value = adversarial_potential(states, self.conditions, self.potentials, temperature)
+                value = self.potentials.adversarial(states, self.conditions, temperature)
                 (adversarial,) = torch.autograd.grad(value.sum(), x0, retain_graph=True)
             if with_feasibility:
-                value = feasibility_potential(states, self.conditions, self.potentials)
+                value = self.potentials.feasibility(states, self.conditions)
                 (feasibility,) = torch.autograd.grad(value.sum(), x0)
         if variable.requires_grad:
             (adversarial,) = torch.autograd.grad(denoised, variable, adversarial)

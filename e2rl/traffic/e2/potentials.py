@@ -40,7 +40,11 @@ MAX_JERK = 2.0  # m/s^3
 @configured("synthesizer/e2", "potentials")
 @dataclass(frozen=True)
 class PotentialSettings:
-    """Weights of the terms, and temperatures [m]; conf/synthesizer/e2.yaml explains each."""
+    """The potentials, with weights of their terms and temperatures [m]; conf/synthesizer/e2.yaml explains each.
+
+    A subclass may have another objective, `adversarial`, or other bounds, `feasibility`: named by
+    `potentials._target_` of a synthesizer.
+    """
 
     off_road: float = setting()
     lateral: float = setting()
@@ -53,6 +57,14 @@ class PotentialSettings:
     wide: float = setting(low=1e-3)
     ttc: float = setting()
     impact_speed: float = setting()
+
+    def adversarial(self, states: Tensor, context: "PotentialContext", temperature: Tensor | float) -> Tensor:
+        """Returns V_adv [B, V], which adversaries lower: see `adversarial_potential`."""
+        return adversarial_potential(states, context, self, temperature)
+
+    def feasibility(self, states: Tensor, context: "PotentialContext") -> Tensor:
+        """Returns V_feas [B, V], which all vehicles lower: see `feasibility_potential`."""
+        return feasibility_potential(states, context, self)
 
 
 @dataclass(frozen=True)
@@ -175,8 +187,8 @@ def _motion_terms(states: Tensor, context: PotentialContext, settings: Potential
     return settings.accel * excess.mean(-1) + settings.jerk * rough.mean(-1)
 
 
-def _with_ego(states: Tensor, context: PotentialContext) -> Tensor:
-    """Sampled states [B, V, H', 4] with the ego's detached plan in row 0."""
+def with_ego(states: Tensor, context: PotentialContext) -> Tensor:
+    """Returns sampled states [B, V, H', 4] with the ego's detached plan in row 0."""
     ego = context.ego_plan[:, None, SAMPLED_STEPS].detach()
     return torch.cat([ego[:, :, : states.shape[2]], states[:, 1:]], 1)
 
@@ -187,7 +199,7 @@ def feasibility_potential(states: Tensor, context: PotentialContext, settings: P
     Terms: off-road, lateral offset, overlap with others (except between an adversary and its target), acceleration,
     jerk, wrong way.
     """
-    states = _with_ego(states, context)
+    states = with_ego(states, context)
     road, motion = _road_terms(states, context, settings), _motion_terms(states, context, settings)
     value = road + motion + settings.pair * _overlap_term(states, context)
     counted = context.valid.clone()
@@ -203,7 +215,7 @@ def adversarial_potential(
     Soft minimum over time of the distance between the centres (temperature in m, default `narrow`), TTC cost and
     closing speed, all against the detached target. 0 outside the coalition.
     """
-    states = _with_ego(states, context)
+    states = with_ego(states, context)
     index = context.target.clamp(min=0)
     target = states.detach().gather(1, index[..., None, None].expand_as(states))
     offset, closing = target[..., :2] - states[..., :2], velocity(target) - velocity(states)

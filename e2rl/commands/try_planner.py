@@ -1,0 +1,115 @@
+"""`e2rl try LOGS --planner MODULE:CLASS`: how a planner of one's own fails in attacked traffic, without a YAML file.
+
+It writes the command line of `e2rl evaluate` and runs it: the same protocol, files and report.
+"""
+
+import argparse
+import inspect
+import os
+import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+from e2rl.commands.inspect import open_source
+from e2rl.planners.ego import Ego
+from e2rl.run.config import assigned
+from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
+
+SCENES = 12
+NAMED = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+
+
+def planner_class(named: str) -> type[Ego]:
+    """Returns the class that MODULE:CLASS or FILE.py:CLASS names; its folder is where modules are sought from then on.
+
+    Raises:
+        InputError: where the module cannot be imported, and where it has no such class, or one that is no Ego.
+    """
+    where = f"--planner {named}"
+    place, _, name = named.rpartition(":")
+    if not place or not name:
+        raise InputError(f"{where}: name a class, as MODULE:CLASS or FILE.py:CLASS")
+    module = _imported(place, where)
+    known = {key: value for key, value in vars(module).items() if _is_planner(value) and value is not Ego}
+    kind = vars(module).get(name)
+    if kind is None:
+        near = get_close_matches(name, known, 1) or list(known)
+        advice = f"it has {', '.join(near)}" if near else "nor any other subclass of e2rl.planners.ego.Ego"
+        raise InputError(f"{where}: {place} has no {name}; {advice}")
+    if not _is_planner(kind):
+        raise InputError(f"{where}: {name} is no planner; make it a subclass of e2rl.planners.ego.Ego with `plan`")
+    return kind
+
+
+def _imported(place: str, where: str) -> ModuleType:
+    """The module of a name or a file."""
+    folder, module = os.getcwd(), place
+    if place.endswith(".py"):
+        file = Path(place).resolve()
+        if not file.is_file():
+            raise InputError(f"{where}: no file {place}; name one that is there")
+        folder, module = str(file.parent), file.stem
+    sys.path.insert(0, folder)
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name and module.split(".")[0] == error.name.split(".")[0]:
+            mend = "start in the folder that holds it, put that on PYTHONPATH, or name the file as FILE.py:CLASS"
+            raise InputError(f"{where}: no module {module} in {folder}; {mend}") from error
+        raise InputError(f"{where}: {module} needs {error.name}, which is not installed; install it") from error
+    except (Exception, SystemExit) as error:  # of outside code
+        raise InputError(f"{where}: {module} cannot be imported: {type(error).__name__}: {error}; mend that") from error
+
+
+def _is_planner(value: object) -> bool:
+    return isinstance(value, type) and issubclass(value, Ego)
+
+
+def check_arguments(kind: type[Ego], settings: Sequence[str], where: str) -> None:
+    """Raises InputError where an argument of the class has neither a default nor a setting NAME=VALUE."""
+    given = {setting.partition("=")[0] for setting in settings}
+    parameters = list(inspect.signature(kind).parameters.values())
+    needed = [each.name for each in parameters if each.kind in NAMED and each.default is each.empty]
+    if missing := [name for name in needed if name not in given]:
+        mend = " ".join(f"--set {name}=VALUE" for name in missing)
+        raise InputError(f"{where}: {kind.__name__} needs {', '.join(missing)}; give defaults, or add {mend}")
+
+
+def overrides_of(options: argparse.Namespace) -> list[str]:
+    """Returns the overrides of `e2rl evaluate` for the options; InputError for a planner or logs that are none."""
+    kind = planner_class(options.planner)
+    check_arguments(kind, options.settings, f"--planner {options.planner}")
+    logs = [each for each in options.logs if "=" not in each]
+    if len(logs) > 1:
+        raise InputError(f"{logs[1]}: name one folder or zip of logs, or leave it out for the bundled scenes")
+    words = ["ego=class", assigned("ego._target_", f"{kind.__module__}.{kind.__qualname__}")]
+    words += [f"+ego.{setting}" for setting in options.settings]
+    if logs:
+        data, _ = open_source(Path(logs[0]), options.data, 1)
+        words += [f"data={data}", assigned("data.path", logs[0])]
+    words += [f"num_scenes={options.scenes}"] if options.scenes else []
+    words += [assigned("hydra.run.dir", options.out)] if options.out else []
+    return [*words, *(each for each in options.logs if "=" in each)]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="e2rl try", description=__doc__.splitlines()[0])
+    logs = "folder or zip of logs (default: the bundled scenes); further KEY=VALUE of evaluate"
+    parser.add_argument("logs", nargs="*", metavar="LOGS", help=logs)
+    parser.add_argument("--planner", required=True, metavar="MODULE:CLASS", help="an Ego, or FILE.py:CLASS")
+    parser.add_argument(
+        "--set", action="append", default=[], dest="settings", metavar="NAME=VALUE", help="its argument"
+    )
+    parser.add_argument("--scenes", type=int, default=SCENES, metavar="N", help="the first N; 0: all (%(default)s)")
+    parser.add_argument("--data", metavar="NAME", help="file of conf/data that reads the logs (default: one that can)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="of the run (default: below runs/evaluate)")
+    options = parser.parse_intermixed_args(arguments)
+    with ending():
+        sys.argv = ["e2rl evaluate", *overrides_of(options)]
+    import_module("e2rl.scripts.evaluate").main()
