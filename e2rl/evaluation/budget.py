@@ -244,7 +244,8 @@ def told_of(row: Mapping, family: str, outcome: Outcome) -> dict:
     """Returns the line of tries.csv of a try, but for what was SPENT."""
     clean = 0.0 if outcome.raised else row["cfr_clean"]
     about = {"family": family, "margin": outcome.margin, "cell": outcome.cell, "clean": clean}
-    return {name: (row | about | {"raised": int(outcome.raised)})[name] for name in TOLD}
+    line = {**row, **about, "raised": int(outcome.raised)}
+    return {name: line[name] for name in TOLD}
 
 
 def within(scored: Scored, charged: Sequence[Mapping]) -> Scored:

@@ -75,9 +75,8 @@ def metric_rows(
             metrics |= scene_metrics(ours[0], draws)
         scenes = {row["scene_id"] for row in ours[0]}
         seeds = {row["seed"] // (TRIES if searched else 1) for row in ours[0]}
-        about = {"searched": searched, "headline": headline(ours[0], searched)._asdict()}
-        counts = len(scenes), len(seeds), len(ours[0])
-        result.append(metric_row(key, *counts, metrics, paired=paired, **about, **fields))
+        row = metric_row(key, len(scenes), len(seeds), len(ours[0]), metrics, paired=paired, **fields)
+        result.append(row | {"searched": searched, "headline": headline(ours[0], searched)._asdict()})
     return result
 
 

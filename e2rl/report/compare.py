@@ -39,7 +39,7 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
     groups, pairs = compared(first, second)
     names = [f"{one.ego} of {one.run}" if first.ego == second.ego else one.ego for one in (first, second)]
     rows = [pair | {side: facts(pair[side]) for side in SIDES} for pair in pairs]
-    told = [*headlines(names, (first, second)), *sentences(groups, first.searched), *notes(first, second, groups)]
+    told = [*sentences(groups, first.searched), *notes(first, second, groups), *facts_of(names, (first, second))]
     changed = [pair for pair in pairs if pair["change"] != "same"]
     runs = first.run, second.run
     ended = [pair for pair in changed if all(pair[side]["errored"] != 1 for side in SIDES)]  # which have files
@@ -66,12 +66,13 @@ def facts(row: Row) -> dict[str, Any]:
     return {**values, "file": rollout_name(row), "contact": hit, "error": row["error"], "named": named}
 
 
-def headlines(names: Sequence[str], sides: Sequence[Driven]) -> Iterator[str]:
-    """The headline of both in each traffic, and what errored."""
+def facts_of(names: Sequence[str], sides: Sequence[Driven]) -> Iterator[str]:
+    """The headline of both in each traffic, then what errored."""
     for name, driven in zip(names, sides, strict=True):
         for rows in driven.traffic().values():
             yield headline_text(headline(rows, driven.searched), name, traffic_name(rows[0]))
-        yield from (f"{name}: {line}" for line in errored_lines(driven.rows))
+    for name, driven in zip(names, sides, strict=True):
+        yield from (f"{name}: {line}" if line.endswith(":") else line for line in errored_lines(driven.rows))
 
 
 def sentences(groups: Sequence[Mapping], searched: bool) -> Iterator[str]:
