@@ -75,6 +75,11 @@ def write_run(folder: Path) -> Path:
     )
     simulated = torch.arange(valid.shape[-1])[None].expand(2, -1) < 3
     rollouts = sourced(rollouts.replace(simulated=simulated, location=["a place"] * 2), "made", "data", "e2", "idm")
+    return save_run(folder, data, rollouts)
+
+
+def save_run(folder: Path, data: dict, rollouts: Rollouts) -> Path:
+    """Write the run of a command in `folder` that drove `rollouts` in scenes of `data`; return its folder."""
     run = folder / "run"
     write_rows(run / TABLE, score_rollouts(rollouts)[0])
     rollouts.to_npz(run / ROLLOUTS)
