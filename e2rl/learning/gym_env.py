@@ -50,7 +50,7 @@ class DrivingVectorEnv(VectorEnv):
         self.single_observation_space = Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
         self.driving = Driving(low=space.low.tolist(), high=space.high.tolist(), steps=env.horizon)
-        self.single_action_space.driving = self.driving
+        vars(self.single_action_space)["driving"] = self.driving
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 

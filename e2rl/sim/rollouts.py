@@ -184,7 +184,7 @@ def _torch_function(
     return _tensorclass_function(func, types, args, kwargs)
 
 
-Rollouts.__torch_function__ = classmethod(_torch_function)  # type: ignore[assignment]
+Rollouts.__torch_function__ = classmethod(_torch_function)
 
 
 def aligned(parts: Sequence[Rollouts]) -> list[Rollouts]:

@@ -1,5 +1,7 @@
 """PDM-Closed: it follows, stops, keeps the limit, comes over, brakes; its score is that of its terms."""
 
+import math
+
 import pytest
 import torch
 
@@ -11,9 +13,11 @@ from e2rl.planners.pdm_closed import (
     OFFSETS,
     PROGRESS,
     TIME_TO_COLLISION,
+    Others,
     PDMClosedEgo,
     at_fault,
     comfortable,
+    runs_into,
     score,
 )
 from e2rl.planners.sampling import take
@@ -78,23 +82,110 @@ def test_proposals_lead_to_their_offsets_and_are_slower_by_their_fraction():
     assert (end[..., 3].diff(dim=1) > 0).all() and (end[..., 0].diff(dim=1) > 0).all()
 
 
-def test_only_whoever_comes_from_behind_is_at_fault_itself():
-    _, world = world_of(vehicles=[(0, 0, 10.0), (3.0, 0, 10.0), (-3.0, 0, 10.0)], num_vrus=0)
-    others = EGO._others(world, range(1))
-    own = world.states[:, None, :1]
-    for agent, fault in ((1, True), (2, False)):
-        same = (others.states[0, :, 0, 0] - world.states[0, agent, 0]).abs() < 0.1
-        one = others._replace(seen=others.seen & same[None])
-        assert bool(at_fault(own, world.scene["size"][:, 0], one)) == fault
-        still = own.clone()
-        still[..., 3] = 0.0
-        assert not at_fault(still, world.scene["size"][:, 0], one).any(), "who stands hits nobody"
+FAULTS = {  # the ego's speed; the other's place beside a moving ego, and its motion: at fault in one lane, in several
+    "the front meets a slower one": (10.0, (4.6, 0.0, 0.0, 5.0), True, True),
+    "the front meets one that comes": (10.0, (4.6, 0.0, math.pi, 5.0), True, True),
+    "one that comes from behind": (10.0, (-4.6, 0.0, 0.0, 15.0), False, False),
+    "one beside": (10.0, (0.0, 1.9, 0.0, 9.0), False, True),
+    "one that stands beside": (10.0, (0.0, 1.9, 0.0, 0.05), True, True),
+    "one that creeps beside": (10.0, (0.0, 1.9, 0.0, 0.06), False, True),
+    "a standing ego": (0.05, (4.6, 0.0, math.pi, 5.0), False, False),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_whose_fault_a_collision_is(name):
+    """nuPlan's rule at the step of the first touch."""
+    speed, place, alone, between = FAULTS[name]
+    ego = torch.tensor([0.0, 0.0, 0.0, speed])[None, None, None]
+    for loose, expected in ((False, alone), (True, between)):
+        fault = at_fault(
+            states=ego,
+            size=torch.tensor([[4.8, 2.0]]),
+            others=others_at(place),
+            touch=torch.ones(1, 1, 1, 1, dtype=torch.bool),
+            loose=torch.full((1, 1, 1), loose),
+        )
+        assert bool(fault.any()) == expected
+
+
+def test_whom_it_touched_without_fault_it_may_touch_again():
+    """Beside first, by its front then; the first touch alone is judged."""
+    states = torch.tensor([0.0, 0.0, 0.0, 10.0]).expand(1, 1, 2, 4)
+    beside, ahead = others_at((0.0, 1.9, 0.0, 9.0)), others_at((4.6, 0.0, 0.0, 9.0))
+    both = beside._replace(states=torch.cat([beside.states, ahead.states], 2))
+    touch = torch.ones(1, 1, 1, 2, dtype=torch.bool)
+    loose = torch.zeros(1, 1, 2, dtype=torch.bool)
+    assert not at_fault(states, torch.tensor([[4.8, 2.0]]), both, touch, loose).any()
+    swapped = both._replace(states=both.states.flip(2))
+    assert at_fault(states, torch.tensor([[4.8, 2.0]]), swapped, touch, loose).any()
+
+
+def others_at(place):
+    """One vehicle of 4.8 x 2 m."""
+    states = torch.tensor(place)[None, None, None]
+    there = torch.ones(1, 1, dtype=torch.bool)
+    return Others(states=states, size=torch.tensor([[[4.8, 2.0]]]), seen=there, objects=~there)
+
+
+def test_an_object_that_it_hits_halves_the_score():
+    """A vehicle that it hits leaves nothing; both make it brake alike."""
+    _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
+    ahead = EGO._others(world, range(HORIZON + 1))
+    go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
+    vehicle, time = score(world, go, ahead)
+    thing, same = score(world, go, ahead._replace(objects=ahead.seen))
+    assert vehicle.item() == 0 and time.item() == same.item() < 2.0
+    assert thing.item() == pytest.approx(0.5 * (PROGRESS + COMFORT) / (PROGRESS + TIME_TO_COLLISION + COMFORT))
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(29, 0), (31, 1)])
+def test_the_time_to_collision_looks_30_degrees_to_each_side_in_one_lane(degrees, expected):
+    """At 8 m from the rear axle, across the ego's way in 0.3 s; in several lanes it counts up to 150 degrees."""
+    axle = -1.461 / 5.176 * 4.8
+    angle = math.radians(degrees)
+    x, y = axle + 8 * math.cos(angle), 8 * math.sin(angle)
+    heading = math.atan2(-y, 2.0 - x)
+    other = others_at((x, y, heading, math.hypot(y, 2.0 - x) / 0.3))
+    states, size = torch.tensor([0.0, 0.0, 0.0, 0.01])[None, None, None], torch.tensor([[4.8, 2.0]])
+    touch = torch.zeros(1, 1, 1, 1, 4, dtype=torch.bool)
+    touch[..., 0] = True
+    for loose, clear in ((False, expected), (True, 0)):
+        assert runs_into(states, size, other, touch, torch.full((1, 1, 1), loose)).item() == (not clear)
+
+
+def test_comfort_has_the_published_windows_and_bounds():
+    """Smooth braking at 4 m/s^2 is within −4.05; a step of 1.3 m/s^2 between two halves of 2 s is no jerk of 4.13."""
+    _, world = world_of(vehicles=[(0, 0, 30.0)], num_vrus=0)
+    world.accel[:, 0] = -4.0
+
+    def smooth(accelerations):
+        actions = torch.stack([torch.tensor(accelerations), torch.zeros(HORIZON)], -1)
+        states = dynamics.rollout(world.states[0, 0], actions)[None, None]
+        return comfortable(world, torch.cat([world.states[:, None, :1], states], 2)).item()
+
+    assert smooth([-4.0] * 40)
+    assert not smooth([-4.1] * 40)
+    assert smooth([-3.9] * 20 + [-2.6] * 20)
+
+
+def test_the_limit_of_the_present_lane_holds_for_the_whole_plan():
+    """It does not brake before a lower limit that begins 20 m ahead, as the published one does not."""
+    scenes = make_scenes(1, vehicles=[(0, 0, 10.0)], num_vrus=0, limit=10.0)
+    slower = scenes.scenes["route_limit"].clone()
+    slower[..., slower.shape[-1] // 2 :] = 2.0
+    _, world = worlds(scenes)
+    before = EGO.proposals(world)
+    scenes.scenes["route_limit"] = slower
+    _, world = worlds(scenes)
+    assert float(world.states[0, 0, 3]) == 10.0
+    assert torch.equal(EGO.proposals(world)[..., :10, 3], before[..., :10, 3])
 
 
 def test_the_score_is_the_weighted_mean_of_its_terms():
     """Alone on the road: the fastest has all; the slower lose progress in proportion; a hard brake loses comfort."""
     _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
-    start, none = world.states[:, :1], EGO._others(world, range(1, HORIZON + 1))
+    start, none = world.states[:, :1], EGO._others(world, range(HORIZON + 1))
     actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(3, 50, 2)
     states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
     distance = states[0, :, HORIZON - 1, 0] - start[0, 0, 0]
@@ -102,12 +193,16 @@ def test_the_score_is_the_weighted_mean_of_its_terms():
     whole = PROGRESS + TIME_TO_COLLISION + COMFORT
     expected = PROGRESS * distance / distance[0] + TIME_TO_COLLISION + COMFORT * torch.tensor([1.0, 1.0, 0.0])
     torch.testing.assert_close(found, expected / whole, atol=1e-4, rtol=0)
-    assert comfortable(world, states[:, :, :HORIZON])[0].tolist() == [True, True, False]
+    assert comfortable(world, torch.cat([start.expand(3, -1, -1)[None], states[:, :, :HORIZON]], 2))[0].tolist() == [
+        True,
+        True,
+        False,
+    ]
 
 
 def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(1, HORIZON + 1))
+    ahead = EGO._others(world, range(HORIZON + 1))
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
     found, collides = score(world, go, ahead)
     size = world.scene["size"][0, 0]
@@ -121,7 +216,7 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
 def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_collision():
     """Braking late, the ego halts 0.8 m behind whom stands, whom it would hit within 0.9 s if it let go the brake."""
     _, world = world_of(vehicles=[(0, 0, 10.0), (20.0, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(1, HORIZON + 1))
+    ahead = EGO._others(world, range(HORIZON + 1))
     actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
     states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
     found, collides = score(world, states, ahead)
@@ -137,7 +232,7 @@ def test_where_every_proposal_is_excluded_it_drives_the_slowest():
     scenes.scenes["field"][:, 86:] = 10.0  # from x = 6 m on
     _, world = worlds(scenes)
     states = EGO.proposals(world)
-    assert (score(world, states, EGO._others(world, range(1, HORIZON + 1)))[0] == 0).all()
+    assert (score(world, states, EGO._others(world, range(HORIZON + 1)))[0] == 0).all()
     torch.testing.assert_close(EGO.plan(world)[0], states[0, 0])
 
 
