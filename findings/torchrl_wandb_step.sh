@@ -58,6 +58,6 @@ for name, found in (("log_scalar(step=0)", plain), ("with override_global_step",
         print("   ", row)
 lost = [row["_step"] for row in plain] == [0, 1, 2] and not any("picture/path" in row for row in plain)
 kept = [row["_step"] for row in shared] == [0] and "picture/path" in shared[0]
-sys.exit(not (lost and kept))
+sys.exit(0 if lost and kept else 1)
 PYTHON
 WANDB_SILENT=true "$folder/venv/bin/python" program.py
