@@ -98,6 +98,7 @@ class SceneBuilder:
         if recording.ego not in self.elsewhere:
             self.elsewhere[recording.ego] = self.levels.elsewhere(recording.ego)
         valid = self.valid & ~self.elsewhere[recording.ego]
+        valid[: frame + 1, [*recording.towed]] = False  # as of one that appears later
         # what stands is held by what was recorded of it until the start frame
         held, _ = hold_headings(self.mended[: frame + 1], self.valid[: frame + 1], recording.agent_type)
         scene, origin = _agents(replace(recording, states=held), frame, self.states, valid, self.settings)

@@ -130,7 +130,9 @@ def motion(recording: Recording) -> dict[str, float]:
     ratio, far = (speed * FRAMES * DT + 0.05) / (distance + 0.05), distance > MOVED
     turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
     turned = np.where(distance < BACKWARDS * FRAMES * DT, np.minimum(turned, pi - turned), turned)  # it may reverse
-    size = recording.size[recording.valid.any(0) & (recording.agent_type == VEHICLE)]
+    single = recording.valid.any(0) & (recording.agent_type == VEHICLE)
+    single[[each for each in recording.coupled if each != recording.ego]] = False
+    size = recording.size[single]
     return {
         "vehicle_length": float(np.median(size[:, 0])),
         "vehicle_width": float(np.median(size[:, 1])),

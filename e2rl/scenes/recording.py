@@ -88,6 +88,7 @@ class Recording:
     current: the start frame, with at least one frame of history before it; None where the log names none;
     egos: the ego's track by start frame, where it is not the same for all (-1: nobody is there);
     heights [F, A] m or None: of the tracks, which tell who is on a bridge (e2rl/scenes/levels.py);
+    towed: tracks of trailers that nobody drives, but a replay shows; coupled: of vehicles with their trailers;
     repairs: how often reading mended something, by a phrase in the plural, such as "headings turned round".
     """
 
@@ -106,6 +107,8 @@ class Recording:
     repairs: Counter[str] = field(default_factory=Counter)
     egos: dict[int, int] = field(default_factory=dict)
     heights: np.ndarray | None = None
+    towed: tuple[int, ...] = ()
+    coupled: tuple[int, ...] = ()
 
     def start_frames(self, starts: Sequence[int] | None, steps: int) -> list[int]:
         """Returns the start frames of `windows`; none where the log is too short for them.

@@ -37,13 +37,14 @@ from e2rl.scenes.recording import MAX_NAME, Recording
 from e2rl.scenes.scene import SceneSet, validate
 from e2rl.scenes.scene_cache import Index, cached, uncached
 from e2rl.scenes.scene_list import listed_scenes
+from e2rl.scenes.trailers import couple
 from e2rl.scenes.versions import MARK, RECORDED, check_versions, version_of
 
 OVERLAP = "ego overlaps a vehicle at the start"  # why scenes are left out
 TOO_SHORT = "too short for a start frame"
 NO_EGO = "nobody to be the ego at the start"
 NO_VERSION = "without such a version"  # or it is invalid, where the log itself makes scenes, too
-VERSION = 11  # of the scene builder: raise it when the same recording would make another scene
+VERSION = 12  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
 NO_MATTER = "path", "cache", "cache_gb", "workers"  # settings that do not change the scenes
@@ -191,7 +192,7 @@ class Source(Extension, ABC):
                 if len(self.versions) > 1:  # all are of one place, or else of one log
                     recording = replace(recording, location=recording.location or recording.scene_id)
                 for version in filter(None, (version_of(recording, name) for name in self.versions)):
-                    yield list(version.windows(self.starts, self.build.steps))
+                    yield list(couple(version).windows(self.starts, self.build.steps))
 
     def _read(self, log: str) -> Iterator[Recording]:
         """Yields `read`; raises InputError where that is anything else than recordings."""
