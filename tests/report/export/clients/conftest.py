@@ -19,7 +19,8 @@ from tests.report.export.small_run import save_run
 def places(tmp_path_factory):
     """The folder of a run that replays the first scene of each place of the bundled test scenes."""
     folder = tmp_path_factory.mktemp("places")
-    first = {recording.location: recording.scene_id for recording in reversed(list(BundledSource("test").recordings()))}
+    recordings = reversed(list(BundledSource(split="test").recordings()))
+    first = {recording.location: recording.scene_id for recording in recordings}
     listed = folder / "scenes.csv"
     listed.write_text("\n".join(["scene_id", *sorted(first.values())]) + "\n")
     data = {"_target_": "e2rl.scenes.bundled.BundledSource", "split": "test", "cache": str(folder / "cache")}
