@@ -1,6 +1,7 @@
 """From a Recording to a Scene: who takes part, from which start state, on which routes, on which map."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,8 +103,9 @@ class SceneBuilder:
         # what stands is held by what was recorded of it until the start frame
         held, _ = hold_headings(self.mended[: frame + 1], self.valid[: frame + 1], recording.agent_type)
         scene, origin = _agents(replace(recording, states=held), frame, self.states, valid, self.settings)
+        elsewhere = self.levels.lanes_elsewhere(scene.pop("height"))
         lights = {name: index for index, name in enumerate(recording.lights)}
-        scene |= _routes(scene, self.graph, origin, lights, self.settings)
+        scene |= _routes(scene, self.graph, origin, lights, self.settings, elsewhere)
         scene |= _lights(recording, frame, origin, self.settings.steps)
         scene |= _map(self.graph, self.drivable, scene, origin, self.settings)
         left_out = scene.pop("left_out")
@@ -116,8 +118,9 @@ class SceneBuilder:
 def _agents(
     recording: Recording, frame: int, states: np.ndarray, valid: np.ndarray, settings: BuildSettings
 ) -> tuple[Arrays, np.ndarray]:
-    """Start states, past and recorded future of the agents that take part, and the scene's origin [2]; states, valid:
-    the smoothed tracks; recording: its tracks until the start frame."""
+    """Start states, past and recorded future of the agents that take part, their heights at the start, which are not
+    part of a scene, and the scene's origin [2]; states, valid: the smoothed tracks; recording: its tracks until the
+    start frame."""
     start, accel, yaw_rate = causal_state(recording.states, valid, frame)
     start = np.where(valid[frame, :, None], start, 0.0)
     origin = np.round(start[recording.ego, :2])
@@ -148,6 +151,7 @@ def _agents(
         "logged_valid": padded(known.T).T,
         "past": np.zeros((settings.vehicles, PAST, 3)),
         "left_out": np.array(left_out),
+        "height": padded(np.full(len(rows), np.nan) if recording.heights is None else recording.heights[frame, chosen]),
     }
     past = causal_past(recording.states[:, tracks[cars]], valid[:, tracks[cars]], frame, start[tracks[cars], 3])
     scene["past"][cars] = past
@@ -219,9 +223,17 @@ def _approach(states: np.ndarray, valid: np.ndarray, vehicle: np.ndarray, ego: i
 
 
 def _routes(
-    scene: Arrays, graph: LaneGraph, origin: np.ndarray, lights: dict[str, int], settings: BuildSettings
+    scene: Arrays,
+    graph: LaneGraph,
+    origin: np.ndarray,
+    lights: dict[str, int],
+    settings: BuildSettings,
+    elsewhere: Callable[[int], np.ndarray | None],
 ) -> Arrays:
-    """Route candidates of every vehicle and the one driven; sets scene["parked"]. lights: lane id -> index."""
+    """Route candidates of every vehicle and the one driven; sets scene["parked"].
+
+    lights: lane id -> index; elsewhere: the points of lanes on another level than a vehicle, by its row.
+    """
     shape, reach = (settings.vehicles, settings.routes), (settings.vertices - 1) * SPACING
     out = {
         "route_points": np.zeros((*shape, settings.vertices, 2)),
@@ -241,7 +253,7 @@ def _routes(
         if not scene["valid"][row]:
             continue
         position = np.array([x, y]) + origin
-        found = graph.candidates(position, heading, max(speed, 0.0), settings.routes, settings.vertices)
+        found = graph.candidates(position, heading, max(speed, 0.0), settings.routes, settings.vertices, elsewhere(row))
         for index, route in enumerate(found):
             _write_route(out, (row, index), route, origin, lights)
         scene["parked"][row] = abs(speed) < STANDING

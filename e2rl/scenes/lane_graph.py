@@ -178,16 +178,24 @@ class LaneGraph:
             lane_s.append((name, float(start * scale)))
         return Route(smooth_vertices(points_at(line, arc, at)), float(length), bool(at[-1] > arc[-1]), lane_s, limit)
 
-    def candidates(self, position: np.ndarray, heading: float, speed: float, count: int, vertices: int) -> list[Route]:
+    def candidates(
+        self,
+        position: np.ndarray,
+        heading: float,
+        speed: float,
+        count: int,
+        vertices: int,
+        away: np.ndarray | None = None,
+    ) -> list[Route]:
         """Up to `count` route candidates of a vehicle, those of the nearest lane first.
 
         Along each lane near the vehicle, from BEHIND m before it to AHEAD m after it, on every branch of the forks that
-        it may reach in 5 s; routes that coincide are one.
+        it may reach in 5 s; routes that coincide are one. away: see `near_lanes`.
         """
         reach = float(np.clip(5.0 * speed + 25.0, 40.0, 120.0))
         found: list[Route] = []
         points = np.empty((count, vertices, 2))
-        for lane, s in self.near_lanes(position, heading):
+        for lane, s in self.near_lanes(position, heading, away):
             behind = self.behind(lane, BEHIND - s)
             before = sum(self.arc[name] for name in behind)
             begin = max(before + s - BEHIND, 0.0)

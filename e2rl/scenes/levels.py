@@ -4,6 +4,8 @@ Simulation and verdicts are flat, so whoever crosses the ego's way above or belo
 heights, agents whose ways come near the ego's on other levels alone are found here, and left out of its scenes.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -11,11 +13,12 @@ from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.paths import arc_length
 from e2rl.scenes.recording import VEHICLE, Recording
 
-LEVEL = 3.5  # m between what is on different levels: bridges leave 4 m or more to what passes below
+LEVEL = 4.0  # m between what is on different levels: bridges leave as much to what passes below
 NEAR = 6.0  # m at most between ways that meet
 AHEAD = 150.0  # m of lanes beyond what an agent drove where it may yet come to
 STRIDE = 3  # frames between the places of a track that are compared
-ON_LANE, UNEVEN = 3.0, 1.5  # m: of a vehicle on a lane; deviation of heights beyond which lanes tell none
+ON_LANE, UNEVEN = 3.0, 1.5  # m: of a vehicle on a lane; deviation of heights up to which the two agree
+SAMPLES, AGREE = 200, 0.8  # places of vehicles that are held against lanes; the fraction that has to agree
 
 
 class Levels:
@@ -33,17 +36,26 @@ class Levels:
             self.lane_height = self._levelled(np.concatenate(heights))
 
     def _levelled(self, height: np.ndarray) -> np.ndarray:
-        """Lane heights [P] on the scale of the tracks, which may be of boxes' middles; NaN where the two disagree."""
+        """Lane heights [P] on the scale of the tracks, which may be of boxes' middles; NaN where the two disagree.
+
+        The difference is the one that puts the most vehicles on a lane: several lie one above the other at a bridge.
+        """
         recording = self.recording
         assert recording.heights is not None
         frame, agent = (self.valid & (recording.agent_type == VEHICLE)).nonzero()
-        frame, agent = frame[::STRIDE], agent[::STRIDE]
-        distance, nearest = self.graph.tree.query(recording.states[frame, agent, :2])
-        offset = (recording.heights[frame, agent] - height[nearest])[distance < ON_LANE]
-        offset = offset[np.isfinite(offset)]
-        if not len(offset) or np.median(np.abs(offset - np.median(offset))) > UNEVEN:
+        chosen = np.unique(np.linspace(0, len(frame) - 1, min(SAMPLES, len(frame))).astype(int))
+        frame, agent = frame[chosen], agent[chosen]
+        near = self.graph.tree.query_ball_point(recording.states[frame, agent, :2], ON_LANE)
+        sample = np.repeat(np.arange(len(near)), [len(points) for points in near])
+        offset = recording.heights[frame, agent][sample] - height[np.concatenate([*near, []]).astype(int)]
+        sample, offset = sample[np.isfinite(offset)], offset[np.isfinite(offset)]
+        best, explained = np.nan, 0
+        for value in sorted(np.unique(np.round(offset)), key=abs):
+            count = len(np.unique(sample[np.abs(offset - value) < UNEVEN]))
+            best, explained = (value, count) if count > explained else (best, explained)
+        if explained < AGREE * len(np.unique(sample)) or not explained:
             return np.full_like(height, np.nan)
-        return height + np.median(offset)
+        return height + np.median(offset[np.abs(offset - best) < UNEVEN])
 
     def elsewhere(self, ego: int) -> np.ndarray:
         """Bool [A]: agents whose ways come near that of the track `ego`, and nowhere on its level."""
@@ -66,8 +78,8 @@ class Levels:
         return other
 
     def way(self, agent: int) -> tuple[np.ndarray, np.ndarray]:
-        """Places [Q, 2] m that an agent drove, and may yet drive along the lanes from its first one, and their heights
-        [Q] m; where a lane's is unknown, that of the agent."""
+        """Places [Q, 2] m that an agent drove, and may yet drive along lanes of known height from its first one on, and
+        their heights [Q] m."""
         recording, graph = self.recording, self.graph
         assert recording.heights is not None
         frames = np.flatnonzero(self.valid[:, agent])
@@ -78,10 +90,22 @@ class Levels:
             starts = [name for name, _ in self.near_lanes(track[0, :2], track[0, 2], height[0])]
             for name in _reached(graph, starts, reach):
                 rows = slice(*graph.first_point[[graph.number[name], graph.number[name] + 1]])
-                lane = self.lane_height[rows]
-                places.append(graph.points[rows])
-                heights.append(np.where(np.isnan(lane), height[0], lane))
+                known = np.isfinite(self.lane_height[rows])
+                places.append(graph.points[rows][known])
+                heights.append(self.lane_height[rows][known])
         return np.concatenate(places), np.concatenate(heights)
+
+    def lanes_elsewhere(self, height: np.ndarray) -> Callable[[int], np.ndarray | None]:
+        """Returns a function that says which points [P] of lanes are on another level than the vehicle of a row, None
+        where all may be on its own; height [rows] m, NaN unknown."""
+        low, high = np.nan_to_num([self.lane_height, -self.lane_height], nan=np.inf).min(1, initial=np.inf)
+
+        def elsewhere(row: int) -> np.ndarray | None:
+            if not max(height[row] - low, -high - height[row]) > LEVEL:
+                return None
+            return np.abs(self.lane_height - height[row]) > LEVEL
+
+        return elsewhere
 
     def near_lanes(self, position: np.ndarray, heading: float, height: float) -> list[tuple[str, float]]:
         """`LaneGraph.near_lanes` without those on another level than `height` m."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from e2rl.scenes.builder import OTHER_LEVEL, BuildSettings, SceneBuilder
+from e2rl.scenes.builder import OTHER_LEVEL, BuildSettings, SceneBuilder, build_scene
 from e2rl.scenes.scenarionet import recording_of
 from tests.scenes.descriptions import ALL, description, lane, straight, track
 
@@ -73,3 +73,16 @@ def test_a_hill_is_no_bridge():
     recording = recording_of(description(tracks, roads))
     builder = SceneBuilder(recording, SETTINGS)
     assert builder.scene(recording)["valid"].sum() == 2 and not builder.repairs[OTHER_LEVEL]
+
+
+@pytest.mark.parametrize(("height", "limit"), [(0.0, 50.0), (7.0, 90.0)])
+def test_a_vehicle_is_on_the_lane_of_its_level_where_two_lie_one_above_the_other(height, limit):
+    roads = {"deck": lane([[-100, 0], [300, 0]], speed_kmh=90.0), "below": lane([[-100, 0], [300, 0]])}
+    roads["deck"]["polyline"][:, 2] = 7.0
+    tracks = {"ego": straight(0, 0, 8), "above": straight(30, 0, 8), "under": straight(-30, 0, 8)}
+    for name, own in (("ego", height), ("above", 7.0), ("under", 0.0)):
+        tracks[name]["state"]["position"][:, 2] = own
+    scene = build_scene(recording_of(description(tracks, roads)), SETTINGS)
+    assert scene["valid"].sum() == 2, "one of the others is on the ego's level"
+    limits = scene["route_limit"][scene["route_valid"]]
+    assert np.allclose(limits, limit / 3.6)
