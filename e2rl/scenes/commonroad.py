@@ -2,8 +2,8 @@
 
 The ego is the obstacle that stands where a planning problem starts. Most scenarios have none there, since their authors
 took the vehicle out to plan for it: then the ego is the vehicle, recorded at the start frame, that moves for the most
-simulated steps, of several the one that drives farthest. Of a long scenario, which makes several scenes, each has an
-ego of its own.
+frames, of several the one that drives farthest. Of a long scenario, which makes several scenes, each has an ego of its
+own, which is chosen by its simulated steps.
 """
 
 import io
@@ -71,9 +71,11 @@ def read_scenario(content: bytes, starts: Sequence[int] | None = None, steps: in
     scenario, problems = XMLFileReader(io.BytesIO(content)).open()
     recording, begun = _recording(scenario, list(problems.planning_problem_dict.values()))
     present = recording.valid & (recording.agent_type == VEHICLE)
-    for start in recording.start_frames(starts, steps) or [HISTORY]:
-        span = slice(min(start, len(present) - 1), start + steps + 1)
-        recording.egos[start] = _ego(recording.states[span], present[span], begun)
+    frames = recording.start_frames(starts, steps) or [HISTORY]
+    for start in frames:
+        span = slice(start, start + steps + 1) if len(frames) > 1 else slice(None)
+        there = present[min(start, len(present) - 1)]
+        recording.egos[start] = _ego(recording.states[span], present[span], there, begun)
     return replace(recording, ego=next((ego for ego in recording.egos.values() if ego >= 0), -1))
 
 
@@ -186,17 +188,17 @@ def _started(begin: Any, states: np.ndarray, valid: np.ndarray, first: int) -> i
     return int(away.argmin()) if away.min() < NEAR else None
 
 
-def _ego(states: np.ndarray, present: np.ndarray, begun: list[int]) -> int:
+def _ego(states: np.ndarray, present: np.ndarray, there: np.ndarray, begun: list[int]) -> int:
     """Returns the ego's track in a window; -1 where no vehicle is there at its start.
 
     One of `begun`, else the vehicle that moves for the most frames, of several the one that drives farthest.
 
     Args:
-        states: [F, A, 4] from the start frame on.
+        states: [F, A, 4] of the simulated steps; of the whole log, where it makes one scene.
         present: [F, A] bool, the vehicles that are there.
+        there: [A] bool, those at the start frame.
         begun: tracks that begin where a planning problem does.
     """
-    there = present[0]
     chosen = [track for track in begun if there[track]]
     if chosen or not there.any():
         return chosen[0] if chosen else -1
