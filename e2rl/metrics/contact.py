@@ -10,9 +10,10 @@ from torch import Tensor
 from e2rl.metrics.catalogue import Batch, Metric, columns, event, rate
 from e2rl.metrics.geometry import edge_distances, edge_parts_inside, pair_overlap, velocity
 from e2rl.metrics.realism import MOVING
-from e2rl.scenes.boxes import separation
+from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.recording import CYCLIST, DT, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.sim.dynamics import wrap
+from e2rl.sim.passing import is_fast, time_inside
 
 FRONT, SIDE, REAR = 0, 1, 2
 KINDS = ("front", "side", "rear")
@@ -34,14 +35,18 @@ def first_contact(batch: Batch) -> Batch:
     so its collision metrics are unknown. hit [B] bool. stop [B]: step of the contact, else T. touching [B, N]: vehicles
     that overlap the ego at `stop`. partner [B]: the one with the largest overlap. kind [B]: index into KINDS, by the
     ego's edge that is hit. Partner and kind are -1 without a contact. before [B]: the step before the contact, or the
-    contact's own where the partner was absent before.
+    contact's own where the partner was absent before. passes [B]: they pass through each other before `stop`, where
+    they are apart again.
     """
     states, valid, size = batch["states"], batch["valid"], batch["size"]
     row = torch.arange(len(states), device=states.device)
     possible = valid & valid[..., :1]
     possible[..., 0] = False
-    area = pair_overlap(states[:, :, :1], size[:, None, :1], states, size[:, None], possible)
-    area = area * ~since_birth(area > 0, valid)
+    ego, ego_size, everybody, sizes = states[:, :, :1], size[:, None, :1], states, size[:, None]
+    area = pair_overlap(ego, ego_size, everybody, sizes, possible)
+    born_inside = since_birth(area > 0, valid)
+    area, moment = with_passing(ego, ego_size, everybody, sizes, possible, area)
+    area = area * ~born_inside
     vehicle_area = area * (batch["agent_type"] == VEHICLE)[:, None]
     overlaps = (vehicle_area > 0).any(-1)
     hit = overlaps[:, 1:].any(-1) & ~overlaps[:, 0]
@@ -50,10 +55,60 @@ def first_contact(batch: Batch) -> Batch:
     partner = at_stop.argmax(-1).masked_fill(~hit, -1)
     before = stop - valid[row, stop - 1, partner.clamp(min=0)].long()
     kind = torch.full_like(stop, -1)
+    latest = moment[row, stop, partner.clamp(min=0)]
     if hit.any():
-        kind[hit] = contact_kind(*boxes_at_contact(states[hit], size[hit], partner[hit], before[hit], stop[hit]))
+        boxes = boxes_at_contact(states[hit], size[hit], partner[hit], before[hit], stop[hit], latest[hit])
+        kind[hit] = contact_kind(*boxes)
     contact = {"area": area, "start_overlap": overlaps[:, 0], "hit": hit, "stop": stop, "touching": at_stop > 0}
-    return contact | {"partner": partner, "kind": kind, "before": before}
+    return contact | {"partner": partner, "kind": kind, "before": before, "passes": hit & (latest < 1)}
+
+
+def with_passing(
+    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor, possible: Tensor, area: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Overlap areas [B, T+1, N] with those of pairs that pass through each other in the step before, at the middle of
+    their contact; and that moment [B, T+1, N], as a fraction of the step, 1 for all others.
+
+    first, second: states [B, T+1, N or 1, 4], with sizes that broadcast; possible, area [B, T+1, N]: of pairs at steps.
+    """
+    moment = torch.ones_like(area)
+    shape = area.shape
+    boxes = [value.expand(*shape, value.shape[-1]) for value in (first, first_size, second, second_size)]
+    offset = (boxes[2] - boxes[0])[..., :2]
+    change = torch.nn.functional.pad(offset.diff(dim=1), (0, 0, 0, 0, 1, 0))
+    reach = (boxes[1].norm(dim=-1) + boxes[3].norm(dim=-1)) / 2 + change.norm(dim=-1)
+    half = [(boxes[index] / 2).movedim(-1, 0) for index in (1, 3)]
+    asked = possible & (area == 0) & is_fast(change.movedim(-1, 0), *half) & (offset.norm(dim=-1) < reach)
+    asked[:, 0] = False
+    asked[:, 1:] &= possible[:, :-1] & (area[:, :-1] == 0)
+    if not asked.any():
+        return area, moment
+    rollout, step, agent = asked.nonzero(as_tuple=True)
+    one, one_size, two, two_size = (value[rollout, step, agent] for value in boxes)
+    one_before, two_before = (boxes[index][rollout, step - 1, agent] for index in (0, 2))
+    middle = [
+        between(then, now, torch.full_like(now[:, 0], 0.5)) for then, now in ((one_before, one), (two_before, two))
+    ]
+    frame = torch.cat([torch.zeros_like(one[:, :2]), middle[0][:, 2:3]], -1)
+    local = [
+        to_frame(value, frame).T for value in (two_before[:, :2] - one_before[:, :2], change[rollout, step, agent])
+    ]
+    turn = middle[1][:, 2] - middle[0][:, 2]
+    begin, end = time_inside(*local, torch.stack([turn.cos(), turn.sin()]), (one_size / 2).T, (two_size / 2).T)
+    at = (begin + end) / 2
+    inside = begin < end
+    shared = pair_overlap(between(one_before, one, at), one_size, between(two_before, two, at), two_size, inside)
+    area, touched = area.clone(), shared > 0
+    area[rollout[touched], step[touched], agent[touched]] = shared[touched]
+    moment[rollout[touched], step[touched], agent[touched]] = at[touched]
+    return area, moment
+
+
+def between(before: Tensor, after: Tensor, fraction: Tensor) -> Tensor:
+    """States [..., 4] at a fraction [...] of the way from `before` to `after` [..., 4]."""
+    change = after - before
+    change = torch.cat([change[..., :2], wrap(change[..., 2:3]), change[..., 3:]], -1)
+    return before + fraction[..., None] * change
 
 
 def since_birth(overlap: Tensor, valid: Tensor) -> Tensor:
@@ -82,26 +137,25 @@ def since_birth(overlap: Tensor, valid: Tensor) -> Tensor:
 
 
 def boxes_at_contact(
-    states: Tensor, size: Tensor, partner: Tensor, before: Tensor, stop: Tensor
+    states: Tensor, size: Tensor, partner: Tensor, before: Tensor, stop: Tensor, latest: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """State [C, 4] and size [C, 2] of the ego and then of its partner at the moment when they first touch.
 
-    The moment is found by bisection of states interpolated linearly between the steps `before` and `stop`. At the step
-    itself two fast vehicles are already deep in each other, and the longest edge inside would be a side.
+    The moment is found by bisection of states interpolated linearly between the step `before` and the fraction `latest`
+    [C] of the way to `stop`, at which they overlap. At the step itself two fast vehicles are already deep in each
+    other, and the longest edge inside would be a side.
     """
     rows = torch.arange(len(states), device=states.device)
     pair = torch.stack([torch.zeros_like(partner), partner], -1)
     start, end = (states[rows[:, None], step[:, None], pair] for step in (before, stop))
-    change = end - start
-    change = torch.cat([change[..., :2], wrap(change[..., 2:3]), change[..., 3:]], -1)
     sizes = size[rows[:, None], pair]
-    low, high = torch.zeros_like(start[:, 0, 0]), torch.ones_like(start[:, 0, 0])
+    low, high = torch.zeros_like(latest), latest
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        now = start + middle[:, None, None] * change
+        now = between(start, end, middle[:, None])
         meet = separation(now[:, 0], sizes[:, 0], now[:, 1], sizes[:, 1]) <= 0
         low, high = torch.where(meet, low, middle), torch.where(meet, middle, high)
-    now = start + high[:, None, None] * change
+    now = between(start, end, high[:, None])
     return now[:, 0], sizes[:, 0], now[:, 1], sizes[:, 1]
 
 
@@ -122,7 +176,9 @@ def kinds_at_stop(batch: Batch) -> Tensor:
     parts = edge_parts_inside(states[:, :1], batch["size"][:, :1], states, batch["size"])
     inside = ((parts > 1e-9) & batch["touching"][..., None]).any(1)
     left, rear, right, front = inside.unbind(-1)
-    return torch.stack([front, right | left, rear], -1)
+    kinds = torch.arange(len(KINDS), device=states.device)
+    passing = batch["passes"][:, None] & (batch["kind"][:, None] == kinds)
+    return torch.stack([front, right | left, rear], -1) | passing
 
 
 @columns(

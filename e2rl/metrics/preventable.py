@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.metrics.contact import with_passing
 from e2rl.metrics.drivers import DRIVERS, Driver, Observation, no_conflict
 from e2rl.metrics.geometry import travel_heading
 from e2rl.run.fused import fused
@@ -123,9 +124,12 @@ def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tens
 
 
 def contacts(states: Tensor, size: Tensor, others: Tracks) -> Tensor:
-    """Bool [B, T+1, N]: a vehicle at states [B, T+1, 4] of size [B, 2] overlaps each of the others."""
-    apart = separation(states[:, :, None], size[:, None, None], others.states, others.size[:, None])
-    return (apart < 0) & others.present
+    """Bool [B, T+1, N]: a vehicle at states [B, T+1, 4] of size [B, 2] overlaps each of the others, or has
+    passed through it since the step before."""
+    boxes = states[:, :, None], size[:, None, None], others.states, others.size[:, None]
+    touches = (separation(*boxes) < 0) & others.present
+    _, moment = with_passing(*boxes, others.present, touches.to(states.dtype))
+    return touches | (moment < 1)
 
 
 class Collision(NamedTuple):

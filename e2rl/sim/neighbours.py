@@ -8,6 +8,7 @@ from torch import Tensor
 from e2rl.run.fused import product, some
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import first_least
+from e2rl.sim.passing import is_fast, time_inside
 from e2rl.sim.static import StaticScene
 from e2rl.sim.world import Agents
 
@@ -56,6 +57,63 @@ def separation_in_frame(position: Tensor, direction: Tensor, own: Tensor, half_s
     across = position[:, 1] * direction[:, 0] - position[:, 0] * direction[:, 1]
     from_other = torch.stack([ahead, across], 1).abs() - half_size - (size * own[:, None]).sum(2)
     return torch.maximum(from_own, from_other).amax(1)
+
+
+TOUCHING = -1e-6  # m: gap of boxes that have passed through each other, at the moment of their contact
+
+
+SLOWEST = (
+    2.0  # m/s of relative velocity below which nobody passes through the ego in a step: it takes half a pedestrian
+)
+SLACK = 1.5  # of the distance that agents are expected to have come in a step
+
+
+def passed(
+    near: Neighbours,
+    ego: tuple[Tensor, Tensor],
+    tracks: tuple[Tensor, Tensor],
+    row: Tensor,
+    step: Tensor,
+    size: Tensor,
+    half_size: Tensor,
+) -> Neighbours:
+    """The neighbours, where they have passed through the ego since the last step as they were on contact with it.
+
+    Args:
+        near: of the egos now.
+        ego: [B, 4] at the last step and now.
+        tracks: of all agents, the ego first; row [B, 1]: 0 .. B - 1; step [B]: the last one.
+        size: [B, 2] m of the egos; half_size: [B, 2, M] m of the agents.
+    """
+    states, there, *_ = near.agents
+    motion = states[:, None, :, 3] * near.direction - torch.nn.functional.pad(ego[1][:, 3:, None], (0, 0, 0, 1))
+    pace = motion.norm(dim=1)
+    asked = there & (near.gap >= 0) & (pace > SLOWEST) & (near.gap < SLACK * DT * pace)
+    if not torch.compiler.is_compiling() and not asked.is_cuda and not bool(asked.any()):
+        return near
+    if torch.compiler.is_compiling():
+        scene, agent = row.expand_as(asked), torch.arange(asked.shape[1], device=row.device).expand_as(asked)
+    else:
+        scene, agent = asked.nonzero(as_tuple=True)
+    then = step[scene]
+    moved = states[scene, agent, :2] - tracks[0][scene, then, agent + 1, :2] - (ego[1] - ego[0])[scene, :2]
+    cos, sin = ego[1][:, 2].cos()[scene], ego[1][:, 2].sin()[scene]
+    x, y = moved.unbind(-1)
+    change = torch.stack([cos * x + sin * y, cos * y - sin * x])
+    position, direction, half = (
+        torch.stack([value[:, 0][scene, agent], value[:, 1][scene, agent]])
+        for value in (near.position, near.direction, half_size)
+    )
+    own = torch.stack([size[:, 0][scene], size[:, 1][scene]]) / 2
+    begin, end = time_inside(position - change, change, direction, own, half)
+    passes = is_fast(change, own, half) & tracks[1][scene, then, agent + 1] & (begin > 0) & (begin < end)
+    passes = passes & asked[scene, agent]
+    touch = torch.where(passes, position - (1 - begin) * change, position)
+    gap = torch.where(passes, TOUCHING, near.gap[scene, agent])
+    if torch.compiler.is_compiling():
+        return near._replace(position=touch.transpose(0, 1), gap=gap)
+    place = near.position.transpose(1, 2).index_put((scene, agent), touch.T).transpose(1, 2)
+    return near._replace(position=place, gap=near.gap.index_put((scene, agent), gap))
 
 
 STANDING = 0.1  # m/s

@@ -11,7 +11,7 @@ from torch import Tensor
 from e2rl.run.fused import fused, is_on, some
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.neighbours import own_fault
+from e2rl.sim.neighbours import own_fault, passed
 from e2rl.sim.observation import EGO_STATE, EgoState, features, glance, observe
 from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
 from e2rl.sim.static import STATIC, FrenetPose, StaticScene, follow
@@ -134,13 +134,15 @@ def _step(
         moved = ego.merged(moved, lambda old, new: torch.where(stay.view(-1, *[1] * (new.ndim - 1)), old, new))
         _, state, action, pose, present, *_ = moved
     seen = (observe if look else glance)(static, moved, others, now / horizon)
-    hit = (seen.neighbours.gap < 0) & others.present & present[:, None]
+    both = ego.state, state
+    near = passed(seen.neighbours, both, tracks, static.row, ego.step, static.size, static.half_size)
+    hit = (near.gap < 0) & others.present & present[:, None]
     contact, contact_vru = some(hit & static.vehicle), some(hit & ~static.vehicle)
     off = seen.beyond > 0
     off_road = off & ego.been_on_road & present
     gone = ~present | (pose.s >= static.mission.end)
     touched = contact | contact_vru
-    fault = own_fault(ego.state[:, 3], seen.neighbours, hit, static, tracks, ego.step)
+    fault = own_fault(ego.state[:, 3], near, hit, static, tracks, ego.step)
     progress = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed)
     terms = reward_terms(progress, touched, fault, off_road, action, ego.action, state[:, 3], seen.limit, pose.d)
     on_contact, off_the_road, when_gone = config.ends.unbind()

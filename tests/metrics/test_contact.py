@@ -177,3 +177,28 @@ def test_touched_is_a_fraction_of_the_traffic_that_moves(speeds, logged, there, 
     batch["traffic"] = torch.arange(count)[None] > 0
     found = touched_columns(batch, torch.isin(torch.arange(count), torch.tensor(hit))[None])
     assert (found["touched"].item(), found["moving_vehicles"].item()) == pytest.approx(expected, nan_ok=True)
+
+
+@pytest.mark.parametrize("ahead", [97.5 + 0.8 * index for index in range(10)])
+def test_who_meet_between_two_steps_collide_at_the_step_after(ahead):
+    """Two of 1.5 and 1.0 m head-on at 78 m/s, of whom no step shows an overlap in one of three cases."""
+    found = score_rollouts(
+        scene(course(0, 0, 0, 38), course(ahead, 0.2, math.pi, 40)).replace(
+            size=torch.tensor([[[1.5, 1.0], [1.0, 0.8]]])
+        )
+    )
+    row = found[0][0]
+    expected = math.ceil((ahead - 1.25) / 7.8 - 1e-6)
+    assert (row["cfr"], row["contact_step"], row["contact_type"], row["partner"]) == (1, expected, "front", 1)
+    assert (row["front"], row["min_dtc"]) == (1, 0)
+    passes = bool((ahead - 7.8 * expected) < -1.25)
+    assert row["front_any"] == 1 or not passes, "who is deep in the other may have its front beyond it"
+    assert row["relvel"] == pytest.approx(78, abs=1e-3)
+
+
+def test_who_passes_by_does_not_collide_and_a_cyclist_that_is_passed_through_is_hit():
+    short = torch.tensor([[[1.5, 1.0], [1.0, 0.8]]])
+    beside = scene(course(0, 0, 0, 38), course(100, 0.95, math.pi, 40)).replace(size=short)
+    assert score_rollouts(beside)[0][0]["cfr"] == 0
+    cyclist = scene(course(0, 0, 0, 38), course(101.5, 0.2, math.pi, 40), kinds=[0, 2]).replace(size=short)
+    assert score_rollouts(cyclist)[0][0]["cfr_vru"] == 1

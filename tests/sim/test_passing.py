@@ -1,0 +1,68 @@
+"""Boxes that pass through each other in a step: the same as a fine look at where they are in between."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.scenes.boxes import separation
+from e2rl.sim.neighbours import neighbours_of, passed, rotation_into
+from e2rl.sim.passing import is_fast, time_inside
+from e2rl.sim.world import Agents
+
+FINE = 400  # moments of a step that are looked at
+
+
+def random_steps(count, generator):
+    """Offset, change, turn of `count` boxes past a box, and half sizes of both."""
+
+    def draw(low, high):
+        return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
+
+    offset = torch.stack([draw(-8, 8), draw(-5, 5)])
+    change = torch.stack([draw(-9, 9), draw(-6, 6)])
+    return offset, change, draw(-math.pi, math.pi), torch.stack([draw(1, 3), draw(0.4, 1)])
+
+
+def test_the_interval_is_that_of_a_fine_look():
+    generator = torch.Generator().manual_seed(0)
+    offset, change, turn, other = random_steps(3000, generator)
+    own = torch.tensor([[2.3], [0.95]], dtype=torch.float64).expand(2, 3000)
+    begin, end = time_inside(offset, change, torch.stack([turn.cos(), turn.sin()]), own, other)
+    time = torch.linspace(0, 1, FINE + 1, dtype=torch.float64)
+    place = offset[..., None] + change[..., None] * time
+    box = torch.stack([*place, turn[:, None].expand(-1, FINE + 1), torch.zeros(3000, FINE + 1)], -1)
+    still = torch.zeros(4, dtype=torch.float64)
+    gap = separation(still, 2 * own.T[:, None], box, 2 * other.T[:, None])
+    inside = (gap < 0).any(1)
+    assert torch.equal(inside | ((gap.amin(1) < 0.02) & (begin < end)), begin < end)
+    first = time[(gap < 0).int().argmax(1)]
+    assert (first - begin)[inside].abs().max() < 1.5 / FINE
+    assert 300 < inside.sum() < 2700
+
+
+def test_what_moves_no_farther_than_half_of_the_smallest_extent_is_not_looked_at():
+    own, other = torch.tensor([[2.0], [1.0]]), torch.tensor([[2.0], [0.4]])
+    assert not is_fast(torch.tensor([[0.3], [0.2]]), own, other).any()
+    assert is_fast(torch.tensor([[0.3], [0.3]]), own, other).all()
+
+
+@pytest.mark.parametrize(("lateral", "known", "hits"), [(0.0, True, True), (0.0, False, False), (2.0, True, False)])
+def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
+    """Head-on at 78 m/s: from 4.2 m before the ego to 3.6 m behind it. Who was not there did not pass."""
+    ego_before, ego = torch.tensor([[0.0, 0.0, 0.0, 38.0]]), torch.tensor([[3.8, 0.0, 0.0, 38.0]])
+    before = torch.tensor([[[4.2, lateral, math.pi, 40.0]]])
+    now = before - torch.tensor([4.0, 0.0, 0.0, 0.0])
+    size, still = torch.tensor([[4.0, 1.9]]), torch.zeros(1, 1)
+    half = torch.tensor([[[1.1], [0.4]]])
+    agents = Agents(now, still == 0, still, still)
+    near = neighbours_of(ego, rotation_into(ego), size, half, agents)
+    tracks = torch.stack([torch.cat([ego[:, None], at], 1) for at in (before, now)], 1)
+    there = torch.tensor([[[True, known], [True, True]]])
+    first = torch.zeros(1, 1, dtype=torch.int64)
+    found = passed(near, (ego_before, ego), (tracks, there), first, first[0], size, half)
+    assert (near.gap > 0).all() and bool((found.gap < 0).all()) == hits
+    if hits:
+        assert found.position[0, :, 0].tolist() == pytest.approx([3.1, 0.0], abs=1e-4)
+    else:
+        assert torch.equal(found.gap, near.gap) and torch.equal(found.position, near.position)
