@@ -138,6 +138,9 @@ def test_an_objective_of_one_s_own_steers_e2_elsewhere(tmp_path):
     run("evaluate.py", tmp_path / "run", *small, "report=false")
     with open(tmp_path / "run" / "rollouts.csv") as file:
         rows = list(csv.DictReader(file))
-    assert {row["method"] for row in rows} == {"e2", "cut_in_front"} and {row["errored"] for row in rows} <= {"0", "0.0"}
-    by_method = [[row["path_kl"] for row in rows if row["method"] == name] for name in ("e2", "cut_in_front")]
+    assert {row["method"] for row in rows} == {"e2", "cut_in_front"} and {row["errored"] for row in rows} <= {
+        "0",
+        "0.0",
+    }
+    by_method = [[row["transport"] for row in rows if row["method"] == name] for name in ("e2", "cut_in_front")]
     assert by_method[0] != by_method[1]

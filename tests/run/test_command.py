@@ -1,71 +1,26 @@
-"""What a command line is told: lists, and jobs of a sweep that are refused."""
+"""What is typed reaches Hydra as it was meant."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from e2rl.evaluation.methods import evaluation_settings
-from e2rl.run.command import told
-from e2rl.run.config import check_list, load_config
-from e2rl.run.errors import InputError
+from e2rl.run.command import with_path
 
-ROOT = Path(__file__).parents[2]
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "mend"),
-    [("seeds", "0,1", "'seeds=[0,1]'"), ("methods", "no anchoring, e2", "'methods=[no anchoring,e2]'")],
-)
-def test_several_values_are_told_as_a_list(key, value, mend):
-    said = f"Ambiguous value for argument '{key}={value}'\n1. To use it as a list, use key=[value1,value2]"
-    assert mend in told("evaluate", [f"{key}={value}"], said)
-    with pytest.raises(InputError, match="several values are a list") as refused:
-        check_list(key, value)
-    assert mend in str(refused.value)
+PATHS = {  # typed; the value that is read
+    "data.path=~/logs/x.zip": str(Path.home() / "logs" / "x.zip"),
+    "data.path=/data/łogs ü/fährten.zip": "/data/łogs ü/fährten.zip",
+    "data.path=/data/o'neill é (1).zip": "/data/o'neill é (1).zip",
+    "prior.checkpoint=~/a=b.pt": str(Path.home() / "a=b.pt"),
+}
 
 
-def test_a_name_with_spaces_is_no_list():
-    check_list("compare", "no anchoring")
-    check_list("seeds", 3)
+@pytest.mark.parametrize("typed", PATHS)
+def test_a_path_is_read_whatever_letters_it_has(typed):
+    override = OverridesParser.create().parse_override(with_path(typed))
+    assert override.value() == PATHS[typed]
 
 
-@pytest.mark.parametrize("key", ["methods", "eta", "seeds", "compare", "budget", "shard"])
-def test_a_text_with_commas_is_refused_for_every_list(key):
-    with pytest.raises(InputError, match=rf"{key}=1,2: several values are a list, '{key}=\[1,2\]'"):
-        evaluation_settings(load_config("evaluate", [f"{key}='1,2'"]))
-
-
-SWEEP = """
-import sys
-from e2rl.run.command import run_command
-from e2rl.run.errors import InputError
-
-def work(run):
-    if run.config.batch == 2:
-        raise InputError("batch=2: refused")
-    print("did", run.config.batch)
-
-sys.argv = ["evaluate.py", *sys.argv[1:]]
-run_command("evaluate", work)
-"""
-
-
-@pytest.mark.parametrize(("values", "status"), [("2,3", 2), ("1,2,3", 2), ("1,3", 0)])
-def test_a_sweep_goes_on_after_a_job_that_is_refused(tmp_path, values, status):
-    command = [sys.executable, "-c", SWEEP, "-m", f"batch={values}", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    names = values.split(",")
-    assert done.returncode == status, done.stderr
-    did = [line for line in done.stdout.splitlines() if line.startswith("did")]
-    assert did == [f"did {name}" for name in names if name != "2"]
-    summary = f"error: 1 of {len(names)} jobs of the sweep were refused: batch=2"
-    assert (done.stderr.strip().splitlines() or [""])[-1] == (summary if status else "")
-    assert done.stderr.count("batch=2: refused") == (status > 0)
-
-
-def test_a_job_alone_that_is_refused_says_so_once(tmp_path):
-    command = [sys.executable, "-c", SWEEP, "batch=2", f"hydra.run.dir={tmp_path / 'run'}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2 and done.stderr == "error: batch=2: refused\n"
+@pytest.mark.parametrize("typed", ["seeds=[0,1]", "data=bundled", "+egos={idm:{ego:idm}}", "~data", "-m", "name='ü'"])
+def test_anything_else_stays_as_it_is(typed):
+    assert with_path(typed) == typed
