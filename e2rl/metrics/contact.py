@@ -90,11 +90,11 @@ def with_passing(
         between(then, now, torch.full_like(now[:, 0], 0.5)) for then, now in ((one_before, one), (two_before, two))
     ]
     frame = torch.cat([torch.zeros_like(one[:, :2]), middle[0][:, 2:3]], -1)
-    local = [
-        to_frame(value, frame).T for value in (two_before[:, :2] - one_before[:, :2], change[rollout, step, agent])
-    ]
+    offset = to_frame(two_before[:, :2] - one_before[:, :2], frame).T
+    moved = to_frame(change[rollout, step, agent], frame).T
     turn = middle[1][:, 2] - middle[0][:, 2]
-    begin, end = time_inside(*local, torch.stack([turn.cos(), turn.sin()]), (one_size / 2).T, (two_size / 2).T)
+    direction = torch.stack([turn.cos(), turn.sin()])
+    begin, end = time_inside(offset, moved, direction, own=(one_size / 2).T, other=(two_size / 2).T)
     at = (begin + end) / 2
     inside = begin < end
     shared = pair_overlap(between(one_before, one, at), one_size, between(two_before, two, at), two_size, inside)
@@ -226,9 +226,9 @@ def contact_columns(batch: Batch) -> Batch:
     before = velocity(states[row, batch["before"]])
     relative = (before[:, 0] - before[row, batch["partner"].clamp(min=0)]).norm(dim=-1)
     until, touches = steps_until(stop, states.shape[1])[..., None], batch["area"] > 0
-    kind = batch["agent_type"][:, None]
-    vulnerable = touches & until & ((kind == PEDESTRIAN) | (kind == CYCLIST))
-    objects = touches & until & (kind == OTHER)
+    agent_type = batch["agent_type"][:, None]
+    vulnerable = touches & until & ((agent_type == PEDESTRIAN) | (agent_type == CYCLIST))
+    objects = touches & until & (agent_type == OTHER)
     return found | {
         "cfr_vru": vulnerable.any((1, 2)).to(states.dtype),
         "cfr_object": objects.any((1, 2)).to(states.dtype),

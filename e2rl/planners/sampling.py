@@ -113,9 +113,9 @@ class ScoringEgo(Weights, Ego):
 
 def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> World:
     """Scenes rows [b] of a World with these keys of the scene, without plans and routes."""
-    now = (getattr(world, key)[rows] for key in ("step", *AGENT_KEYS))
+    agents = {key: getattr(world, key)[rows] for key in AGENT_KEYS}
     mission_s = None if world.mission_s is None else world.mission_s[rows]
-    return World(world.scene.select(*keys)[rows], *now, mission_s=mission_s)
+    return World(world.scene.select(*keys)[rows], world.step[rows], **agents, mission_s=mission_s)
 
 
 def ranked_actions(ego: ScoringEgo, world: World, count: int, hold: int) -> tuple[Tensor, Tensor]:

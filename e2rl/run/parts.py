@@ -52,10 +52,13 @@ class Parts:
             return None
 
     def save(self, name: str, identity: Any, value: Any) -> None:
-        """Write a part, in place of an older one of its name."""
+        """Write a part, in place of an older one of its name; a link or a pipe there is not written through."""
         if self.folder is not None:
+            file = self._file(name)
+            if file.is_symlink() or (file.exists() and not file.is_file() and not file.is_dir()):
+                file.unlink()
             part = {"format": FORMAT, "about": self.about, "identity": identity, "value": value}
-            write_atomically(self._file(name), state_bytes(part))
+            write_atomically(file, state_bytes(part))
 
     def _file(self, name: str) -> Path:
         assert self.folder is not None

@@ -69,5 +69,6 @@ class Bar(tqdm):
 
     def close(self) -> None:
         """End the bar; lines need no end."""
-        self.disable = self.disable or self.as_lines
+        if self.as_lines:
+            self.disable = True
         super().close()

@@ -158,7 +158,7 @@ def _sensor_log(path: Path) -> Recording:
     states[:, 0, :2], states[:, 0, 2] = (place + AHEAD * turn[..., 0])[:, :2], _heading(turn[..., 0])
     valid[frame, track + 1], valid[:, 0] = True, True
     seconds = (stamps - stamps[0]) / 1e9
-    heights = resample_heights(heights, valid, seconds)
+    resampled = resample_heights(heights, valid, seconds)
     states, valid = resample_uniform(states, valid, seconds)
     states[..., 3] = speeds(states, valid)
     size = np.stack([EGO_SIZE, *table[["length_m", "width_m"]].to_numpy(float)[first]])
@@ -166,7 +166,7 @@ def _sensor_log(path: Path) -> Recording:
     code = _files(path)[-1].stem.split("____")[-1].split("_")[0]
     arrays = (states, valid, size, _types(kinds))
     place_name = CITIES.get(code, code)
-    return Recording(path.parent.name, place_name, "argoverse2", *arrays, 0, {}, current=None, heights=heights)
+    return Recording(path.parent.name, place_name, "argoverse2", *arrays, 0, {}, current=None, heights=resampled)
 
 
 def _types(kinds: list[str]) -> np.ndarray:

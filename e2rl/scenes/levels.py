@@ -65,7 +65,7 @@ class Levels:
             return other
         path, height = self.way(ego)
         tree, states = cKDTree(path), self.recording.states
-        for agent in np.flatnonzero(self.valid.any(0)):
+        for agent in np.flatnonzero(self.valid.any(0)).tolist():
             frames = np.flatnonzero(self.valid[:, agent])[::STRIDE]
             _, nearest = tree.query(states[frames, agent, :2])
             if agent == ego or not (np.abs(heights[frames, agent] - height[nearest]) > LEVEL).any():

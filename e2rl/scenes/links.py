@@ -114,7 +114,8 @@ def drivable_exits(lanes: dict[str, Lane]) -> tuple[dict[str, list[str]], Counte
 
     A lane without a recorded successor that can be driven has those that geometry shows.
     """
-    repairs, number = Counter(), {name: index for index, name in enumerate(lanes)}
+    repairs: Counter[str] = Counter()
+    number = {name: index for index, name in enumerate(lanes)}
     recorded = [(name, other) for name, lane in lanes.items() for other in dict.fromkeys(lane.exits)]
     repairs[ITSELF] = sum(name == other for name, other in recorded)
     known = [(number[name], number[other]) for name, other in recorded if other in number and other != name]

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,7 @@ ARRAYS = (  # fields of a Recording: name, kinds of numbers, columns, in words
     ("size", "fiu", 2, "an array [agents, 2] of lengths and widths"),
     ("agent_type", "iu", 0, "an integer array [agents]"),
 )
-FIELDS = (  # further ones: name, classes, in words
+FIELDS: tuple[tuple[str, Any, str], ...] = (  # further ones: name, classes, in words
     ("ego", int | np.integer, "the index of a track"),
     ("current", int | np.integer | None, "a frame, or None"),
     ("lanes", Mapping, "a dict of Lane objects"),
@@ -186,9 +187,9 @@ class Recording:
                 raise self._wrong(name, value, f"{text}, as valid is of {shape}")
         if not ((self.agent_type >= VEHICLE) & (self.agent_type <= OTHER)).all():
             raise self._wrong("agent_type", self.agent_type, f"numbers from {VEHICLE} to {OTHER}")
-        for name, kinds, text in FIELDS:
+        for name, types, text in FIELDS:
             value = getattr(self, name)
-            if not isinstance(value, kinds) or isinstance(value, bool):
+            if not isinstance(value, types) or isinstance(value, bool):
                 raise self._wrong(name, value, text)
         self._validate_map(frames)
         return self
@@ -221,10 +222,9 @@ class Recording:
 
     def _wrong(self, name: str, value: object, expected: str) -> InputError:
         """Returns the error of a field that is not what is expected."""
-        array = isinstance(value, np.ndarray)
         kind = (
             f"{value.dtype} {list(value.shape)}"
-            if array
+            if isinstance(value, np.ndarray)
             else f"{type(value).__name__} {' '.join(ascii(value).split())[:40]}"
         )
         return InputError(f"scene {self.scene_id!r}: its {name} is {kind}; expected {expected}")

@@ -223,7 +223,7 @@ def _speed_limit(feature: dict) -> float:
     """
     for key, factor in LIMIT_UNITS.items():
         recorded = feature.get(key)
-        numbers = [_number(value) for value in (recorded if np.ndim(recorded) else [recorded])]
+        numbers = [_number(value) for value in np.atleast_1d(np.asarray(recorded, object)).tolist()]
         known = [value for value in numbers if 0 < value < np.inf]
         if known:
             return min(known) * factor

@@ -151,7 +151,7 @@ def write(path: Path, build: Build) -> None:
                 if shape != rows.shape[1:]:
                     rows[number] = RAGGED[key]
                 value = np.ndarray(shape, rows.dtype, waiting.read(prod(shape) * rows.itemsize))
-                rows[(number, *map(slice, shape))] = value
+                rows[number][tuple(slice(end) for end in shape)] = value
         content.flush()
     about = json.dumps(vars(index)).encode()
     digest = hashlib.sha256(content.data)

@@ -105,7 +105,7 @@ def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
     states, valid, size = recording.states.copy(), recording.valid.copy(), recording.size.astype(float)
     there = valid[:, pair]
     front, rear = _ends(states[:, pair], size[pair, 0])
-    both = there.all(1)
+    both = np.asarray(there.all(1))
     reach = np.linalg.norm(front[both, 0] - rear[both, 1], axis=-1)
     length = float(np.median(reach))
     alone = np.where(there[:, :1], states[:, tractor], states[:, trailer])
@@ -115,8 +115,9 @@ def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
     middle = np.where(there[:, :1], front[:, 0] - direction * length / 2, rear[:, 1] + direction * length / 2)
     heading = np.arctan2(direction[:, 1], direction[:, 0])
     joined = np.concatenate([middle, heading[:, None], alone[:, 3:]], 1)
-    states[:, tractor] = np.where(there.any(1)[:, None], joined, 0.0)
-    valid[:, tractor] = there.any(1)
+    either = np.asarray(there.any(1))
+    states[:, tractor] = np.where(either[:, None], joined, 0.0)
+    valid[:, tractor] = either
     valid[:, trailer] = False
     size[tractor] = length, size[pair, 1].max()
     heights = recording.heights

@@ -152,11 +152,12 @@ class DrivingEnv(EnvBase):
         ego, begins = self._ego, (self._ego.step == 0)[:, None]
         own = ego.state, ego.present, ego.action[:, 0], ego.action[:, 1]
         start = (self.scene[key] for key in START_KEYS)
-        driven, now = trajectories_at(self._trajectories.states, self._trajectories.valid, ego.step), []
-        for mine, first, later in zip(own, start, driven, strict=True):
+        driven = trajectories_at(self._trajectories.states, self._trajectories.valid, ego.step)
+        agents = {}
+        for key, mine, first, later in zip(AGENT_KEYS, own, start, driven, strict=True):
             known = torch.where(begins[..., None] if first.ndim > 2 else begins, first, later)
-            now.append(torch.cat([mine[:, None], known[:, 1:]], 1))
-        return World(self.scene, ego.step, *now, mission_s=ego.pose.s)
+            agents[key] = torch.cat([mine[:, None], known[:, 1:]], 1)
+        return World(self.scene, ego.step, **agents, mission_s=ego.pose.s)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
         batch = self.batch_size[0]

@@ -68,8 +68,9 @@ class World:
         scene["light_state"] = lights.gather(1, last[..., None].expand_as(lights))
         scene["size"] = torch.where(there[..., None], self.scene["size"], 1.0)
         scene["agent_type"] = self.scene["agent_type"] * there
-        now = (getattr(self, key).clone() for key in ("step", *AGENT_KEYS))
-        return World(scene, *now, mission_s=None if self.mission_s is None else self.mission_s.clone())
+        agents = {key: getattr(self, key).clone() for key in AGENT_KEYS}
+        mission_s = None if self.mission_s is None else self.mission_s.clone()
+        return World(scene, self.step.clone(), **agents, mission_s=mission_s)
 
     def ego_action(self) -> Tensor:
         """The egos' last executed acceleration and yaw rate [B, 2]."""
