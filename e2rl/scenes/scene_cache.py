@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
+from typing import Any
 
 import numpy as np
 import torch
@@ -151,7 +152,8 @@ def write(path: Path, build: Build) -> None:
                 if shape != rows.shape[1:]:
                     rows[number] = RAGGED[key]
                 value = np.ndarray(shape, rows.dtype, waiting.read(prod(shape) * rows.itemsize))
-                rows[number][tuple(slice(end) for end in shape)] = value
+                place: tuple[Any, ...] = (number, *map(slice, shape))
+                rows[place] = value
         content.flush()
     about = json.dumps(vars(index)).encode()
     digest = hashlib.sha256(content.data)

@@ -196,7 +196,7 @@ def test_what_goes_wrong_in_a_scene_costs_that_scene_and_is_told(nuplan, tmp_pat
     (row,) = run_protocol(setup, [Method("replay", LogReplay())], [0], tmp_path)
     (entry,) = json.loads((tmp_path / ERRORED_FILE).read_text())
     reason, detail = WRONG[how]
-    assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 3
+    assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 4
     assert entry["scene_id"] == scene_set().scene_id[BAD] and detail in entry["detail"]
 
 
