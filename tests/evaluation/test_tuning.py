@@ -173,11 +173,11 @@ def test_the_best_is_written_with_the_groups_of_dotted_names_and_none_where_ther
 
 def test_every_planner_s_ranges_hold_its_present_values():
     tunable = []
-    for name in choices("ego"):
+    for name in set(choices("ego")) - {"class"}:  # which names no planner by itself
         present = load_choice("ego", name)
         module, _, kind = present["_target_"].rpartition(".")
         ranges = getattr(__import__(module, fromlist=[kind]), kind).tuned
         tunable += [name] * bool(ranges)
         for parameter, (low, high, *_) in ranges.items():
             assert low <= present[parameter] <= high, f"{name}.{parameter}"
-    assert tunable == ["bits", "lane_graph", "lane_graph_tuned", "sampling"]
+    assert sorted(tunable) == ["bits", "lane_graph", "lane_graph_tuned", "sampling"]

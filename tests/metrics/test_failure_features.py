@@ -104,8 +104,9 @@ def test_contacts_soon_after_the_start_use_what_is_known():
     window, known, size = last_seconds(batch)
     assert window.shape == (1, WINDOW + 1, 2, 4) and size.shape == (1, 2, 2)
     assert known.tolist() == [int(batch["before"]) - 2] and window[0, 0, 0, 0] == pytest.approx(2.0)
-    late = course(5.5, 0, EAST, 5, appears=5)  # never seen before the contact
+    late = course(5.5, 0, EAST, 5, appears=2)  # a step before the contact
     assert words(course(0, 0, EAST, 8), late)[1:] == ("keeps speed", "keeps speed")
+    assert words(course(0, 0, EAST, 8), course(5.5, 0, EAST, 5, appears=5))[1:] == ("", "")  # at its birth: none
 
 
 def test_speeds_just_above_and_below_the_thresholds():

@@ -99,7 +99,7 @@ def test_other_kinds_and_a_missing_library_are_told_before_anything_is_drawn(tmp
     with pytest.raises(InputError, match="failure.avi.*gif or .mp4"):
         save_animation(tmp_path / "failure.avi", frames)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(InputError, match=r"failure.mp4.*e2rl\[mp4\]"):
+    with pytest.raises(InputError, match=r"failure.mp4.*\[mp4\]"):
         save_animation(tmp_path / "failure.mp4", frames)
 
 

@@ -114,5 +114,5 @@ def test_errors_of_workers_arrive_and_one_that_always_dies_is_named(workers, mon
 
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(ray_workers, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"launcher=ray: .*e2rl\[ray\]"):
+    with pytest.raises(InputError, match=r"launcher=ray: .*\[ray\]"):
         RayWorkers()

@@ -52,7 +52,7 @@ def test_a_run_of_a_version_without_an_option_that_is_off_goes_on(tmp_path):
 
 @pytest.mark.parametrize("group", ["learner", "ego", "curriculum", "synthesizer"])
 def test_every_file_of_ones_own_goes_on(tmp_path, group):
-    for name in set(choices(group)) - {"external", "nuplan", "policy_file"}:
+    for name in set(choices(group)) - {"class", "external", "nuplan", "policy_file"}:
         own = changed(TRAIN, with_choice(group, name))
         assert reading(tmp_path, own, TRAIN) == own, name
 
