@@ -11,17 +11,16 @@ from e2rl.planners.ego import Ego, EgoPolicy, PlannerError
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import METRICS, DrivingEnv, SimSettings, touches
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
 
-OUTCOMES = ("contact", "contact_vru", "off_road", "progress")
 OUTCOME_KEYS = (
     ("traffic", "row"),
     "scene_index",
     *(("next", name) for name in ("timestep", "done", "episode_reward")),
-    *(("next", "metrics", name) for name in OUTCOMES),
+    *(("next", "metrics", name) for name in METRICS),
 )
 
 
@@ -77,7 +76,7 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
     after, metrics = data["next"], data["next", "metrics"]
     begin = torch.arange(data.shape[1]) + 1 - decisions(after["timestep"][..., 0], hold)
     ended = after["done"][..., 0] & (begin + decisions(horizon, hold) <= data.shape[1])
-    row, contact = data["traffic", "row"][ended][:, 0], metrics["contact"] | metrics["contact_vru"]
+    row, contact = data["traffic", "row"][ended][:, 0], touches(metrics)
     unknown = torch.full((len(row),), torch.nan)
     return Episodes(
         row,
@@ -125,7 +124,7 @@ class PoolDriver:
         after, metrics = steps["next"], steps["next", "metrics"]
         done = after["done"][..., 0].int()
         alive = done.cumsum(1) - done == 0
-        contact = (metrics["contact"] | metrics["contact_vru"])[..., 0]
+        contact = (touches(metrics))[..., 0]
         frames = {
             "observation": steps["observation"],
             "intended": steps["intended"],

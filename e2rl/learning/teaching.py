@@ -20,6 +20,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting, settings_of
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
+from e2rl.sim.env import touches
 from e2rl.sim.prospects import time_to_contact
 from e2rl.sim.world import World
 from e2rl.traffic.e2.skeleton import first_after
@@ -53,7 +54,7 @@ def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
     """Bool [B, T]: decisions of a collected batch at most `window` s before a contact, or before a near miss: less than
     `near` s to a contact if the ego goes on. Both in the same episode."""
     metrics, length = data["next", "metrics"], data.shape[1]
-    contact = (metrics["contact"] | metrics["contact_vru"])[..., 0]
+    contact = (touches(metrics))[..., 0]
     event = first_after(contact | (time_to_contact(data["observation"]) < near))[:, :-1]
     step = data["timestep"][..., 0]
     wait = step.gather(1, event.clamp(max=length - 1)) - step

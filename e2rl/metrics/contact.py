@@ -11,7 +11,7 @@ from e2rl.metrics.catalogue import Batch, Metric, columns, event, rate
 from e2rl.metrics.geometry import edge_distances, edge_parts_inside, pair_overlap, velocity
 from e2rl.metrics.realism import MOVING
 from e2rl.scenes.boxes import separation, to_frame
-from e2rl.scenes.recording import CYCLIST, DT, OTHER, PEDESTRIAN, VEHICLE
+from e2rl.scenes.recording import CYCLIST, DT, HIDDEN, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.passing import is_fast, time_inside
 
@@ -19,7 +19,6 @@ FRONT, SIDE, REAR = 0, 1, 2
 KINDS = ("front", "side", "rear")
 EDGE_KIND = (SIDE, REAR, SIDE, FRONT)  # of geometry.EDGES
 BISECTIONS = 20
-GAP = 5  # steps of absence, as of one that is hidden, after which an agent appears anew
 
 
 def steps_until(stop: Tensor, length: int) -> Tensor:
@@ -114,7 +113,7 @@ def between(before: Tensor, after: Tensor, fraction: Tensor) -> Tensor:
 def since_birth(overlap: Tensor, valid: Tensor) -> Tensor:
     """Returns the steps [B, T+1, N] bool at which agents overlap the ego as they have since they appeared.
 
-    Whoever appears within the ego, at the start or after more than GAP steps of absence, touches it only after they
+    Whoever appears within the ego, at the start or after more than HIDDEN steps of absence, touches it only after they
     have been apart once. Agents of the first step are there from before, and not counted here.
 
     Args:
@@ -127,9 +126,9 @@ def since_birth(overlap: Tensor, valid: Tensor) -> Tensor:
         return born
     overlaps, there = overlap[rows, :, agents], valid[rows, :, agents]
     steps = torch.arange(overlap.shape[1], device=overlap.device)
-    seen = torch.where(there, steps, -GAP - 1).cummax(1).values
+    seen = torch.where(there, steps, -HIDDEN - 1).cummax(1).values
     before = torch.nn.functional.pad(seen[:, :-1], (1, 0), value=0)
-    appears = there & (steps - before > GAP + 1)
+    appears = there & (steps - before > HIDDEN + 1)
     birth = torch.where(appears, steps, -1).cummax(1).values
     apart = torch.where(there & ~overlaps, steps, -2).cummax(1).values
     born[rows, :, agents] = overlaps & (birth >= 0) & (apart < birth)

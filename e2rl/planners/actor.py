@@ -46,7 +46,7 @@ class ObservingEgo(Ego):
         state, present, action = world.states[:, 0], world.valid[:, 0], world.ego_action()
         pieces, place = [], world.mission_s
         for done in range(0, PLAN_STEPS, HOLD):
-            ego = placed_ego(static.mission, world.step + done, state, action, present, present, place)
+            ego = placed_ego(static.mission, world.step + done, state, action, present, present, place, static.vehicle)
             seen = features(static, ego, others_at(world, expected, done), ego.step / horizon)
             action = self.decide(seen)
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))

@@ -61,6 +61,8 @@ class BitsEgo(ScoringEgo):
 def observed(world: World) -> Tensor:
     """The environment's observations [B, D] of Worlds, but for the elapsed time, which is 0."""
     static, state, present = static_scene(world.scene, mission_of(world.scene)), world.states[:, 0], world.valid[:, 0]
-    ego = placed_ego(static.mission, world.step, state, world.ego_action(), present, present, world.mission_s)
+    ego = placed_ego(
+        static.mission, world.step, state, world.ego_action(), present, present, world.mission_s, static.vehicle
+    )
     seen = features(static, ego, world.others(), world.step.to(state.dtype))
     return seen.index_fill(1, torch.tensor([ELAPSED], device=state.device), 0.0)

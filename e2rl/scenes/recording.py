@@ -20,6 +20,7 @@ COLOURS = {  # by the words in the names of logs; of several, such as "red yello
 }
 NO_SIGNAL = {"FLASHING", "BLINKING", "OFF", "INACTIVE"}  # words of lights that let nobody wait for another colour
 DT = 0.1  # s, the time step of every recording, scene and simulation
+HIDDEN = 5  # steps of absence, at most, of an agent that is merely out of sight; after more it appears anew
 HISTORY = 10  # frames of history before a start frame that is chosen here
 MOVED_START = "start frames moved to where enough past and future are recorded"
 MAX_NAME = 128  # characters of the name of a scene, a place or a data set

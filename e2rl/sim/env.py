@@ -16,12 +16,17 @@ from e2rl.sim.mission import Mission, mission_of, start_place
 from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, features, placed_ego
 from e2rl.sim.reward import check_weights
 from e2rl.sim.static import static_scene, write_rows
-from e2rl.sim.step import Outcome, StepConfig, hold_step
+from e2rl.sim.step import CONTACTS, Outcome, StepConfig, hold_step
 from e2rl.sim.world import AGENT_KEYS, START_KEYS, Agents, Trajectories, World, trajectories_at
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
 OF_SCENE = (*START_KEYS, "size", "agent_type", "field_origin", "light_state")
-FLAGS, METRICS = ("terminated", "truncated"), ("contact", "contact_vru", "off_road", "progress")
+FLAGS, METRICS = ("terminated", "truncated"), (*CONTACTS, "off_road", "progress")
+
+
+def touches(metrics: TensorDictBase) -> Tensor:
+    """Bool [..., 1]: the ego touches anybody, by the metrics [...] of an environment."""
+    return metrics["contact"] | metrics["contact_vru"] | metrics["contact_object"]
 
 
 @configured("sim/default")
@@ -43,9 +48,10 @@ class DrivingEnv(EnvBase):
     """Closed-loop driving in batches of recorded or synthesized scenes.
 
     Keys of a step: action [B, 2] (m/s^2, rad/s); observation [B, OBSERVATION_SIZE]; reward, done, terminated, truncated
-    [B, 1]; scene_index, timestep [B, 1] int64; metrics: contact, contact_vru, off_road [B, 1] bool at this step and
-    progress [B, 1], m along the mission since the start. With agents=True also agents: states [B, N, 4], valid [B, N],
-    accel and turn_rate [B, N], for policies that plan. Maps stay in `scene`.
+    [B, 1]; scene_index, timestep [B, 1] int64; metrics: contact (with a vehicle), contact_vru (with a pedestrian or
+    cyclist), contact_object, off_road [B, 1] bool at this step and progress [B, 1], m along the mission since the
+    start. With agents=True also agents: states [B, N, 4], valid [B, N], accel and turn_rate [B, N], for policies that
+    plan. Maps stay in `scene`.
 
     An episode terminates at contact and off the road (settings). It is truncated after the scenes' T steps or when the
     ego leaves the scene. A reset takes the scenes "scene_index" [B, 1] of its input; without this key it draws them
@@ -92,7 +98,7 @@ class DrivingEnv(EnvBase):
         self._static = static_scene(self.scene, mission)
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
         action, place = torch.zeros_like(start[:, :2]), start_place(mission, start)
-        self._ego = placed_ego(mission, flags.long(), start, action, flags, flags, place)
+        self._ego = placed_ego(mission, flags.long(), start, action, flags, flags, place, self._static.vehicle)
         self._features = torch.zeros(batch_size, width, device=device)  # as last observed
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
@@ -113,7 +119,7 @@ class DrivingEnv(EnvBase):
             "observation": number(self._features.shape[1]),
             "scene_index": number(dtype=torch.int64),
             "timestep": number(dtype=torch.int64),
-            "metrics": group(contact=flag(), contact_vru=flag(), off_road=flag(), progress=number()),
+            "metrics": group(**dict.fromkeys(METRICS[:-1], flag()), progress=number()),
         }
         if self.agents:
             states, valid, accel, turn = number(agents, 4), flag(agents), number(agents), number(agents)
@@ -200,7 +206,9 @@ class DrivingEnv(EnvBase):
         action = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
         flags = torch.ones_like(on_road), on_road
         state = scene["start"][:, 0]
-        fresh = placed_ego(mission, torch.zeros_like(index), state, action, *flags, start_place(mission, state))
+        fresh = placed_ego(
+            mission, torch.zeros_like(index), state, action, *flags, start_place(mission, state), scene["valid"][:, 1:]
+        )
 
         self._ego = self._ego.merged(fresh, lambda old, new: old.index_copy(0, index, new))
         return fresh

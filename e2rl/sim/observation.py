@@ -39,7 +39,8 @@ class EgoState(NamedTuple):
 
     step [B] int64; state [B, 4]: x, y, heading, speed; action [B, 2]: last executed acceleration and yaw rate; pose:
     Frenet pose on the mission; present [B] bool: still in the scene; been_on_road [B] bool: was on the road before,
-    so off_road counts; start_s [B]: arc length at the start.
+    so off_road counts; start_s [B]: arc length at the start; inside [B, M] bool: agents that have overlapped the ego
+    since they appeared, which is no contact.
     """
 
     step: Tensor
@@ -49,6 +50,7 @@ class EgoState(NamedTuple):
     present: Tensor
     been_on_road: Tensor
     start_s: Tensor
+    inside: Tensor
 
     def merged(self, other: "EgoState", function: Callable[[Tensor, Tensor], Tensor]) -> "EgoState":
         """An EgoState of function(own, other's) of every tensor."""
@@ -65,17 +67,19 @@ def placed_ego(
     present: Tensor,
     on_road: Tensor,
     place: Tensor | None,
+    agents: Tensor,
 ) -> EgoState:
     """The egos of B scenes at states [B, 4], projected on their missions, from which progress counts.
 
-    place [B]: arc length [m] near which they are, None where it is unknown.
+    place [B]: arc length [m] near which they are, None where it is unknown; agents [B, M]: any tensor of the others.
     """
     hint = None if place is None else place[:, None]
     pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points, hint)))
-    return EgoState(step, state, action, pose, present, on_road, pose.s)
+    inside = torch.zeros_like(agents, dtype=torch.bool)
+    return EgoState(step, state, action, pose, present, on_road, pose.s, inside)
 
 
-EGO_STATE = ("B:int64", "B 4!", "B 2!", "B", "B", "B", "B:bool", "B:bool", "B")
+EGO_STATE = ("B:int64", "B 4!", "B 2!", "B", "B", "B", "B:bool", "B:bool", "B", "B M:bool")
 """Shapes of an EgoState's tensors in fused functions."""
 
 

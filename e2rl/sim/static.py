@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.scenes.recording import VEHICLE
+from e2rl.scenes.recording import OTHER, VEHICLE
 from e2rl.scenes.route import SPACING, WINDOW, first_least, onto_nearer, segment, tangents
 from e2rl.sim.mission import Mission, lights_of
 
@@ -24,8 +24,8 @@ class StaticScene(NamedTuple):
 
     mission; segments [B, P - 1, 12]: table of the mission's segments (`segment_table`); row [B, 1]: 0 .. B - 1;
     lights [B, T + 1, 2]: states of the mission's lights; field [B, G, G], origin [B, 2]: the drivable field; size
-    [B, 2]: length and width of the ego; half_size [B, 2, M]: half lengths and widths of the others; vehicle [B, M]
-    bool; top_speed [B]: the recorded ego's highest speed [m/s].
+    [B, 2]: length and width of the ego; half_size [B, 2, M]: half lengths and widths of the others; vehicle, plain
+    [B, M] bool: they are vehicles, or objects such as cones; top_speed [B]: the recorded ego's highest speed [m/s].
     """
 
     mission: Mission
@@ -37,13 +37,14 @@ class StaticScene(NamedTuple):
     size: Tensor
     half_size: Tensor
     vehicle: Tensor
+    plain: Tensor
     top_speed: Tensor
 
 
 OF_MISSION = ("B P 2!", "B P!", "B", "B 2:int64!", "B 2!")
 STATIC = (
     *OF_MISSION,
-    *("B S 12!", "B 1:int64!", "B T 2:int64!", "B G G:float16", "B 2!", "B 2!", "B 2 M", "B M:bool", "B"),
+    *("B S 12!", "B 1:int64!", "B T 2:int64!", "B G G:float16", "B 2!", "B 2!", "B 2 M", "B M:bool", "B M:bool", "B"),
 )
 """Shapes of a StaticScene's tensors in fused functions."""
 
@@ -62,6 +63,7 @@ def static_scene(scene: TensorDictBase, mission: Mission) -> StaticScene:
         scene["size"][:, 0],
         half_size,
         scene["agent_type"][:, 1:] == VEHICLE,
+        scene["agent_type"][:, 1:] == OTHER,
         (scene["logged"][:, :, 0, 3] * scene["logged_valid"][:, :, 0]).amax(1),
     )
 
@@ -70,7 +72,7 @@ def write_rows(static: StaticScene, rows: Tensor, new: StaticScene) -> None:
     """Overwrite rows [b] of a StaticScene, in place; views of the scenes' storage need no copy."""
     for old, fresh in zip(static.mission, new.mission, strict=True):
         old.index_copy_(0, rows, fresh)
-    for name in ("segments", "lights", "half_size", "vehicle", "top_speed"):
+    for name in ("segments", "lights", "half_size", "vehicle", "plain", "top_speed"):
         getattr(static, name).index_copy_(0, rows, getattr(new, name))
 
 

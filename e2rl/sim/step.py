@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from e2rl.run.fused import fused, is_on, some
-from e2rl.scenes.recording import DT
+from e2rl.scenes.recording import DT, HIDDEN
 from e2rl.sim import dynamics
 from e2rl.sim.neighbours import own_fault, passed
 from e2rl.sim.observation import EGO_STATE, EgoState, features, glance, observe
@@ -19,7 +19,8 @@ from e2rl.sim.world import AGENTS, Agents, trajectories_at
 
 Tracks = tuple[Tensor, Tensor]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
 Outcome = dict[str, Tensor]  # see `step`
-FLAGS = ("contact", "contact_vru", "off_road", "terminated", "truncated")
+CONTACTS = ("contact", "contact_vru", "contact_object")  # with a vehicle, a pedestrian or cyclist, an object
+FLAGS = (*CONTACTS, "off_road", "terminated", "truncated")
 
 
 class StepConfig(NamedTuple):
@@ -37,7 +38,8 @@ class StepConfig(NamedTuple):
 
 class Driven(NamedTuple):
     """Egos after a step (`EgoState`, whose pose is s, d, heading), and of its outcome reward and progress, each [B];
-    truths [7, B], 0 or 1: FLAGS, and whether the egos are still in the scene and have been on the road."""
+    truths [8, B], 0 or 1: FLAGS, and whether the egos are still in the scene and have been on the road; inside [B, M],
+    0 or 1."""
 
     state: Tensor
     action: Tensor
@@ -47,6 +49,7 @@ class Driven(NamedTuple):
     reward: Tensor
     progress: Tensor
     truths: Tensor
+    inside: Tensor
 
 
 def step(
@@ -69,8 +72,9 @@ def step(
         ended: [B] bool, egos that stay where they are.
 
     Returns:
-        The egos, and observation [B, D] ([B, 0] without a look), reward, contact (with a vehicle), contact_vru (with
-        another agent), off_road, terminated, truncated and progress (m along the mission since the start), each [B].
+        The egos, and observation [B, D] ([B, 0] without a look), reward, CONTACTS, off_road, terminated, truncated and
+        progress (m along the mission since the start), each [B]. Whoever appears within the ego touches it only after
+        they have been apart once, as in `metrics.contact.since_birth`.
     """
     horizon = tracks[0].shape[1] - 1
     now = (ego.step + 1).clamp(max=horizon)
@@ -85,7 +89,7 @@ def step(
         driven = drive(ego, given, now, others, *tracks, static, config, stay)
         *flags, present, on_road = (driven.truths > 0).unbind()
         pose = FrenetPose(driven.s, driven.d, driven.heading)
-        moved = EgoState(now, driven.state, driven.action, pose, present, on_road, ego.start_s)
+        moved = EgoState(now, driven.state, driven.action, pose, present, on_road, ego.start_s, driven.inside > 0)
         seen = features(static, moved, others, now / horizon) if look else ego.state[:, :0]
         numbers = {"observation": seen, "reward": driven.reward, "progress": driven.progress}
         return moved, numbers | dict(zip(FLAGS, flags, strict=True))
@@ -107,7 +111,8 @@ def drive(
     """`step` of actions without a look; now [B] is the step that the egos come to, at which others are met."""
     moved, of = _step(ego, given, now, others, (states, known), static, config, False, ended)
     truths = torch.stack([*(of[name] for name in FLAGS), moved.present, moved.been_on_road]).to(given.dtype)
-    return Driven(moved.state, moved.action, *moved.pose, of["reward"], of["progress"], truths)
+    inside = moved.inside.to(given.dtype)
+    return Driven(moved.state, moved.action, *moved.pose, of["reward"], of["progress"], truths, inside)
 
 
 def _step(
@@ -128,7 +133,7 @@ def _step(
         state, present = torch.where(given[1][:, None], given[0], ego.state), ego.present & given[1]
     action = dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0]
     pose = follow(static, state[:, :2], ego.pose.s + ego.state[:, 3] * DT)
-    moved = EgoState(now, state, action, pose, present, ego.been_on_road, ego.start_s)
+    moved = EgoState(now, state, action, pose, present, ego.been_on_road, ego.start_s, ego.inside)
     if ended is not None:
         stay = ended
         moved = ego.merged(moved, lambda old, new: torch.where(stay.view(-1, *[1] * (new.ndim - 1)), old, new))
@@ -137,11 +142,14 @@ def _step(
     both = ego.state, state
     near = passed(seen.neighbours, both, tracks, static.row, ego.step, static.size, static.half_size)
     hit = (near.gap < 0) & others.present & present[:, None]
-    contact, contact_vru = some(hit & static.vehicle), some(hit & ~static.vehicle)
+    inside = since_birth(hit, ego.inside, others.present, tracks[1], static.row, now)
+    hit = hit & ~inside
+    kinds = static.vehicle, ~(static.vehicle | static.plain), static.plain
+    contacts = [some(hit & kind) for kind in kinds]
     off = seen.beyond > 0
     off_road = off & ego.been_on_road & present
     gone = ~present | (pose.s >= static.mission.end)
-    touched = contact | contact_vru
+    touched = contacts[0] | contacts[1] | contacts[2]
     fault = own_fault(ego.state[:, 3], near, hit, static, tracks, ego.step)
     progress = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed)
     terms = reward_terms(progress, touched, fault, off_road, action, ego.action, state[:, 3], seen.limit, pose.d)
@@ -149,14 +157,30 @@ def _step(
     outcome = {
         "observation": seen.features,
         "reward": weighted_sum(terms, config.weights),
-        "contact": contact,
-        "contact_vru": contact_vru,
+        **dict(zip(CONTACTS, contacts, strict=True)),
         "off_road": off_road,
         "terminated": (touched & on_contact) | (off_road & off_the_road),
         "truncated": (now >= horizon) | (gone & when_gone),
         "progress": pose.s - ego.start_s,
     }
-    return moved._replace(present=~gone, been_on_road=ego.been_on_road | ~off), outcome
+    return moved._replace(present=~gone, been_on_road=ego.been_on_road | ~off, inside=inside), outcome
+
+
+def since_birth(overlap: Tensor, inside: Tensor, present: Tensor, valid: Tensor, row: Tensor, now: Tensor) -> Tensor:
+    """Returns the agents [B, M] bool that have overlapped the ego ever since they appeared.
+
+    Args:
+        overlap, present: [B, M] bool, who overlaps the ego and who is there at this step.
+        inside: [B, M] bool, this function's result of the step before.
+        valid: [B, T+1, N] bool, presence of all agents, the ego first; row [B, 1]: 0 .. B - 1; now [B]: this step.
+    """
+    eager = not torch.compiler.is_compiling() and not overlap.is_cuda
+    if eager and not bool((overlap | inside).any()):
+        return inside
+    steps = (now[:, None] - torch.arange(1, HIDDEN + 2, device=now.device)).clamp(min=0)
+    agent = torch.arange(1, overlap.shape[1] + 1, device=now.device)
+    absent = ~some(valid[row[..., None], steps[..., None], agent])
+    return torch.where(present, overlap & (inside | absent), inside)
 
 
 def hold_step(

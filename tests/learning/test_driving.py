@@ -73,6 +73,7 @@ def frames(lengths, total, fail=()):
                 "metrics": {
                     "contact": contact[None, :, None],
                     "contact_vru": torch.zeros(1, total, 1).bool(),
+                    "contact_object": torch.zeros(1, total, 1).bool(),
                     "off_road": torch.zeros(1, total, 1).bool(),
                     "progress": 2.0 * timestep[None, :, None],
                 },

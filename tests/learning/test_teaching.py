@@ -28,7 +28,7 @@ def timeline(contacts, dones, near=(), decisions=30):
     step = torch.stack([2 * (ended[:k] == ended[k]).sum() for k in range(decisions)])
     observation = torch.ones(1, decisions, OBSERVATION_SIZE)
     observation[flags[2, ..., 0], -15:] = 0.5 / 3.7
-    metrics = {"contact": flags[0], "contact_vru": torch.zeros_like(flags[0])}
+    metrics = {"contact": flags[0], **dict.fromkeys(("contact_vru", "contact_object"), torch.zeros_like(flags[0]))}
     after = TensorDict({"metrics": metrics, "done": flags[1]}, [1, decisions])
     return TensorDict({"observation": observation, "timestep": step[None, :, None], "next": after}, [1, decisions])
 

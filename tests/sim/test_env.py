@@ -6,12 +6,12 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.recording import DT
+from e2rl.scenes.recording import DT, OTHER
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.world import World
 from tests.synthetic import make_scenes
 
-METRIC_KEYS = [("metrics", name) for name in ("contact", "contact_vru", "off_road", "progress")]
+METRIC_KEYS = [("metrics", name) for name in ("contact", "contact_vru", "contact_object", "off_road", "progress")]
 
 
 def make_env(batch=2, settings=None, **scene):
@@ -41,7 +41,7 @@ def ended(yaw_rate=0.0, **scene):
 
 def flags(td):
     """What is true of all environments: how they end, and the metrics."""
-    names = {"terminated": "terminated", "truncated": "truncated", **{key[1]: key for key in METRIC_KEYS[:3]}}
+    names = {"terminated": "terminated", "truncated": "truncated", **{key[1]: key for key in METRIC_KEYS[:4]}}
     assert all(len(td[key].unique()) == 1 for key in names.values())
     return [name for name, key in names.items() if td[key].all()]
 
@@ -176,6 +176,29 @@ def test_pedestrian_contact_is_its_own_metric():
     env.scenes.scenes["logged"][:, :, 32, 1] = 0.0
     env.reset()
     assert flags(drive(env, 80)) == ["terminated", "contact_vru"]
+
+
+def test_contact_with_an_object_is_its_own_metric():
+    env = make_env(num_scenes=1, num_vehicles=1, settings=SimSettings(end_off_road=False))
+    env.scenes.scenes["logged"][:, :, 32, 1] = 0.0
+    env.scenes.scenes["agent_type"][:, 32] = OTHER
+    env.reset()
+    assert flags(drive(env, 80)) == ["terminated", "contact_object"]
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_who_appears_within_the_ego_touches_it_once_they_have_been_apart(apart):
+    """A pedestrian appears at step 20 where the ego is, goes along with it, and stays there or is aside for a step."""
+    env = make_env(batch=1, num_scenes=1, num_vehicles=1, settings=SimSettings(end_off_road=False))
+    scene = env.scenes.scenes
+    scene["logged"][:, :, 32] = scene["logged"][:, :, 0]
+    scene["logged_valid"][:, :20, 32] = scene["valid"][:, 32] = False
+    scene["logged_valid"][:, 20:, 32] = True
+    if apart:
+        scene["logged"][:, 40, 32, 1] += 30.0
+    env.reset()
+    touched = [step for step in range(1, 81) if act(env)["metrics", "contact_vru"].any()]
+    assert touched == (list(range(41, 81)) if apart else [])
 
 
 def test_map_end_truncates():
