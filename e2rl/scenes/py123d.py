@@ -28,7 +28,7 @@ from e2rl.scenes.recording import (
     light_colour,
     same_way,
 )
-from e2rl.scenes.smoothing import latest_frames, resample_uniform, speeds
+from e2rl.scenes.smoothing import latest_frames, resample_heights, resample_uniform, speeds
 from e2rl.scenes.source import Source
 
 SYNC = "sync.arrow"  # every log's folder holds one
@@ -43,11 +43,11 @@ OWN = "py123d."  # modules that a file may name
 
 
 class Frame(NamedTuple):
-    """A moment: time [s], boxes {track: (type, x, y, heading, length, width)} with the ego's first, named EGO, and
+    """A moment: time [s], boxes {track: (type, x, y, z, heading, length, width)} with the ego's first, named EGO, and
     lights {lane: state}."""
 
     time: float
-    boxes: dict[str, tuple[int, float, float, float, float, float]]
+    boxes: dict[str, tuple[int, float, float, float, float, float, float]]
     lights: dict[str, int]
 
 
@@ -135,13 +135,13 @@ def _frames(scene: Any) -> list[Frame]:
         ego, boxes = scene.get_ego_state_se3_at_iteration(step), scene.get_box_detections_se3_at_iteration(step)
         if ego is None or boxes is None:
             continue
-        pose, box = ego.center_se2, ego.metadata
-        agents = {EGO: (VEHICLE, pose.x, pose.y, pose.yaw, box.length, box.width)}
+        pose, box = ego.center_se3, ego.metadata
+        agents = {EGO: (VEHICLE, pose.x, pose.y, pose.z, pose.yaw, box.length, box.width)}
         for other in boxes:
-            kind, flat = other.attributes.default_label.name, other.bounding_box_se2
+            kind, body = other.attributes.default_label.name, other.bounding_box_se3
             if kind not in LEFT_OUT:
-                place = flat.center_se2
-                shape = (place.x, place.y, place.yaw, flat.length, flat.width)
+                place = body.center_se3
+                shape = (place.x, place.y, place.z, place.yaw, body.length, body.width)
                 agents[other.attributes.track_token] = (TYPES.get(kind, OTHER), *shape)
         lights = scene.get_traffic_light_detections_at_iteration(step) or ()
         states = {str(light.lane_id): light_colour(light.status.name) for light in lights}
@@ -167,21 +167,24 @@ def _recording(scene_id: str, frames: list[Frame]) -> Recording:
     column = {name: index for index, name in enumerate(names)}
     states, valid = np.zeros((len(frames), len(names), 4)), np.zeros((len(frames), len(names)), bool)
     sizes: list[list[tuple[float, float]]] = [[] for _ in names]
+    heights = np.zeros(valid.shape)
     types = np.full(len(names), OTHER)
     for row, frame in enumerate(frames):
-        for name, (kind, x, y, heading, length, width) in frame.boxes.items():
+        for name, (kind, x, y, z, heading, length, width) in frame.boxes.items():
             index = column[name]
             states[row, index, :3], valid[row, index], types[index] = (x, y, heading), True, kind
+            heights[row, index] = z
             sizes[index].append((length, width))
     seconds = np.array([frame.time for frame in frames])
     seconds -= seconds[0]
     lanes = dict.fromkeys(lane for frame in frames for lane in frame.lights)
     lights = {lane: np.array([frame.lights.get(lane, LIGHT_UNKNOWN) for frame in frames]) for lane in lanes}
+    resampled = resample_heights(heights, valid, seconds)
     states, valid = resample_uniform(states, valid, seconds)
     states[..., 3] = speeds(states, valid)
     latest = latest_frames(seconds, len(states))
     size = np.array([np.median(found, axis=0) for found in sizes])
-    recording = Recording(scene_id, "", "", states, valid, size, types, 0, {}, current=None)
+    recording = Recording(scene_id, "", "", states, valid, size, types, 0, {}, current=None, heights=resampled)
     recording.lights = {lane: values[latest] for lane, values in lights.items()}
     return recording
 

@@ -28,12 +28,12 @@ EGO = EgoStateSE3Metadata(
 BOXES = BoxDetectionsSE3Metadata(Label)
 
 
-def turned(x, y, heading):
-    return PoseSE3(x, y, 0.0, np.cos(heading / 2), 0, 0, np.sin(heading / 2))
+def turned(x, y, heading, height=0.0):
+    return PoseSE3(x, y, height, np.cos(heading / 2), 0, 0, np.sin(heading / 2))
 
 
-def box(name, label, x, y, heading, size):
-    shape = BoundingBoxSE3(turned(x, y, heading), *size, 1.5)
+def box(name, label, x, y, heading, size, height=0.0):
+    shape = BoundingBoxSE3(turned(x, y, heading, height), *size, 1.5)
     return d.BoxDetectionSE3(d.BoxDetectionAttributes(label, name), shape, None)
 
 
@@ -73,7 +73,7 @@ def write_log(root, name="log", seconds=12.0, rate=10.0, location="town", about=
         stamp = d.Timestamp.from_us(1_000_000_000 + round(1e6 * time))
         ego = d.EgoStateSE3.from_imu(turned(20 + 8 * time - 1.5, 0, 0), EGO, stamp)
         found = [
-            box("truck", Label.VEHICLE, 60 + 6 * time, 3.6, 0.02 * time, (9.0, 2.5)),
+            box("truck", Label.VEHICLE, 60 + 6 * time, 3.6, 0.02 * time, (9.0, 2.5), 0.05 * time),
             box("rider", Label.BICYCLE, 30 + 4 * time, -4, 0, (1.8, 0.7)),
             box("cone", Label.TRAFFIC_CONE, 70, -5, 0, (0.4, 0.4)),
             box("sign", Label.CZONE_SIGN, 80, -5, 0, (0.4, 0.4)),
@@ -120,6 +120,8 @@ def test_tracks_arrive_as_they_were_written(made):
     )
     truck = recording.states[:, row[VEHICLE]]
     assert np.allclose(truck[:, 0], 60 + 6 * time) and np.allclose(truck[:, 2], 0.02 * time, atol=1e-6)
+    height = recording.heights
+    assert np.allclose(height[:, 0], 0.5) and np.allclose(height[:, row[VEHICLE]], 0.05 * time, atol=1e-6)
     assert recording.size[[0, row[VEHICLE], row[CYCLIST]]].tolist() == [[5, 2], [9, 2.5], [1.8, 0.7]]
     assert recording.valid[:, row[PEDESTRIAN]].sum() == 20 and recording.valid[:, :3].all()
     assert set(recording.lights) == {"2", "3"} and (recording.lights["3"] == LIGHT_UNKNOWN).all()
