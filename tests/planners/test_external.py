@@ -123,12 +123,8 @@ def test_its_process_ends_with_its_ego(tmp_path):
     assert not alive(process)
 
 
-@linux
-@pytest.mark.slow
-@pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGKILL"])
-def test_no_process_is_left(tmp_path, how):
-    """Two workers wait for planners that hang."""
-    ego = ExternalEgo(wrong_planner(tmp_path, 0.0, act="time.sleep(100)"), timeout=100.0)
+def started_command(ego):
+    """The process of a command with two workers, which a terminal's Ctrl-C reaches with all that it starts."""
 
     def command():
         os.setsid()
@@ -138,21 +134,43 @@ def test_no_process_is_left(tmp_path, how):
 
     running = multiprocessing.get_context("fork").Process(target=command)
     running.start()
-    marks, begin = tmp_path / "marks", time.monotonic()
-    while len(list(marks.iterdir())) < 2 and time.monotonic() - begin < 30:
+    return running
+
+
+def pids_in(folder, count):
+    """Numbers of the files in a folder, once there are so many; each is a process that lives."""
+    begin = time.monotonic()
+    while len(list(folder.iterdir())) < count and time.monotonic() - begin < 30:
         time.sleep(0.02)
-    planners = [int(mark.name) for mark in marks.iterdir()]
-    assert len(planners) == 2 and all(map(alive, planners))
+    pids = [int(mark.name) for mark in folder.iterdir()]
+    assert len(pids) == count and all(map(alive, pids))
     time.sleep(0.2)
+    return pids
+
+
+def alive_after(pids, seconds):
+    """Whether any of these processes still lives, so many seconds from now at most."""
+    begin = time.monotonic()
+    while any(map(alive, pids)) and time.monotonic() - begin < seconds:
+        time.sleep(0.02)
+    return any(map(alive, pids))
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGKILL"])
+def test_no_process_is_left(tmp_path, how):
+    """Two workers wait for planners that hang."""
+    ego = ExternalEgo(wrong_planner(tmp_path, 0.0, act="time.sleep(100)"), timeout=100.0)
+    running = started_command(ego)
+    planners = pids_in(tmp_path / "marks", 2)
     if how == "SIGINT":
         os.killpg(running.pid, signal.SIGINT)
     else:
         os.kill(running.pid, getattr(signal, how))
     running.join(20)
-    while any(map(alive, planners)) and time.monotonic() - begin < 60:
-        time.sleep(0.02)
+    assert not alive_after(planners, 30)
     assert running.exitcode == {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}[how]
-    assert not any(map(alive, planners))
 
 
 def starting(folder):
@@ -192,21 +210,8 @@ def test_nothing_is_left_of_what_planners_started(tmp_path, how, kind):
     ego = Starter(statements)
     if kind == "external":
         ego = ExternalEgo(wrong_planner(tmp_path, 0.0, act=statements), timeout=100.0)
-
-    def command():
-        os.setsid()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        with ending(lambda: "do it again"):
-            run(ego, processes=2, batch=2)
-
-    running = multiprocessing.get_context("fork").Process(target=command)
-    running.start()
-    children, begin = tmp_path / "children", time.monotonic()
-    while len(list(children.iterdir())) < 4 and time.monotonic() - begin < 30:
-        time.sleep(0.02)
-    started = [int(mark.name) for mark in children.iterdir()]
-    assert len(started) == 4 and all(map(alive, started))
-    time.sleep(0.2)
+    running = started_command(ego)
+    started = pids_in(tmp_path / "children", 4)
     if how == "SIGINT":
         os.killpg(running.pid, signal.SIGINT)
     elif how == "a worker is killed":
@@ -214,10 +219,8 @@ def test_nothing_is_left_of_what_planners_started(tmp_path, how, kind):
     else:
         os.kill(running.pid, getattr(signal, how))
     running.join(20)
-    while any(map(alive, started)) and time.monotonic() - begin < 60:
-        time.sleep(0.02)
+    assert not alive_after(started, 30)
     assert running.exitcode == {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}.get(how, 2)
-    assert not any(map(alive, started))
 
 
 def workers_of(process):
