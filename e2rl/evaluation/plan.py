@@ -97,8 +97,13 @@ def purpose(run: Run, asked: EvaluationSettings, egos: Sequence[str]) -> str:
     config = run.config
     if config.failure is not None:
         return f"Drives the failure {config.failure} again, into {run.folder}."
-    count = "" if asked.num_scenes is None else f"the first {asked.num_scenes} "
-    scenes = f"{count}{run.choices['data']} scenes" if config.scene is None else f"scene {config.scene}"
+    scenes = f"{run.choices['data']} scenes"
+    if config.scene is not None:
+        scenes = f"scene {config.scene}"
+    elif asked.num_scenes == 1:
+        scenes = f"the first of {scenes}"
+    elif asked.num_scenes is not None:
+        scenes = f"the first {asked.num_scenes} {scenes}"
     often = f"{', '.join(f'{value:g}' for value in asked.budget)} {asked.budget_unit} a scene and seed"
     often = often if asked.budget else "once a scene and seed"
     return (

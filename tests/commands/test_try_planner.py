@@ -91,4 +91,4 @@ def test_it_drives_the_class_and_names_it(folder, capsys):
     main(["--planner", f"{folder[1]}:Steady", "--scenes", "1", "--out", "run", *small])
     rows = read_rows(folder[0] / "run" / "rollouts.csv")
     assert {row["ego_policy"] for row in rows} == {"Steady"} and {row["method"] for row in rows} == {"e2", "nominal"}
-    assert capsys.readouterr().out.startswith("Drives Steady in the first 1 bundled scenes against e2, nominal")
+    assert capsys.readouterr().out.startswith("Drives Steady in the first of bundled scenes against e2, nominal")
