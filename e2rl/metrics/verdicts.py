@@ -52,12 +52,20 @@ AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
 LANE_HALF = 1.75  # m from a lane's centreline to its edge
 
 
-def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor, Tensor], struck: Tensor) -> Tensor:
-    """Index [B] into DUTIES of collisions [B].
+def duties(
+    collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor, Tensor], struck: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Returns which duty the partner broke, as an index [B] into DUTIES, and whether the ego broke one [B] bool.
 
-    rear [B] bool: the ego is hit at its rear; red [B] int64: step at which the partner last crossed a stop line at red,
-    -1 for never; lanes: points [B, M, 2] of the map's centrelines, and which line [B, M] each is of (-1: padding);
-    struck [B] bool: see `Prevention`.
+    The ego breaks its own by crossing a stop line at red before a vehicle of another direction, or by driving against
+    its lane towards a vehicle that keeps to its own. Whoever meets it there owes it neither way nor gap.
+
+    Args:
+        collision: of B egos.
+        rear: [B] bool, the ego is hit at its rear.
+        red: [B, 2] int64, step at which the ego and its partner last crossed a stop line at red, -1 for never.
+        lanes: points [B, M, 2] of the map's centrelines, and which line [B, M] each is of (-1: padding).
+        struck: [B] bool, see `Prevention`.
     """
     row = torch.arange(len(rear), device=rear.device)
     pair = torch.stack([torch.zeros_like(collision.partner), collision.partner], 1)
@@ -78,10 +86,14 @@ def duties(collision: Collision, rear: Tensor, red: Tensor, lanes: tuple[Tensor,
     result = torch.full_like(stop, NONE)
     result = torch.where(unsafe & ~crosses, ENTRY, result)
     result = torch.where(unsafe & crosses & priority, RIGHT_OF_WAY, result)
-    result = torch.where(_against(other, stop, lanes), WRONG_WAY, result)
-    result = torch.where((red >= 0) & (stop - red <= LIGHT_STEPS) & (red <= stop), LIGHT, result)
+    against, other_against = _against(ego, stop, lanes), _against(other, stop, lanes)
+    ran, other_ran = ((red >= 0) & (stop[:, None] - red <= LIGHT_STEPS) & (red <= stop[:, None])).unbind(1)
+    ego_broke = ((ran & crosses) | (against & oncoming)) & ~other_against & ~other_ran
+    result = result.masked_fill(ego_broke, NONE)
+    result = torch.where(other_against, WRONG_WAY, result)
+    result = torch.where(other_ran, LIGHT, result)
     faster = other[row, before, 3].abs() * angle.cos() > ego[row, before, 3].abs()
-    return torch.where(rear & (angle.abs() < torch.pi / 3) & faster, REAR_END, result)
+    return torch.where(rear & (angle.abs() < torch.pi / 3) & faster, REAR_END, result), ego_broke
 
 
 def _turn(track: Tensor, stop: Tensor) -> Tensor:
@@ -114,25 +126,34 @@ def _against(track: Tensor, stop: Tensor, lanes: tuple[Tensor, Tensor]) -> Tenso
     return against.float().mean(-1) >= 0.5
 
 
-def at_fault(batch: Batch, struck: Tensor) -> Tensor:
-    """Whether the ego is at fault [B]: 1 or 0, NaN without contact.
+def at_fault(batch: Batch, *, struck: Tensor, broke: Tensor, prevented: Tensor) -> Tensor:
+    """Returns whether the ego is at fault [B]: 1 or 0, NaN without contact.
 
     It is if it moves and its partner has stood for STOOD steps. Else, where the ego moved sideways into its partner or
     that into the ego, it is if the ego did. Else it is if it moves and its leading edge (the front, of an ego that
     reverses the rear) hits a partner that moves and did not cut in: that entered the ego's path more than a second
-    before the contact. It is not where a competent driver who stands would be struck all the same: struck [B]. An ego
-    that stands is, if it has stood for STOOD steps in the way of a lane that the partner comes along. Nobody is where
-    the partner stands and has only turned on the spot.
+    before the contact, or two where no competent driver prevents it. It is not where a competent driver who stands
+    would be struck all the same. An ego that stands is, if it has stood for STOOD steps in the way of a lane that the
+    partner comes along. It is, whichever edge is hit, where it broke a duty of its own and has not stood for STOOD
+    steps. Nobody is where the partner stands and has only turned on the spot.
+
+    Args:
+        batch: B rollouts.
+        struck: [B] bool, see `Prevention`.
+        broke: [B] bool, the ego broke a duty (`duties`).
+        prevented: [B] bool, the human driver prevents the collision.
     """
     row, partner = torch.arange(len(batch["states"])), batch["partner"].clamp(min=0)
     speed = batch["states"][row, batch["before"], :, 3].abs()
     moves, partner_moves = speed[:, 0] > STANDING, speed[row, partner] > STANDING
     leads = batch["kind"] == leading_edge(batch)
-    runs_into = leads & partner_moves & ~cuts_in(batch) & ~struck
+    late = cuts_in(batch, CUT_IN_STEPS) | (cuts_in(batch, STOOD) & ~prevented)
+    runs_into = leads & partner_moves & ~late & ~struck
     moved, _ = batch["moved_into"].unbind(1)
     runs_into = torch.where(batch["moved_into"].any(1), moved, runs_into)
     fault = moves & (stood(batch, partner) | runs_into) & ~turned_on_the_spot(batch)
-    fault = fault | (~moves & stood(batch, torch.zeros_like(partner)) & blocks(batch, partner))
+    ego_stood = stood(batch, torch.zeros_like(partner))
+    fault = fault | (~moves & ego_stood & blocks(batch, partner)) | (broke & ~ego_stood)
     return fault.to(speed.dtype).masked_fill(~batch["hit"], torch.nan)
 
 
@@ -181,14 +202,14 @@ def blocks(batch: Batch, partner: Tensor) -> Tensor:
     return across & on_it.any(1)
 
 
-def cuts_in(batch: Batch) -> Tensor:
-    """Bool [B]: at some step of the last second the partner touches no part of the ego's path from that step on.
+def cuts_in(batch: Batch, steps: int) -> Tensor:
+    """Bool [B]: at one of the last steps the partner touches no part of the ego's path from that step on.
 
     The path is the ego's own boxes until the contact, and a straight strip of its width ahead of the last of them.
     """
     states, size, stop, partner = batch["states"], batch["size"], batch["stop"], batch["partner"].clamp(min=0)[:, None]
     row = torch.arange(len(states), device=states.device)[:, None]
-    window = stop[:, None] + torch.arange(-CUT_IN_STEPS, 1, device=states.device)
+    window = stop[:, None] + torch.arange(-steps, 1, device=states.device)
     known, window = (window >= 0) & (window < stop[:, None]), window.clamp(min=0)
     other, other_size = states[row, window, partner], size[row, partner]
     known = known & batch["valid"][row, window, partner]
@@ -244,13 +265,14 @@ def judge(batch: Batch) -> tuple[Batch, Tensor]:
     """
     hit, driver = batch["hit"], torch.full_like(batch["states"][:, :, 0], torch.nan)
     found = {name: torch.full_like(driver[:, 0, 0], torch.nan) for name in COLUMNS}
-    duty, struck = torch.full_like(batch["stop"], -1), torch.zeros_like(hit)
+    duty = torch.full_like(batch["stop"], -1)
+    struck, broke = torch.zeros_like(hit), torch.zeros_like(hit)
     if hit.any():
-        of_hits, duty[hit], human = collision_verdicts(batch, hit)
+        of_hits, duty[hit], broke[hit], human = collision_verdicts(batch, hit)
         driver[hit], struck[hit] = human.states, human.struck
         for name, value in of_hits.items():
             found[name][hit] = value
-    fault = at_fault(batch, struck)
+    fault = at_fault(batch, struck=struck, broke=broke, prevented=found["preventable"] == 1)
     counted = torch.maximum(fault, found["preventable"])
     known = torch.zeros_like(fault).masked_fill(batch["start_overlap"], torch.nan)
     rates = {"cfr_counted": counted, "cfr_preventable": found["preventable"]}
@@ -258,16 +280,18 @@ def judge(batch: Batch) -> tuple[Batch, Tensor]:
     return found | rates | {"at_fault": fault, "counted": counted, "duty": duty}, driver
 
 
-def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Prevention]:
-    """COLUMNS, duty [C] and the human driver's Prevention of the C collisions hit [B] bool."""
+def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor, Prevention]:
+    """COLUMNS, duty [C], whether the ego broke one [C], and the human driver's Prevention of the C collisions hit [B]
+    bool."""
     vehicles = (batch["valid"] & (batch["agent_type"] == VEHICLE)[:, None])[hit]
     collision = Collision(batch["states"][hit], vehicles, batch["size"][hit], batch["partner"][hit], batch["stop"][hit])
     row, ran = torch.arange(len(collision.stop)), batch.get("ran_light")
-    red = torch.full_like(collision.stop, -1) if ran is None else ran[hit][row, collision.partner]
+    pair = torch.stack([torch.zeros_like(collision.partner), collision.partner], 1)
+    red = torch.full_like(pair, -1) if ran is None else ran[hit].gather(1, pair)
     lanes, result = (batch["lane_points"][hit], batch["lane_index"][hit]), preventions(collision)
     leads = leading_edge(batch)[hit]
     trailing = batch["kind"][hit] == torch.where(leads == FRONT, REAR, FRONT)
-    duty = duties(collision, trailing, red, lanes, result["human"].struck)
+    duty, ego_broke = duties(collision, trailing, red, lanes, result["human"].struck)
     ego_moved, partner_moved = batch["moved_into"][hit].unbind(1)
     kept_its_way = ego_moved & ~partner_moved & (duty != LIGHT) & (duty != WRONG_WAY)
     duty = duty.masked_fill(kept_its_way, NONE)
@@ -280,7 +304,7 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Preven
     found["preventable"] = found.pop("preventable_human")
     found["preventable_chain"] = found["preventable"] * (human.followers > 0)
     found["replayed"] = found["preventable"] * (partner_moves & (batch["kind"][hit] != leads))
-    return found, duty, human
+    return found, duty, ego_broke & (duty != REAR_END), human
 
 
 def clean(found: Batch) -> Tensor:

@@ -68,7 +68,7 @@ class SceneBuilder:
         self.repairs = Counter(recording.repairs)
         check(extent(recording), recording.scene_id)
         self.valid = drop_jumps(recording.states, recording.valid)
-        egos = [recording.ego, *recording.egos.values()]
+        egos = recording.all_egos()
         self.valid[:, egos] = recording.valid[:, egos]  # without the ego there is no scene
         self.mended, turned = mend_headings(recording.states, recording.valid, recording.agent_type)
         recording = replace(recording, states=self.mended)

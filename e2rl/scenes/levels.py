@@ -5,19 +5,21 @@ heights, agents whose ways come near the ego's on other levels alone are found h
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.paths import arc_length
-from e2rl.scenes.recording import VEHICLE, Recording
+from e2rl.scenes.recording import DT, VEHICLE, Recording
 
 LEVEL = 4.0  # m between what is on different levels: bridges leave as much to what passes below
 NEAR = 6.0  # m at most between ways that meet
 AHEAD = 150.0  # m of lanes beyond what an agent drove where it may yet come to
 STRIDE = 3  # frames between the places of a track that are compared
 ON_LANE, UNEVEN = 3.0, 1.5  # m: of a vehicle on a lane; deviation of heights up to which the two agree
+DRIVES = 10.0  # m that a vehicle drives whose heights vary, where they are measured
 SAMPLES, AGREE = 200, 0.8  # places of vehicles that are held against lanes; the fraction that has to agree
 
 
@@ -29,11 +31,12 @@ class Levels:
 
     def __init__(self, recording: Recording, graph: LaneGraph, valid: np.ndarray) -> None:
         """valid [F, A]: frames of the tracks that count."""
-        self.recording, self.graph, self.valid = recording, graph, valid
+        self.recording = recording if ego_climbs(recording, valid) else replace(recording, heights=None)
+        self.graph, self.valid = graph, valid
         self.lane_height = np.full(len(graph.points), np.nan)
-        if recording.heights is not None:
-            heights = [_at_points(graph, name) for name in graph.ids]
-            self.lane_height = self._levelled(np.concatenate(heights))
+        if self.recording.heights is not None:
+            height = np.concatenate([_at_points(graph, name) for name in graph.ids])
+            self.lane_height = self._levelled(height)
 
     def _levelled(self, height: np.ndarray) -> np.ndarray:
         """Lane heights [P] on the scale of the tracks, which may be of boxes' middles; NaN where the two disagree.
@@ -53,7 +56,9 @@ class Levels:
         for value in sorted(np.unique(np.round(offset)), key=abs):
             count = len(np.unique(sample[np.abs(offset - value) < UNEVEN]))
             best, explained = (value, count) if count > explained else (best, explained)
-        if explained < AGREE * len(np.unique(sample)) or not explained:
+        known = height[np.isfinite(height)]
+        drawn_flat = len(known) > 0 and np.ptp(known) == 0
+        if explained < (1.0 if drawn_flat else AGREE) * len(np.unique(sample)) or not explained:
             return np.full_like(height, np.nan)
         return height + np.median(offset[np.abs(offset - best) < UNEVEN])
 
@@ -87,8 +92,8 @@ class Levels:
         places, heights = [track[::STRIDE, :2]], [height[::STRIDE]]
         if recording.agent_type[agent] == VEHICLE:
             reach = arc_length(track[:, :2])[-1] + AHEAD
-            starts = [name for name, _ in self.near_lanes(track[0, :2], track[0, 2], height[0])]
-            for name in _reached(graph, starts, reach):
+            places_on_lanes = dict(self.near_lanes(track[0, :2], track[0, 2], height[0]))
+            for name in _reached(graph, places_on_lanes, reach):
                 rows = slice(*graph.first_point[[graph.number[name], graph.number[name] + 1]])
                 known = np.isfinite(self.lane_height[rows])
                 places.append(graph.points[rows][known])
@@ -122,9 +127,29 @@ def _at_points(graph: LaneGraph, name: str) -> np.ndarray:
     return np.interp(np.linspace(0, arc[-1], len(line)), arc, lane.heights)
 
 
-def _reached(graph: LaneGraph, starts: list[str], reach: float) -> list[str]:
-    """Lanes that begin at most `reach` m after the beginnings of `starts`."""
-    begin = dict.fromkeys(starts, 0.0)
+def ego_climbs(recording: Recording, valid: np.ndarray) -> bool:
+    """Returns whether the ego's heights are measured: those of some logs (nuScenes) are 0 whatever it drives, and the
+    others' are relative to it, so that who drives ahead of it uphill is above it.
+
+    Args:
+        recording: with states [F, A, 4], and heights [F, A] m or None.
+        valid: [F, A] bool, frames of the tracks that count.
+    """
+    if recording.heights is None:
+        return False
+    heights = np.where(valid, recording.heights, np.nan)
+    drives = (np.abs(recording.states[..., 3]) * valid).sum(0) * DT > DRIVES
+    drives &= recording.agent_type == VEHICLE
+    if not drives[recording.ego]:
+        return True
+    change = np.array([np.nanmax(track) - np.nanmin(track) for track in heights[:, drives].T])
+    own = np.nanmax(heights[:, recording.ego]) - np.nanmin(heights[:, recording.ego])
+    return bool(own > 0 or np.median(change) == 0)
+
+
+def _reached(graph: LaneGraph, starts: dict[str, float], reach: float) -> list[str]:
+    """Lanes that begin at most `reach` m after places [m] on `starts`."""
+    begin = {name: -place for name, place in starts.items()}
     waiting = list(starts)
     while waiting:
         name = waiting.pop(0)

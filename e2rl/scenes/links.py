@@ -141,11 +141,17 @@ def adjacent(lanes: dict[str, Lane], lines: dict[str, np.ndarray]) -> tuple[dict
     repairs: Counter[str] = Counter()
     angle = {name: tangent_angle(line) for name, line in lines.items()}
 
+    def lateral(name: str, other: str) -> float:
+        distance = _lateral(lines[name], angle[name], lines[other], angle[other])
+        if np.isnan(distance):  # the other may be short, between two places that were compared
+            distance = -_lateral(lines[other], angle[other], lines[name], angle[name])
+        return distance
+
     def nearest(name: str, recorded: list[str], side: int) -> list[str]:
         others = [other for other in dict.fromkeys(recorded) if other in lanes and other != name]
         if not others:
             return []
-        away = np.array([side * _lateral(lines[name], angle[name], lines[other], angle[other]) for other in others])
+        away = np.array([side * lateral(name, other) for other in others])
         room = [(plausible_width(lanes[name].width) + plausible_width(lanes[other].width)) / 2 for other in others]
         near = (away > -BESIDE) & (away < np.array(room) + SPARE)
         apart = near & (away > BESIDE)

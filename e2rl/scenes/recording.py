@@ -112,6 +112,10 @@ class Recording:
     towed: tuple[int, ...] = ()
     coupled: tuple[int, ...] = ()
 
+    def all_egos(self) -> list[int]:
+        """Returns the tracks that are the ego's at any start frame."""
+        return sorted({self.ego, *self.egos.values()} - {-1})
+
     def start_frames(self, starts: Sequence[int] | None, steps: int) -> list[int]:
         """Returns the start frames of `windows`; none where the log is too short for them.
 

@@ -7,7 +7,7 @@ import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import numpy as np
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_regular
 from e2rl.scenes.log_files import MAX_BYTES, LogFiles
+from e2rl.scenes.paths import tangent_angle, wrap
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import AGENT_TYPES, DT, LIGHT_UNKNOWN, Lane, Recording, light_colour
@@ -33,6 +34,7 @@ SIZES = {  # m: usual length and width by a track's type, for those that say non
     "TRAFFIC_BARRIER": (2.0, 0.5),
 }
 SMALL = (0.7, 0.7)  # m: of every other type
+IS_HEADING = 0.3  # rad at most from the lanes' directions at all their points: their third numbers are headings
 
 
 @dataclass
@@ -193,6 +195,14 @@ def _recorded_size(track: dict, known: np.ndarray) -> list[float] | None:
     return size if len(size) == 2 else None
 
 
+def _are_headings(lines: list[np.ndarray]) -> bool:
+    """Returns whether the third numbers of lanes [P, 3] are no heights but headings, as ScenarioNet's converter of
+    nuScenes writes them."""
+    numbers = np.concatenate([np.zeros(0), *(line[:, 2] for line in lines)])
+    tangents = np.concatenate([np.zeros(0), *(tangent_angle(line[:, :2]) for line in lines)])
+    return bool(numbers.any() and np.abs(wrap(numbers - tangents)).max() < IS_HEADING)
+
+
 def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
     """Lanes for motor vehicles by id, and the drivable polygons that belong to them."""
     lanes, drivable = {}, []
@@ -213,6 +223,9 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
         )
         if len(feature.get("polygon", ())) >= 3:
             drivable.append(np.array(feature["polygon"], float)[:, :2])
+    lines = [np.column_stack([lane.points, lane.heights]) for lane in lanes.values() if lane.heights is not None]
+    if _are_headings(lines):
+        lanes = {name: replace(lane, heights=None) for name, lane in lanes.items()}
     return lanes, drivable
 
 

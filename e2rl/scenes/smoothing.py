@@ -24,6 +24,7 @@ FLIP = 2.0  # rad from one frame to the next, which no vehicle turns
 TOP_SPEED = 45.0  # m/s; recorded speeds beyond it are glitches
 REVERSES, LATELY = 0.25, 5  # m/s, frames: slower motion backwards is noise, of 4 sd where positions jitter by 2 cm
 REVERSED = 0.5  # m: what drives less far backwards does not reverse
+AT_REST, REST_FRAMES = 0.1, 3  # m/s on average, to so many frames after or before, of what has halted or not moved off
 
 
 def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -229,7 +230,18 @@ def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     around = _mean_velocity(states[..., :2], valid, back=LATELY // 2, ahead=LATELY // 2)
     out[..., 3] = _signed(along, ~fitted | ((around * unit).sum(-1) < -REVERSES))
     _stop_short_reversing(out[..., 3], valid)
+    out[..., 3] = np.where(_at_rest(states[..., :2], valid), 0.0, out[..., 3])
     return out
+
+
+def _at_rest(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Returns where tracks [F, A, 2] m have halted, or have not yet moved off, bool [F, A]: a polynomial that is fitted
+    across a hard stop goes on for half a second."""
+    known = valid[1:] & valid[:-1]
+    beyond = np.zeros_like(valid[:1])
+    after = np.linalg.norm(_mean_velocity(position, valid, back=0, ahead=REST_FRAMES), axis=-1) < AT_REST
+    before = np.linalg.norm(_mean_velocity(position, valid, back=REST_FRAMES, ahead=0), axis=-1) < AT_REST
+    return (after & np.concatenate([known, beyond])) | (before & np.concatenate([beyond, known]))
 
 
 def _stop_short_reversing(speed: np.ndarray, valid: np.ndarray) -> None:

@@ -7,13 +7,15 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from e2rl.scenes.paths import wrap
 from e2rl.scenes.recording import DT, VEHICLE, Recording
 
 DRIVEN, DRIVES = 5.0, 1.0  # m that a pair drives, m/s above which its frames count
-FRAMES = 10  # of a pair that drives
+FRAMES = 30  # of a pair that drives: followers keep a distance for a second or two, too
 REACH = 2.5  # m at most from a tractor's rear to its trailer's front
+ASIDE, OVERLAP = 0.5, 0.5  # m at most by which a trailer's front is beside its tractor's rear, in line, and before it
 HEADWAY = 0.25  # s: nobody follows another vehicle at that distance
 PLAY = 0.2  # m by which that distance varies, in nine of ten frames
 ALIGNED = 0.2  # rad between both up to which they are one long box
@@ -47,30 +49,63 @@ def _pairs(recording: Recording) -> list[tuple[int, int]]:
 
     A vehicle is in one pair at most: the next one of a road train is found once the first are joined.
     """
-    states, valid = recording.states, recording.valid
-    speed = np.abs(states[..., 3]) * valid
+    speed = np.abs(recording.states[..., 3]) * recording.valid
     drives = (speed.sum(0) * DT > DRIVEN) & (recording.agent_type == VEHICLE)
-    drives[[*recording.towed]] = False
-    tracks = np.flatnonzero(drives)
-    front, rear = _ends(states[:, tracks], recording.size[tracks, 0])
-    moving = (speed[:, tracks] > DRIVES)[:, :, None] & valid[:, tracks][:, None]
-    gap = np.linalg.norm(rear[:, :, None] - front[:, None], axis=-1)  # [F, tractor, trailer]
-    gap = np.where(moving, gap, np.nan)
-    near = (moving.sum(0) >= FRAMES) & (np.where(moving, gap, np.inf).min(0, initial=np.inf) < REACH)
-    np.fill_diagonal(near, False)
+    moving = (speed > DRIVES) & drives
+    front, rear = _ends(recording.states, recording.size[:, 0])
+    fixed = {*recording.all_egos(), *recording.towed}  # no trailers
     found = []
-    for one, other in np.argwhere(near):
-        distances = gap[moving[:, one, other], one, other]
-        middle, top = np.median(distances), speed[moving[:, one, other], tracks[one]].max()
+    for tractor, trailer in sorted(_near_pairs(front, rear, moving, recording.valid)):
+        frames = np.flatnonzero(moving[:, tractor] & recording.valid[:, trailer])
+        offset = front[frames, trailer] - rear[frames, tractor]
+        distances = np.linalg.norm(offset, axis=-1)
+        if len(frames) < FRAMES or trailer in fixed or not _behind(recording, tractor, trailer, frames, offset=offset):
+            continue
+        middle = np.median(distances)
         play = np.quantile(np.abs(distances - middle), 0.9)
-        if middle < min(REACH, HEADWAY * top) and play < PLAY and tracks[other] != recording.ego:
-            found.append((middle, int(tracks[one]), int(tracks[other])))
+        if middle < min(REACH, HEADWAY * speed[frames, tractor].max()) and play < PLAY:
+            found.append((middle, tractor, trailer))
     pairs, taken = [], set[int]()
     for _, tractor, trailer in sorted(found):
         if not taken & {tractor, trailer}:
             pairs.append((tractor, trailer))
             taken |= {tractor, trailer}
     return pairs
+
+
+def _near_pairs(front: np.ndarray, rear: np.ndarray, moving: np.ndarray, valid: np.ndarray) -> set[tuple[int, int]]:
+    """Returns pairs of tracks of which the first moves and has the other's front within REACH of its rear at a frame.
+
+    Args:
+        front, rear: [F, A, 2] m.
+        moving, valid: [F, A] bool.
+    """
+    pairs = set()
+    driving = moving.any(0)
+    for frame in np.flatnonzero(moving.any(1)):
+        tractors, trailers = np.flatnonzero(moving[frame]), np.flatnonzero(valid[frame] & driving)
+        near = cKDTree(front[frame, trailers]).query_ball_point(rear[frame, tractors], REACH)
+        pairs |= {
+            (int(tractor), int(trailers[index]))
+            for tractor, indices in zip(tractors, near, strict=True)
+            for index in indices
+            if trailers[index] != tractor
+        }
+    return pairs
+
+
+def _behind(recording: Recording, tractor: int, trailer: int, frames: np.ndarray, *, offset: np.ndarray) -> bool:
+    """Returns whether a trailer's front is behind its tractor's rear, and not beside it, where both are in line.
+
+    offset: [frames, 2] m from that rear to that front.
+    """
+    heading = recording.states[frames, tractor, 2]
+    in_line = np.abs(wrap(heading - recording.states[frames, trailer, 2])) < ALIGNED
+    if not in_line.any():
+        return True
+    ahead = (offset * np.stack([np.cos(heading), np.sin(heading)], -1)).sum(-1)[in_line]
+    aside = (offset * np.stack([-np.sin(heading), np.cos(heading)], -1)).sum(-1)[in_line]
+    return bool(np.median(np.abs(aside)) < ASIDE and np.median(ahead) < OVERLAP)
 
 
 def _ends(states: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +123,7 @@ def _turns(recording: Recording, tractor: int, trailer: int) -> bool:
 
 def _marked(recording: Recording, tractor: int, trailer: int) -> Recording:
     """Returns the recording with a trailer that only a replay shows; without it, where the ego is the tractor."""
-    if tractor in {recording.ego, *recording.egos.values()}:
+    if tractor in recording.all_egos():
         valid = recording.valid.copy()
         valid[:, trailer] = False
         return replace(recording, valid=valid)

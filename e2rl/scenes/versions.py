@@ -74,18 +74,24 @@ def unparked(recording: Recording) -> Recording:
     lines = [resample(lane.points, 1.0) for lane in recording.lanes.values() if len(lane.points) > 1]
     beside = cKDTree(np.concatenate([np.zeros((0, 2)), *lines])).query(np.where(stands[:, None], low, 0.0))[0] > BESIDE
     keep = ~(stands & beside & (recording.agent_type == VEHICLE))
-    keep[[recording.ego, *recording.egos.values()]] = True
-    tracks = {name: getattr(recording, name)[:, keep] for name in ("states", "valid")}
-    of = {name: getattr(recording, name)[keep] for name in ("size", "agent_type")}
+    keep[recording.all_egos()] = True
     place = np.cumsum(keep) - 1
-    egos = {start: int(place[ego]) if ego >= 0 else -1 for start, ego in recording.egos.items()}
-    return replace(recording, **tracks, **of, ego=int(place[recording.ego]), egos=egos)
+    return replace(
+        recording,
+        states=recording.states[:, keep],
+        valid=valid[:, keep],
+        heights=None if recording.heights is None else recording.heights[:, keep],
+        size=recording.size[keep],
+        agent_type=recording.agent_type[keep],
+        ego=int(place[recording.ego]),
+        egos={start: int(place[ego]) if ego >= 0 else -1 for start, ego in recording.egos.items()},
+    )
 
 
 def turned(recording: Recording) -> Recording:
     """With the others' headings off by HEADING_NOISE, the same all along a track."""
     noise = np.asarray(_draws(recording).normal(0.0, HEADING_NOISE, recording.valid.shape[1]))
-    noise[recording.ego] = 0.0
+    noise[recording.all_egos()] = 0.0
     states = recording.states.copy()
     states[..., 2] += noise
     return replace(recording, states=states)
@@ -100,12 +106,18 @@ def shifted(recording: Recording) -> Recording:
 
 
 def cropped(recording: Recording) -> Recording:
-    """With the lanes alone that come within CROP of the ego's path."""
-    path = recording.states[recording.valid[:, recording.ego], recording.ego, :2]
+    """With the lanes alone that come within CROP of the egos' paths."""
+    egos = recording.all_egos()
+    path = recording.states[:, egos, :2][recording.valid[:, egos]]
     if not len(path):
         return recording
     tree = cKDTree(path)
-    near = {name for name, lane in recording.lanes.items() if tree.query(lane.points)[0].min(initial=np.inf) < CROP}
+
+    def is_near(lane: Lane) -> bool:
+        points = resample(lane.points, CROP / 2) if len(lane.points) > 1 else lane.points
+        return bool(tree.query(points)[0].min(initial=np.inf) < CROP)
+
+    near = {name for name, lane in recording.lanes.items() if is_near(lane)}
     lanes = {name: lane for name, lane in recording.lanes.items() if name in near}
     lights = {name: light for name, light in recording.lights.items() if name in near}
     return replace(recording, lanes=lanes, lights=lights)

@@ -61,7 +61,8 @@ NO_LANES = torch.zeros(1, 2, 2, dtype=torch.float64), torch.full((1, 2), -1)
 
 def duty(case, red=-1, lanes=NO_LANES):
     struck = preventions(case)["human"].struck
-    return DUTIES[duties(case, torch.tensor([False]), torch.tensor([red]), lanes, struck).item()]
+    duty, _ = duties(case, torch.tensor([False]), torch.tensor([[-1, red]]), lanes, struck)
+    return DUTIES[duty.item()]
 
 
 def crossing(speed, from_left):
@@ -145,8 +146,8 @@ def test_a_red_light_counts_for_five_seconds(steps, expected):
     assert duty(case, red=case.stop.item() - steps) == expected
 
 
-@pytest.mark.parametrize(("off_until", "fault"), [(19, 1.0), (20, 0.0), (26, 0.0)])
-def test_whoever_enters_the_ego_s_path_less_than_a_second_before_the_contact_cuts_in(off_until, fault):
+@pytest.mark.parametrize(("off_until", "fault"), [(9, 1.0), (10, 0.0), (20, 0.0), (26, 0.0)])
+def test_whoever_enters_the_ego_s_path_in_the_last_two_seconds_cuts_in_where_nobody_prevents_it(off_until, fault):
     """The ego's front meets at step 30 a partner that is beside its path up to the step `off_until`."""
     states, valid = course(34.3, 0, 0, 0)
     states[:, 3], states[: off_until + 1, 1] = 5.0, 10.0
@@ -231,3 +232,63 @@ def test_the_driver_of_the_verdict_goes_with_the_rollout():
     torch.testing.assert_close(rollouts.driver[0, 0, :2], rollouts.states[0, 0, 0, :2])
     gap = rollouts.states[0, :, 1, 0] - rollouts.driver[0, :, 0]
     assert gap.min() > 4.8 and (rollouts.driver[0, :, 3].diff() < 0).any()
+
+
+@pytest.mark.parametrize("from_left", [True, False])
+@pytest.mark.parametrize("both", [False, True])
+def test_who_runs_a_red_light_into_crossing_traffic_is_at_fault_and_owed_no_way(from_left, both):
+    """The partner crosses at green; at red, too, the light is its own duty, and the rules of contacts decide."""
+    sign = 1 if from_left else -1
+    ego, partner = course(0, 0, 0, 10), course(40, sign * 30, -sign * math.pi / 2, 8)
+    contact = int(row_of(ego, partner)["contact_step"])
+    ran = torch.tensor([[contact - 5, contact - 5 if both else -1]])
+    row = row_of(ego, partner, ran_light=ran)
+    assert row["duty"] == ("light" if both else "none")
+    if not both:
+        assert row["at_fault"] == row["counted"] == 1
+
+
+def test_who_runs_a_red_light_and_is_run_into_from_behind_is_not_at_fault():
+    ego, partner = course(0, 0, 0, 8), course(-20, 0, 0, 14)
+    contact = int(row_of(ego, partner)["contact_step"])
+    row = row_of(ego, partner, ran_light=torch.tensor([[contact - 5, -1]]))
+    assert row["duty"] == "rear-end"
+    assert row["at_fault"] == 0
+
+
+def two_way():
+    """Lanes of a road: one along +x at y = 0, one along -x at y = 3.5."""
+    x = torch.arange(-60.0, 120.0, 2.0, dtype=torch.float64)
+    there = torch.stack([x, torch.zeros_like(x)], -1)
+    back = torch.stack([x.flip(0), torch.full_like(x, 3.5)], -1)
+    index = torch.tensor([0, 1]).repeat_interleave(len(x))
+    return {
+        "lane_points": torch.cat([there, back])[None],
+        "lane_index": index[None],
+        "lane_width": torch.full((1, 2), 3.5),
+    }
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_who_drives_on_the_wrong_side_towards_one_that_keeps_to_its_own_is_at_fault(wrong):
+    """Head-on on the lane along -x, or on that along +x."""
+    y = 3.5 if wrong else 0.0
+    row = row_of(course(0, y, 0, 10), course(60, y, math.pi, 10), **two_way())
+    assert row["at_fault"] == row["counted"] == (1 if wrong else 0)
+    assert row["duty"] == ("none" if wrong else "wrong way")
+
+
+def swerve_and_brake(gap):
+    """It comes over `gap` m ahead at the ego's 14 m/s, and brakes as hard as it can half a second later."""
+    partner = cut_in(gap, 14.0, 14.0)
+    braking = track(torch.cat([torch.full((14,), 14.0), (14.0 - 0.8 * torch.arange(67)).clamp(min=0)]))
+    partner[..., 0] = partner[..., :1, 0] + braking[..., 0]
+    partner[..., 3] = braking[..., 3]
+    return partner[0], torch.ones(81, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(("gap", "counted"), [(4.0, 0), (10.0, 1)])
+def test_who_swerves_in_and_brakes_counts_once_two_seconds_are_over(gap, counted):
+    row = row_of(course(0, 0, 0, 14), swerve_and_brake(gap))
+    assert row["contact_type"] == "front"
+    assert row["counted"] == counted

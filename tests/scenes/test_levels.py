@@ -86,3 +86,48 @@ def test_a_vehicle_is_on_the_lane_of_its_level_where_two_lie_one_above_the_other
     assert scene["valid"].sum() == 2, "one of the others is on the ego's level"
     limits = scene["route_limit"][scene["route_valid"]]
     assert np.allclose(limits, limit / 3.6)
+
+
+def test_headings_in_the_place_of_heights_are_none():
+    """ScenarioNet's converter of nuScenes writes them: a lane to the west would lie 3 m above one to the east."""
+    roads = {"west": lane([[300, 0], [0, 0], [-100, 0]]), "north": lane([[50, -200], [50, 0], [50, 200]])}
+    roads["west"]["polyline"][:, 2] = 3.1
+    roads["north"]["polyline"][:, 2] = 1.6
+    recording = recording_of(description({"ego": straight(0, 0, 8)}, roads))
+    assert [each.heights for each in recording.lanes.values()] == [None, None]
+
+
+def test_an_ego_whose_height_is_always_0_tells_nothing_of_those_ahead_uphill():
+    """Heights of the others are relative to it (nuScenes): the car ahead stays 5 m above it on the same road."""
+    tracks = {"ego": straight(0, 0, 8), "ahead": straight(60, 0, 8), "behind": straight(-60, 0, 8)}
+    wobble = 0.05 * np.sin(np.arange(len(tracks["ego"]["state"]["position"])))
+    for name, height in (("ahead", 5.0), ("behind", -5.0)):
+        tracks[name]["state"]["position"][:, 2] = height + wobble
+    recording = recording_of(description(tracks, {"road": lane([[-100, 0], [300, 0]])}))
+    builder = SceneBuilder(recording, SETTINGS)
+    assert builder.scene(recording)["valid"].sum() == 3
+
+
+def test_a_flat_map_below_tracks_with_heights_takes_no_lane_from_who_is_on_a_hill():
+    roads = {"road": lane([[-100, 0], [0, 0], [300, 0]])}
+    tracks = {"ego": straight(0, 0, 8), "hill": straight(100, 0, 8)}
+    tracks |= {f"flat{k}": straight(-20.0 * k, 0, 8) for k in range(1, 5)}
+    for each in tracks.values():
+        x = each["state"]["position"][:, 0]
+        each["state"]["position"][:, 2] = 0.1 * np.maximum(x - 50.0, 0.0)
+    recording = recording_of(description(tracks, roads))
+    levels = SceneBuilder(recording, SETTINGS).levels
+    assert np.isnan(levels.lane_height).all()
+
+
+def test_where_a_lane_leads_does_not_depend_on_where_its_vehicle_is_on_it():
+    """A car 400 m along a deck of 500 m, which a ramp of 100 m then brings down onto the ego's road."""
+    deck = lane([[-600, 50], [-100, 50]], exits=["ramp"])
+    ramp = lane([[-100, 50], [-50, 25], [0, 0]], exits=["road"])
+    road = lane([[0, 0], [300, 0]])
+    deck["polyline"][:, 2], ramp["polyline"][:, 2] = 7.0, [7.0, 3.5, 0.0]
+    tracks = {"ego": straight(20, 0, 8), "comes": straight(-160, 50, 8)}
+    tracks["comes"]["state"]["position"][:, 2] = 7.0
+    recording = recording_of(description(tracks, {"deck": deck, "ramp": ramp, "road": road}))
+    builder = SceneBuilder(recording, SETTINGS)
+    assert builder.scene(recording)["valid"].sum() == 2

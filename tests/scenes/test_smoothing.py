@@ -244,3 +244,19 @@ def test_a_light_holds_from_its_frame_on(rate):
 def test_impossible_time_stamps_are_refused(stamps):
     with pytest.raises(InputError, match="time stamps"):
         resample_uniform(accelerating(), np.ones((40, 1), bool), stamps)
+
+
+@pytest.mark.parametrize("braking", [4.0, 9.0])
+def test_who_has_halted_stands_and_who_has_not_moved_off_yet_does(braking):
+    """It brakes from 10 m/s to a halt, stands for a second, and moves off at 3 m/s^2."""
+    time = 0.1 * np.arange(120)
+    halts = 10.0 / braking
+    leaves = halts + 1.0
+    driven = np.where(time < halts, 10 * time - braking / 2 * time**2, 50.0 / braking)
+    driven = driven + 1.5 * np.maximum(time - leaves, 0.0) ** 2
+    states = np.zeros((len(time), 1, 4))
+    states[:, 0, 0] = driven
+    speed = smooth(states, np.ones((len(time), 1), bool))[:, 0, 3]
+    stands = (time >= halts) & (time <= leaves)
+    assert (speed[stands] == 0).all()
+    assert speed[(time < halts - 0.5) | (time > leaves + 0.5)].min() > 0.4

@@ -78,3 +78,23 @@ def test_vehicles_that_follow_each_other_are_two(speed, distance):
 def test_who_comes_nearer_is_no_trailer():
     log = recording(driving(10, 3.5, 10.0), driving(4.8, 3.5, 9.9), sizes=[(4.5, 1.9)] * 2)
     assert not couple(log).repairs
+
+
+@pytest.mark.parametrize(("aside", "back"), [(1.2, 0.0), (1.6, 1.0)])
+def test_who_rides_beside_another_is_no_trailer(aside, back):
+    log = recording(driving(10, 3.5, 12.0), driving(10 - back, 3.5 + aside, 12.0), sizes=[(2.2, 0.8)] * 2)
+    assert not couple(log).repairs
+
+
+def test_the_ego_of_another_window_is_no_trailer():
+    log = recording(driving(10, 3.5, 15.0), driving(0.7, 3.5, 15.0), sizes=[(6, 2.4), (12, 2.6)])
+    assert couple(log).repairs == {JOINED: 1}
+    assert not couple(Recording(**{**vars(log), "egos": {40: 2}})).repairs
+
+
+@pytest.mark.parametrize("gaps", [(0.3, 0.5), (0.5, 0.3)])
+def test_both_trailers_of_a_road_train_that_turns_are_shown_by_a_replay_alone(gaps):
+    first = 6 / 2 + gaps[0] + 6 / 2
+    second = first + 6 / 2 + gaps[1] + 6 / 2
+    log = recording(on_a_circle(0, 15), on_a_circle(first, 15), on_a_circle(second, 15), sizes=[(6, 2.4)] * 3)
+    assert sorted(couple(log).towed) == [2, 3]

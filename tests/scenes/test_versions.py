@@ -20,7 +20,7 @@ CHANGED = {  # fields of a Recording that a version may change
     "unlit": {"lights"},
     "unlimited": {"lanes"},
     "unmeasured": {"lanes"},
-    "unparked": {"states", "valid", "size", "agent_type", "ego"},
+    "unparked": {"states", "valid", "size", "agent_type", "ego", "heights"},
     "turned": {"states"},
     "shifted": {"lanes", "drivable"},
     "cropped": {"lanes", "lights"},
@@ -168,3 +168,13 @@ def test_an_invalid_version_beside_the_log_is_left_out_and_alone_is_told(monkeyp
 def test_versions_that_are_none_are_named(versions, message):
     with pytest.raises(InputError, match=message):
         e2rl.load_scenes("bundled", num_scenes=1, versions=versions)
+
+
+def test_heights_go_with_their_tracks(recordings):
+    """Each track has its own number for a height, and keeps it where others are left out."""
+    recording = recordings[0]
+    number = np.broadcast_to(np.arange(recording.valid.shape[1], dtype=float), recording.valid.shape)
+    whole = replace(recording, heights=number.copy())
+    kept = VERSIONS["unparked"](whole)
+    assert kept.heights.shape == kept.valid.shape
+    assert np.array_equal(whole.states[:, kept.heights[0].astype(int)], kept.states)
