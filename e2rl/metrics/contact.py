@@ -35,7 +35,8 @@ def first_contact(batch: Batch) -> Batch:
     that overlap the ego at `stop`. partner [B]: the one with the largest overlap. kind [B]: index into KINDS, by the
     ego's edge that is hit. Partner and kind are -1 without a contact. before [B]: the step before the contact, or the
     contact's own where the partner was absent before. passes [B]: they pass through each other before `stop`, where
-    they are apart again.
+    they are apart again. born_inside [B, T+1, N]: agents that overlap the ego as they have since they appeared, which
+    is no contact.
     """
     states, valid, size = batch["states"], batch["valid"], batch["size"]
     row = torch.arange(len(states), device=states.device)
@@ -59,7 +60,8 @@ def first_contact(batch: Batch) -> Batch:
         boxes = boxes_at_contact(states[hit], size[hit], partner[hit], before[hit], stop[hit], latest[hit])
         kind[hit] = contact_kind(*boxes)
     contact = {"area": area, "start_overlap": overlaps[:, 0], "hit": hit, "stop": stop, "touching": at_stop > 0}
-    return contact | {"partner": partner, "kind": kind, "before": before, "passes": hit & (latest < 1)}
+    contact |= {"partner": partner, "kind": kind, "before": before, "passes": hit & (latest < 1)}
+    return contact | {"born_inside": born_inside}
 
 
 def with_passing(
@@ -113,8 +115,8 @@ def between(before: Tensor, after: Tensor, fraction: Tensor) -> Tensor:
 def since_birth(overlap: Tensor, valid: Tensor) -> Tensor:
     """Returns the steps [B, T+1, N] bool at which agents overlap the ego as they have since they appeared.
 
-    Whoever appears within the ego, at the start or after more than HIDDEN steps of absence, touches it only after they
-    have been apart once. Agents of the first step are there from before, and not counted here.
+    Whoever appears within the ego, after more than HIDDEN steps of absence, touches it only after they have been apart
+    once. Agents of the first step are there from before, and not counted here.
 
     Args:
         overlap: [B, T+1, N] bool, agents that overlap the ego.

@@ -28,6 +28,7 @@ NEAREST = 16  # vehicles that come nearest to the ego are seen
 AFTER = round(3.0 / DT)  # steps beyond the ego's contact for which the driver must have none
 CHAIN = 2  # followers that may be driven again
 CREEPING = 0.5  # m/s: an ego that is slower does not run into anybody
+MOVED = 0.02  # m within a step that tell the direction of motion
 SAME_WAY = 0.5  # cosine of the headings of a follower and its leader at least
 
 
@@ -54,6 +55,27 @@ def driven_length(states: Tensor) -> Tensor:
     return torch.nn.functional.pad(states[..., :2].diff(dim=1).norm(dim=-1).cumsum(-1), (1, 0))
 
 
+def last_direction(states: Tensor, step: Tensor) -> Tensor:
+    """Returns the direction [B] rad in which vehicles moved last: against their heading where they reversed, and have
+    halted since.
+
+    Args:
+        states: [B, T+1, 4]; speeds may be without sign.
+        step: [B] int64, up to which motion counts and whose heading is taken.
+    """
+    row = torch.arange(len(step), device=step.device)
+    change = states[..., :2].diff(dim=1)
+    steps = torch.arange(change.shape[1], device=step.device)
+    moved = (change.norm(dim=-1) > MOVED) & (steps < step[:, None])
+    last = torch.where(moved, steps, -1).amax(1)
+    heading = states[..., 2]
+    began = heading[row, last.clamp(min=0)]
+    along = change[row, last.clamp(min=0)]
+    backwards = (last >= 0) & (along[:, 0] * began.cos() + along[:, 1] * began.sin() < 0)
+    present = heading[row, step]
+    return torch.where(backwards, wrap(present + torch.pi), present)
+
+
 def poses(states: Tensor, s: Tensor) -> Tensor:
     """Poses [B, K, 3] at arc lengths s [B, K] of a path states [B, T+1, 4], straight on beyond its end."""
     length = driven_length(states)
@@ -63,7 +85,7 @@ def poses(states: Tensor, s: Tensor) -> Tensor:
     first, second = (states.gather(1, index[..., None].expand(-1, -1, 4)) for index in (after - 1, after))
     heading = first[..., 2] + fraction[..., 0] * wrap(second[..., 2] - first[..., 2])
     beyond = (s - length[:, -1:]).clamp(min=0)[..., None]
-    onwards = travel_heading(states[:, -1:])
+    onwards = last_direction(states, torch.full_like(s[:, 0], states.shape[1] - 1).long())[:, None]
     ahead = torch.stack([onwards.cos(), onwards.sin()], -1)
     return torch.cat([torch.lerp(first[..., :2], second[..., :2], fraction) + beyond * ahead, heading[..., None]], -1)
 
@@ -229,7 +251,7 @@ def _follows(leader: Tensor, others: Tracks, touched: Tensor, index: Tensor) -> 
     row = torch.arange(len(index), device=index.device)
     step = touched[row, :, index].int().argmax(1)
     other, ahead = others.states[row, step, index], leader[row, step]
-    onwards = travel_heading(ahead)
+    onwards = last_direction(leader, step)
     behind = to_frame(other[:, :2], torch.cat([ahead[:, :2], onwards[:, None]], -1))[:, 0] < 0
     return behind & ((travel_heading(other) - onwards).cos() > SAME_WAY)
 

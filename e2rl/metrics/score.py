@@ -71,6 +71,7 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     traffic = batch["simulated"].clone()
     traffic[:, 0] = False
     batch = batch | {"traffic": traffic} | first_contact(batch)
+    batch["valid"] = batch["valid"] & ~batch["born_inside"]  # nobody avoids who appears within the ego
     batch["moved_into"] = moved_into(batch)
     verdicts, driver = judge(batch)
     batch, result = batch | verdicts | {"driver": driver}, verdicts

@@ -84,12 +84,16 @@ def up_to_contact(batch: Batch, steps: int) -> tuple[Tensor, Tensor]:
 def sideways(states: Tensor, lanes: Tensor) -> tuple[Tensor, Tensor]:
     """Metres across their lanes, to the left, that vehicles states [C, W + 1, P, 4] have moved since the first step
     [C, W + 1, P], and that direction [C, W + 1, P, 2]; lanes [C, W + 1, P]: headings."""
+    aside = torch.stack([-lanes.sin(), lanes.cos()], -1)
     change = wrap(lanes.diff(dim=1))
     middle = lanes[:, :-1] + change / 2
     step = states[..., :2].diff(dim=1)
     across = step[..., 1] * middle.cos() - step[..., 0] * middle.sin()
     across = torch.cat([torch.zeros_like(lanes[:, :1]), across.cumsum(1)], 1)
-    return across, torch.stack([-lanes.sin(), lanes.cos()], -1)
+    # Who turns round comes to a lane that runs against the one before, of which its left is the right.
+    turns = (change.abs() > ALIGNED).any(1, keepdim=True)
+    whole = ((states[..., :2] - states[:, :1, :, :2]) * aside).sum(-1)
+    return torch.where(turns, whole, across), aside
 
 
 def lane_headings(batch: Batch, window: Tensor, every: int) -> Tensor:

@@ -48,6 +48,7 @@ ONCOMING = 5 * torch.pi / 6  # rad from which on it comes towards it
 TURN = torch.pi / 7  # rad of heading within the last four seconds that make a turn
 TURN_STEPS = round(4.0 / DT)
 CUT_IN_STEPS = 10  # 1 s at 10 Hz
+TURNED = 1e-3  # rad: a heading that has changed less is the same
 AHEAD = 30.0  # m, straight on from the contact, that count as the ego's path
 LANE_HALF = 1.75  # m from a lane's centreline to its edge
 
@@ -153,7 +154,8 @@ def at_fault(batch: Batch, *, struck: Tensor, broke: Tensor, prevented: Tensor) 
     runs_into = torch.where(batch["moved_into"].any(1), moved, runs_into)
     fault = moves & (stood(batch, partner) | runs_into) & ~turned_on_the_spot(batch)
     ego_stood = stood(batch, torch.zeros_like(partner))
-    fault = fault | (~moves & ego_stood & blocks(batch, partner)) | (broke & ~ego_stood)
+    fault = fault | (~moves & ego_stood & blocks(batch, partner))
+    fault = fault | (broke & ~ego_stood & ~turned_on_the_spot(batch))
     return fault.to(speed.dtype).masked_fill(~batch["hit"], torch.nan)
 
 
@@ -165,8 +167,8 @@ def leading_edge(batch: Batch) -> Tensor:
 
 
 def turned_on_the_spot(batch: Batch) -> Tensor:
-    """Bool [B]: the partner stands, and the ego would not touch it if it had kept the heading with which it halted (or
-    is first known)."""
+    """Bool [B]: the partner stands, has turned since it halted (or is first known), and the ego would not touch it with
+    the heading that it had then, neither at the contact nor within the second after it."""
     states, stop = batch["states"], batch["stop"]
     row, partner = torch.arange(len(stop), device=stop.device), batch["partner"].clamp(min=0)
     track, known = states[row, :, partner], batch["valid"][row, :, partner]
@@ -174,8 +176,11 @@ def turned_on_the_spot(batch: Batch) -> Tensor:
     moves = (track[..., 3].abs() > STANDING) | ~known
     since = torch.where(moves & (steps < stop[:, None]), steps + 1, 0).amax(1)
     held = torch.cat([track[row, stop, :2], track[row, since, 2:3], track[row, stop, 3:]], -1)
-    apart = separation(states[row, stop, 0], batch["size"][:, 0], held, batch["size"][row, partner]) > 0
-    return batch["hit"] & (since < stop) & ~moves[row, stop] & apart
+    turned = wrap(track[row, stop, 2] - track[row, since, 2]).abs() > TURNED
+    later = (stop[:, None] + torch.arange(CUT_IN_STEPS + 1, device=stop.device)).clamp(max=states.shape[1] - 1)
+    ego, size = states[row[:, None], later, 0], batch["size"]
+    apart = separation(ego, size[:, :1], held[:, None], size[row, partner][:, None]) > 0
+    return batch["hit"] & (since < stop) & ~moves[row, stop] & turned & apart.all(1)
 
 
 def stood(batch: Batch, agent: Tensor) -> Tensor:

@@ -184,3 +184,34 @@ def test_a_standing_car_that_turns_on_the_spot_makes_no_failure_that_counts(turn
 def test_a_cyclist_s_or_nobody_s_contact_is_no_movement_into_anybody():
     found = verdict(course(0, 0, EAST, 9), course(0, 30, EAST, 9))
     assert found["cfr"] == 0 and math.isnan(found["at_fault"]) and found["duty"] == ""
+
+
+@pytest.mark.parametrize("placing", range(5))
+@pytest.mark.parametrize("speed", [0.6, 1.0, 2.0])
+def test_a_standing_car_whose_heading_jitters_is_run_into_all_the_same(speed, placing):
+    """The front of the ego meets its rear straight on; its recorded heading changed by two degrees."""
+    states, valid = course(4.5 + speed * (2.0 + 0.02 * placing), 0, 0, 0)
+    states[5:, 2] = math.radians(2)
+    row = verdict(course(0, 0, 0, speed), (states, valid))
+    assert row["cfr"] == 1
+    assert row["counted"] == 1
+
+
+@pytest.mark.parametrize("radius", [3.3, 3.5, 3.7])
+def test_a_u_turn_into_the_lane_of_who_comes_is_at_fault_until_its_nose_has_been_there_for_a_second(radius):
+    """The ego turns from y = 0 into the lane at y = 7, along which somebody comes from behind it."""
+    speed, begins = 5.0, 2.0
+    time = 0.1 * torch.arange(81, dtype=torch.float64)
+    angle = ((time - begins) * speed / radius).clamp(0, math.pi)
+    turned = angle * radius
+    straight = (speed * time).clamp(max=speed * begins)
+    back = (speed * (time - begins) - turned).clamp(min=0)
+    x = straight + radius * angle.sin() - back
+    ego = torch.stack([x, radius * (1 - angle.cos()), angle, torch.full_like(time, speed)], -1)
+    contact = int((begins + radius * math.radians(165) / speed) / 0.1)
+    meets = ego[contact, 0].item() + 2.4
+    partner = course(meets + 14 * 0.1 * contact, 7.0, math.pi, 14.0)
+    row = verdict((ego, torch.ones(81, dtype=torch.bool)), partner, straight_lanes(0.0))
+    assert row["cfr"] == 1
+    assert row["at_fault"] == 1
+    assert row["duty"] == "none"

@@ -292,3 +292,24 @@ def test_who_swerves_in_and_brakes_counts_once_two_seconds_are_over(gap, counted
     row = row_of(course(0, 0, 0, 14), swerve_and_brake(gap))
     assert row["contact_type"] == "front"
     assert row["counted"] == counted
+
+
+@pytest.mark.parametrize("gap", [5.0, 6.5])
+def test_who_reverses_and_halts_after_the_contact_is_judged_as_the_same_motion_forwards(gap):
+    ego, partner = course(0, 0, 0, 4, accel=-1.0), course(4.5 + gap, 0, 0, 0)
+    backwards = ego[0].clone()
+    backwards[:, 2], backwards[:, 3] = math.pi, -ego[0][:, 3]
+    forwards_row, row = row_of(ego, partner), row_of((backwards, ego[1]), partner)
+    assert forwards_row["cfr"] == 1
+    for name in ("at_fault", "preventable", "preventable_fsm", "preventable_rss", "counted", "duty"):
+        assert row[name] == forwards_row[name], name
+
+
+def test_who_appears_within_the_ego_and_is_gone_again_changes_nothing():
+    ego, leader = course(0, 0, 0, 12), course(30.5, 0, 0, 5)
+    states, valid = course(0, 0, 0, 12, appears=4)
+    valid[9:] = False
+    alone = score_rollouts(scene(ego, leader))[0][0]
+    row = score_rollouts(scene(ego, leader, (states, valid)))[0][0]
+    for name in ("cfr", "contact_step", "at_fault", "preventable", "counted", "cfr_clean", "min_dtc", "avoidable"):
+        assert row[name] == alone[name] or math.isnan(alone[name]), name
