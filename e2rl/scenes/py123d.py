@@ -1,12 +1,14 @@
 """Source of logs that py123d has converted: nuScenes, nuPlan, Waymo, Argoverse 2, KITTI-360 and others in one format
 (Arrow; extra `py123d`; docs/data.md).
 
-The ego is the recording vehicle. Logs of a higher rate are read at about 10 Hz, long ones in pieces.
+The ego is the recording vehicle. Logs of a higher rate are read at about 10 Hz, long ones and those
+with pauses in pieces.
 """
 
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +36,8 @@ from e2rl.scenes.source import Source
 SYNC = "sync.arrow"  # every log's folder holds one
 FILES = (SYNC, "ego_state_se3.arrow", "box_detections_se3.arrow", "traffic_light_detections.arrow", "map.arrow")
 MAX_BYTES = 1 << 29  # of one of these files
-LONGEST, PIECE = 30.0, 20.0  # s: longer logs are cut into pieces
+LONGEST, PIECE, SHORTEST = 30.0, 20.0, 5.0  # s: longer logs are cut into pieces; the least between two pauses
+PAUSE = 1.0  # s without the ego or boxes at which a log is cut
 REACH = 250.0  # m around the ego's path in which the map is taken
 TYPES = {"VEHICLE": VEHICLE, "TRAIN": VEHICLE, "TWO_WHEELER": CYCLIST, "PERSON": PEDESTRIAN}  # others are OTHER
 LEFT_OUT = ("EGO", "TRAFFIC_SIGN", "TRAFFIC_LIGHT")  # the ego's own box, and what stands beside or hangs over the road
@@ -150,14 +153,24 @@ def _frames(scene: Any) -> list[Frame]:
 
 
 def _pieces(frames: list[Frame]) -> Iterator[list[Frame]]:
-    """The frames of a log, those of a long one in pieces; what is left at its end and is too short to be one is not."""
-    if frames[-1].time - frames[0].time <= LONGEST:
-        yield frames
-        return
+    """Yields the frames of a log, those of a long one, or of one with pauses, in pieces.
+
+    What is too short to be one, between two pauses or at the end, is left out.
+
+    Args:
+        frames: two or more.
+    """
     times = np.array([frame.time for frame in frames])
-    for start in np.arange(times[0], times[-1] - PIECE + DT / 2, PIECE):
-        first, last = np.searchsorted(times, (start - 1e-6, start + PIECE + 1e-6))
-        yield frames[first:last]
+    steps = np.diff(times)
+    pauses = np.flatnonzero(steps > max(PAUSE, 1.5 * float(np.median(steps)))) + 1  # some logs are of 1 Hz
+    for begin, end in pairwise([0, *pauses, len(frames)]):
+        length = times[end - 1] - times[begin]
+        if length > LONGEST:
+            for start in np.arange(times[begin], times[end - 1] - PIECE + DT / 2, PIECE):
+                first, last = np.searchsorted(times, (start - 1e-6, start + PIECE + 1e-6))
+                yield frames[first:last]
+        elif length >= SHORTEST or not len(pauses):
+            yield frames[begin:end]
 
 
 def _recording(scene_id: str, frames: list[Frame]) -> Recording:

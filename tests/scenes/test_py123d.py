@@ -64,12 +64,17 @@ def write_map(root, location="town"):
     return about
 
 
-def write_log(root, name="log", seconds=12.0, rate=10.0, location="town", about=None):
-    """The ego at 8 m/s from x = 20 m, a truck that turns, a cyclist, a pedestrian for 2 s, a cone, a sign; a light."""
+def write_log(root, name="log", seconds=12.0, rate=10.0, location="town", about=None, pauses=()):
+    """The ego at 8 m/s from x = 20 m, a truck that turns, a cyclist, a pedestrian for 2 s, a cone, a sign; a light.
+
+    Nothing is there between the times of pauses [(begin, end)] in s.
+    """
     writer = ArrowLogWriter(LogWriterConfig(), root / "logs", root / "sensors")
     assert writer.reset(d.LogMetadata("made", "made_val", name, location, about))
     for step in range(int(seconds * rate) + 1):
         time = step / rate
+        if any(begin < time < end for begin, end in pauses):
+            continue
         stamp = d.Timestamp.from_us(1_000_000_000 + round(1e6 * time))
         ego = d.EgoStateSE3.from_imu(turned(20 + 8 * time - 1.5, 0, 0), EGO, stamp)
         found = [
@@ -156,6 +161,21 @@ def test_a_long_log_is_cut_into_pieces(tmp_path):
     assert [piece.scene_id for piece in pieces] == ["log#0", "log#1"]
     assert [len(piece.states) for piece in pieces] == [201, 201]
     assert pieces[1].states[0, 0, 0] == pytest.approx(20 + 8 * PIECE)
+
+
+def test_a_log_is_cut_at_its_pauses(tmp_path):
+    write_map(tmp_path)
+    log = write_log(tmp_path, seconds=78.0, pauses=[(12.0, 30.0), (30.15, 35.0)])
+    pieces = recordings(log)
+    assert [piece.scene_id for piece in pieces] == ["log#0", "log#1", "log#2"]
+    assert [len(piece.states) for piece in pieces] == [121, 201, 201], "nothing of the 0.1 s between the pauses"
+    assert [piece.states[0, 0, 0] for piece in pieces] == pytest.approx([20, 20 + 8 * 35, 20 + 8 * 55])
+    assert all(piece.valid[:, 0].all() for piece in pieces)
+
+
+def test_a_log_of_1_hz_has_no_pauses(tmp_path):
+    write_map(tmp_path)
+    assert len(recordings(write_log(tmp_path, rate=0.9, seconds=20.0))) == 1
 
 
 def test_it_makes_scenes_from_the_root_and_from_a_split(made, tmp_path):
