@@ -5,6 +5,7 @@ told by SIGTERM or when the process that writes its standard input is gone, howe
 """
 
 import ctypes
+import gc
 import multiprocessing
 import os
 import resource
@@ -15,25 +16,28 @@ import threading
 import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing import popen_fork
 from pathlib import Path
 
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # of prctl(2)
 PAUSE = 0.02  # s between two looks at what is left
 GRACE = 1.0  # s between SIGTERM and SIGKILL
 PATIENCE = 5.0  # s in which a killed process ends, unless it hangs in the kernel
+LOOK = 0.3  # s between two looks at who has ended
 PROCESSES = Path("/proc")
-FINISHING = (b"multiprocessing.resource_tracker", b"wandb", b"/ray/", b"ray::")  # they end by themselves, and tidy up
+# Helpers of libraries, which end by themselves, and tidy up: programs, what Ray's workers call
+# themselves, Ray's own scripts, and what Python runs by -c.
+PROGRAMS = (b"raylet", b"gcs_server", b"wandb-core", b"wandb-symon")
+TITLE, SCRIPTS, CODE = b"ray::", b"-packages/ray/", b"from multiprocessing.resource_tracker"
 
 
 def descendants(root: int, spared: Collection[int] = ()) -> list[int]:
     """Returns the processes that descend from `root`, in whatever group or session, but for `spared` and what descends
     from those alone; none where there is no /proc."""
     children: dict[int, list[int]] = {}
-    for folder in PROCESSES.glob("[0-9]*"):
-        with suppress(OSError):
-            state, parent = (folder / "stat").read_text().rpartition(") ")[2].split()[:2]
-            if state not in "ZX":
-                children.setdefault(int(parent), []).append(int(folder.name))
+    for process, state, parent in _processes():
+        if state not in "ZX":
+            children.setdefault(parent, []).append(process)
     found: list[int] = []
     waiting = [root]
     while waiting:
@@ -44,7 +48,7 @@ def descendants(root: int, spared: Collection[int] = ()) -> list[int]:
 
 
 def kill_descendants(spared: Collection[int] = ()) -> None:
-    """Kill all that this process has started and that they have started, but for `spared` and FINISHING."""
+    """Kill all that this process has started and that they have started, but for `spared` and helpers of libraries."""
     for child in multiprocessing.active_children():
         if child.pid not in spared:
             child.kill()
@@ -59,23 +63,97 @@ def kill_descendants(spared: Collection[int] = ()) -> None:
 
 @contextmanager
 def adopting() -> Iterator[None]:
-    """On Linux: what has lost its parent in the block becomes a child of this process, for `kill_descendants`."""
+    """On Linux: what has lost its parent in the block becomes a child of this process, for `kill_descendants`.
+
+    What of it ends leaves no zombie.
+    """
     if sys.platform != "linux":
         yield
         return
     library, before = ctypes.CDLL(None, use_errno=True), ctypes.c_int()
     library.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(before))
     library.prctl(PR_SET_CHILD_SUBREAPER, 1)
+    ended = threading.Event()
+    reaping = threading.Thread(target=Orphans().reap_until, args=(ended,), daemon=True)
+    reaping.start()
     try:
         yield
     finally:
+        ended.set()
+        reaping.join()
         library.prctl(PR_SET_CHILD_SUBREAPER, before.value)
 
 
+class Orphans:
+    """Adopted processes that have ended.
+
+    The system does not tell them from children that this process has started, whose status belongs
+    to whoever waits for them: those are the ones that a Popen object knows. Another waiter takes a
+    status at once, so what is left for a while is nobody's.
+    """
+
+    def __init__(self) -> None:
+        self._zombies: set[int] = set()  # at the last look
+        self._awaited: set[int] = set()
+
+    def reap_until(self, ended: threading.Event) -> None:
+        """Take the status of those that have ended, until the event, and then of the last."""
+        while not ended.wait(LOOK):
+            self._reap()
+        self._reap()
+        if self._zombies:
+            time.sleep(PAUSE)
+            self._reap()
+
+    def _reap(self) -> None:
+        """Take the status of those that had ended at the last look already."""
+        zombies = _zombies()
+        self._awaited &= zombies
+        left = (self._zombies & zombies) - self._awaited
+        if left:
+            self._awaited |= zombies & _known_to_popen()
+            for process in left - self._awaited:
+                with suppress(ChildProcessError):
+                    os.waitpid(process, os.WNOHANG)
+        self._zombies = zombies - self._awaited
+
+
+def _zombies() -> set[int]:
+    """Returns the children of this process that have ended and whose status nobody has taken."""
+    with suppress(ChildProcessError):
+        if os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
+            own = os.getpid()
+            return {process for process, state, parent in _processes() if state == "Z" and parent == own}
+    return set()
+
+
+def _known_to_popen() -> set[int]:
+    """Returns the processes that have an object in this one which may wait for them."""
+    kinds = (subprocess.Popen, popen_fork.Popen)
+    popens = [each for each in gc.get_objects() if issubclass(type(each), kinds)]
+    return {process for each in popens if (process := getattr(each, "pid", None)) is not None}
+
+
+def _processes() -> Iterator[tuple[int, str, int]]:
+    """Yields number, state and parent of all processes; none where there is no /proc."""
+    for folder in PROCESSES.glob("[0-9]*"):
+        with suppress(OSError):
+            state, parent = (folder / "stat").read_text().rpartition(") ")[2].split()[:2]
+            yield int(folder.name), state, int(parent)
+
+
 def _finishes(process: int) -> bool:
-    with suppress(OSError):
-        return any(name in (PROCESSES / str(process) / "cmdline").read_bytes() for name in FINISHING)
-    return False
+    """Returns whether a process is a helper of a library, by its program, title or script."""
+    try:
+        words = (PROCESSES / str(process) / "cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return False
+    if os.path.basename(words[0]) in PROGRAMS or words[0].startswith(TITLE):
+        return True
+    if not os.path.basename(words[0]).startswith(b"python"):
+        return False
+    script = next((word for word in words[1:] if not word.startswith(b"-")), b"")  # or the code of -c
+    return SCRIPTS in script or script.startswith(CODE)
 
 
 def _signal(processes: Collection[int], number: int) -> None:
