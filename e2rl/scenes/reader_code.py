@@ -113,13 +113,23 @@ def _imported_files(module: str, file: Path | None) -> dict[str, Path | None]:
 
 
 def _imports(file: Path, package: str) -> Iterator[str]:
-    """Yields the dotted names that a file may import, from anywhere in it."""
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    """Yields the dotted names that a file may import, from anywhere in it; none of one that is no Python.
+
+    A relative import that leads out of its package is none: files that catch its error name another.
+    """
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError):  # whoever imports it may catch that
+        return
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = "." * node.level + (node.module or "")
-            name = resolve_name(base, package) if node.level else base
+            try:
+                name = resolve_name(base, package) if node.level else base
+            except ImportError:
+                continue
             yield from (name, *(f"{name}.{alias.name}" for alias in node.names))
 
 
