@@ -26,6 +26,8 @@ from e2rl.run.run import Run, how_to_go_on
 from e2rl.run.settings import conf_folder
 from e2rl.run.trust import nodes
 
+BEFORE_QUOTE = re.compile(r"(\\+)(?='|$)")  # elsewhere Hydra keeps backslashes as they are
+
 
 def run_command(
     name: str,
@@ -116,7 +118,7 @@ def with_path(argument: str) -> str:
         value = str(Path(value).expanduser())
     elif value.isascii():
         return argument
-    quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+    quoted = BEFORE_QUOTE.sub(r"\1\1", value).replace("'", r"\'")
     return f"{option}='{quoted}'"
 
 

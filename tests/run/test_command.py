@@ -11,6 +11,8 @@ PATHS = {  # typed; the value that is read
     "data.path=~/logs/x.zip": str(Path.home() / "logs" / "x.zip"),
     "data.path=/data/łogs ü/fährten.zip": "/data/łogs ü/fährten.zip",
     "data.path=/data/o'neill é (1).zip": "/data/o'neill é (1).zip",
+    r"data.path=/data/a\ü": r"/data/a\ü",
+    r"data.path=/data/a\\ü\'b\\'c\\": r"/data/a\\ü\'b\\'c\\",
     "prior.checkpoint=~/a=b.pt": str(Path.home() / "a=b.pt"),
 }
 
