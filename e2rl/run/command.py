@@ -26,7 +26,7 @@ from e2rl.run.run import Run, how_to_go_on
 from e2rl.run.settings import conf_folder
 from e2rl.run.trust import nodes
 
-BEFORE_QUOTE = re.compile(r"(\\+)(?='|$)")  # elsewhere Hydra keeps backslashes as they are
+BEFORE_QUOTE = re.compile(r"(\\+)(?='|\Z)")  # elsewhere Hydra keeps backslashes as they are
 
 
 def run_command(

@@ -13,6 +13,7 @@ import io
 import json
 import os
 import re
+import secrets
 import shutil
 import stat
 import sys
@@ -42,7 +43,7 @@ WAIT = 5  # s that another run's workers have to end
 LOGGER = "wandb"
 HASH = "sha256"  # key in the header of a file of weights
 SEAL = "sha256.json"  # of a sealed folder: {file: hash}
-MODE = 0o644  # permissions of a new file
+LONG_NAME, SHORT_NAME = 230, 50  # bytes of a name that leave room for more; characters of a longer one that are kept
 ANY_WRITE = 0o222  # permissions to write
 MOST_LINKS = 40  # that lead to one file, as on Linux
 DESCRIPTOR = re.compile(r"/(?:dev|proc/(?P<process>\d+)(?:/task/\d+)?)/fd/(?P<number>\d+)")
@@ -225,13 +226,15 @@ def _write_through(path: Path, content: bytes | str | Callable[[Path], object]) 
 
 def _replace(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
     """Write a regular file, which keeps its permissions, or a new one."""
-    mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else MODE
-    if path.exists() and not (mode & ANY_WRITE and os.access(path, os.W_OK)):
+    mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else None
+    if mode is not None and not (mode & ANY_WRITE and os.access(path, os.W_OK)):
         raise PermissionError(errno.EACCES, "read-only", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    part = _part_of(path)
+    handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
+    if mode is None:
+        mode = stat.S_IMODE(os.fstat(handle).st_mode)  # as the umask has it
     os.close(handle)
-    part = Path(name)
     try:
         if callable(content):
             content(part)
@@ -242,6 +245,12 @@ def _replace(path: Path, content: bytes | str | Callable[[Path], object]) -> Non
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _part_of(path: Path) -> Path:
+    """Returns a name beside a path, of which there is none yet, for what it will be."""
+    name = path.name if len(os.fsencode(path.name)) <= LONG_NAME else path.name[:SHORT_NAME]
+    return path.with_name(f".{name}.{secrets.token_hex(8)}.part")
 
 
 def write_beside(path: Path, suffix: str, content: bytes | str | Callable[[Path], object]) -> None:
@@ -263,10 +272,10 @@ def written_whole(folder: Path) -> Iterator[Path]:
     """An empty folder under a temporary name beside `folder`, renamed to it where the block ends well, else removed."""
     folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".part"))
+    part = _part_of(folder)
+    part.mkdir()
     try:
         yield part
-        part.chmod(0o755)
         part.rename(folder)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)

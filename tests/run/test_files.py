@@ -80,6 +80,29 @@ def test_a_link_to_nothing_yet_makes_what_it_leads_to(tmp_path):
     assert (tmp_path / "link").is_symlink() and (tmp_path / "new" / "file").read_text() == "text"
 
 
+@pytest.mark.parametrize(("umask", "mode"), [(0o077, 0o600), (0o022, 0o644), (0o002, 0o664)])
+@pytest.mark.parametrize("content", ["new", by_path("new")])
+def test_new_files_and_folders_have_the_permissions_that_the_user_wants(tmp_path, content, umask, mode):
+    before = os.umask(umask)
+    try:
+        write_atomically(tmp_path / "file", content)
+        with written_whole(tmp_path / "folder") as folder:
+            (folder / "file").write_text("new")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == mode
+    assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o777 & ~umask
+
+
+@pytest.mark.parametrize("letter", ["a", "\N{OGHAM LETTER BEITH}"])
+def test_a_name_may_be_as_long_as_the_disk_allows(tmp_path, letter):
+    name = letter * (255 // len(letter.encode()))
+    write_atomically(tmp_path / name, "new")
+    with written_whole(tmp_path / name[1:]):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {name, name[1:]}
+
+
 @pytest.mark.parametrize("content", ["new", by_path("new")])
 def test_a_device_is_written_through_and_nothing_beside_it(tmp_path, content):
     """Another node of /dev/null, so that a mistake does not replace the machine's."""
