@@ -26,7 +26,8 @@ class Prefetch:
         """name: of the work, in messages; forked: in a process with one thread, else in a thread of this process."""
         context = multiprocessing.get_context("fork")
         self._name, (self._receiver, sender) = name, context.Pipe(duplex=False)
-        sys.stdout.flush(), sys.stderr.flush()  # or the fork would write them once more
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            stream.flush()  # or the fork would write it once more
         start: Callable = context.Process if forked else Thread
         self._worker = start(target=_run, args=(work, sender, os.getpid() if forked else None), daemon=True)
         self._worker.start()

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import select
 import shlex
 import signal
 import sys
@@ -56,14 +57,15 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
     others = descendants(os.getpid())
     try:
         yield
-        sys.stdout.flush()
+        if sys.stdout is not None:  # as after `>&-`
+            sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         if arrived or isinstance(error, KeyboardInterrupt):
             number = signal.Signals(arrived[0] if arrived else signal.SIGINT)
             _end(f"\ninterrupted ({number.name}); go on with: {go_on()}", 128 + number, others)
         if isinstance(error, InputError):
             _end(f"error: {' '.join(str(error).split())}", REFUSED, others)
-        if isinstance(error, BrokenPipeError):
+        if isinstance(error, BrokenPipeError) and _is_unread():
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the end of python complains, too
             _end(f"\nerror: nobody reads the output any more; go on with: {go_on()}", 1, others)
         failed = error.__cause__ if isinstance(error.__cause__, OSError) else error  # of logging that is set up
@@ -79,6 +81,17 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _is_unread() -> bool:
+    """Returns whether the standard output is a pipe that nobody reads any more."""
+    try:
+        number = sys.stdout.fileno()
+    except (AttributeError, ValueError):  # it is closed, or something else stands for it
+        return False
+    poll = select.poll()
+    poll.register(number, 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 def _end(message: str, status: int, others: Collection[int]) -> NoReturn:

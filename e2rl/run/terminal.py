@@ -43,9 +43,9 @@ class Bar(tqdm):
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         """Takes what tqdm takes."""
-        self.as_lines = not sys.stderr.isatty()
+        self.as_lines = sys.stderr is None or not sys.stderr.isatty()
         self._line_due = time.monotonic() + FIRST
-        super().__init__(*args, **settings)
+        super().__init__(*args, disable=sys.stderr is None, **settings)  # as after `2>&-`
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:
         """Show the state: draw the bar, or write a line where one is due."""

@@ -103,6 +103,24 @@ def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):
     assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
 
 
+@pytest.mark.parametrize(
+    ("code", "redirection", "status", "reason"),
+    [
+        ("print('good')", ">&-", 0, ""),
+        ("print('x' * 100_000)", "| true", 1, "error: nobody reads the output any more; go on with: again"),
+        ("time.sleep(0.5); print('x')", "| true", 1, "error: nobody reads the output any more; go on with: again"),
+        ("raise BrokenPipeError(32, 'Broken pipe')", "| cat", 1, "BrokenPipeError: [Errno 32] Broken pipe"),
+        ("raise BrokenPipeError(32, 'Broken pipe')", ">&-", 1, "BrokenPipeError: [Errno 32] Broken pipe"),
+    ],
+    ids=["closed", "unread", "unread at the end", "another pipe", "another pipe, closed"],
+)
+def test_an_output_that_nobody_reads_is_told_from_others(code, redirection, status, reason):
+    script = f"import time\nfrom e2rl.run.endings import ending\nwith ending(lambda: 'again'): {code}"
+    command = f'set -o pipefail; "$0" -c "$1" {redirection}'
+    done = subprocess.run(["bash", "-c", command, sys.executable, script], stderr=subprocess.PIPE, text=True)
+    assert done.returncode == status and done.stderr.strip().splitlines()[-1:] == ([reason] if reason else [])
+
+
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_is_one(capsys, monkeypatch, number, status):
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "a=$(touch x)"])
