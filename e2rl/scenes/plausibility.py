@@ -131,11 +131,11 @@ def motion(recording: Recording) -> dict[str, float]:
     turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
     turned = np.where(distance < BACKWARDS * FRAMES * DT, np.minimum(turned, pi - turned), turned)  # it may reverse
     single = recording.valid.any(0) & (recording.agent_type == VEHICLE)
-    single[[each for each in recording.coupled if each != recording.ego]] = False
-    size = recording.size[single]
+    single[[*recording.coupled, *recording.towed]] = False
+    length, width = np.median(recording.size[single], axis=0) if single.any() else (np.nan, np.nan)
     return {
-        "vehicle_length": float(np.median(size[:, 0])),
-        "vehicle_width": float(np.median(size[:, 1])),
+        "vehicle_length": float(length),
+        "vehicle_width": float(width),
         "speed": _median(distance / (FRAMES * DT)),
         "speed_ratio": _median(ratio),
         "direction": _median(turned[far]),

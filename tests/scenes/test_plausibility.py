@@ -108,6 +108,19 @@ def test_what_is_no_traffic_in_metres_on_its_map_is_refused_with_the_reason(genu
         build_scene(recording, SMALL)
 
 
+@pytest.mark.parametrize("part", ["coupled", "towed"])
+def test_vehicles_with_trailers_do_not_tell_the_usual_size(genuine, part):
+    """They are long, and an ego that is one may be alone."""
+    recording = copy.deepcopy(genuine)
+    others = [each for each in range(len(recording.size)) if each != recording.ego]
+    recording.size[recording.ego] = (18.0, 2.5)
+    recording.valid[:, others] = False
+    assert motion(recording)["vehicle_length"] == 18.0
+    setattr(recording, part, (recording.ego,))
+    assert np.isnan(motion(recording)["vehicle_length"]) and np.isnan(motion(recording)["vehicle_width"])
+    build_scene(recording, SMALL)
+
+
 def copies_of_a_lane(recording):
     lane = next(iter(recording.lanes.values()))
     recording.lanes |= {f"copy {number}": lane for number in range(4000)}
