@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from e2rl.run.errors import InputError
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.paths import arc_length, wrap
-from e2rl.scenes.recording import DT, VEHICLE, Recording
+from e2rl.scenes.recording import DT, FEW_FRAMES, VEHICLE, Recording
 
 FRAMES = 5  # between the two poses of a displacement: half a second
 MOVED, DRIVES = 1.0, 2.0  # m, m/s: a vehicle that moves
@@ -64,6 +64,8 @@ def check(measures: dict[str, float], scene_id: str) -> None:
     """InputError for the first measure outside of its limits; NaN, of what a log is too short to tell, passes."""
     for name, value in measures.items():
         low, high, what, mend = LIMITS[name]
+        if name == "states" and value < low:
+            raise InputError(f"scene {scene_id[:100]!r}: {FEW_FRAMES}")
         if not isnan(value) and not low <= value <= high:
             bound = f"at least {low:g}" if value < low else f"at most {high:g}"
             raise InputError(f"scene {scene_id[:100]!r}: {value:.3g} {what}, plausible is {bound}; {mend}")

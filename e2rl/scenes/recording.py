@@ -55,9 +55,10 @@ def light_colour(name: object, otherwise: int = LIGHT_UNKNOWN) -> int:
     return next((state for word, state in COLOURS.items() if word in words), otherwise)
 
 
+NUMBERS = "fiu"  # kinds of arrays
 ARRAYS = (  # fields of a Recording: name, kinds of numbers, columns, in words
     ("states", "f", 4, "a float array [frames, agents, 4]"),
-    ("size", "fiu", 2, "an array [agents, 2] of lengths and widths"),
+    ("size", NUMBERS, 2, "an array [agents, 2] of lengths and widths"),
     ("agent_type", "iu", 0, "an integer array [agents]"),
 )
 FIELDS: tuple[tuple[str, Any, str], ...] = (  # further ones: name, classes, in words
@@ -69,7 +70,10 @@ FIELDS: tuple[tuple[str, Any, str], ...] = (  # further ones: name, classes, in 
     ("repairs", Mapping, "a Counter"),
     ("egos", Mapping, "a dict of frames and tracks"),
     ("heights", np.ndarray | None, "an array [frames, agents], or None"),
+    ("towed", list | tuple, "a tuple of tracks"),
+    ("coupled", list | tuple, "a tuple of tracks"),
 )
+FEW_FRAMES = "fewer than two frames of different time stamps; leave it out"
 
 
 def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[str]:
@@ -196,6 +200,11 @@ class Recording:
             value = getattr(self, name)
             if not isinstance(value, types) or isinstance(value, bool):
                 raise self._wrong(name, value, text)
+        if self.heights is not None and not _are_numbers(self.heights, (frames, agents)):
+            raise self._wrong("heights", self.heights, f"numbers [frames, agents], as valid is of {shape}")
+        for name in ("towed", "coupled"):
+            if not all(_is_index(track, agents) for track in getattr(self, name)):
+                raise self._wrong(name, getattr(self, name), f"a tuple of tracks from 0 to {agents - 1}")
         self._validate_map(frames)
         return self
 
@@ -208,6 +217,9 @@ class Recording:
                 value = getattr(lane, part)
                 if not isinstance(value, np.ndarray) and not (part == "heights" and value is None):
                     raise self._wrong(f"lanes[{name!r}].{part}", value, "an array")
+            if lane.heights is not None and not _are_numbers(lane.heights, lane.points.shape[:1]):
+                count = len(lane.points) if lane.points.ndim else 0
+                raise self._wrong(f"lanes[{name!r}].heights", lane.heights, f"{count} numbers, one of each point")
             for part in ("width", "speed_limit"):
                 if not isinstance(getattr(lane, part), int | float | np.number):
                     raise self._wrong(f"lanes[{name!r}].{part}", getattr(lane, part), "a number")
@@ -256,6 +268,8 @@ class Recording:
         if self.states.shape != (frames, agents, 4) or not frames or not agents:
             shapes = f"states {self.states.shape} do not match valid {self.valid.shape}"
             return f"{shapes}; expected [frames, agents, 4] and [frames, agents]"
+        if frames < 2:
+            return FEW_FRAMES
         if not 0 <= self.ego < agents:
             return "no ego; name its track in metadata.sdc_id, or leave the scene out"
         if not self.lanes:
@@ -278,6 +292,18 @@ class Recording:
         return None
 
 
+def _are_numbers(values: np.ndarray, shape: tuple[int, ...]) -> bool:
+    """Returns whether an array is of numbers and of a shape."""
+    return values.dtype.kind in NUMBERS and values.shape == shape
+
+
+def _is_index(value: object, count: int) -> bool:
+    """Returns whether a value is one of 0 .. count - 1."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) < count
+
+
 def _are_points(points: np.ndarray) -> bool:
     """Whether an array is of finite points [P, 2 or more]."""
-    return points.ndim == 2 and points.shape[1] >= 2 and points.dtype.kind in "fiu" and bool(np.isfinite(points).all())
+    if points.ndim != 2 or points.shape[1] < 2 or points.dtype.kind not in NUMBERS:
+        return False
+    return bool(np.isfinite(points).all())

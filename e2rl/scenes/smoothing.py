@@ -8,7 +8,7 @@ from scipy.signal import savgol_coeffs
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.paths import wrap
-from e2rl.scenes.recording import DT
+from e2rl.scenes.recording import DT, FEW_FRAMES
 
 WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order
 CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
@@ -41,10 +41,12 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
         ts: their time stamps [F] s, ascending; frames of one time stamp become one.
 
     Raises:
-        InputError: time stamps that descend, or are not in seconds.
+        InputError: fewer than two time stamps, or such as descend or are not in seconds.
     """
     states, valid, ts = _merge_equal_stamps(states, valid, ts)
-    step = np.diff(ts) if len(ts) > 1 else np.array([np.nan])
+    if len(ts) < 2:
+        raise InputError(FEW_FRAMES)
+    step = np.diff(ts)
     median, in_order = float(np.median(step)), bool((step > 0).all())
     if not (in_order and FRAME_STEPS[0] <= median <= FRAME_STEPS[1] and step.max() < LONGEST_PAUSE):
         raise InputError(f"time stamps do not increase in seconds (median step {median:g}); repair metadata.ts")

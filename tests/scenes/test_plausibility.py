@@ -10,7 +10,7 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.builder import BuildSettings, build_scene
 from e2rl.scenes.bundled import read_recordings, unpack
 from e2rl.scenes.lane_graph import LaneGraph
-from e2rl.scenes.plausibility import LIMITS, extent, lane_spacing, map_fit, motion
+from e2rl.scenes.plausibility import LIMITS, check, extent, lane_spacing, map_fit, motion
 from e2rl.scenes.recording import VEHICLE, Lane
 
 SMALL = BuildSettings(steps=20, vehicles=4, others=2, field_cells=32)
@@ -119,6 +119,12 @@ def test_vehicles_with_trailers_do_not_tell_the_usual_size(genuine, part):
     setattr(recording, part, (recording.ego,))
     assert np.isnan(motion(recording)["vehicle_length"]) and np.isnan(motion(recording)["vehicle_width"])
     build_scene(recording, SMALL)
+
+
+@pytest.mark.parametrize("size", [0, 1])
+def test_a_log_of_one_frame_is_not_told_to_be_cut(size):
+    with pytest.raises(InputError, match="fewer than two frames"):
+        check({"states": size}, "short")
 
 
 def copies_of_a_lane(recording):

@@ -209,6 +209,17 @@ def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(tmp_path,
         load_scenes(config | {"lane_width": "wide"})
 
 
+def test_a_log_of_one_frame_is_told_so(tmp_path):
+    class Short(SpeedSource):
+        def read(self, log):
+            whole = next(SpeedSource.read(self, log))
+            yield replace(whole, states=whole.states[:1], valid=whole.valid[:1])
+
+    (tmp_path / "a.txt").write_text("5.0")
+    with pytest.raises(InputError, match=r"^a\.txt: scene 'a\.txt': fewer than two frames .*; leave it out"):
+        Short(str(tmp_path), cache=str(tmp_path), workers=1).load()
+
+
 @pytest.mark.parametrize("what", ["scene_id", "location", "dataset"])
 @pytest.mark.parametrize("name", ["a\ud800", "a\x1b[2J", "a\nb", "a\u202eb", "x" * 129, 7, None])
 def test_names_that_no_file_table_or_terminal_can_hold_are_refused_whatever_the_source(tmp_path, what, name):
@@ -287,6 +298,9 @@ WRONG = {  # a field of a recording of 200 frames and one car: what a mistaken r
         "a dict|an integer array",
     ),
     "repairs": ([None, 3], "a Counter"),
+    "heights": ([[0.0], np.zeros((200, 2)), np.full((200, 1), "low")], "an array|numbers"),
+    "towed": ([None, 0, (1,), (-1,), ("0",), (True,)], "a tuple of tracks"),
+    "coupled": ([None, 0, (1,), (-1,), ("0",), (0.0,)], "a tuple of tracks"),
 }
 
 
@@ -303,7 +317,15 @@ def test_a_field_of_another_kind_type_or_shape_is_named_with_its_log(tmp_path, n
 
 @pytest.mark.parametrize(
     ("part", "value"),
-    [("points", [[0, 0], [9, 0]]), ("width", None), ("exits", [1]), ("left", "road"), ("heights", [0])],
+    [
+        ("points", [[0, 0], [9, 0]]),
+        ("width", None),
+        ("exits", [1]),
+        ("left", "road"),
+        ("heights", [0]),
+        ("heights", np.zeros(3)),
+        ("heights", np.array(["low", "low"])),
+    ],
 )
 def test_a_field_of_a_lane_is_named_with_its_log(tmp_path, part, value):
     class Wrong(SpeedSource):
