@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import convolve1d, maximum_filter1d, median_filter
 
 from e2rl.scenes.paths import wrap
-from e2rl.scenes.recording import DT, PEDESTRIAN
+from e2rl.scenes.recording import DT, HIDDEN, PEDESTRIAN
 
 MAX_STEP = 5.0  # m from one frame to the next; more is a jump
 HALF = 3  # frames before and after over which the direction of motion is taken
@@ -211,12 +211,19 @@ def _interpolate_spikes(states: np.ndarray, valid: np.ndarray) -> int:
     for agent in np.flatnonzero((jump & valid[1:] & valid[:-1]).any(0)):
         frames = np.flatnonzero(valid[:, agent])
         heading = np.unwrap(states[frames, agent, 2])
-        spike = np.zeros(len(frames), bool)
-        for window, height in SPIKES:
-            if len(frames) >= window:
-                spike |= np.abs(heading - median_filter(heading, window, mode="mirror")) > height
-        spike &= moving[frames, agent]
+        # in a longer gap it may turn
+        runs = np.split(heading, np.flatnonzero(np.diff(frames) > HIDDEN + 1) + 1)
+        spike = np.concatenate([_spikes(run) for run in runs]) & moving[frames, agent]
         if spike.any() and not spike.all():
             states[frames[spike], agent, 2] = wrap(np.interp(frames[spike], frames[~spike], heading[~spike]))
             count += 1
     return count
+
+
+def _spikes(heading: np.ndarray) -> np.ndarray:
+    """Returns which headings [K] of frames without a long gap, and without wraps, are far from their median."""
+    spike = np.zeros(len(heading), bool)
+    for window, height in SPIKES:
+        if len(heading) >= window:
+            spike |= np.abs(heading - median_filter(heading, window, mode="mirror")) > height
+    return spike

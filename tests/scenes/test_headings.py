@@ -104,6 +104,25 @@ def test_spikes_are_interpolated(frames, angle):
     assert np.abs(wrap(mended[known, 0, 2] - states[known, 0, 2])).max() < 0.03
 
 
+def test_who_turns_while_hidden_has_no_spike():
+    heading = np.clip(1.2 * (TIME - 4), 0, np.pi / 2)
+    step = 0.4 * np.stack([np.cos(heading), np.sin(heading)], -1)
+    states = np.concatenate([np.cumsum(step, axis=0), heading[:, None], np.full((FRAMES, 1), 4.0)], -1)[:, None]
+    valid = EVERY.copy()
+    valid[30:70] = valid[72:] = False
+    mended, counts = mend_headings(turned_by(states, 0.5, slice(10, 11)), valid, TYPES)
+    assert counts == {SPIKES: 1}, "that before the gap"
+    assert_same(mended, states, valid)
+
+
+def test_a_spike_beside_frames_that_are_lost_is_one():
+    valid = EVERY.copy()
+    valid[[41, 44, 46]] = False
+    mended, counts = mend_headings(turned_by(MOTIONS["fast"], 1.2, np.array([42, 45])), valid, TYPES)
+    assert counts == {SPIKES: 1}
+    assert_same(mended, MOTIONS["fast"], valid)
+
+
 def test_a_log_whose_headings_are_all_turned_round_is_not_mended():
     """That is its convention, which is refused."""
     states = np.concatenate([turned_by(MOTIONS["fast"], np.pi)] * 4, axis=1)
