@@ -93,7 +93,7 @@ class Recording:
     agent_type [A]; ego: index of the ego's track; lights: lane id -> [F] light state; drivable: polygons [P, 2];
     current: the start frame, with at least one frame of history before it; None where the log names none;
     egos: the ego's track by start frame, where it is not the same for all (-1: nobody is there);
-    heights [F, A] m or None: of the tracks, which tell who is on a bridge (e2rl/scenes/levels.py);
+    heights [F, A] m (NaN: unknown) or None: of the tracks, which tell who is on a bridge (e2rl/scenes/levels.py);
     towed: tracks of trailers that nobody drives, but a replay shows; coupled: of vehicles with their trailers;
     repairs: how often reading mended something, by a phrase in the plural, such as "headings turned round".
     """

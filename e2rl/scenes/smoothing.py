@@ -33,10 +33,11 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     A grid frame is interpolated between the track's own valid frames before and after it, so that
     invalid rows never count, and is valid where `_bridged` allows this. Where it does not, as at the
     ends of a track, the log's frame nearest to the grid frame may still be a valid one of the track
-    within NEAR: then it is extrapolated from there. Elsewhere the states are 0.
+    within NEAR: then it is extrapolated from there, along its recorded speed where it is alone.
+    Elsewhere the states are 0.
 
     Args:
-        states: of the log's frames [F, A, 4]: x, y [m], heading [rad], speed [m/s].
+        states: of the log's frames [F, A, 4]: x, y [m], heading [rad], signed speed [m/s], 0 where unknown.
         valid: where they are recorded [F, A].
         ts: their time stamps [F] s, ascending; frames of one time stamp become one.
 
@@ -64,6 +65,10 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     before = np.where(between, before, np.minimum(inner, nearest))
     after = np.where(between, after, np.maximum(inner, nearest))
     out = _interpolate(states, ts, grid, before, after)
+    alone = near & ~between & (before == after)
+    way = np.where(alone, np.clip(out[..., 3], -TOP_SPEED, TOP_SPEED) * offset, 0.0)
+    out[..., 0] += way * np.cos(out[..., 2])
+    out[..., 1] += way * np.sin(out[..., 2])
     known = between | near
     return np.where(known[..., None], out, 0.0), known
 
@@ -71,16 +76,25 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
 def resample_heights(heights: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> np.ndarray | None:
     """Returns heights [G, A] m of tracks on the grid of `resample_uniform`; None where the log knows none.
 
+    Where a track's height is unknown, it is the nearest in time that is known; NaN, where none is.
+
     Args:
         heights: of the log's frames [F, A] m; all alike, or not finite, where the log has none.
         valid: where the tracks are recorded [F, A].
         ts: time stamps [F] s.
     """
-    known = heights[valid]
-    if not len(known) or not np.isfinite(known).all() or np.ptp(known) == 0:
+    known = valid & np.isfinite(heights)
+    if not known.any() or np.ptp(heights[known]) == 0:
         return None
     states = np.zeros((*heights.shape, 4))
     states[..., 0] = np.where(valid, heights, 0.0)
+    for agent in np.flatnonzero((valid & ~known).any(0)):
+        frames = np.flatnonzero(known[:, agent])
+        if not len(frames):
+            states[:, agent, 0] = np.nan
+            continue
+        nearest = np.searchsorted((ts[frames[1:]] + ts[frames[:-1]]) / 2, ts)
+        states[:, agent, 0] = heights[frames[nearest], agent]
     return resample_uniform(states, valid, ts)[0][..., 0]
 
 

@@ -6,7 +6,15 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.smoothing import causal_past, causal_state, drop_jumps, latest_frames, resample_uniform, smooth
+from e2rl.scenes.smoothing import (
+    causal_past,
+    causal_state,
+    drop_jumps,
+    latest_frames,
+    resample_heights,
+    resample_uniform,
+    smooth,
+)
 
 TIME = np.arange(40) * 0.1
 
@@ -223,6 +231,31 @@ def test_frames_of_one_time_stamp_are_one():
     out, known = resample_uniform(states, valid, seconds)
     expected, _ = resample_uniform(circle(np.unique(seconds)), np.ones((40, 1), bool), np.unique(seconds))
     assert known.all() and np.allclose(out, expected)
+
+
+@pytest.mark.parametrize("speed", [0.0, 6.0, -6.0])
+def test_a_frame_beside_the_grid_that_is_alone_is_moved_along_its_speed(speed):
+    seconds, frames, grid = np.arange(50) / 14, [10, 25], [7, 18]
+    states, valid = circle(seconds), np.zeros((50, 1), bool)
+    valid[frames], states[..., 3] = True, speed
+    out, known = resample_uniform(np.where(valid[..., None], states, 0.0), valid, seconds)
+    assert np.flatnonzero(known[:, 0]).tolist() == grid
+    x, y, heading, _ = states[frames, 0].T
+    way = speed * (0.1 * np.array(grid) - seconds[frames])
+    assert np.allclose(out[grid, 0, :3].T, [x + way * np.cos(heading), y + way * np.sin(heading), heading])
+
+
+def test_a_height_that_is_unknown_is_the_nearest_of_its_track_and_others_stay():
+    heights, valid = np.tile([0.0, 8.0, 4.0], (40, 1)), np.ones((40, 3), bool)
+    heights[:, 0] = TIME
+    heights[[0, 1, 9, 10], 0] = np.nan
+    heights[:, 2] = np.nan
+    out = resample_heights(heights, valid, TIME)
+    expected = TIME.copy()
+    expected[[0, 1, 9, 10]] = TIME[[2, 2, 8, 11]]
+    assert np.allclose(out[:, 0], expected) and (out[:, 1] == 8).all() and np.isnan(out[:, 2]).all()
+    assert resample_heights(np.full((40, 3), np.nan), valid, TIME) is None
+    assert resample_heights(np.where(valid, 1.0, heights), valid, TIME) is None
 
 
 def test_a_heading_that_flips_between_frames_is_never_halfway():
