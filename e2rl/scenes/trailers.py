@@ -20,6 +20,7 @@ HEADWAY = 0.25  # s: nobody follows another vehicle at that distance
 PLAY = 0.2  # m by which that distance varies, in nine of ten frames
 ALIGNED = 0.2  # rad between both up to which they are one long box
 LONGEST = 5  # vehicles of a road train
+STRAIGHTENS = 20  # frames in which a trailer that is not seen comes in line with its tractor
 JOINED = "trailers joined to their tractors"
 TURNING = "trailers that turn against their tractors, which only a replay shows"
 
@@ -133,8 +134,8 @@ def _marked(recording: Recording, tractor: int, trailer: int) -> Recording:
 def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
     """Returns the recording with both as one vehicle, in the tractor's track; the trailer's is empty.
 
-    Its box reaches from the tractor's front to the trailer's rear; where one of both is not there, it lies along the
-    other.
+    Its box reaches from the tractor's front to the trailer's rear; where one of both is not there, its angle to the
+    other passes from that before to that after, and beyond these to 0 within STRAIGHTENS frames.
     """
     pair = [tractor, trailer]
     states, valid, size = recording.states.copy(), recording.valid.copy(), recording.size.astype(float)
@@ -144,8 +145,10 @@ def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
     reach = np.linalg.norm(front[both, 0] - rear[both, 1], axis=-1)
     length = float(np.median(reach))
     alone = np.where(there[:, :1], states[:, tractor], states[:, trailer])
-    direction = np.stack([np.cos(alone[:, 2]), np.sin(alone[:, 2])], -1)
     chord = front[:, 0] - rear[:, 1]
+    angles = [_angle_to_chord(chord, states[:, each, 2], both) for each in pair]
+    along = alone[:, 2] + np.where(there[:, 0], *angles)
+    direction = np.stack([np.cos(along), np.sin(along)], -1)
     direction = np.where(both[:, None], chord / np.maximum(np.linalg.norm(chord, axis=-1), 1e-6)[:, None], direction)
     middle = np.where(there[:, :1], front[:, 0] - direction * length / 2, rear[:, 1] + direction * length / 2)
     heading = np.arctan2(direction[:, 1], direction[:, 0])
@@ -161,3 +164,17 @@ def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
         heights[:, tractor] = np.where(there[:, 0], heights[:, tractor], heights[:, trailer])
     coupled = (*recording.coupled, tractor)
     return replace(recording, states=states, valid=valid, size=size, heights=heights, coupled=coupled)
+
+
+def _angle_to_chord(chord: np.ndarray, heading: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Returns the angles [F] rad from a heading to a chord, interpolated where the chord is unknown.
+
+    Args:
+        chord: [F, 2] m.
+        heading: [F] rad.
+        known: [F] bool, at one frame at least.
+    """
+    frames = np.flatnonzero(known)
+    angle = wrap(np.arctan2(chord[frames, 1], chord[frames, 0]) - heading[frames])
+    ends = frames[0] - STRAIGHTENS, frames[-1] + STRAIGHTENS
+    return np.interp(np.arange(len(known)), [ends[0], *frames, ends[1]], [0.0, *angle, 0.0])

@@ -55,6 +55,23 @@ def test_a_road_train_is_one_vehicle_and_stays_where_it_is_while_one_part_is_hid
     assert np.diff(found.states[:, 1, 0]) == pytest.approx(np.full(FRAMES - 1, 1.5))
 
 
+@pytest.mark.parametrize("part", [1, 2])
+def test_a_long_box_stays_on_its_bend_while_one_part_is_hidden(part):
+    whole = recording(on_a_circle(0, 70), on_a_circle(9.3, 70), sizes=[(6, 2.4), (12, 2.6)])
+    log = recording(on_a_circle(0, 70), on_a_circle(9.3, 70), sizes=[(6, 2.4), (12, 2.6)])
+    log.valid[40:55, part] = log.valid[62:64, part] = False
+    expected, found = couple(whole).states[:, 1], couple(log).states[:, 1]
+    assert np.abs(found[:, 2] - expected[:, 2]).max() < 0.01
+    assert np.linalg.norm(found[:, :2] - expected[:, :2], axis=-1).max() < 0.05
+
+
+def test_a_trailer_that_is_lost_from_sight_comes_in_line_within_two_seconds():
+    log = recording(on_a_circle(0, 70), on_a_circle(9.3, 70), sizes=[(6, 2.4), (12, 2.6)])
+    log.valid[50:, 2] = False
+    angle = couple(log).states[:, 1, 2] - log.states[:, 1, 2]
+    assert angle[49] < -0.05 and np.abs(np.diff(angle)).max() < 0.01 and np.allclose(angle[69:], 0)
+
+
 def test_a_trailer_that_turns_is_shown_by_a_replay_alone_and_counted():
     log = recording(on_a_circle(0, 15), on_a_circle(9.3, 15), sizes=[(6, 2.4), (12, 2.6)])
     found = couple(log)
