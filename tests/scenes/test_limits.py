@@ -57,6 +57,24 @@ def test_a_motorway_keeps_its_limit_in_a_jam_too(speed):
     assert limits((STRAIGHT, 100), (bend(400), 100), speed=speed) == ([100.0, 100.0], [])
 
 
+LONG = np.array([[-300.0, 0], [900, 0]])
+RAMP = 60 * np.stack([np.cos(np.linspace(0, 1.5 * np.pi, 60)), np.sin(np.linspace(0, 1.5 * np.pi, 60))], 1)
+KINKED = np.array([[-300.0, 0], [500, 0], [499, 0.1], [512, 0], [520, 0], [900, 0]])
+
+
+@pytest.mark.parametrize("further", [RAMP, KINKED], ids=["a loop", "a kink"])
+@pytest.mark.parametrize("speed", [12, 25])
+def test_a_motorway_keeps_its_limit_beside_a_ramp_or_a_kink_of_its_map(further, speed):
+    assert limits(*[(LONG, 100)] * 3, (further, 100), speed=speed) == ([100.0] * 4, [])
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_connectors_of_an_intersection_lead_straight_on_too(turns):
+    straight = np.array([[0.0, 0], [25, 0]])
+    lanes = [(straight, 100)] * 2 + [(bend(12), 100)] * turns
+    assert limits(*lanes, (LONG, 0), speed=15)[0] == [0.0] * (turns + 3)
+
+
 def test_a_map_with_several_limits_knows_them():
     """Converters give the turns of an intersection the limit of their road."""
     assert limits((STRAIGHT, 90), (bend(10), 90), (STRAIGHT, 50), speed=9) == ([90.0, 90.0, 50.0], [])
