@@ -178,7 +178,7 @@ def pair_of(key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched
     """Two rollouts of one PAIR of which one has failed, None: none has; of a search the tries that are nearest to a
     preventable failure. `change` is of CHANGES, `what` differs between two failures: verdict, side of the ego,
     counterpart, time by LATER; of searches way; ending, where the planner raised in one of them. `preventable`: whether
-    one is."""
+    one is, as one in which the planner raised is."""
     first, second = (max(each, key=nearness) for each in (tries, others))
     ways = [{cell_of(row) for row in each} - {None} for each in (tries, others)]
     crashed = [any(map(raised, each)) for each in (tries, others)]
@@ -196,5 +196,6 @@ def pair_of(key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched
         differs = {"ending": crashed[0] != crashed[1], "way": searched and differs["way"]}
     what = [name for name, there in differs.items() if there] if all(failed) else []
     change = ("moved" if what else "same") if all(failed) else "gone" if failed[0] else "new"
-    about = {"change": change, "what": what, "preventable": any(map(bool, ways)), **dict(zip(PAIR, key, strict=True))}
+    preventable = any(map(bool, ways)) or any(crashed)
+    about = {"change": change, "what": what, "preventable": preventable, **dict(zip(PAIR, key, strict=True))}
     return about | {"first": first, "second": second} if any(failed) else None

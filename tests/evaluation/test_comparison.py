@@ -140,5 +140,7 @@ def test_a_planner_that_raises_is_a_failure_of_its_own_kind(tmp_path, searched):
     assert found == {
         **{"scene_0": ("new", []), "scene_1": ("gone", []), "scene_2": ("same", []), "scene_3": ("moved", ["ending"])}
     }
+    assert group["preventable"] == {"new": 1, "gone": 1, "moved": 1, "same": 1}, "to raise is a preventable failure"
+    assert group["differences"]["preventable"]["difference"] == 0
     assert group["of"] == 4, "what the traffic lost is no pair"
     assert group["differences"]["contacts"]["difference"] == 0
