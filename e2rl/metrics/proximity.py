@@ -21,7 +21,7 @@ SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 LEAST_WAY = 1.0  # m: of a shorter recorded way no fraction is known
 STANDING = 0.5  # m/s at the start frame
 MOVED = 2.0  # m from the start position
-per_km = partial(Metric, unit="1/km", per="driven_km", raised=1.0, tables="egos")
+per_km = partial(Metric, unit="1/km", per="driven_km", tables="egos")
 
 
 @columns(

@@ -146,7 +146,8 @@ def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor
     """Totals and weights [R, M] float64 of the rows' metrics, whose sums' quotient is the mean; NaN where unknown.
 
     The total of a metric is its value times its weight; of a metric `per` another column, just its value. Where the
-    planner raised, a metric has the value that it declares for that, over a distance of 0.
+    planner raised, a metric has the value that it declares for that. A metric `per` another column knows none: what a
+    rollout would have driven is unknown, and a failure over no distance is no rate.
     """
     errored = torch.tensor([raised(row) for row in rows], dtype=torch.bool)
 
@@ -157,9 +158,9 @@ def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor
     for metric in metrics:
         value, divisor = column(metric.source), metric.per or metric.weight
         weight = column(divisor) if divisor else torch.ones_like(value)
-        if not math.isnan(metric.raised):
+        if not (metric.per or math.isnan(metric.raised)):
             value = value.masked_fill(errored, metric.raised)
-            weight = weight.masked_fill(errored, 0.0 if metric.per else 1.0)
+            weight = weight.masked_fill(errored, 1.0)
         weights.append(weight)
         totals.append(value if metric.per else value * weights[-1])
     return torch.stack(totals, 1), torch.stack(weights, 1)

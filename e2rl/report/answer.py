@@ -85,9 +85,9 @@ def compared_answer(
     if pairs:
         old, new = max(pairs, key=lambda pair: pair[1]["eta"])
         lines += wrapped(
-            f"After training, {new['ego']} {ended(new)} in {of(new, 'cfr')} rollouts {traffic(new)} "
-            f"({rate(new, 'cfr')}); "
-            f"before it in {of(old, 'cfr')} ({rate(old, 'cfr')})."
+            f"After training, {new['ego']} was {ended(old, new)} in {of(new, 'cfr')} rollouts {traffic(new)} "
+            f"{bracketed(rate(new, 'cfr'), ends(new))}; "
+            f"before it in {of(old, 'cfr')} {bracketed(rate(old, 'cfr'), ends(old))}."
         )
         kinds = {"hit": "cfr", **{kind: KINDS[kind] for kind in ("preventable", "count")}, "progress [m]": "progress"}
         kinds |= {"clean": KINDS["clean"], "count per 1,000 km": "counted_per_km"}
@@ -130,15 +130,24 @@ def told(row: dict, nominal: dict | None) -> list[str]:
     if row.get("searched"):
         return [line for text in searched(row, nominal) for line in wrapped(text, "  ")]
     kind = "attacked rollouts" if row["eta"] else "rollouts"
-    found = f"{row['ego']} {ended(row)} in {of(row, 'cfr')} {kind} ({rate(row, 'cfr')})"
-    per_km = value(row, "counted_per_km")
-    rates = "" if per_km == UNKNOWN else f"Failures that count per 1,000 km driven: {per_km}"
-    sentences = [f"{found}.", verdict(row), rates and f"{rates}."]
-    if nominal:
-        sentences = [f"{found}, {of(nominal, 'cfr')} nominal.", verdict(row)]
-        sentences += [rates and f"{rates} attacked, {value(nominal, 'counted_per_km')} nominal."]
-        sentences += [effect(row, nominal), cost(row, nominal)]
+    driven = [row, nominal] if nominal else [row]
+    found = f"{row['ego']} was {ended(*driven)} in {of(row, 'cfr')} {kind} {bracketed(rate(row, 'cfr'), ends(row))}"
+    if nominal is None:
+        return [line for text in (f"{found}.", verdict(row), per_distance(row)) for line in wrapped(text, "  ")]
+    sentences = [f"{found}, {of(nominal, 'cfr')} nominal {bracketed(ends(nominal))}".strip() + ".", verdict(row)]
+    sentences += [per_distance(row, nominal), effect(row, nominal), cost(row, nominal)]
     return [line for sentence in sentences for line in wrapped(sentence, "  ")]
+
+
+def per_distance(row: dict, nominal: dict | None = None) -> str:
+    """The failures that count per distance, and how many rollouts, since the planner raised, are not in it."""
+    rates = [value(each, "counted_per_km") for each in (row, nominal) if each]
+    if rates[0] == UNKNOWN:
+        return ""
+    text = f"Failures that count per 1,000 km driven: {rates[0]}"
+    text += f" attacked, {rates[1]} nominal" if nominal else ""
+    crashed = sum(tally(each, "errored") for each in (row, nominal) if each)
+    return f"{text}; without {plural(crashed, 'rollout')} in which it raised." if crashed else f"{text}."
 
 
 def searched(row: dict, nominal: dict | None) -> list[str]:
@@ -148,10 +157,21 @@ def searched(row: dict, nominal: dict | None) -> list[str]:
     return [*sentences, cost(row, nominal)] if nominal else sentences
 
 
-def ended(row: dict) -> str:
-    """What a rollout that counts in `cfr` has come to."""
+def ended(*rows: dict) -> str:
+    """What rollouts that count in `cfr` have come to."""
+    return "hit, or raised," if any(tally(row, "errored") for row in rows) else "hit"
+
+
+def ends(row: dict) -> str:
+    """How many of the rollouts that count in `cfr` came to which of the two, "" where the planner never raised."""
     crashed = tally(row, "errored")
-    return f"was hit ({tally(row, 'cfr') - crashed}) or raised ({crashed})" if crashed else "was hit"
+    return f"hit in {tally(row, 'cfr') - crashed}, raised in {crashed}" if crashed else ""
+
+
+def bracketed(*parts: str) -> str:
+    """The parts that are there in brackets, "" where none is."""
+    text = "; ".join(filter(None, parts))
+    return f"({text})" if text else ""
 
 
 def verdict(row: dict) -> str:
@@ -226,7 +246,9 @@ def compared(rows: Sequence[dict]) -> list[str]:
     rest = len(ranked) - MOST_ROWS
     more = [f"... and {rest} more in tables.md"] if rest > 0 else []
     shown_rows = table if several else [line[1:] for line in table]
-    return [*wrapped(lead), *columns(shown_rows), *more, *wrapped(COUNTS)]
+    lost = sum(tally(row, "errored") for row in cells.values())
+    left_out = f" Rates per 1,000 km are without {plural(lost, 'rollout')} in which a planner raised." if lost else ""
+    return [*wrapped(lead), *columns(shown_rows), *more, *wrapped(COUNTS + left_out)]
 
 
 # --- weaknesses, and what was measured

@@ -147,6 +147,17 @@ def test_failures_per_kilometre_are_all_failures_over_all_kilometres():
     assert paired["relative"] == pytest.approx(3.0)
 
 
+def test_rates_per_distance_leave_out_what_the_planner_raised_in():
+    """2 failures in 0.5 km, and 20 rollouts in which it raised: 4 a km, not 44."""
+    values = [1.0, 0.0, 1.0] + [math.nan] * 20
+    rows = rows_of(values, driven_km=[0.1, 0.3, 0.1] + [math.nan] * 20, errored=[0.0] * 3 + [1.0] * 20)
+    table = brief(*rows)
+    assert table["failures_per_km"]["mean"] == pytest.approx(2 / 0.5) and table["failures_per_km"]["n"] == 3
+    assert table["cfr"]["mean"] == pytest.approx(22 / 23) and table["cfr"]["n"] == 23
+    nothing = brief(*rows_of([math.nan] * 2, driven_km=[math.nan] * 2, errored=[1.0] * 2))["failures_per_km"]
+    assert math.isnan(nothing["mean"]) and nothing["n"] == 0
+
+
 def test_a_paired_difference_uses_shared_scenes_and_is_narrower_than_unpaired_ones():
     generator = torch.Generator().manual_seed(3)
     base = torch.rand(60, generator=generator) * 10

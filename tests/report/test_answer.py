@@ -164,5 +164,13 @@ def test_rollouts_in_which_the_planner_raised_are_failures_and_named():
     about = {"method": "e2", "eta": 2.0, "seed": 0, "errored": 1.0, "raised_by": "ego", "error": "KeyError: lane"}
     rollouts = [about | {"scene_id": f"place_{k}"} for k in range(6)]
     text = " ".join(" ".join(answer_lines([crashed], rollouts=rollouts)).split())
-    assert "was hit (3) or raised (6) in 9 of 12 attacked rollouts" in text
+    assert "lane_graph was hit, or raised, in 9 of 12 attacked rollouts (75%; hit in 3, raised in 6)." in text
+    assert "per 1,000 km driven: 15,000; without 6 rollouts in which it raised." in text
+    nominal = row(cfr=1 / 12)
+    nominal["metrics"]["errored"] = value(1 / 12)
+    text = " ".join(" ".join(answer_lines([nominal, row("e2", 2.0, cfr=0.5)])).split())
+    assert "was hit, or raised, in 6 of 12 attacked rollouts (50%), 1 of 12 nominal (hit in 0, raised in 1)." in text
+    assert "10,000 attacked, 1,667 nominal; without 1 rollout in which it raised." in text
+    text = " ".join(answer_lines([row("a", 1.0, cfr=0.5), crashed], rollouts=rollouts))
+    assert "Rates per 1,000 km are without 6 rollouts in which a planner raised." in " ".join(text.split())
     assert "KeyError: lane (6 under e2 at η=2): place_0 (seed 0), place_1 (seed 0)" in text
