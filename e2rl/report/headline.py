@@ -21,15 +21,16 @@ def traffic_name(row: Mapping[str, Any]) -> str:
 
 def headline_text(found: Headline, ego: str, traffic: str) -> str:
     """The headline of an ego in a traffic, in a sentence or two."""
-    ways = f", in {plural(found.ways, 'way')}" if found.ways else ""
-    text = (
-        f"{ego} under {traffic}: preventable failures in {found.preventable} of {plural(found.scenes, 'scene')}{ways}"
-    )
+    scenes, ways = plural(found.scenes, "scene"), f", in {plural(found.ways, 'way')}" if found.ways else ""
+    text = f"{ego} under {traffic}: preventable failures in {found.preventable} of {scenes}{ways}"
+    if found.raised:
+        text = f"{ego} under {traffic}: preventable failures, or it raised, in {found.failed} of {scenes}"
     if found.searches:
         searches = "" if found.searches == 1 else f" and each of {found.searches} searches"
         text += f", within {found.tries:.1f} tries ({found.nfe:.0f} NFE) a scene{searches}"
     if found.raised:
-        text += f"; in {found.raised} the planner raised, in {found.failed} either"
+        text += f"; preventable failures in {found.preventable} of {found.scenes}{ways}"
+        text += f"; it raised in {found.raised} of {found.scenes}"
     return f"{text}."
 
 

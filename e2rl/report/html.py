@@ -182,7 +182,7 @@ def summary(group: Mapping, metrics: Sequence[dict], rows: Sequence[dict], searc
     known, crashed = rates(group, metrics, searched), any(map(raised, own))
     lines = [headline_text(headline(own, searched), group["ego_policy"], traffic_name(group))]
     if "cfr" in known:
-        lines.append(f"It was hit{' or raised' if crashed else ''} in {known['cfr']}.")
+        lines.append(f"It was hit{', or raised,' if crashed else ''} in {known['cfr']}.")
     if "cfr_counted" in known:
         reasons = f"its fault, or a competent driver prevents it{', or it raised' if crashed else ''}"
         lines.append(f"It has a failure that counts in {known['cfr_counted']}: {reasons}.")
