@@ -101,12 +101,13 @@ def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
     target = settings.get("_target_")
     try:
         made = instantiate(settings, _partial_=True, _convert_="all")(**given)
-    except InputError:
+    except (InputError, MemoryError, torch.OutOfMemoryError):
         raise
     except SystemExit as error:  # of outside code, perhaps as it is imported
         raise InputError(f"{where}={target}: it called sys.exit({error.code!r}) instead of being built") from error
-    except (InstantiationException, TypeError) as error:
-        reason = f"{where}={target}: cannot be built: {error.__cause__ or error}"
+    except Exception as error:  # outside code raises anything
+        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+        reason = f"{where}={target}: cannot be built: {type(cause).__name__}: {cause}"
         raise InputError(f"{reason}; check the class path and its arguments in conf/{where}") from error
     if not isinstance(made, kind):
         raise InputError(f"{where}={target}: is no {kind.__module__}.{kind.__name__}; subclass it")

@@ -65,6 +65,13 @@ class Unfinished(Ego):
     """It has neither `plan` nor `act`."""
 
 
+class Unlicensed(Cruise):
+    """Its constructor raises."""
+
+    def __init__(self, **settings):
+        raise KeyError("no licence file")
+
+
 def ego_of(target):
     config = load_config("evaluate", ["~ego", f"+ego._target_={target}", "+ego.replan_every=2", "+ego.speed=3"])
     return built(config.ego, "ego", Ego)
@@ -74,7 +81,8 @@ def ego_of(target):
     ("target", "message"),
     [
         ("no.such.Ego", "(?s)ego=no.such.Ego: cannot be built: .*conf/ego"),
-        (f"{HERE}.Unfinished", "Unfinished: cannot be built: Unfinished overrides neither plan nor act"),
+        (f"{HERE}.Unfinished", "Unfinished: cannot be built: TypeError: Unfinished overrides neither plan nor act"),
+        (f"{HERE}.Unlicensed", "ego=tests.run.test_config.Unlicensed: cannot be built: KeyError: 'no licence file'; "),
         ("builtins.dict", "ego=builtins.dict: is no e2rl.planners.ego.Ego; subclass it"),
     ],
 )
