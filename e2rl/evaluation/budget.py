@@ -5,7 +5,7 @@ families. What they find is told at several budgets by `report.budget`.
 """
 
 import csv
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import accumulate
@@ -16,7 +16,19 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from e2rl.evaluation.methods import as_list, build_traffic, config_and_prior, is_search, method_config, rows_of
-from e2rl.evaluation.protocol import HERE, Method, Part, Scored, Setup, Task, Work, extend, in_batches, score_all
+from e2rl.evaluation.protocol import (
+    HERE,
+    Method,
+    Part,
+    Scored,
+    Setup,
+    Task,
+    Work,
+    extend,
+    first_names,
+    in_batches,
+    score_all,
+)
 from e2rl.metrics.atlas import cell_of
 from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.margin import FARTHEST
@@ -136,9 +148,11 @@ def spend(searches: Sequence[tuple], work: Work = HERE) -> list[tuple[Scored, li
     all_spent: list[tuple[Scored, list[dict]]] = [(([], [], []), []) for _ in searches]
     begun = {number: spending(*given) for number, given in enumerate(searches)}
     rounds = {number: next(each) for number, each in begun.items()}
+    first: Collection[str] | None = None
     while rounds:
         jobs = [(f"search-{number:03}/tries-{job:06}", part) for number, jobs in rounds.items() for job, part in jobs]
-        scored, after = score_all(jobs, work, lambda job: len(job[1][2])), {}
+        first = first_names(jobs) if first is None else ()  # of the first round
+        scored, after = score_all(jobs, work, lambda job: len(job[1][2]), first=first), {}
         for number, asked in rounds.items():
             found: Scored = ([], [], [])
             for _ in asked:

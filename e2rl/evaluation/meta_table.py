@@ -135,7 +135,7 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
             bar.update(done)
             for begin in range(done, len(tasks), setup.batch):
                 batch = tasks[begin : begin + setup.batch]
-                driven, others = attempt(partial(setup.roll_out, method), batch)
+                driven, others = attempt(partial(setup.roll_out, method), batch, begins=begin == 0)
                 for pairs, rolled_out in driven:
                     tally.add(torch.tensor([task.scene for task in pairs]), rolled_out, rollouts // count)
                 errored += [why["reason"] for _, why in others]

@@ -1,7 +1,7 @@
 """The closed-loop protocol: methods x scenes x seeds with one ego, the files of a run (docs/method.md, section 11)."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -96,9 +96,16 @@ class Setup:
         """Values of the columns SOURCE of a method's rollouts."""
         return self.scenes.dataset, self.scenes.split, method.name, self.ego_name
 
-    def score(self, method: Method, tasks: Sequence[Task], folder: Path | None = None) -> Scored:
-        """What (scene, seed) pairs score under one method; folder: for the rollouts' files."""
-        parts, errored = attempt(partial(self.roll_out, method), tasks)
+    def score(self, method: Method, tasks: Sequence[Task], folder: Path | None = None, begins: bool = False) -> Scored:
+        """What (scene, seed) pairs score under one method.
+
+        Args:
+            method: of the traffic.
+            tasks: the pairs.
+            folder: for the rollouts' files.
+            begins: the ego begins the run with them; then InputError where its first plan is none.
+        """
+        parts, errored = attempt(partial(self.roll_out, method), tasks, begins)
         rows, samples = [], []
         for done, rollouts in parts:
             found, features = score_rollouts(rollouts)
@@ -190,9 +197,14 @@ def drive_all(setups: Sequence[Setup], methods: Sequence[Method], seeds: Sequenc
             bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
             bar.update(len(batch))
 
-        for scored in score_all(jobs, work, lambda job: job[1][1].eta, done):
+        for scored in score_all(jobs, work, lambda job: job[1][1].eta, done, first_names(jobs)):
             extend(found, scored)
     return found
+
+
+def first_names(jobs: Sequence[Job]) -> set[str]:
+    """Returns the names of the first job of each ego."""
+    return set({part[0].ego_name: name for name, part in reversed(jobs)}.values())
 
 
 def in_batches(tasks: Sequence[Task], size: int) -> list[list[Task]]:
@@ -202,18 +214,23 @@ def in_batches(tasks: Sequence[Task], size: int) -> list[list[Task]]:
 
 
 def score_all(
-    jobs: Sequence[Job], how: Work, cost: Callable[[Job], float], done: Callable[[Job], None] = lambda job: None
+    jobs: Sequence[Job],
+    how: Work,
+    cost: Callable[[Job], float],
+    done: Callable[[Job], None] = lambda job: None,
+    first: Collection[str] = (),
 ) -> Iterator[Scored]:
     """What each of some batches of rollouts scores, in their order.
 
     A batch is the unit that is checkpointed: rounding makes a rollout's last digits depend on the others of its batch.
-    Raises InputError where files of a worker do not arrive.
+    Raises InputError where files of a worker do not arrive, and where an ego's very first plan is none.
 
     Args:
         jobs: with names for their parts.
         how: of the work, `only` and `shard` are in the jobs.
         cost: by which a job takes longer than others.
         done: called with each job that is done.
+        first: names of the jobs with which an ego begins the run.
     """
 
     into, parts = how.into, how.parts  # what goes to the workers
@@ -222,7 +239,8 @@ def score_all(
         name, (setup, method, batch) = job
         told = [(task.scene, task.seed) if task.one is None else list(task.one) for task in batch]
         identity = [setup.ego_name, method.name, float(method.eta), told]
-        return parts.result(name, identity, partial(setup.score, method, batch, into), partial(has_files, into))
+        score = partial(setup.score, method, batch, into, begins=name in first)
+        return parts.result(name, identity, score, partial(has_files, into))
 
     for scored in in_processes(work, jobs, how.processes, cost, done):
         if not has_files(into, scored):

@@ -144,7 +144,8 @@ class PoolDriver:
         parts = [Episodes(none, none, never, never, never, *[torch.zeros(0)] * 4, batch_size=[0])]
         errored: list[dict] = []
         for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):
-            found, failed = attempt(lambda tasks: self._frames(ego, pool, tasks), rows.tolist())
+            begins = len(parts) == 1 and not errored
+            found, failed = attempt(lambda tasks: self._frames(ego, pool, tasks), rows.tolist(), begins)
             parts += [episodes_of(frames, pool, torch.tensor(done)) for done, frames in found]
             errored += [{"row": row, **why} for row, why in failed]
         every = torch.cat(parts)

@@ -124,8 +124,15 @@ class PlannerExited(PlannerError):
     """A planner called sys.exit."""
 
 
-class WrongPlan(PlannerError):
-    """A planner that has driven before returned something else than a tensor of the shape asked for."""
+class WrongPlan(PlannerError, InputError):
+    """A planner returned something else than a tensor of the shape asked for; begins: at the start of its rollouts.
+
+    Bad input where the run begins with it, else the end of these rollouts.
+    """
+
+    def __init__(self, message: str, begins: bool = False) -> None:
+        super().__init__(message)
+        self.begins = begins
 
 
 class NotFinite(ArithmeticError):
@@ -164,22 +171,22 @@ def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str, begins: b
         given: what was returned.
         shape: that it should have.
         ego, method: who returned it.
-        begins: it is the first answer, so that a wrong shape is a mistake of the code and not of a situation.
+        begins: it is the first answer of rollouts.
 
     Raises:
-        InputError: the first answer is no tensor of floats of this shape.
-        WrongPlan: a later one is not.
+        WrongPlan: it is no tensor of floats of this shape.
         NotFinite: it is not finite.
     """
     floats = isinstance(given, Tensor) and given.is_floating_point()
     if not floats or tuple(given.shape) != shape:
-        found = f"{given.dtype} {list(given.shape)}" if hasattr(given, "shape") else type(given).__name__
-        mend = "" if isinstance(given, Tensor) else "; torch.as_tensor makes one of an array"
-        kind = InputError if begins else WrongPlan
-        raise kind(
-            f"{type(ego).__name__}.{method}: returns {type(given).__module__.partition('.')[0]} {found}, expected a "
-            f"tensor of floats {list(shape)}{mend} (docs/how-to/planner.md)"
-        )
+        found, mend = type(given).__name__, "; torch.as_tensor makes one of an array"
+        if isinstance(given, Tensor):
+            found, mend = f"{given.dtype} {list(given.shape)}", ""
+        elif hasattr(given, "shape") and hasattr(given, "dtype"):
+            found = f"{type(given).__module__.partition('.')[0]} {found} of {given.dtype} {list(given.shape)}"
+        returned = f"{type(ego).__name__}.{method}: returns {found}"
+        wanted = f"expected a tensor of floats {list(shape)}{mend} (docs/how-to/planner.md)"
+        raise WrongPlan(f"{returned}, {wanted}", begins)
     return finite(given, "plan" if method == "plan" else "action")
 
 

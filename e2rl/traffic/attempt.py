@@ -11,7 +11,7 @@ from typing import TypeVar
 import torch
 from tensordict import TensorDictBase
 
-from e2rl.planners.ego import BY_EGO, NotFinite, PlannerError, RowsError, TrafficNotFinite
+from e2rl.planners.ego import BY_EGO, NotFinite, PlannerError, RowsError, TrafficNotFinite, WrongPlan
 from e2rl.run.errors import InputError
 from e2rl.sim.rollouts import Rollouts
 
@@ -25,18 +25,25 @@ Batch = TypeVar("Batch", Rollouts, TensorDictBase)
 
 
 def attempt(
-    roll_out: Callable[[Sequence[Task]], Batch], tasks: Sequence[Task]
+    roll_out: Callable[[Sequence[Task]], Batch], tasks: Sequence[Task], begins: bool = False
 ) -> tuple[list[tuple[list[Task], Batch]], list[tuple[Task, dict]]]:
     """(the tasks that could be rolled out, in parts with their rollouts; the others with the reasons).
 
     roll_out(tasks) returns Rollouts, or a TensorDict with states [B, ..., C] and valid [B, ...]. What raises for a
     batch is looked for by halving the batch, where a RowsError does not name it.
+
+    Args:
+        begins: the run begins with these rollouts, so that a planner whose first plan is a WrongPlan, which is then
+            raised, has a mistake in its code.
     """
     try:
         rollouts = roll_out(tasks)
-    except OF_THE_RUN:
-        raise
     except (Exception, SystemExit) as error:  # outside code raises anything
+        if isinstance(error, WrongPlan):
+            if begins and error.begins:
+                raise
+        elif isinstance(error, OF_THE_RUN):
+            raise
         if isinstance(error, OSError) and error.errno in EXHAUSTED:
             raise
         named = error.rows if isinstance(error, RowsError) else {}

@@ -130,7 +130,7 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
         done: list[int] = []
         parts, errored = list[Rollouts](), dict[int, dict]()
         for rows in torch.arange(len(scene_index)).split(batch):
-            found, lost = attempt(roll_out_rows, rows.tolist())
+            found, lost = attempt(roll_out_rows, rows.tolist(), begins=not (done or errored))
             done += [row for tasks, _ in found for row in tasks]
             parts += [part for _, part in found]
             errored |= dict(lost)

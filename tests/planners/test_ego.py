@@ -111,9 +111,9 @@ def drive(ego, scenes, steps=12):
 @pytest.mark.parametrize(
     ("of", "told"),
     [
-        (lambda plan: plan[:, :30], r"Planned.plan: returns torch torch.float32 \[2, 30, 4\], .*floats \[2, 50, 4\]"),
+        (lambda plan: plan[:, :30], r"Planned.plan: returns torch.float32 \[2, 30, 4\], .*floats \[2, 50, 4\]"),
         (lambda plan: plan[0], r"\[50, 4\], expected a tensor of floats \[2, 50, 4\]"),
-        (lambda plan: plan.numpy(), "returns numpy float32 .*torch.as_tensor"),
+        (lambda plan: plan.numpy(), r"returns numpy ndarray of float32 \[2, 50, 4\], .*torch.as_tensor"),
         (lambda plan: plan.long(), "torch.int64"),
         (lambda plan: None, "NoneType"),
     ],
