@@ -14,7 +14,7 @@ from e2rl.evaluation import rollout_files as files
 from e2rl.evaluation.modes import ATLAS_FILE, MODES_FILE, find_atlas, find_modes
 from e2rl.evaluation.summary import empty_rows, group_of, metric_rows
 from e2rl.metrics.catalogue import SOURCE
-from e2rl.metrics.errored import errored_row
+from e2rl.metrics.errored import errored_row, lost
 from e2rl.metrics.evasion import add_avoidable
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.score import score_rollouts
@@ -271,14 +271,14 @@ def record(
     """The rows of metrics.json: summarise(rows, samples), with the counts of what errored where they have none.
 
     Writes rollouts.csv, modes.json, atlas.json, metrics.json and, where rollouts errored, errored.json into a folder. A
-    method of which all rollouts errored has a row too, without metrics. Raises InputError where no rollout could be
-    scored.
+    method of which the traffic lost all rollouts has a row too, without metrics. Raises InputError where it lost those
+    of all.
     """
     modes = find_modes(rows)
     if folder is not None:
         files.write_errored(folder / files.ERRORED_FILE, errored)
         files.write_rows(folder / files.TABLE, rows)
-    files.require_rows([row for row in rows if row.get("errored") != 1], errored, folder)
+    files.require_rows([row for row in rows if not lost(row)], errored, folder)
     known = summarise(rows, samples)
     known += empty_rows(known, errored)
     result = [

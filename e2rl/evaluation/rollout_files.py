@@ -234,6 +234,6 @@ def require_rows(rows: Sequence, errored: Sequence[dict], folder: Path | None) -
     if rows or not errored:
         return
     first = f", as in {errored[0]['scene_id']}, seed {errored[0]['seed']}" if "scene_id" in errored[0] else ""
-    where = f"; {folder / ERRORED_FILE} has the tracebacks" if folder is not None else ""
+    where = f"; {folder / ERRORED_FILE} has the tracebacks, {TABLE} a row of each" if folder is not None else ""
     said = f"{summary_of(errored)}{first}{where}"
     raise InputError(f"no rollout could be scored: {said}; mend the planner or the traffic")

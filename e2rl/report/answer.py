@@ -202,7 +202,9 @@ def effect(row: dict, nominal: dict) -> str:
 
 
 def cost(row: dict, nominal: dict) -> str:
-    """What the attack costs in realism."""
+    """What the attack costs in realism, "" where no rollout of either ended."""
+    if value(row, "real") == value(nominal, "real") == UNKNOWN:
+        return ""
     adversaries = value(row, "real_adv")
     alone = f", of the adversaries alone {adversaries}" if adversaries != UNKNOWN else ""
     return (

@@ -233,7 +233,8 @@ def budget_figure(told: Sequence[Mapping], scenes: int) -> Figure:
                 for plan in dict.fromkeys(each["method"] for each in told):
                     own = [each for each in told if each["ego_policy"] == ego and each["method"] == plan]
                     axis.plot(*curve(own, unit, name, scenes), label=plan, linewidth=1.2)
-                axis.set_xscale("log")
+                if any(each[unit] > 0 for each in told):
+                    axis.set_xscale("log")
                 axis.set_xlabel(f"{unit} a scene")
                 axis.set_ylabel(f"{ego}: {ABOUT[name]}")
     axes[0][0].legend(fontsize=7, frameon=False)

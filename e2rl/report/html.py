@@ -20,7 +20,16 @@ from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.headline import headline
 from e2rl.evaluation.methods import SEARCH
 from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, cell, nulls, own_folder, read_metrics, read_run
+from e2rl.evaluation.rollout_files import (
+    ERRORED_FILE,
+    METRICS_FILE,
+    TABLE,
+    cell,
+    nulls,
+    own_folder,
+    read_metrics,
+    read_run,
+)
 from e2rl.metrics.atlas import CELL, Cell, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import raised
@@ -72,6 +81,9 @@ def write_report(
         methods: only their failures; (): those of all.
         path: of the file; None: PAGE in the folder.
     """
+    if metrics is None and not (run / METRICS_FILE).is_file():
+        why = f"the run is not finished, or none of its rollouts could be scored, as {ERRORED_FILE} says then"
+        raise InputError(f"{run}: no {METRICS_FILE}: {why}; `e2rl gate` and `e2rl compare` read its {TABLE}")
     metrics = read_metrics(run / METRICS_FILE) if metrics is None else metrics
     modes = read_modes(run / MODES_FILE) if modes is None else modes
     tables = [*metric_tables(metrics), *mode_tables(modes)] if tables is None else tables

@@ -9,6 +9,8 @@ import torch
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.rollout_files import ERRORED_FILE, METRICS_FILE, TABLE, add_errored, read_metrics, read_rows
 from e2rl.planners.idm_planner import IDMEgo
+from e2rl.report.answer import answer_lines
+from e2rl.report.html import write_report
 from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
@@ -114,9 +116,28 @@ def test_the_others_are_scored_and_the_count_stands_everywhere(tmp_path, name, p
     assert whole["errored"] == {} and whole["n_rollouts"] == 8 and not (tmp_path / ERRORED_FILE).exists()
 
 
-def test_where_all_end_the_message_says_why(tmp_path):
-    with pytest.raises(InputError, match="no rollout could be scored: 2 raised ZeroDivisionError .no way out.*traceb"):
-        run(Fails(6.0, NO_WAY), tmp_path, count=1)
+def test_where_the_traffic_loses_all_the_message_says_why(tmp_path):
+    setup = Setup(scene_set(3), IDMEgo(), "idm", SimSettings(), 4)
+    setup.scenes.scenes["start"][:, 0, 3] = 8.0
+    with pytest.raises(InputError, match="no rollout could be scored: 3 raised KeyError .'route'.*traceb"):
+        run_protocol(setup, [Method("refuses", Refuses())], [0], tmp_path)
+    with pytest.raises(InputError, match="no metrics.json: .*errored.json says then; `e2rl gate` and `e2rl compare`"):
+        write_report(tmp_path)
+
+
+def test_a_planner_that_always_raises_is_rated_as_any_other(tmp_path):
+    (row,) = run(Fails(6.0, NO_WAY), tmp_path, count=1)
+    assert row["n_rollouts"] == 2 and row["errored"] == {"raised ZeroDivisionError": 2}
+    assert row["headline"] | {"scenes": 1, "raised": 1, "failed": 1, "preventable": 0} == row["headline"]
+    found = {name: row["metrics"][name]["mean"] for name in ("cfr", "cfr_preventable", "errored", "progress")}
+    assert found == {"cfr": 1.0, "cfr_preventable": 1.0, "errored": 1.0, "progress": 0.0}
+    assert row["metrics"]["real"]["n"] == row["metrics"]["counted_per_km"]["n"] == 0
+    assert read_metrics(tmp_path / METRICS_FILE)[0]["headline"] == row["headline"]
+    text = " ".join(" ".join(answer_lines([row], rollouts=read_rows(tmp_path / TABLE))).split())
+    assert "preventable failures, or it raised, in 1 of 1 scene; preventable failures in 0 of 1; it raised in 1" in text
+    assert "ZeroDivisionError: no way out (2 under replay)" in text and "per 1,000 km" not in text
+    page = write_report(tmp_path).read_text()
+    assert "ZeroDivisionError: no way out" in page and "it raised in 1 of 1." in page
 
 
 def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
@@ -160,10 +181,34 @@ def test_whose_error_it_is(tmp_path, ego, traffic, blamed):
     assert row["metrics"]["errored"]["mean"] == (0.25 if blamed == "ego" else 0.0)
 
 
-def test_a_wrong_shape_from_the_first_plan_on_is_a_mistake_of_the_code(tmp_path):
-    class Always(IDMEgo):
-        def plan(self, world):
-            return super().plan(world)[:, :10]
+class From(IDMEgo):
+    """Plans too few steps from its n-th call on."""
 
-    with pytest.raises(InputError, match=r"Always.plan: returns torch torch.float32 \[8, 10, 4\], expected"):
-        run(Always(), tmp_path)
+    def __init__(self, call):
+        super().__init__()
+        self.call, self.calls = call, 0
+
+    def plan(self, world):
+        self.calls += 1
+        return super().plan(world)[:, : 10 if self.calls >= self.call else None]
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("batch", [2, 64])
+def test_a_wrong_shape_of_the_very_first_plan_is_a_mistake_of_the_code(tmp_path, batch, processes):
+    said = rf"From.plan: returns torch.float32 \[{min(batch, 8)}, 10, 4\], expected a tensor of floats"
+    with pytest.raises(InputError, match=said):
+        run(From(1), tmp_path, batch, processes)
+
+
+@pytest.mark.parametrize(("call", "batch", "raise_in"), [(2, 64, 8), (21, 2, 6)])
+def test_a_wrong_shape_later_on_ends_rollouts_and_not_the_run(tmp_path, call, batch, raise_in):
+    """A rollout has 20 plans: of batches of two, those after the first raise from their start on."""
+    (row,) = run(From(call), tmp_path, batch)
+    assert row["n_rollouts"] == 8 and sum(row["errored"].values()) == raise_in
+    rows = [row for row in read_rows(tmp_path / TABLE) if row["errored"] == 1]
+    assert {row["raised_by"] for row in rows} == {"ego"}
+    assert all(
+        "From.plan: returns torch.float32 [1, 10, 4], expected a tensor of floats [1, 50," in row["error"]
+        for row in rows
+    )
