@@ -34,6 +34,7 @@ STRAYS = (
     f"a plan that begins more than {ALONG:g} m ahead of, behind, {ASIDE:g} m beside or {TURNED:g} rad from where the "
     "ego will be 0.1 s from now: its states are of the scene's frame, the first of them 0.1 s ahead"
 )
+BACKWARDS = "a plan that goes backwards: egos do not reverse, and who reverses at the start comes to a halt"
 WILD = f"an action that is not finite, or above {LARGEST:g}"
 BY_EGO = "raised by the ego"  # note on what its code raises
 
@@ -164,6 +165,13 @@ def strays(now: Tensor, first: Tensor) -> Tensor:
     return away.any(-1) | (turned & moves)
 
 
+def reverses(now: Tensor, planned: Tensor) -> Tensor:
+    """Bool [B]: a plan [B, H, 4] of an ego at states now [B, 4], which does not reverse, begins against its heading."""
+    moved = to_frame(planned[:, 1, :2], planned[:, 0])
+    against = moved[:, 0] < -moved[:, 1].abs()
+    return (now[:, 3] >= 0) & (against | (planned[:, 0, 3] < 0))
+
+
 def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str, begins: bool) -> Tensor:
     """Returns what `plan` or `act` of an ego returned.
 
@@ -264,7 +272,9 @@ class EgoPlanner(TensorDictModuleBase):
             answer, begins = self._ask("plan", world), bool((world.step == 0).all())
             fresh = checked(answer, (len(now), PLAN_STEPS, 4), self.ego, "plan", begins).to(now)
             self._refuse(due & ~drivable(now, fresh), JUMPS)
-            self._refuse(due & strays(now, fresh[:, 0]), STRAYS)
+            astray = due & strays(now, fresh[:, 0])
+            self._refuse(astray & reverses(now, fresh), BACKWARDS)
+            self._refuse(astray, STRAYS)
             fresh = torch.cat([world.states[:, :1], fresh], 1)
             self._plan = torch.where(due[:, None, None], fresh, self._plan)
             self._planned_at = torch.where(due, world.step, self._planned_at)
@@ -292,7 +302,9 @@ class EgoPolicy(EgoPlanner):
             plan = self.plan(world)
             answer, begins = self._ask("act", world, tensordict["observation"], plan), bool((world.step == 0).all())
             action = checked(answer, (len(plan), 2), self.ego, "act", begins)
-            self._refuse((action.abs() > LARGEST).any(1), WILD)
+            wild = (action.abs() > LARGEST).any(1)
+            self._refuse(wild & reverses(world.states[:, 0], plan[:, 1:]), BACKWARDS)
+            self._refuse(wild, WILD)
         tensordict["action"] = action.clamp(self.bounds.low, self.bounds.high)
         tensordict["ego", "plan"] = plan[:, 1:]
         return tensordict

@@ -139,6 +139,23 @@ def test_a_plan_that_begins_elsewhere_ends_its_rollout(of):
     drive(Planned(lambda plan: plan + torch.tensor([0.5, 3.0, 0.1, 0])), make_scenes(2), steps=8)  # on the lane beside
 
 
+def reversing(plan):
+    """Back along x at 5 m/s from where the ego is."""
+    ahead = 0.1 * torch.arange(1, PLAN_STEPS + 1)
+    start = plan[:, :1, 0] - 0.1 * plan[:, :1, 3]
+    return torch.stack([start - 5 * ahead, *plan[..., 1:3].unbind(-1), torch.full_like(start - ahead, -5.0)], -1)
+
+
+@pytest.mark.parametrize(("signed", "speed"), [(True, 20.0), (False, 20.0), (True, 12.0)])
+def test_a_plan_that_goes_backwards_is_told_that_egos_do_not_reverse(signed, speed):
+    """Whether or not it says so by its speeds; at 12 m/s it begins less than 2 m from the ego, and asks for an action
+    beyond all bounds."""
+    planned = Planned(lambda plan: reversing(plan) * torch.tensor([1.0, 1, 1, 1 if signed else -1]))
+    scenes = make_scenes(1, speed=speed)
+    with pytest.raises(Undrivable, match="goes backwards: egos do not reverse"):
+        drive(planned, scenes)
+
+
 class Braking(Ego):
     """A policy: it has no plan."""
 
