@@ -2,7 +2,8 @@
 
 The 95% interval decides, not the estimate: a rule holds where the whole interval does, fails where none of it does.
 The status is 0 where all hold, 1 where one fails, 3 where none fails and rollouts are too few, 2 for bad input
-(docs/how-to/compare.md). A rollout in which the planner raised has failed.
+(docs/how-to/compare.md). A rollout in which the planner raised has failed; where it raised in every scene, and these
+rollouts alone break a limit, a rule fails without an interval, too.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from e2rl.metrics.catalogue import METRICS, Metric
 from e2rl.metrics.errored import raised
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.statistics import LEAST, Row, cluster_index, exact_interval, summarise
-from e2rl.report.headline import errored_lines, headline_text, traffic_name
+from e2rl.report.headline import errored_lines, headline_text, plural, traffic_name
 from e2rl.report.tables import estimate
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
@@ -67,26 +68,46 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
         found = summarise(rows, [NO_SAMPLES] * len(rows), realism_draws=0)[metric.name]
     if not (count := int(found["n"])):
         raise InputError(f"{text}: {driven.run} knows no {rule['rate']}; searches know no progress")
-    ends = found["difference" if change else "mean"], found["low"], found["high"]
-    value, low, high = ends
+    places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))[1]
+    value, low, high = ends = found["difference" if change else "mean"], found["low"], found["high"]
+    if math.isnan(low) and metric.fraction and not change and places >= LEAST:  # all places are alike
+        value, low, high = ends = value, *exact_interval(value, places)
     holds, broken = (high <= limit, low > limit) if rule["sign"] == "<=" else (low >= limit, high < limit)
     outcome, more = PASSED if holds else FAILED if broken else UNDECIDED, None
+    every, crashed = driven.traffic()[key], sum(map(raised, rows))
+    known = headline(every, driven.searched)
+    alone = math.isnan(low) and not change and breaks_alone(metric, rule["sign"], limit, (value, crashed / count))
+    if alone and known.raised == known.scenes:
+        outcome = FAILED
     told = estimate(metric, dict(zip(("mean", "low", "high"), ends, strict=True)), "mean", "+" if change else "")
     reason = f"{text}: found {told} {metric.unit or ('points' if change else '%')}, {count} {driven.unit}"
-    crashed = sum(map(raised, rows))
     reason += f", in {crashed} of them the planner raised" if crashed else ""
+    reason += f": these alone break the limit, in {known.raised} of {plural(known.scenes, 'scene')}" if alone else ""
     if outcome == UNDECIDED:
-        places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))[1]
         factor = growth(ends, limit, places, metric.fraction and not change)
         more = factor and max(1, math.ceil(count * (factor - 1)))
         advice = f"about {more} more, at further places" if more else "no number decides, the estimate is at the limit"
         advice += f" ({places} places, an interval needs {LEAST})" if places < LEAST else ""
         reason = f"{advice}; {reason}"
-    every = driven.traffic()[key]
-    reason += f"; {headline_text(headline(every, driven.searched), driven.ego, traffic_name(every[0]))}"
+    reason += f"; {headline_text(known, driven.ego, traffic_name(every[0]))}"
     about = {"rule": text, "outcome": outcome, "reason": f"{outcome}: {reason}", "more": more, "unit": driven.unit}
     values = {"value": value, "low": low, "high": high, "n": count}
     return about | values | traffic_facts(every, driven.searched)
+
+
+def breaks_alone(metric: Metric, sign: str, limit: float, found: tuple[float, float]) -> bool:
+    """Returns whether rollouts in which the planner raised break a limit, whatever becomes of all others.
+
+    Args:
+        metric: that is limited.
+        sign: `<=` or `>=`.
+        limit: of its value.
+        found: the value, and the fraction of the rollouts in which the planner raised.
+    """
+    value, crashed = found
+    if metric.fraction:
+        return sign == "<=" and metric.raised * crashed > limit
+    return sign == ">=" and crashed == 1 and value < limit
 
 
 def traffic_facts(rows: Sequence[Row], searched: bool) -> dict[str, Any]:

@@ -180,6 +180,36 @@ def test_a_planner_that_raises_fails_whatever_is_gated(tmp_path, capsys, rule, s
     assert result["n"] == 80 and len(result["errored"]) == result["headline"]["raised"] == 40
 
 
+@pytest.mark.parametrize(
+    ("rule", "crashed", "status"),
+    [
+        ("contacts<=0.05", 3, 1),
+        ("preventable<=0.6", 3, 1),
+        ("progress>=5", 3, 1),
+        ("contacts<=0.05", 2, 3),  # not in every scene
+        ("contacts<=0.7", 2, 3),
+        ("progress>=5", 2, 3),
+        ("contacts<=1", 3, 3),
+        ("contacts>=0.5", 3, 3),
+    ],
+)
+def test_at_few_places_a_planner_that_raises_in_every_scene_fails(tmp_path, capsys, rule, crashed, status):
+    """3 scenes give no interval; those in which it raised break a limit below their fraction, whatever else happens."""
+    rows = [errored(k, seed=seed) if k < crashed else row_of(k, seed) for k in range(3) for seed in (0, 1)]
+    found, said = gate(capsys, run_of(tmp_path, rows), rule)
+    alone = f"in {2 * crashed} of them the planner raised: these alone break the limit, in {crashed} of 3 scenes"
+    assert found == status and (alone in said) == (status == 1 or rule == "contacts<=0.05")
+    assert said.startswith("failed" if status == 1 else "not enough rollouts")
+
+
+@pytest.mark.parametrize(("limit", "status"), [(0.2, 1), (0.3, 3), (0.7, 3), (0.8, 0)])
+def test_where_all_places_are_alike_the_exact_interval_decides(tmp_path, capsys, limit, status):
+    """One of two rollouts at each of 12 places: the draws agree, Clopper and Pearson say 0.21 to 0.79."""
+    rows = [errored(k) if seed else row_of(k) for k in range(12) for seed in (0, 1)]
+    found, said = gate(capsys, run_of(tmp_path, rows), f"contacts<={limit}")
+    assert found == status and "found 50.0 [21.1, 78.9] %" in said
+
+
 def test_what_the_traffic_raised_is_named_and_counts_neither_way(tmp_path, capsys):
     driven = [row_of(k, hit=k < 8) for k in range(80)]
     run = run_of(tmp_path, driven + [errored(80 + k, "traffic") for k in range(40)])
