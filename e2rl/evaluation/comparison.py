@@ -15,7 +15,7 @@ from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.rollout_files import TABLE, cell, read_run
 from e2rl.evaluation.summary import scene_rows
 from e2rl.metrics.atlas import cell_of
-from e2rl.metrics.catalogue import METRICS
+from e2rl.metrics.catalogue import LATER, METRICS
 from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.failure_modes import Row, is_failure
 from e2rl.metrics.realism import NO_SAMPLES
@@ -32,11 +32,12 @@ SHARED = (  # settings and inputs without which rollouts are no pairs
     *("prior", "sim", "synthesizer", "search"),
 )
 SHOWN = 3  # rollouts that a message names
-LATER = 0.5  # s from which on a contact has moved: a replan
+DELAY = 0.5  # s from which on a contact has moved: a replan
 RATES = {  # what is compared, and the columns of the tables
     **{"contacts": "cfr", "counted": "cfr_counted", "preventable": "cfr_preventable", "clean": "cfr_clean"},
-    "progress": "progress",
+    **{"contacts_vru": "cfr_vru", "contacts_object": "cfr_object", "progress": "progress"},
 }
+OTHERS = ("cfr_vru", "cfr_object")  # contacts with others than vehicles, compared where there are any
 
 
 class Driven(NamedTuple):
@@ -92,17 +93,18 @@ class Driven(NamedTuple):
 
 def check_values(run: Path, rows: Sequence[Row]) -> None:
     """Raises InputError, naming it, for a value of RATES that no rollout has: a fraction outside of [0, 1], an infinite
-    or negative distance, a contact without a verdict; or where no rollout has a value."""
+    or negative distance, a contact without a verdict; or where no rollout has a value of a column that earlier versions
+    wrote, too."""
     ended = [row for row in rows if row["errored"] != 1]
     for column in RATES.values():
         high = 1.0 if METRICS[column].fraction else sys.float_info.max
         wrong = [row for row in ended if not (0 <= row[column] <= high or math.isnan(row[column]))]
-        unknown = [row for row in ended if row["cfr"] == 1 and math.isnan(row[column])]
+        unknown = [row for row in ended if row["cfr"] == 1 and math.isnan(row[column]) and column not in LATER]
         mend = f"restore {TABLE}, or run evaluate.py again"
         for row in (wrong or unknown)[:1]:
             place = f"{row['scene_id']}, seed {row['seed']}"
             raise InputError(f"{run / TABLE}: {column} of {place} is {cell(row[column]) or 'empty'}; {mend}")
-        if ended and all(math.isnan(row[column]) for row in ended):
+        if ended and column not in LATER and all(math.isnan(row[column]) for row in ended):
             raise InputError(f"{run / TABLE}: the column {column} is empty; {mend}")
 
 
@@ -127,7 +129,7 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
     CHANGES. Raises InputError, saying what differs, where the two are no pairs.
 
     A traffic has the number `of` units that both have, the numbers of CHANGES and of `preventable` ones among them, and
-    paired `differences` of RATES, second minus first.
+    paired `differences` of RATES, second minus first, of OTHERS where one of the two has any.
     """
     check_shared(first, second)
     ours, theirs, others, groups = first.rollouts(), second.rollouts(), second.units(), []
@@ -135,7 +137,13 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
     found = [pair for pair in pairs if pair]
     found.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))
     for (method, eta), rows in first.units().items():
-        values = difference(others.get((method, eta), []), rows)
+        other = others.get((method, eta), [])
+        values = difference(other, rows)
+        shown = [
+            name
+            for name, column in RATES.items()
+            if values[column]["n"] and (column not in OTHERS or any(row[column] == 1 for row in (*rows, *other)))
+        ]
         own = [pair for pair in found if (pair["method"], pair["eta"]) == (method, eta)]
         changes = [(pair["change"], pair["preventable"]) for pair in own]
         groups.append(
@@ -143,7 +151,7 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
             | {"of": sum(key[:2] == (method, eta) and key in theirs for key in ours)}
             | {name: sum(change == name for change, _ in changes) for name in CHANGES}
             | {"preventable": {name: changes.count((name, True)) for name in CHANGES}}
-            | {"differences": {name: values[column] for name, column in RATES.items() if values[column]["n"]}}
+            | {"differences": {name: values[RATES[name]] for name in shown}}
         )
     return groups, found
 
@@ -177,7 +185,7 @@ def nearness(row: Row) -> tuple[bool, float]:
 def pair_of(key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched: bool) -> dict[str, Any] | None:
     """Two rollouts of one PAIR of which one has failed, None: none has; of a search the tries that are nearest to a
     preventable failure. `change` is of CHANGES, `what` differs between two failures: verdict, side of the ego,
-    counterpart, time by LATER; of searches way; ending, where the planner raised in one of them. `preventable`: whether
+    counterpart, time by DELAY; of searches way; ending, where the planner raised in one of them. `preventable`: whether
     one is, as one in which the planner raised is."""
     first, second = (max(each, key=nearness) for each in (tries, others))
     ways = [{cell_of(row) for row in each} - {None} for each in (tries, others)]
@@ -188,7 +196,7 @@ def pair_of(key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched
         "verdict": any(cell(first[name]) != cell(second[name]) for name in ("counted", "at_fault", "preventable")),
         "side": first["contact_type"] != second["contact_type"],
         "counterpart": first["partner"] != second["partner"],
-        "time": abs(first["contact_time"] - second["contact_time"]) > LATER + 1e-9,
+        "time": abs(first["contact_time"] - second["contact_time"]) > DELAY + 1e-9,
     }
     if searched:
         differs = {"way": all(ways) and not ways[0] & ways[1]}

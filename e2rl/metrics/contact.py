@@ -185,8 +185,8 @@ def kinds_at_stop(batch: Batch) -> Tensor:
 @columns(
     event("cfr", "ego hits any vehicle", raised=1.0, tables="main traffic adversaries methods egos public"),
     event("cfr_adv", "ego hits an adversary", tables="main adversaries methods"),
-    event("cfr_vru", "ego hits a pedestrian or cyclist", tables="main public"),
-    event("cfr_object", "ego hits an object, such as a cone"),
+    event("cfr_vru", "ego hits a pedestrian or cyclist", raised=1.0, tables="main public"),
+    event("cfr_object", "ego hits an object, such as a cone", raised=1.0, tables="main public"),
     event("front", "first contact at the ego's front", tables="main adversaries egos"),
     event("side", "first contact at the ego's side", tables="main adversaries egos"),
     event("rear", "first contact at the ego's rear", tables="main adversaries egos"),

@@ -14,7 +14,7 @@ from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.metrics.atlas import CELL
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report.comparison_tables import by_ego
-from e2rl.report.headline import errored_lines, plural, row_headline, traffic_name, unit_of
+from e2rl.report.headline import errored_lines, plural, row_headline, touched_lines, traffic_name, unit_of
 from e2rl.report.tables import UNKNOWN, closed_loop, number
 from e2rl.run.terminal import column_groups, terminal_width
 
@@ -47,13 +47,14 @@ def answer_lines(
         folder: of the run, which holds tables.md.
         report: the failure report, where one was written.
         notes: further lines, such as the scenes that were left out.
-        rollouts: of rollouts.csv, of which those that errored are named.
+        rollouts: of rollouts.csv, of which those that errored, or touched people or objects, are named.
     """
     driven = [row for row in closed_loop(rows) if row["n_rollouts"]]
     nominal = [row for row in driven if not row["eta"]]
     attacks = [row for row in driven if row["eta"]]
     first = sorted(driven, key=lambda row: not row["eta"])[:HEADLINES]  # attacks before nominal traffic
-    lines = [line for text in (*map(row_headline, first), *errored_lines(rollouts)) for line in wrapped(text, "  ")]
+    texts = (*map(row_headline, first), *errored_lines(rollouts), *touched_lines(rollouts, shown=report is not None))
+    lines = [line for text in texts for line in wrapped(text, "  ")]
     if len({row["ego"] for row in driven}) == 1 and len(attacks) <= 1 and len(nominal) <= 1:
         lines += told(attacks[0] if attacks else nominal[0], nominal[0] if attacks and nominal else None)
     elif driven:
@@ -91,6 +92,8 @@ def compared_answer(
         )
         kinds = {"hit": "cfr", **{kind: KINDS[kind] for kind in ("preventable", "count")}, "progress [m]": "progress"}
         kinds |= {"clean": KINDS["clean"], "count per 1,000 km": "counted_per_km"}
+        others = {"people touched": "cfr_vru", "objects touched": "cfr_object"}
+        kinds |= {title: name for title, name in others.items() if any(tally(row, name) for row in (*before, *after))}
         if atlases:  # which leave room for the traffic at the ends
             pairs = [pair for pair in pairs if pair[1]["eta"] in (0, new["eta"])]
         table = [["", "before", "after", "difference"]]

@@ -15,7 +15,7 @@ from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import Row, is_failure, mode_name
 from e2rl.report.answer import FEW, wrapped
 from e2rl.report.failure_tracks import replay_data
-from e2rl.report.headline import errored_lines, headline_text, traffic_name
+from e2rl.report.headline import errored_lines, headline_text, touched_lines, traffic_name
 from e2rl.report.html import ASSETS, COLUMNS, page
 from e2rl.report.tables import difference_cell
 from e2rl.run.endings import ending
@@ -67,11 +67,12 @@ def facts(row: Row) -> dict[str, Any]:
 
 
 def facts_of(names: Sequence[str], sides: Sequence[Driven]) -> Iterator[str]:
-    """The headline of both in each traffic, then what errored."""
+    """The headline of both in each traffic, then whom else they touched, and what errored."""
     for name, driven in zip(names, sides, strict=True):
         for rows in driven.traffic().values():
             yield headline_text(headline(rows, driven.searched), name, traffic_name(rows[0]))
     for name, driven in zip(names, sides, strict=True):
+        yield from (f"{name}: {line}" for line in touched_lines(driven.rows))
         yield from (f"{name}: {line}" if line.endswith(":") else line for line in errored_lines(driven.rows))
 
 

@@ -24,7 +24,7 @@ from e2rl.metrics.catalogue import METRICS, Metric
 from e2rl.metrics.errored import raised
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.statistics import LEAST, Row, cluster_index, exact_interval, summarise
-from e2rl.report.headline import errored_lines, headline_text, plural, traffic_name
+from e2rl.report.headline import errored_lines, headline_text, plural, touched_lines, traffic_name
 from e2rl.report.tables import estimate
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
@@ -66,8 +66,10 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
         found = difference(rows, traffic_of(rule, former)[1])[metric.name]
     else:
         found = summarise(rows, [NO_SAMPLES] * len(rows), realism_draws=0)[metric.name]
-    if not (count := int(found["n"])):
-        raise InputError(f"{text}: {driven.run} knows no {rule['rate']}; searches know no progress")
+    ended = [row for row in rows if not raised(row)]
+    if not (count := int(found["n"])) or (ended and all(math.isnan(row[metric.source]) for row in ended)):
+        mend = "searches know no progress, runs of earlier versions no contacts_object"
+        raise InputError(f"{text}: {driven.run} knows no {rule['rate']}; {mend}")
     places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))[1]
     value, low, high = ends = found["difference" if change else "mean"], found["low"], found["high"]
     if math.isnan(low) and metric.fraction and not change and places >= LEAST:  # all places are alike
@@ -191,7 +193,7 @@ def main(arguments: list[str] | None = None) -> None:
             if not any(re.search("=[+-]", text) for text in options.rules):
                 raise InputError("--against: no rule is on a change; write one as 'counted<=+0.02'")
         results = [judged(text, driven, former) for text in options.rules]
-        told = errored_lines(driven.rows, named=0)
+        told = [*errored_lines(driven.rows, named=0), *touched_lines(driven.rows)]
         if options.junit is not None:
             write_atomically(options.junit, junit([each | {"told": told} for each in results], str(options.run)))
         if options.json is not None:

@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from e2rl.evaluation.headline import Headline
-from e2rl.evaluation.rollout_files import ERRORED_FILE
+from e2rl.evaluation.rollout_files import ERRORED_FILE, TABLE
 from e2rl.metrics.errored import lost, raised
 
 NAMED, MESSAGES = 12, 3  # scenes of a message, and messages, that a summary names
+TOUCHED = {"cfr_vru": "a pedestrian or cyclist", "cfr_object": "an object"}
 
 
 def plural(count: int, word: str) -> str:
@@ -71,8 +72,40 @@ def errored_lines(rows: Sequence[Mapping[str, Any]], named: int = NAMED) -> list
     return lines
 
 
-def scenes_text(rows: Sequence[Mapping[str, Any]], named: int) -> str:
-    """The scenes of rows with the seeds of each, such as `a (seeds 0, 1), b (seed 0)`; named: so many, 0: all."""
+def touched_lines(rows: Sequence[Mapping[str, Any]], shown: bool = False) -> list[str]:
+    """In how many rollouts each ego touched a pedestrian or cyclist, or an object, a line for each of the two where any
+    did. Headlines, verdicts and failures are of contacts with vehicles.
+
+    Args:
+        rows: of all rollouts.
+        shown: of a run with a failure report, which lacks them; else their scenes are named.
+    """
+    return [
+        touched_text([row for row in rows if row["ego_policy"] == ego and row.get(column) in (0, 1)], column, shown)
+        for column in TOUCHED
+        for ego in dict.fromkeys(row["ego_policy"] for row in rows if row.get(column) == 1)
+    ]
+
+
+def touched_text(rows: Sequence[Mapping[str, Any]], column: str, shown: bool) -> str:
+    """`touched_lines` of the rows of one ego, which know the column of TOUCHED."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in sorted(rows, key=lambda row: not row["eta"]):  # attacks before nominal traffic
+        groups.setdefault(traffic_name(row), []).append(row)
+    touching = {name: [row for row in own if row[column] == 1] for name, own in groups.items()}
+    told = [name for name in groups if touching[name] or len(groups) <= 2]
+    counts = [f"{len(touching[name])} of {plural(len(groups[name]), 'rollout')} under {name}" for name in told]
+    text = f"{rows[0]['ego_policy']} touched {TOUCHED[column]} in {', '.join(counts)}"
+    if shown:
+        return f"{text}; the failure report lacks them, see {column} in {TABLE}."
+    named = NAMED if len(told) <= 2 else MESSAGES
+    places = {name: scenes_text(touching[name], named, TABLE) for name in told if touching[name]}
+    return f"{text}: {'; '.join(places.values() if len(told) == 1 else map(' in '.join, places.items()))}."
+
+
+def scenes_text(rows: Sequence[Mapping[str, Any]], named: int, file: str = ERRORED_FILE) -> str:
+    """The scenes of rows with the seeds of each, such as `a (seeds 0, 1), b (seed 0)`; named: so many, 0: all; file:
+    that has the others."""
     seeds: dict[str, list[int]] = {}
     for row in rows:
         seeds.setdefault(row["scene_id"], []).append(row["seed"])
@@ -81,4 +114,4 @@ def scenes_text(rows: Sequence[Mapping[str, Any]], named: int) -> str:
         shown = ", ".join(map(str, own[: named or None]))
         texts.append(f"{scene} ({'seed' if len(own) == 1 else 'seeds'} {shown}{', ...' * (0 < named < len(own))})")
     rest = len(seeds) - len(texts)
-    return ", ".join(texts) + (f" and {plural(rest, 'other scene')} in {ERRORED_FILE}" if rest else "")
+    return ", ".join(texts) + (f" and {plural(rest, 'other scene')} in {file}" if rest else "")

@@ -36,7 +36,7 @@ from e2rl.metrics.errored import raised
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.answer import FEW, of, rate
 from e2rl.report.failure_tracks import replay_data
-from e2rl.report.headline import errored_lines, headline_text, traffic_name, unit_of
+from e2rl.report.headline import errored_lines, headline_text, touched_lines, traffic_name, unit_of
 from e2rl.report.tables import Table, closed_loop, column_names, metric_tables, mode_tables
 from e2rl.run.config import assigned
 from e2rl.run.endings import ending
@@ -200,6 +200,7 @@ def summary(group: Mapping, metrics: Sequence[dict], rows: Sequence[dict], searc
         lines.append(f"It has a failure that counts in {known['cfr_counted']}: {reasons}.")
     lines += [] if "interval" in known.get("cfr", "interval") else [FEW]
     lines += ["Tries go where failures are: rates of tries are no rates of the planner."] if searched else []
+    lines += touched_lines(own, shown=True)
     return [*lines, *(f"{line.rstrip(':')}." for line in errored_lines(own) if line.endswith(":"))]
 
 

@@ -29,7 +29,8 @@ def row_of(scene: int, seed: int = 0, hit: dict | bool = False, ego: str = "a", 
     """A row of rollouts.csv; every scene is a place of its own."""
     about = {"dataset": "d", "split": "s", "method": "e2", "ego_policy": ego, "eta": 2.0, "seed": seed}
     about |= {"scene_id": f"scene_{scene}", "location": f"place_{scene}", "progress": 30.0, "min_dtc": 1.5}
-    row = about | dict.fromkeys(("cfr", "cfr_counted", "cfr_preventable", "cfr_clean"), 0.0)
+    fractions = ("cfr", "cfr_counted", "cfr_preventable", "cfr_clean", "cfr_vru", "cfr_object")
+    row = about | dict.fromkeys(fractions, 0.0)
     row |= {"partner": -1, "contact_step": math.nan, "margin": -3.0}
     return row | (HIT if hit else {}) | (hit if isinstance(hit, dict) else {}) | values
 

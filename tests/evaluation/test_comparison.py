@@ -98,6 +98,13 @@ def test_runs_that_are_no_pairs_are_refused_by_what_differs(tmp_path, settings, 
         compared(Driven.read(one), Driven.read(two))
 
 
+def test_contacts_with_people_are_compared_where_there_are_any(tmp_path):
+    first, second = ([row_of(k, cfr_vru=float(k < count)) for k in range(12)] for count in (1, 4))
+    (group,), pairs = changes_of(tmp_path / "some", first, second)
+    assert group["differences"]["contacts_vru"]["difference"] == pytest.approx(3 / 12) and not pairs
+    assert "contacts_object" not in group["differences"]
+
+
 def test_another_planner_version_or_machine_may_differ(tmp_path):
     one = run_of(tmp_path / "one", [row_of(0)])
     two = run_of(tmp_path / "two", [row_of(0, ego="b")], {"ego": {"x": 1}, "processes": 8}, {"ego.file=b.onnx": "9"})

@@ -1,6 +1,7 @@
 """The answer on the terminal: what it says of known rows, and that it fits 80 columns and 25 lines."""
 
 import math
+from pathlib import Path
 
 import pytest
 
@@ -174,3 +175,23 @@ def test_rollouts_in_which_the_planner_raised_are_failures_and_named():
     text = " ".join(answer_lines([row("a", 1.0, cfr=0.5), crashed], rollouts=rollouts))
     assert "Rates per 1,000 km are without 6 rollouts in which a planner raised." in " ".join(text.split())
     assert "KeyError: lane (6 under e2 at η=2): place_0 (seed 0), place_1 (seed 0)" in text
+
+
+@pytest.mark.parametrize("report", [None, Path("failures.html")])
+def test_people_touched_are_told_and_named_where_there_is_no_page(report):
+    """Although no vehicle was hit."""
+    about = {"method": "e2", "eta": 2.0, "ego_policy": "lane_graph", "seed": 0, "errored": 0.0, "cfr": 0.0}
+    rollouts = [about | {"scene_id": f"place_{k}", "cfr_vru": float(k == 3), "cfr_object": 0.0} for k in range(12)]
+    text = " ".join(" ".join(answer_lines([row("e2", 2.0)], rollouts=rollouts, report=report)).split())
+    assert "lane_graph was hit in 0 of 12 attacked rollouts" in text and "an object" not in text
+    assert "lane_graph touched a pedestrian or cyclist in 1 of 12 rollouts under e2 at η=2" in text
+    assert (": place_3 (seed 0)." in text) == (report is None) == ("see cfr_vru in rollouts.csv" not in text)
+
+
+def test_people_touched_before_or_after_training_have_a_row():
+    old, new = row("e2", 2.0), row("e2", 2.0)
+    for each, rate in ((old, 0.25), (new, 0.0)):
+        each["metrics"] |= {"cfr_vru": value(rate), "cfr_object": value(0.0)}
+    lines = compared_answer([old], [new])
+    (line,) = [line for line in lines if line.startswith("people touched")]
+    assert "25% (3 of 12)" in line and "0% (0 of 12)" in line and not any("objects" in line for line in lines)

@@ -210,6 +210,26 @@ def test_where_all_places_are_alike_the_exact_interval_decides(tmp_path, capsys,
     assert found == status and "found 50.0 [21.1, 78.9] %" in said
 
 
+def test_people_and_objects_have_rates_of_their_own(tmp_path, capsys):
+    """No vehicle is hit; of 40 places a pedestrian is at 20, a cone at 1."""
+    rows = [row_of(k, cfr_vru=float(k % 2), cfr_object=float(k == 0)) for k in range(40)]
+    run = run_of(tmp_path / "run", rows)
+    assert gate(capsys, run, "contacts<=0.1")[0] == 0
+    status, said = gate(capsys, run, "contacts_vru<=0.1")
+    assert status == 1 and "found 50.0" in said and "a touched a pedestrian or cyclist in 20 of 40 rollouts" in said
+    assert gate(capsys, run, "contacts_object<=0.2")[0] == 0 and gate(capsys, run, "contacts_object<=0.01")[0] == 3
+    crashed = run_of(tmp_path / "raised", rows[:1] + [errored(k) for k in range(1, 40)])
+    assert gate(capsys, crashed, "contacts_vru<=0.1")[0] == 1, "to raise is to fail, here too"
+
+
+def test_a_run_that_knows_no_objects_is_gated_by_all_else(tmp_path, capsys):
+    """As those of earlier versions."""
+    run = run_of(tmp_path, [row_of(k, cfr_object=math.nan) for k in range(40)] + [errored(40)])
+    assert gate(capsys, run, "contacts<=0.2", "contacts_vru<=0.2")[0] == 0
+    status, said = gate(capsys, run, "contacts_object<=0.2")
+    assert status == 2 and "knows no contacts_object; searches know no progress, runs of earlier versions no" in said
+
+
 def test_what_the_traffic_raised_is_named_and_counts_neither_way(tmp_path, capsys):
     driven = [row_of(k, hit=k < 8) for k in range(80)]
     run = run_of(tmp_path, driven + [errored(80 + k, "traffic") for k in range(40)])

@@ -12,7 +12,7 @@ import pytest
 from e2rl.evaluation.headline import headline
 from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_metrics, read_rows
 from e2rl.metrics.errored import errored_row
-from e2rl.report.headline import errored_lines, headline_text
+from e2rl.report.headline import errored_lines, headline_text, touched_lines
 from e2rl.search.tries import TRIES
 from tests.evaluation.constructed_runs import row_of
 from tests.scripts import ROOT
@@ -62,6 +62,32 @@ def test_every_errored_rollout_is_named_or_counted(named):
         assert (f"scene_{k} (seeds 0, 1)" in text) == (not named or k in (0, 1, 2, 4, 5, 6))
     assert text.count("and 1 other scene in errored.json") == (3 if named else 0)
     assert ("and 1 other message in errored.json" in text) == bool(named)
+
+
+def test_people_and_objects_are_told_by_traffic_and_kind():
+    rows = [row_of(k, cfr_vru=float(k < 2)) for k in range(3)] + [errored(3), errored(4, raised_by="traffic")]
+    assert touched_lines(rows[2:]) == []
+    assert touched_lines(rows) == [
+        "a touched a pedestrian or cyclist in 2 of 3 rollouts under e2 at η=2: scene_0 (seed 0), scene_1 (seed 0)."
+    ]
+    rows += [row_of(k, method="nominal", eta=0.0, cfr_object=float(k == 0)) for k in range(3)]
+    ends = "0 of 3 rollouts under nominal: e2 at η=2 in scene_0 (seed 0), scene_1 (seed 0)."
+    assert touched_lines(rows)[0].endswith(ends)
+    people, objects = touched_lines(rows, shown=True)
+    assert people == (
+        "a touched a pedestrian or cyclist in 2 of 3 rollouts under e2 at η=2, 0 of 3 rollouts under nominal; the "
+        "failure report lacks them, see cfr_vru in rollouts.csv."
+    )
+    assert objects.startswith("a touched an object in 0 of 3 rollouts under e2 at η=2, 1 of 3 rollouts under nominal;")
+
+
+def test_of_many_methods_those_are_told_in_which_somebody_was_touched():
+    rows = [row_of(k, method=f"m{m}", cfr_vru=float(m == 1)) for m in range(4) for k in range(9)]
+    (line,) = touched_lines(rows)
+    assert "in 9 of 9 rollouts under m1 at η=2: " in line and "m2" not in line
+    assert "scene_2 (seed 0) and 6 other scenes in rollouts.csv" not in line and "scene_8" in line
+    (line,) = touched_lines([row | {"cfr_vru": 1.0} for row in rows])
+    assert line.count("and 6 other scenes in rollouts.csv") == 4
 
 
 @pytest.fixture(scope="module")
