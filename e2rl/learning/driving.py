@@ -7,7 +7,7 @@ from tensordict import TensorDict, TensorDictBase, tensorclass
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from e2rl.planners.ego import Ego, EgoPolicy, PlannerError
+from e2rl.planners.ego import Ego, EgoPolicy, renumbered
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.dynamics import wrap
@@ -154,11 +154,8 @@ class PoolDriver:
     def _frames(self, ego: Ego, pool: TrafficPool, rows: Sequence[int]) -> TensorDict:
         """Frames of `drive` of at most as many rows as there are environments, as `attempt` looks at them."""
         every = torch.arange(self.env.batch_size[0]) % len(rows)  # the other environments drive them once more
-        try:
+        with renumbered(every):
             frames = self.drive(ego, pool, torch.tensor(rows)[every])[: len(rows)]
-        except PlannerError as error:
-            error.rows = {row % len(rows): why for row, why in error.rows.items()}
-            raise
         return frames.update({"states": frames["executed"], "valid": frames["alive"]})
 
 

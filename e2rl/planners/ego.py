@@ -109,6 +109,17 @@ class RowsError(Exception):
         self.rows = dict(rows or {})
 
 
+@contextmanager
+def renumbered(rows: Tensor) -> Iterator[None]:
+    """Lets a RowsError of rows [G] of a batch name them by their numbers in that batch."""
+    try:
+        yield
+    except RowsError as error:
+        numbers = rows.tolist()
+        error.rows = {numbers[row]: why for row, why in error.rows.items() if 0 <= row < len(numbers)}
+        raise
+
+
 class PlannerError(RowsError):
     """A planner has no plan for scenes of its batch."""
 

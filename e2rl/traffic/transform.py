@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from e2rl.planners.ego import PLAN_STEPS, Ego, answering, ask, checked, from_outside
+from e2rl.planners.ego import PLAN_STEPS, Ego, answering, ask, checked, from_outside, renumbered
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
@@ -163,7 +163,8 @@ class AdversarialSynthesizer(Transform):
         whole = len(rows) == len(world.step)
         state, now = (self._state, world) if whole else (take_rows(self._state, rows), take_rows(world, rows))
         queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}
-        state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
+        with renumbered(rows):
+            state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
         self._state = state if whole else put_rows(self._state, rows, state)
         self._plan[rows] = plan.states.to(self._plan.dtype)
         if self.on_plan is not None:
@@ -244,7 +245,7 @@ class Lookahead:
         moved = constant_velocity(states[:, vehicles:], DT * ends)
         now = world
         for number, after in enumerate(ends.tolist()):
-            with answering(now):
+            with renumbered(rows), answering(now):
                 answer = ask(self.ego, "plan", now, scene=world.scene)
                 plan = checked(answer, (len(now.step), PLAN_STEPS, 4), self.ego, "plan", begins=False)
             pieces.append(plan[:, : self.period])

@@ -2,15 +2,17 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from e2rl.learning.policy import RowDraw
-from e2rl.planners.ego import EgoPolicy
+from e2rl.planners.ego import Ego, EgoPolicy, PlannerError, TrafficNotFinite
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.traffic.attempt import attempt
 from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
@@ -181,6 +183,60 @@ def test_a_method_that_asks_the_ego_can_where_there_is_one():
         env = environment(live(), Asking(), ego=ego)
         advance(env, still, env.reset(), 1)
     assert asked == [(1, 50, 4), None]
+
+
+class Picky(Ego):
+    """Has no plan for an ego beyond 100 m at the present, nor where a vehicle is NaN."""
+
+    def plan(self, world):
+        if not bool(world.states.isfinite().all()):
+            raise ValueError("NaN")
+        lacking = ((world.states[:, 0, 0] > 100) & (world.step <= 1)).nonzero()[:, 0].tolist()
+        if lacking:
+            raise PlannerError("no plan", dict.fromkeys(lacking, "no plan"))
+        return keep_velocity(world.states[:, 0])[:, :50]
+
+
+class Reordering(March):
+    """Asks the ego in groups, in another order than that of the batch; broken: plans NaN where the ego is beyond
+    50 m."""
+
+    queries_ego = True
+
+    def __init__(self, broken):
+        super().__init__()
+        self.broken = broken
+
+    def replan(self, state, world, ego_plan, react=None):
+        for group in torch.arange(len(world.step)).flip(0).split(2):
+            wrong = self.broken & (world.states[group, 0, 0] > 50)
+            react(group, keep_velocity(world.states[group, :ROWS]).masked_fill(wrong[:, None, None, None], torch.nan))
+        return super().replan(state, world, ego_plan)
+
+
+@pytest.mark.parametrize("due", [[0, 1, 2, 3, 4], [1, 2, 3, 4]])
+@pytest.mark.parametrize("broken", [False, True])
+def test_who_raises_where_the_traffic_asks_is_named_by_its_own_scene(due, broken):
+    """By the ego, and by the traffic that it is shown; where all are planned anew, and where some are."""
+    scene_set = scenes(5, 20)
+    for name in ("start", "logged"):
+        scene_set.scenes[name][3, ..., 0, 0] += 60.0 if broken else 110.0
+
+    def driven(tasks):
+        pool = TrafficPool.live(torch.tensor(tasks), torch.zeros(len(tasks)), torch.tensor(tasks))
+        env = environment(pool, Reordering(broken), batch=len(tasks), scene_set=scene_set, ego=Picky())
+        tensordict = env.reset()
+        env.transform._planned_at = torch.tensor([-5 if task in due else 0 for task in tasks])
+        env.step(still(tensordict))
+        world = env.base_env.world()
+        return TensorDict({"states": world.states[:, None], "valid": world.valid[:, None]}, [len(tasks)])
+
+    with pytest.raises(TrafficNotFinite if broken else PlannerError) as raised:
+        driven([0, 1, 2, 3, 4])
+    assert list(raised.value.rows) == [3]
+    parts, errored = attempt(driven, [0, 1, 2, 3, 4])
+    assert [task for tasks, _ in parts for task in tasks] == [0, 1, 2, 4] and [task for task, _ in errored] == [3]
+    assert errored[0][1]["raised_by"] == ("traffic" if broken else "ego")
 
 
 def test_traffic_that_is_told_the_plan_refuses_a_policy_that_writes_none():
