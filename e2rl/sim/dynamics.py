@@ -70,11 +70,13 @@ def rollout(start: Tensor, actions: Tensor) -> Tensor:
     """States [..., H, 4] at steps 1..H from start [..., 4] under actions [..., H, 2], without a loop over time.
 
     The speed recursion v' = clip(v + a DT, low, MAX_SPEED) is a composition of shifted clips, which are closed under
-    composition: a parallel scan of log2 H levels. Headings and positions are cumulative sums.
+    composition: a parallel scan of log2 H levels. Headings and positions are cumulative sums. Who reverses brakes by
+    HALTING at least, to a halt: until then its speed is a sum, too, and the bound itself.
     """
-    v0 = start[..., 3:4]
-    times = DT * torch.arange(1, actions.shape[-2] + 1, device=v0.device, dtype=v0.dtype)
-    speed = bounded_speed(v0, actions[..., 0] * DT, rolling_back(v0, times))
+    v0, change = start[..., 3:4], actions[..., 0] * DT
+    halting = change.clamp(min=HALTING * DT)
+    back = v0 + halting.cumsum(-1)
+    speed = bounded_speed(v0, torch.where(back < 0, halting, change), back.clamp(max=0))
     before = torch.cat([v0.expand_as(speed[..., :1]), speed[..., :-1]], -1)
     bound = yaw_rate_bound(((before + speed) / 2).abs())
     turn = torch.maximum(torch.minimum(actions[..., 1], bound), -bound) * DT

@@ -58,6 +58,24 @@ def test_who_reverses_comes_to_a_halt_however_it_is_told_to_go_on(acceleration, 
     assert states[-1, 3].item() == pytest.approx(max(0.0, acceleration * 1.0 - 2.0), abs=1e-5)
 
 
+def test_who_reverses_and_brakes_harder_goes_on_from_the_speed_that_it_has():
+    """From -4 m/s by 8 m/s^2 to -0.8; then by 3 m/s^2 at least, whatever it is told, to a halt; then as it is told."""
+    accelerations = torch.tensor([8.0] * 4 + [-8.0] * 4 + [5.0, -8.0])
+    states = dynamics.rollout(torch.tensor([0.0, 0.0, 0.0, -4.0]), torch.stack([accelerations, torch.zeros(10)], -1))
+    speeds = torch.tensor([-3.2, -2.4, -1.6, -0.8, -0.5, -0.2, 0.0, 0.0, 0.5, 0.0])
+    torch.testing.assert_close(states[:, 3], speeds, rtol=0, atol=1e-5)
+
+
+def test_a_rollout_is_repeated_steps_forwards_and_backwards():
+    start, actions = random_case(256, seed=4)
+    start[:, 3] -= 10
+    assert ((start[:, 3] < 0).sum() > 100) and (dynamics.rollout(start, actions)[:, 5, 3] < 0).any()
+    state = start
+    for moment, expected in enumerate(dynamics.rollout(start, actions).unbind(1)):
+        state = dynamics.step(state, actions[:, moment])
+        torch.testing.assert_close(state, expected, rtol=0, atol=1e-9)
+
+
 def test_who_reverses_turns_within_the_steering_s_limits():
     """A path's curvature times the metres driven, which are negative."""
     state = dynamics.step(torch.tensor([0.0, 0.0, 0.0, -5.0]), torch.tensor([0.0, 9.0]))
