@@ -40,9 +40,10 @@ class Foresight(NamedTuple):
 def foresee(path: Tensor, size: Tensor, tracks: Tensor, sizes: Tensor, since: Tensor, settled: Tensor) -> Foresight:
     """The Foresight of O plans of each of G vehicles, tracks [G, O, T + 1, 4] from now on, each alone with an ego.
 
-    path [G, T + 1, 4]: the ego's expected states; size, sizes [G, 2] of ego and vehicle; since [G]: s for which the ego
-    has had the vehicle before it (-1: not yet), when a competent driver would have begun to react; settled [G] bool:
-    that driver would have prevented what has begun, so that it need not prevent what is left of it.
+    path [G, T + 1, 4]: the ego's expected states, whose way has no backwards; size, sizes [G, 2] of ego and vehicle;
+    since [G]: s for which the ego has had the vehicle before it (-1: not yet), when a competent driver would have begun
+    to react; settled [G] bool: that driver would have prevented what has begun, so that it need not prevent what is
+    left of it.
     """
     plans = tracks.transpose(1, 2)
     box = sizes[:, None].expand(*tracks.shape[:2], 2)
@@ -62,8 +63,9 @@ def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tupl
     """
     plans, steps = along.rear.shape[1:], path.shape[1] - 1
     delay, braking = (path.new_tensor(values) for values in (DELAYS, BRAKING))
-    own = (path[..., 3].diff(dim=1) / DT).T[..., None].expand(steps, *plans).flatten(1)
-    length, speed, since = (value[:, None].expand(plans).flatten() for value in (length, path[:, 0, 3], since))
+    pace = path[..., 3].abs()
+    own = (pace.diff(dim=1) / DT).T[..., None].expand(steps, *plans).flatten(1)
+    length, speed, since = (value[:, None].expand(plans).flatten() for value in (length, pace[:, 0], since))
     way = path.new_zeros(len(DELAYS), plans.numel())
     met = speed.expand_as(way), way, since.expand_as(way), way, way, way, way, torch.full_like(way, torch.inf)
     seen = [value.flatten(1) for value in (along.rear, along.speed, along.lateral_gap, along.length)]
@@ -129,7 +131,7 @@ def time_before(world: World, ego_plan: Tensor, since: Tensor) -> Tensor:
     present = world.valid[:, None, :vehicles]
     seen = along_way(path, size[:, 0, 1], Tracks(world.states[:, None, :vehicles], size[:, :vehicles], present))
     gap = seen.rear[0] - size[:, :1, 0] / 2
-    closing, driver = world.states[:, :1, 3] - seen.speed[0], HumanDriver()
+    closing, driver = world.states[:, :1, 3].abs() - seen.speed[0], HumanDriver()
     before = (seen.lateral_gap[0] <= 0) & (closing > 0) & (gap > 0)
     needed = torch.maximum(closing * driver.time_to_collision, driver.stopping_gap(closing))
     begun = torch.where(gap <= needed, 0.0, -1.0)

@@ -44,6 +44,39 @@ def test_what_has_begun_need_not_be_prevented_again():
     assert bool(plan(since=0.7).prevented), "a driver that has begun to react 0.7 s ago still stops"
 
 
+def mirrored(states):
+    """The same motion of a vehicle that looks the other way."""
+    turned = states.clone()
+    turned[..., 2] += torch.pi
+    turned[..., 3] *= -1
+    return turned
+
+
+def test_who_reverses_is_foreseen_as_the_same_motion_forwards():
+    """From 10 m/s, braking by 1 m/s^2, towards who stands 20 m ahead."""
+    path, time = torch.zeros(1, STEPS, 4), 0.1 * torch.arange(STEPS)
+    path[0, :, 0], path[0, :, 3] = SPEED * time - time**2 / 2, SPEED - time
+    tracks = torch.zeros(1, 1, STEPS, 4)
+    tracks[..., 0] = 24.0
+    ways = [
+        foresee(each, SIZE, tracks, SIZE, torch.tensor([-1.0]), torch.tensor([False]))
+        for each in (path, mirrored(path))
+    ]
+    assert float(ways[0].worth) > 0.2 and float(ways[0].time) < 3
+    for ahead, back in zip(*ways, strict=True):
+        torch.testing.assert_close(back, ahead)
+
+
+def test_the_clock_starts_where_the_ego_reverses_into_the_risk():
+    scene = make_scenes(1, vehicles=[(0, 0, 10.0), (18.0, 0, 1.0), (18.0, 1, 1.0)], steps=20).scenes
+    world = World.at_start(scene)
+    plan = world.states[:, :1] + torch.zeros(1, 50, 4)
+    plan[..., 0] += torch.arange(1, 51)
+    world.states[:, :1] = mirrored(world.states[:, :1])
+    since = time_before(world, mirrored(plan), torch.full((1, scene["route_log"].shape[1]), -1.0))
+    assert since[0, 1:3].tolist() == [0.0, -1.0]
+
+
 @pytest.mark.parametrize(("ahead", "before"), [(18.0, -1.0), (18.0, 0.5), (80.0, 0.5)])
 def test_the_clock_starts_at_the_competent_driver_s_risk_and_runs_while_it_lasts(ahead, before):
     scene = make_scenes(1, vehicles=[(0, 0, 10.0), (ahead, 0, 1.0), (ahead, 1, 1.0)], steps=20).scenes
