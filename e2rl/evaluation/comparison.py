@@ -93,12 +93,12 @@ class Driven(NamedTuple):
 
 def check_values(run: Path, rows: Sequence[Row]) -> None:
     """Raises InputError, naming it, for a value of RATES that no rollout has: a fraction outside of [0, 1], an infinite
-    or negative distance, a contact without a verdict; or where no rollout has a value of a column that earlier versions
-    wrote, too."""
+    distance (it is negative where the ego reverses), a contact without a verdict; or where no rollout has a value of a
+    column that earlier versions wrote, too."""
     ended = [row for row in rows if row["errored"] != 1]
     for column in RATES.values():
-        high = 1.0 if METRICS[column].fraction else sys.float_info.max
-        wrong = [row for row in ended if not (0 <= row[column] <= high or math.isnan(row[column]))]
+        low, high = (0.0, 1.0) if METRICS[column].fraction else (-sys.float_info.max, sys.float_info.max)
+        wrong = [row for row in ended if not (low <= row[column] <= high or math.isnan(row[column]))]
         unknown = [row for row in ended if row["cfr"] == 1 and math.isnan(row[column]) and column not in LATER]
         mend = f"restore {TABLE}, or run evaluate.py again"
         for row in (wrong or unknown)[:1]:

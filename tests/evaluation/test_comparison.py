@@ -70,6 +70,15 @@ def test_a_run_has_no_difference_to_itself(tmp_path):
         assert value["difference"] == 0 and not (value["low"] > 0 or value["high"] < 0), name
 
 
+def test_an_ego_that_reverses_makes_negative_progress(tmp_path):
+    runs = [
+        Driven.read(run_of(tmp_path / name, [row_of(k, progress=metres) for k in range(12)]))
+        for name, metres in (("before", -0.375), ("after", 4.0))
+    ]
+    ((group,), _) = compared(*runs)
+    assert group["differences"]["progress"]["difference"] == 4.375
+
+
 def test_two_egos_of_one_run_and_none_by_chance(tmp_path):
     rows = [row_of(k, hit=k == 0) for k in range(3)] + [row_of(k, hit=k == 1, ego="b") for k in range(3)]
     run = run_of(tmp_path, rows)

@@ -271,8 +271,8 @@ def test_what_is_no_limit_is_refused(tmp_path, capsys, rule):
         ({"cfr": -1.0}, "cfr of scene_3, seed 0 is -1"),
         ({"cfr_preventable": math.inf}, "cfr_preventable of scene_3, seed 0 is inf"),
         ({"cfr_clean": 7.0}, "cfr_clean of scene_3, seed 0 is 7"),
-        ({"progress": -1.0}, "progress of scene_3, seed 0 is -1"),
         ({"progress": math.inf}, "progress of scene_3, seed 0 is inf"),
+        ({"progress": -math.inf}, "progress of scene_3, seed 0 is -inf"),
         ({"cfr": 1.0, "cfr_counted": math.nan}, "cfr_counted of scene_3, seed 0 is empty"),
     ],
 )
