@@ -3,7 +3,6 @@
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -31,7 +30,6 @@ def evaluate(run: Run) -> None:
         (scored,) = score_all([("failure", plan.part_of(then, Path(config.reproduce)))], work, lambda job: 1)
     elif asked.budget:
         scored, tries = search_all(setups, plan.searches, most, asked.budget_unit, asked.seeds, work)
-        egos = replace(egos, pairs=())  # tries of different egos are no pairs
     else:
         scored = drive_all(setups, plan.methods, asked.seeds, work)  # every ego, method, eta, scene and seed
     if asked.shard != WHOLE:

@@ -45,7 +45,7 @@ def metric_rows(
     """Rows of metrics.json from the rows of rollouts and their realism samples (`features`).
 
     Rollouts that the traffic lost take no part. Of tries of searches (`searched`) events are those of `scene_rows`, as
-    rates of tries are none of the planner.
+    rates of tries are none of the planner, and nothing is paired: a search goes on by what it has found.
 
     A row's `paired` compares it with every other method (or eta) on the same dataset, split and ego over the shared
     (scene, seed); a method there with several etas is named method@eta. egos: pairs of egos of which the first is also
@@ -63,10 +63,10 @@ def metric_rows(
         paired = {}
         others = [other for other in members if other != key and (*other[:2], other[3]) == (*key[:2], key[3])]
         others = [other for other in others if references is None or other[2] in references]
-        for other in others[: 1 if egos else None]:
+        for other in others[: 0 if searched else 1 if egos else None]:
             differences = paired_differences(*ours, *members[other], draws, realism_draws)
             paired[_method_name(other, members)] = differences
-        for first, second in egos:
+        for first, second in () if searched else egos:
             other = (*key[:3], second, key[4])
             if first == key[3] and other in members:
                 paired[f"ego {second}"] = paired_differences(*ours, *members[other], draws, 0, relative=True)

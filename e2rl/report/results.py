@@ -52,8 +52,6 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
 
 def references(plan: Evaluation) -> tuple[str, ...] | None:
     """Returns the methods that all are compared with; None: each with every other."""
-    if plan.asked.budget:
-        return ()  # tries of different methods are no pairs
     return (*plan.asked.compare, NOMINAL) if compares(plan.asked) and not plan.egos.pairs else None
 
 

@@ -13,12 +13,14 @@ from e2rl.evaluation import rollout_files as files
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.evaluation.rollout_files import read_metrics, read_rows, write_json
 from e2rl.evaluation.summary import metric_rows
+from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import file_stem, rollout_name
 from e2rl.traffic.rule_based import ConstantVelocity
+from tests.evaluation.constructed_runs import row_of
 from tests.metrics.random_rollouts import labelled, random_rollouts
 from tests.synthetic import make_scenes
 
@@ -59,6 +61,21 @@ def test_several_intensities_of_one_method_are_told_apart(rollouts):
     many += labelled(rows, "synthetic", "test", "nominal", "lane_graph")
     result = metric_rows(many, features * 4, draws=10, realism_draws=2)
     assert [list(row["paired"]) for row in result] == [["e2@2", "nominal"], ["e2@1", "nominal"], ["e2@1", "e2@2"], []]
+
+
+def test_tries_of_searches_are_no_pairs():
+    """All scenes of both methods fail, in the first try of one and in each try of the other."""
+    rows = [
+        row_of(scene, number, hit=number == 0 or method == "b", method=method, ego=ego, errored=0.0, raised_by="")
+        for ego in ("old", "new")
+        for method in ("a", "b")
+        for scene in range(20)
+        for number in range(4)
+    ]
+    result = metric_rows(
+        rows, [NO_SAMPLES] * len(rows), draws=10, realism_draws=0, egos=[("new", "old")], searched=True
+    )
+    assert [(row["metrics"]["cfr_preventable"]["mean"], row["paired"]) for row in result] == [(1.0, {})] * 4
 
 
 PARTS = st.lists(st.text(min_size=1, max_size=150), min_size=3, max_size=3)
