@@ -8,7 +8,10 @@ product serves all draws and metrics. Where the bootstrap would mislead:
 - a fraction with fewer than LEAST places at which the event occurs, or at which it does not, has the exact interval of
   Clopper and Pearson (1934), with the places as the sample. A difference of such fractions lies between the differences
   of their exact bounds at 97.5% each (Bonferroni);
-- a ratio per kilometre with fewer than LEAST places at which the event occurs, and draws that all agree, give none.
+- a ratio per kilometre with fewer than LEAST places at which the event occurs gives none;
+- where all draws of a mean agree, all places do. Of a fraction the exact interval bounds those that are otherwise, at
+  which it, or its difference, may be the least or the most that it can be; another mean is its own interval.
+  Medians, ratios and realism, of which draws may agree where places do not, then have none.
 
 Rows of several trainings of one policy say which in `training` (0, 1, ..). Trainings are then drawn with replacement
 as well as places, independently of them: a rollout counts as often as its place times its training was drawn (the
@@ -28,6 +31,7 @@ from e2rl.metrics.errored import raised
 from e2rl.metrics.realism import Samples, realism
 
 DRAWS = 1000
+SAME = 1e-9  # of the values of draws that agree, but for rounding
 REALISM_DRAWS = 400  # each costs a pass over all samples
 LEVEL = 0.95
 LEVELS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
@@ -137,6 +141,13 @@ def exact_interval(fraction: float, places: float, level: float = LEVEL) -> tupl
     return low, high
 
 
+def bounds_of_alike(fraction: float, places: int, least: float = 0.0) -> tuple[float, float]:
+    """Bounds of a fraction, or of a difference of two, that is the same at each of so many places: the others, of which
+    there are as many as the exact interval of none allows, may have the least, or 1."""
+    others = exact_interval(0.0, places)[1]
+    return fraction + others * (least - fraction), fraction + others * (1 - fraction)
+
+
 def row_metrics() -> list[Metric]:
     """The metrics that are averaged over rows, not computed from pooled samples."""
     return [metric for metric in METRICS.values() if not metric.samples]
@@ -220,6 +231,31 @@ class Bootstrap:
                 found[metric.name] = exact_interval(mean, places, level) if known else (torch.nan, torch.nan)
         return found
 
+    def agreed(
+        self, values: Mapping[str, Tensor], known: Mapping[str, Tensor], least: float
+    ) -> dict[str, tuple[float, float]]:
+        """Bounds of the means of which all draws agree, LEAST places or more: see `bounds_of_alike`.
+
+        Args:
+            values: [D] of each metric, row 0 the estimate.
+            known: bool [R] of each metric, the rollouts that a value uses.
+            least: the least that a fraction can be: 0, of a difference -1.
+        """
+        found = {}
+        for metric in row_metrics():
+            mean, places = values[metric.name][0].item(), self.places(known[metric.name])
+            drawn = values[metric.name][1:]
+            drawn = drawn[drawn.isfinite()]
+            plain = not (metric.median or metric.places or metric.per or metric.per_collision)
+            if (
+                plain
+                and places >= LEAST
+                and len(drawn)
+                and bool(((drawn - mean).abs() <= SAME * max(1, abs(mean))).all())
+            ):
+                found[metric.name] = bounds_of_alike(mean, places, least) if metric.fraction else (mean, mean)
+        return found
+
     def intervals(self, values: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
         """{metric: {mean, low, high, n}} in the catalogue's order; known [R] bool: the n rollouts that a value uses."""
         counts = {name: 0 if values[name][0].isnan() else int(known[name].sum()) for name in METRICS}
@@ -255,6 +291,8 @@ def summarise(
     result = bootstrap.intervals(values, known)
     for name, bounds in bootstrap.exact(bootstrap.rare(totals, weights), totals, weights, values, LEVEL).items():
         result[name] |= dict(zip(("low", "high"), bounds, strict=True))
+    for name, (low, high) in bootstrap.agreed(values, known, 0.0).items():
+        result[name] |= {"low": low, "high": high}
     return result
 
 
@@ -296,6 +334,8 @@ def paired_differences(
     other = bootstrap.exact(rare, second, second_weights, theirs, (1 + LEVEL) / 2)
     for name in rare:
         result[name] |= {"low": own[name][0] - other[name][1], "high": own[name][1] - other[name][0]}
+    for name, (low, high) in bootstrap.agreed(differences, both, -1.0).items():
+        result[name] |= {"low": low, "high": high}
     found = {name: {"difference": value.pop("mean"), **value} for name, value in result.items()}
     if relative:
         for name, value in bootstrap.intervals(ratios(differences, theirs), both).items():

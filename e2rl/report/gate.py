@@ -89,6 +89,8 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
         factor = growth(ends, limit, places, metric.fraction and not change)
         more = factor and max(1, math.ceil(count * (factor - 1)))
         advice = f"about {more} more, at further places" if more else "no number decides, the estimate is at the limit"
+        if math.isnan(low) and places >= LEAST:
+            advice = f"fewer than {LEAST} places know it, there is no interval"
         advice += f" ({places} places, an interval needs {LEAST})" if places < LEAST else ""
         reason = f"{advice}; {reason}"
     reason += f"; {headline_text(known, driven.ego, traffic_name(every[0]))}"
@@ -144,10 +146,12 @@ def growth(found: tuple[float, float, float], limit: float, places: int, fractio
     """By which factor places, and so rollouts, must grow until the interval (value, low, high) ends at the limit if the
     value stays; without an interval, to LEAST places; None: none decides.
 
-    Of a fraction it is m/k, the places of which the exact interval (Clopper and Pearson) ends at the limit, and where
-    the one found does; else the square of half-width over distance to the limit.
+    Of a fraction, and of a change of 0 at each place, it is m/k, the places of which the exact interval (Clopper and
+    Pearson) ends at the limit, and where the one found does; else the square of half-width over distance to the limit.
     """
     value, low, high = found
+    if not fraction and value == 0 and math.isclose(high, -low) and math.isclose(high, exact_interval(0.0, places)[1]):
+        low, limit, fraction = 0.0, abs(limit), True  # none is otherwise: as of a fraction without an event
     upper, end = value < limit, high if value < limit else low
     if math.isnan(end) or abs(value - limit) < NEAR:
         return LEAST / places if places < LEAST else None

@@ -262,9 +262,9 @@ def difference_cell(metric: Metric, value: dict | None) -> str:
 
 
 def estimate(metric: Metric, value: dict, name: str, sign: str = "") -> str:
-    """The value called `name` and, where it is known, its interval."""
+    """The value called `name` and, where it is known and no point, its interval."""
     centre, low, high = (number(metric, value[key], sign) for key in (name, "low", "high"))
-    return centre if math.isnan(value["low"]) else f"{centre} [{low}, {high}]"
+    return f"{centre} [{low}, {high}]" if value["low"] < value["high"] else centre
 
 
 def number(metric: Metric, value: float, sign: str = "") -> str:

@@ -117,9 +117,9 @@ def test_rollouts_at_one_place_are_one_trial():
     assert (found["low"], found["high"]) == pytest.approx(exact_interval(0.2, 40)) and found["n"] == 120
 
 
-def test_draws_that_agree_and_ratios_of_few_events_have_no_interval():
+def test_medians_that_agree_and_ratios_of_few_events_have_no_interval():
     assert interval(torch.arange(1001.0).double(), 10)["low"] == pytest.approx(1 + 0.025 * 999)
-    assert math.isnan(brief(*rows_of([3.0] * 40, name="progress"))["progress"]["low"])
+    assert math.isnan(brief(*rows_of([3.0] * 40, name="contact_time"))["contact_time"]["low"])
     few, many = (brief(*rows_of([1.0] * n + [0.0] * (60 - n), driven_km=[0.1] * 60)) for n in (9, 10))
     assert math.isnan(few["failures_per_km"]["low"]) and few["failures_per_km"]["mean"] == pytest.approx(1.5)
     assert many["failures_per_km"]["low"] < 10 / 6 < many["failures_per_km"]["high"]
@@ -135,6 +135,50 @@ def test_a_difference_of_rare_events_lies_between_the_differences_of_their_bound
     assert six["difference"] == pytest.approx(-1 / 3) and math.isnan(six["low"]) and math.isnan(six["high"])
     same = paired_differences(*ours, *ours, draws=50, realism_draws=2)["cfr"]
     assert same["difference"] == 0 and same["low"] == -same["high"] < 0
+
+
+@pytest.mark.parametrize("places", [9, 10, 40])
+def test_a_fraction_that_is_the_same_at_each_place_is_bounded_by_that_of_places_that_are_otherwise(places):
+    """Half of two rollouts at each; the exact bound u of none of them solves (1 - u)^places = 0.025."""
+    halves, clusters = [0.0, 1.0] * places, [index // 2 for index in range(2 * places)]
+    found = brief(*rows_of(halves, clusters))["cfr"]
+    u = 1 - 0.025 ** (1 / places)
+    expected = (0.5 * (1 - u), 0.5 * (1 + u)) if places >= 10 else (math.nan, math.nan)
+    assert (found["low"], found["high"]) == pytest.approx(expected, nan_ok=True) and found["mean"] == 0.5
+    none = brief(*rows_of([0.0] * places))["cfr"]
+    assert (none["low"], none["high"]) == pytest.approx((0.0, u) if places >= 10 else expected, nan_ok=True)
+
+
+def test_a_mean_that_is_the_same_at_each_place_is_its_own_interval():
+    found = brief(*rows_of([0.1] * 30, name="progress"))["progress"]
+    assert found["low"] == found["high"] == found["mean"] == pytest.approx(0.1)
+    assert brief(*rows_of([0.1] * 29 + [0.2], name="progress"))["progress"]["low"] < found["high"]
+
+
+@pytest.mark.parametrize("events", [0, 5, 20, 40])
+def test_what_has_not_changed_is_bounded_by_the_places_that_may_differ(events):
+    """Exactly by those of which there may be as many where none of 40 has been seen, for the worse or the better."""
+    ours = rows_of([1.0] * events + [0.0] * (40 - events), progress=[30.0 + k for k in range(40)])
+    found = paired_differences(*ours, *ours, draws=100, realism_draws=2)
+    u = exact_interval(0.0, 40)[1]
+    assert [found["cfr"][end] for end in ("low", "difference", "high")] == pytest.approx([-u, 0.0, u])
+    assert [found["progress"][end] for end in ("low", "difference", "high")] == [0.0, 0.0, 0.0]
+
+
+def test_a_change_that_is_the_same_at_each_place_is_within_what_others_may_have():
+    """One of two rollouts more fails at each of 20 places: others may have lost or won all."""
+    clusters = [index // 2 for index in range(40)]
+    ours, theirs = rows_of([1.0, 1.0] * 20, clusters), rows_of([0.0, 1.0] * 20, clusters)
+    found = paired_differences(*ours, *theirs, draws=100, realism_draws=2)["cfr"]
+    u = exact_interval(0.0, 20)[1]
+    assert (found["low"], found["high"]) == pytest.approx((0.5 - 1.5 * u, 0.5 + 0.5 * u))
+    longer = paired_differences(
+        *rows_of([40.1 + k for k in range(20)], name="progress"),
+        *rows_of([40.0 + k for k in range(20)], name="progress"),
+        draws=100,
+        realism_draws=2,
+    )["progress"]
+    assert longer["low"] == longer["high"] == longer["difference"] == pytest.approx(0.1)
 
 
 def test_failures_per_kilometre_are_all_failures_over_all_kilometres():

@@ -123,6 +123,46 @@ def test_changes_are_measured_against_a_former_run(tmp_path, capsys):
     assert status == 2 and "which has other seeds" in said
 
 
+@pytest.mark.parametrize(
+    ("rule", "status"),
+    [
+        ("counted<=+0.05", 0),
+        ("preventable<=+0.05", 0),
+        ("contacts>=-0.05", 0),
+        ("contacts<=+0.04", 3),
+        ("contacts<=+0", 3),
+        ("contacts<=-0.05", 1),
+        ("progress>=-0.5", 0),
+        ("progress>=+0", 0),
+        ("progress>=+0.5", 1),
+    ],
+)
+def test_a_planner_that_has_not_changed_is_within_what_its_places_exclude(tmp_path, capsys, rule, status):
+    """No place of 80 differs: at most 4.5% do."""
+    run = run_with(tmp_path, 80, 24)
+    found, said = gate(capsys, run, rule, "--against", run)
+    assert found == status and ("[-4.5, +4.5] points" in said) == ("progress" not in rule)
+
+
+@pytest.mark.parametrize(("places", "limit", "more"), [(40, 0.05, 32), (40, -0.05, 32), (80, 0.04, 11)])
+def test_the_number_for_an_unchanged_planner_is_that_without_an_event(places, limit, more):
+    """ln 0.025 / ln 0.95 = 72, and 90.4 for 4%."""
+    bound = exact_interval(0.0, places)[1]
+    assert math.ceil(places * (growth((0.0, -bound, bound), limit, places, False) - 1)) == more
+
+
+def test_the_same_progress_everywhere_is_decided(tmp_path, capsys):
+    run = run_of(tmp_path, [row_of(k, progress=96.0) for k in range(40)])
+    assert gate(capsys, run, "progress>=50")[0] == 0
+    assert gate(capsys, run, "progress>=97")[0] == 1
+
+
+def test_a_rate_that_few_places_know_has_no_interval_and_says_why(tmp_path, capsys):
+    run = run_of(tmp_path, [row_of(k, progress=30.0 + k if k < 5 else math.nan) for k in range(40)])
+    status, said = gate(capsys, run, "progress>=50")
+    assert status == 3 and "fewer than 10 places know it, there is no interval" in said
+
+
 SCHEMA = {  # of JUnit: element: (attributes it must have, attributes it may have, children)
     "testsuites": ((), (), {"testsuite"}),
     "testsuite": (("name", "tests", "failures", "errors"), ("skipped", "time"), {"testcase"}),
