@@ -27,26 +27,30 @@ def planner_class(named: str) -> type[Ego]:
     """Returns the class that MODULE:CLASS or FILE.py:CLASS names; its folder is where modules are sought from then on.
 
     Raises:
-        InputError: where the module cannot be imported, and where it has no such class, or one that is no Ego.
+        InputError: where the module cannot be imported, and where it has no such class, or one that is no Ego or does
+            not drive.
     """
     where = f"--planner {named}"
     place, _, name = named.rpartition(":")
     if not place or not name:
         raise InputError(f"{where}: name a class, as MODULE:CLASS or FILE.py:CLASS")
     module = _imported(place, where)
-    known = {key: value for key, value in vars(module).items() if _is_planner(value) and value is not Ego}
+    known = {key: value for key, value in vars(module).items() if _is_planner(value) and _drives(value)}
     kind = vars(module).get(name)
+    near = get_close_matches(name, known, 1) or list(known)
     if kind is None:
-        near = get_close_matches(name, known, 1) or list(known)
         advice = f"it has {', '.join(near)}" if near else "nor any other subclass of e2rl.planners.ego.Ego"
         raise InputError(f"{where}: {place} has no {name}; {advice}")
     if not _is_planner(kind):
         raise InputError(f"{where}: {name} is no planner; make it a subclass of e2rl.planners.ego.Ego with `plan`")
+    if not _drives(kind):
+        advice = f"; name {', '.join(near)}" if near else ""
+        raise InputError(f"{where}: {name} overrides neither plan nor act, so that it does not drive{advice}")
     return kind
 
 
 def _imported(place: str, where: str) -> ModuleType:
-    """The module of a name or a file."""
+    """The module of a name or a file; InputError where another one has its name."""
     folder, module = os.getcwd(), place
     if place.endswith(".py"):
         file = Path(place).resolve()
@@ -56,7 +60,7 @@ def _imported(place: str, where: str) -> ModuleType:
     sys.path.insert(0, folder)
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
     try:
-        return import_module(module)
+        loaded = import_module(module)
     except ModuleNotFoundError as error:
         if error.name and module.split(".")[0] == error.name.split(".")[0]:
             mend = "start in the folder that holds it, put that on PYTHONPATH, or name the file as FILE.py:CLASS"
@@ -64,10 +68,19 @@ def _imported(place: str, where: str) -> ModuleType:
         raise InputError(f"{where}: {module} needs {error.name}, which is not installed; install it") from error
     except (Exception, SystemExit) as error:  # of outside code
         raise InputError(f"{where}: {module} cannot be imported: {type(error).__name__}: {error}; mend that") from error
+    file = Path(folder, *module.split(".")).with_suffix(".py")
+    other = getattr(loaded, "__file__", None) or "a part of Python"
+    if file.is_file() and Path(other).resolve() != file.resolve():
+        raise InputError(f"{where}: rename {file.name}: a module {module} is loaded already, {other}")
+    return loaded
 
 
 def _is_planner(value: object) -> bool:
     return isinstance(value, type) and issubclass(value, Ego)
+
+
+def _drives(kind: type[Ego]) -> bool:
+    return kind.plan is not Ego.plan or kind.act is not Ego.act
 
 
 def check_arguments(kind: type[Ego], settings: Sequence[str], where: str) -> None:

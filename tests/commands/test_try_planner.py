@@ -20,6 +20,9 @@ class Wide(Steady):
     def __init__(self, gap, replan_every=5):
         super().__init__(replan_every)
 
+class Idle(Ego):
+    pass
+
 class Other:
     pass
 """
@@ -31,6 +34,8 @@ def folder(tmp_path, monkeypatch):
     name = f"planners_of_{tmp_path.name.replace('-', '_')}"
     (tmp_path / f"{name}.py").write_text(PLANNERS)
     (tmp_path / "broken.py").write_text("1 / 0")
+    for taken in ("random.py", "sys.py"):
+        (tmp_path / taken).write_text(PLANNERS)
     (tmp_path / "lacking.py").write_text("import no_such_library")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -50,6 +55,11 @@ def folder(tmp_path, monkeypatch):
         ("nowhere.py:Steady", "no file nowhere.py"),
         ("broken:Steady", "broken cannot be imported: ZeroDivisionError: division by zero; mend that"),
         ("lacking.py:Steady", "lacking needs no_such_library, which is not installed"),
+        ("{name}:Ego", "Ego overrides neither plan nor act, so that it does not drive; name Steady, Wide"),
+        ("{name}:Idle", "Idle overrides neither plan nor act"),
+        ("random.py:Steady", "rename random.py: a module random is loaded already"),
+        ("random:Steady", "rename random.py: a module random is loaded already"),
+        ("sys.py:Steady", "rename sys.py: a module sys is loaded already, a part of Python"),
     ],
 )
 def test_a_planner_that_cannot_be_driven_is_one_line(folder, capsys, planner, message):
