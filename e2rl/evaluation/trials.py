@@ -14,6 +14,7 @@ import torch
 from e2rl.evaluation.protocol import Method, Part, Setup, Work, drive_all, extend, score_all
 from e2rl.evaluation.rollout_files import require_rows
 from e2rl.evaluation.tuning import Parameters
+from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.statistics import summarise
 from e2rl.planners.ego import Ego
 from e2rl.run.processes import Processes
@@ -23,7 +24,7 @@ from e2rl.traffic.traffic import Traffic
 
 SOUGHT = ("cfr_preventable", "cfr_clean", "cfr_counted", "cfr")
 MEASURED = (*SOUGHT, "aor_step", "cfr_bg", "real", "real_adv", "nfe")
-ERRORED = 0.01  # fraction of rollouts that may error
+ERRORED = 0.01  # fraction of rollouts that an attack may lose
 NOMINAL = "nominal"  # after a metric's name: its value in the traffic that the budget is held against
 DRIVING = ("collision", "comfort", "progress")
 COLLISIONS = ("cfr", "cfr_vru", "cfr_object", "ego_off_road")  # columns of which one is a collision
@@ -46,7 +47,7 @@ class PlannerObjective:
     comfort_ceiling: float = setting(low=0)
 
     def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
-        """See `Objective`. A trial in which more rollouts errored than of the reference is refused."""
+        """See `Objective`. A trial in which the planner raised more often than in the reference is refused."""
         errored = metrics.get("errored", 0.0) - reference.get("errored", 0.0)
         progress = metrics["progress"] / max(reference["progress"], 1e-6)
         rougher = metrics["comfort"] / max(reference["comfort"], 1e-6)
@@ -72,8 +73,8 @@ class AttackObjective:
     realism: float | None = setting(low=0, high=1, optional=True)
 
     def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
-        """See `Objective`; each trial has its nominal metrics. One that loses more than ERRORED of its rollouts beyond
-        nominal traffic's is refused: it would be compared on other scenes."""
+        """See `Objective`; each trial has its nominal metrics. One whose traffic loses more than ERRORED of its
+        rollouts beyond nominal traffic's is refused: it would be compared on other scenes."""
         over = metrics["aor_step"] - metrics[f"aor_step {NOMINAL}"] - self.off_road
         more = metrics.get("errored", 0.0) - metrics.get(f"errored {NOMINAL}", 0.0) - ERRORED
         excess = max(0.0, over) + max(0.0, more)
@@ -99,7 +100,8 @@ class PlannerTrials:
         """Returns the means of DRIVING, also of every method alone as `NAME METHOD@ETA`, and `errored`.
 
         collision: fraction of rollouts in which the ego touches something or leaves the road; comfort: mean
-        |acceleration| [m/s^2]; progress [m]; errored: fraction without a score, `errored: REASON` for each reason.
+        |acceleration| [m/s^2]; progress [m]; errored: fraction in which the planner raised, of those that the traffic
+        did not lose; `errored: REASON`: fraction of all that errored for each reason.
         """
         setup = replace(self.setup, ego=self.make(parameters), evasions=False)
         work = Work(processes=self.processes)
@@ -114,9 +116,9 @@ class PlannerTrials:
         for method, eta in dict.fromkeys((each.name, each.eta) for each in driven):
             own = [row for row in rows if (row["method"], row["eta"]) == (method, eta)]
             metrics |= {f"{name} {method}@{eta:g}": value for name, value in driving(own).items()}
-        count = len(rows) + len(errored)
-        metrics |= {f"errored: {reason}": number / count for reason, number in count_reasons(errored).items()}
-        return metrics | {"errored": len(errored) / count}
+        metrics |= {f"errored: {reason}": number / len(every) for reason, number in count_reasons(errored).items()}
+        crashed = sum(map(raised, every))
+        return metrics | {"errored": crashed / max(1, len(rows) + crashed)}
 
 
 def driving(rows: Sequence[Mapping]) -> dict[str, float]:
@@ -139,8 +141,9 @@ class AttackTrials:
     processes: Processes = 1
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
-        """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of SOUGHT, and `errored`; and all
-        of them as `NAME nominal` in nominal traffic."""
+        """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of SOUGHT, and `errored`, the
+        fraction that the traffic lost; and all of them as `NAME nominal` in nominal traffic. A rollout in which the
+        planner raised is a failure of the planner."""
         return self.measure(Method("trial", self.make(parameters), self.eta)) | self.reference
 
     @cached_property
@@ -149,12 +152,12 @@ class AttackTrials:
         return {f"{name} {NOMINAL}": found[name] for name in (*MEASURED, "errored")}
 
     def measure(self, method: Method) -> dict[str, float]:
-        """Returns the metrics of a method; InputError where no rollout has a score."""
+        """Returns the metrics of a method; InputError where all rollouts errored."""
         setup = replace(self.setup, evasions=False)  # no trial is judged by them
         rows, samples, errored = drive_all([setup], [method], self.seeds, Work(processes=self.processes))
-        ended = [k for k, row in enumerate(rows) if row["errored"] != 1]
-        require_rows(ended, errored, None)
-        found = summarise([rows[k] for k in ended], [samples[k] for k in ended], realism_draws=0)
+        require_rows([row for row in rows if row["errored"] != 1], errored, None)
+        kept = [k for k, row in enumerate(rows) if not lost(row)]
+        found = summarise([rows[k] for k in kept], [samples[k] for k in kept], realism_draws=0)
         metrics = {name: found[name]["mean"] for name in MEASURED}
-        metrics["errored"] = len(errored) / len(rows)
+        metrics["errored"] = 1 - len(kept) / len(rows)
         return metrics | {f"{name}_{end}": found[name][end] for name in SOUGHT for end in ("low", "high")}

@@ -22,6 +22,7 @@ from e2rl.run.files import write_atomically
 from e2rl.run.settings import configured, settings_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
+from e2rl.traffic.attempt import EGO
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic
 
@@ -62,7 +63,8 @@ class PlannerImprovement(Improvement):
             driven.append((parameters, episodes, errored))
             summary = {"contact": nan, "acceleration": nan, "progress": nan} | episodes.summary()
             named = {"collision": summary["contact"], "comfort": summary["acceleration"]}
-            return named | summary | counted(errored)
+            own = sum(entry["raised_by"] == EGO for entry in errored)
+            return named | summary | counted(errored) | {"errored": float(own)}
 
         self.trials = search(evaluate, self.present, self.space, self.search, self.objective)
         first, best = self.trials[0], best_of(self.trials) or self.trials[0]

@@ -86,6 +86,53 @@ def test_contacts_with_anybody_and_leaving_the_road_count_as_collisions():
     assert all(map(math.isnan, driving([]).values()))
 
 
+class Stumbles(Cruise):
+    """Raises in scenes whose ego starts beyond 50 m."""
+
+    def plan(self, world):
+        if bool(((world.states[:, 0, 0] > 50) & (world.step == 0)).any()):
+            raise ValueError("it stumbles")
+        return super().plan(world)
+
+
+class Loses(NominalTraffic):
+    """Raises in scenes whose ego starts before -50 m."""
+
+    def replan(self, state, world, ego_plan, react=None):
+        if bool((world.states[:, 0, 0] < -50).any()):
+            raise ValueError("it is lost")
+        return super().replan(state, world, ego_plan, react)
+
+
+@pytest.fixture(scope="module")
+def stumbling():
+    """Five scenes: the planner raises in the first, the traffic in the next two."""
+    scene_set = scenes(5, steps=20)
+    for name in ("start", "logged"):
+        scene_set.scenes[name][0, ..., 0] += 100.0
+        scene_set.scenes[name][1:3, ..., 0] -= 100.0
+    return Setup(scene_set, Stumbles(), "stumbles", SimSettings(), batch=5)
+
+
+def test_a_planner_s_trial_counts_what_it_raised_itself(stumbling):
+    """One of the three that the traffic did not lose."""
+    methods = [Method("nominal", Loses(small_prior(0), "plan"))]
+    metrics = PlannerTrials(stumbling, methods, [0], lambda parameters: Stumbles())({})
+    assert metrics["errored"] == pytest.approx(1 / 3) and metrics["errored: raised ValueError"] == 3 / 5
+    assert metrics["progress"] > 15, "of the two that were driven"
+
+
+def test_an_attack_s_trial_counts_what_its_traffic_lost_and_what_the_planner_raised_as_failed(stumbling):
+    nominal = Method("nominal", NominalTraffic(small_prior(0), "plan"))
+    trials = AttackTrials(stumbling, nominal, 2.0, [0], lambda parameters: Loses(small_prior(0), "plan"))
+    metrics = trials({})
+    assert metrics["errored"] == pytest.approx(2 / 5) and metrics["errored nominal"] == 0
+    (row,) = run_protocol(stumbling, [Method("same", trials.make({}), 2.0)], [0])
+    for name in SOUGHT:
+        assert metrics[name] == pytest.approx(row["metrics"][name]["mean"]) and metrics[name] >= 1 / 3
+        assert metrics[f"{name} nominal"] >= 1 / 5
+
+
 def attack(parameters):
     """More gain finds more failures, leaves the road more often (1 point a unit, 0.2 nominal) and is less real."""
     gain = parameters["gain"]
