@@ -71,11 +71,11 @@ class Stopped(Setup):
     left = 0
     done: list
 
-    def score(self, method, tasks, folder=None):
+    def score(self, method, tasks, folder=None, begins=False):
         if self.left == 0:
             raise KeyboardInterrupt
         self.left -= 1
-        found = super().score(method, tasks, folder)
+        found = super().score(method, tasks, folder, begins)
         self.done += [(method.name, *task) for task in tasks]
         return found
 
