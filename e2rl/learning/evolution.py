@@ -46,7 +46,7 @@ class RoundSettings:
 
 
 @dataclass
-class Attack:
+class RoundTraffic:
     """The traffic of a round: the pool, which of the ordered attacks its first K rows are (drawn [K] int64; the others
     were left out), and metrics; contact: the attacked ego's contact rate, None if unknown before the episodes are
     driven; spent: seconds; errored: rows that could not be made."""
@@ -116,7 +116,7 @@ class Evolution:
         order, self._next = self._next or self._order(self.round), None
         return order
 
-    def roll_out(self, order: Order) -> Attack:
+    def roll_out(self, order: Order) -> RoundTraffic:
         """Returns the attacks on the ordered ego, without those that no driver avoids, with remembered attacks and
         nominal traffic; of live traffic the rows alone, whose attacks are rolled out while the policy drives."""
         return self._live(order) if self.settings.traffic == "live" else self._stored(order)
@@ -131,7 +131,7 @@ class Evolution:
             if self.round + 1 < self.curriculum.rounds:
                 self._prefetch = self._begin(self._next)
 
-    def learn(self, attack: Attack) -> dict[str, float]:
+    def learn(self, attack: RoundTraffic) -> dict[str, float]:
         """Improve the ego in the traffic of the round; returns the metrics of learning."""
         begin = time.perf_counter()
         learned, self.episodes = self.improve(attack.pool, self.curriculum)
@@ -140,7 +140,7 @@ class Evolution:
         attack.spent |= {name: learned.pop(name) for name in timed if name in learned}
         return learned
 
-    def move_on(self, order: Order, attack: Attack, learned: dict[str, float]) -> dict[str, float]:
+    def move_on(self, order: Order, attack: RoundTraffic, learned: dict[str, float]) -> dict[str, float]:
         """Move the curriculum by what became of the attacks; returns all metrics of the round, named by group (train/,
         curriculum/, synthesizer/, time/)."""
         curriculum, episodes, state = self.curriculum, self.episodes, self.curriculum.summary()
@@ -188,7 +188,7 @@ class Evolution:
         how = (self.settings.nominal == "prior", self.batch, self.workers or 1)
         self.memory.write(order.number, *make_traffic(order, self.synthesize, self.solvable, *how))
 
-    def _stored(self, order: Order) -> Attack:
+    def _stored(self, order: Order) -> RoundTraffic:
         """D' of an order joined with the memory, and nominal traffic."""
         begin = time.perf_counter()
         if self.settings.prefetch:
@@ -202,9 +202,9 @@ class Evolution:
         if self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
             pool = pool + TrafficPool.recorded(order.scenes)
         metrics, drawn = {"attacked": made.traffic["attacked"].item()}, made.traffic["entered"].nonzero()[:, 0]
-        return Attack(pool, drawn, metrics, spent, made.traffic["contact"].item(), made.errored)
+        return RoundTraffic(pool, drawn, metrics, spent, made.traffic["contact"].item(), made.errored)
 
-    def _live(self, order: Order) -> Attack:
+    def _live(self, order: Order) -> RoundTraffic:
         """Rows whose traffic is replanned against the learning ego, attacked and nominal."""
         index, eta, template = (each.repeat(NOISES) for each in (order.scenes, order.eta, order.template))
         noise = index + (order.seed * NOISES + torch.arange(NOISES).repeat_interleave(len(order.scenes))) * 1_000_003
@@ -213,7 +213,7 @@ class Evolution:
             pool = pool + TrafficPool.live(index, torch.zeros_like(eta), noise)
         elif self.settings.nominal == "log":
             pool = pool + TrafficPool.recorded(order.scenes)
-        return Attack(pool, torch.arange(len(order.scenes)).repeat(NOISES), {}, {"synthesize": 0.0})
+        return RoundTraffic(pool, torch.arange(len(order.scenes)).repeat(NOISES), {}, {"synthesize": 0.0})
 
     def state_dict(self) -> dict:
         """Curriculum, improvement and the order of the coming round; the checkpoint adds weights, the memory's index

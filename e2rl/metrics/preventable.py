@@ -29,7 +29,7 @@ AFTER = round(3.0 / DT)  # steps beyond the ego's contact for which the driver m
 CHAIN = 2  # followers that may be driven again
 CREEPING = 0.5  # m/s: an ego that is slower does not run into anybody
 MOVED = 0.02  # m within a step that tell the direction of motion
-SAME_WAY = 0.5  # cosine of the headings of a follower and its leader at least
+LEAST_COSINE = 0.5  # cosine of the headings of a follower and its leader at least
 
 
 class Tracks(NamedTuple):
@@ -253,7 +253,7 @@ def _follows(leader: Tensor, others: Tracks, touched: Tensor, index: Tensor) -> 
     other, ahead = others.states[row, step, index], leader[row, step]
     onwards = last_direction(leader, step)
     behind = to_frame(other[:, :2], torch.cat([ahead[:, :2], onwards[:, None]], -1))[:, 0] < 0
-    return behind & ((travel_heading(other) - onwards).cos() > SAME_WAY)
+    return behind & ((travel_heading(other) - onwards).cos() > LEAST_COSINE)
 
 
 def preventions(collision: Collision, drivers: dict[str, Driver] = DRIVERS) -> dict[str, Prevention]:

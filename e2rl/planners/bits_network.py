@@ -26,7 +26,7 @@ from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.observation import OBSERVATION_SIZE
 
-HORIZON = PLAN_STEPS * DT  # s
+PLAN_SECONDS = PLAN_STEPS * DT  # s
 DISTANCES, SIDES = 32, 7  # cells along the mission and beside it
 CELLS = DISTANCES * SIDES  # G: cell w * SIDES + s
 SIDE = 1.0  # m, width of a cell
@@ -35,7 +35,7 @@ FASTEST = 2.5  # m/s^2: acceleration over the horizon that leads to the grid's e
 
 def reach(speed: Tensor) -> Tensor:
     """Distances [...] m to the end of the grid from speeds [...] m/s."""
-    return HORIZON * speed + FASTEST * HORIZON**2 / 2
+    return PLAN_SECONDS * speed + FASTEST * PLAN_SECONDS**2 / 2
 
 
 def place(speed: Tensor, cell: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,9 +58,9 @@ def cell_of(speed: Tensor, distance: Tensor, side: Tensor) -> tuple[Tensor, Tens
 def needed_acceleration(speed: Tensor, distance: Tensor) -> Tensor:
     """The constant acceleration [...] m/s^2 that drives `distance` [...] m within the horizon from speed [...] m/s: to
     its end, or to a halt before it."""
-    going = 2 * (distance - HORIZON * speed) / HORIZON**2
+    going = 2 * (distance - PLAN_SECONDS * speed) / PLAN_SECONDS**2
     halting = -speed.square() / (2 * distance.clamp(min=0.1))
-    return torch.where(distance < HORIZON * speed / 2, halting, going)
+    return torch.where(distance < PLAN_SECONDS * speed / 2, halting, going)
 
 
 FORMAT = "e2rl-bits/1"

@@ -13,7 +13,7 @@ from e2rl.sim.mission import light_state_at, limit_at, mission_of, stop_line_dis
 from e2rl.sim.world import World
 
 MAX_SLOPE = 1.0  # rad, bound of the angle between vehicle and route at the start of a path
-HORIZON = 200.0  # m of speed caps
+CAPPED_AHEAD = 200.0  # m of speed caps
 LATERAL_ACCELERATION = 3.0  # m/s^2 that curves are taken with
 BRAKING = 3.0  # m/s^2 ahead of curves, limits and lights
 STOP_GAP = 1.0  # m kept to a stop line
@@ -81,13 +81,13 @@ class MissionPath(RoutePath):
         super().__init__(world.states[:, 0], self.mission.points, world.mission_s)
 
     def speed_caps(self, desired: float, braking: float = BRAKING, limits: bool = True, lights: bool = True) -> Tensor:
-        """Squares [B, HORIZON / SPACING] of the highest speeds every SPACING metres ahead; read them by `look_up`.
+        """Squares [B, CAPPED_AHEAD / SPACING] of the highest speeds every SPACING metres ahead; read them by `look_up`.
 
         From these speeds, braking at `braking` m/s^2 meets all limits: `desired` m/s, or the speed limit where it is
         known and `limits`; LATERAL_ACCELERATION in curves; with `lights` a halt before a light that binds (negative
         beyond it). c(a)^2 = min over b >= a of v(b)^2 + 2 braking (b - a), which is piecewise linear in a.
         """
-        count = int(HORIZON / SPACING)
+        count = int(CAPPED_AHEAD / SPACING)
         grid = SPACING * torch.arange(count, device=self.s.device, dtype=self.s.dtype)
         at = self.s[:, None] + grid
         curvature = torch.nn.functional.avg_pool1d(interpolate(self.mission.points, at)[2], 3, 1, 1)

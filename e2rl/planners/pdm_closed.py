@@ -35,7 +35,7 @@ from e2rl.sim.world import World
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the speed limit; of proposals that score alike the first is driven
 OFFSETS = (0.0, -1.0, 1.0)  # m beside the mission, left positive
-HORIZON = 40  # steps that are scored: 4 s
+SCORED_STEPS = 40  # steps that are scored: 4 s
 LOOKS = (0.0, 0.3, 0.6, 0.9)  # s ahead of each state at constant velocity: the time to collision
 STANDS, NO_LOOK = 0.05, 0.005  # m/s: up to which one stands at a collision; below which the ego has no time to one
 REAR_AXLE = 1.461 / 5.176  # of the length: nuPlan's vehicle, from its centre back to the rear axle
@@ -84,7 +84,7 @@ class PDMClosedEgo(Ego):
 
     def _plan(self, world: World) -> Tensor:
         proposals = self.proposals(world)
-        scores, collides = score(world, proposals, self._others(world, range(HORIZON + 1)))
+        scores, collides = score(world, proposals, self._others(world, range(SCORED_STEPS + 1)))
         best = scores.argmax(1)
         row = torch.arange(len(best), device=best.device)
         brake = torch.tensor([-self.emergency_braking, 0.0], device=best.device).expand(len(best), PLAN_STEPS, 2)
@@ -150,8 +150,8 @@ def _extent(size: Tensor, turn: Tensor, axis: int) -> Tensor:
 
 
 def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tensor]:
-    """nuPlan's closed-loop score, in [0, 1], of proposals over the HORIZON, and the time of their first collision at
-    fault.
+    """nuPlan's closed-loop score, in [0, 1], of proposals over the SCORED_STEPS, and the time of their first collision
+    at fault.
 
     Collision and drivable area multiply the weighted mean of progress, relative to the proposal that gets farthest by
     what these two leave of it, time to collision and comfort. Proposals follow the mission, and so never drive against
@@ -159,21 +159,21 @@ def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tens
 
     Args:
         proposals: [B, P, PLAN_STEPS, 4].
-        others: at steps 0 to HORIZON.
+        others: at steps 0 to SCORED_STEPS.
 
     Returns:
         Scores [B, P]; seconds [B, P], inf without a collision.
     """
     size = world.scene["size"][:, 0]
     now = world.states[:, None, None, 0].expand_as(proposals[:, :, :1])
-    scored = torch.cat([now, proposals[:, :, :HORIZON]], 2)
+    scored = torch.cat([now, proposals[:, :, :SCORED_STEPS]], 2)
     contacts = contacts_of(scored, size, others)
     loose = in_several_lanes(world, scored, size)
     fault = at_fault(scored, size, others, contacts[..., 0], loose)
     hit = fault & ~others.objects[:, None, :, None]
     factor = torch.where(hit.any((2, 3)), 0.0, torch.where(fault.any((2, 3)), OBJECT_HIT, 1.0))
     factor = factor * on_road(scored, size, world)
-    times = DT * torch.arange(HORIZON + 1, device=fault.device)
+    times = DT * torch.arange(SCORED_STEPS + 1, device=fault.device)
     collides = torch.where(fault.any(2), times, torch.inf).amin(-1)
     clear = ~runs_into(scored, size, others, contacts, loose)
     driven, smooth = progress(world, scored, factor), comfortable(world, scored)
@@ -278,7 +278,7 @@ def on_road(states: Tensor, size: Tensor, world: World) -> Tensor:
 
 
 def comfortable(world: World, scored: Tensor) -> Tensor:
-    """Bool [B, P]: scored [B, P, HORIZON + 1, 4] keep nuPlan's bounds of comfort, by the published filters.
+    """Bool [B, P]: scored [B, P, SCORED_STEPS + 1, 4] keep nuPlan's bounds of comfort, by the published filters.
 
     The accelerations are a step's changes of speed, the first one the ego's last; like nuPlan's vehicle it has none to
     the side.
@@ -286,7 +286,7 @@ def comfortable(world: World, scored: Tensor) -> Tensor:
     speed, heading = scored[..., 3], scored[..., 2]
     accel = torch.cat([world.accel[:, None, :1].expand_as(speed[..., :1]), speed.diff(dim=-1) / DT], -1)
     turned = torch.nn.functional.pad(wrap(heading.diff(dim=-1)).cumsum(-1), (1, 0))
-    whole = HORIZON + 1
+    whole = SCORED_STEPS + 1
 
     def filtered(values: Tensor, window: int, order: int, derivative: int = 0) -> Tensor:
         return values @ savitzky_golay(window, order, derivative).to(values).mT
@@ -303,6 +303,6 @@ def comfortable(world: World, scored: Tensor) -> Tensor:
 
 @cache
 def savitzky_golay(window: int, order: int, derivative: int) -> Tensor:
-    """The filter of HORIZON + 1 values at steps of DT as a matrix [HORIZON + 1, HORIZON + 1]."""
-    unit = np.eye(HORIZON + 1)
+    """The filter of SCORED_STEPS + 1 values at steps of DT as a matrix [SCORED_STEPS + 1, SCORED_STEPS + 1]."""
+    unit = np.eye(SCORED_STEPS + 1)
     return torch.from_numpy(savgol_filter(unit, window, order, deriv=derivative, delta=DT, axis=0))

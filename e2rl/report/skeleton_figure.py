@@ -37,7 +37,7 @@ from e2rl.traffic.grouping import take_rows
 
 SIDE, GAP, HEAD, FOOT = 600, 12, 62, 34  # points: of a panel, between panels, above and below them
 NODES = 10  # of the matrix at most
-HORIZON = 50  # steps of what was driven, as long as the reference rollout
+SHOWN_STEPS = 50  # steps of what was driven, as long as the reference rollout
 MARGIN, SMALLEST, LARGEST = 30.0, 60.0, 140.0  # m: around the coalition, and a map's least and greatest side
 CANDIDATE, FEASIBLE = drawing.VULNERABLE, "#2e8b57"
 ON_TOP = 10  # drawing order of edges, arrows and names, above the map
@@ -75,7 +75,7 @@ class SkeletonPicture:
     def driven(cls, rollout: Rollout, selection: Selection) -> "SkeletonPicture":
         """The same with what the rollout drove in the five seconds after the choice in place of the reference."""
         start, count = int(selection.step), min(selection.weights.shape[-1], rollout.states.shape[1])
-        steps = np.arange(start, min(start + HORIZON, len(rollout.states) - 1) + 1, STRIDE)
+        steps = np.arange(start, min(start + SHOWN_STEPS, len(rollout.states) - 1) + 1, STRIDE)
         states, valid = (torch.as_tensor(value[steps, :count]) for value in (rollout.states, rollout.valid))
         weights = pair_weights(states, valid, torch.as_tensor(rollout.size[:count]), selection.settings)
         moments = torch.as_tensor((steps - start) * rollout.dt)

@@ -9,10 +9,10 @@ from e2rl.planners.ego import EgoPolicy
 from e2rl.planners.pdm_closed import (
     COMFORT,
     FRACTIONS,
-    HORIZON,
     KEYS,
     OFFSETS,
     PROGRESS,
+    SCORED_STEPS,
     TIME_TO_COLLISION,
     Others,
     PDMClosedEgo,
@@ -132,7 +132,7 @@ def others_at(place):
 def test_an_object_that_it_hits_halves_the_score():
     """A vehicle that it hits leaves nothing; both make it brake alike."""
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(HORIZON + 1))
+    ahead = EGO._others(world, range(SCORED_STEPS + 1))
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
     vehicle, time = score(world, go, ahead)
     thing, same = score(world, go, ahead._replace(objects=ahead.seen))
@@ -161,7 +161,7 @@ def test_comfort_has_the_published_windows_and_bounds():
     world.accel[:, 0] = -4.0
 
     def smooth(accelerations):
-        actions = torch.stack([torch.tensor(accelerations), torch.zeros(HORIZON)], -1)
+        actions = torch.stack([torch.tensor(accelerations), torch.zeros(SCORED_STEPS)], -1)
         states = dynamics.rollout(world.states[0, 0], actions)[None, None]
         return comfortable(world, torch.cat([world.states[:, None, :1], states], 2)).item()
 
@@ -186,24 +186,21 @@ def test_the_limit_of_the_present_lane_holds_for_the_whole_plan():
 def test_the_score_is_the_weighted_mean_of_its_terms():
     """Alone on the road: the fastest has all; the slower lose progress in proportion; a hard brake loses comfort."""
     _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
-    start, none = world.states[:, :1], EGO._others(world, range(HORIZON + 1))
+    start, none = world.states[:, :1], EGO._others(world, range(SCORED_STEPS + 1))
     actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(3, 50, 2)
     states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
-    distance = states[0, :, HORIZON - 1, 0] - start[0, 0, 0]
+    distance = states[0, :, SCORED_STEPS - 1, 0] - start[0, 0, 0]
     found = score(world, states, none)[0][0]
     whole = PROGRESS + TIME_TO_COLLISION + COMFORT
     expected = PROGRESS * distance / distance[0] + TIME_TO_COLLISION + COMFORT * torch.tensor([1.0, 1.0, 0.0])
     torch.testing.assert_close(found, expected / whole, atol=1e-4, rtol=0)
-    assert comfortable(world, torch.cat([start.expand(3, -1, -1)[None], states[:, :, :HORIZON]], 2))[0].tolist() == [
-        True,
-        True,
-        False,
-    ]
+    scored = torch.cat([start.expand(3, -1, -1)[None], states[:, :, :SCORED_STEPS]], 2)
+    assert comfortable(world, scored)[0].tolist() == [True, True, False]
 
 
 def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(HORIZON + 1))
+    ahead = EGO._others(world, range(SCORED_STEPS + 1))
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
     found, collides = score(world, go, ahead)
     size = world.scene["size"][0, 0]
@@ -217,11 +214,11 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
 def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_collision():
     """Braking late, the ego halts 0.8 m behind whom stands, whom it would hit within 0.9 s if it let go the brake."""
     _, world = world_of(vehicles=[(0, 0, 10.0), (20.0, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(HORIZON + 1))
+    ahead = EGO._others(world, range(SCORED_STEPS + 1))
     actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
     states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
     found, collides = score(world, states, ahead)
-    late, early = states[0, :, HORIZON - 1, 0]
+    late, early = states[0, :, SCORED_STEPS - 1, 0]
     expected = torch.stack([late / late * PROGRESS + COMFORT, early / late * PROGRESS + TIME_TO_COLLISION])
     assert collides.isinf().all()
     torch.testing.assert_close(found[0], expected / (PROGRESS + TIME_TO_COLLISION + COMFORT), atol=1e-4, rtol=0)
@@ -233,7 +230,7 @@ def test_where_every_proposal_is_excluded_it_drives_the_slowest():
     scenes.scenes["field"][:, 86:] = 10.0  # from x = 6 m on
     _, world = worlds(scenes)
     states = EGO.proposals(world)
-    assert (score(world, states, EGO._others(world, range(HORIZON + 1)))[0] == 0).all()
+    assert (score(world, states, EGO._others(world, range(SCORED_STEPS + 1)))[0] == 0).all()
     torch.testing.assert_close(EGO.plan(world)[0], states[0, 0])
 
 

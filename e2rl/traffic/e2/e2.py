@@ -23,7 +23,7 @@ from e2rl.traffic.e2.decisions import ANY, eligible
 from e2rl.traffic.e2.foresight import time_before
 from e2rl.traffic.e2.kernels import (
     DRAWN,
-    Attack,
+    KernelAttack,
     Kernels,
     KernelSettings,
     best_try,
@@ -107,19 +107,19 @@ class E2(Coalitions):
 
     def _kernels(
         self, state: E2State, world: World, ego_plan: Tensor, context: Context, acts: Tensor
-    ) -> tuple[Attack, Kernels]:
+    ) -> tuple[KernelAttack, Kernels]:
         """The best kernels for vehicles that do not act [B, V] already, and what they are valued by."""
         mean = self.prior.estimate(context)
         plan = self.prior.decode(mean, context).states()
         more = state.coalition.sum(1) < state.near  # of the scene's template
         free = context.active & ~acts & (state.coalition | more[:, None]) & (state.eta > 0)[:, None]
         free &= eligible(world, state.now.whom, False) | (state.now.whom == ANY)[:, None]
-        attack = Attack.of(world, free, ego_plan, plan, state.since, state.settled)
+        attack = KernelAttack.of(world, free, ego_plan, plan, state.since, state.settled)
         gain, count = self.kernels.gain * state.eta, self.kernels.samples - 1
         return attack, propose_kernels(attack, state.lane, state.routed.points, mean, gain, count)
 
     def _best(
-        self, state: E2State, attack: Attack, kernels: Kernels, anchor: Anchor, context: Context, noise: Tensor
+        self, state: E2State, attack: KernelAttack, kernels: Kernels, anchor: Anchor, context: Context, noise: Tensor
     ) -> tuple[E2State, Tensor, Tensor, Tensor]:
         """State, x0, path KL and jump of the joint sample of highest value in each scene: a plain one, or one of those
         drawn to kernels, which has gain times its worth more and its path KL less.
@@ -155,7 +155,7 @@ class E2(Coalitions):
         least = math.log((self.kernels.samples - 1) / DRAWN)
         return state.eta > 0 if budget is None else (state.eta > 0) & (budget > least)
 
-    def _worth(self, attack: Attack, context: Context, x0: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
+    def _worth(self, attack: KernelAttack, context: Context, x0: Tensor, many: Tensor) -> tuple[Tensor, Tensor]:
         """What `foresee` makes of samples x0 [C, V, SIZE] of scenes many [C]: worth and prevented [C, V]."""
         zero = torch.zeros_like(x0[..., 0])
         copy, pair = (attack.row == many[:, None]).nonzero(as_tuple=True)

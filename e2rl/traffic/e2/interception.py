@@ -22,7 +22,7 @@ from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.lane_graph import against_lanes
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING
-from e2rl.sim.dynamics import wrap
+from e2rl.sim.dynamics import SHARPEST, wrap
 from e2rl.sim.world import World
 from e2rl.traffic.e2.foresight import foresee
 from e2rl.traffic.e2.motion import direction, distance_to_stop_line, take
@@ -30,7 +30,6 @@ from e2rl.traffic.e2.motion import direction, distance_to_stop_line, take
 ENDS = 3  # directions tried at the end of a path
 SAMPLES = 17  # points of a path that are checked
 MAX_BEARING, MAX_TURN = 1.05, 1.4  # rad between heading and target, and between both ends of a path
-MAX_CURVATURE = 0.12  # 1/m, what a car's steering allows
 CLEARANCE = 0.3  # m kept to others on the path
 SHOULDER = 0.5  # m that its centre may leave the drivable area by
 ACCEL_COST, LATERAL_COST = 0.2, 0.2  # s that 1 m/s^2 of acceleration, and of lateral acceleration, weighs
@@ -125,7 +124,7 @@ def _within(
     """Bool [B, M, O]: paths entered at speed [B, M, 1], driven at accel for time [B, M, O], keep the limits of eta."""
     lateral, curvature = _lateral(paths, speed, accel)
     ok = (accel <= settings.push * eta) & (accel >= -settings.brake * eta) & (speed + accel * time >= 0)
-    ok &= (lateral <= settings.lateral * eta) & (curvature < MAX_CURVATURE)
+    ok &= (lateral <= settings.lateral * eta) & (curvature < SHARPEST)
     return ok & (paths.bearing.abs() < MAX_BEARING) & (paths.turn.abs() < MAX_TURN)
 
 

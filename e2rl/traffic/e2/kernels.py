@@ -136,7 +136,7 @@ def lateral_nats(states: Tensor, lane: LaneState, points: Tensor, path: Tensor, 
 
 
 @dataclass(frozen=True)
-class Attack:
+class KernelAttack:
     """G vehicles whose plans are valued: scene row [G] and vehicle [G] int64; world: the B scenes now; ego_plan [B, H,
     4]: the ego's expected states; plan [B, V, H, 4]: everybody's; since, settled [G]: see `foresee`."""
 
@@ -151,7 +151,7 @@ class Attack:
     @classmethod
     def of(
         cls, world: World, active: Tensor, ego_plan: Tensor, plan: Tensor, since: Tensor, settled: Tensor
-    ) -> "Attack":
+    ) -> "KernelAttack":
         """Of the NEAREST active [B, V] vehicles that move, within REACH of the ego and ASIDE of its path."""
         gap = (world.states[:, : active.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
         way, points = ego_plan[:, None, 4::5, :2], plan[..., 4::5, :2]
@@ -205,7 +205,9 @@ class Attack:
         return wrong.view(at.shape).any(-1)
 
 
-def propose_kernels(attack: Attack, lane: LaneState, points: Tensor, mean: Tensor, gain: Tensor, count: int) -> Kernels:
+def propose_kernels(
+    attack: KernelAttack, lane: LaneState, points: Tensor, mean: Tensor, gain: Tensor, count: int
+) -> Kernels:
     """The `count` kernels of highest value: gain [B] nats times their worth, less what they cost.
 
     lane: states [B, V] on routes points [B, V, P, 2]; mean [B, V, SIZE]: the prior's. Those that gain nothing are none.

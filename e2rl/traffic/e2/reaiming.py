@@ -19,13 +19,12 @@ from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import separation, to_frame
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
-from e2rl.sim.dynamics import HOLD, TURN, Arc, along_arc, curvature_of
+from e2rl.sim.dynamics import HOLD, SHARPEST, TURN, Arc, along_arc, curvature_of
 from e2rl.sim.world import World
 from e2rl.traffic.e2.interception import (
     ACCEL_COST,
     LATERAL_COST,
     MAX_BEARING,
-    MAX_CURVATURE,
     SHOULDER,
     TIME_COST,
     InterceptionSettings,
@@ -87,7 +86,7 @@ def best_aim(
     top = torch.minimum(limits.push * dial, (v.clamp(min=TOP_SPEED) - v) / times)
     accel = torch.minimum(accel.maximum(-limits.brake * dial), top).maximum(-v / times)
     fastest = torch.maximum(v, v + accel * times)
-    bound = (limits.lateral * dial / fastest.square().clamp(min=1e-3)).clamp(max=MAX_CURVATURE)
+    bound = (limits.lateral * dial / fastest.square().clamp(min=1e-3)).clamp(max=SHARPEST)
     curvature = torch.minimum((2 * bearing.sin() / chord.clamp(min=0.1)).maximum(-bound), bound)
     aim, portions = Arc(accel, curvature), torch.arange(1, CHECKED + 1, device=times.device) / CHECKED
     looked_at = torch.cat([times[:, None], times[:, None].clamp(min=RUN_ON) * portions], 1)

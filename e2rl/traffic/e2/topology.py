@@ -18,7 +18,7 @@ from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.motion import smallest
 
 STRIDE = 5  # steps between the graphs (0.5 s)
-HORIZON = 8.0  # s; no contact within it at constant velocity is no risk
+RISK_SECONDS = 8.0  # s; no contact within it at constant velocity is no risk
 NODES = 24  # vehicles nearest to the ego that a graph may have: enumeration is exponential at worst
 HOPS = 2  # edges from the ego within which a clique must have a member (or the ego): a far queue is no candidate
 
@@ -60,7 +60,7 @@ def _overlap_interval(offset: Tensor, closing: Tensor, extent: Tensor) -> tuple[
     return middle - half, middle + half
 
 
-def time_to_collision(states: Tensor, size: Tensor, horizon: float = HORIZON) -> Tensor:
+def time_to_collision(states: Tensor, size: Tensor, horizon: float = RISK_SECONDS) -> Tensor:
     """Time [s] to the first contact of oriented boxes at constant velocity and heading: states [..., N, 4], size
     [..., N, 2] -> [..., N, N].
 

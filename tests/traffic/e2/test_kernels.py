@@ -15,7 +15,7 @@ from e2rl.traffic.e2 import kernels
 from e2rl.traffic.e2.control import Pull
 from e2rl.traffic.e2.kernels import (
     DRAWN,
-    Attack,
+    KernelAttack,
     Kernels,
     best_try,
     choice_nats,
@@ -124,7 +124,7 @@ def proposed(gain, count=5):
     context = on.encode(state, world, EGO.plan(world))
     mean = on.prior.estimate(context)
     plan = on.prior.decode(mean, context).states()
-    attack = Attack.of(world, context.active, EGO.plan(world), plan, state.since, state.settled)
+    attack = KernelAttack.of(world, context.active, EGO.plan(world), plan, state.since, state.settled)
     gains = torch.full((3,), gain)
     return mean, world, propose_kernels(attack, state.lane, state.routed.points, mean, gains, count)
 

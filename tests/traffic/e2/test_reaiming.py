@@ -12,9 +12,9 @@ from e2rl.planners.idm_planner import IDMEgo
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.dynamics import Arc, along_arc
+from e2rl.sim.dynamics import SHARPEST, Arc, along_arc
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.traffic.e2.interception import MAX_CURVATURE, InterceptionSettings
+from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.reaiming import LATEST, Ground, ReactSettings, Reaiming, best_aim, drawn, moments, surroundings
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import FULL, PAIR, SINGLE
@@ -146,7 +146,7 @@ def test_aims_keep_the_limits_at_every_intensity():
     assert 0.2 < some.float().mean() < 0.8, "not where the ego is behind"
     accel, curvature, eta, v = aim.accel[some], aim.curvature[some].abs(), eta[some], states[some, 3]
     assert (accel <= 1.5 * eta + 1e-4).all() and (accel >= -1.2 * eta - 1e-4).all()
-    assert (curvature <= MAX_CURVATURE + 1e-6).all() and (v**2 * curvature <= 2 * eta + 1e-3).all()
+    assert (curvature <= SHARPEST + 1e-6).all() and (v**2 * curvature <= 2 * eta + 1e-3).all()
 
 
 def test_it_aims_where_the_ego_is_expected_by_its_motion():
