@@ -72,8 +72,6 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
         raise InputError(f"{text}: {driven.run} knows no {rule['rate']}; {mend}")
     places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))[1]
     value, low, high = ends = found["difference" if change else "mean"], found["low"], found["high"]
-    if math.isnan(low) and metric.fraction and not change and places >= LEAST:  # all places are alike
-        value, low, high = ends = value, *exact_interval(value, places)
     holds, broken = (high <= limit, low > limit) if rule["sign"] == "<=" else (low >= limit, high < limit)
     outcome, more = PASSED if holds else FAILED if broken else UNDECIDED, None
     every, crashed = driven.traffic()[key], sum(map(raised, rows))

@@ -242,12 +242,12 @@ def test_at_few_places_a_planner_that_raises_in_every_scene_fails(tmp_path, caps
     assert said.startswith("failed" if status == 1 else "not enough rollouts")
 
 
-@pytest.mark.parametrize(("limit", "status"), [(0.2, 1), (0.3, 3), (0.7, 3), (0.8, 0)])
+@pytest.mark.parametrize(("limit", "status"), [(0.3, 1), (0.4, 3), (0.6, 3), (0.7, 0)])
 def test_where_all_places_are_alike_the_exact_interval_decides(tmp_path, capsys, limit, status):
-    """One of two rollouts at each of 12 places: the draws agree, Clopper and Pearson say 0.21 to 0.79."""
+    """One of two rollouts at each of 12 places: of 12, none, so at most 26%, is otherwise, and then 0 or 1."""
     rows = [errored(k) if seed else row_of(k) for k in range(12) for seed in (0, 1)]
     found, said = gate(capsys, run_of(tmp_path, rows), f"contacts<={limit}")
-    assert found == status and "found 50.0 [21.1, 78.9] %" in said
+    assert found == status and "found 50.0 [36.8, 63.2] %" in said
 
 
 def test_people_and_objects_have_rates_of_their_own(tmp_path, capsys):
