@@ -6,7 +6,7 @@ import torch
 from e2rl.planners.bits import BitsEgo
 from e2rl.planners.bits_network import (
     CELLS,
-    HORIZON,
+    PLAN_SECONDS,
     SIDES,
     cell_of,
     load_bits,
@@ -88,5 +88,5 @@ def test_the_needed_acceleration_drives_the_distance():
     speed, way = torch.tensor([10.0, 10.0, 10.0, 0.0]), torch.tensor([50.0, 75.0, 20.0, 5.0])
     accel = needed_acceleration(speed, way)
     torch.testing.assert_close(accel, torch.tensor([0.0, 2.0, -2.5, 0.4]))
-    time = torch.where(accel < 0, speed / -accel, HORIZON).clamp(max=HORIZON)  # to the halt
+    time = torch.where(accel < 0, speed / -accel, PLAN_SECONDS).clamp(max=PLAN_SECONDS)  # to the halt
     torch.testing.assert_close(speed * time + accel * time**2 / 2, way)

@@ -12,7 +12,7 @@ from e2rl.scenes.boxes import corners
 from e2rl.traffic.e2 import topology
 from e2rl.traffic.e2.topology import (
     HOPS,
-    HORIZON,
+    RISK_SECONDS,
     STRIDE,
     TopologySettings,
     pair_weights,
@@ -66,7 +66,7 @@ def test_first_contact_is_that_of_stepped_polygons():
 def test_ttc_of_a_follower_of_equal_speeds_and_at_the_horizon(gap, ttc):
     states = torch.tensor([[0.0, 0, 0, 10], [4 + gap, 0, 0, 0], [-30, 0, 0, 10]])
     found = time_to_collision(states, torch.tensor([4.0, 2.0]).expand(3, 2))
-    assert HORIZON == 8.0 and found[0, 1].item() == pytest.approx(ttc)
+    assert RISK_SECONDS == 8.0 and found[0, 1].item() == pytest.approx(ttc)
     assert found[0, 2] == torch.inf and found[0, 0] == 0
 
 
