@@ -180,11 +180,11 @@ def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(world, t
     """In its own folder, with its own configuration; what changes its meaning is refused."""
     score, left = Setup.score, [3]
 
-    def stopped(*given):
+    def stopped(*tasks, **settings):
         left[0] -= 1
         if left[0] < 0:
             raise KeyboardInterrupt
-        return score(*given)
+        return score(*tasks, **settings)
 
     small = ["seeds=[0]", "batch=1", "processes=1", "methods=[constant_velocity,replay]", "data.build.steps=20"]
     given = [*arguments(world, tmp_path, "good", *small), "ego=idm"]
