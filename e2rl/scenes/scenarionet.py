@@ -273,9 +273,10 @@ def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: 
         if lane not in lanes:
             continue
         states, last = np.zeros(len(seconds), np.int8), LIGHT_UNKNOWN
-        given = list(light["state"].get("object_state", ()))[: len(seconds)]
-        for frame, state in enumerate(given):  # LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
-            last = states[frame] = light_colour(state, otherwise=last)
-        states[len(given) :] = last
+        words = light["state"].get("object_state")
+        words = [] if words is None else list(words)[: len(seconds)]
+        for frame, word in enumerate(words):  # LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
+            last = states[frame] = light_colour(word, otherwise=last)
+        states[len(words) :] = last
         lights[lane] = states[now]
     return lights

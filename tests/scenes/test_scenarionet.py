@@ -284,3 +284,9 @@ def test_what_is_wrong_is_named_with_the_file(change, message):
     change(scene)
     with pytest.raises(InputError, match=rf"^made\.pkl: {message}"):
         read(scene)
+
+
+def test_a_light_without_states_is_unknown():
+    scene = description() | {"dynamic_map_states": {"on": {"state": {"object_state": None}}}}
+    (recording,) = read(scene)
+    assert (recording.lights["on"] == LIGHT_UNKNOWN).all()
