@@ -124,7 +124,7 @@ class PoolDriver:
         after, metrics = steps["next"], steps["next", "metrics"]
         done = after["done"][..., 0].int()
         alive = done.cumsum(1) - done == 0
-        contact = (touches(metrics))[..., 0]
+        contact = touches(metrics)[..., 0]
         frames = {
             "observation": steps["observation"],
             "intended": steps["intended"],

@@ -54,7 +54,7 @@ def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
     """Bool [B, T]: decisions of a collected batch at most `window` s before a contact, or before a near miss: less than
     `near` s to a contact if the ego goes on. Both in the same episode."""
     metrics, length = data["next", "metrics"], data.shape[1]
-    contact = (touches(metrics))[..., 0]
+    contact = touches(metrics)[..., 0]
     event = first_after(contact | (time_to_contact(data["observation"]) < near))[:, :-1]
     step = data["timestep"][..., 0]
     wait = step.gather(1, event.clamp(max=length - 1)) - step

@@ -152,10 +152,11 @@ def at_fault(batch: Batch, *, struck: Tensor, broke: Tensor, prevented: Tensor) 
     runs_into = leads & partner_moves & ~late & ~struck
     moved, _ = batch["moved_into"].unbind(1)
     runs_into = torch.where(batch["moved_into"].any(1), moved, runs_into)
-    fault = moves & (stood(batch, partner) | runs_into) & ~turned_on_the_spot(batch)
+    genuine = ~turned_on_the_spot(batch)
+    fault = moves & (stood(batch, partner) | runs_into) & genuine
     ego_stood = stood(batch, torch.zeros_like(partner))
     fault = fault | (~moves & ego_stood & blocks(batch, partner))
-    fault = fault | (broke & ~ego_stood & ~turned_on_the_spot(batch))
+    fault = fault | (broke & ~ego_stood & genuine)
     return fault.to(speed.dtype).masked_fill(~batch["hit"], torch.nan)
 
 

@@ -137,14 +137,15 @@ def ego_climbs(recording: Recording, valid: np.ndarray) -> bool:
     """
     if recording.heights is None:
         return False
-    heights = np.where(valid, recording.heights, np.nan)
+    known = valid & np.isfinite(recording.heights)
+    low = np.where(known, recording.heights, np.inf).min(0, initial=np.inf)
+    high = np.where(known, recording.heights, -np.inf).max(0, initial=-np.inf)
     drives = (np.abs(recording.states[..., 3]) * valid).sum(0) * DT > DRIVES
-    drives &= recording.agent_type == VEHICLE
+    drives &= (recording.agent_type == VEHICLE) & known.any(0)
     if not drives[recording.ego]:
         return True
-    change = np.array([np.nanmax(track) - np.nanmin(track) for track in heights[:, drives].T])
-    own = np.nanmax(heights[:, recording.ego]) - np.nanmin(heights[:, recording.ego])
-    return bool(own > 0 or np.median(change) == 0)
+    change = high[drives] - low[drives]
+    return bool(high[recording.ego] > low[recording.ego] or np.median(change) == 0)
 
 
 def _reached(graph: LaneGraph, starts: dict[str, float], reach: float) -> list[str]:

@@ -1,5 +1,7 @@
 """Who is above or below the ego's road is left out where heights tell, and nobody else is."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -131,3 +133,13 @@ def test_where_a_lane_leads_does_not_depend_on_where_its_vehicle_is_on_it():
     recording = recording_of(description(tracks, {"deck": deck, "ramp": ramp, "road": road}))
     builder = SceneBuilder(recording, SETTINGS)
     assert builder.scene(recording)["valid"].sum() == 2
+
+
+def test_a_track_without_heights_takes_those_of_the_others_from_nobody():
+    """No warning, no change: the bridge is told by the tracks that have heights."""
+    tracks = {"ego": straight(0, 0, 8), "beside": straight(-20, 3.5, 8), "crossing": crossing(-40.0, 10.0, 7.0)}
+    recording = recording_of(description(tracks, lanes(7.0)))
+    recording.heights[:, 1] = np.nan
+    with warnings.catch_warnings(action="error"):
+        builder = SceneBuilder(recording, SETTINGS)
+    assert builder.repairs[OTHER_LEVEL] == 1
