@@ -21,10 +21,14 @@ MAY_CHANGE = ("processes", "launcher", "shard")  # when a run is resumed
 
 def evaluate(run: Run) -> None:
     """Roll out and score what is not done yet; then summarise, draw and print."""
-    config, folder, plan = run.config, run.folder, begin(run)
-    asked, egos = plan.asked, plan.egos
+    config = run.config
+    folder = run.folder
+    plan = begin(run)
+    asked = plan.asked
+    egos = plan.egos
     work = Work(plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
-    setups, most = egos.setups(plan.setup), max(asked.budget, default=0.0)
+    setups = egos.setups(plan.setup)
+    most = max(asked.budget, default=0.0)
     then = failure_row(Path(config.reproduce), config.failure) if config.failure else None
     if then is not None:
         (scored,) = score_all([("failure", plan.part_of(then, Path(config.reproduce)))], work, lambda job: 1)

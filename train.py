@@ -43,12 +43,16 @@ def train_round(run: Evolution) -> dict[str, float]:
 
 def evolve(task: Run) -> None:
     """Harden an ego: measure it, train it for `rounds` rounds, measure it again."""
-    config, folder, done = task.config, task.folder, rounds_done(task.config.resume)
+    config = task.config
+    folder = task.folder
+    done = rounds_done(task.config.resume)
     progress = build_progress(config, done)
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
-    traffic, ego = build_traffic(config.synthesizer, prior), build_ego(config)
+    traffic = build_traffic(config.synthesizer, prior)
+    ego = build_ego(config)
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    run, logger = build_evolution(config, scenes, ego, traffic, folder=folder), build_logger(config, folder)
+    run = build_evolution(config, scenes, ego, traffic, folder=folder)
+    logger = build_logger(config, folder)
     measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
     task.begin({"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)})
     logger.forget(load_checkpoint(config.resume, run) if done else 0)
@@ -112,7 +116,8 @@ def losses_line(row: dict[str, float]) -> str:
 
 def purpose(task: Run) -> str:
     """What a stage does, in a line."""
-    config, data = task.config, task.choices["data"]
+    config = task.config
+    data = task.choices["data"]
     if config.stage.name != "evolution":
         return f"Trains {config.stage.name} on {data} logs, into {task.folder}."
     return (

@@ -20,7 +20,8 @@ def collector(bench: Bench) -> Iterator[Row]:
     sizes = bench.batches(32, 128, 512)
     for batch, fast in product(sizes, (False, True) if bench.compile else (False,)):
         fused.switch(fast)
-        env, actor = DrivingEnv(bench.scenes, bench.sim, batch), ActorEgo().network.actor
+        env = DrivingEnv(bench.scenes, bench.sim, batch)
+        actor = ActorEgo().network.actor
         source = Collector(
             env,
             actor,

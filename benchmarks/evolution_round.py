@@ -27,7 +27,8 @@ def evolution_round(bench: Bench) -> Iterator[Row]:
         begin = time.perf_counter()
         metrics = train_round(run)
         total = time.perf_counter() - begin
-        index, where = bench.pick(config.learner.round.scenes), ", prefetch" if prefetch else ""
+        index = bench.pick(config.learner.round.scenes)
+        where = ", prefetch" if prefetch else ""
         yield bench.row("evolution_round", f"whole{where}", index, total, "s")
         for part in ("synthesize", "improve", *(["waiting"] if prefetch else [])):
             yield bench.row("evolution_round", f"{part}{where}", index, metrics[f"time/{part}"], "s")

@@ -19,7 +19,8 @@ def learning(bench: Bench) -> Iterator[Row]:
     for fast in (False, True) if bench.compile else (False,):
         fused.switch(fast)
         collected, whole = rates(bench)
-        index, how = bench.pick(bench.configured("train").learner.collect.batch), ", compiled" if fast else ""
+        index = bench.pick(bench.configured("train").learner.collect.batch)
+        how = ", compiled" if fast else ""
         yield bench.row("learning", f"collect{how}", index, collected, "simulator steps/CPU s")
         yield bench.row("learning", f"collect and update{how}", index, whole, "simulator steps/CPU s")
     fused.switch(False)
@@ -29,11 +30,13 @@ def rates(bench: Bench) -> tuple[float, float]:
     """Steps per second of CPU of collecting, and of collecting and updating."""
     config = bench.configured("train")
     torch.manual_seed(0)
-    collect, ppo = dict(config.learner.collect), {**config.learner.ppo, "cloning": 0.0}
+    collect = dict(config.learner.collect)
+    ppo = {**config.learner.ppo, "cloning": 0.0}
     improve = PolicyImprovement(
         build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo, react=None, rounds=config.rounds
     )
-    collected, whole = [], []
+    collected = []
+    whole = []
     for number in range(WARM_UP + bench.repeats):
         begin = time.process_time()
         data = improve.collected()

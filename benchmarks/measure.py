@@ -127,9 +127,11 @@ class Bench:
     def both(self, function: Callable[[], object]) -> tuple[float, float]:
         """`best`, and the least time [s] that the process was on a core, which others on the machine hardly change."""
         function()
-        wall, cpu = [], []
+        wall = []
+        cpu = []
         for _ in range(self.repeats):
-            begin, begun = time.perf_counter(), time.process_time()
+            begin = time.perf_counter()
+            begun = time.process_time()
             function()
             wall.append(time.perf_counter() - begin), cpu.append(time.process_time() - begun)
         return min(wall), min(cpu)

@@ -20,7 +20,9 @@ WORK = (("simulator", 512), ("nominal rollout", 48), ("e2 rollout", 8), ("e2 rol
 def memory(bench: Bench) -> Iterator[Row]:
     """MiB at most resident: the scenes alone, 512 of them simulated, rollouts in nominal traffic and against e2, and
     environments that a policy learns in."""
-    context, alone, done = multiprocessing.get_context("spawn"), 0.0, set()
+    context = multiprocessing.get_context("spawn")
+    alone = 0.0
+    done = set()
     bench.pick(1)  # the scenes are built: processes of a pool cannot
     for name, size in WORK:
         (batch,) = bench.batches(size)
@@ -56,7 +58,8 @@ def _peak(bench: Bench, name: str, batch: int) -> tuple[float, float]:
 def _learn(bench: Bench, batch: int) -> None:
     """Collect and update twice, in recorded traffic."""
     config = bench.configured("train")
-    ppo, collect = {**config.learner.ppo, "cloning": 0.0}, {**config.learner.collect, "batch": batch}
+    ppo = {**config.learner.ppo, "cloning": 0.0}
+    collect = {**config.learner.collect, "batch": batch}
     improve = PolicyImprovement(
         build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo, react=None
     )

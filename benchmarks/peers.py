@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 
-AGENTS, STEPS = 32, 20
+AGENTS = 32
+STEPS = 20
 Measured = tuple[int, int, str, float]  # scenes at once, agents a scene, work, agent-steps per CPU second
 
 
@@ -80,7 +81,8 @@ def torchdrivesim(repeats: int) -> Iterator[Measured]:
     from torchdrivesim.simulator import Simulator, TorchDriveConfig
 
     torch.set_num_threads(1)
-    side, cells = 400.0, 14
+    side = 400.0
+    cells = 14
     axis = torch.linspace(-side / 2, side / 2, cells + 1)
     vertices = torch.cartesian_prod(axis, axis)
     corner = (torch.arange(cells)[:, None] * (cells + 1) + torch.arange(cells)).flatten()
@@ -122,7 +124,8 @@ PEERS = {
 
 
 if __name__ == "__main__":
-    name, repeats = sys.argv[1], int(sys.argv[2])
+    name = sys.argv[1]
+    repeats = int(sys.argv[2])
     if name not in PEERS:
         sys.exit(f"{name} is not on the package index, so that nothing here runs it")
     package, measure = PEERS[name]

@@ -14,7 +14,8 @@ from e2rl.sim.env import DrivingEnv
 def ppo_update(bench: Bench) -> Iterator[Row]:
     """Seconds and frames per second of an update."""
     config = bench.configured("train")
-    batch, steps = config.learner.collect.batch, config.learner.collect.steps
+    batch = config.learner.collect.batch
+    steps = config.learner.collect.steps
     network = ActorEgo().network
     source = Collector(
         DrivingEnv(bench.scenes, bench.sim, batch),

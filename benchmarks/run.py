@@ -57,8 +57,7 @@ def main(arguments: list[str]) -> None:
         if value is not None and value < 1:
             raise InputError(f"--{name} {value}: expected at least 1")
     torch.set_num_threads(1)
-    bench, rows = (
-        Bench(
+    bench = (Bench(
             options.data,
             options.prior,
             options.repeats,
@@ -66,9 +65,8 @@ def main(arguments: list[str]) -> None:
             tuple(options.train),
             options.compile,
             options.peers,
-        ),
-        [],
-    )
+        ))
+    rows = []
     line = "{:20} {:60} {:>5} {:>6} {:>10} {:>12} {:18} {:>5}"
     print(line.format("benchmark", "variant", "batch", "agents", "map points", "value", "unit", "load"))
     for name in options.only or BENCHMARKS:

@@ -16,7 +16,8 @@ from e2rl.traffic.rollout import roll_out
 SCENES = 64, 512, 2048, 10_000
 STEPS = 20
 CHUNK = 64  # scenes simulated at once: memory does not grow with their number
-ROLLOUTS, AT_ONCE = 64, 16
+ROLLOUTS = 64
+AT_ONCE = 16
 
 
 def scaling(bench: Bench) -> Iterator[Row]:
@@ -30,7 +31,8 @@ def scaling(bench: Bench) -> Iterator[Row]:
             yield bench.row("scaling", name, index, 1e6 * spent / count / STEPS, "us/scene and step")
             yield bench.row("scaling", name, index, peak, "MiB")
     (count,) = bench.batches(ROLLOUTS)
-    parts, seconds = bench.pick(count).split(min(AT_ONCE, -(-count // 2))), {}
+    parts = bench.pick(count).split(min(AT_ONCE, -(-count // 2)))
+    seconds = {}
 
     def work(index: torch.Tensor) -> None:
         eta = torch.full((len(index),), 2.0)

@@ -12,13 +12,15 @@ from e2rl.evaluation.protocol import Setup
 from e2rl.search.search import Search
 from e2rl.search.tries import Try
 
-SCENES, TRIES = 32, 4
+SCENES = 32
+TRIES = 4
 
 
 def searched_rollouts(bench: Bench) -> Iterator[Row]:
     """CPU seconds a rollout of a search, of the same rollouts in full batches, and of questions and answers."""
     (scenes,) = bench.batches(SCENES)
-    index, only = arange(scenes), range(scenes)
+    index = arange(scenes)
+    only = range(scenes)
     setup = Setup(bench.scenes, bench.ego, "lane_graph", bench.sim, 32, "cpu")
     plan = build_plans(bench.config, bench.traffic.prior)[0]
     tries, talk = searched(setup, plan, only)

@@ -64,7 +64,8 @@ def reacting(bench: Bench) -> Iterator[Row]:
     """Time of an episode in which vehicles re-aim in 70% of the environments, by that of its replay."""
     (batch,) = bench.batches(256)
     index = bench.pick(batch)
-    scene, rows = bench.scenes.batch(index), torch.arange(batch)
+    scene = bench.scenes.batch(index)
+    rows = torch.arange(batch)
     adversaries = scene["valid"] & (torch.arange(scene["valid"].shape[1]) < 4)
     traffic = {"scene_index": index, "states": scene["logged"], "valid": scene["logged_valid"]}
     pool = TrafficPool.stored(traffic | {"adversaries": adversaries}, 2.0)
@@ -101,9 +102,11 @@ def all_driven(bench: Bench, index: Tensor) -> tuple[float, float]:
     """Agent-steps per second and per CPU second of `everybody`, AGENTS rows a scene, all counted: absent ones
     cost the same."""
     scene = bench.scenes.batch(index)
-    start, size = scene["start"][:, :AGENTS], scene["size"][:, :AGENTS]
+    start = scene["start"][:, :AGENTS]
+    size = scene["size"][:, :AGENTS]
     agents = start.shape[1]
-    pairs, action = torch.triu_indices(agents, agents, 1), torch.zeros(*start.shape[:2], 2)
+    pairs = torch.triu_indices(agents, agents, 1)
+    action = torch.zeros(*start.shape[:2], 2)
 
     @torch.no_grad()
     def steps() -> None:

@@ -73,7 +73,8 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
 
 def parts(run: Callable[[], object]) -> dict[str, float]:
     """Shares of a run's time inside each of PARTS, and of the rest."""
-    spent, inside = Counter[str](), ["rest"]
+    spent = Counter[str]()
+    inside = ["rest"]
     since = [time.perf_counter()]
 
     def enter(part: str) -> None:
@@ -113,7 +114,8 @@ def kinds(run: Callable[[], object]) -> tuple[dict[str, float], int]:
     begin = time.perf_counter()
     run()
     total = time.perf_counter() - begin
-    spent, called = Counter[str](), fused.Fused.__call__
+    spent = Counter[str]()
+    called = fused.Fused.__call__
 
     def timed(*given: Any) -> Any:
         begin = time.perf_counter()

@@ -12,7 +12,11 @@ import struct
 import sys
 
 VERSION = 1
-HELLO, SCENE, PLAN, ACTION, FAILED = 1, 2, 3, 5, 6
+HELLO = 1
+SCENE = 2
+PLAN = 3
+ACTION = 5
+FAILED = 6
 RED, SPACING = 1, 2.0  # state of a light; metres between two points of a route
 DESIRED, GAP, HEADWAY, ACCELERATION, BRAKING = 10.0, 4.0, 1.2, 1.5, 3.0  # m/s, m, s, m/s^2, m/s^2
 
@@ -43,15 +47,18 @@ def act(known, lights, agents):
     _, _, x, y, heading, speed, *_ = agents[0]
     near = min(range(len(route)), key=lambda k: (route[k][0] - x) ** 2 + (route[k][1] - y) ** 2)
     desired = route[near][2] or DESIRED
-    gap, leader = math.inf, 0.0
+    gap = math.inf
+    leader = 0.0
     for _, _, other_x, other_y, other_heading, other_speed, other_length, other_width, _, _ in agents[1:]:
         along, aside = ahead(other_x - x, other_y - y, heading)
         if along > 0 and abs(aside) < (width + other_width) / 2 and along - (length + other_length) / 2 < gap:
-            gap, leader = along - (length + other_length) / 2, other_speed * math.cos(other_heading - heading)
+            gap = along - (length + other_length) / 2
+            leader = other_speed * math.cos(other_heading - heading)
     for light, line in lines:
         to_line = line - SPACING * near - length / 2
         if light >= 0 and lights[light] == RED and 0 < to_line < gap:
-            gap, leader = to_line, 0.0
+            gap = to_line
+            leader = 0.0
     wanted = GAP + max(0.0, speed * HEADWAY + speed * (speed - leader) / (2 * math.sqrt(ACCELERATION * BRAKING)))
     push = 1 - (speed / desired) ** 4 - (wanted / max(gap, 0.1)) ** 2
     goal = route[min(near + 2 + int(speed / SPACING), len(route) - 1)]
@@ -61,7 +68,8 @@ def act(known, lights, agents):
 
 def ahead(x, y, heading):
     """Metres ahead and to the left of a vehicle that looks along heading."""
-    cos, sin = math.cos(heading), math.sin(heading)
+    cos = math.cos(heading)
+    sin = math.sin(heading)
     return cos * x + sin * y, cos * y - sin * x
 
 

@@ -77,7 +77,8 @@ class Polyline(PolylineMapObject):
 
     def get_curvature_at_arc_length(self, arc_length):
         """Change of heading over the metre on either side."""
-        start, end = max(arc_length - 1.0, 0.0), min(arc_length + 1.0, self.length)
+        start = max(arc_length - 1.0, 0.0)
+        end = min(arc_length + 1.0, self.length)
         return wrap(self._heading_at(end) - self._heading_at(start)) / max(end - start, 1e-6)
 
     def _heading_at(self, s):
@@ -89,8 +90,14 @@ class LaneOfScene:
 
     def __init__(self, name, points, width):
         super().__init__(name)
-        self.width, self.light, self.limit, self.block, self.left, self.right = width, None, None, None, None, None
-        self.incoming, self.outgoing = [], []
+        self.width = width
+        self.light = None
+        self.limit = None
+        self.block = None
+        self.left = None
+        self.right = None
+        self.incoming = []
+        self.outgoing = []
         normal = np.gradient(points, axis=0)[:, ::-1] * [-1.0, 1.0]
         normal *= width / 2 / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         self._lines = [
@@ -196,7 +203,9 @@ class SceneMap(AbstractMap):
     def __init__(self, name, lines, about, lights):
         """lines: centrelines [P, 2], P >= 2, by lane; about [L, 9]: width, left, right and 6 exits of each, -1 none;
         lights [S, 2]: where lanes with lights begin."""
-        self._name, self._boxes, self._objects = name, {}, {layer: {} for layer in (*LANES, *BLOCKS, BESIDE, *EMPTY)}
+        self._name = name
+        self._boxes = {}
+        self._objects = {layer: {} for layer in (*LANES, *BLOCKS, BESIDE, *EMPTY)}
         left, right = ([int(row[k]) if row[k] in lines else -1 for row in about] for k in (1, 2))
         exits = [{int(lane) for lane in row[3:] if lane in lines} for row in about]
         entries = [sum(lane in after for after in exits) for lane in range(len(about))]
@@ -216,7 +225,8 @@ class SceneMap(AbstractMap):
                 made.block, self.lanes[lane] = block, made
                 self._objects[LANES[connector]][made.id] = made
         for number, lane in self.lanes.items():
-            lane.left, lane.right = self.lanes.get(left[number]), self.lanes.get(right[number])
+            lane.left = self.lanes.get(left[number])
+            lane.right = self.lanes.get(right[number])
             lane.outgoing = [self.lanes[after] for after in sorted(exits[number])]
             for after in lane.outgoing:
                 after.incoming.append(lane)
@@ -315,10 +325,13 @@ def lanes_along(route, lanes):
     """The lane [P] of each point of a route [P, 2], None where none is near: of all sequences of lanes the one of least
     distance, lane changes and jumps. lanes: by number."""
     steps = np.gradient(route, axis=0)
-    heading, names, costs = np.arctan2(steps[:, 1], steps[:, 0]), [], []
+    heading = np.arctan2(steps[:, 1], steps[:, 0])
+    names = []
+    costs = []
     for name, lane in lanes.items():
         path = lane.baseline_path.poses
-        low, high = path[:, :2].min(0) - DISTANT, path[:, :2].max(0) + DISTANT
+        low = path[:, :2].min(0) - DISTANT
+        high = path[:, :2].max(0) + DISTANT
         if not ((route >= low) & (route <= high)).all(1).any():
             continue
         distance = np.linalg.norm(route[:, None] - path[:, :2], axis=-1)
@@ -331,7 +344,8 @@ def lanes_along(route, lanes):
     near = [lanes[name] for name in names]
     change = np.array([[_change(lane, other) for other in near] for lane in near])
     cost = np.minimum(np.array(costs).T, DISTANT)  # [P, lanes near the route]
-    best, came = cost[0], []
+    best = cost[0]
+    came = []
     for here in cost[1:]:
         total = best[:, None] + change
         came.append(total.argmin(0))

@@ -35,7 +35,11 @@ from nuplan.planning.simulation.simulation_time_controller.simulation_iteration 
 from nuplan_map import LIT, SceneMap, lanes_along, wrap
 
 VERSION = 1
-HELLO, SCENE, PLAN, TRAJECTORY, FAILED = 1, 2, 3, 4, 6
+HELLO = 1
+SCENE = 2
+PLAN = 3
+TRAJECTORY = 4
+FAILED = 6
 STEPS, STEP = 50, 0.1  # of a plan, at most; s
 STEP_US, START_US = 100_000, 10_000_000  # us of a step; time of step 0, which leaves room for a past
 PAST = 20  # steps of history besides the present, as in nuPlan's simulation
@@ -69,15 +73,20 @@ class Scene:
 
     def __init__(self, payload, make):
         """payload: of SCENE; make: returns a new planner."""
-        self._make, self._planner, self._history, self._last = make, None, None, None
+        self._make = make
+        self._planner = None
+        self._history = None
+        self._last = None
         _, index, count, dots, lanes, lights, length, width, self._end = struct.unpack_from("<6I3f", payload)
-        parts, at = [], 36
+        parts = []
+        at = 36
         for rows, form in ((count, "3f"), (2, "if"), (dots, "i2f"), (lanes, "f8i"), (lights, "2f")):
             end = at + rows * struct.calcsize("<" + form)
             parts.append(list(struct.iter_unpack("<" + form, payload[at:end])))
             at = end
         route, self._ahead, points, about, lights = parts
-        self._route, self._limit = np.array(route)[:, :2], np.array(route)[:, 2]
+        self._route = np.array(route)[:, :2]
+        self._limit = np.array(route)[:, 2]
         self._lights = np.array(lights).reshape(-1, 2)
         self.map = SceneMap(f"scene {index}", lines_of(np.array(points).reshape(-1, 3)), about, self._lights)
         self.vehicle = VehicleParameters(
@@ -192,12 +201,14 @@ class Scene:
         at = now + STEP_US * np.arange(min(STEPS, round((times[-1] - now) / STEP_US)) + 1)
         x, y, heading, speed = (np.interp(at, times, one) for one in (x, y, np.unwrap(heading), speed))
         ahead = self.vehicle.rear_axle_to_center
-        x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
+        x = x + ahead * np.cos(heading)
+        y = y + ahead * np.sin(heading)
         away = math.hypot(x[0] - ego[2], y[0] - ego[3])
         if away > AWAY:
             raise ValueError(f"the trajectory begins {away:.1f} m from the ego")
         if speed.any():
-            driven, told = np.hypot(np.diff(x), np.diff(y)).sum(), STEP * np.abs(speed[1:]).sum()
+            driven = np.hypot(np.diff(x), np.diff(y)).sum()
+            told = STEP * np.abs(speed[1:]).sum()
             if abs(driven - told) > 2.0 + 0.25 * driven:  # e2rl follows poses and speeds
                 raise ValueError(f"the trajectory's poses move {driven:.1f} m, its rear-axle velocities {told:.1f} m")
         else:
@@ -225,7 +236,8 @@ def returning(states, ego):
     turned = math.tan(np.clip(wrap(ego[4] - heading[0]), -1.0, 1.0))
     aside = (1 - part) ** 2 * (beside * (1 + 2 * part) + turned * length * part)
     slope = (1 - part) * (turned * (1 - 3 * part) - 6 * beside * part / length)
-    x, y = x - aside * np.sin(heading), y + aside * np.cos(heading)
+    x = x - aside * np.sin(heading)
+    y = y + aside * np.cos(heading)
     return np.stack([x, y, wrap(heading + np.arctan(slope)), speed], 1)
 
 
@@ -238,7 +250,8 @@ def lines_of(points):
 
 def tracks(step, moment):
     """Everybody but the ego, as nuPlan's detections. moment: records by id, the ego first."""
-    time, found = START_US + step * STEP_US, []
+    time = START_US + step * STEP_US
+    found = []
     for name, kind, x, y, heading, speed, length, width, _, yaw_rate in list(moment.values())[1:]:
         found.append(
             Agent(
@@ -257,7 +270,8 @@ def before(record, seconds):
     name, kind, x, y, heading, speed, length, width, _, yaw_rate = record
     half = yaw_rate * seconds / 2
     chord = speed * seconds * (math.sin(half) / half if half else 1.0)
-    x, y = x - chord * math.cos(heading - half), y - chord * math.sin(heading - half)
+    x = x - chord * math.cos(heading - half)
+    y = y - chord * math.sin(heading - half)
     return name, kind, x, y, wrap(heading - 2 * half), speed, length, width, 0.0, yaw_rate
 
 
@@ -328,7 +342,8 @@ def maker(options):
             (config,) = config.values()
         return lambda: instantiate(config)
     module, _, name = options.planner.partition(":")
-    kind, given = getattr(importlib.import_module(module), name), {}
+    kind = getattr(importlib.import_module(module), name)
+    given = {}
     for argument in options.arguments:
         key, _, value = argument.partition("=")
         try:

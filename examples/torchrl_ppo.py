@@ -18,7 +18,8 @@ import e2rl
 from e2rl.planners.network import ActorCritic
 
 BATCH, STEPS = 16, 10  # environments, and decisions of each in a collected batch
-MINIBATCH, GAMMA = 64, 0.97
+MINIBATCH = 64
+GAMMA = 0.97
 
 
 def collected(env: TransformedEnv, network: ActorCritic, frames: int) -> Collector:
@@ -32,7 +33,8 @@ def collected(env: TransformedEnv, network: ActorCritic, frames: int) -> Collect
 def ppo(env: TransformedEnv, network: ActorCritic, frames: int) -> None:
     """Train the network by TorchRL's PPOTrainer, four passes over every batch."""
     loss = ClipPPOLoss(network.actor, network.critic, entropy_coeff=0.0)
-    storage, sampler = LazyTensorStorage(BATCH * STEPS), SamplerWithoutReplacement()
+    storage = LazyTensorStorage(BATCH * STEPS)
+    sampler = SamplerWithoutReplacement()
     trainer = PPOTrainer(
         collector=collected(env, network, frames),
         total_frames=frames,

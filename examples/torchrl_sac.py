@@ -62,7 +62,8 @@ def main(steps: str = "100000", file: str = "sac.onnx", num_envs: int = 64, **se
     values = ValueOperator(values, in_keys=["observation", "action"])
     loss = SACLoss(actor, values, action_spec=spec, alpha_init=0.1)
     loss.make_value_estimator(gamma=0.97)
-    target, optimiser = SoftUpdate(loss, tau=0.005), torch.optim.Adam(loss.parameters(), 3e-4)
+    target = SoftUpdate(loss, tau=0.005)
+    optimiser = torch.optim.Adam(loss.parameters(), 3e-4)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(int(steps)), batch_size=BATCH)
     options = {"frames_per_batch": num_envs, "total_frames": int(steps), "auto_register_policy_transforms": False}
     with Path(file).with_suffix(".monitor.csv").open("w") as monitor:

@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
 
-CPU, PRETENDED = torch.device("cpu"), torch.device("cuda", 0)
+CPU = torch.device("cpu")
+PRETENDED = torch.device("cuda", 0)
 MARK = "pretended"
 TAKEN = {"tensor", "as_tensor", "asarray"}  # whose result lies where what they are given lies
 CREATED = TAKEN | {
@@ -52,7 +53,8 @@ class Pretended(TorchFunctionMode):
     """Between enter and exit there is a device `cuda`."""
 
     def __torch_function__(self, function: Callable, types, args=(), kwargs=None) -> Any:
-        kwargs, name = dict(kwargs or {}), getattr(function, "__name__", "")
+        kwargs = dict(kwargs or {})
+        name = getattr(function, "__name__", "")
         given = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
         if function == Tensor.device.__get__:
             return device_of(args[0])

@@ -43,7 +43,8 @@ def make_scenes(
         raise ValueError(f"{len(vehicles)} vehicles, {num_vrus} VRUs exceed {max_vehicles}, {max_agents} rows")
     shift = torch.arange(num_scenes, dtype=torch.float32)[:, None]
     start = torch.zeros(num_scenes, max_agents, 4)
-    n, u = len(vehicles), max_vehicles + num_vrus
+    n = len(vehicles)
+    u = max_vehicles + num_vrus
     start[:, :n, 0], start[:, :n, 1], start[:, :n, 3] = x + shift, lane * LANE_WIDTH, v
     start[:, max_vehicles:u, 0] = 15.0 * torch.arange(1, num_vrus + 1) + shift
     start[:, max_vehicles:u, 1], start[:, max_vehicles:u, 3] = -6.0, 1.0
@@ -102,7 +103,8 @@ def _routes(start, valid, num_routes, num_points, limit, red_light_x, road):
     first = torch.zeros(shape, dtype=torch.bool)
     first[..., 0] = valid
     length = (road[1] - begin).clamp(0, arc[-1].item())
-    light, light_s = torch.full((*shape, 2), -1), torch.zeros(*shape, 2)
+    light = torch.full((*shape, 2), -1)
+    light_s = torch.zeros(*shape, 2)
     if red_light_x is not None:
         light_s[..., 0] = (red_light_x - begin)[..., None]
         light[..., 0] = torch.where(first & (light_s[..., 0] > 0) & (light_s[..., 0] < length[..., None]), 0, -1)
@@ -132,13 +134,15 @@ def _map(road):
     x = torch.arange(road[0], road[1] + 1e-6, SPACING)
     y = torch.tensor([0.0, LANE_WIDTH])
     lane = torch.stack([x.repeat(2), y.repeat_interleave(len(x))], -1)
-    low, high = -LANE_WIDTH / 2, 1.5 * LANE_WIDTH
+    low = -LANE_WIDTH / 2
+    high = 1.5 * LANE_WIDTH
     polygon = torch.tensor([[road[0], low], [road[1], low], [road[1], high], [road[0], high]])
     cells = math.ceil(road[1] - road[0]) + 41
     origin = torch.tensor([road[0] - 20.0, -cells // 2])
     centre = torch.arange(cells, dtype=torch.float32)
     gx, gy = torch.meshgrid(centre + origin[0], centre + origin[1], indexing="ij")
-    along, across = torch.maximum(road[0] - gx, gx - road[1]), torch.maximum(low - gy, gy - high)
+    along = torch.maximum(road[0] - gx, gx - road[1])
+    across = torch.maximum(low - gy, gy - high)
     polygon_gap = torch.hypot(along.clamp(min=0), across.clamp(min=0)) + torch.maximum(along, across).clamp(max=0)
     lane_gap = torch.hypot(along.clamp(min=0)[..., None], gy[..., None] - y).amin(-1) - (LANE_WIDTH / 2 + MARGIN)
     field = torch.minimum(polygon_gap, lane_gap)

@@ -33,7 +33,8 @@ def test_what_a_file_builds_has_no_default_for_its_keys(file):
 
 
 def test_settings_dataclasses_have_no_defaults():
-    root, found = Path(e2rl.__file__).parent, 0
+    root = Path(e2rl.__file__).parent
+    found = 0
     for path in root.rglob("*.py"):
         if path.parent.name in ("scripts", "commands") or path.stem.startswith("__"):
             continue

@@ -25,7 +25,8 @@ def test_every_package_and_the_configuration_are_in_the_wheel():
 def test_a_notebook_rolls_out_what_the_command_does():
     """The ten lines of e2rl.api: the rollouts do not depend on how they are asked for."""
     scenes = e2rl.load_scenes("bundled", num_scenes=2)
-    ego, prior = e2rl.make_ego("lane_graph"), e2rl.load_prior()
+    ego = e2rl.make_ego("lane_graph")
+    prior = e2rl.load_prior()
     ours = e2rl.roll_out(scenes, ego, e2rl.make_traffic("e2", prior), eta=2.0)
     config = load_config("evaluate", ["num_scenes=2"])
     setup = Setup(scenes, ego, "lane_graph", build_sim(config))

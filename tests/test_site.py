@@ -25,7 +25,10 @@ class Page(HTMLParser):
 
     def __init__(self, path: Path):
         super().__init__()
-        self.links, self.loads, self.anchors, self.tags = [], [], set(), set()
+        self.links = []
+        self.loads = []
+        self.anchors = set()
+        self.tags = set()
         self.feed(path.read_text())
 
     def handle_starttag(self, tag, attributes):

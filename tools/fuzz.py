@@ -59,7 +59,9 @@ class Watch:
     """Notes what code that runs in an input would do; inputs are written below `folder`."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.seen, self.on = str(folder), "", False
+        self.folder = str(folder)
+        self.seen = ""
+        self.on = False
         sys.addaudithook(self._audit)
 
     def _audit(self, event: str, arguments: tuple) -> None:
@@ -90,7 +92,10 @@ def _by_workers() -> bool:
 
 def outcome(read: Callable[[bytes], Any], content: bytes, watch: Watch, mark: Path) -> tuple[str, str]:
     """What came of one input, and a note on what is bad."""
-    result, note, watch.seen, watch.on = "read", "", "", True
+    result = "read"
+    note = ""
+    watch.seen = ""
+    watch.on = True
     try:
         signal.setitimer(signal.ITIMER_PROF, LIMIT)
         signal.setitimer(signal.ITIMER_REAL, WALL)
@@ -98,16 +103,19 @@ def outcome(read: Callable[[bytes], Any], content: bytes, watch: Watch, mark: Pa
     except InputError as error:
         result, note = ("refused", "") if str(error) else ("escaped", "an InputError without a word")
     except Garbage as error:
-        result, note = "garbage", str(error)
+        result = "garbage"
+        note = str(error)
     except BaseException as error:
         kinds = {MemoryError: "memory", Hang: "hang"}
-        result, note = kinds.get(type(error), "escaped"), f"{type(error).__name__}: {str(error)[:200]}{place(error)}"
+        result = kinds.get(type(error), "escaped")
+        note = f"{type(error).__name__}: {str(error)[:200]}{place(error)}"
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
         watch.on = False
     if watch.seen or mark.exists():
-        result, note = "executed", watch.seen or "the mark is there"
+        result = "executed"
+        note = watch.seen or "the mark is there"
         mark.unlink(missing_ok=True)
     return result, note
 
@@ -154,7 +162,8 @@ def child(folder: Path, reader: str, count: int, start: int, data: str | None) -
 
 def rows_of(folder: Path, reader: str, options: argparse.Namespace) -> Iterator[tuple[str, str]]:
     """Outcomes of N inputs of a reader; a child that dies or waits too long costs one input."""
-    left, start = options.count, options.seed
+    left = options.count
+    start = options.seed
     while left > 0:
         command = [sys.executable, "-m", "tools.fuzz", str(left), reader, "--seed", str(start), "--child", str(folder)]
         command += ["--data", options.data] if options.data else []
@@ -171,7 +180,8 @@ def rows_of(folder: Path, reader: str, options: argparse.Namespace) -> Iterator[
         if left == begun:
             raise SystemExit(f"{reader}: the child does not start")
         yield "hang" if process.returncode == 124 else "crash", f"status {process.returncode}"
-        left, start = left - 1, start + 1
+        left = left - 1
+        start = start + 1
 
 
 def main(arguments: list[str] | None = None) -> int:

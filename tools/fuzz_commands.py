@@ -57,7 +57,8 @@ Edit = tuple[str, str, Any]  # a file of the case; what becomes of it; its conte
 
 def commands(folder: Path, mark: str, run: Callable[[list[str]], None]) -> tuple[st.SearchStrategy[bytes], Callable]:
     """A strategy of cases, and what runs one in folder/case; the run that they are made of lies in folder/run."""
-    pristine, case = prepared(folder), folder / "case"
+    pristine = prepared(folder)
+    case = folder / "case"
 
     def read(content: bytes) -> None:
         name, edits = pickle.loads(content)
@@ -111,7 +112,8 @@ def prepared(folder: Path) -> Path:
 def called(command: list[str]) -> None:
     """Call a command's `main` here; InputError where it ends with one line."""
     module, *arguments = command
-    main, said = vars(__import__(module, fromlist=["main"]))["main"], io.StringIO()
+    main = vars(__import__(module, fromlist=["main"]))["main"]
+    said = io.StringIO()
     sys.argv = [f"{module}.py", *arguments]
     logging.getLogger().handlers.clear()  # Hydra's, of a folder that is gone
     try:
@@ -217,8 +219,6 @@ def tables(text: str) -> st.SearchStrategy[bytes]:
         lines = [",".join(row[:left]) for row in table + [table[index] for index in repeated]]
         return "\n".join(lines).encode("utf-8", "surrogatepass")
 
-    repeated, left = (
-        st.lists(st.integers(0, len(rows) - 1), max_size=2),
-        st.sampled_from([len(rows[0])] * 4 + [0, 1, 9]),
-    )
+    repeated = st.lists(st.integers(0, len(rows) - 1), max_size=2)
+    left = st.sampled_from([len(rows[0])] * 4 + [0, 1, 9])
     return st.builds(changed, st.lists(cell, max_size=2), repeated, left)

@@ -67,9 +67,12 @@ def mutated(draw: Callable, data: Any, odd: st.SearchStrategy = PLAIN) -> Any:
     """Copies of nested containers with one to three parts removed, replaced, or with one number changed."""
     data = copy.deepcopy(data)
     for _ in range(draw(st.integers(1, 3))):
-        place, parent, key = data, None, None
+        place = data
+        parent = None
+        key = None
         while isinstance(place, dict | list) and place and (parent is None or draw(st.integers(0, 6))):
-            parent, key = place, draw(st.sampled_from(sorted(place) if isinstance(place, dict) else range(len(place))))
+            parent = place
+            key = draw(st.sampled_from(sorted(place) if isinstance(place, dict) else range(len(place))))
             place = parent[key]
         if parent is None:
             continue
@@ -101,7 +104,8 @@ def opcodes() -> st.SearchStrategy[bytes]:
 
 def hostile(mark: str) -> st.SearchStrategy[bytes]:
     """Pickles that run code, claim terabytes, nest deep, or are random programs; code would write the file `mark`."""
-    code, laugh = f"open({mark!r}, 'w').close()", []
+    code = f"open({mark!r}, 'w').close()"
+    laugh = []
     for _ in range(60):
         laugh = [laugh, laugh]
     calls = [(exec, code), (os.system, f"touch {mark}"), (subprocess.check_call, ["touch", mark])]
@@ -123,7 +127,8 @@ def stored(values: dict, save: Callable = np.savez) -> bytes:
 
 def with_program(whole: bytes, program: bytes, method: int = zipfile.ZIP_STORED) -> bytes:
     """A finished part with another pickle in it, and its hash made anew; the zip's members deflated, if asked for."""
-    begin, result = whole.index(b"PK"), io.BytesIO()
+    begin = whole.index(b"PK")
+    result = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(whole[begin:])) as old, zipfile.ZipFile(result, "w", method) as new:
         for name in old.namelist():
             new.writestr(name, program if name.endswith("data.pkl") else old.read(name))

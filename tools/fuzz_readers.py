@@ -55,7 +55,9 @@ class Readers:
     )
 
     def __init__(self, folder: Path, data: str | None) -> None:
-        self.folder, self.mark, self.data = folder, folder / "mark", [description()]
+        self.folder = folder
+        self.mark = folder / "mark"
+        self.data = [description()]
         if data:
             source = ScenarioNetSource(data)
             self.data = [safe_load(source.content(log), log) for log in source.logs()[:8]]
@@ -73,7 +75,8 @@ class Readers:
 
     def descriptions(self) -> Reader:
         def read(content: bytes) -> None:
-            logs, cache = self.file("logs/input.pkl", content).parent, self.folder / "scenes"
+            logs = self.file("logs/input.pkl", content).parent
+            cache = self.folder / "scenes"
             scenes = ScenarioNetSource(str(logs), build=SMALL, workers=1, cache=str(cache)).load()
             for name, value in scenes.scenes.items():
                 require(not value.is_floating_point() or bool(value.isfinite().all()), f"{name} is not finite")
@@ -106,7 +109,8 @@ class Readers:
 
         def read(content: bytes) -> None:
             rollouts = Rollouts.from_npz(self.file("input.npz", content))
-            known, driven = rollouts.valid, rollouts.states[rollouts.valid]
+            known = rollouts.valid
+            driven = rollouts.states[rollouts.valid]
             require(known.shape == rollouts.states.shape[:3], "states of other agents")
             require(bool(driven.isfinite().all() and (driven.abs() < 200_000).all()), "no place or speed")
             score_rollouts(rollouts)
@@ -130,7 +134,8 @@ class Readers:
         """The configuration of a run that is resumed: none may name code outside of e2rl."""
         whole = (self.folder / "run" / CONFIG).read_bytes()
         plain = OmegaConf.to_container(OmegaConf.create(whole.decode()))
-        given, folder = load_config("evaluate", ["resume=input"]), self.folder / "inputs" / "resumed"
+        given = load_config("evaluate", ["resume=input"])
+        folder = self.folder / "inputs" / "resumed"
 
         def read(content: bytes) -> None:
             self.file(f"resumed/{CONFIG}", content)
@@ -169,7 +174,10 @@ class Readers:
         def read(content: bytes) -> None:
             ours, theirs = socket.socketpair()
             link = PlannerLink.__new__(PlannerLink)
-            link._buffer, link._socket, link._process, link._name = bytearray(), ours, None, "input"
+            link._buffer = bytearray()
+            link._socket = ours
+            link._process = None
+            link._name = "input"
             link.close = ours.close  # type: ignore[method-assign]
             ego = ExternalEgo(command="true", timeout=0.05)
             ego._link = link
@@ -189,7 +197,9 @@ class Readers:
 
 def require_plain(data: Any, most: int) -> None:
     """Garbage where data hold anything but containers, numbers, text and arrays, or are larger than `most` bytes."""
-    size, waiting, seen = 0, [data], set()
+    size = 0
+    waiting = [data]
+    seen = set()
     while waiting:
         value = waiting.pop()
         if id(value) in seen:

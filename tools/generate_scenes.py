@@ -48,7 +48,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("e2rl/assets/scenes"))
     options = parser.parse_args()
     began = time.time()
-    nets, refusals = [], Counter()
+    nets = []
+    refusals = Counter()
     with tempfile.TemporaryDirectory() as folder:
         for index, family in enumerate(schedule(options.nets)):
             scene_map, scenes, refused = make_net(index, family, options.seed, options.windows, Path(folder))

@@ -34,7 +34,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 LIMIT = 600.0  # s of one command
 SCENES = "data.build.steps=20 data.build.vehicles=8 data.build.others=2 data.build.field_cells=128 data.workers=1"
-TRAINED, TESTED = f"train.py {SCENES}", f"evaluate.py data.split=tune {SCENES} prior.sampler.steps=2"
+TRAINED = f"train.py {SCENES}"
+TESTED = f"evaluate.py data.split=tune {SCENES} prior.sampler.steps=2"
 STAGES = {
     "prior": f"{TRAINED} stage=prior num_scenes=40 prior.network.width=32 stage.steps=60"
     " stage.validate_every=10 stage.route_steps=50",
@@ -172,13 +173,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--stages", nargs="+", choices=STAGES, default=list(STAGES))
     given = parser.parse_args(arguments)
-    draw, took, counts, done, tried = random.Random(given.seed), {}, Counter(), 0, 0
+    draw = random.Random(given.seed)
+    took = {}
+    counts = Counter()
+    done = 0
+    tried = 0
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
         while done < given.count:
             stage = given.stages[done % len(given.stages)]
             command = [*STAGES[stage].split(), f"data.cache={folder / 'cache'}", "hydra.run.dir=run"]
-            whole, own, tried = folder / stage, folder / f"{stage}-{tried}", tried + 1
+            whole = folder / stage
+            own = folder / f"{stage}-{tried}"
+            tried = tried + 1
             if stage not in took:
                 begin = time.monotonic()
                 if wrong := complete(command, whole):

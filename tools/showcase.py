@@ -17,7 +17,9 @@ from e2rl.run.endings import ending
 from e2rl.scenes.source import load_scenes
 
 SCENE, SEED, ETA = "arterial_065_0440", 0, 2.0  # of the bundled test scenes
-METRES, PIXELS, COLOURS = 60.0, 400, 32
+METRES = 60.0
+PIXELS = 400
+COLOURS = 32
 PICTURES = {  # file: the ego's checkpoint, traffic, two lines of the picture
     "nominal": (None, "nominal", ("Nominal traffic", "untrained policy")),
     "attacked": (None, "e2", ("Attacked by e2", "untrained policy")),
@@ -33,7 +35,9 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with ending():
         config = load_config("evaluate", ["ego=actor", "data.workers=1"])
-        scenes, prior, sim = load_scenes(config.data), build_prior(config)[0], build_sim(config)
+        scenes = load_scenes(config.data)
+        prior = build_prior(config)[0]
+        sim = build_sim(config)
         for name, (checkpoint, traffic, caption) in PICTURES.items():
             config.ego.checkpoint = checkpoint
             setup = Setup(scenes, build_ego(config), "actor", sim)

@@ -47,7 +47,8 @@ def help_text() -> str:
 
 def main() -> None:
     """The command."""
-    name, arguments = (sys.argv[1] if len(sys.argv) > 1 else "--help"), sys.argv[2:]
+    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    arguments = sys.argv[2:]
     if name in ("-h", "--help", "help"):
         print(help_text())
     elif name in ("-V", "--version", "version"):

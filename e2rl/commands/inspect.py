@@ -40,8 +40,12 @@ LIMIT = "limit: "  # of a scene's route vertices by the speed limit there, which
 
 def content(scene: dict[str, np.ndarray]) -> Counts:
     """Returns the counts of one scene; agents are those present at its start frame."""
-    present, kinds, ego = scene["valid"], scene["agent_type"], scene["logged"][scene["logged_valid"][:, 0], 0, :2]
-    vehicles, index, count = present & (kinds == VEHICLE), scene["lane_index"], len(scene["lane_width"])
+    present = scene["valid"]
+    kinds = scene["agent_type"]
+    ego = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
+    vehicles = present & (kinds == VEHICLE)
+    index = scene["lane_index"]
+    count = len(scene["lane_width"])
     beside = (scene["lane_left"] >= 0) | (scene["lane_right"] >= 0)
     agents = {f"{name}s": (present & (kinds == kind)).sum() for kind, name in enumerate(AGENT_TYPES)}
     return agents | {
@@ -129,7 +133,9 @@ def _shapes(scene: dict[str, np.ndarray]) -> list[Shape]:
     points = zip(scene["light_points"], states, strict=True)
     shapes = [drawing.disc(point, 0.7, LIGHTS[state], drawing.INK) for point, state in points]
     for agent in np.flatnonzero(scene["valid"])[::-1]:
-        state, size, kind = scene["start"][agent], scene["size"][agent], AGENT_TYPES[scene["agent_type"][agent]]
+        state = scene["start"][agent]
+        size = scene["size"][agent]
+        kind = AGENT_TYPES[scene["agent_type"][agent]]
         shapes += drawing.agent(kind, state, size, _colour(scene, agent))
     return shapes
 
@@ -158,7 +164,9 @@ def inspect(source: Source, chosen: str | None) -> tuple[list[Row], list[Counts]
     That is the scene `chosen`, by default the first; None where no log makes a scene. Raises InputError where there is
     no such scene.
     """
-    rows, contents, drawn = [], [], None
+    rows = []
+    contents = []
+    drawn = None
     with closing(source.rows()) as found:
         for row in found:
             rows.append(row._replace(scene=None))

@@ -37,11 +37,15 @@ class TableSettings:
 
 def prior_tables(run: Run) -> None:
     """Make the rows of the tables; write and print them."""
-    config, folder = run.config, run.folder
+    config = run.config
+    folder = run.folder
     asked = settings_of(TableSettings, {each.name: config[each.name] for each in fields(TableSettings)})
     plan = begin(run)
-    methods, setup, parts = plan.methods, plan.setup, run.parts()
-    before, after = [], []
+    methods = plan.methods
+    setup = plan.setup
+    parts = run.parts()
+    before = []
+    after = []
     if asked.open_loop_samples:
         before = open_loop_rows(plan.scenes, methods, asked.open_loop_samples, config.device, parts)
     if asked.spread_samples:

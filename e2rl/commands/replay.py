@@ -24,7 +24,8 @@ def chosen(run: Path, failures: int, modes: bool) -> Iterator[tuple[str, Failure
     rows = read_rows(run / TABLE)
     found = [("", row) for row in found_failures(rows, failures)]
     if modes:
-        files, known = {rollout_name(row): row for row in rows}, read_modes(run / MODES_FILE)["modes"]
+        files = {rollout_name(row): row for row in rows}
+        known = read_modes(run / MODES_FILE)["modes"]
         if lost := [mode["typical"]["file"] for mode in known if mode["typical"]["file"] not in files]:
             raise InputError(f"{run / MODES_FILE}: {lost[0]} is not in {TABLE}; run evaluate.py again to rewrite both")
         found = [

@@ -51,12 +51,14 @@ def planner_class(named: str) -> type[Ego]:
 
 def _imported(place: str, where: str) -> ModuleType:
     """The module of a name or a file; InputError where another one has its name."""
-    folder, module = os.getcwd(), place
+    folder = os.getcwd()
+    module = place
     if place.endswith(".py"):
         file = Path(place).resolve()
         if not file.is_file():
             raise InputError(f"{where}: no file {place}; name one that is there")
-        folder, module = str(file.parent), file.stem
+        folder = str(file.parent)
+        module = file.stem
     sys.path.insert(0, folder)
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
     try:

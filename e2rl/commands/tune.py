@@ -34,7 +34,9 @@ GROUPS = ("synthesizer", "ego")
 
 def tune(run: Run) -> dict:
     """Do the trials that are left; returns what tuning.json holds."""
-    config, folder, group = run.config, run.folder, run.config.tuning.group
+    config = run.config
+    folder = run.folder
+    group = run.config.tuning.group
     check_choice("tuning.group", group, GROUPS)
     given = {each.name: config.tuning[each.name] for each in fields(SearchSettings)}
     settings = settings_of(SearchSettings, given, "tuning")
@@ -43,7 +45,8 @@ def tune(run: Run) -> dict:
     trials: PlannerTrials | AttackTrials
     if group == "ego":
         objective = settings_of(PlannerObjective, config.tuning.planner, "tuning.planner")
-        trials, ranges = planner_trials(config, plan), plan.setup.ego.tuned
+        trials = planner_trials(config, plan)
+        ranges = plan.setup.ego.tuned
     else:
         objective = settings_of(AttackObjective, config.tuning.attack, "tuning.attack")
         trials, ranges = attack_trials(config, plan)

@@ -71,7 +71,8 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
         raise InputError(
             f"eta={eta}: a search has one intensity, of which its families take shares; name one, or set tries=1"
         )
-    method, plans = methods_at(eta[0]), []
+    method = methods_at(eta[0])
+    plans = []
     for name in rows_of(config):
         changed, own = config_and_prior(config, name, prior)
         if is_search(config, name):
@@ -105,9 +106,11 @@ def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictCon
     if not named:
         raise InputError("search.families: name at least one, such as +search.families.rule={}")
     families = [family_of(str(key), value, "search.families") for key, value in named.items()]
-    traffic, methods = {}, {name: method_config(config, name) for name in {each.method for each in families}}
+    traffic = {}
+    methods = {name: method_config(config, name) for name in {each.method for each in families}}
     for each in families:
-        where, own = f"search.families.{each.name}.changes", methods[each.method]
+        where = f"search.families.{each.name}.changes"
+        own = methods[each.method]
         traffic[each.name] = method(each.method, with_changes(own, each.changes, where, "synthesizer"))
         if each.ranges and not traffic[each.name].traffic.follows_decisions:
             decision = next(iter(each.ranges))
@@ -152,7 +155,8 @@ def spend(searches: Sequence[tuple], work: Work = HERE) -> list[tuple[Scored, li
     while rounds:
         jobs = [(f"search-{number:03}/tries-{job:06}", part) for number, jobs in rounds.items() for job, part in jobs]
         first = first_names(jobs) if first is None else ()  # of the first round
-        scored, after = score_all(jobs, work, lambda job: len(job[1][2]), first=first), {}
+        scored = score_all(jobs, work, lambda job: len(job[1][2]), first=first)
+        after = {}
         for number, asked in rounds.items():
             found: Scored = ([], [], [])
             for _ in asked:
@@ -212,10 +216,12 @@ def spending(
     the budget, and these tries in their order: round by round, the scenes of a round in an order of its own, so that a
     budget that ends within a round is spent on scenes at random. A try that errors counts as one that comes nowhere
     near."""
-    search, told = plan.begin(setup, seed, scenes), list[dict]()
+    search = plan.begin(setup, seed, scenes)
+    told = list[dict]()
     found: Scored = ([], [], [])
     account = Account(budget, unit, {family.name: (family.nfe, 0.0) for family in plan.families})
-    generator, driven = torch.Generator().manual_seed(seed), 0
+    generator = torch.Generator().manual_seed(seed)
+    driven = 0
     with Bar(total=budget, desc=f"{plan.name}: {unit} a scene") as bar:
         while active := len(search.active()):
             order = torch.randperm(len(scenes), generator=generator).tolist()
@@ -314,7 +320,8 @@ def failures_of(file: Path, ego_name: str, plan: Plan, setup: Setup) -> list[Par
         raise InputError(f"{file}: a try of {other} depends on those before it; make the whole search again")
     tries: dict[int, list[Try]] = {}
     for scene_id, number, name in rows:
-        seed, scene = number // TRIES, setup.scenes.index(scene_id)
+        seed = number // TRIES
+        scene = setup.scenes.index(scene_id)
         drawn = families[name].draw(scene, number % TRIES, searches[seed].seed_of(scene), plan.settings.stratified)
         tries.setdefault(seed, []).append(drawn)
     return [part for seed, own in tries.items() for part in batches(setup, plan, seed, every, own)]

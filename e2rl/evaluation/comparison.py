@@ -132,7 +132,10 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
     paired `differences` of RATES, second minus first, of OTHERS where one of the two has any.
     """
     check_shared(first, second)
-    ours, theirs, others, groups = first.rollouts(), second.rollouts(), second.units(), []
+    ours = first.rollouts()
+    theirs = second.rollouts()
+    others = second.units()
+    groups = []
     pairs = [pair_of(key, ours[key], theirs[key], first.searched) for key in ours if key in theirs]
     found = [pair for pair in pairs if pair]
     found.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))

@@ -120,7 +120,8 @@ def build_egos(config: DictConfig, name: str) -> EgoSet:
 
 def trainings_of(config: DictConfig, name: str) -> dict[str, dict[str, Any]]:
     """Returns {name in files: {ego: FILE, changes of its fields}} of an entry, one for each of its `checkpoints`."""
-    entry, where = config.egos[name], f"egos.{name}"
+    entry = config.egos[name]
+    where = f"egos.{name}"
     if not NAME.fullmatch(name):
         raise InputError(f"{where}: the name goes into file names; use letters, digits and . _ + -")
     if not isinstance(entry, DictConfig) or "ego" not in entry:
@@ -164,7 +165,8 @@ def one_ego(config: DictConfig, name: str, changes: Mapping[str, Any]) -> Ego:
 def compared(config: DictConfig) -> list[tuple[str, str]]:
     """Returns pairs of names whose difference is of interest: `policy_learning.after` with each other ego, `before`
     first; or without `policy_learning` each ego with `compare`, or with the first."""
-    names, roles = [str(name) for name in config.egos], config.policy_learning
+    names = [str(name) for name in config.egos]
+    roles = config.policy_learning
     if roles is None:
         reference = (as_list(config.compare) or names)[0]
         return [(name, reference) for name in names if name != reference]

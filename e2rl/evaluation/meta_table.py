@@ -45,7 +45,8 @@ class Tally:
 
     def __init__(self, scenes: SceneSet, state: tuple | None = None):
         """state: of a Tally to go on from."""
-        self.scenes, self.vehicles = scenes, scenes.scenes["route_log"].shape[1]
+        self.scenes = scenes
+        self.vehicles = scenes.scenes["route_log"].shape[1]
         none = torch.zeros(len(scenes) * self.vehicles, dtype=torch.float64)
         counts = {name: none.new_zeros(len(none), FEATURES[name].bins) for name in HISTOGRAMS}
         self.state = state or (none.clone(), counts, {name: none.clone() for name in INDICATIONS})
@@ -124,11 +125,13 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
     once. The row of the log also has its split-half `real`. Rollouts that error are counted in `errored`, and in no
     likelihood. parts: the counts of each method so far.
     """
-    scenes, rows = setup.scenes, []
+    scenes = setup.scenes
+    rows = []
     seeds = [rollouts if method.traffic.stochastic else 1 for method in methods]
     with Bar(total=sum(seeds) * len(scenes), desc="meta-metric", unit="rollout") as bar:
         for number, (method, count) in enumerate(zip(methods, seeds, strict=True)):
-            name, identity = f"meta-{number:03}", [method.name, float(method.eta), rollouts, "with errored"]
+            name = f"meta-{number:03}"
+            identity = [method.name, float(method.eta), rollouts, "with errored"]
             done, errored, state = parts.load(name, identity) or (0, [], None)
             tally = Tally(scenes, state)
             tasks = [Task(scene, seed) for seed in range(count) for scene in range(len(scenes))]

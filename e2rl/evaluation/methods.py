@@ -181,7 +181,8 @@ def varied(config: DictConfig, name: str) -> DictConfig:
     `synthesizer: METHOD` makes it a variant of another method than the run's. Raises InputError for changes of others
     than VARIED.
     """
-    changed, changes = copy.deepcopy(config), config.variants[name]
+    changed = copy.deepcopy(config)
+    changes = config.variants[name]
     if not isinstance(changes, DictConfig):
         raise InputError(f"variants.{name}={changes}: expected changes, such as {{synthesizer.support: random}}")
     if isinstance(method := changes.get("synthesizer"), str):
@@ -215,7 +216,8 @@ def _check_compared(config: DictConfig, settings: EvaluationSettings) -> None:
 def processes_of(config: DictConfig) -> Processes:
     """Returns the processes that rollouts are spread over: one a core by default, one on a device that they would
     share; with launcher=ray, Ray workers."""
-    machine, device = machine_of(config), str(config.device)
+    machine = machine_of(config)
+    device = str(config.device)
     alone = device == "cpu" and machine.threads == 1
     if not alone and (machine.launcher == "ray" or (machine.processes or 1) > 1):
         raise InputError(
@@ -231,7 +233,8 @@ def processes_of(config: DictConfig) -> Processes:
 def caption(config: DictConfig, origin: Mapping, methods: Sequence[Method] = ()) -> str:
     """What stands in every table's caption: the settings that all methods share, and what each knows of the ego and
     owes it."""
-    sampler, bounds = config.prior.sampler, config.prior.bounds
+    sampler = config.prior.sampler
+    bounds = config.prior.bounds
     on = [name for name in ("meeting", "curve") if bounds[name]]
     changes = "".join(f"; {name}: {what}".replace("'", "") for name, what in config.get("variants", {}).items())
     return (

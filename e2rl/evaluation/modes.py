@@ -23,7 +23,8 @@ from e2rl.metrics.failure_modes import (
 from e2rl.run.files import misfit
 from e2rl.sim.rollout_file import rollout_name
 
-MODES_FILE, ATLAS_FILE = "modes.json", "atlas.json"
+MODES_FILE = "modes.json"
+ATLAS_FILE = "atlas.json"
 OTHER = 0  # number of the small modes together
 VERDICTS = ("counted", "preventable", "at_fault", "avoidable")  # fractions of a mode's failures
 MEANS = ("ego_speed", "partner_speed", "relvel")  # m/s
@@ -56,7 +57,8 @@ def find_modes(rows: Sequence[dict]) -> dict:
     numbers = cluster_failures(failures)
     for row, number in zip(failures, numbers, strict=True):
         row["mode"] = number
-    large, used = large_modes(numbers), known_features(failures)
+    large = large_modes(numbers)
+    used = known_features(failures)
     members = {number: [row for row in failures if row["mode"] == number] for number in large}
     if len(large) < len(set(numbers)):
         members[OTHER] = [row for row in failures if row["mode"] not in large]

@@ -58,7 +58,8 @@ def open_loop_rows(
         count = samples if method.traffic.stochastic else 1
         compute = partial(open_loop_metrics, scenes, method, count, device)
         found = parts.result(f"open-loop-{number:03}", [method.name, count, "with errored"], compute)
-        done, key = found["scenes"], (scenes.dataset, scenes.split, method.name, EGO, method.eta)
+        done = found["scenes"]
+        key = (scenes.dataset, scenes.split, method.name, EGO, method.eta)
         fields = {"stage": OPEN_LOOP_STAGE, "errored": found["errored"]}
         rows.append(metric_row(key, done, count, done * count, found["metrics"], **fields))
     return rows
@@ -98,7 +99,8 @@ def _displacements(columns: TensorDict, scenes: SceneSet, done: Sequence[int]) -
     draws = bootstrap_draws(clusters)
     result: dict[str, dict[str, float]] = {}
     for at in (f"_{horizon}" for horizon in HORIZONS):
-        vehicles, straight = columns[f"vehicles{at}"], columns[f"cv_ade{at}"]
+        vehicles = columns[f"vehicles{at}"]
+        straight = columns[f"cv_ade{at}"]
         quotients = {
             f"{name}{at}": (columns[name + at], vehicles) for name in ("min_ade", "mean_ade", "joint_ade", "cv_ade")
         }
@@ -136,7 +138,8 @@ def spread_rows(
             for each in (prior, many)
         )
         key = (scenes.dataset, scenes.split, method.name, EGO, method.eta)
-        count, metrics = len(scenes), _spread(few_sums, many_sums, scenes)
+        count = len(scenes)
+        metrics = _spread(few_sums, many_sums, scenes)
         rows.append(metric_row(key, count, samples, count * samples, metrics, stage=SPREAD_STAGE))
     return rows
 
@@ -153,11 +156,13 @@ def _sums(prior: Prior, scenes: SceneSet, samples: int, device: str) -> Tensor:
 def _spread(few: Tensor, many: Tensor, scenes: SceneSet) -> dict[str, dict[str, float]]:
     """{metric: {mean, low, high, n}}; n counts vehicles."""
     cluster, clusters = cluster_index(scenes.location, scenes.scene_id)
-    draws, vehicles = bootstrap_draws(clusters), few[:, 3:4].expand(-1, 3)
+    draws = bootstrap_draws(clusters)
+    vehicles = few[:, 3:4].expand(-1, 3)
     of_few, of_many = (resampled_means(sums[:, :3], vehicles, cluster, draws) for sums in (few, many))
     for means in (of_few, of_many):
         means[:, 2] = means[:, 2].sqrt()
-    places, names = len(cluster[few[:, 3] > 0].unique()), [metric.name for metric in STAGES[SPREAD_STAGE]]
+    places = len(cluster[few[:, 3] > 0].unique())
+    names = [metric.name for metric in STAGES[SPREAD_STAGE]]
     covered = resampled_means(few[:, 4:6], few[:, 6:].expand(-1, 2), cluster, draws)
     columns = torch.cat([of_few, of_few / of_many, covered], 1)
     counts = [*[int(few[:, 3].sum())] * 6, *[int(few[:, 6].sum())] * 2]

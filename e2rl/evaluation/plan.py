@@ -57,7 +57,8 @@ class Evaluation:
         """Returns the rollout of a row in the table of a run of this plan, to be driven again, in a batch of its own.
         Raises InputError where the run's folder does not say what was tried."""
         setup = next(each for each in self.egos.setups(self.setup) if each.ego_name == row["ego_policy"])
-        name, task = row["method"], Task(self.scenes.index(row["scene_id"]), row["seed"])
+        name = row["method"]
+        task = Task(self.scenes.index(row["scene_id"]), row["seed"])
         methods = [each for each in self.methods if (each.name, each.eta) == (name, row["eta"])]
         parts: list[Part] = [(setup, method, [task]) for method in methods]
         for search in (each for each in self.searches if each.name == name):
@@ -73,7 +74,8 @@ def begin(run: Run) -> Evaluation:
     run, and for inputs that changed since the run began."""
     config = run.config
     set_up(config)
-    asked, egos = evaluation_settings(config), build_egos(config, ego_name(config.ego, run.choices["ego"]))
+    asked = evaluation_settings(config)
+    egos = build_egos(config, ego_name(config.ego, run.choices["ego"]))
     print(purpose(run, asked, list(egos.egos)), flush=True)
     prepare_fused(config)
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path

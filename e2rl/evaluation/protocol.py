@@ -80,7 +80,8 @@ class Setup:
 
     def roll_out(self, method: Method, tasks: Sequence[Task]) -> Rollouts:
         """The rollouts of (scene, seed) pairs under one method."""
-        index, tries = torch.tensor([task.scene for task in tasks]), [task.one for task in tasks if task.one]
+        index = torch.tensor([task.scene for task in tasks])
+        tries = [task.one for task in tasks if task.one]
         noise = torch.tensor([scene_seed(self.scenes.number[task.scene], task.seed) for task in tasks])
         noise = torch.tensor([one.seed for one in tries]) if tries else noise
         decisions = torch.tensor([one.decisions for one in tries]) if tries else None
@@ -106,7 +107,8 @@ class Setup:
             begins: the ego begins the run with them; then InputError where its first plan is none.
         """
         parts, errored = attempt(partial(self.roll_out, method), tasks, begins)
-        rows, samples = [], []
+        rows = []
+        samples = []
         for done, rollouts in parts:
             found, features = score_rollouts(rollouts)
             if self.evasions:
@@ -116,7 +118,8 @@ class Setup:
             rows += found
             samples += features
         about = dict(zip(SOURCE, self.source(method), strict=True)) | {"eta": float(method.eta)}
-        names, places = self.scenes.scene_id, self.scenes.location
+        names = self.scenes.scene_id
+        places = self.scenes.location
         scene = [{"scene_id": names[task.scene], "location": places[task.scene]} for task, _ in errored]
         lost = [about | each | {"seed": task.seed} | why for each, (task, why) in zip(scene, errored, strict=True)]
         return rows, samples, lost

@@ -47,17 +47,22 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
         raise InputError(f"failure={config.failure}: is one of a run; name its folder by reproduce=RUN_DIR")
     if config.resume or not config.reproduce:
         return Run.of(config, free)
-    where, old = f"reproduce={config.reproduce}", Path(config.reproduce).resolve()
+    where = f"reproduce={config.reproduce}"
+    old = Path(config.reproduce).resolve()
     whole = config.copy()
     whole.failure = None
-    saved, known = saved_configuration(whole, old, where), read_provenance(old)
+    saved = saved_configuration(whole, old, where)
+    known = read_provenance(old)
     if missing := [name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()]:
         raise InputError(f"{where}: {missing[0]} is missing; give a finished run of evaluate.py that has tables")
     read_metrics(old / METRICS_FILE)  # what is damaged is told now, and not at the end
     files = {name: value for name, value in known["inputs"].items() if "=" in name and isinstance(value, str)}
     _move(config, saved, [_key(name) for name in files], known["choices"], where)
     check_written(saved, old, where, config, load_config())
-    saved.plugins, saved.resume, saved.reproduce, saved.scenes = config.plugins, None, str(old), str(old / SCENES)
+    saved.plugins = config.plugins
+    saved.resume = None
+    saved.reproduce = str(old)
+    saved.scenes = str(old / SCENES)
     saved.failure = config.failure or saved.failure
     _check_weights(config, saved, files, where)
     _tell_versions(saved, known, where)
@@ -99,7 +104,8 @@ def _check_weights(config: DictConfig, saved: DictConfig, files: Mapping[str, st
     {key=path: SHA-256}."""
     now = {name.partition("=")[0]: value for name, value in inputs(saved)}
     for name, value in files.items():
-        key, setting = name.partition("=")[0], _key(name)
+        key = name.partition("=")[0]
+        setting = _key(name)
         if key == LISTED:
             continue
         mend = f"{'++' if OmegaConf.select(config, setting) is None else ''}{setting}=FILE"
@@ -114,7 +120,8 @@ def _check_weights(config: DictConfig, saved: DictConfig, files: Mapping[str, st
 
 def _tell_versions(saved: DictConfig, known: Mapping[str, Any], where: str) -> None:
     """Tell on stderr which versions, and which files in conf/ of methods and egos, are others than the run's."""
-    then, now = known["versions"][-1], versions(saved)
+    then = known["versions"][-1]
+    now = versions(saved)
     told = [f"{name} {_short(then.get(name))} then, {_short(now.get(name))} now" for name in changed(then, now)]
     before = {name: value for name, value in known["inputs"].items() if not isinstance(value, str)}
     here = json.loads(json.dumps(dict(inputs(saved))))
@@ -184,7 +191,8 @@ def compare_tables(then: Sequence[Mapping], now: Sequence[Mapping]) -> Compariso
     equal = close = 0
     different = []
     for name in dict.fromkeys([*before, *after]):
-        old, new = before.get(name, "missing"), after.get(name, "missing")
+        old = before.get(name, "missing")
+        new = after.get(name, "missing")
         both = all(isinstance(value, int | float) for value in (old, new))
         if old == new or (both and math.isnan(old) and math.isnan(new)):
             equal += 1

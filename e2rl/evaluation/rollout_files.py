@@ -18,7 +18,9 @@ from e2rl.run.parts import PARTS
 from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.traffic.attempt import summary_of
 
-TABLE, METRICS_FILE, ERRORED_FILE = "rollouts.csv", "metrics.json", "errored.json"
+TABLE = "rollouts.csv"
+METRICS_FILE = "metrics.json"
+ERRORED_FILE = "errored.json"
 MAX_JSON, MOST_ROWS = 48 << 20, 300_000  # bytes and lines that take less than 2 GB of memory
 DIGITS = 15  # of a whole number: more would not fit a float
 NUMBER = (int, float, NoneType)
@@ -88,7 +90,8 @@ def read_rows(path: Path) -> list[dict]:
 def read_run(run: Path) -> list[dict]:
     """The rows of a run's rollouts.csv, and one for each rollout of its errored.json that the table lacks, as tables of
     earlier versions do. Raises InputError where either is damaged."""
-    rows, file = read_rows(run / TABLE), run / ERRORED_FILE
+    rows = read_rows(run / TABLE)
+    file = run / ERRORED_FILE
     entries = read_json(file, lambda found: misfit(found, [ENTRY]), printable=False) if file.is_file() else []
     place = {row["scene_id"]: row["location"] for row in rows}
     known = set(map(_identity, rows))

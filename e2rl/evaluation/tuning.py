@@ -26,7 +26,9 @@ REFUSED = 10.0  # added to the objective of refused trials, so that the sampler 
 UNKNOWN = 2 * REFUSED  # of trials in which no rollout has a score
 STUDY = {"task": dict, "trials": [{"parameters": {...: int | float}, "metrics": {...: int | float | None}}]}  # its file
 MAX_STUDY = 1 << 24  # bytes of it
-STUDY_FILE, TUNING_FILE, TUNED_FILE = "study.json", "tuning.json", "tuned.yaml"
+STUDY_FILE = "study.json"
+TUNING_FILE = "tuning.json"
+TUNED_FILE = "tuned.yaml"
 
 
 class Objective(Protocol):
@@ -102,7 +104,8 @@ def read_study(file: Path | None, task: Mapping, ranges: Mapping, objective: Obj
         study = json.loads(read_regular(file, MAX_STUDY))
         if wrong := misfit(study, STUDY):
             raise ValueError(wrong)
-        known, rows = study["task"], [nans(row) for row in study["trials"]]
+        known = study["task"]
+        rows = [nans(row) for row in study["trials"]]
         if differ := sorted(name for name in {*known, *task} if known.get(name) != task.get(name)):
             raise InputError(f"tuning.study={file}: a study that differs in {', '.join(differ)}; name another file")
         return [_row(row["parameters"], row["metrics"], rows[0]["metrics"], ranges, objective) for row in rows]

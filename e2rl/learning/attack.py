@@ -37,7 +37,8 @@ class Solved(NamedTuple):
 
 def unsearched(states: Tensor) -> Solved:
     """Everything enters and no evasion is known, of traffic with states [S, T+1, N, 4]."""
-    rows, steps = states.shape[0], states.shape[1] - 1
+    rows = states.shape[0]
+    steps = states.shape[1] - 1
     span = torch.zeros(rows, 2, dtype=torch.int64)
     return Solved(torch.ones(rows, dtype=torch.bool), torch.zeros(rows, steps, 2), span)
 
@@ -45,14 +46,16 @@ def unsearched(states: Tensor) -> Solved:
 def solvable(traffic: Mapping[str, Tensor], scenes: SceneSet, sim: SimSettings) -> Solved:
     """A search with full knowledge of the others' motion (e2rl.metrics) where the ego was hit: for an evasion that
     begins LATE steps before the contact, and where none is found, for one from the start."""
-    contact, solved = traffic["contact"].cpu(), unsearched(traffic["states"])
+    contact = traffic["contact"].cpu()
+    solved = unsearched(traffic["states"])
     hit = contact.nonzero()[:, 0]
     if len(hit):
         scene = scenes.batch(traffic["scene_index"].cpu()[hit])
         states, valid = (traffic[name].cpu()[hit] for name in ("states", "valid"))
         first = first_contact({"states": states, "valid": valid, **{key: scene[key] for key in ("size", "agent_type")}})
         late = (first["stop"] - LATE).clamp(min=0).masked_fill(~first["hit"], 0)
-        result, begin = find_evasions(scene, states, valid, sim, moment=late), late
+        result = find_evasions(scene, states, valid, sim, moment=late)
+        begin = late
         again = (~result.found & (late > 0)).nonzero()[:, 0]
         if len(again):
             result[again] = find_evasions(scene[again], states[again], valid[again], sim)
@@ -137,7 +140,8 @@ def _make_part(
     """The traffic of an order's scenes rows [s], attacked or at intensity 0; FLAGS of them (entered [s], the others of
     the rows that were made); and the errored rest."""
     rows, attack = job
-    scenes, none = order.scenes[rows], torch.zeros_like(order.eta[rows])
+    scenes = order.scenes[rows]
+    none = torch.zeros_like(order.eta[rows])
     eta, template = (order.eta[rows], order.template[rows]) if attack else (none, torch.full_like(scenes, FULL))
     limits = () if not attack or bool((order.template == FULL).all()) else (template,)
     made = synthesize(order.ego, scenes, eta, order.seed, *limits)
@@ -175,7 +179,9 @@ def mixture(first: Synthesize, second: Synthesize, fraction: float) -> Synthesiz
 
     def synthesize(ego: Ego, scenes: Tensor, eta: Tensor, seed: int, *template: Tensor) -> dict[str, Any]:
         other = drawn(scenes, seed, fraction)
-        parts, places, errored = [], [], dict[int, dict]()
+        parts = []
+        places = []
+        errored = dict[int, dict]()
         for make, chosen in ((first, ~other), (second, other)):
             rows = chosen.nonzero()[:, 0]
             if not len(rows):

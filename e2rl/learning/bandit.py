@@ -52,9 +52,11 @@ class BanditCurriculum(CurriculumScheduler):
         self.templates = tuple(dict.fromkeys(templates))
         levels = torch.tensor(sorted(set(etas)), dtype=torch.float32)
         codes = torch.tensor([TEMPLATES.index(name) for name in self.templates])
-        self._eta, self._template = levels.repeat(len(codes)), codes.repeat_interleave(len(levels))
+        self._eta = levels.repeat(len(codes))
+        self._template = codes.repeat_interleave(len(levels))
         self._counts = torch.zeros(6, len(self._eta), dtype=torch.float64)
-        self._forgetting, self.fraction = forgetting, fraction
+        self._forgetting = forgetting
+        self.fraction = fraction
 
     @property
     def eta(self) -> float:  # type: ignore[override]
@@ -66,7 +68,8 @@ class BanditCurriculum(CurriculumScheduler):
         where p is the failure rate, whose prior is uniform, and s what the teacher would survive, beside one attack of
         which it would survive 1 - p."""
         failed, survived, entered, left_out, looked_at, survivable = self._counts
-        failed, survived = failed + 1, survived + 1
+        failed = failed + 1
+        survived = survived + 1
         total = failed + survived
         share = (survivable + survived / (total + 1)) / (looked_at + 1)  # E[p (1 - p)] / E[p] where nobody tells
         return (entered + 1) / (entered + left_out + 1) * failed / total * share
@@ -88,8 +91,10 @@ class BanditCurriculum(CurriculumScheduler):
     def observe(self, outcomes: Outcomes) -> None:
         """Forget a fraction of all counts, then count the round's attacks."""
         same = (outcomes.eta[:, None] == self._eta) & (outcomes.template[:, None] == self._template)
-        driven, rate = outcomes.episodes > 0, (outcomes.failures / outcomes.episodes).nan_to_num()
-        left_out, told = outcomes.left_out, ~outcomes.survivable.isnan() & self._teacher_tells
+        driven = outcomes.episodes > 0
+        rate = (outcomes.failures / outcomes.episodes).nan_to_num()
+        left_out = outcomes.left_out
+        told = ~outcomes.survivable.isnan() & self._teacher_tells
         looked_at = told, outcomes.survivable.nan_to_num() * told
         seen = torch.stack([rate * driven, (1 - rate) * driven, ~left_out, left_out, *looked_at]).double()
         self._counts = (1 - self._forgetting) * self._counts + seen @ same.double()

@@ -42,8 +42,10 @@ class BeforeAfter:
 
         The rows of stage `after` are paired with the same method before, under the name `before`.
         """
-        setup, folder = replace(self.setup, ego=ego), self.folder / stage
-        parts, measured = Parts(self.folder, stage, f"after {rounds} rounds"), Parts(self.folder, "measured")
+        setup = replace(self.setup, ego=ego)
+        folder = self.folder / stage
+        parts = Parts(self.folder, stage, f"after {rounds} rounds")
+        measured = Parts(self.folder, "measured")
         work = Work(folder / ROLLOUTS, self.processes, parts=parts)
         scored = drive_all([setup], self.methods, self.seeds, work)
         if self.search is not None:

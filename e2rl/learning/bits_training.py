@@ -83,7 +83,8 @@ def world_at(scene: TensorDictBase, step: int) -> World:
     """The Worlds of recorded scenes [W] at a step: as estimated at the start frame, later as recorded."""
     if step == 0:
         return World.at_start(scene)
-    now, before = scene["logged"][:, step], scene["logged"][:, step - 1]
+    now = scene["logged"][:, step]
+    before = scene["logged"][:, step - 1]
     valid = scene["logged_valid"][:, step]
     change = torch.where((valid & scene["logged_valid"][:, step - 1])[..., None], now - before, 0.0) / DT
     turn = wrap(change[..., 2] * DT) / DT
@@ -94,12 +95,14 @@ def world_at(scene: TensorDictBase, step: int) -> World:
 def windows(scenes: SceneSet, seed: int, disturbed: Sequence[float] = DISTURBED) -> TensorDict:
     """Returns windows [W] of all moving vehicles: observation [D], start [4], route [P, 2], future [PLAN_STEPS, 4],
     scene_index, and the goal: distance along the route and lateral offset. Raises InputError where there are none."""
-    every, generator = scenes.scenes, torch.Generator().manual_seed(seed)
+    every = scenes.scenes
+    generator = torch.Generator().manual_seed(seed)
     vehicles = every["route_log"].shape[1]
     logged = every["logged"][:, :, :vehicles, :2]
     moved = (logged - logged[:, :1]).norm(dim=-1).masked_fill(~every["logged_valid"][:, :, :vehicles], 0).amax(1)
     moving = every["valid"][:, :vehicles] & ~every["parked"][:, :vehicles] & (every["route_log"] >= 0)
-    rows, parts = (moving & (moved > MOVES)).nonzero(), []
+    rows = (moving & (moved > MOVES)).nonzero()
+    parts = []
     for scene, vehicle in Bar([part.unbind(1) for part in rows.split(CHUNK) if len(part)], "windows"):
         own = as_ego(every, scene, vehicle)
         for step in range(0, own["logged"].shape[1] - PLAN_STEPS, EVERY):
@@ -125,9 +128,11 @@ def _disturbed(world: World, size: Sequence[float], generator: torch.Generator) 
 
 def _windows(world: World, scene: Tensor) -> TensorDict:
     """Windows of Worlds [B], without those whose ego's next 5 s are not recorded or lead away from its route."""
-    step, route = int(world.step[0]), mission_of(world.scene).points
+    step = int(world.step[0])
+    route = mission_of(world.scene).points
     ahead = slice(step + 1, step + 1 + PLAN_STEPS)
-    future, known = world.scene["logged"][:, ahead, 0], world.scene["logged_valid"][:, step : ahead.stop, 0].all(1)
+    future = world.scene["logged"][:, ahead, 0]
+    known = world.scene["logged_valid"][:, step : ahead.stop, 0].all(1)
     path = RoutePath(world.states[:, 0], route)
     hint = path.s + (future[..., 3] * DT).sum(1)
     end, offset, _ = (value[:, 0] for value in project(future[:, -1:, :2], route, hint[:, None]))
@@ -143,8 +148,11 @@ def _windows(world: World, scene: Tensor) -> TensorDict:
 def losses(network: BitsNetwork, batch: TensorDictBase, noise: Tensor | None = None) -> dict[str, Tensor]:
     """Mean losses of windows [W]: goal (cross-entropy of the recorded goal's cell, nats), residual (of the place in it,
     cells), trajectory (distance from the recording of the plan to that goal, mean over the 5 s, m)."""
-    start, distance, offset = batch["start"], batch["distance"], batch["offset"]
-    path, code = RoutePath(start, batch["route"]), network.encode(batch["observation"], noise)
+    start = batch["start"]
+    distance = batch["distance"]
+    offset = batch["offset"]
+    path = RoutePath(start, batch["route"])
+    code = network.encode(batch["observation"], noise)
     cell, residual = cell_of(start[:, 3], distance, offset)
     logits, residuals = network.goals(code)
     guessed = residuals.gather(1, cell[:, None, None].expand(-1, 1, 2))[:, 0]
@@ -203,9 +211,11 @@ class BitsTraining(Epochs):
 def run_bits_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     """stage=bits: a new network of ego=bits learns from the training scenes, and its weights are written to the run's
     folder. Returns the losses of the chosen epoch."""
-    config, settings = run.config, stage_settings(run.config, BitsSettings)
+    config = run.config
+    settings = stage_settings(run.config, BitsSettings)
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    network, data = BitsNetwork(settings.hidden, DROPOUT).to(config.device), windows(scenes, settings.seed)
+    network = BitsNetwork(settings.hidden, DROPOUT).to(config.device)
+    data = windows(scenes, settings.seed)
     training = BitsTraining(network, data, settings)
     run.begin({"scenes": listed(scenes)})
     row = training.fit("bits", settings.epochs, run.parts("bits"), vars(settings), logger)

@@ -48,7 +48,8 @@ def build_evolution(
     synthesize: makes D'; default: closed-loop rollouts with `traffic`. folder: of the run, where D' is remembered;
     default: a temporary one.
     """
-    sim, seed = build_sim(config), config.seed
+    sim = build_sim(config)
+    seed = config.seed
     made_by = partial(synthesize_traffic, scenes, sim=sim, batch=config.batch, device=config.device)
     synthesize = synthesize or made_by(traffic)
     given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
@@ -142,11 +143,13 @@ def build_measure(
     Sources with splits are measured on their tune split; a path's scenes on `measure.path`, both as recorded; or
     without it on the first training scenes (see `split` in the rows).
     """
-    options, data = measure_settings(config), config.data.copy()
+    options = measure_settings(config)
+    data = config.data.copy()
     with open_dict(data):
         data.versions = [RECORDED]
         if options.path:
-            data.path, data.split = options.path, None
+            data.path = options.path
+            data.split = None
     apart = options.path or source_of(data).has_splits
     scenes = load_scenes(data, options.scenes, split="tune", scenes=None if apart else config.scenes)
     nominal = built(load_choice("synthesizer", "nominal"), "synthesizer", Traffic, prior=prior)

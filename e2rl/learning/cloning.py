@@ -26,7 +26,8 @@ NOISE = (0.3, 1.0)
 
 def clip_expert(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Actions [..., 2] within EXPERT_RANGE of the bounds low, high [2]."""
-    middle, reach = (high + low) / 2, (high - low) / 2 * EXPERT_RANGE
+    middle = (high + low) / 2
+    reach = (high - low) / 2 * EXPERT_RANGE
     return torch.maximum(torch.minimum(action, middle + reach), middle - reach)
 
 
@@ -102,11 +103,14 @@ def drawn(experts: Sequence[TensorDictBase], count: int) -> TensorDict:
 
     Labels are filled up to the most candidates C of any kind, with actions of weight 0.
     """
-    kinds, most, parts = len(experts), max(each["action"].shape[1] for each in experts), []
+    kinds = len(experts)
+    most = max(each["action"].shape[1] for each in experts)
+    parts = []
     for kind, each in enumerate(experts):
         own = count * (kind + 1) // kinds - count * kind // kinds
         part = each[torch.randint(len(each), (own,), device=each.device)]
-        action, weight = part["action"], part["weight"]
+        action = part["action"]
+        weight = part["weight"]
         missing = most - action.shape[1]
         action = torch.cat([action, action[:, :1].expand(-1, missing, -1)], 1)
         weight = torch.nn.functional.pad(weight, (0, missing))

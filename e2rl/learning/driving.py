@@ -73,10 +73,12 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
     [R]: of the pool's rows.
     """
     data = TensorDict.cat([batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1)
-    after, metrics = data["next"], data["next", "metrics"]
+    after = data["next"]
+    metrics = data["next", "metrics"]
     begin = torch.arange(data.shape[1]) + 1 - decisions(after["timestep"][..., 0], hold)
     ended = after["done"][..., 0] & (begin + decisions(horizon, hold) <= data.shape[1])
-    row, contact = data["traffic", "row"][ended][:, 0], touches(metrics)
+    row = data["traffic", "row"][ended][:, 0]
+    contact = touches(metrics)
     unknown = torch.full((len(row),), torch.nan)
     return Episodes(
         row,
@@ -121,7 +123,8 @@ class PoolDriver:
 
         length = decisions(self.env.horizon, self.env.hold)
         steps = env.rollout(length, disturbed, break_when_any_done=False)
-        after, metrics = steps["next"], steps["next", "metrics"]
+        after = steps["next"]
+        metrics = steps["next", "metrics"]
         done = after["done"][..., 0].int()
         alive = done.cumsum(1) - done == 0
         contact = touches(metrics)[..., 0]
@@ -140,7 +143,8 @@ class PoolDriver:
     def drive_all(self, ego: Ego, pool: TrafficPool) -> tuple[Episodes, list[dict]]:
         """Outcomes of one episode in every row of the pool, in their order, but for those in which the ego raises or
         becomes NaN; and these, each with its row and reason."""
-        none, never = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
+        none = torch.zeros(0, dtype=torch.int64)
+        never = torch.zeros(0, dtype=torch.bool)
         parts = [Episodes(none, none, never, never, never, *[torch.zeros(0)] * 4, batch_size=[0])]
         errored: list[dict] = []
         for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):

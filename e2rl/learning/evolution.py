@@ -89,9 +89,15 @@ class Evolution:
         batch: int = 64,
         workers: RayWorkers | None = None,
     ) -> None:
-        self.curriculum, self.improve, self.synthesize = curriculum, improve, synthesize
-        self.settings, self.seed, self.solvable = settings, seed, solvable
-        self.memory, self.batch, self.workers = memory or Memory(None, settings.memory), batch, workers
+        self.curriculum = curriculum
+        self.improve = improve
+        self.synthesize = synthesize
+        self.settings = settings
+        self.seed = seed
+        self.solvable = solvable
+        self.memory = memory or Memory(None, settings.memory)
+        self.batch = batch
+        self.workers = workers
         self._start = copy.deepcopy(improve.ego) if settings.against == "start" else None
         self.episodes: Episodes | None = None
         self.choices: list[Choice] = []
@@ -113,7 +119,8 @@ class Evolution:
 
     def draw(self) -> Order:
         """Returns what is attacked: scenes, intensities and causal templates by the curriculum, and the current ego."""
-        order, self._next = self._next or self._order(self.round), None
+        order = self._next or self._order(self.round)
+        self._next = None
         return order
 
     def roll_out(self, order: Order) -> RoundTraffic:
@@ -143,7 +150,9 @@ class Evolution:
     def move_on(self, order: Order, attack: RoundTraffic, learned: dict[str, float]) -> dict[str, float]:
         """Move the curriculum by what became of the attacks; returns all metrics of the round, named by group (train/,
         curriculum/, synthesizer/, time/)."""
-        curriculum, episodes, state = self.curriculum, self.episodes, self.curriculum.summary()
+        curriculum = self.curriculum
+        episodes = self.episodes
+        state = self.curriculum.summary()
         assert episodes is not None
         told = episodes.row, episodes.failed, episodes.survivable
         outcomes = outcomes_of(order.eta, order.template, attack.drawn, *told)
@@ -192,7 +201,8 @@ class Evolution:
         """D' of an order joined with the memory, and nominal traffic."""
         begin = time.perf_counter()
         if self.settings.prefetch:
-            at_work, self._prefetch = self._prefetch or self._begin(order), None
+            at_work = self._prefetch or self._begin(order)
+            self._prefetch = None
             spent = {"synthesize": at_work.wait(), "waiting": time.perf_counter() - begin}
         else:
             self._make(order)
@@ -201,7 +211,8 @@ class Evolution:
         pool = self.memory.pool(self.settings.fresh)
         if self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
             pool = pool + TrafficPool.recorded(order.scenes)
-        metrics, drawn = {"attacked": made.traffic["attacked"].item()}, made.traffic["entered"].nonzero()[:, 0]
+        metrics = {"attacked": made.traffic["attacked"].item()}
+        drawn = made.traffic["entered"].nonzero()[:, 0]
         return RoundTraffic(pool, drawn, metrics, spent, made.traffic["contact"].item(), made.errored)
 
     def _live(self, order: Order) -> RoundTraffic:
@@ -220,7 +231,8 @@ class Evolution:
         and generators."""
         state = {"curriculum": self.curriculum.state_dict(), "improvement": self.improve.state_dict(), "next": None}
         if self._next is not None:
-            order, ego = self._next, self._next.ego
+            order = self._next
+            ego = self._next.ego
             assert isinstance(ego, ActorEgo)
             weights = {name: value.detach().cpu() for name, value in ego.network.weights().items()}
             given = {name: getattr(order, name) for name in ("number", "scenes", "eta", "template", "seed")}
@@ -233,7 +245,8 @@ class Evolution:
         self.improve.load_state_dict(state["improvement"])
         self._next = self._prefetch = None
         if state["next"] is not None:
-            given, ego = dict(state["next"]), copy.deepcopy(self.ego)
+            given = dict(state["next"])
+            ego = copy.deepcopy(self.ego)
             assert isinstance(ego, ActorEgo)
             ego.network.set_weights(given.pop("weights"))
             self._next = Order(ego=ego, **given)

@@ -24,7 +24,8 @@ class GivenActions(Ego):
 
     def __init__(self, actions: Tensor, hold: int) -> None:
         super().__init__(PLAN_STEPS)
-        self.actions, self.hold = actions, hold
+        self.actions = actions
+        self.hold = hold
 
     def plan(self, world: World) -> Tensor:
         """States [B, PLAN_STEPS, 4] at constant velocity: the plan is not followed."""

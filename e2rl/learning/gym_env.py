@@ -44,7 +44,9 @@ class DrivingVectorEnv(VectorEnv):
     """
 
     def __init__(self, env: TransformedEnv, autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:
-        self.env, self.num_envs, space = env, env.batch_size[0], env.action_spec_unbatched.space
+        self.env = env
+        self.num_envs = env.batch_size[0]
+        space = env.action_spec_unbatched.space
         self.metadata = {"autoreset_mode": autoreset_mode}
         self.bounds = torch.stack([space.low, space.high])
         self.single_observation_space = Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
@@ -64,7 +66,8 @@ class DrivingVectorEnv(VectorEnv):
         super().reset(seed=seed)
         if seed is not None:
             self.env.set_seed(seed)
-        synthesizer, scene = self.env.transform, (options or {}).get("scene")
+        synthesizer = self.env.transform
+        scene = (options or {}).get("scene")
         every = synthesizer.draw.probability
         if scene is not None:
             synthesizer.draw.probability = every * (synthesizer.pool.scene_index == self.env.scenes.index(scene))
@@ -122,8 +125,10 @@ class DrivingGymEnv(gymnasium.Env):
 
     def __init__(self, env: TransformedEnv) -> None:
         self._batch = DrivingVectorEnv(env)
-        self.bounds, self.observation_space = self._batch.bounds, self._batch.single_observation_space
-        self.action_space, self.driving = self._batch.single_action_space, self._batch.driving
+        self.bounds = self._batch.bounds
+        self.observation_space = self._batch.single_observation_space
+        self.action_space = self._batch.single_action_space
+        self.driving = self._batch.driving
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         super().reset(seed=seed)
@@ -132,7 +137,8 @@ class DrivingGymEnv(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         observation, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
-        seen, told = info.get("final_obs", observation)[0], row_of(info.get("final_info", info), 0)
+        seen = info.get("final_obs", observation)[0]
+        told = row_of(info.get("final_info", info), 0)
         return seen, float(reward[0]), bool(terminated[0]), bool(truncated[0]), told
 
 

@@ -59,7 +59,8 @@ def recorded_demonstrations(scenes: SceneSet, sim: SimSettings, seed: int, drive
     contact or off the road; actions are clipped to 0.99 of the bounds.
     """
     generator = torch.Generator().manual_seed(seed)
-    pool, parts = TrafficPool.recorded(torch.arange(len(scenes))), []
+    pool = TrafficPool.recorded(torch.arange(len(scenes)))
+    parts = []
     batch = min(BATCH, len(scenes))
     exact = PoolDriver(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch)
     free = PoolDriver(scenes, replace(sim, replay_ego=False), batch)
@@ -124,7 +125,8 @@ class Imitation(Epochs):
 def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     """stage=imitation: ego=actor clones the recorded egos of the training scenes, and its weights are written to the
     run's folder. Returns the losses of the chosen epoch."""
-    config, ego = run.config, build_ego(run.config)
+    config = run.config
+    ego = build_ego(run.config)
     if not isinstance(ego, ActorEgo):
         raise InputError("stage=imitation trains ego=actor; set it")
     settings = stage_settings(config, ImitationSettings)

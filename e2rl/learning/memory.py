@@ -48,7 +48,8 @@ class Memory:
         if folder is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="e2rl-memory-")
             folder = Path(self._temporary.name)
-        self.folder, self.bound = Path(folder) / FOLDER, bound
+        self.folder = Path(folder) / FOLDER
+        self.bound = bound
         self.rounds: list[Remembered] = []
 
     @property

@@ -48,7 +48,9 @@ class PlannerImprovement(Improvement):
         """parameters: those that `ego` was built with. Raises InputError for live traffic."""
         if traffic is not None:
             raise InputError("learner.round.traffic=live: a planner is tuned on stored traffic; set it to replay")
-        self.ego, self.present, self.space = ego, dict(parameters), dict(space) or dict(ego.tuned)
+        self.ego = ego
+        self.present = dict(parameters)
+        self.space = dict(space) or dict(ego.tuned)
         self.search = settings_of(SearchSettings, {"seed": seed, "sweep": 0} | dict(search), "learner.search")
         self.objective = settings_of(PlannerObjective, objective, "learner.objective")
         self.driver = PoolDriver(scenes, sim, batch, device)
@@ -67,7 +69,8 @@ class PlannerImprovement(Improvement):
             return named | summary | counted(errored) | {"errored": float(own)}
 
         self.trials = search(evaluate, self.present, self.space, self.search, self.objective)
-        first, best = self.trials[0], best_of(self.trials) or self.trials[0]
+        first = self.trials[0]
+        best = best_of(self.trials) or self.trials[0]
         self.present, episodes, errored = driven[self.trials.index(best)]
         self.ego = type(self.ego)(**self.present)
         metrics = {f"parameter_{name}": float(value) for name, value in best["parameters"].items()}

@@ -123,15 +123,19 @@ class PolicyImprovement(Improvement):
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
         self.settings = settings_of(CollectSettings, collect, "learner.collect")
         update = settings_of(UpdateSettings, ppo, "learner.ppo")
-        batch, self.horizon = self.settings.batch, scenes.steps
-        hold, iterations = self.settings.hold, self.settings.iterations
+        batch = self.settings.batch
+        self.horizon = scenes.steps
+        hold = self.settings.hold
+        iterations = self.settings.iterations
         if self.settings.steps * iterations * hold < self.horizon:
             raise InputError(
                 f"learner.collect: {self.settings.steps} x {iterations} decisions of {hold} steps a round cannot hold "
                 f"an episode of {self.horizon} steps"
             )
-        self.ego, self._learning = ego, on_device(ego, device)
-        self.learner, self.frames = Learner(self._learning.network, update, rounds * iterations), 0
+        self.ego = ego
+        self._learning = on_device(ego, device)
+        self.learner = Learner(self._learning.network, update, rounds * iterations)
+        self.frames = 0
         placed = scenes.to(device)
         self.experts: Experts | None = None
         self.teacher: Teacher | None = None
@@ -181,7 +185,10 @@ class PolicyImprovement(Improvement):
         self.synthesizer.pool = pool
         self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.fraction)
         self._collector.reset()
-        outcomes, rows, collecting, begun = [], [], 0.0, self.frames
+        outcomes = []
+        rows = []
+        collecting = 0.0
+        begun = self.frames
         bar = Bar(range(self.settings.iterations), "collect and update", unit="batch", leave=False)
         for _ in bar:
             begin = time.perf_counter()
@@ -209,7 +216,8 @@ class PolicyImprovement(Improvement):
         """The teacher's labels so far, those in a batch included, and what these were."""
         if self.teacher is None:
             return None, {}
-        begin, count = time.perf_counter(), -(-self.teacher.settings.states // self.settings.iterations)
+        begin = time.perf_counter()
+        count = -(-self.teacher.settings.states // self.settings.iterations)
         made = self.teacher.watch(data, adversarial, self._learning, count)
         return self.teacher.labelled, {**made, "label_seconds": time.perf_counter() - begin}
 

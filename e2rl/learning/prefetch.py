@@ -39,7 +39,8 @@ class Prefetch:
         try:
             seconds, reason = self._receiver.recv()
         except EOFError:  # it died without a word
-            seconds, reason = 0.0, "its process was killed, perhaps for lack of memory"
+            seconds = 0.0
+            reason = "its process was killed, perhaps for lack of memory"
         self._worker.join()
         self._receiver.close()
         if reason:
@@ -51,7 +52,8 @@ def _run(work: Callable[[], None], sender: Connection, parent: int | None) -> No
     if parent is not None:
         die_with_parent(parent)
         torch.set_num_threads(1)
-    begin, reason = time.perf_counter(), ""
+    begin = time.perf_counter()
+    reason = ""
     try:
         work()
     except InputError as error:

@@ -22,7 +22,8 @@ from e2rl.run.errors import InputError
 from e2rl.run.files import altered, misfit, read_regular, seal, written_whole
 from e2rl.run.parts import load_plain
 
-STATE, FORMAT = "state.pt", "e2rl-checkpoint/9"
+STATE = "state.pt"
+FORMAT = "e2rl-checkpoint/9"
 
 
 def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:

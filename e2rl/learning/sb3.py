@@ -39,7 +39,9 @@ class SB3Env(VecEnv):
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(self._given)
-        done, last, seen = terminated | truncated, info.pop("final_info", {}), info.pop("final_obs", observation)
+        done = terminated | truncated
+        last = info.pop("final_info", {})
+        seen = info.pop("final_obs", observation)
         infos = [row_of(last if ended else info, row) for row, ended in enumerate(done)]
         for row in done.nonzero()[0]:
             infos[row] |= {"terminal_observation": seen[row], "TimeLimit.truncated": not terminated[row]}
@@ -78,7 +80,8 @@ class Deterministic(nn.Module):
         super().__init__()
         check_spaces(model)
         driving = driving_of(model, env)
-        self.low, self.high = torch.tensor(driving["low"]), torch.tensor(driving["high"])
+        self.low = torch.tensor(driving["low"])
+        self.high = torch.tensor(driving["high"])
         self.policy = type(model.policy)(**model.policy._get_constructor_parameters())  # a copy on the CPU
         self.policy.load_state_dict(model.policy.state_dict())
         trained_in = env if env is not None else model.get_env()

@@ -51,8 +51,11 @@ def outcomes_of(
 
     drawn [K] int64: the attack of each of the pool's first K rows; episodes in other rows do not count.
     """
-    count, known = len(eta), row < len(drawn)
-    attack, failed, told = drawn[row[known]], failed[known], survivable[known]
+    count = len(eta)
+    known = row < len(drawn)
+    attack = drawn[row[known]]
+    failed = failed[known]
+    told = survivable[known]
     left_out = torch.ones(count, dtype=torch.bool).index_fill(0, drawn, False)
     episodes, failures = (torch.bincount(each, minlength=count) for each in (attack, attack[failed]))
     share = torch.full((count,), torch.nan).index_copy(0, attack, told)  # the same in all episodes of a row
@@ -72,7 +75,8 @@ def tally(number: int, level: Tensor, outcomes: Outcomes, value: Mapping[tuple[f
     rows: list[Choice] = []
     for arm in sorted({*arms, *value}, key=lambda each: (TEMPLATES.index(each[1]), each[0])):
         of_arm = torch.tensor([each == arm for each in arms], dtype=torch.bool)
-        draws, left_out = int(of_arm.sum()), int(outcomes.left_out[of_arm].sum())
+        draws = int(of_arm.sum())
+        left_out = int(outcomes.left_out[of_arm].sum())
         episodes, failures = (int(each[of_arm].sum()) for each in (outcomes.episodes, outcomes.failures))
         rate = failures / episodes if episodes else float("nan")
         numbers = (draws, left_out, episodes, failures, rate, value.get(arm, float("nan")))
@@ -105,8 +109,12 @@ class CurriculumScheduler(Extension):
     ) -> None:
         if num_scenes < 1:
             raise InputError("curriculum: no scenes; check data.path and data.split")
-        self.rounds, self.round, self.prioritised, self.solvable_only = rounds, 0, prioritised, solvable_only
-        self._teacher_tells, self._generator = regret, torch.Generator().manual_seed(seed)
+        self.rounds = rounds
+        self.round = 0
+        self.prioritised = prioritised
+        self.solvable_only = solvable_only
+        self._teacher_tells = regret
+        self._generator = torch.Generator().manual_seed(seed)
         self._failing = torch.full((num_scenes,), torch.nan)
         self._survivable = torch.full((num_scenes,), torch.nan)
         self._drawn = torch.full((num_scenes,), -1, dtype=torch.int64)
@@ -122,7 +130,8 @@ class CurriculumScheduler(Extension):
 
     def around(self, count: int, spread: float, low: float = 0.0, high: float = float("inf")) -> Tensor:
         """Intensities [count] drawn uniformly from [eta - spread, eta + spread], cut at `low` and `high`."""
-        first, last = max(self.eta - spread, low), min(self.eta + spread, high)
+        first = max(self.eta - spread, low)
+        last = min(self.eta + spread, high)
         return first + (last - first) * torch.rand(count, generator=self._generator)
 
     def regret(self) -> Tensor:
@@ -155,7 +164,8 @@ class CurriculumScheduler(Extension):
     def update(self, scene_index: Tensor, failed: Tensor, adversarial: Tensor, survivable: Tensor) -> None:
         """Update with episodes [E]: scene, whether the ego failed, whether the traffic was adversarial, and the
         fraction of its row's critical moments that the teacher would survive (NaN: unknown)."""
-        scene_index, adversarial = scene_index.cpu(), adversarial.cpu()
+        scene_index = scene_index.cpu()
+        adversarial = adversarial.cpu()
         told = adversarial & ~survivable.isnan() & self._teacher_tells
         for known, value, of in ((self._failing, failed.float(), adversarial), (self._survivable, survivable, told)):
             scenes, inverse = scene_index[of].unique(return_inverse=True)
@@ -187,7 +197,8 @@ class CurriculumScheduler(Extension):
 
     def summary(self) -> dict[str, float]:
         """Metrics to log."""
-        regret, seen = self.regret(), ~self._failing.isnan()
+        regret = self.regret()
+        seen = ~self._failing.isnan()
         result = {"eta": self.eta, "fraction": self.fraction, "scenes_seen": seen.float().mean().item()}
         return result | ({"regret": regret[seen].mean().item()} if seen.any() else {})
 

@@ -20,7 +20,8 @@ class ConstantCurriculum(CurriculumScheduler):
         self._cycle = torch.tensor([eta] if isinstance(eta, int | float) else list(eta), dtype=torch.float32)
         check_range("curriculum.eta: intensities", len(self._cycle), 1)
         check_range("curriculum.eta", float(self._cycle.min()), 0)
-        self.eta, self.fraction = self._cycle.mean().item(), fraction
+        self.eta = self._cycle.mean().item()
+        self.fraction = fraction
 
     def etas(self, scenes: Tensor) -> Tensor:
         """The intensities in turn; a scene in the same place has the next one in the next round."""
@@ -47,8 +48,10 @@ class LinearCurriculum(CurriculumScheduler):
         check_range("curriculum.fraction", fraction, 0, 1)
         check_range("curriculum.fraction_final", fraction_final, 0, 1)
         check_range("curriculum.spread", spread, 0)
-        self._etas, self._fractions = (eta, eta_final), (fraction, fraction_final)
-        self._ramp, self._spread = ramp, spread
+        self._etas = (eta, eta_final)
+        self._fractions = (fraction, fraction_final)
+        self._ramp = ramp
+        self._spread = spread
 
     def _between(self, first: float, last: float) -> float:
         return first + min(1.0, self.round / max(1.0, self._ramp * self.rounds)) * (last - first)
@@ -93,8 +96,12 @@ class AdaptiveCurriculum(CurriculumScheduler):
         check_range("curriculum.target_high", target_high, target_low, 1)
         check_range("curriculum.fraction", fraction, 0, 1)
         check_range("curriculum.spread", spread, 0)
-        self.eta, self.fraction, self._band = eta, fraction, (target_low, target_high)
-        self._bounds, self._step, self._spread = (eta_min, eta_max), eta_step, spread
+        self.eta = eta
+        self.fraction = fraction
+        self._band = (target_low, target_high)
+        self._bounds = (eta_min, eta_max)
+        self._step = eta_step
+        self._spread = spread
 
     def etas(self, scenes: Tensor) -> Tensor:
         """Drawn around the current intensity, within its bounds."""

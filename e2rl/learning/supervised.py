@@ -106,7 +106,8 @@ class Epochs(Supervised):
         """network: with `device` and `normaliser`; settings: minibatch, learning_rate, held_out and seed; parameters:
         the module whose parameters are trained. Raises InputError where no scene is left to train on."""
         super().__init__()
-        self.network, self.settings = network, settings
+        self.network = network
+        self.settings = settings
         self._generator = torch.Generator().manual_seed(settings.seed)
         scenes = data["scene_index"].unique()
         scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]

@@ -53,7 +53,8 @@ class TeachingSettings:
 def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
     """Bool [B, T]: decisions of a collected batch at most `window` s before a contact, or before a near miss: less than
     `near` s to a contact if the ego goes on. Both in the same episode."""
-    metrics, length = data["next", "metrics"], data.shape[1]
+    metrics = data["next", "metrics"]
+    length = data.shape[1]
     contact = touches(metrics)[..., 0]
     event = first_after(contact | (time_to_contact(data["observation"]) < near))[:, :-1]
     step = data["timestep"][..., 0]
@@ -80,7 +81,10 @@ class Teacher:
                 "ScoringEgo such as e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
             )
         self.settings = settings_of(TeachingSettings, settings, "learner.teaching")
-        self.planner, self.scenes, self.bounds, self.hold = planner, scenes, bounds, hold
+        self.planner = planner
+        self.scenes = scenes
+        self.bounds = bounds
+        self.hold = hold
         self.labelled: TensorDict | None = None
         self._looked_at = NOTHING
 

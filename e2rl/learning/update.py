@@ -56,7 +56,10 @@ class Learner:
 
     def __init__(self, network: ActorCritic, settings: UpdateSettings, total: int | None = None) -> None:
         """total: updates of the whole run, over which the learning rate falls to final_lr of it; None: constant."""
-        self.network, self.settings, self.total, self.updates = network, settings, total, 0
+        self.network = network
+        self.settings = settings
+        self.total = total
+        self.updates = 0
         self.returns = PopArtValueNorm(shape=1, beta=VALUE_MEMORY, device=network.device)
         self.peak = torch.zeros((), device=network.device)  # running maximum of |advantage|
         self.ppo = ClipPPOLoss(
@@ -67,7 +70,8 @@ class Learner:
             normalize_advantage=False,
             functional=False,
         )
-        self.cloning, self.teaching = CloningLoss(network.actor), TeachingLoss(network.network)
+        self.cloning = CloningLoss(network.actor)
+        self.teaching = TeachingLoss(network.network)
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
 
     def update(
@@ -83,7 +87,9 @@ class Learner:
                 has as many of each.
             labels: a teacher's labels [M].
         """
-        settings, sums, stopped = self.settings, defaultdict(list), False
+        settings = self.settings
+        sums = defaultdict(list)
+        stopped = False
         seen_before = bool(self.network.normaliser.count > 0)
         if not seen_before:  # the last layer is still zero, so statistics change no probability
             self.network.normaliser.observe(data["observation"].to(self.network.device))
@@ -91,7 +97,8 @@ class Learner:
         flat = self._with_advantages(data, 0.0 if warming else settings.advantage_filter)
         done = 0.0 if self.total is None else min(self.updates / self.total, 1.0)
         self.optimiser.param_groups[0]["lr"] = rate = settings.learning_rate * (1 - (1 - settings.final_lr) * done)
-        storage, sampler = TensorStorage(flat, device="auto"), SamplerWithoutReplacement()
+        storage = TensorStorage(flat, device="auto")
+        sampler = SamplerWithoutReplacement()
         minibatches = ReplayBuffer(storage=storage, sampler=sampler, batch_size=settings.minibatch)
         for _ in range(settings.epochs):
             moved = []
@@ -127,7 +134,8 @@ class Learner:
         inputs = self.network.prepared(data["observation"])
         advantage, target = self.advantages(data, inputs["seen"])
         self.returns.update(target)
-        size, highest = advantage.abs(), advantage.abs().max()
+        size = advantage.abs()
+        highest = advantage.abs().max()
         self.peak = highest if self.updates == 0 else torch.lerp(highest, self.peak, PEAK_MEMORY)
         frames = data.select("action", "action_log_prob").update(inputs)
         frames["calm"] = time_to_contact(data["observation"]) > TIMES[-1]
@@ -143,9 +151,11 @@ class Learner:
         The value of a next observation is that of the following frame, but at the batch's end and where an episode is
         cut off.
         """
-        after, settings = data["next"], self.settings
+        after = data["next"]
+        settings = self.settings
         value = self._value(seen)
-        done, terminated = after["done"], after["terminated"]
+        done = after["done"]
+        terminated = after["terminated"]
         cut = done & ~terminated
         cut[:, -1] = True
         following = torch.cat([value[:, 1:], value[:, -1:]], 1)

@@ -35,7 +35,8 @@ def by_likelihood(row: Row) -> tuple:
     """Sorts failures, the likeliest first: by the path KL [nats] that moved the traffic away from the prior, infinite
     where it is unknown (`transport`), then by the realism of the adversaries, the higher first, then by scene and
     seed."""
-    cost, realism = number(row, "transport", math.inf), number(row, "real_adv", -math.inf)
+    cost = number(row, "transport", math.inf)
+    realism = number(row, "real_adv", -math.inf)
     return (cost, -realism, row["scene_id"], row["seed"], *identity(row))  # the last tells methods and egos apart
 
 

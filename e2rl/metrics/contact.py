@@ -15,7 +15,9 @@ from e2rl.scenes.recording import CYCLIST, DT, HIDDEN, OTHER, PEDESTRIAN, VEHICL
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.passing import is_fast, time_inside
 
-FRONT, SIDE, REAR = 0, 1, 2
+FRONT = 0
+SIDE = 1
+REAR = 2
 KINDS = ("front", "side", "rear")
 EDGE_KIND = (SIDE, REAR, SIDE, FRONT)  # of geometry.EDGES
 BISECTIONS = 20
@@ -38,11 +40,16 @@ def first_contact(batch: Batch) -> Batch:
     they are apart again. born_inside [B, T+1, N]: agents that overlap the ego as they have since they appeared, which
     is no contact.
     """
-    states, valid, size = batch["states"], batch["valid"], batch["size"]
+    states = batch["states"]
+    valid = batch["valid"]
+    size = batch["size"]
     row = torch.arange(len(states), device=states.device)
     possible = valid & valid[..., :1]
     possible[..., 0] = False
-    ego, ego_size, everybody, sizes = states[:, :, :1], size[:, None, :1], states, size[:, None]
+    ego = states[:, :, :1]
+    ego_size = size[:, None, :1]
+    everybody = states
+    sizes = size[:, None]
     area = pair_overlap(ego, ego_size, everybody, sizes, possible)
     born_inside = since_birth(area > 0, valid)
     area, moment = with_passing(ego, ego_size, everybody, sizes, possible, area)
@@ -99,7 +106,8 @@ def with_passing(
     at = (begin + end) / 2
     inside = begin < end
     shared = pair_overlap(between(one_before, one, at), one_size, between(two_before, two, at), two_size, inside)
-    area, touched = area.clone(), shared > 0
+    area = area.clone()
+    touched = shared > 0
     area[rollout[touched], step[touched], agent[touched]] = shared[touched]
     moment[rollout[touched], step[touched], agent[touched]] = at[touched]
     return area, moment
@@ -126,7 +134,8 @@ def since_birth(overlap: Tensor, valid: Tensor) -> Tensor:
     rows, agents = overlap.any(1).nonzero(as_tuple=True)
     if not len(rows):
         return born
-    overlaps, there = overlap[rows, :, agents], valid[rows, :, agents]
+    overlaps = overlap[rows, :, agents]
+    there = valid[rows, :, agents]
     steps = torch.arange(overlap.shape[1], device=overlap.device)
     seen = torch.where(there, steps, -HIDDEN - 1).cummax(1).values
     before = torch.nn.functional.pad(seen[:, :-1], (1, 0), value=0)
@@ -150,12 +159,14 @@ def boxes_at_contact(
     pair = torch.stack([torch.zeros_like(partner), partner], -1)
     start, end = (states[rows[:, None], step[:, None], pair] for step in (before, stop))
     sizes = size[rows[:, None], pair]
-    low, high = torch.zeros_like(latest), latest
+    low = torch.zeros_like(latest)
+    high = latest
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         now = between(start, end, middle[:, None])
         meet = separation(now[:, 0], sizes[:, 0], now[:, 1], sizes[:, 1]) <= 0
-        low, high = torch.where(meet, low, middle), torch.where(meet, middle, high)
+        low = torch.where(meet, low, middle)
+        high = torch.where(meet, middle, high)
     now = between(start, end, high[:, None])
     return now[:, 0], sizes[:, 0], now[:, 1], sizes[:, 1]
 
@@ -226,7 +237,8 @@ def contact_columns(batch: Batch) -> Batch:
     row = torch.arange(len(states))
     before = velocity(states[row, batch["before"]])
     relative = (before[:, 0] - before[row, batch["partner"].clamp(min=0)]).norm(dim=-1)
-    until, touches = steps_until(stop, states.shape[1])[..., None], batch["area"] > 0
+    until = steps_until(stop, states.shape[1])[..., None]
+    touches = batch["area"] > 0
     agent_type = batch["agent_type"][:, None]
     vulnerable = touches & until & ((agent_type == PEDESTRIAN) | (agent_type == CYCLIST))
     objects = touches & until & (agent_type == OTHER)
@@ -254,7 +266,9 @@ def traffic_contact_columns(batch: Batch) -> Batch:
 
     Pairs that overlap at step 0 already are counted apart and left out of the rest.
     """
-    states, size, traffic = batch["states"], batch["size"], batch["traffic"]
+    states = batch["states"]
+    size = batch["size"]
+    traffic = batch["traffic"]
     used = traffic.any(0).nonzero()[:, 0]
     one, two = used[torch.triu_indices(len(used), len(used), 1, device=states.device)]
     index = nearby(states, size, one, two, batch["valid"] & traffic[:, None])
@@ -273,7 +287,8 @@ def traffic_contact_columns(batch: Batch) -> Batch:
 
 def nearby(states: Tensor, size: Tensor, one: Tensor, two: Tensor, present: Tensor) -> tuple[Tensor, ...]:
     """Indices (rollout, step, pair) where agents one [P] and two [P] are present and their bounding circles meet."""
-    x, y = states[..., 0], states[..., 1]
+    x = states[..., 0]
+    y = states[..., 1]
     radius = size.norm(dim=-1) / 2
     square = (x[:, :, one] - x[:, :, two]).square_().add_((y[:, :, one] - y[:, :, two]).square_())
     reach = (radius[:, one] + radius[:, two]).square_()

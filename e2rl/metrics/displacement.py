@@ -53,7 +53,8 @@ def scene_displacements(
     """
     steps = torch.arange(1, plans.shape[3] + 1, device=logged.device)
     future = logged[:, steps.clamp(max=logged.shape[1] - 1)].transpose(1, 2)  # no vehicle counts after the log's end
-    planned, constant = displacement(plans, future), displacement(reference[:, None], future)[:, 0]
+    planned = displacement(plans, future)
+    constant = displacement(reference[:, None], future)[:, 0]
     columns: dict[str, Tensor] = {}
     for horizon in HORIZONS:
         last = round(horizon / DT)

@@ -106,7 +106,9 @@ def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor
     generator = torch.Generator().manual_seed(0)
     for _ in range(ROUNDS):
         left = ~result.found[row]
-        row, task, pool = row[left], task[left], pool[left]
+        row = row[left]
+        task = task[left]
+        pool = pool[left]
         if not len(row):
             break
         parents = pool.best(SURVIVORS)
@@ -147,9 +149,11 @@ def lateral_targets(route_valid: Tensor, mission: Tensor) -> tuple[Tensor, Tenso
 def grid(driven: Tensor, route_valid: Tensor, mission: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Route [B, C], acceleration and shift knots [B, C, K] of every profile on every lateral target."""
     accel, (route, shift) = profiles(driven), lateral_targets(route_valid, mission)
-    shape, knots = (*accel.shape[:2], route.shape[1]), accel.shape[-1]
+    shape = (*accel.shape[:2], route.shape[1])
+    knots = accel.shape[-1]
     ramp = (torch.arange(-1, knots - 1, device=shift.device) / RAMP).clamp(0, 1)
-    accel, shift = accel[:, :, None], shift[:, None, :, None] * ramp
+    accel = accel[:, :, None]
+    shift = shift[:, None, :, None] * ramp
     knots_each = [value.expand(*shape, knots).flatten(1, 2) for value in (accel, shift)]
     return route[:, None].expand(shape).flatten(1), knots_each[0], knots_each[1]
 
@@ -167,7 +171,9 @@ def _try(task: EvasionScene, route: Tensor, accel: Tensor, shift: Tensor, sim: S
 def _mutated(parents: Trials, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
     """Route, acceleration and shift knots of SAMPLES children of parents [B, C], better ones more often: disturbed
     smoothly over about 1 s, with a strength drawn for each child."""
-    count, knots, device = SAMPLES, parents.accel.shape[-1], parents.accel.device
+    count = SAMPLES
+    knots = parents.accel.shape[-1]
+    device = parents.accel.device
     parent = torch.rand(count, generator=generator).to(device)
     strength = torch.rand(count, 2, generator=generator).square() + 0.02
     gap = torch.arange(knots)[:, None] - torch.arange(knots)
@@ -209,7 +215,8 @@ def add_avoidable(rows: list[dict], rollouts: Rollouts, scene: TensorDictBase, s
             "avoidable_1s": float(late.found[row]),
             "evasion_accel": peak[row].item(),
         }
-    start, driven = given[1][:, :1, 0], given[1][:, 1:, 0]
+    start = given[1][:, :1, 0]
+    driven = given[1][:, 1:, 0]
     for evasion, begin in ((late, moment), (early, torch.zeros_like(moment))):
         whole = torch.cat([start, spliced(driven, evasion.states, begin)], 1)
         rollouts.evasion[picked[evasion.found]] = whole[evasion.found]

@@ -27,7 +27,12 @@ MANOEUVRES = (
     *("stands", "keeps speed", "brakes", "accelerates"),
     *("turns left", "turns right", "veers left", "veers right"),
 )  # what a vehicle does
-STANDS, KEEPS, BRAKES, ACCELERATES, TURNS, VEERS = 0, 1, 2, 3, 4, 6
+STANDS = 0
+KEEPS = 1
+BRAKES = 2
+ACCELERATES = 3
+TURNS = 4
+VEERS = 6
 WINDOW, LATE = round(2 / DT), round(1 / DT)  # steps before contact: of headings and ways, of positions and speeds
 STANDING = 0.5  # m/s, never exceeded in the window
 SPEEDING = 1.0  # m/s^2 of mean acceleration over the last second
@@ -62,7 +67,9 @@ def last_seconds(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     that both are known without a gap (at most W - 1; earlier states repeat the first known one), and sizes [C, P, 2].
     """
     hit = batch["hit"]
-    row, before, partner = hit.nonzero()[:, 0], batch["before"][hit], batch["partner"][hit]
+    row = hit.nonzero()[:, 0]
+    before = batch["before"][hit]
+    partner = batch["partner"][hit]
     pair = torch.stack([torch.zeros_like(partner), partner], -1)
     step = before[:, None] + torch.arange(-WINDOW, 1, device=hit.device)
     present = batch["valid"][row[:, None, None], step.clamp(min=0)[..., None], pair[:, None]].all(-1) & (step >= 0)
@@ -78,7 +85,8 @@ def manoeuvre(window: Tensor, known: Tensor, lanes: Tensor) -> Tensor:
     A vehicle that never moves stands. Else a turn decides, then motion across the lane (unless the vehicle turns the
     other way: it follows a bend, not exactly), then the last second's mean acceleration.
     """
-    speed, heading = window[..., 3].abs(), window[..., 2]
+    speed = window[..., 3].abs()
+    heading = window[..., 2]
     turn = wrap(heading[:, 1:] - heading[:, :-1]).sum(1)
     across = (speed * DT * (travel_heading(window) - lanes).sin())[:, 1:]
     steps = torch.arange(1, WINDOW + 1, device=window.device)
@@ -102,10 +110,12 @@ def approach(window: Tensor, size: Tensor, stands: Tensor, entered: Tensor) -> T
     a partner ahead, one that was off the ego's way within the two seconds cuts in. A partner that stands is ahead,
     beside or behind, whatever its heading.
     """
-    early, late = 0, -1 - LATE
+    early = 0
+    late = -1 - LATE
     way = travel_heading(window)
     relative = wrap(way[:, early, 1] - way[:, early, 0])
-    ego, other = window[:, :, 0], window[:, :, 1]
+    ego = window[:, :, 0]
+    other = window[:, :, 1]
     (first, follows, side), (second, _, later_side) = (on_way(ego, other, size, step) for step in (early, late))
     _, followed, _ = on_way(other, ego, size.flip(1), early)
     facing = torch.stack([*ego[:, late, :2].unbind(-1), way[:, late, 0]], -1)
@@ -126,7 +136,8 @@ def on_way(ego: Tensor, other: Tensor, size: Tensor, step: int) -> tuple[Tensor,
     """Whether the other [C, W, 4] touches, at a step of the window, the way of the ego [C, W, 4] from that step on
     (its boxes, then a straight strip); whether it also runs along the way there; and how far to the left of the way it
     is [m]. Each [C]. size [C, 2, 2]: of the ego and the other."""
-    way, other = ego[:, step:], other[:, step]
+    way = ego[:, step:]
+    other = other[:, step]
     boxes, sizes = ego_path_boxes(way, size[:, 0])
     touches = (separation(other[:, None], size[:, None, 1], boxes, sizes) <= 0).any(-1)
     nearest = (way[..., :2] - other[:, None, :2]).norm(dim=-1).argmin(-1)

@@ -122,7 +122,8 @@ def mode_name(members: Sequence[Row]) -> str:
     keeps speed: right of way". What they do not agree on is left out, and so is a duty that no row knows."""
     who = {"approach": "", "partner_manoeuvre": "partner ", "ego_manoeuvre": "ego "}
     parts = [whose + text for column, whose in who.items() if (text := agreed_word(members, column))]
-    named, duty = ", ".join(parts) or "various", agreed_word(members, "duty")
+    named = ", ".join(parts) or "various"
+    duty = agreed_word(members, "duty")
     return named + (f": {'no duty broken' if duty == 'none' else duty.replace('_', ' ')}" if duty else "")
 
 

@@ -23,7 +23,8 @@ def velocity(states: Tensor) -> Tensor:
 
 def travel_heading(states: Tensor) -> Tensor:
     """Direction [...] [rad] in which vehicles of states [..., 4] move: against their heading where they reverse."""
-    heading, speed = states[..., 2], states[..., 3]
+    heading = states[..., 2]
+    speed = states[..., 3]
     return torch.where(speed < -STANDING, wrap(heading + torch.pi), heading)
 
 

@@ -50,7 +50,8 @@ def shifts(knots: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     at = torch.arange(steps + 1, device=knots.device, dtype=knots.dtype) / KNOT_STEPS
     since = at[:, None] - torch.arange(count + 2, device=knots.device)  # two more: the last knot is held
     gap = since.abs()
-    near, far = gap < 1, gap < 2
+    near = gap < 1
+    far = gap < 2
     basis = torch.where(near, 2 / 3 - gap**2 + gap**3 / 2, (2 - gap) ** 3 / 6) * far
     slope = torch.where(near, -2 * gap + 1.5 * gap**2, -((2 - gap) ** 2) / 2) * far * since.sign()
     held = knots[..., -1:].expand(*knots.shape[:-1], 2)
@@ -70,12 +71,14 @@ def execute(
     bounded = accelerations(accel, steps).clamp(-sim.max_braking, sim.max_acceleration)
     v0 = start[..., 3:4]
     speed = torch.cat([v0, dynamics.bounded_speed(v0, bounded * DT)], -1)
-    mean, change = (speed[..., 1:] + speed[..., :-1]) / 2, speed.diff(dim=-1) / DT
+    mean = (speed[..., 1:] + speed[..., :-1]) / 2
+    change = speed.diff(dim=-1) / DT
     driven = torch.nn.functional.pad((mean * DT).cumsum(-1), (1, 0))
     path = RoutePath(start, route)
     offset, slope = path.offset(driven)
     lateral, rate = shifts(shift, steps)
-    offset, curvature = offset + lateral, interpolate(route, path.s[..., None] + driven)[2]
+    offset = offset + lateral
+    curvature = interpolate(route, path.s[..., None] + driven)[2]
     inner = (1 - curvature * offset).clamp(min=0.2)
     slope = slope + inner * rate * speed / speed.clamp(min=CREEP) ** 2
     stretch = torch.hypot(inner, slope)
@@ -124,10 +127,12 @@ class EvasionScene(TensorClass):
         horizon = states.shape[1] - 1
         row = torch.arange(len(states), device=states.device)
         step = moment[:, None] + torch.arange(1, horizon + 1, device=states.device)
-        inside, step = step <= horizon, step.clamp(max=horizon)
+        inside = step <= horizon
+        step = step.clamp(max=horizon)
         present = valid[row[:, None], step, 1:] & inside[..., None]
         ever = present.any(1).any(0)  # columns without any agent cost as much as others
-        start, mission = states[row, moment, 0], mission_of(scene)
+        start = states[row, moment, 0]
+        mission = mission_of(scene)
         others = states[row[:, None], step, 1:].masked_fill(~present[..., None], AWAY)[:, :, ever]
         agents = {"ego_size": scene["size"][:, 0], "others": others, "other_size": scene["size"][:, 1:][:, ever]}
         road = {"field": scene["field"], "origin": scene["field_origin"], "routes": scene["route_points"][:, 0]}
@@ -149,9 +154,12 @@ def violations(states: Tensor, scene: EvasionScene, clearance: float, road_margi
 
 def clearance_violation(states: Tensor, scene: EvasionScene, clearance: float) -> Tensor:
     """Metres [B, C, T] of missing clearance, summed over the agents nearer than it; exact box separation."""
-    others, size, other_size = scene.others, scene.ego_size, scene.other_size
+    others = scene.others
+    size = scene.ego_size
+    other_size = scene.other_size
     reach = (size.norm(dim=-1)[:, None] + other_size.norm(dim=-1)) / 2 + clearance
-    chunk, parts = max(1, PAIRS // max(1, states.shape[0] * states.shape[2] * others.shape[2])), []
+    chunk = max(1, PAIRS // max(1, states.shape[0] * states.shape[2] * others.shape[2]))
+    parts = []
     for part in states.split(chunk, 1):
         gap_x = part[..., None, 0] - others[:, None, ..., 0]
         gap_y = part[..., None, 1] - others[:, None, ..., 1]

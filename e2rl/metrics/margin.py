@@ -29,9 +29,12 @@ def margin_columns(batch: Batch) -> Batch:
 def approach_distance(batch: Batch) -> Tensor:
     """(t^2 + d^2)^(1/2) [B, T+1] of the ego's nearest closest approach at each step until its first contact, at most
     FARTHEST; FARTHEST at step 0 and after a contact."""
-    states, valid, size = batch["states"], batch["valid"], batch["size"]
+    states = batch["states"]
+    valid = batch["valid"]
+    size = batch["size"]
     moving = velocity(states)
-    offset, closing = states[..., :2] - states[:, :, :1, :2], moving - moving[:, :, :1]
+    offset = states[..., :2] - states[:, :, :1, :2]
+    closing = moving - moving[:, :, :1]
     speed = closing.norm(dim=-1)
     time = (-(offset * closing).sum(-1) / speed.square().clamp(min=1e-6)).clamp(min=0)
     half = (size[:, :, 1] + size[:, :1, 1])[:, None] / 2  # as if side by side

@@ -37,10 +37,14 @@ def track_features(
     batch: states [B, T+1, N, 4], valid [B, T+1, N], size [B, N, 2], field [B, G, G], field_origin [B, 2], light_state
     [B, T+1, L], and of the routes followed route_points [B, V, P, 2], route_light, route_light_s [B, V, K].
     """
-    states, valid = batch["states"][:, 1:].float(), batch["valid"][:, 1:]
-    size, others = batch["size"].float(), states[rollout]
+    states = batch["states"][:, 1:].float()
+    valid = batch["valid"][:, 1:]
+    size = batch["size"].float()
+    others = states[rollout]
     is_track = torch.arange(states.shape[2], device=agent.device) == agent[:, None]
-    track, known, own = states[rollout, :, agent], valid[rollout, :, agent], size[rollout, agent]
+    track = states[rollout, :, agent]
+    known = valid[rollout, :, agent]
+    own = size[rollout, agent]
     pairs = (track, own, others, size[rollout], valid[rollout] & ~is_track[:, None])
     gap = nearest_object(*pairs)
     vehicles = batch["route_points"].shape[1]
@@ -60,7 +64,8 @@ def central(values: Tensor, known: Tensor, angle: bool = False) -> Series:
     """Central difference per second of values [M, T(, C)], known where both neighbours are [M, T]; 0 elsewhere."""
     change = values[:, 2:] - values[:, :-2]
     change = (wrap(change) if angle else change) / (2 * DT)
-    edge, no_change = torch.zeros_like(known[:, :1]), torch.zeros_like(values[:, :1])
+    edge = torch.zeros_like(known[:, :1])
+    no_change = torch.zeros_like(values[:, :1])
     both = torch.cat([edge, known[:, 2:] & known[:, :-2], edge], 1)
     change = torch.cat([no_change, change, no_change], 1)
     return torch.where(both if change.ndim == both.ndim else both[..., None], change, 0.0), both
@@ -101,7 +106,8 @@ def time_to_collision(track: Tensor, size: Tensor, others: Tensor, other_size: T
     The agent ahead is the nearest one whose box lies in the track's own width, within AHEAD_ANGLE of its heading.
     Arguments as in nearest_object.
     """
-    cos, sin = track[..., 2].cos()[..., None], track[..., 2].sin()[..., None]
+    cos = track[..., 2].cos()[..., None]
+    sin = track[..., 2].sin()[..., None]
     dx, dy = (others[..., k] - track[..., None, k] for k in (0, 1))
     turn = wrap(others[..., 2] - track[..., None, 2])
     length, width = (other_size[:, None, :, k] / 2 for k in (0, 1))

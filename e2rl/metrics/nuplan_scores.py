@@ -107,7 +107,8 @@ class Places(NamedTuple):
 
 def places_of(batch: Batch) -> Places:
     """Where the ego is among the lanes, strips of half their width about the centreline."""
-    states, size = batch["states"][:, :, 0], batch["size"][:, None, 0]
+    states = batch["states"][:, :, 0]
+    size = batch["size"][:, None, 0]
     points = torch.cat([corners(states, size), rear_axle(states, size)[..., None, :]], -2)  # [B, T+1, 5, 2]
     each = points[0, ..., 0].numel()
     point, lane, _ = lanes_at(points.flatten(1, 2), batch)
@@ -167,7 +168,8 @@ def lanes_at(points: Tensor, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
 
 def linked(batch: Batch, chosen: Tensor) -> Tensor:
     """1 at [B, j, i] where the chosen lane j [B, M] is lane i, or begins where lane i ends, else 0."""
-    index, count = batch["lane_index"], batch["lane_width"].shape[1]
+    index = batch["lane_index"]
+    count = batch["lane_width"].shape[1]
     at = torch.arange(index.shape[1]).expand(index.shape)
     slot = index.masked_fill(index < 0, count)
     ends = []
@@ -195,8 +197,10 @@ def at_fault(batch: Batch, places: Places) -> tuple[Tensor, Tensor]:
     touching = batch["area"] > 0
     new = touching & (touching.long().cumsum(1) == 1)
     row, step, agent = new.nonzero(as_tuple=True)
-    ego, other = batch["states"][row, step, 0], batch["states"][row, step, agent]
-    size, other_size = batch["size"][row, 0], batch["size"][row, agent]
+    ego = batch["states"][row, step, 0]
+    other = batch["states"][row, step, agent]
+    size = batch["size"][row, 0]
+    other_size = batch["size"][row, agent]
     behind = angle_at(rear_axle(ego, size), ego[:, 2], other[:, :2]) > BEHIND
     front = edge_parts_inside(ego, size, other, other_size)[:, 3] > 0
     moves = ego[:, 3].abs() > STOPPED
@@ -219,7 +223,8 @@ def collision_score(fault: Tensor, agent_type: Tensor) -> Tensor:
 def drivable_area(batch: Batch) -> Tensor:
     """1 [B] where all corners stay within MAX_OUTSIDE of a lane's strip or a drivable polygon, else 0; NaN without a
     map."""
-    states, size = batch["states"][:, :, 0], batch["size"][:, None, 0]
+    states = batch["states"][:, :, 0]
+    size = batch["size"][:, None, 0]
     where = corners(states, size)
     points = where.flatten(0, 2)
     rollout = torch.arange(len(states)).repeat_interleave(where[0, ..., 0].numel())
@@ -254,8 +259,11 @@ def time_to_collision(batch: Batch, places: Places, fault: Tensor, new: Tensor) 
 
     Others count while they are ahead, or beside an ego that is not in one lane or on a crossing, until they meet it.
     """
-    states, size, speed = batch["states"], batch["size"], batch["track_speed"]
-    ego, length = states[:, :, :1], size[:, None, :1]
+    states = batch["states"]
+    size = batch["size"]
+    speed = batch["track_speed"]
+    ego = states[:, :, :1]
+    length = size[:, None, :1]
     angle = angle_at(rear_axle(ego, length), ego[..., 2], states[..., :2])
     beside = (places.loose | places.crossing)[..., None] & (angle <= BEHIND)
     counted = batch["valid"] & ~(new.cumsum(1) > 0) & ((angle < AHEAD) | beside) & (speed[..., :1] > MOVING)

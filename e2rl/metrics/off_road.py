@@ -34,7 +34,8 @@ def line_segments(points: Tensor, index: Tensor, closed: bool = False) -> tuple[
         last = known & torch.cat([~same_line, edge], 1)
         ring, start = first.nonzero(as_tuple=True)
         stop = last.nonzero(as_tuple=True)[1]
-        rollout, line = torch.cat([rollout, ring]), torch.cat([line, index[ring, start]])
+        rollout = torch.cat([rollout, ring])
+        line = torch.cat([line, index[ring, start]])
         ends = torch.cat([ends, torch.stack([points[ring, stop], points[ring, start]], 1)])
     return rollout, line, ends
 
@@ -54,9 +55,11 @@ def near_lane(
 def near_segments(points: Tensor, rollout: Tensor, owner: Tensor, ends: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     """(point, segment) of all pairs of a point [n, 2] of rollouts [n] and a segment [m, 2, 2] of rollouts `owner` [m]
     that is at most reach [m] m away."""
-    low, high = ends.amin(1) - reach[:, None], ends.amax(1) + reach[:, None]
+    low = ends.amin(1) - reach[:, None]
+    high = ends.amax(1) + reach[:, None]
     point, segment = candidates(points, rollout, low, high, owner, LANE_CELL)
-    start, along = ends[segment, 0], (ends[:, 1] - ends[:, 0])[segment]
+    start = ends[segment, 0]
+    along = (ends[:, 1] - ends[:, 0])[segment]
     near = from_segment(points[point], start, along).square().sum(-1) <= reach[segment].square()
     return point[near], segment[near]
 
@@ -123,7 +126,8 @@ def off_road_columns(batch: Batch) -> Batch:
     Vehicles absent or off the road at step 0 are left out (`aor_left_out` counts the latter). NaN where no vehicle is
     left, of the ego where it is left out, or where the rollout has no map.
     """
-    states, stop = batch["states"], batch["stop"]
+    states = batch["states"]
+    stop = batch["stop"]
     counted = batch["traffic"] & batch["valid"][:, 0]
     looked_at = counted.clone()
     looked_at[:, 0] = True

@@ -80,7 +80,8 @@ def poses(states: Tensor, s: Tensor) -> Tensor:
     """Poses [B, K, 3] at arc lengths s [B, K] of a path states [B, T+1, 4], straight on beyond its end."""
     length = driven_length(states)
     after = torch.searchsorted(length, s.contiguous(), right=True).clamp(1, length.shape[1] - 1)
-    low, high = length.gather(1, after - 1), length.gather(1, after)
+    low = length.gather(1, after - 1)
+    high = length.gather(1, after)
     fraction = ((s - low) / (high - low).clamp(min=1e-6)).clamp(0, 1)[..., None]
     first, second = (states.gather(1, index[..., None].expand(-1, -1, 4)) for index in (after - 1, after))
     heading = first[..., 2] + fraction[..., 0] * wrap(second[..., 2] - first[..., 2])
@@ -103,8 +104,10 @@ def seen_along(route: Tensor, width: Tensor, states: Tensor, size: Tensor, prese
     """The fields of Along of others states [B, T+1, N, 4], size [B, N, 2], present (1 or 0) along routes [B, P, 2]."""
     s, d, heading = project(states[..., :2].flatten(1, 2), route)
     s, d, heading = (value.unflatten(1, present.shape[1:]) for value in (s, d, heading))
-    turn, speed = states[..., 2] - heading, states[..., 3]
-    cos, sin = turn.cos(), turn.sin()
+    turn = states[..., 2] - heading
+    speed = states[..., 3]
+    cos = turn.cos()
+    sin = turn.sin()
     half = size[:, None] / 2
     extent = half[..., 0] * cos.abs() + half[..., 1] * sin.abs()
     side = half[..., 0] * sin.abs() + half[..., 1] * cos.abs()
@@ -123,13 +126,17 @@ def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tens
     """
     along = states[..., 3].abs()  # the way has no backwards
     recorded = along.diff(dim=1) / DT
-    speed, s = along[:, 0], torch.zeros_like(along[:, 0])
-    acceleration, reacted = torch.zeros_like(speed), torch.zeros_like(speed, dtype=torch.bool)
+    speed = along[:, 0]
+    s = torch.zeros_like(along[:, 0])
+    acceleration = torch.zeros_like(speed)
+    reacted = torch.zeros_like(speed, dtype=torch.bool)
     memory = no_conflict(others.rear[0])
     length = size[:, :1].expand_as(others.rear[0])
-    way, speeds = [s], [speed]
+    way = [s]
+    speeds = [speed]
     for t in range(recorded.shape[1]):
-        gap, side = others.rear[t] - (s + size[:, 0] / 2)[:, None], others.lateral_gap[t]
+        gap = others.rear[t] - (s + size[:, 0] / 2)[:, None]
+        side = others.lateral_gap[t]
         own = speed[:, None].expand_as(gap), acceleration[:, None].expand_as(gap)
         lateral = side, others.lateral_speed[t], side <= 0
         seen = Observation(*own, gap, others.speed[t], *lateral, length, others.length[t])
@@ -138,10 +145,13 @@ def redrive(driver: Driver, states: Tensor, size: Tensor, others: Along) -> Tens
         reacted = reacted | (asked < 0)
         chosen = torch.where(reacted, torch.minimum(asked, recorded[:, t]), recorded[:, t])
         after = (speed + chosen * DT).clamp(min=0)
-        acceleration, s, speed = (after - speed) / DT, s + (speed + after) / 2 * DT, after
+        acceleration = (after - speed) / DT
+        s = s + (speed + after) / 2 * DT
+        speed = after
         way.append(s)
         speeds.append(speed)
-    way_driven, speed_driven = torch.stack(way, 1), torch.stack(speeds, 1)
+    way_driven = torch.stack(way, 1)
+    speed_driven = torch.stack(speeds, 1)
     return torch.cat([poses(states, way_driven), speed_driven[..., None]], -1)
 
 
@@ -177,7 +187,8 @@ class Prevention(NamedTuple):
 
 def nearest_first(collision: Collision) -> Collision:
     """The collision with the ego, its partner, then the other NEAREST - 1 vehicles by their least distance to it."""
-    states, present = collision.states, collision.present
+    states = collision.states
+    present = collision.present
     gap = (states[..., :2] - states[:, :, :1, :2]).square().sum(-1).masked_fill(~present, torch.inf).amin(1)
     gap[:, 0] = -2.0
     gap = gap.scatter(1, collision.partner[:, None], -1.0)
@@ -191,7 +202,8 @@ def nearest_first(collision: Collision) -> Collision:
 
 def seen_out(collision: Collision) -> Collision:
     """The collision with AFTER more steps at constant velocity, so that the end of a rollout saves nobody."""
-    states, present = collision.states, collision.present
+    states = collision.states
+    present = collision.present
     times = DT * torch.arange(1, AFTER + 1, device=states.device, dtype=states.dtype)
     more = constant_velocity(states[:, -1], times).transpose(1, 2)
     longer = present[:, -1:].expand(-1, AFTER, -1)
@@ -216,10 +228,12 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
     steps = torch.arange(states.shape[1], device=states.device)
     counts = (steps >= 1) & (steps <= stop[:, None] + AFTER)
     touched = contacts(driven, size[:, 0], others) & counts[..., None]
-    avoided, followers = ~touched[:, :, 0].any(1), torch.zeros_like(stop)
+    avoided = ~touched[:, :, 0].any(1)
+    followers = torch.zeros_like(stop)
     first = touched[:, :, 0].int().argmax(1)
     struck = ~avoided & (driven[torch.arange(len(stop), device=stop.device), first, 3] <= CREEPING)
-    leader, leader_size = driven, size[:, 0]
+    leader = driven
+    leader_size = size[:, 0]
     blamed = touched.any(1)
     blamed[:, 0] = False  # the partner
     for _ in range(CHAIN):
@@ -230,7 +244,8 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
         row = torch.arange(len(stop), device=stop.device)
         follows = _follows(leader, others, touched, first) & (blamed.sum(1) == 1)
         avoided = avoided & (~hits | follows)
-        track, track_size = others.states[row, :, first], others.size[row, first]
+        track = others.states[row, :, first]
+        track_size = others.size[row, first]
         ahead = Tracks(leader[:, :, None], leader_size[:, None], torch.ones_like(touched[..., :1]))
         braked = redrive(DRIVERS["human"], track, track_size, along_way(track, track_size[:, 1], ahead))
         still = (contacts(braked, track_size, ahead)[..., 0] & counts).any(1)
@@ -241,7 +256,8 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
         touched = contacts(braked, track_size, others) & counts[..., None] & ~before.any(1, keepdim=True)
         blamed = touched.any(1) & ~itself & hits[:, None] & avoided[:, None]
         touched = touched & ~itself[:, None]
-        leader, leader_size = braked, track_size
+        leader = braked
+        leader_size = track_size
     return Prevention(avoided, followers, driven, struck)
 
 
@@ -250,7 +266,8 @@ def _follows(leader: Tensor, others: Tracks, touched: Tensor, index: Tensor) -> 
     heading, when they first touch it."""
     row = torch.arange(len(index), device=index.device)
     step = touched[row, :, index].int().argmax(1)
-    other, ahead = others.states[row, step, index], leader[row, step]
+    other = others.states[row, step, index]
+    ahead = leader[row, step]
     onwards = last_direction(leader, step)
     behind = to_frame(other[:, :2], torch.cat([ahead[:, :2], onwards[:, None]], -1))[:, 0] < 0
     return behind & ((travel_heading(other) - onwards).cos() > LEAST_COSINE)

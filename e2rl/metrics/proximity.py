@@ -37,7 +37,9 @@ per_km = partial(Metric, unit="1/km", per="driven_km", tables="egos")
 def motion_columns(batch: Batch) -> Batch:
     """min_dtc, ttc_c, ttc_c_all, macc, progress, driven_km and route_completion over the steps 1..stop; NaN without any
     agent to measure them on."""
-    states, valid, stop = batch["states"], batch["valid"], batch["stop"]
+    states = batch["states"]
+    valid = batch["valid"]
+    stop = batch["stop"]
     seen = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
     seen[..., 0] = False
     gap = distance(states[:, :, :1], batch["size"][:, None, :1], states, batch["size"][:, None])
@@ -122,7 +124,8 @@ def _place_on(points: Tensor, count: Tensor, way: Tensor, piece: Tensor, ends: T
 
     piece [B, P-1]: which pieces are part of the way; ends [B, P-1, 2] m: along it, where they begin and end.
     """
-    start, along = way[:, None, :-1], (way[:, 1:] - way[:, :-1])[:, None]
+    start = way[:, None, :-1]
+    along = (way[:, 1:] - way[:, :-1])[:, None]
     offset = points[:, :, None] - start
     fraction = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)).clamp(0, 1)
     gap = (offset - fraction[..., None] * along).norm(dim=-1).masked_fill(~piece[:, None], torch.inf)
@@ -183,7 +186,8 @@ def standing_columns(batch: Batch) -> Batch:
     counted = batch["traffic"] & batch["logged_valid"].all(1)
     parked = counted & batch["parked"]
     standing = counted & ~batch["parked"] & (states[:, 0, :, 3].abs() < STANDING)
-    now, log = moved(states, batch["valid"]), moved(batch["logged"], batch["logged_valid"])
+    now = moved(states, batch["valid"])
+    log = moved(batch["logged"], batch["logged_valid"])
     found = {
         "parked_moved": (parked & now).sum(-1) / parked.sum(-1),
         "parked_vehicles": parked.sum(-1),

@@ -102,7 +102,8 @@ def wasserstein(pair: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
     values, order = pair.flatten().sort()
     sign = torch.ones_like(pair)
     sign[1] = -1.0
-    sign, owner = sign.flatten()[order], cluster.repeat(2)[order]
+    sign = sign.flatten()[order]
+    owner = cluster.repeat(2)[order]
     step = torch.cat([values.diff(), values.new_zeros(1)])
     height = values.new_zeros(draws.shape[1])
     area = values.new_zeros(draws.shape[0])
@@ -130,7 +131,8 @@ def realism(samples: list[Samples], cluster: Tensor, draws: Tensor) -> dict[str,
 
 def _pooled(samples: list[Samples], cluster: Tensor, draws: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
     """`realism` without real_adv, of the samples of these names."""
-    distances, ranges = [], []
+    distances = []
+    ranges = []
     for name in names:
         pair = torch.cat([sample[name] for sample in samples], 1) if samples else draws.new_zeros(2, 0)
         if not pair.shape[1]:
@@ -139,7 +141,8 @@ def _pooled(samples: list[Samples], cluster: Tensor, draws: Tensor, names: tuple
         distances.append(wasserstein(pair, cluster.repeat_interleave(counts), draws.to(pair)))
         log = pair[1].sort().values
         ranges.append((quantile_of_sorted(log, 0.95) - quantile_of_sorted(log, 0.05)).clamp(min=1e-9))
-    distance, log_range = torch.stack(distances), torch.stack(ranges)[:, None]
+    distance = torch.stack(distances)
+    log_range = torch.stack(ranges)[:, None]
     table = {"real": 1 - distance.clamp(max=1).mean(0), "real_norm": 1 - (distance / log_range).clamp(max=1).mean(0)}
     return table | dict(zip(W1, distances, strict=True))
 

@@ -44,7 +44,9 @@ def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:
     SOURCE that the rollouts tell. Its own realism rests on few samples; sets of rollouts pool them. Sets
     `rollouts.driver`: the competent driver of the verdict in the ego's place, NaN without a collision.
     """
-    rows, samples, drivers = [], [], []
+    rows = []
+    samples = []
+    drivers = []
     for begin in range(0, len(rollouts), CHUNK):
         part = rollouts[begin : begin + CHUNK]
         found, features, driver = score_batch(as_doubles(part))
@@ -74,7 +76,8 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     batch["valid"] = batch["valid"] & ~batch["born_inside"]  # nobody avoids who appears within the ego
     batch["moved_into"] = moved_into(batch)
     verdicts, driver = judge(batch)
-    batch, result = batch | verdicts | {"driver": driver}, verdicts
+    batch = batch | verdicts | {"driver": driver}
+    result = verdicts
     for name, compute in COMPUTE.items():
         found = compute(batch)
         result |= found if isinstance(found, dict) else {METRICS[name].source: found}
@@ -83,7 +86,8 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a metric is one number per rollout, a tensor [{len(traffic)}] here")
     samples = traffic_samples(batch)
-    once, owner = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, dtype=torch.int64)
+    once = torch.ones(1, 1, dtype=torch.float64)
+    owner = torch.zeros(1, dtype=torch.int64)
     single = [realism([sample], owner, once) for sample in samples]
     return result | {name: torch.cat([values[name] for values in single]) for name in single[0]}, samples, driver
 

@@ -60,7 +60,8 @@ def beside(states: Tensor, size: Tensor, lanes: Tensor, aside: Tensor) -> Tensor
         lanes: [C, W + 1, P], headings of the lanes; aside: [C, W + 1, P, 2], directions to their left.
     """
     half = size[:, None] / 2
-    strip_heading, strip_aside = lanes.flip(2), aside.flip(2)
+    strip_heading = lanes.flip(2)
+    strip_aside = aside.flip(2)
     offset = ((states[..., :2] - states.flip(2)[..., :2]) * strip_aside).sum(-1).abs()
     for heading, box in ((states[..., 2], half), (states.flip(2)[..., 2], half.flip(2))):
         turn = heading - strip_heading
@@ -72,7 +73,9 @@ def up_to_contact(batch: Batch, steps: int) -> tuple[Tensor, Tensor]:
     """States [C, W + 1, P, 4] in the `steps` steps up to the contact, and sizes [C, P, 2]; steps before both are known
     without a gap repeat the first of those."""
     hit = batch["hit"]
-    row, stop, partner = hit.nonzero()[:, 0], batch["stop"][hit], batch["partner"][hit]
+    row = hit.nonzero()[:, 0]
+    stop = batch["stop"][hit]
+    partner = batch["partner"][hit]
     pair = torch.stack([torch.zeros_like(partner), partner], -1)
     step = stop[:, None] + torch.arange(-steps, 1, device=stop.device)
     present = batch["valid"][row[:, None, None], step.clamp(min=0)[..., None], pair[:, None]].all(-1) & (step >= 0)
@@ -118,7 +121,8 @@ def last_lane_headings(batch: Batch, window: Tensor) -> Tensor:
 
 def lanes_along(batch: Batch, moments: Tensor) -> tuple[Tensor, Tensor]:
     """Heading [C, K, P] [rad] of the lane that each vehicle of moments [C, K, P, 4] is on, and whether there is one."""
-    points, index = batch["lane_points"][batch["hit"]], batch["lane_index"][batch["hit"]]
+    points = batch["lane_points"][batch["hit"]]
+    index = batch["lane_index"][batch["hit"]]
     heading = travel_heading(moments)
     if points.shape[1] < 2:
         return heading, torch.zeros_like(heading, dtype=torch.bool)
@@ -134,7 +138,8 @@ def lanes_along(batch: Batch, moments: Tensor) -> tuple[Tensor, Tensor]:
 def _near(points: Tensor, along: Tensor, index: Tensor, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of points [C, M, 2] of lanes, with directions along and lane numbers index [C, M], those in reach of the bounding
     box of places [C, K, 2], in their order."""
-    low, high = places.amin(1, keepdim=True) - LANE_REACH, places.amax(1, keepdim=True) + LANE_REACH
+    low = places.amin(1, keepdim=True) - LANE_REACH
+    high = places.amax(1, keepdim=True) + LANE_REACH
     inside = ((points >= low) & (points <= high)).all(-1) & (index >= 0)
     count = max(int(inside.sum(1).amax()), 1)
     chosen = torch.argsort(~inside, dim=1, stable=True)[:, :count]

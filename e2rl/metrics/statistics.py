@@ -126,7 +126,8 @@ def interval(values: Tensor, places: int) -> dict[str, float]:
 def jackknife(values: Tensor) -> dict[str, float]:
     """{mean, low, high} of a statistic, values [1 + P]: of all P places, then without each of them (Efron 1982). No
     interval (NaN) from fewer than LEAST places, or where one of the values is not finite."""
-    others, count = values[1:], len(values) - 1
+    others = values[1:]
+    count = len(values) - 1
     spread = ((count - 1) / max(count, 1) * (others - others.mean()).square().sum()).sqrt().item()
     half = Z * spread if count >= LEAST and values.isfinite().all() and spread > 0 else float("nan")
     mean = values[0].item() if values[0].isfinite() else float("nan")
@@ -135,7 +136,8 @@ def jackknife(values: Tensor) -> dict[str, float]:
 
 def exact_interval(fraction: float, places: float, level: float = LEVEL) -> tuple[float, float]:
     """Bounds of Clopper and Pearson for a fraction in [0, 1] of so many independent places, a whole number or not."""
-    events, tail = fraction * places, (1 - level) / 2
+    events = fraction * places
+    tail = (1 - level) / 2
     low = float(betaincinv(events, places - events + 1, tail)) if events > 0 else 0.0
     high = float(betaincinv(events + 1, places - events, 1 - tail)) if events < places else 1.0
     return low, high
@@ -165,9 +167,11 @@ def metric_table(rows: Sequence[Row], metrics: Sequence[Metric]) -> tuple[Tensor
     def column(name: str) -> Tensor:
         return torch.tensor([float(row.get(name, torch.nan)) for row in rows], dtype=torch.float64)
 
-    totals, weights = [], []
+    totals = []
+    weights = []
     for metric in metrics:
-        value, divisor = column(metric.source), metric.per or metric.weight
+        value = column(metric.source)
+        divisor = metric.per or metric.weight
         weight = column(divisor) if divisor else torch.ones_like(value)
         if not (metric.per or math.isnan(metric.raised)):
             value = value.masked_fill(errored, metric.raised)
@@ -184,7 +188,8 @@ class Bootstrap:
         self.place, places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))
         training = torch.tensor([row.get("training", 0) for row in rows], dtype=torch.int64)
         trainings = int(training.amax()) + 1 if len(rows) else 1
-        self.cluster, self.place_draws = self.place * trainings + training, bootstrap_draws(places, draws)
+        self.cluster = self.place * trainings + training
+        self.place_draws = bootstrap_draws(places, draws)
         self.draws = crossed(self.place_draws, bootstrap_draws(trainings, draws, seed=1))
         other = bootstrap_draws(trainings, realism_draws, seed=1)
         self.realism_draws = crossed(bootstrap_draws(places, realism_draws), other)
@@ -243,7 +248,8 @@ class Bootstrap:
         """
         found = {}
         for metric in row_metrics():
-            mean, places = values[metric.name][0].item(), self.places(known[metric.name])
+            mean = values[metric.name][0].item()
+            places = self.places(known[metric.name])
             drawn = values[metric.name][1:]
             drawn = drawn[drawn.isfinite()]
             plain = not (metric.median or metric.places or metric.per or metric.per_collision)
@@ -314,12 +320,15 @@ def paired_differences(
         relative: also give `relative`, `relative_low` and `relative_high`, the difference over the other's value.
     """
     pairs = matched(rows, other_rows)
-    rows, samples = [rows[own] for own, _ in pairs], [samples[own] for own, _ in pairs]
-    other_rows, other_samples = [other_rows[other] for _, other in pairs], [other_samples[other] for _, other in pairs]
+    rows = [rows[own] for own, _ in pairs]
+    samples = [samples[own] for own, _ in pairs]
+    other_rows = [other_rows[other] for _, other in pairs]
+    other_samples = [other_samples[other] for _, other in pairs]
     metrics = row_metrics()
     (first, first_weights), (second, second_weights) = metric_table(rows, metrics), metric_table(other_rows, metrics)
     unmatched = (first.isnan() | second.isnan()) & torch.tensor([not metric.per_collision for metric in metrics])
-    first, second = first.masked_fill(unmatched, torch.nan), second.masked_fill(unmatched, torch.nan)
+    first = first.masked_fill(unmatched, torch.nan)
+    second = second.masked_fill(unmatched, torch.nan)
     shared = [{**other, **own} for own, other in zip(rows, other_rows, strict=True)]  # either may tell the training
     bootstrap = Bootstrap(shared, draws, realism_draws)
     ours = bootstrap.resampled(first, first_weights, samples)

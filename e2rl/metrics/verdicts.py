@@ -73,13 +73,15 @@ def duties(
     states = held(collision.states, collision.present)[row[:, None], :, pair]  # [B, 2, T+1, 4]
     size = collision.size[row[:, None], pair]
     ego, other = states.unbind(1)
-    way, ahead = travel_heading(ego), travel_heading(other)
+    way = travel_heading(ego)
+    ahead = travel_heading(other)
     stop = collision.stop
     before = (stop - 1).clamp(min=0)
     turned = torch.stack([_turn(track, stop) for track in (ego, other)])
     angle = wrap(ahead[row, before] - way[row, before])
     entered, safe = _entry(ego, other, size, stop)
-    crosses, oncoming = angle.abs() > SAME_WAY, angle.abs() > ONCOMING
+    crosses = angle.abs() > SAME_WAY
+    oncoming = angle.abs() > ONCOMING
     unsafe = entered & (~safe | (oncoming & struck))  # a driver who stands cannot lose the speed of who comes
     # Who turns gives way; where both or none do, the other does if it comes from the ego's left, or leaves its side.
     priority = torch.where(turned[0] == turned[1], angle < 0, turned[1] & ~turned[0])
@@ -87,7 +89,8 @@ def duties(
     result = torch.full_like(stop, NONE)
     result = torch.where(unsafe & ~crosses, ENTRY, result)
     result = torch.where(unsafe & crosses & priority, RIGHT_OF_WAY, result)
-    against, other_against = _against(ego, stop, lanes), _against(other, stop, lanes)
+    against = _against(ego, stop, lanes)
+    other_against = _against(other, stop, lanes)
     ran, other_ran = ((red >= 0) & (stop[:, None] - red <= LIGHT_STEPS) & (red <= stop[:, None])).unbind(1)
     ego_broke = ((ran & crosses) | (against & oncoming)) & ~other_against & ~other_ran
     result = result.masked_fill(ego_broke, NONE)
@@ -144,9 +147,11 @@ def at_fault(batch: Batch, *, struck: Tensor, broke: Tensor, prevented: Tensor) 
         broke: [B] bool, the ego broke a duty (`duties`).
         prevented: [B] bool, the human driver prevents the collision.
     """
-    row, partner = torch.arange(len(batch["states"])), batch["partner"].clamp(min=0)
+    row = torch.arange(len(batch["states"]))
+    partner = batch["partner"].clamp(min=0)
     speed = batch["states"][row, batch["before"], :, 3].abs()
-    moves, partner_moves = speed[:, 0] > STANDING, speed[row, partner] > STANDING
+    moves = speed[:, 0] > STANDING
+    partner_moves = speed[row, partner] > STANDING
     leads = batch["kind"] == leading_edge(batch)
     late = cuts_in(batch, CUT_IN_STEPS) | (cuts_in(batch, STOOD) & ~prevented)
     runs_into = leads & partner_moves & ~late & ~struck
@@ -170,16 +175,20 @@ def leading_edge(batch: Batch) -> Tensor:
 def turned_on_the_spot(batch: Batch) -> Tensor:
     """Bool [B]: the partner stands, has turned since it halted (or is first known), and the ego would not touch it with
     the heading that it had then, neither at the contact nor within the second after it."""
-    states, stop = batch["states"], batch["stop"]
-    row, partner = torch.arange(len(stop), device=stop.device), batch["partner"].clamp(min=0)
-    track, known = states[row, :, partner], batch["valid"][row, :, partner]
+    states = batch["states"]
+    stop = batch["stop"]
+    row = torch.arange(len(stop), device=stop.device)
+    partner = batch["partner"].clamp(min=0)
+    track = states[row, :, partner]
+    known = batch["valid"][row, :, partner]
     steps = torch.arange(states.shape[1], device=stop.device)
     moves = (track[..., 3].abs() > STANDING) | ~known
     since = torch.where(moves & (steps < stop[:, None]), steps + 1, 0).amax(1)
     held = torch.cat([track[row, stop, :2], track[row, since, 2:3], track[row, stop, 3:]], -1)
     turned = wrap(track[row, stop, 2] - track[row, since, 2]).abs() > TURNED
     later = (stop[:, None] + torch.arange(CUT_IN_STEPS + 1, device=stop.device)).clamp(max=states.shape[1] - 1)
-    ego, size = states[row[:, None], later, 0], batch["size"]
+    ego = states[row[:, None], later, 0]
+    size = batch["size"]
     apart = separation(ego, size[:, :1], held[:, None], size[row, partner][:, None]) > 0
     return batch["hit"] & (since < stop) & ~moves[row, stop] & turned & apart.all(1)
 
@@ -199,8 +208,10 @@ def blocks(batch: Batch, partner: Tensor) -> Tensor:
     ego, other = (batch["states"][row, batch["before"], agent] for agent in (torch.zeros_like(partner), partner))
     onwards = travel_heading(other)
     across = wrap(onwards - ego[:, 2]).sin().abs() > math.sin(SAME_WAY)
-    points, line = batch["lane_points"], batch["lane_index"]
-    begin, step = points[:, :-1], points.diff(dim=1)
+    points = batch["lane_points"]
+    line = batch["lane_index"]
+    begin = points[:, :-1]
+    step = points.diff(dim=1)
     along = ((ego[:, None, :2] - begin) * step).sum(-1) / step.square().sum(-1).clamp(min=1e-9)
     gap = (begin + along.clamp(0, 1)[..., None] * step - ego[:, None, :2]).norm(dim=-1)
     turn = wrap(torch.atan2(step[..., 1], step[..., 0]) - onwards[:, None])
@@ -213,11 +224,16 @@ def cuts_in(batch: Batch, steps: int) -> Tensor:
 
     The path is the ego's own boxes until the contact, and a straight strip of its width ahead of the last of them.
     """
-    states, size, stop, partner = batch["states"], batch["size"], batch["stop"], batch["partner"].clamp(min=0)[:, None]
+    states = batch["states"]
+    size = batch["size"]
+    stop = batch["stop"]
+    partner = batch["partner"].clamp(min=0)[:, None]
     row = torch.arange(len(states), device=states.device)[:, None]
     window = stop[:, None] + torch.arange(-steps, 1, device=states.device)
-    known, window = (window >= 0) & (window < stop[:, None]), window.clamp(min=0)
-    other, other_size = states[row, window, partner], size[row, partner]
+    known = (window >= 0) & (window < stop[:, None])
+    window = window.clamp(min=0)
+    other = states[row, window, partner]
+    other_size = size[row, partner]
     known = known & batch["valid"][row, window, partner]
     path, path_size = ego_path_boxes(states[row, window, 0], size[:, 0])
     meet = separation(other[:, :, None], other_size[:, :, None], path[:, None], path_size[:, None]) <= 0
@@ -269,10 +285,12 @@ def judge(batch: Batch) -> tuple[Batch, Tensor]:
             rollout: cfr_counted, cfr_preventable.
         driver: states [B, T+1, 4] of the human driver in the ego's place, NaN without a collision.
     """
-    hit, driver = batch["hit"], torch.full_like(batch["states"][:, :, 0], torch.nan)
+    hit = batch["hit"]
+    driver = torch.full_like(batch["states"][:, :, 0], torch.nan)
     found = {name: torch.full_like(driver[:, 0, 0], torch.nan) for name in COLUMNS}
     duty = torch.full_like(batch["stop"], -1)
-    struck, broke = torch.zeros_like(hit), torch.zeros_like(hit)
+    struck = torch.zeros_like(hit)
+    broke = torch.zeros_like(hit)
     if hit.any():
         of_hits, duty[hit], broke[hit], human = collision_verdicts(batch, hit)
         driver[hit], struck[hit] = human.states, human.struck
@@ -291,10 +309,12 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor
     bool."""
     vehicles = (batch["valid"] & (batch["agent_type"] == VEHICLE)[:, None])[hit]
     collision = Collision(batch["states"][hit], vehicles, batch["size"][hit], batch["partner"][hit], batch["stop"][hit])
-    row, ran = torch.arange(len(collision.stop)), batch.get("ran_light")
+    row = torch.arange(len(collision.stop))
+    ran = batch.get("ran_light")
     pair = torch.stack([torch.zeros_like(collision.partner), collision.partner], 1)
     red = torch.full_like(pair, -1) if ran is None else ran[hit].gather(1, pair)
-    lanes, result = (batch["lane_points"][hit], batch["lane_index"][hit]), preventions(collision)
+    lanes = (batch["lane_points"][hit], batch["lane_index"][hit])
+    result = preventions(collision)
     leads = leading_edge(batch)[hit]
     trailing = batch["kind"][hit] == torch.where(leads == FRONT, REAR, FRONT)
     duty, ego_broke = duties(collision, trailing, red, lanes, result["human"].struck)
@@ -303,7 +323,8 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor
     duty = duty.masked_fill(kept_its_way, NONE)
     dtype = batch["states"].dtype
     speed = batch["states"][hit][row, batch["before"][hit], :, 3].abs()
-    moves, partner_moves = speed[:, 0] > CREEPING, speed[row, collision.partner] > STANDING
+    moves = speed[:, 0] > CREEPING
+    partner_moves = speed[row, collision.partner] > STANDING
     counts = moves & ~turned_on_the_spot(batch)[hit]
     found = {f"preventable_{name}": (value.avoided & counts).to(dtype) for name, value in result.items()}
     human = result["human"]

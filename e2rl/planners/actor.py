@@ -41,17 +41,22 @@ class ObservingEgo(Ego):
 
         Vehicles follow their plans where these are known; all other agents keep their velocity.
         """
-        static, expected = static_scene(world.scene, mission_of(world.scene)), expected_states(world)
+        static = static_scene(world.scene, mission_of(world.scene))
+        expected = expected_states(world)
         horizon = world.scene["logged"].shape[1] - 1
-        state, present, action = world.states[:, 0], world.valid[:, 0], world.ego_action()
-        pieces, place = [], world.mission_s
+        state = world.states[:, 0]
+        present = world.valid[:, 0]
+        action = world.ego_action()
+        pieces = []
+        place = world.mission_s
         for done in range(0, PLAN_STEPS, HOLD):
             ego = placed_ego(static.mission, world.step + done, state, action, present, present, place, static.vehicle)
             seen = features(static, ego, others_at(world, expected, done), ego.step / horizon)
             action = self.decide(seen)
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
-            state, action = driven[:, -1], dynamics.inverse(last_two)[:, 0]
+            state = driven[:, -1]
+            action = dynamics.inverse(last_two)[:, 0]
             place = ego.pose.s + DT * driven[..., 3].sum(1)
             pieces.append(driven)
         return torch.cat(pieces, 1)
@@ -104,7 +109,8 @@ class ActorEgo(ObservingEgo):
         sizes = self.hidden, self.agent_units, self.reference, self.slack, self.room, self.initial_std
         self.network = ActorCritic(low, high, *sizes, self.device)
         if self.checkpoint is not None:
-            asked, path = self.network.architecture, find_weights(self.checkpoint)
+            asked = self.network.architecture
+            path = find_weights(self.checkpoint)
             self.network = read_actor(path, self.device)
             own, wanted = ((of["low"], of["high"]) for of in (self.network.architecture, asked))
             if own != wanted:

@@ -42,7 +42,8 @@ class BitsEgo(ScoringEgo):
     @torch.no_grad()
     def candidates(self, world: World) -> Candidates:
         """Plans to `goals` goals of each scene."""
-        path, start = MissionPath(world), world.states[:, 0]
+        path = MissionPath(world)
+        start = world.states[:, 0]
         network = self.network.to(start.device)
         code = network.encode(observed(world))
         distance, side = self.drawn(*network.goals(code), start[:, 3])
@@ -60,7 +61,9 @@ class BitsEgo(ScoringEgo):
 
 def observed(world: World) -> Tensor:
     """The environment's observations [B, D] of Worlds, but for the elapsed time, which is 0."""
-    static, state, present = static_scene(world.scene, mission_of(world.scene)), world.states[:, 0], world.valid[:, 0]
+    static = static_scene(world.scene, mission_of(world.scene))
+    state = world.states[:, 0]
+    present = world.valid[:, 0]
     ego = placed_ego(
         static.mission, world.step, state, world.ego_action(), present, present, world.mission_s, static.vehicle
     )

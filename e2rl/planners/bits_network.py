@@ -51,7 +51,8 @@ def cell_of(speed: Tensor, distance: Tensor, side: Tensor) -> tuple[Tensor, Tens
     grid counts to the nearest cell."""
     along = distance / reach(speed) * DISTANCES - 0.5
     across = side / SIDE + (SIDES - 1) / 2
-    w, s = along.round().clamp(0, DISTANCES - 1), across.round().clamp(0, SIDES - 1)
+    w = along.round().clamp(0, DISTANCES - 1)
+    s = across.round().clamp(0, SIDES - 1)
     return (w * SIDES + s).long(), torch.stack([along - w, across - s], -1)
 
 
@@ -111,7 +112,8 @@ class BitsNetwork(nn.Module):
     def controls(self, code: Tensor, speed: Tensor, offset: Tensor, distance: Tensor, side: Tensor) -> Controls:
         """The policy's Controls of plans to the goals distance, side [B, K] m, from codes [B, hidden], speeds [B] m/s
         and offsets [B] m beside the mission."""
-        speed, offset = speed[:, None].expand_as(distance), offset[:, None]
+        speed = speed[:, None].expand_as(distance)
+        offset = offset[:, None]
         features = [distance / reach(speed), distance / 50, needed_acceleration(speed, distance) / 4, side / 3]
         features += [(side - offset) / 3, speed / 15]
         code = code[:, None].expand(-1, distance.shape[1], -1)

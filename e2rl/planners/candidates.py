@@ -54,10 +54,12 @@ def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Te
     """
     shift, time = (value.expand(*speed.shape[:2], value.shape[-1]) for value in (shift, time))
     speed = speed[:, :, None]
-    mean, accel = (speed[..., 1:] + speed[..., :-1]) / 2, speed.diff(dim=-1) / DT
+    mean = (speed[..., 1:] + speed[..., :-1]) / 2
+    accel = speed.diff(dim=-1) / DT
     driven = torch.nn.functional.pad((mean * DT).cumsum(-1), (1, 0))
     length = (time * start[:, 3, None, None]).clamp(min=RETURN_LENGTH)[..., None]
-    beside, turned = shift[..., None], path.turned[:, None, None]
+    beside = shift[..., None]
+    turned = path.turned[:, None, None]
     offset, slope = fading(path.d[:, None, None, None] - beside, turned[..., None], length, driven)
     table = heading_table(path)
     before, after, _ = between_entries(table, driven / CELL)

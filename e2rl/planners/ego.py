@@ -198,9 +198,11 @@ def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str, begins: b
     """
     floats = isinstance(given, Tensor) and given.is_floating_point()
     if not floats or tuple(given.shape) != shape:
-        found, mend = type(given).__name__, "; torch.as_tensor makes one of an array"
+        found = type(given).__name__
+        mend = "; torch.as_tensor makes one of an array"
         if isinstance(given, Tensor):
-            found, mend = f"{given.dtype} {list(given.shape)}", ""
+            found = f"{given.dtype} {list(given.shape)}"
+            mend = ""
         elif hasattr(given, "shape") and hasattr(given, "dtype"):
             found = f"{type(given).__module__.partition('.')[0]} {found} of {given.dtype} {list(given.shape)}"
         returned = f"{type(ego).__name__}.{method}: returns {found}"
@@ -221,7 +223,8 @@ def ask(ego: Ego, method: str, world: World, *given: Tensor, scene: TensorDictBa
     """
     asked = getattr(ego, method)
     if from_outside(ego) and asked.__module__ != __name__:
-        world, given = world.shown(scene), tuple(value.clone() for value in given)
+        world = world.shown(scene)
+        given = tuple(value.clone() for value in given)
     try:
         return asked(world, *given)
     except SystemExit as error:
@@ -259,7 +262,9 @@ class EgoPlanner(TensorDictModuleBase):
         """env: the DrivingEnv (or a TransformedEnv around it) in which the ego drives."""
         super().__init__()
         base = getattr(env, "base_env", env)
-        self.ego, self.scene, self.bounds = ego, base.scene, base.action_spec.space
+        self.ego = ego
+        self.scene = base.scene
+        self.bounds = base.action_spec.space
         start = self.scene["start"][:, :1]
         self._plan = torch.zeros_like(start).repeat(1, 1 + PLAN_STEPS, 1)  # the state at the time of planning first
         self._planned_at = torch.full(start.shape[:1], -PLAN_STEPS, device=start.device)  # step of planning
@@ -280,7 +285,8 @@ class EgoPlanner(TensorDictModuleBase):
         due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
         if bool(due.any()):
             now = world.states[:, 0]
-            answer, begins = self._ask("plan", world), bool((world.step == 0).all())
+            answer = self._ask("plan", world)
+            begins = bool((world.step == 0).all())
             fresh = checked(answer, (len(now), PLAN_STEPS, 4), self.ego, "plan", begins).to(now)
             self._refuse(due & ~drivable(now, fresh), JUMPS)
             astray = due & strays(now, fresh[:, 0])
@@ -311,7 +317,8 @@ class EgoPolicy(EgoPlanner):
         world = World.of(tensordict, self.scene)
         with answering(world):
             plan = self.plan(world)
-            answer, begins = self._ask("act", world, tensordict["observation"], plan), bool((world.step == 0).all())
+            answer = self._ask("act", world, tensordict["observation"], plan)
+            begins = bool((world.step == 0).all())
             action = checked(answer, (len(plan), 2), self.ego, "act", begins)
             wild = (action.abs() > LARGEST).any(1)
             self._refuse(wild & reverses(world.states[:, 0], plan[:, 1:]), BACKWARDS)

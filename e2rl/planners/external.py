@@ -52,7 +52,8 @@ class ExternalEgo(Ego):
             raise InputError(
                 "ego=external: give one of ego.command, which starts the planner, and ego.address of one that runs"
             )
-        self._owner, self._starts = os.getpid(), 0
+        self._owner = os.getpid()
+        self._starts = 0
         self._link: PlannerLink | None = None
         self._asked = torch.zeros(0, dtype=torch.int64)  # [B] step of the last request
 
@@ -107,7 +108,9 @@ class ExternalEgo(Ego):
     def _connected(self, count: int) -> PlannerLink:
         """The link of this process; opened where there is none, at most 1 + restarts times."""
         if self._owner != os.getpid():  # forked: the parent's link is the parent's
-            self._owner, self._starts, self._link = os.getpid(), 0, None
+            self._owner = os.getpid()
+            self._starts = 0
+            self._link = None
         if self._link is not None:
             return self._link
         if self._starts > self.restarts:
@@ -141,8 +144,10 @@ def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tenso
     many. Raises PlannerError with the rows that have none."""
     failed: dict[int, str] = {}
     bad: dict[int, str] = {}
-    given, known = torch.zeros(len(now), PLAN_STEPS, 4), torch.full((len(now),), steps)
-    actions, acts = torch.zeros(len(now), 2), torch.zeros(len(now), dtype=torch.bool)
+    given = torch.zeros(len(now), PLAN_STEPS, 4)
+    known = torch.full((len(now),), steps)
+    actions = torch.zeros(len(now), 2)
+    acts = torch.zeros(len(now), dtype=torch.bool)
     for row, reply in enumerate(replies):
         try:
             found = torch.from_numpy(read_reply(*reply))

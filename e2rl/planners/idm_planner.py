@@ -33,11 +33,14 @@ class IDMEgo(Ego):
 
     def plan(self, world: World) -> Tensor:
         """The current IDM acceleration held for the whole plan, within the path's speed caps."""
-        path, speed = MissionPath(world), world.states[:, 0, 3]
+        path = MissionPath(world)
+        speed = world.states[:, 0, 3]
         caps = path.speed_caps(self.desired_speed, self.braking, self.use_limits, lights=False)
-        now, size = world.states[:, :, None], world.scene["size"]
+        now = world.states[:, :, None]
+        size = world.scene["size"]
         found = leaders(path.s[:, None], path.route[:, None], now, size, world.valid, free_gap=torch.inf)
-        gap, leading = found.gap[:, 0, 0], found.speed[:, 0, 0].clamp(min=0)
+        gap = found.gap[:, 0, 0]
+        leading = found.speed[:, 0, 0].clamp(min=0)
         light = path.stop_distance(self.braking) + self.standstill_gap
         gap, leading = torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)
         desired = torch.full_like(path.s, self.desired_speed)

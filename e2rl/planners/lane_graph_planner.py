@@ -42,12 +42,15 @@ def predict(world: World, speed_factors: Sequence[float], acceleration: float) -
     heading without a match; other agents keep their heading. Each agent is predicted at each speed factor times its
     speed, approached at `acceleration` m/s^2.
     """
-    states, vehicles = world.states, world.scene["route_log"].shape[1]
+    states = world.states
+    vehicles = world.scene["route_log"].shape[1]
     seen = world.valid & ((states[..., :2] - states[:, :1, :2]).norm(dim=-1) < INTERACTION_DISTANCE)
     seen[:, 0] = False
     batch, agent, candidate = (seen[:, :vehicles, None] & world.scene["route_valid"]).nonzero(as_tuple=True)
     on = matched(RoutePath(states[batch, agent], world.scene["route_points"][batch, agent, candidate]))
-    batch, agent, candidate = batch[on], agent[on], candidate[on]
+    batch = batch[on]
+    agent = agent[on]
+    candidate = candidate[on]
     straight = seen.clone()
     straight[batch, agent] = False
     rest_batch, rest_agent = straight.nonzero(as_tuple=True)
@@ -55,7 +58,8 @@ def predict(world: World, speed_factors: Sequence[float], acceleration: float) -
     rest = states[rest_batch, rest_agent]
     on_route = path.at(ahead(states[batch, agent, 3], speed_factors, acceleration).flatten(1))
     poses = torch.cat([on_route, straight_on(rest, ahead(rest[:, 3], speed_factors, acceleration).flatten(1))])
-    batch, agent = torch.cat([batch, rest_batch]), torch.cat([agent, rest_agent])
+    batch = torch.cat([batch, rest_batch])
+    agent = torch.cat([agent, rest_agent])
     count = len(speed_factors)
     size = world.scene["size"][batch, agent].repeat_interleave(count, 0)
     return Prediction(poses.view(-1, sum(HALVES) + 1, 3), size, batch.repeat_interleave(count))
@@ -98,17 +102,21 @@ def collision_hazard(ego: Tensor, ego_size: Tensor, others: Prediction, slope: f
     weight = slope + growth * torch.arange(times, device=ego.device, dtype=ego.dtype)
     reach = (ego_size[others.scene].norm(dim=-1) + others.size.norm(dim=-1))[:, None] / 2
     cut = reach + math.atanh(1 - NEGLIGIBLE) / weight  # [J, T]
-    centre, at = ego[..., :2], others.poses[..., :2]
+    centre = ego[..., :2]
+    at = others.poses[..., :2]
     low, high = (bound(1)[others.scene] for bound in (centre.amin, centre.amax))  # [J, T, 2], of all profiles
     beside = torch.maximum(low - at, at - high).clamp(min=0)
     j, t = (_squared(beside, torch.zeros_like(beside)) < cut.square()).nonzero(as_tuple=True)
     near = profiles_near(ego, others.poses, cut, j, t, others.scene[j])
     pair, profile = near.nonzero(as_tuple=True)
-    pairs, hazard = torch.stack([j[pair], t[pair], profile, others.scene[j[pair]]]), ego.new_zeros(batch * count)
-    poses, other_poses = ego.flatten(0, 2), others.poses.flatten(0, 1)
+    pairs = torch.stack([j[pair], t[pair], profile, others.scene[j[pair]]])
+    hazard = ego.new_zeros(batch * count)
+    poses = ego.flatten(0, 2)
+    other_poses = others.poses.flatten(0, 1)
     for j, t, c, b in pairs.split(CHUNK, 1):
         row = b * count + c
-        mine, its = poses.index_select(0, row * times + t), other_poses.index_select(0, j * times + t)
+        mine = poses.index_select(0, row * times + t)
+        its = other_poses.index_select(0, j * times + t)
         sizes = ego_size.index_select(0, b), others.size.index_select(0, j)
         hazard.index_add_(0, row, hazard_of(mine, sizes[0], its, sizes[1], weight.index_select(0, t)))
     return hazard.view(batch, count)
@@ -137,10 +145,12 @@ def circles(pose: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """x, y and radii [5, ...] of five circles in a box: one of radius width / 2 at the centre, four of radius width / 4
     in the corners."""
     length, width = (value.expand(pose.shape[:-1]) for value in size.unbind(-1))
-    along, across = (length - width) / 2 + width / 4, width / 4
+    along = (length - width) / 2 + width / 4
+    across = width / 4
     x = torch.stack([torch.zeros_like(along), along, along, -along, -along])
     y = torch.stack([torch.zeros_like(across), across, -across, across, -across])
-    cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
+    cos = pose[..., 2].cos()
+    sin = pose[..., 2].sin()
     radius = torch.stack([width / 2, *[width / 4] * 4])
     return pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y, radius
 
@@ -202,7 +212,8 @@ class LaneGraphEgo(Ego):
         speed at its start. The path's speed caps apply as far as braking at max_acceleration attains them.
         """
         first, second = HALVES
-        start, slope = world.states[:, 0, 3], self.max_acceleration * PLAN_DT
+        start = world.states[:, 0, 3]
+        slope = self.max_acceleration * PLAN_DT
         caps = path.speed_caps(self.max_speed)
         top = caps.amax(1).clamp(min=0).sqrt()
         one = approach(start[:, None], targets(start, top, first * slope, self.speeds), slope, first)
@@ -230,7 +241,8 @@ class LaneGraphEgo(Ego):
 
 def targets(start: Tensor, top: Tensor, reach: float, count: int) -> Tensor:
     """Target speeds [..., count], evenly from max(0, start - reach) to min(top, start + reach); start, top [...]."""
-    low, high = (start - reach).clamp(min=0), torch.minimum(top, start + reach)
+    low = (start - reach).clamp(min=0)
+    high = torch.minimum(top, start + reach)
     fraction = torch.linspace(0, 1, count, device=start.device, dtype=start.dtype)
     return low[..., None] + fraction * (high - low)[..., None]
 
@@ -249,7 +261,8 @@ def capped(wanted: Tensor, caps: Tensor, slope: float) -> Tensor:
     The caps depend on the distance driven so far, so this loops over the 26 nodes, for all profiles at once.
     """
     speed = wanted[..., 0]
-    speeds, driven = [speed], torch.zeros_like(speed)
+    speeds = [speed]
+    driven = torch.zeros_like(speed)
     for node in wanted.unbind(-1)[1:]:
         allowed = look_up(caps, driven + speed * PLAN_DT)
         after = torch.minimum(node, torch.maximum(allowed, (speed - slope).clamp(min=0)))

@@ -24,7 +24,8 @@ class ReplayEgo(Ego):
 
     def plan(self, world: World) -> Tensor:
         """Recorded states [B, PLAN_STEPS, 4] of the coming steps."""
-        track, known = world.scene["logged"][:, :, 0], world.scene["logged_valid"][:, :, 0]
+        track = world.scene["logged"][:, :, 0]
+        known = world.scene["logged_valid"][:, :, 0]
         steps = torch.arange(track.shape[1], device=track.device)
         last = torch.where(known, steps, 0).amax(1)
         want = world.step[:, None] + torch.arange(1, PLAN_STEPS + 1, device=track.device)

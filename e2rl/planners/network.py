@@ -47,7 +47,8 @@ class Normaliser(nn.Module):
         """Update the statistics with observations [..., D] (Chan et al.'s pairwise update)."""
         flat = observation.reshape(-1, observation.shape[-1])
         total = self.count + len(flat)
-        weight, mean = (len(flat) / total).float(), flat.mean(0)
+        weight = (len(flat) / total).float()
+        mean = flat.mean(0)
         delta = mean - self.mean
         variance = (flat - mean).square().mean(0) if is_on() else flat.var(0, correction=0)  # which takes long
         spread = self.variance * (1 - weight) + variance * weight
@@ -89,7 +90,10 @@ class ActorNetwork(nn.Module):
         high: Tensor,
     ) -> None:
         super().__init__()
-        self.normaliser, self.reference, self.slack, self.room = normaliser, reference, slack, room
+        self.normaliser = normaliser
+        self.reference = reference
+        self.slack = slack
+        self.room = room
         self.trunk = Trunk(hidden, agent_units, 4 if reference else 2, last_gain=0.0)
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
         self.noise: Tensor | None = None  # [D], set by `noisy`
@@ -166,8 +170,11 @@ class ActorCritic(nn.Module):
         conf/ego/actor.yaml."""
         super().__init__()
         device = torch.device(device)
-        low, high = low.to(device, torch.float32), high.to(device, torch.float32)
-        self.low, self.high, self.device = low, high, device
+        low = low.to(device, torch.float32)
+        high = high.to(device, torch.float32)
+        self.low = low
+        self.high = high
+        self.device = device
         self.architecture = {
             "observation": OBSERVATION_SIZE,
             "hidden": [int(size) for size in hidden],
@@ -259,7 +266,8 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
             )
         saved = json.loads(header["architecture"])
         low, high = (torch.tensor(saved[key], dtype=torch.float32).reshape(2) for key in ("low", "high"))
-        sizes, units = [int(size) for size in saved["hidden"]], int(saved["agent_units"])
+        sizes = [int(size) for size in saved["hidden"]]
+        units = int(saved["agent_units"])
         slack, room = (None if saved.get(key) is None else float(saved[key]) for key in ("slack", "room"))
         least = float(saved.get("least_scale", 0.05))  # of earlier versions, which had no bounds either
         fits = 0 < len(sizes) <= DEEPEST and all(0 < size <= WIDEST for size in [*sizes, units])

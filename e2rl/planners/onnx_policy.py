@@ -33,7 +33,8 @@ class OnnxPolicy:
 
     def __init__(self, content: bytes, where: str) -> None:
         """content: of the file; where: its name in messages. Raises InputError where it holds more than arithmetic."""
-        self.content, self.where = content, where
+        self.content = content
+        self.where = where
         try:
             check_arithmetic(memoryview(content))
         except ValueError as error:
@@ -52,7 +53,8 @@ class OnnxPolicy:
         except Exception as error:  # onnxruntime's are of many kinds
             reason = " ".join(str(error).split())[:200]
             raise InputError(f"{self.where}: cannot be read as ONNX ({reason}); export it again") from error
-        self.name, self._process = self.session.get_inputs()[0].name, os.getpid()
+        self.name = self.session.get_inputs()[0].name
+        self._process = os.getpid()
 
     def __call__(self, observation: Tensor) -> Any:
         if self._process != os.getpid():  # forked
@@ -72,13 +74,16 @@ def bound_memory() -> None:
 
 def check_arithmetic(content: memoryview) -> None:
     """Raises ValueError where the bytes of a ModelProto are none, are too many, or hold one of REFUSED."""
-    fields, rest, waiting = 0, 0, [("model", content)]
+    fields = 0
+    rest = 0
+    waiting = [("model", content)]
     while waiting:
         kind, message = waiting.pop()
         at = 0
         while at < len(message):
             tag, at = _varint(message, at)
-            number, written = tag >> 3, tag & 7
+            number = tag >> 3
+            written = tag & 7
             length, start = _length(message, at, written)
             at = start + length
             if tag >= 1 << 14 or not number or at > len(message):

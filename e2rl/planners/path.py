@@ -33,7 +33,9 @@ class RoutePath:
         self.route = route
         hint = None if place is None else place[..., None]
         s, d, heading = (value[..., 0] for value in project(state[..., None, :2], route, hint))
-        self.s, self.d, self.turned = s, d, wrap(state[..., 2] - heading)
+        self.s = s
+        self.d = d
+        self.turned = wrap(state[..., 2] - heading)
         self.length = return_length(state[..., 3])
         self.residual = torch.zeros_like(state[..., :2])
         self.residual = state[..., :2] - self.at(torch.zeros_like(s)[..., None])[..., 0, :2]
@@ -69,7 +71,8 @@ def fading(d: Tensor, turned: Tensor, length: Tensor, ahead: Tensor) -> tuple[Te
     """Offset [m] and its slope, both of the shape that the arguments broadcast to, `ahead` m after an offset d m and a
     heading `turned` rad off the route: the critically damped return over `length` m (`RoutePath`)."""
     slope = torch.tan(turned.clamp(-MAX_SLOPE, MAX_SLOPE))
-    rate, decay = slope + d / length, torch.exp(-ahead.clamp(min=0) / length)
+    rate = slope + d / length
+    decay = torch.exp(-ahead.clamp(min=0) / length)
     return (d + rate * ahead) * decay, (slope - rate * ahead / length) * decay
 
 
@@ -77,7 +80,8 @@ class MissionPath(RoutePath):
     """The ego's path along its mission in the Worlds of B scenes."""
 
     def __init__(self, world: World) -> None:
-        self.world, self.mission = world, mission_of(world.scene)
+        self.world = world
+        self.mission = mission_of(world.scene)
         super().__init__(world.states[:, 0], self.mission.points, world.mission_s)
 
     def speed_caps(self, desired: float, braking: float = BRAKING, limits: bool = True, lights: bool = True) -> Tensor:
@@ -104,8 +108,10 @@ class MissionPath(RoutePath):
         """Metres [B] until the ego's front is STOP_GAP m before the next stop line that binds; negative beyond that
         point, inf for none. A yellow light binds if `braking` m/s^2 halts before it, a red one if twice as much does.
         """
-        scene, mission = self.world.scene, self.mission
-        lights, ahead = light_state_at(scene["light_state"], mission.light, self.world.step), mission.light_s
+        scene = self.world.scene
+        mission = self.mission
+        lights = light_state_at(scene["light_state"], mission.light, self.world.step)
+        ahead = mission.light_s
         speed = self.world.states[:, 0, 3]
         line = stop_line_distance(lights, ahead - self.s[:, None], speed, 2 * braking, braking)
         return line - scene["size"][:, 0, 0] / 2 - STOP_GAP

@@ -94,7 +94,8 @@ class PDMClosedEgo(Ego):
 
     def proposals(self, world: World) -> Tensor:
         """States [B, P, PLAN_STEPS, 4] of the proposals: of each offset, all fractions."""
-        path, start = MissionPath(world), world.states[:, 0]
+        path = MissionPath(world)
+        start = world.states[:, 0]
         offset = start.new_tensor(OFFSETS).repeat_interleave(len(FRACTIONS))
         speed = self.speeds(world, path, offset, start.new_tensor(FRACTIONS).repeat(len(OFFSETS)))
         shift = offset[:, None].expand(len(start), -1, 1)
@@ -104,14 +105,16 @@ class PDMClosedEgo(Ego):
         """Speeds [B, P, PLAN_STEPS + 1] m/s by IDM behind leaders on the offsets [P] m, and before red lights, at
         fractions [P] of the speed limit where the ego is."""
         driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking, EXPONENT)
-        others, half = self._others(world, range(PLAN_STEPS)), world.scene["size"][:, 0] / 2
+        others = self._others(world, range(PLAN_STEPS))
+        half = world.scene["size"][:, 0] / 2
         onto = project(others.states[..., :2].flatten(1, 2), path.route)
         s, d, heading = (x.unflatten(1, others.states.shape[1:3]) for x in onto)
         turn = others.states[..., 2] - heading
         along, side = (_extent(others.size, turn, axis) for axis in (0, 1))
         leads = (d[:, None] - offset[:, None, None]).abs() < (side + half[:, 1, None, None])[:, None]
         leads &= others.seen[:, None, :, None]  # [B, P, M, T]
-        rear, leading = (s - along)[:, None], (others.states[..., 3] * turn.cos())[:, None]
+        rear = (s - along)[:, None]
+        leading = (others.states[..., 3] * turn.cos())[:, None]
         limit = limit_at(path.mission, path.s)[:, None]
         wanted = fraction * torch.where(limit > 0, limit, self.desired_speed)
         light = (path.s + path.stop_distance(self.braking) + self.standstill_gap)[:, None]
@@ -127,7 +130,8 @@ class PDMClosedEgo(Ego):
             gap = torch.minimum(gap, light - way).clamp(min=self.standstill_gap)
             asked = idm_acceleration(now, wanted, gap, pace, driver, improved=False)
             after = (now + DT * asked.clamp(-self.braking, self.acceleration)).clamp(0, dynamics.MAX_SPEED)
-            way, now = way + (now + after) / 2 * DT, after
+            way = way + (now + after) / 2 * DT
+            now = after
             found.append(now)
         return torch.stack(found, -1)
 
@@ -136,7 +140,8 @@ class PDMClosedEgo(Ego):
         agents, seen = nearest(world, self.agents)
         row = torch.arange(len(agents), device=agents.device)[:, None]
         objects = world.scene["agent_type"][row, agents] == OTHER
-        states, size = world.states[row, agents], world.scene["size"][row, agents]
+        states = world.states[row, agents]
+        size = world.scene["size"][row, agents]
         states = torch.cat([states[..., :3], states[..., 3:].masked_fill(objects[..., None], 0.0)], -1)
         touches = overlap(world.states[:, :1], world.scene["size"][:, :1], states, size)
         times = DT * torch.tensor(steps, device=agents.device)
@@ -145,7 +150,8 @@ class PDMClosedEgo(Ego):
 
 def _extent(size: Tensor, turn: Tensor, axis: int) -> Tensor:
     """Half of what boxes [B, M, 2] turned by turn [B, M, T] rad take along (axis 0) or across (1) a direction."""
-    own, other = size[..., axis, None] / 2, size[..., 1 - axis, None] / 2
+    own = size[..., axis, None] / 2
+    other = size[..., 1 - axis, None] / 2
     return own * turn.cos().abs() + other * turn.sin().abs()
 
 
@@ -176,7 +182,8 @@ def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tens
     times = DT * torch.arange(SCORED_STEPS + 1, device=fault.device)
     collides = torch.where(fault.any(2), times, torch.inf).amin(-1)
     clear = ~runs_into(scored, size, others, contacts, loose)
-    driven, smooth = progress(world, scored, factor), comfortable(world, scored)
+    driven = progress(world, scored, factor)
+    smooth = comfortable(world, scored)
     weighted = PROGRESS * driven + TIME_TO_COLLISION * clear + COMFORT * smooth
     return factor * weighted / (PROGRESS + TIME_TO_COLLISION + COMFORT), collides
 
@@ -229,8 +236,10 @@ def at_fault(states: Tensor, size: Tensor, others: Others, touch: Tensor, loose:
         Bool [B, P, M, T].
     """
     scene, proposal, agent, step = first(touch)
-    own, box = states[scene, proposal, step], size[scene]
-    other, other_size = others.states[scene, agent, step], others.size[scene, agent]
+    own = states[scene, proposal, step]
+    box = size[scene]
+    other = others.states[scene, agent, step]
+    other_size = others.size[scene, agent]
     direction = torch.stack([own[:, 2].cos(), own[:, 2].sin()], -1)
     bumper = torch.cat([own[:, :2] + box[:, :1] / 2 * direction, own[:, 2:]], -1)
     front = overlap(bumper, box * box.new_tensor([0.0, 1.0]), other, other_size)
@@ -263,7 +272,8 @@ def runs_into(states: Tensor, size: Tensor, others: Others, touch: Tensor, loose
 
 def in_several_lanes(world: World, states: Tensor, size: Tensor) -> Tensor:
     """Bool [B, P, T]: states [B, P, T, 4] reach beyond a lane of LANE_WIDTH about the mission: egos know no other."""
-    path, centres = MissionPath(world), states[..., :2]
+    path = MissionPath(world)
+    centres = states[..., :2]
     driven = torch.nn.functional.pad(centres.diff(dim=2).norm(dim=-1).cumsum(-1), (1, 0))
     near = (path.s[:, None, None] + driven).flatten(1, 2)
     beside = project(centres.flatten(1, 2), path.route, near)[1].view(driven.shape)
@@ -272,7 +282,8 @@ def in_several_lanes(world: World, states: Tensor, size: Tensor) -> Tensor:
 
 def on_road(states: Tensor, size: Tensor, world: World) -> Tensor:
     """Bool [B, P]: no corner of states [B, P, T, 4] leaves the drivable area."""
-    field, origin = world.scene["field"], world.scene["field_origin"]
+    field = world.scene["field"]
+    origin = world.scene["field_origin"]
     beyond = off_road(corners(states, size[:, None, None]).flatten(1, 3), field, origin).view(*states.shape[:3], 4)
     return beyond.amax((-2, -1)) <= 0
 
@@ -283,7 +294,8 @@ def comfortable(world: World, scored: Tensor) -> Tensor:
     The accelerations are a step's changes of speed, the first one the ego's last; like nuPlan's vehicle it has none to
     the side.
     """
-    speed, heading = scored[..., 3], scored[..., 2]
+    speed = scored[..., 3]
+    heading = scored[..., 2]
     accel = torch.cat([world.accel[:, None, :1].expand_as(speed[..., :1]), speed.diff(dim=-1) / DT], -1)
     turned = torch.nn.functional.pad(wrap(heading.diff(dim=-1)).cumsum(-1), (1, 0))
     whole = SCORED_STEPS + 1

@@ -54,7 +54,8 @@ def scene_messages(world: World, rows: list[int]) -> bytes:
 def _scene(world: World, mission: Mission, row: int) -> bytes:
     scene = world.scene[row]
     on_lane = scene["lane_index"] >= 0  # others are padding
-    lane, points = scene["lane_index"][on_lane], scene["lane_points"][on_lane]
+    lane = scene["lane_index"][on_lane]
+    points = scene["lane_points"][on_lane]
     lanes = int(lane.max()) + 1 if len(lane) else 0
     counts = [row, int(scene["scene_index"]), mission.points.shape[1], len(points), lanes, len(scene["light_points"])]
     about = [scene[key][:lanes, None] for key in ("lane_width", "lane_left", "lane_right")]
@@ -73,7 +74,8 @@ def _scene(world: World, mission: Mission, row: int) -> bytes:
 def plan_message(world: World) -> bytes:
     """PLAN of all scenes of a World: the agents that are there, and the lights, now."""
     count, agents = world.valid.shape
-    scene, row = world.scene, torch.arange(count, device=world.step.device)
+    scene = world.scene
+    row = torch.arange(count, device=world.step.device)
     lights = torch.arange(scene["light_state"].shape[-1], device=row.device).expand(count, -1)
     state = light_state_at(scene["light_state"], lights, world.step)
     number = torch.arange(agents, device=row.device).expand(count, -1)
@@ -137,7 +139,8 @@ class PlannerLink:
         self.buffer = bytearray()
         """What came beyond the last message taken."""
         self._name = f"ego.address={address}" if command is None else f"ego.command={command}"
-        self._process, begun = None, time.monotonic()
+        self._process = None
+        begun = time.monotonic()
         deadline = begun + timeout
         try:
             if command is None:

@@ -26,7 +26,8 @@ from e2rl.run.files import read_regular, write_atomically
 from e2rl.run.settings import configured, setting
 from e2rl.sim.observation import OBSERVATION_SIZE
 
-ONNX, TORCHSCRIPT = ".onnx", ".pt"
+ONNX = ".onnx"
+TORCHSCRIPT = ".pt"
 MAPS = f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] for every B (docs/observation.md)"
 PROBED = (1, 3)  # batches that a file is tried with
 MAX_FILE = 1 << 26  # bytes: 16 million weights
@@ -80,7 +81,8 @@ def probe(policy: Callable[[Tensor], Any], where: str, count: int) -> None:
         fits = isinstance(action, Tensor) and action.is_floating_point() and action.shape == (count, 2)
         found = f"maps them to {action.dtype} {list(action.shape)}" if isinstance(action, Tensor) else type(action)
     except Exception as error:  # the file's own
-        fits, found = False, " ".join(str(error).split())[-300:]
+        fits = False
+        found = " ".join(str(error).split())[-300:]
     if not fits:
         raise InputError(f"{where}: fails at observations [{count}, {OBSERVATION_SIZE}]: {found}; {MAPS}")
 

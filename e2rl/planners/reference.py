@@ -19,7 +19,8 @@ from e2rl.sim.leaders import GATE_MARGIN, IDMParameters, idm_acceleration
 from e2rl.sim.observation import FAR, LOOK_AHEAD, NEAR, NEAREST, OBSERVATION_SIZE, PER_AGENT, PROBE_X, PROBE_Y, SPEED
 from e2rl.sim.prospects import ACCELERATIONS, OFFSETS, PROSPECTS, WIDEST
 
-EGO, LAST_ACTION = slice(0, 11), (1, 2)
+EGO = slice(0, 11)
+LAST_ACTION = (1, 2)
 ROUTE = slice(11, 11 + 5 * len(LOOK_AHEAD))
 LIGHTS = slice(ROUTE.stop, ROUTE.stop + 8)
 PROBED = LIGHTS.stop + len(PROBE_X) * len(PROBE_Y)
@@ -73,7 +74,8 @@ def _following(speed: Tensor, desired: Tensor, gap: Tensor, leading: Tensor, acc
     the constant-acceleration heuristic, which only avoids the crash, is therefore raised towards it.
     """
     own = idm_acceleration(speed, desired, gap, leading, DRIVER, improved=True)
-    space, steady = gap.clamp(0.5, 1e3), acceleration.clamp(-HARDEST_BRAKING, ACCELERATION)
+    space = gap.clamp(0.5, 1e3)
+    steady = acceleration.clamp(-HARDEST_BRAKING, ACCELERATION)
     stops_first = leading * (speed - leading) <= -2 * space * steady
     halting = speed**2 * steady / (leading**2 - 2 * space * steady).clamp(min=1e-3)
     closing = steady - (speed - leading).clamp(min=0) ** 2 / (2 * space)
@@ -98,7 +100,9 @@ def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
 
 def _capped(route: Tensor, speed: Tensor) -> Tensor:
     """Acceleration [...] that reaches the speed cap by limits and curves ahead within REACTION."""
-    ahead, curvature, limit = route.new_tensor(LOOK_AHEAD), route[..., 3].abs() / 10, route[..., 4] * SPEED
+    ahead = route.new_tensor(LOOK_AHEAD)
+    curvature = route[..., 3].abs() / 10
+    limit = route[..., 4] * SPEED
     squared = torch.minimum(LATERAL / curvature.clamp(min=1e-3), limit**2)
     allowed = (squared + 2 * BRAKING * (ahead - speed[..., None] * REACTION).clamp(min=0)).amin(-1).sqrt()
     return (allowed - speed) / REACTION
@@ -108,14 +112,17 @@ def _leaders(observation: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor,
     """Free gap [..., NEAREST + 2] m along path [..., K, 2], inf for none, speed along it and acceleration, of agents
     and stop lines; and whether the bound of `follow` holds behind it."""
     ego = observation[..., EGO]
-    half_length, half_width = 2.5 * ego[..., 8, None], ego[..., 9, None]
+    half_length = 2.5 * ego[..., 8, None]
+    half_width = ego[..., 9, None]
     agents = observation[..., AGENTS].unflatten(-1, (NEAREST, PER_AGENT))
     position = torch.stack([agents[..., 1] * FAR, agents[..., 2] * NEAR], -1)
     along, apart, direction = _on_path(position, path)
-    cos, sin = agents[..., 3], agents[..., 4]
+    cos = agents[..., 3]
+    sin = agents[..., 4]
     aligned = cos * direction[..., 0] + sin * direction[..., 1]
     across = (sin * direction[..., 0] - cos * direction[..., 1]).abs()
-    length, width = 2.5 * agents[..., 9], agents[..., 10]
+    length = 2.5 * agents[..., 9]
+    width = agents[..., 10]
     inside = apart < across * length + aligned.abs() * width + half_width + GATE_MARGIN
     leads = inside & (along > 0) & (agents[..., 0] > 0)
     gap = (along - aligned.abs() * length - across * width - half_length).masked_fill(~leads, torch.inf)
@@ -139,7 +146,8 @@ def _on_path(position: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     offset = position[..., :, None, :] - corner[..., None, :-1, :]
     t = torch.minimum((offset * unit).sum(-1).clamp(min=0), length[..., None, :])
     distance = (offset - t[..., None] * unit).norm(dim=-1)
-    apart, index = distance.amin(-1), first_least(distance)
+    apart = distance.amin(-1)
+    index = first_least(distance)
     begun = (length.cumsum(-1) - length)[..., None, :]
     along = (begun + t).gather(-1, index[..., None])[..., 0]
     direction = unit.expand(*t.shape, 2).gather(-2, index[..., None, None].expand(*index.shape, 1, 2))[..., 0, :]

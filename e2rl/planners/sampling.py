@@ -151,7 +151,8 @@ class SamplingEgo(ScoringEgo):
 
     def candidates(self, world: World) -> Candidates:
         """Every speed profile on every lateral move."""
-        path, start = MissionPath(world), world.states[:, 0]
+        path = MissionPath(world)
+        start = world.states[:, 0]
         caps = path.speed_caps(self.max_speed)
         speed = speed_profiles(start[:, 3], start.new_tensor(PROFILES), caps, BRAKING + BRAKING_MORE)
         beside = start.new_tensor(SHIFTS).expand(len(start), -1)

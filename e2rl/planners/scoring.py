@@ -46,7 +46,8 @@ def forecast(world: World, agents: Tensor, seen: Tensor, times: Tensor, hold: fl
     the heading stay.
     """
     row = torch.arange(len(agents), device=agents.device)[:, None]
-    state, accel = world.states[row, agents], world.accel[row, agents]
+    state = world.states[row, agents]
+    accel = world.accel[row, agents]
     rate = world.turn_rate[row, agents]
     step = times[0]
     nodes = torch.nn.functional.pad(times, (1, 0))
@@ -115,7 +116,8 @@ def meeting_cost(ego: Tensor, ego_size: Tensor, others: Forecast, times: Tensor,
     dy = ego[:, :, None, :, 1] - others.poses[:, None, :, :, 1]
     near = (dx * dx + dy * dy < room * room) & others.seen[:, None, :, None]
     scene, candidate, agent, time = torch.unravel_index(near.view(-1).nonzero()[:, 0], near.shape)
-    mine, pair = scene * count + candidate, scene * agents + agent
+    mine = scene * count + candidate
+    pair = scene * agents + agent
     cost, ends = pair_cost(
         ego.reshape(-1, 4)[mine * steps + time],
         ego_size[scene],
@@ -142,12 +144,17 @@ def pair_cost(
     fraction of `margin` [Q] m or of `headway` s that is missing, the latter before the ego's own speed closes the gap
     to whom it has ahead. An agent behind the ego counts `rear`: its driver is to keep the distance.
     """
-    dx, dy = other[:, 0] - ego[:, 0], other[:, 1] - ego[:, 1]
-    cos_a, sin_a = ego[:, 2].cos(), ego[:, 2].sin()
-    cos_b, sin_b = other[:, 2].cos(), other[:, 2].sin()
-    cos, sin = cos_a * cos_b + sin_a * sin_b, sin_a * cos_b - cos_a * sin_b
+    dx = other[:, 0] - ego[:, 0]
+    dy = other[:, 1] - ego[:, 1]
+    cos_a = ego[:, 2].cos()
+    sin_a = ego[:, 2].sin()
+    cos_b = other[:, 2].cos()
+    sin_b = other[:, 2].sin()
+    cos = cos_a * cos_b + sin_a * sin_b
+    sin = sin_a * cos_b - cos_a * sin_b
     (la, wa), (lb, wb) = (ego_size / 2).unbind(-1), (other_size / 2).unbind(-1)
-    ahead, side = dx * cos_a + dy * sin_a, dy * cos_a - dx * sin_a
+    ahead = dx * cos_a + dy * sin_a
+    side = dy * cos_a - dx * sin_a
     along = ahead.abs() - (la + cos.abs() * lb + sin.abs() * wb)
     beside = side.abs() - (wa + sin.abs() * lb + cos.abs() * wb)
     from_other = torch.maximum(
@@ -171,14 +178,17 @@ def pair_cost(
 def beyond_border(states: Tensor, world: World, border: float) -> Tensor:
     """Metres [B, C], summed over T, by which centres [B, C, T, 4] come nearer to the drivable border than `border`, or
     leave it; only what exceeds the ego's present place counts."""
-    field, origin = world.scene["field"], world.scene["field_origin"]
+    field = world.scene["field"]
+    origin = world.scene["field_origin"]
     now = off_road(world.states[:, :1, :2], field, origin).clamp(min=-border)
     return (off_road(states[..., :2], field, origin) - now[..., None]).clamp(0, FARTHEST).sum(-1)
 
 
 def discomfort(states: Tensor, world: World) -> Tensor:
     """Mean |acceleration| [B, C] m/s^2 of candidates [B, C, T, 4], along and across, and JERK_TIME s of jerk now."""
-    speed, turn = states[..., 3], wrap(states[..., 2].diff(dim=-1)) / DT
+    speed = states[..., 3]
+    turn = wrap(states[..., 2].diff(dim=-1)) / DT
     first = (speed[..., 0] - world.states[:, :1, 3]) / DT - world.accel[:, :1]
-    along, across = speed.diff(dim=-1).abs().mean(-1) / DT, (turn * speed[..., 1:]).abs().mean(-1)
+    along = speed.diff(dim=-1).abs().mean(-1) / DT
+    across = (turn * speed[..., 1:]).abs().mean(-1)
     return along + across + JERK_TIME * first.abs()

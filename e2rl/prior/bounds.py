@@ -113,16 +113,19 @@ def apply_cap(cap: Tensor | None, x0: Tensor, state: LaneState) -> tuple[Tensor,
 
 def _meeting_braking(motion: LaneState, state: LaneState, obstacles: Obstacles, steps: Tensor) -> Tensor:
     """`meeting_braking` [B, V] of planned motions, towards the agent that each runs into first."""
-    vehicles, duty = state.v.shape[1], obstacles.duty
+    vehicles = state.v.shape[1]
+    duty = obstacles.duty
     others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
-    own, driven = motion.states()[:, :, steps], motion.s[..., steps] - state.s[..., None]
+    own = motion.states()[:, :, steps]
+    driven = motion.s[..., steps] - state.s[..., None]
     sizes = obstacles.size[:, :vehicles], obstacles.size
     here = obstacles.present[:, :vehicles]
     plans = Plans(own, torch.cat([own, others], 1), driven, *sizes, here, obstacles.present, steps + 1)
     length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2
     if duty is None:  # nobody is behind the ego by any duty
         none = torch.zeros_like(here)
-        duty, length = Duty(none, none, torch.zeros_like(length)), torch.full_like(length, -torch.inf)
+        duty = Duty(none, none, torch.zeros_like(length))
+        length = torch.full_like(length, -torch.inf)
     return braking_for_meetings(plans, state.v, length, duty)
 
 
@@ -220,7 +223,8 @@ def _towards_ego(duty: Duty, meets: Tensor, yields: Tensor, room: Tensor, closin
 
 def _curve_braking(settings: BoundSettings, motion: LaneState, state: LaneState, steps: Tensor) -> Tensor:
     """Braking [B, V] by which v^2 kappa is at most `lateral` at every point of the plan."""
-    v, kappa = motion.v[..., steps], motion.kappa[..., steps].abs()
+    v = motion.v[..., steps]
+    kappa = motion.kappa[..., steps].abs()
     allowed = settings.lateral / kappa.clamp(min=1e-4)
     driven = (motion.s[..., steps] - state.s[..., None]).clamp(min=1.0)
     braking = ((state.v[..., None] ** 2 - allowed) / (2 * driven)).clamp(min=0)

@@ -64,7 +64,8 @@ def load_prior(
             f"stage=prior`, or use prior.checkpoint={BUNDLED} (an actor is given by ego=actor ego.checkpoint=)"
         )
     try:
-        architecture, origin = json.loads(header["architecture"]), json.loads(header["origin"])
+        architecture = json.loads(header["architecture"])
+        origin = json.loads(header["origin"])
         if architecture["features"] != FEATURES:
             raise ValueError(f"made for {architecture['features']} features, this version has {FEATURES}")
         settings = settings_of(DenoiserSettings, architecture["denoiser"], "denoiser")

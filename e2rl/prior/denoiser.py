@@ -169,7 +169,8 @@ class Denoiser(nn.Module):
         parts = zip(self.blocks, encoding.biases, encoding.modulations, self.modulated(level), strict=True)
         for block, bias, of_node, of_level in parts:
             h = block(h, of_node + of_level, bias, encoding.pairs)
-        alpha, sigma = self.schedule.alpha(level)[..., None], self.schedule.sigma(level)[..., None]
+        alpha = self.schedule.alpha(level)[..., None]
+        sigma = self.schedule.sigma(level)[..., None]
         return alpha * x + sigma * self.head(h).to(x.dtype)
 
 
@@ -178,7 +179,8 @@ class _Module(nn.Module):
 
     def __init__(self, settings: DenoiserSettings, method: str) -> None:
         super().__init__()
-        self.network, self.method = Denoiser(settings).eval(), method
+        self.network = Denoiser(settings).eval()
+        self.method = method
         self.names = [name for name, _ in (*self.named_parameters(), *self.named_buffers())]
         self.sizes = [" ".join(map(str, value.shape)) for value in self.network._read]
 
@@ -193,7 +195,8 @@ class _Module(nn.Module):
 @cache
 def fused_estimate(settings: DenoiserSettings) -> Fused:
     """`Denoiser.estimate` of networks of these sizes: of x, level, nodes, pairs, biases, modulations and weights."""
-    module, blocks = _Module(settings, "estimate"), settings.blocks
+    module = _Module(settings, "estimate")
+    blocks = settings.blocks
 
     def denoise(x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *given: Tensor) -> Tensor:
         encoding = Encoding(nodes, pairs, list(given[:blocks]), list(given[blocks : 2 * blocks]))

@@ -57,7 +57,8 @@ def _placed(motion: LaneState, state: LaneState, driven: Tensor, on_lane: Tensor
     pairs = (torch.cat([getattr(state, name)[..., None], getattr(line, name)], -1) for name in ALONG_LINE)
     table = torch.stack(list(pairs), -2)
     after = torch.searchsorted(metres, driven.contiguous()).clamp(1, metres.shape[-1] - 1)
-    low, high = metres.gather(-1, after - 1), metres.gather(-1, after)
+    low = metres.gather(-1, after - 1)
+    high = metres.gather(-1, after)
     part = ((driven - low) / (high - low).clamp(min=TINY)).clamp(0, 1)[..., None, :]
     index = after[..., None, :].expand(*table.shape[:-1], after.shape[-1])
     values = torch.lerp(table.gather(-1, index - 1), table.gather(-1, index), part)

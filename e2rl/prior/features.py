@@ -18,7 +18,8 @@ TURN_AT = (10.0, 20.0, 40.0, 60.0, 80.0)  # m ahead
 LEADER_AT = (0.0, 1.5, 3.0)  # s ahead, the others at constant velocity
 COMFORT_LATERAL, COMFORT_BRAKE = 2.5, 1.2  # m/s^2
 DRIVER = IDMParameters(headway=1.0, standstill_gap=2.0, acceleration=1.5, braking=2.0)
-NODE, EDGE = 51 + PAST + 4, 15
+NODE = 51 + PAST + 4
+EDGE = 15
 SIDED_NODE = (2, 3, 4, *range(9, 22), *range(51 + PAST, NODE))  # features that change sign under a mirror image
 SIDED_EDGE = (1, 3, 5, 13)
 
@@ -38,7 +39,8 @@ def node_features(routed: RoutedScene, state: LaneState, followed: Leaders, step
     near = torch.exp(-followed.gap.clamp(min=0) / 20.0)
     closing = torch.where(followed.gap < FREE_GAP, (v[..., None] - followed.speed) / 5.0, 0.0)
     lead = torch.stack([near, closing], -1).flatten(2).unbind(-1)
-    gap, gap_speed = followed.gap[..., 0], followed.speed[..., 0]
+    gap = followed.gap[..., 0]
+    gap_speed = followed.speed[..., 0]
     desired_speed = torch.where(known, limit, 15.0).clamp(min=1.0)
     idm = idm_acceleration(v, desired_speed, gap, gap_speed, DRIVER, improved=False).clamp(-6.0, 2.0)
     motion = [v / 10, state.a / 2, state.d, state.d1 * 5, state.d2 * 20, (v < 0.5).float()]
@@ -105,12 +107,19 @@ def past_features(past: Tensor, v: Tensor, estimated: Tensor) -> list[Tensor]:
 @fused(ROUTED, "B V")
 def edge_features(routed: RoutedScene, state: LaneState) -> Tensor:
     """[B, V, V, EDGE] of each pair (i, j): j in i's frame, and where their routes meet."""
-    x, y, heading, v = state.x, state.y, state.heading, state.v
-    cos, sin = torch.cos(heading)[..., None], torch.sin(heading)[..., None]
-    dx, dy = x[:, None, :] - x[..., None], y[:, None, :] - y[..., None]
-    along, across = cos * dx + sin * dy, cos * dy - sin * dx
+    x = state.x
+    y = state.y
+    heading = state.heading
+    v = state.v
+    cos = torch.cos(heading)[..., None]
+    sin = torch.sin(heading)[..., None]
+    dx = x[:, None, :] - x[..., None]
+    dy = y[:, None, :] - y[..., None]
+    along = cos * dx + sin * dy
+    across = cos * dy - sin * dx
     turn = heading[:, None, :] - heading[..., None]
-    vx, vy = v[:, None, :] * torch.cos(turn) - v[..., None], v[:, None, :] * torch.sin(turn)
+    vx = v[:, None, :] * torch.cos(turn) - v[..., None]
+    vy = v[:, None, :] * torch.sin(turn)
     distance = torch.sqrt(dx**2 + dy**2 + 0.01)
     closing = -(along * vx + across * vy) / distance
     own = routed.conflict_s - state.s[..., None]

@@ -35,7 +35,8 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     v, travelled = speeds(state, ACCEL_SCALE * x[..., :KNOTS])
     scale = curvature_scale(state.v)[..., None]
     reach = lateral_horizon(state.v)[..., None]
-    half, end = scale * x[..., KNOTS, None], scale * x[..., KNOTS + 1, None]
+    half = scale * x[..., KNOTS, None]
+    end = scale * x[..., KNOTS + 1, None]
     first, second, beyond = _segments(travelled, reach)
     now = state.kappa[..., None]
     kappa = now + (half - now) * first + (end - half) * second
@@ -47,7 +48,8 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     xs = state.x[..., None] + (step * torch.cos(middle)).cumsum(-1)
     ys = state.y[..., None] + (step * torch.sin(middle)).cumsum(-1)
     accel = (v - torch.cat([state.v[..., None], v[..., :-1]], -1)) / DT
-    s, zero = state.s[..., None] + travelled, torch.zeros_like(v)
+    s = state.s[..., None] + travelled
+    zero = torch.zeros_like(v)
     return LaneState(s, state.d[..., None] + zero, zero, zero, v, accel, xs, ys, heading, kappa)
 
 

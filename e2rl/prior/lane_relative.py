@@ -147,7 +147,8 @@ def offset_coefficients(state: LaneState, half: Tensor, end: Tensor) -> Tensor:
     reach = lateral_horizon(state.v)
     low = torch.stack([state.d, state.d1 * reach, 0.5 * state.d2 * reach**2], -1)
     at_half = low[..., 0] + 0.5 * low[..., 1] + 0.25 * low[..., 2]
-    slope, bend = low[..., 1] + 2 * low[..., 2], 2 * low[..., 2]
+    slope = low[..., 1] + 2 * low[..., 2]
+    bend = 2 * low[..., 2]
     target = torch.stack([half - at_half, end - low.sum(-1), -slope, -bend], -1)
     return torch.cat([low, target @ _offset_basis(low.device).T], -1)
 
@@ -179,10 +180,12 @@ def decode(
     knots, half, end = split(x, state)
     v, travelled = speeds(state, knots)
     accel = torch.diff(v, dim=-1, prepend=state.v[..., None])[..., steps] / DT
-    v, travelled = v[..., steps], travelled[..., steps]
+    v = v[..., steps]
+    travelled = travelled[..., steps]
     reach = lateral_horizon(state.v)[..., None]
     d, d1, d2 = polynomial(offset_coefficients(state, half, end), (travelled / reach).clamp(max=1.0))
-    d1, d2 = d1 / reach, d2 / reach**2
+    d1 = d1 / reach
+    d2 = d2 / reach**2
     s = state.s[..., None] + travelled
     xy, heading, curvature = interpolate(points, s, along)
     normal = torch.stack([-torch.sin(heading), torch.cos(heading)], -1)
@@ -209,7 +212,8 @@ class _Polynomial(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        value, first = c[..., 6, None] * u + c[..., 5, None], c[..., 6, None]
+        value = c[..., 6, None] * u + c[..., 5, None]
+        first = c[..., 6, None]
         second = third = torch.zeros_like(first)
         for k in range(4, -1, -1):
             third = third * u + 3 * second
@@ -229,7 +233,8 @@ class _Polynomial(torch.autograd.Function):
         of_value, of_first, of_second = (
             (table[..., : 7 - shift, :] * grad[..., None, :]).sum(-1) for shift, grad in enumerate(grads)
         )
-        power, pad = torch.arange(7, device=c.device, dtype=c.dtype), torch.nn.functional.pad
+        power = torch.arange(7, device=c.device, dtype=c.dtype)
+        pad = torch.nn.functional.pad
         of_c = of_value + power * pad(of_first, (1, 0)) + power * (power - 1) * pad(of_second, (2, 0))
         return of_c.sum_to_size(c.shape), grads[0] * first + grads[1] * second + grads[2] * third
 
@@ -269,7 +274,9 @@ def ridge(unit: Tensor, target: Tensor, damping: Tensor) -> Tensor:
     right = (unit * target[..., None]).sum(-2)
     if torch.compiler.is_compiling() and unit.shape[-1] == 2:  # Cramer's rule, as the compiler has no `solve`
         one, two = unit.unbind(-1)
-        a, b, d = (one * one).sum(-1), (one * two).sum(-1), (two * two).sum(-1)
+        a = (one * one).sum(-1)
+        b = (one * two).sum(-1)
+        d = (two * two).sum(-1)
         a, d, (e, f) = a + damping[0, 0], d + damping[1, 1], right.unbind(-1)
         return torch.stack([d * e - b * f, a * f - b * e], -1) / (a * d - b * b)[..., None]
     return torch.linalg.solve(unit.transpose(-1, -2) @ unit + damping, right[..., None])[..., 0]
@@ -278,7 +285,8 @@ def ridge(unit: Tensor, target: Tensor, damping: Tensor) -> Tensor:
 def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tensor:
     """Acceleration knots [..., V, KNOTS] m/s^2 of recorded motion."""
     device = track.v.device
-    basis, distance = _speed_basis(device), _distance_basis(device)
+    basis = _speed_basis(device)
+    distance = _distance_basis(device)
     time = DT * torch.arange(1, HORIZON + 1, device=device)
     weight = torch.ones_like(track.v)[..., None] if known is None else known.to(basis.dtype)[..., None]
     rows_of_all, inverse = _fit_of_all(device)

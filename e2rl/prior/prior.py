@@ -90,7 +90,8 @@ class Prior(nn.Module):
         super().__init__()
         self.denoiser = Denoiser(denoiser)
         self.route_choice = RouteChoice()
-        self.sampler, self.bounds = sampler or SamplerSettings(), bounds or BoundSettings()
+        self.sampler = sampler or SamplerSettings()
+        self.bounds = bounds or BoundSettings()
         self.schedule = self.denoiser.schedule
 
     @torch.no_grad()
@@ -175,27 +176,33 @@ class Prior(nn.Module):
             budget: [B], path KL that control may add to a scene, all vehicles together (None: any). A step that would
                 exceed it takes the fraction of its control that uses the budget up; no later step is controlled.
         """
-        settings, levels = self.sampler, self.sampler.levels(self.schedule, noise.device)
+        settings = self.sampler
+        levels = self.sampler.levels(self.schedule, noise.device)
         noise = settings.temperature * noise
-        x, past, last = noise[0], None, levels[1]
+        x = noise[0]
+        past = None
+        last = levels[1]
         kl = log_ratio = torch.zeros(noise.shape[1:3], device=noise.device)
         any_budget = kl.new_full(kl.shape[:1], torch.inf) if budget is None else budget
         for k in range(settings.steps, 0, -1):
             index = settings.steps - k
-            high, low = levels[index], levels[index + 1]
+            high = levels[index]
+            low = levels[index + 1]
             if control is None:
                 with torch.no_grad():
                     x0 = nominal = self.denoise(x, high, context)
             else:
                 x, nominal, x0 = control(x, high, k, context, partial(self.denoise, level=high, context=context))
             if k > 1:  # the last step takes x0 itself
-                before, walk = past or (x0, nominal), (last, high, low, noise[index + 1])
+                before = past or (x0, nominal)
+                walk = (last, high, low, noise[index + 1])
                 if control is None:
                     x = fused_step(settings, SIZE)(x, x0, before[0], *walk)
                 else:
                     step = fused_controlled_step(settings, SIZE, budget is not None)
                     x, x0, kl, log_ratio = step(x, x0, nominal, *before, *walk, kl, log_ratio, any_budget)
-                past, last = (x0, nominal), high
+                past = (x0, nominal)
+                last = high
             elif budget is not None and control is not None:  # without noise there is no KL to count
                 x0 = torch.where((kl.sum(-1) < BUDGET_SPENT * budget)[:, None, None], x0, nominal)
         return Sample(x0, kl, log_ratio)
@@ -203,7 +210,9 @@ class Prior(nn.Module):
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> Plan:
         """The motion that is executed: decoded, `as_driven` and bounded; standing vehicles are held, routes end."""
-        held, routed, state = ~context.active, context.routed, context.state
+        held = ~context.active
+        routed = context.routed
+        state = context.state
         held[:, 0] = False
 
         def decode(rows: Rows | None, cap: Tensor | None) -> LaneState:

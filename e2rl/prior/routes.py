@@ -69,7 +69,8 @@ def route_scene(scene: TensorDictBase, route: Tensor) -> RoutedScene:
     """The RoutedScene of scenes [B] whose vehicles follow candidates route [B, V]."""
     vehicles = route.shape[1]
     assigned = {name: take_route(scene[f"route_{name}"], route) for name in ROUTE_FIELDS}
-    valid, parked = scene["valid"][:, :vehicles], scene["parked"][:, :vehicles]
+    valid = scene["valid"][:, :vehicles]
+    parked = scene["parked"][:, :vehicles]
     has_lane = take_route(scene["route_valid"], route)
     all_rows = torch.arange(vehicles, device=route.device)
     pairs = [_conflicts(points, all_rows)[0] for points in assigned["points"]]
@@ -175,7 +176,8 @@ def start_of(scene: TensorDictBase) -> Moment:
 def candidate_features(scene: TensorDictBase, now: Moment) -> Tensor:
     """[B, V, R, FEATURES] of each route candidate as seen from the vehicles now."""
     vehicles = now.states.shape[1]
-    points, length = scene["route_points"][:, :vehicles], scene["route_length"][:, :vehicles]
+    points = scene["route_points"][:, :vehicles]
+    length = scene["route_length"][:, :vehicles]
     s, d, heading = (value[..., 0] for value in project(now.states[:, :, None, None, :2], points))
     v = now.states[..., 3].clamp(min=0)[..., None].expand_as(s)
     at = s[..., None] + torch.tensor((0.0, *TURN_AT), device=s.device)

@@ -77,7 +77,8 @@ class Sampler(ABC):
     """
 
     def __init__(self, schedule: NoiseSchedule, churn: float = 1.0) -> None:
-        self.schedule, self.churn = schedule, churn
+        self.schedule = schedule
+        self.churn = churn
 
     @abstractmethod
     def step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past = None) -> Stepped:
@@ -90,8 +91,10 @@ class DDIM(Sampler):
 
     def step(self, x: Tensor, x0: Tensor, high: Tensor, low: Tensor, noise: Tensor, past: Past = None) -> Stepped:
         schedule = self.schedule
-        alpha_high, alpha_low = schedule.alpha(high), schedule.alpha(low)
-        sigma_high, sigma_low = schedule.sigma(high), schedule.sigma(low)
+        alpha_high = schedule.alpha(high)
+        alpha_low = schedule.alpha(low)
+        sigma_high = schedule.sigma(high)
+        sigma_low = schedule.sigma(low)
         ratio = (alpha_high / alpha_low) ** 2
         scale = self.churn * sigma_low / sigma_high * torch.sqrt((1 - ratio).clamp(min=0))
         eps = schedule.noise(x, x0, high)
@@ -165,7 +168,8 @@ def fused_controlled_step(settings: SamplerSettings, size: int, limited: bool) -
     Of x, clean estimates x0 and nominal, those of the past, the levels past, high and low, noise, the KL and log ratio
     [B, V] so far and the budget [B] to x, x0, KL and log ratio. limited: there is a budget.
     """
-    sampler, temperature = settings.on(NoiseSchedule()), settings.temperature
+    sampler = settings.on(NoiseSchedule())
+    temperature = settings.temperature
 
     def step(*given: Tensor) -> tuple[Tensor, ...]:
         x, x0, nominal, past, past_nominal, last, high, low, noise, kl, log_ratio, budget = given
@@ -175,7 +179,8 @@ def fused_controlled_step(settings: SamplerSettings, size: int, limited: bool) -
         added = path_kl(moved - plain, variance)
         if limited:
             fraction = within_budget(budget, kl, added)[:, None, None]
-            moved, x0 = plain + fraction * (moved - plain), nominal + fraction * (x0 - nominal)
+            moved = plain + fraction * (moved - plain)
+            x0 = nominal + fraction * (x0 - nominal)
             added = fraction[..., 0] ** 2 * added
         martingale = path_martingale(moved - plain, noise, variance, temperature)
         return moved, x0, kl + added, log_ratio + added + martingale

@@ -24,7 +24,8 @@ def sample_variances(prior: Prior, scene: TensorDictBase, samples: int, seed: in
     Routes are the recorded ones, drawn where there is none; the ego is sampled like every vehicle. So what varies is
     the reverse SDE alone.
     """
-    device, shape = scene["start"].device, scene["route_log"].shape
+    device = scene["start"].device
+    shape = scene["route_log"].shape
     generator = torch.Generator(device).manual_seed(seed)
     drawn_route = prior.choose_routes(scene, torch.rand(shape, generator=generator, device=device))
     routed, lane = prior.start(scene, torch.where(scene["route_log"] >= 0, scene["route_log"], drawn_route))
@@ -44,7 +45,8 @@ def sample_variances(prior: Prior, scene: TensorDictBase, samples: int, seed: in
         "travel": travel.var(0),
     }
     sums = {name: (value * counted).sum(-1).double() for name, value in parts.items()}
-    at, vehicles = min(HORIZON, scene["logged"].shape[1] - 1), shape[1]
+    at = min(HORIZON, scene["logged"].shape[1] - 1)
+    vehicles = shape[1]
     recorded = counted & (scene["route_log"] >= 0) & scene["logged_valid"][:, at, :vehicles] & (at == HORIZON)
     logged = torch.where(recorded[..., None], scene["logged"][:, at, :vehicles, :2], scene["start"][:, :vehicles, :2])
     way = project(logged[:, :, None], routed.points, (lane.s + travel.mean(0))[..., None])[0][..., 0] - lane.s

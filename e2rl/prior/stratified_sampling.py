@@ -25,11 +25,14 @@ def impulse_response(schedule: NoiseSchedule, sampler: SamplerSettings, device: 
 
     The sampler is linear then, and the answers to unit impulses are read off.
     """
-    levels, noise = sampler.levels(schedule, device), torch.eye(sampler.steps, device=device)
+    levels = sampler.levels(schedule, device)
+    noise = torch.eye(sampler.steps, device=device)
     past: Past = None
-    x, step = noise[0], sampler.on(schedule).step
+    x = noise[0]
+    step = sampler.on(schedule).step
     for k in range(sampler.steps - 1):
-        high, low = levels[k], levels[k + 1]
+        high = levels[k]
+        low = levels[k + 1]
         x0 = schedule.alpha(high) * x  # the mean of a standard normal x0 given x_t
         x, _ = step(x, x0, high, low, noise[k + 1], past)
         past = (x0, high)

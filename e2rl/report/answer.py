@@ -179,12 +179,14 @@ def bracketed(*parts: str) -> str:
 
 def verdict(row: dict) -> str:
     """How many of the collisions were preventable, clean, and count; how many a search could have avoided."""
-    hits, found = row["metrics"].get("counted", {}).get("n", 0), tally(row, "counted")
+    hits = row["metrics"].get("counted", {}).get("n", 0)
+    found = tally(row, "counted")
     if not hits:
         return ""
     avoidable = row["metrics"].get("avoidable", {}).get("n", 0)
     search = f" A search found a way out of {tally(row, 'avoidable')} of {avoidable}." if avoidable else ""
-    preventable, fault = tally(row, "preventable"), tally(row, "at_fault")
+    preventable = tally(row, "preventable")
+    fault = tally(row, "at_fault")
     text = f"A careful and competent driver would have prevented {preventable or 'none'} of the {hits}"
     if preventable and not row.get("searched"):
         text += f" ({tally(row, 'cfr_clean') - tally(row, 'errored')} clean: nobody else did wrong)"
@@ -229,7 +231,8 @@ def compared(rows: Sequence[dict]) -> list[str]:
     several = len(egos) > 1
 
     def rank(key: tuple[str, str]) -> tuple:
-        row, sign = cells[key], 1 if several else -1
+        row = cells[key]
+        sign = 1 if several else -1
         means = [row["metrics"].get(name, {}).get("mean", math.nan) for name in (*KINDS.values(), "cfr")]
         found = [math.inf if math.isnan(mean) else sign * mean for mean in means]
         return (-row["eta"], labels.index(key[1]), *found) if several else (not row["eta"], *found, row["eta"])
@@ -238,7 +241,8 @@ def compared(rows: Sequence[dict]) -> list[str]:
     ego, name = ranked[0]
     best = cells[ranked[0]]
     most = "fails most" if best["metrics"]["cfr"]["mean"] else "does not fail, not even"
-    hits, crashed = f"{of(best, 'cfr')} {unit_of(best)}", tally(best, "errored")
+    hits = f"{of(best, 'cfr')} {unit_of(best)}"
+    crashed = tally(best, "errored")
     hits = f"hit or raised in {hits}" if crashed else f"hit in {hits}"
     lead = f"{ego} {most} in the traffic of {name}: {hits}"
     if several:
@@ -303,7 +307,8 @@ def measured(rows: Sequence[dict]) -> str:
     if not rows:
         return "No rollout was scored."
     first = max(closed_loop(rows) or rows, key=lambda row: row["n_rollouts"])
-    scenes, seeds = plural(first["n_scenes"], "scene"), plural(first["n_seeds"], "seed")
+    scenes = plural(first["n_scenes"], "scene")
+    seeds = plural(first["n_seeds"], "seed")
     methods = dict.fromkeys(traffic_name(row) for row in rows if row["eta"])
     attack = f"; attack: {', '.join(methods)}" if len(methods) == 1 else ""
     text = f"Measured: {first['dataset']}/{first['split']}, {scenes}, {seeds}{attack}."
@@ -346,7 +351,8 @@ def cell(row: dict, name: str) -> str:
 
 def gap(row: dict, name: str) -> str:
     """The paired difference to `before`, such as `-20 [-28, -12]`: points of per cent, or rates per 1,000 km."""
-    found, metric = (row["paired"].get("before") or {}).get(name), METRICS[name]
+    found = (row["paired"].get("before") or {}).get(name)
+    metric = METRICS[name]
     if not found or math.isnan(found["difference"]):
         return UNKNOWN
     scale = 100 if metric.fraction else 1000 if metric.per else 1
@@ -356,7 +362,8 @@ def gap(row: dict, name: str) -> str:
 
 def value(row: dict, name: str) -> str:
     """The mean of a metric as the tables print it; a rate of metres or kilometres per 1,000 of them."""
-    found, metric = row["metrics"].get(name), METRICS[name]
+    found = row["metrics"].get(name)
+    metric = METRICS[name]
     if not found or not found["n"] or math.isnan(found["mean"]):
         return UNKNOWN
     return f"{1000 * found['mean']:,.0f}" if metric.per else number(metric, found["mean"])
@@ -382,7 +389,8 @@ def columns(table: Sequence[Sequence[str]]) -> list[str]:
 
     Columns that find no room stand beneath, beside the first column again, which is cut where it is too wide.
     """
-    width, body = terminal_width(), list(zip(*table, strict=True))
+    width = terminal_width()
+    body = list(zip(*table, strict=True))
     sizes = [max(max(map(len, cells), default=0), *map(len, head.split() or [""])) for head, *cells in body]
     sizes[0] = min(sizes[0], max(width // 3, width - sum(sizes[1:]) - 2 * (len(sizes) - 1)))
     lines: list[str] = []

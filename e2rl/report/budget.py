@@ -72,7 +72,8 @@ class Found:
     ) -> None:
         within = [row for row in told if row[unit] <= budget * (1 + 1e-9)]
         place, count = cluster_index(*zip(*scenes, strict=True))
-        draws, number = bootstrap_draws(count), {scene: k for k, (_, scene) in enumerate(scenes)}
+        draws = bootstrap_draws(count)
+        number = {scene: k for k, (_, scene) in enumerate(scenes)}
         seeds = sorted({row["seed"] // TRIES for row in told})
         self.spent = dict.fromkeys(SPENT, 0.0)
         self.tried = len({(row["scene_id"], row["seed"] // TRIES) for row in within}) / max(len(seeds), 1)  # scenes
@@ -247,7 +248,8 @@ def curve(told: Sequence[Mapping], unit: str, name: str, scenes: int) -> tuple[l
     """Budgets, and what the tries of all seeds within each have found in the mean."""
     seeds = sorted({row["seed"] // TRIES for row in told})
     known: set[tuple] = set()
-    x, y = [], []
+    x = []
+    y = []
     for row in sorted(told, key=lambda row: row[unit]):
         if row["cell"] or (name == "scenes" and row.get("raised")):
             known.add((row["seed"] // TRIES, row["scene_id"] if name == "scenes" else row["cell"]))

@@ -117,7 +117,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, metavar="FILE", help=f"the page (default: {PAGE} in the last run's folder)")
     options = parser.parse_args(arguments)
     with ending():
-        runs, egos = options.runs, options.egos or (None, None)
+        runs = options.runs
+        egos = options.egos or (None, None)
         if len(runs) > 2 or (len(runs) == 1 and not options.egos):
             raise InputError("give two runs, or one with several egos and --egos BEFORE AFTER")
         if options.out is not None and options.out.suffix != ".html":

@@ -60,7 +60,8 @@ def method_tables(
     text = f"{origin(group[0])}. {counts(group, names)}"
     note = f"{MEANS} Knowledge: the ego's plan, or its motion predicted; duty: what adversaries owe the ego. {settings}"
     difference = f"{text} Difference of each method to {' and to '.join(references)}"
-    head, keys = ["method", "knowledge", "duty"], {name: name for name in references}
+    head = ["method", "knowledge", "duty"]
+    keys = {name: name for name in references}
     return tables_of(group, labels, head, table, "Methods", f"{text} {note}", difference, keys)
 
 
@@ -70,12 +71,14 @@ def planner_tables(
     """Returns the same with a row for each ego of `names` and each traffic and intensity, and differences to the egos
     `references` in the same traffic, as far as the rows are paired with them."""
     cells, _ = by_ego(closed_loop(rows), names)
-    group, labels = list(cells.values()), [list(key) for key in cells]
+    group = list(cells.values())
+    labels = [list(key) for key in cells]
     text = f"{group[0]['dataset']}/{group[0]['split']}. "
     text += counts(group, [f"{ego} under {traffic}" for ego, traffic in labels], "ego and traffic")
     difference = f"{text} Difference of each ego to {' and to '.join(references)} in the same traffic"
     pooled = f" {TRAININGS}" if any(row.get("n_trainings", 1) > 1 for row in group) else ""
-    caption, keys = f"{text} {MEANS}{pooled} {settings}", {name: f"ego {name}" for name in references}
+    caption = f"{text} {MEANS}{pooled} {settings}"
+    keys = {name: f"ego {name}" for name in references}
     return tables_of(group, labels, ["ego", "traffic"], table, "Egos", caption, difference, keys)
 
 
@@ -91,7 +94,8 @@ def tables_of(
 ) -> list[Table]:
     """The table of means of rows of metrics.json, which begin with `labels` under `head`, then that of differences to
     the `references` {name: its key in a row's `paired`} where there are some."""
-    metrics, labelled = known_metrics(group, table_metrics(table)), list(zip(labels, group, strict=True))
+    metrics = known_metrics(group, table_metrics(table))
+    labelled = list(zip(labels, group, strict=True))
     means = [[*cells, *(mean_cell(metric, row) for metric in metrics)] for cells, row in labelled]
     caption = " ".join(filter(None, (f"{caption.strip().rstrip('.')}.", notes_on(group))))
     found = [Table(caption, [*head, *map(heading, metrics)], means, title)]
@@ -166,10 +170,12 @@ def guard_table(rows: Sequence[dict], before: str, after: str, planner: str, rec
     row = by_ego(rows, [after])[0][after, "nominal"]
     lines = []
     for name, other, most in (("cfr", before, UP), ("cfr", planner, 0.0), ("ego_off_road", before, 0.0)):
-        metric, paired = METRICS[name], row["paired"][f"ego {other}"][name]
+        metric = METRICS[name]
+        paired = row["paired"][f"ego {other}"][name]
         found = difference_cell(metric, paired), verdict(paired["difference"], most)
         lines.append([f"{name} over {other} [points]", f"≤ {100 * most:.0f}", *found])
-    progress, ceiling = row["paired"][f"ego {planner}"]["progress"], ROUGHNESS * recorded
+    progress = row["paired"][f"ego {planner}"]["progress"]
+    ceiling = ROUGHNESS * recorded
     found = relative_cell(progress), verdict(-progress["relative"], 1 - PROGRESS)
     smooth = mean_cell(METRICS["macc"], row), verdict(row["metrics"]["macc"]["mean"], ceiling)
     lines[2:2] = [

@@ -24,7 +24,8 @@ from e2rl.traffic.traffic import TEMPLATES
 
 CHOICES, PICTURE = "curriculum.csv", "curriculum.png"  # of a run's folder
 Choice = Mapping[str, float | str]  # a row of curriculum.csv
-TEXT, NEEDED = "template", ("round", "eta", "template", "draws", "episodes", "failures")
+TEXT = "template"
+NEEDED = ("round", "eta", "template", "draws", "episodes", "failures")
 LINE, MARGIN, WIDTH, DPI = 14, 90, 900, 144  # points: a line of an arm, the space around them, the width
 PANELS = (("fraction of the round's draws", "viridis"), ("fraction of failed episodes", "magma"))
 

@@ -33,7 +33,8 @@ PANELS = (  # (horizontal, vertical): failures over realism, then what they are 
     (("cfr", "cfr_preventable"), ("real_adv", "cfr_preventable"), ("cfr", "cfr_counted")),
 )
 COLUMNS = ("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "real", "real_adv", "aor_step", "cfr_bg", "nfe")
-OURS, NOMINAL = "e2", "nominal"
+OURS = "e2"
+NOMINAL = "nominal"
 COLOURS = {OURS: drawing.ADVERSARY, NOMINAL: drawing.INK}  # what stands out
 APART = [f"C{number}" for number in (0, 1, 2, 4, 5, 6, 7, 8, 9)]  # for the others: the cycle's red is too near to ours
 TABLES_ETA = 2.0  # intensity of the tables
@@ -66,7 +67,8 @@ def points_of_rows(rows: Sequence[dict]) -> list[Point]:
 def points_of_tuning(result: Mapping, method: str) -> list[Point]:
     """The points of tuning.json: the trials that differ from the first in the gain alone, which is the first of the
     parameters; the best trial; and the nominal traffic beside them."""
-    first, best = result["trials"][0], result["best"]
+    first = result["trials"][0]
+    best = result["best"]
     dial, *others = first["parameters"]
     points: list[Point] = []
     for trial in result["trials"]:
@@ -131,7 +133,8 @@ def by_method(points: Sequence[Point]) -> dict[str, list[Point]]:
 
 def curves_figure(points: Sequence[Point]) -> Figure:
     """PANELS, with a line a method: dots grow with the gain, the chosen setting is filled and has its intervals."""
-    figure, methods = new_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), DPI), by_method(points)
+    figure = new_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), DPI)
+    methods = by_method(points)
     figure.set_layout_engine("tight")
     panels = figure.subplots(len(PANELS), len(PANELS[0])).ravel()
     for axes, (across, up) in zip(panels, (pair for row in PANELS for pair in row), strict=True):
@@ -161,7 +164,9 @@ def draw_curve(axes: Axes, points: Sequence[Point], across: str, up: str, colour
     places = [[at(point, name) for point in line] for name in (across, up)]
     axes.plot(*places, color=colour, linewidth=1.8 if points[0].method == OURS else 1, label=points[0].method)
     for rank, point in enumerate(points):
-        x, y, face = at(point, across), at(point, up), colour if point.chosen else drawing.PANEL
+        x = at(point, across)
+        y = at(point, up)
+        face = colour if point.chosen else drawing.PANEL
         axes.plot(x, y, "o", markersize=3 + 5 * (rank + 1) / len(points), color=colour, markerfacecolor=face, zorder=3)
         if point.chosen:
             axes.vlines(x, at(point, up, "low"), at(point, up, "high"), color=colour, linewidth=0.7, alpha=0.6)
@@ -170,7 +175,8 @@ def draw_curve(axes: Axes, points: Sequence[Point], across: str, up: str, colour
 
 def save_curves(folder: Path, points: Sequence[Point]) -> list[Path]:
     """Write curves.csv and curves.png (and .pdf) into a folder; returns their paths."""
-    table, picture = Path(folder) / f"{NAME}.csv", Path(folder) / f"{NAME}.png"
+    table = Path(folder) / f"{NAME}.csv"
+    picture = Path(folder) / f"{NAME}.png"
     write_atomically(table, curves_csv(points))
     save_figure(picture, curves_figure(points))
     return [table, picture]

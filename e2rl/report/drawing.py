@@ -23,9 +23,17 @@ from e2rl.sim.rollout_file import Road
 
 Colour = str | tuple[str, float]  # of matplotlib: a name, or a name with its opacity
 
-GROUND, ROAD, CENTRELINE = "#eef0ec", "#d5d9df", "#f7f8fa"
-INK, MUTED, PANEL = "#1c2430", "#5d6877", "#ffffff"
-EGO, ADVERSARY, BACKGROUND, REPLAYED, VULNERABLE = "#1565d8", "#dc2f3c", "#8793a3", "#b3bcc8", "#f0950c"
+GROUND = "#eef0ec"
+ROAD = "#d5d9df"
+CENTRELINE = "#f7f8fa"
+INK = "#1c2430"
+MUTED = "#5d6877"
+PANEL = "#ffffff"
+EGO = "#1565d8"
+ADVERSARY = "#dc2f3c"
+BACKGROUND = "#8793a3"
+REPLAYED = "#b3bcc8"
+VULNERABLE = "#f0950c"
 CONTACT = "#dc2f3c"
 CLEAR = (0, 0, 0, 0)
 UNDATED = {"CreationDate": None, "Producer": None, "Creator": None}  # of a PDF
@@ -64,15 +72,18 @@ class TrafficMap:
 
     def __init__(self, axes: Axes, road: Road, metres: float):
         box = axes.get_window_extent()
-        self.axes, self.scale = axes, box.width / axes.figure.dpi * 72 / metres
+        self.axes = axes
+        self.scale = box.width / axes.figure.dpi * 72 / metres
         self.reach = metres / 2 * np.array([1, box.height / box.width])
         axes.set(facecolor=GROUND, xticks=(), yticks=())
         axes.spines[:].set_visible(False)
-        lanes, widths = road.lanes(), (road.lane_width + VERGE) * self.scale
+        lanes = road.lanes()
+        widths = (road.lane_width + VERGE) * self.scale
         # Agg clips lines without a fill at the canvas by their middle, which would cut wide ones: hence a clear fill.
         surface = LineCollection(lanes, linewidths=widths, colors=ROAD, facecolors=CLEAR)
         surface.set(capstyle="round", joinstyle="round")
-        self.trails, self.shapes = LineCollection([]), PolyCollection([], zorder=3)
+        self.trails = LineCollection([])
+        self.shapes = PolyCollection([], zorder=3)
         axes.add_collection(PolyCollection(road.polygons(), facecolors=ROAD))
         axes.add_collection(surface)
         axes.add_collection(LineCollection(lanes, linewidths=0.16 * self.scale, colors=CENTRELINE))
@@ -81,9 +92,12 @@ class TrafficMap:
 
     def show(self, centre: np.ndarray, trails: Sequence[Trail], shapes: Sequence[Shape]) -> None:
         """Move the map's centre [2] m, and draw trails and then shapes, the last on top."""
-        low, high = centre - self.reach, centre + self.reach
+        low = centre - self.reach
+        high = centre + self.reach
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        parts, colours, widths = [], [], []
+        parts = []
+        colours = []
+        widths = []
         for path, colour, width in trails:
             fade = np.arange(1, len(path)) / len(path)
             parts += list(np.stack([path[:-1], path[1:]], 1))
@@ -100,7 +114,9 @@ class TrafficMap:
 
 def placed(outline: Sequence[tuple[float, float]], state: np.ndarray, size: np.ndarray) -> np.ndarray:
     """World points [k, 2] m of an outline at a state (x, y, heading, ...), for a size (length, width)."""
-    local, cos, sin = np.array(outline) * size / 2, np.cos(state[2]), np.sin(state[2])
+    local = np.array(outline) * size / 2
+    cos = np.cos(state[2])
+    sin = np.sin(state[2])
     return state[:2] + local @ np.array([[cos, sin], [-sin, cos]])
 
 
@@ -121,7 +137,8 @@ def agent(kind: str, state: np.ndarray, size: np.ndarray, colour: Colour) -> lis
 
 def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:
     """A dot at a point of contact [2] m and a ring around it, which widens as `phase` goes from 0 to 1."""
-    radius, width = 1.9 + 2.6 * phase, 0.34 - 0.18 * phase
+    radius = 1.9 + 2.6 * phase
+    width = 0.34 - 0.18 * phase
     return [
         disc(point, radius, "none", PANEL, width + 0.24),
         disc(point, radius, "none", CONTACT, width),

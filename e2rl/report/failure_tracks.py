@@ -69,11 +69,14 @@ def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str,
     of the CHANNELS [6, tracks, K] in their quanta; the gap [m] is that of the ego, and of those in its place, to the
     partner. `plans` may be None.
     """
-    rollout, contact, like = failure.rollout, failure.contact, failure
+    rollout = failure.rollout
+    contact = failure.contact
+    like = failure
     if contact is None and beside is not None:
         like = beside
     assert like.contact is not None
-    partner, steps = like.partner, min(like.contact + AFTER + 1, len(rollout.states))
+    partner = like.partner
+    steps = min(like.contact + AFTER + 1, len(rollout.states))
     rows = np.union1d(np.flatnonzero(rollout.valid[:steps].any(0)), partner)
     driven = rollout.states[:steps], rollout.valid[:steps]
     tracks = [
@@ -120,7 +123,8 @@ def role_of(rollout: Rollout, row: int) -> str:
 def other_egos(rollout: Rollout, steps: int) -> list[Track]:
     """Others in the ego's place: the careful and competent driver of UN R157 as the verdict has it, the recording, and
     the evasion that the search found; where the file has them."""
-    ego, always = rollout.ego, np.ones(steps, bool)
+    ego = rollout.ego
+    always = np.ones(steps, bool)
     known = {
         "driver": (rollout.driver, always),
         "recorded": (rollout.logged[:, ego], rollout.logged_valid[:steps, ego]),

@@ -30,7 +30,9 @@ from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 
-PASSED, FAILED, UNDECIDED = "passed", "failed", "not enough rollouts"
+PASSED = "passed"
+FAILED = "failed"
+UNDECIDED = "not enough rollouts"
 STATUS = {FAILED: 1, UNDECIDED: 3, PASSED: 0}  # of the command, the first that applies
 KINDS = {FAILED: "failure", UNDECIDED: "error"}  # of JUnit
 RULE = re.compile(  # names of methods may hold spaces
@@ -57,7 +59,9 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
             f"{text!r}: no rule; write [METHOD:]RATE<=LIMIT or >=, such as 'preventable<=0.05', or with --against RUN "
             f"a change, 'preventable<=+0.02'; rates: {', '.join(RATES)}"
         )
-    limit, metric, change = float(rule["limit"]), METRICS[RATES[rule["rate"]]], rule["limit"][0] in "+-"
+    limit = float(rule["limit"])
+    metric = METRICS[RATES[rule["rate"]]]
+    change = rule["limit"][0] in "+-"
     check_limit(text, rule["rate"], limit, metric, change)
     key, rows = traffic_of(rule, driven)
     if not rows:
@@ -73,8 +77,10 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
     places = cluster_index(*([row[name] for row in rows] for name in ("location", "scene_id")))[1]
     value, low, high = ends = found["difference" if change else "mean"], found["low"], found["high"]
     holds, broken = (high <= limit, low > limit) if rule["sign"] == "<=" else (low >= limit, high < limit)
-    outcome, more = PASSED if holds else FAILED if broken else UNDECIDED, None
-    every, crashed = driven.traffic()[key], sum(map(raised, rows))
+    outcome = PASSED if holds else FAILED if broken else UNDECIDED
+    more = None
+    every = driven.traffic()[key]
+    crashed = sum(map(raised, rows))
     known = headline(every, driven.searched)
     alone = math.isnan(low) and not change and breaks_alone(metric, rule["sign"], limit, (value, crashed / count))
     if alone and known.raised == known.scenes:
@@ -121,7 +127,8 @@ def traffic_facts(rows: Sequence[Row], searched: bool) -> dict[str, Any]:
 
 def check_limit(text: str, name: str, limit: float, metric: Metric, change: bool) -> None:
     """Raises InputError for a limit that no value of a rate of this name and metric, or change of it, can reach."""
-    low, high = (-1.0 if change else 0.0), (1.0 if metric.fraction else math.inf)
+    low = -1.0 if change else 0.0
+    high = 1.0 if metric.fraction else math.inf
     if not low <= limit <= high and (metric.fraction or not change):
         span = f"from {low:g} to {high:g}" if metric.fraction else "of 0 or more"
         mend = ", such as 0.05 for 5%" if metric.fraction else ""
@@ -150,7 +157,8 @@ def growth(found: tuple[float, float, float], limit: float, places: int, fractio
     value, low, high = found
     if not fraction and value == 0 and math.isclose(high, -low) and math.isclose(high, exact_interval(0.0, places)[1]):
         low, limit, fraction = 0.0, abs(limit), True  # none is otherwise: as of a fraction without an event
-    upper, end = value < limit, high if value < limit else low
+    upper = value < limit
+    end = high if value < limit else low
     if math.isnan(end) or abs(value - limit) < NEAR:
         return LEAST / places if places < LEAST else None
     if not fraction:
@@ -188,7 +196,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the values")
     options = parser.parse_intermixed_args(arguments)
     with ending():
-        driven, former = Driven.read(options.run, options.ego), None
+        driven = Driven.read(options.run, options.ego)
+        former = None
         if options.against is not None:
             former = Driven.read(options.against, options.ego)
             check_shared(former, driven)

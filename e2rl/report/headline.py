@@ -22,7 +22,8 @@ def traffic_name(row: Mapping[str, Any]) -> str:
 
 def headline_text(found: Headline, ego: str, traffic: str) -> str:
     """The headline of an ego in a traffic, in a sentence or two."""
-    scenes, ways = plural(found.scenes, "scene"), f", in {plural(found.ways, 'way')}" if found.ways else ""
+    scenes = plural(found.scenes, "scene")
+    ways = f", in {plural(found.ways, 'way')}" if found.ways else ""
     text = f"{ego} under {traffic}: preventable failures in {found.preventable} of {scenes}{ways}"
     if found.raised:
         text = f"{ego} under {traffic}: preventable failures, or it raised, in {found.failed} of {scenes}"

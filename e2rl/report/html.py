@@ -135,7 +135,8 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
     if wrong := [name for name in methods if name not in known]:
         raise InputError(f"--method {wrong[0]}: not in {run / TABLE}; choose among {', '.join(known)}")
     labels = zip(modes["groups"], column_names(modes["groups"]), strict=True)
-    every, searched = read_run(run), (run / TRIES_FILE).is_file()
+    every = read_run(run)
+    searched = (run / TRIES_FILE).is_file()
     groups = {
         group_key(group): {"ego": group["ego_policy"], "label": label}
         | {"rates": rates(group, metrics, searched), "summary": summary(group, metrics, every, searched)}
@@ -191,7 +192,8 @@ def summary(group: Mapping, metrics: Sequence[dict], rows: Sequence[dict], searc
         searched: they are tries.
     """
     own = [row for row in rows if group_key(row) == group_key(group)]
-    known, crashed = rates(group, metrics, searched), any(map(raised, own))
+    known = rates(group, metrics, searched)
+    crashed = any(map(raised, own))
     lines = [headline_text(headline(own, searched), group["ego_policy"], traffic_name(group))]
     if "cfr" in known:
         lines.append(f"It was hit{', or raised,' if crashed else ''} in {known['cfr']}.")

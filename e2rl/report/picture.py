@@ -76,7 +76,8 @@ class Replay:
 
     def trails(self, time: float) -> list[Trail]:
         """The last two seconds of all agents that move, those of the adversaries and of the ego on top."""
-        end, trails = math.floor(time) + 1, []
+        end = math.floor(time) + 1
+        trails = []
         recent = slice(max(0, end - 1 - round(TRAIL / self.rollout.dt)), end)
         for agent in sorted(range(self.rollout.states.shape[1]), key=self.layer):
             path = self.rollout.states[recent, agent, :2][self.rollout.valid[recent, agent]]
@@ -86,8 +87,11 @@ class Replay:
 
     def shapes(self, time: float, phase: float | None) -> list[Shape]:
         """All agents and the mark of contact, from the lowest to the highest."""
-        rollout, step, shapes = self.rollout, math.floor(time), []
-        states, size = interpolated(rollout.states, rollout.valid, time), rollout.size
+        rollout = self.rollout
+        step = math.floor(time)
+        shapes = []
+        states = interpolated(rollout.states, rollout.valid, time)
+        size = rollout.size
         for agent in sorted(np.flatnonzero(rollout.valid[step]).tolist(), key=self.layer):
             shapes += drawing.agent(rollout.agent_type[agent], states[agent], size[agent], self.colour(agent))
         if phase is not None:
@@ -111,7 +115,9 @@ class Panel:
     """A replay on a square figure of SIDE, with a header, a map and a legend; `show` moves it to another moment."""
 
     def __init__(self, replay: Replay, figure: Figure | SubFigure):
-        self.replay, self.figure, rollout = replay, figure, replay.rollout
+        self.replay = replay
+        self.figure = figure
+        rollout = replay.rollout
         large = replay.caption is not None
         head, foot = (LARGE_HEAD, LARGE_FOOT) if large else (HEAD, FOOT)
         title, detail = replay.caption or (
@@ -121,7 +127,10 @@ class Panel:
         axes = self.figure.add_axes((0, foot / SIDE, 1, 1 - (head + foot) / SIDE))
         self.map = TrafficMap(axes, rollout, replay.metres)
         first, second = (26, 20) if large else (16, 11)  # points, of the letters
-        left, right, upper, lower = 14 / SIDE, 706 / SIDE, 1 - 0.46 * head / SIDE, 1 - 0.82 * head / SIDE
+        left = 14 / SIDE
+        right = 706 / SIDE
+        upper = 1 - 0.46 * head / SIDE
+        lower = 1 - 0.82 * head / SIDE
         text = self.figure.text
         text(left, upper, title, fontsize=first, color=drawing.INK)
         text(left, lower, detail, fontsize=second, color=drawing.MUTED)
@@ -137,7 +146,8 @@ class Panel:
         text(sum(bar) / 2, 14 / SIDE, "10 m", fontsize=second - 1, color=drawing.MUTED, ha="center")
 
     def show(self, time: float, phase: float | None) -> None:
-        replay, rollout = self.replay, self.replay.rollout
+        replay = self.replay
+        rollout = self.replay.rollout
         centre = np.array([np.interp(time, np.arange(len(replay.centres)), axis) for axis in replay.centres.T])
         self.map.show(centre, replay.trails(time), replay.shapes(time, phase))
         speed = interpolated(rollout.states, rollout.valid, time)[rollout.ego, 3]
@@ -159,7 +169,8 @@ def contact_point(rollout: Rollout, step: int, partner: int) -> np.ndarray:
     """Where the ego and its partner touch [2] m: the mean of the corners that lie inside the other box, or, where there
     are none, the middle between the two centres."""
     pair = [rollout.ego, partner]
-    pose, size = torch.tensor(rollout.states[step, pair]).double(), torch.tensor(rollout.size[pair]).double()
+    pose = torch.tensor(rollout.states[step, pair]).double()
+    size = torch.tensor(rollout.size[pair]).double()
     others = corners(pose, size).flip(0)
     inside = (to_frame(others, pose[:, None]).abs() <= size[:, None] / 2 + 1e-6).all(-1)
     return (others[inside] if inside.any() else pose[:, :2]).mean(0).numpy()

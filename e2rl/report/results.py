@@ -30,7 +30,9 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
     Args:
         rows: of metrics.json.
     """
-    folder, asked, modes = run.folder, plan.asked, read_modes(run.folder / MODES_FILE)
+    folder = run.folder
+    asked = plan.asked
+    modes = read_modes(run.folder / MODES_FILE)
     notes = [f"left out: {count} scenes ({reason})" for reason, count in plan.scenes.dropped.items()]
     notes += ["tries go where failures are: rates of tries are no rates of the planner"] if plan.searches else []
     methods = [*plan.methods, *(next(iter(one.traffic.values())) for one in plan.searches if len(one.traffic) == 1)]
@@ -65,7 +67,8 @@ def tables_of(plan: Evaluation, rows: Sequence[dict], text: str, folder: Path) -
     metrics = MAIN if plan.asked.metrics == ALL else plan.asked.metrics
     if not compares(plan.asked):
         return metric_tables(rows, text, metrics)
-    others, egos = plan.asked.compare or (NOMINAL,), plan.egos
+    others = plan.asked.compare or (NOMINAL,)
+    egos = plan.egos
     if egos.pairs:
         tables = planner_tables(rows, egos.names, others, text, metrics)
     else:
@@ -77,7 +80,8 @@ def tables_of(plan: Evaluation, rows: Sequence[dict], text: str, folder: Path) -
 def egos_tables(run: Run, plan: Evaluation, rows: Sequence[dict], text: str) -> list[Table]:
     """Returns the tables that compare several egos; with `policy_learning` also its guards, and draws what
     training changed."""
-    roles, egos = run.config.policy_learning, plan.egos
+    roles = run.config.policy_learning
+    egos = plan.egos
     if not egos.pairs or plan.asked.compare:
         return []
     others = dict.fromkeys(second for _, second in egos.pairs)

@@ -19,7 +19,8 @@ METRES, PIXELS = 60.0, 360  # side of a video's picture
 
 def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
     """A round in one line of at most 100 characters, errored rollouts apart."""
-    hit, left_out = metrics.get("synthesizer/contact", float("nan")), metrics["synthesizer/left_out"]
+    hit = metrics.get("synthesizer/contact", float("nan"))
+    left_out = metrics["synthesizer/left_out"]
     found = {name.rpartition("/errored_")[2]: count for name, count in metrics.items() if "/errored_" in name}
     reasons = ", ".join(f"{count:.0f} {reason.replace('_', ' ')}" for reason, count in found.items())
     errored = f", without a score: {reasons}" if reasons else ""
@@ -65,7 +66,8 @@ def replay_of(traffic: Mapping[str, Tensor], row: int, scenes: SceneSet, method:
     """The replay of one row of a round's traffic."""
     shown = ("scene_index", "states", "valid", "adversaries")
     own: dict[str, Any] = {name: traffic[name][row : row + 1] for name in shown}
-    index, about = own.pop("scene_index"), {"dataset": "", "split": "train", "method": method, "ego_policy": "actor"}
+    index = own.pop("scene_index")
+    about = {"dataset": "", "split": "train", "method": method, "ego_policy": "actor"}
     eta = traffic["eta"][row : row + 1].double().round(decimals=2)
     names: dict[str, Any] = {name: [value] for name, value in about.items()}
     rollouts = Rollouts.in_scenes(scenes, index, **own, seed=index, eta=eta, seconds=torch.zeros(1), **names)

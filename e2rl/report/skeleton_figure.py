@@ -39,7 +39,8 @@ SIDE, GAP, HEAD, FOOT = 600, 12, 62, 34  # points: of a panel, between panels, a
 NODES = 10  # of the matrix at most
 SHOWN_STEPS = 50  # steps of what was driven, as long as the reference rollout
 MARGIN, SMALLEST, LARGEST = 30.0, 60.0, 140.0  # m: around the coalition, and a map's least and greatest side
-CANDIDATE, FEASIBLE = drawing.VULNERABLE, "#2e8b57"
+CANDIDATE = drawing.VULNERABLE
+FEASIBLE = "#2e8b57"
 ON_TOP = 10  # drawing order of edges, arrows and names, above the map
 LEGEND = {"ego": drawing.EGO, "coalition C*": drawing.ADVERSARY, "candidate of the topology": CANDIDATE}
 LEGEND |= {"feasible, no candidate": FEASIBLE, "others": drawing.BACKGROUND}
@@ -62,7 +63,8 @@ class SkeletonPicture:
         self.settings = chosen.settings
         masks = (chosen.coalition, chosen.candidates, chosen.feasible)
         self.coalition, self.candidates, self.feasible = (mask[0].cpu().numpy() for mask in masks)
-        self.target, self.step = chosen.target[0].tolist(), int(chosen.step)
+        self.target = chosen.target[0].tolist()
+        self.step = int(chosen.step)
         # Among steps of equal risk of the links, the one with the greatest risk of all pairs.
         moment = int((link_risk(chosen)[0] + 1e-6 * chosen.weights[0].sum((1, 2))).argmax())
         self.time = float(chosen.moments[0, moment])
@@ -74,7 +76,8 @@ class SkeletonPicture:
     @classmethod
     def driven(cls, rollout: Rollout, selection: Selection) -> "SkeletonPicture":
         """The same with what the rollout drove in the five seconds after the choice in place of the reference."""
-        start, count = int(selection.step), min(selection.weights.shape[-1], rollout.states.shape[1])
+        start = int(selection.step)
+        count = min(selection.weights.shape[-1], rollout.states.shape[1])
         steps = np.arange(start, min(start + SHOWN_STEPS, len(rollout.states) - 1) + 1, STRIDE)
         states, valid = (torch.as_tensor(value[steps, :count]) for value in (rollout.states, rollout.valid))
         weights = pair_weights(states, valid, torch.as_tensor(rollout.size[:count]), selection.settings)
@@ -108,7 +111,8 @@ class SkeletonPicture:
             f"{shorten(rollout.scene_id)}   seed {rollout.seed}   intensity {rollout.eta:g}   "
             f"{rollout.method} vs {rollout.ego_policy}   chosen at {self.step * rollout.dt:.1f} s"
         )
-        gap, longest = f"{self.settings.clearance:g} m", f"{self.ttc(self.settings.edge_threshold):.1f} s"
+        gap = f"{self.settings.clearance:g} m"
+        longest = f"{self.ttc(self.settings.edge_threshold):.1f} s"
         parts = {
             f"time to a gap of {gap} [s], {self.time:.1f} s into the reference rollout": self.matrix,
             f"risk graph at that time, edges of TTC < {longest}": self.graph,
@@ -119,7 +123,8 @@ class SkeletonPicture:
     def matrix(self, axes: Axes) -> None:
         """TTC of every pair of nodes, red by weight; the links of the coalition are framed."""
         axes.set_axis_off()
-        table, nodes = axes.inset_axes((0.09, 0.02, 0.89, 0.89)), self.nodes()
+        table = axes.inset_axes((0.09, 0.02, 0.89, 0.89))
+        nodes = self.nodes()
         weights = self.weights[np.ix_(nodes, nodes)]
         reds = LinearSegmentedColormap.from_list("risk", (drawing.GROUND, drawing.CONTACT))
         colours = reds.with_extremes(bad=drawing.BACKGROUND)
@@ -128,12 +133,14 @@ class SkeletonPicture:
         font = min(16, 180 / len(nodes))
         for row, column in np.argwhere(others.filled(0) > 0):
             weight = float(weights[row, column])
-            ink, text = drawing.PANEL if weight > 0.6 else drawing.INK, f"{self.ttc(weight):.1f}"
+            ink = drawing.PANEL if weight > 0.6 else drawing.INK
+            text = f"{self.ttc(weight):.1f}"
             table.text(column + 0.5, row + 0.5, text, color=ink, fontsize=font, ha="center", va="center")
         for agent in self.members:
             corner = (nodes.index(self.target[agent]), nodes.index(agent))
             table.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor=drawing.INK, linewidth=4, zorder=3))
-        centres, names = np.arange(len(nodes)) + 0.5, [name(agent) for agent in nodes]
+        centres = np.arange(len(nodes)) + 0.5
+        names = [name(agent) for agent in nodes]
         table.set(xticks=centres, xticklabels=names, yticks=centres, yticklabels=names, ylim=(len(nodes), 0))
         table.tick_params(top=True, labeltop=True, labelbottom=False, length=0, labelsize=14)
         table.spines[:].set_visible(False)
@@ -145,18 +152,21 @@ class SkeletonPicture:
         """The reference rollout at the time of the risk, with the edges of the risk graph."""
         self.draw_map(axes, self.risky, [])
         for i, j in np.argwhere(np.tril(self.weights, -1) >= self.settings.edge_threshold):
-            ends, weight = self.risky[[i, j]], float(self.weights[i, j])
+            ends = self.risky[[i, j]]
+            weight = float(self.weights[i, j])
             axes.plot(*ends[:, :2].T, color=drawing.INK, linewidth=1 + 4 * weight, zorder=ON_TOP)
 
     def chain(self, axes: Axes) -> None:
         """The moment of the choice: who acts on whom, and how the coalition and the ego drove from there."""
-        states, valid = self.rollout.states[self.step :, :, :2], self.rollout.valid[self.step :]
+        states = self.rollout.states[self.step :, :, :2]
+        valid = self.rollout.valid[self.step :]
         own = [*self.members, 0]
         trails = [Trail(states[valid[:, agent], agent], self.colour(agent), 0.6) for agent in own]
         self.draw_map(axes, self.now, trails)
         head = {"arrowstyle": "-|>", "mutation_scale": 30, "color": drawing.INK, "shrinkA": 0, "shrinkB": 0}
         for agent in self.members:
-            start, end = self.now[agent, :2], self.now[self.target[agent], :2]
+            start = self.now[agent, :2]
+            end = self.now[self.target[agent], :2]
             axes.plot(*np.stack([start, end], 1), color=drawing.INK, linewidth=4, zorder=ON_TOP)
             axes.annotate("", start + 0.8 * (end - start), start, arrowprops=head, zorder=ON_TOP)
 
@@ -199,7 +209,8 @@ class LongestChain:
         self.method.traffic.on_decision = self
 
     def __call__(self, selection: Selection) -> None:
-        depth, size = chain_depth(selection.target).amax(1), selection.coalition.sum(1)
+        depth = chain_depth(selection.target).amax(1)
+        size = selection.coalition.sum(1)
         ranks = torch.stack([depth.double(), size.double(), link_risk(selection).amax(1).double()], 1)
         for row, rank in enumerate(map(tuple, ranks.tolist())):
             for kind in ("longest", *(("first",) if selection.step[row] == 0 else ())):

@@ -71,7 +71,8 @@ class Table:
 
     def latex(self) -> str:
         """A table environment with a tabular of package booktabs."""
-        grid, caption = self.grid("latex_booktabs").translate(SYMBOLS), escaped(self.caption)
+        grid = self.grid("latex_booktabs").translate(SYMBOLS)
+        caption = escaped(self.caption)
         return f"\\begin{{table}}\n{grid}\n\\caption{{{caption}}}\n\\end{{table}}\n"
 
 
@@ -102,7 +103,8 @@ def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main")
 
 def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric]) -> Table:
     """The mean and interval of each metric, with a column for each row of metrics.json."""
-    known, names = known_metrics(group, metrics), column_names(group)
+    known = known_metrics(group, metrics)
+    names = column_names(group)
     unknown = [metric.name for metric in metrics if metric not in known]
     counted = COUNTED.get(group[0].get("stage", ""))
     caption = f"{origin(group[0])}. {counts(group, names)} "
@@ -117,11 +119,14 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
 def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
     """Paired differences, of fractions in percentage points: of each method to the first one or, where rows have
     stages, of each method after training to itself before. No rows where nothing is paired."""
-    first, names = group[0], column_names(group)
+    first = group[0]
+    names = column_names(group)
     # A method with several etas is named method@eta in `paired`.
-    reference, keys = names[0], [f"{first['method']}@{first['eta']:g}", first["method"]]
+    reference = names[0]
+    keys = [f"{first['method']}@{first['eta']:g}", first["method"]]
     if any(row.get("stage") == "after" for row in group):
-        reference, keys = "before", ["before"]
+        reference = "before"
+        keys = ["before"]
     found = [(name, row["paired"].get(key)) for name, row in zip(names, group, strict=True) for key in keys]
     columns = {name: paired for name, paired in found if paired}
     cells = {
@@ -211,7 +216,8 @@ def mode_table(found: Mapping, ego: str, several: bool) -> Table:
     chosen = [index for index, group in enumerate(found["groups"]) if group["ego_policy"] == ego]
     groups = [found["groups"][index] for index in chosen]
     known = {name: title for name, title in VERDICTS.items() if any(mode[name] is not None for mode in found["modes"])}
-    rows, failures = [], 0
+    rows = []
+    failures = 0
     for mode in found["modes"]:
         if count := sum(mode["groups"][index]["count"] for index in chosen):
             failures += count
@@ -273,7 +279,8 @@ def number(metric: Metric, value: float, sign: str = "") -> str:
     Without one, shares are in per cent with one decimal (two below one per cent), and others have three digits.
     """
     value = 100 * value if metric.fraction else value
-    size, decimals = abs(value), metric.decimals
+    size = abs(value)
+    decimals = metric.decimals
     if decimals is None and metric.fraction:
         decimals = 1 if size >= 1 or size == 0 else 2
     elif decimals is None:

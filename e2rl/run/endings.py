@@ -25,7 +25,8 @@ MEMORY = ("can't allocate memory", "not enough memory", "out of memory")  # in w
 
 def program() -> list[str]:
     """Returns the words that start the running command: `python evaluate.py`, `e2rl evaluate`, `python -m MODULE`."""
-    script, package = Path(sys.argv[0]), Path(__file__).parents[1]
+    script = Path(sys.argv[0])
+    package = Path(__file__).parents[1]
     if script.suffix != ".py":
         return sys.argv[0].split()
     if package not in script.resolve().parents:

@@ -57,7 +57,10 @@ class Fused:
     def __init__(
         self, function: Callable[..., Any], shapes: tuple[Shape, ...], settings: object = None, constants: int = 0
     ) -> None:
-        self.function, self.shapes, self.settings, self.constants = function, shapes, settings, constants
+        self.function = function
+        self.shapes = shapes
+        self.settings = settings
+        self.constants = constants
         self.name = f"{function.__module__}.{function.__qualname__}"
         self.__doc__ = function.__doc__
         FUSED[self.name] = self
@@ -161,13 +164,15 @@ class Fused:
     def _compile(self) -> None:
         free = sorted({name for given in self.declared for name in given.sizes if isinstance(name, str)})
         size: dict[Any, int] = dict(zip(free, SIZES, strict=False))
-        examples, dynamic = [], []
+        examples = []
+        dynamic = []
         for names, kind, apart, truth in self.declared:
             names = [names[-1], *names[:-1]] if apart else names
             kind = torch.float32 if truth else kind
             examples.append(torch.zeros([size.get(name, name) for name in names], dtype=kind))
             dynamic.append({at: torch.export.Dim.DYNAMIC for at, name in enumerate(names) if name in size})
-        module, package = _Module(self), io.BytesIO()
+        module = _Module(self)
+        package = io.BytesIO()
         sizes_of_1 = torch.fx.experimental._config.patch(backed_size_oblivious=True)  # type: ignore[attr-defined]
         with torch.no_grad(), sizes_of_1, warnings.catch_warnings(action="ignore"):
             with switched_off():

@@ -12,7 +12,9 @@ import torch
 
 from e2rl.run.files import MAX_FILE, read_regular, write_atomically
 
-PARTS, FORMAT, HASHED = "parts", "e2rl-part/1", b"e2rl-sha256:"
+PARTS = "parts"
+FORMAT = "e2rl-part/1"
+HASHED = b"e2rl-sha256:"
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,9 @@ def load_plain(content: bytes) -> Any:
     if packed or sum(each.file_size for each in members) > len(content):
         raise ValueError("packed")
     value = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    waiting, known, size = [value], set(), 0
+    waiting = [value]
+    known = set()
+    size = 0
     while waiting:
         part = waiting.pop()
         if id(part) not in known and isinstance(part, dict | list | tuple):

@@ -28,7 +28,9 @@ PROCESSES = Path("/proc")
 # Helpers of libraries, which end by themselves, and tidy up: programs, what Ray's workers call
 # themselves, Ray's own scripts, and what Python runs by -c.
 PROGRAMS = (b"raylet", b"gcs_server", b"wandb-core", b"wandb-symon")
-TITLE, SCRIPTS, CODE = b"ray::", b"-packages/ray/", b"from multiprocessing.resource_tracker"
+TITLE = b"ray::"
+SCRIPTS = b"-packages/ray/"
+CODE = b"from multiprocessing.resource_tracker"
 
 
 def descendants(root: int, spared: Collection[int] = ()) -> list[int]:
@@ -70,7 +72,8 @@ def adopting() -> Iterator[None]:
     if sys.platform != "linux":
         yield
         return
-    library, before = ctypes.CDLL(None, use_errno=True), ctypes.c_int()
+    library = ctypes.CDLL(None, use_errno=True)
+    before = ctypes.c_int()
     library.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(before))
     library.prctl(PR_SET_CHILD_SUBREAPER, 1)
     ended = threading.Event()

@@ -64,7 +64,8 @@ def in_processes(
     with _forked(work, jobs, processes) if isinstance(processes, int) else processes.tasks(work, jobs) as submit:
         with interrupts_held():
             futures = {submit(k): k for k in order}
-        early, coming = {}, 0
+        early = {}
+        coming = 0
         for future in as_completed(futures):
             number = futures.pop(future)  # or all results would stay in memory
             early[number] = future.result()
@@ -161,7 +162,8 @@ def interrupts_held() -> Iterator[None]:
 def without_main() -> Iterator[None]:
     """Processes that the block spawns do not import the running script, which would run again without a main guard."""
     main = sys.modules["__main__"]
-    file, spec = vars(main).pop("__file__", None), getattr(main, "__spec__", None)
+    file = vars(main).pop("__file__", None)
+    spec = getattr(main, "__spec__", None)
     main.__spec__ = None
     try:
         yield

@@ -48,7 +48,8 @@ class RayWorkers:
         Left by an exception, it cancels the tasks. Raises InputError where a job lost its worker RETRIES + 1 times, or
         where what is sent, such as an ego of one's own, cannot be pickled. What a task raised is raised here.
         """
-        ray, begun = self.connect(), []
+        ray = self.connect()
+        begun = []
         task = ray.remote(num_cpus=1, max_retries=RETRIES, scheduling_strategy="SPREAD")(_work)
         try:
             given = [ray.put((function, jobs))]  # in a list it arrives as a reference, which a worker resolves once
@@ -82,7 +83,8 @@ class RayWorkers:
         ray = importlib.import_module("ray")
         if ray.is_initialized():
             return ray
-        address, before = os.environ.get(ADDRESS), signal.getsignal(signal.SIGTERM)
+        address = os.environ.get(ADDRESS)
+        before = signal.getsignal(signal.SIGTERM)
         here = {} if address else {"address": "local", "num_cpus": self.count, "include_dashboard": False}
         try:
             ray.init(log_to_driver=False, **here)

@@ -60,8 +60,10 @@ class Run:
         hydra = HydraConfig.get()
         if not config.resume:
             return cls(config, Path(hydra.runtime.output_dir), dict(hydra.runtime.choices), free)
-        folder, where = Path(config.resume).resolve(), f"resume={config.resume}"
-        saved, known = saved_configuration(config, folder, where), read_provenance(folder)
+        folder = Path(config.resume).resolve()
+        where = f"resume={config.resume}"
+        saved = saved_configuration(config, folder, where)
+        known = read_provenance(folder)
         given = {item.split("=", 1)[0].lstrip("+~") for item in hydra.overrides.task}
         default = load_config(str(hydra.job.config_name))
         needed = {option.partition("=")[0] for option in written_outside(saved, folder, default)}
@@ -72,7 +74,8 @@ class Run:
         check_written(saved, folder, where, config, default)
         for key in given.intersection(free):
             saved[key] = config[key]
-        saved.plugins, saved.resume = config.plugins, str(folder)
+        saved.plugins = config.plugins
+        saved.resume = str(folder)
         return cls(saved, folder, known["choices"], free)
 
     def enter(self) -> None:
@@ -128,7 +131,8 @@ class Run:
                     f"resume={self.folder}: {', '.join(names)} changed since the run began, so what is finished "
                     "would not fit to the rest; restore them, or begin a new run"
                 )
-        last, here = known["versions"][-1], now["versions"][0]
+        last = known["versions"][-1]
+        here = now["versions"][0]
         if names := [name for name in changed(last, here) if name in last]:  # modules may join
             said = f"other versions than before ({', '.join(names)}); see {PROVENANCE}"
             print(f"resume={self.folder}: {said}", file=sys.stderr)
@@ -144,7 +148,8 @@ def how_to_go_on(config: DictConfig) -> str:
     folder = Path(config.resume or HydraConfig.get().runtime.output_dir)
     if not (folder / PROVENANCE).is_file():
         return command_line()
-    words, arguments = program(), sys.argv[1:]
+    words = program()
+    arguments = sys.argv[1:]
     for position, argument in enumerate(arguments):  # further folders of configuration
         if argument.split("=")[0] in ("--config-dir", "-cd"):
             words += [argument] if "=" in argument else arguments[position : position + 2]

@@ -95,7 +95,8 @@ def settings_of(kind: type[Settings], values: Mapping, where: str = "") -> Setti
         typed = OmegaConf.merge(OmegaConf.structured(kind), OmegaConf.create(dict(values)))
         plain = OmegaConf.to_container(typed, resolve=True)
     except OmegaConfBaseException as error:
-        key, reason = error.full_key or error.key, str(error).splitlines()[0]
+        key = error.full_key or error.key
+        reason = str(error).splitlines()[0]
         value = f"={values[key]}" if key in values else ""
         raise InputError(f"{_dotted(where, key)}{value}: {reason}; compare it with its file in conf/") from error
     assert isinstance(plain, dict)
@@ -108,7 +109,8 @@ def settings_of(kind: type[Settings], values: Mapping, where: str = "") -> Setti
 def check_settings(made: Any, where: str) -> None:
     """Raises InputError where a `setting` of a dataclass has a value that it must not have."""
     for each in fields(made):
-        value, rule = getattr(made, each.name), each.metadata
+        value = getattr(made, each.name)
+        rule = each.metadata
         if "low" not in rule or (value is None and rule["optional"]):
             continue
         if rule["choices"]:

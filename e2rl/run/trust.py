@@ -124,7 +124,8 @@ def written_outside(saved: DictConfig, folder: Path, *trusted: DictConfig) -> li
     mine = {(key.rpartition(".")[2], _place(value)) for config in trusted for key, value in _written(config)}
     added = []
     for key, value in _written(saved):
-        place, inside = _place(value), isinstance(value, str) and leads_into(Path(value), folder)
+        place = _place(value)
+        inside = isinstance(value, str) and leads_into(Path(value), folder)
         if value is not None and not inside and (key.rpartition(".")[2], place) not in mine:
             added.append(assigned(next((name for name in WRITTEN if key.endswith(name)), key), value))
     return list(dict.fromkeys(added))

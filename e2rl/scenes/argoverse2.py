@@ -97,9 +97,11 @@ def _scenario(path: Path) -> Recording:
 
     _check_table(path)
     scenario = load_argoverse_scenario_parquet(path)
-    frames, tracks = len(scenario.timestamps_ns), scenario.tracks
+    frames = len(scenario.timestamps_ns)
+    tracks = scenario.tracks
     check({"states": frames * len(tracks)}, scenario.scenario_id)
-    states, valid = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool)
+    states = np.zeros((frames, len(tracks), 4))
+    valid = np.zeros((frames, len(tracks)), bool)
     for index, track in enumerate(tracks):
         for state in track.object_states:
             if valid[state.timestep, index]:
@@ -192,7 +194,8 @@ def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
     for key, segment in segments.items():
         if segment.lane_type == LaneType.BIKE:
             continue
-        left, right = segment.left_lane_boundary.xyz, segment.right_lane_boundary.xyz
+        left = segment.left_lane_boundary.xyz
+        right = segment.right_lane_boundary.xyz
         points, width = compute_midpoint_line(left, right, MID_POINTS)
         exits = [str(other) for other in segment.successors]
         lanes[key] = Lane(points[:, :2], float(width), exits=exits, heights=points[:, 2])

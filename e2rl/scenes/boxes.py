@@ -9,7 +9,8 @@ from torch import Tensor
 
 def corners(pose: Tensor, size: Tensor) -> Tensor:
     """Corners [..., 4, 2], counter-clockwise from the front left one."""
-    cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
+    cos = pose[..., 2].cos()
+    sin = pose[..., 2].sin()
     forward = torch.stack([cos, sin], -1) * size[..., :1] / 2
     left = torch.stack([-sin, cos], -1) * size[..., 1:] / 2
     offsets = torch.stack([forward + left, left - forward, -forward - left, forward - left], -2)
@@ -19,7 +20,8 @@ def corners(pose: Tensor, size: Tensor) -> Tensor:
 def to_frame(points: Tensor, pose: Tensor) -> Tensor:
     """Points [..., 2] in the frame of pose [..., >= 3]: x forward, y to the left."""
     delta = points - pose[..., :2]
-    cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
+    cos = pose[..., 2].cos()
+    sin = pose[..., 2].sin()
     return torch.stack([cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]], -1)
 
 
@@ -29,9 +31,14 @@ def separation(first: Tensor, first_size: Tensor, second: Tensor, second_size: T
     Negative exactly where the interiors overlap (then minus the penetration depth); where positive, a lower bound of
     the distance.
     """
-    dx, dy = second[..., 0] - first[..., 0], second[..., 1] - first[..., 1]
-    cos_a, sin_a, cos_b, sin_b = first[..., 2].cos(), first[..., 2].sin(), second[..., 2].cos(), second[..., 2].sin()
-    cos, sin = (cos_a * cos_b + sin_a * sin_b).abs(), (sin_a * cos_b - cos_a * sin_b).abs()
+    dx = second[..., 0] - first[..., 0]
+    dy = second[..., 1] - first[..., 1]
+    cos_a = first[..., 2].cos()
+    sin_a = first[..., 2].sin()
+    cos_b = second[..., 2].cos()
+    sin_b = second[..., 2].sin()
+    cos = (cos_a * cos_b + sin_a * sin_b).abs()
+    sin = (sin_a * cos_b - cos_a * sin_b).abs()
     (la, wa), (lb, wb) = (first_size / 2).unbind(-1), (second_size / 2).unbind(-1)
     gap_first = torch.maximum(
         (dx * cos_a + dy * sin_a).abs() - (la + cos * lb + sin * wb),

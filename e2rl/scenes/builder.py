@@ -127,7 +127,8 @@ def _agents(
     shift = np.array([*origin, 0.0, 0.0])
     tracks, left_out = _participants(recording, frame, states, valid, settings)
     rows = np.flatnonzero(tracks >= 0)
-    chosen, cars = tracks[rows], rows[rows < settings.vehicles]
+    chosen = tracks[rows]
+    cars = rows[rows < settings.vehicles]
     frames = frame + np.arange(settings.steps + 1)
     recorded = np.minimum(frames, len(valid) - 1)
     present = valid[frame, chosen]
@@ -174,7 +175,8 @@ def _participants(
         states, valid: the smoothed tracks.
         settings: how many agents of which kind there are.
     """
-    ego, vehicle = recording.ego, recording.agent_type == VEHICLE
+    ego = recording.ego
+    vehicle = recording.agent_type == VEHICLE
     span = slice(frame, frame + settings.steps + 1)
     distance = np.linalg.norm(states[span, :, :2] - states[span, [ego], :2], axis=-1)
     path_distance, moves = _approach(states[span], valid[span], vehicle, ego)
@@ -210,7 +212,8 @@ def _approach(states: np.ndarray, valid: np.ndarray, vehicle: np.ndarray, ego: i
         vehicle: [A] bool; other agents are infinitely far, and do not move.
         ego: its track.
     """
-    path_distance, moves = np.full(len(vehicle), np.inf), np.zeros(len(vehicle), bool)
+    path_distance = np.full(len(vehicle), np.inf)
+    moves = np.zeros(len(vehicle), bool)
     known = valid & vehicle
     frame, track = known.nonzero()
     points = states[frame, track, :2]
@@ -234,7 +237,8 @@ def _routes(
 
     lights: lane id -> index; elsewhere: the points of lanes on another level than a vehicle, by its row.
     """
-    shape, reach = (settings.vehicles, settings.routes), (settings.vertices - 1) * SPACING
+    shape = (settings.vehicles, settings.routes)
+    reach = (settings.vertices - 1) * SPACING
     out = {
         "route_points": np.zeros((*shape, settings.vertices, 2)),
         "route_length": np.full(shape, reach),
@@ -365,6 +369,7 @@ def ego_overlaps(scene: TensorDict) -> str:
     """
     others = scene["valid"].clone()
     others[0] = False
-    pose, size = scene["start"].double(), scene["size"].double()
+    pose = scene["start"].double()
+    size = scene["size"].double()
     overlap = boxes.overlap(pose[:1], size[:1], pose, size) & others
     return AGENT_WORDS[int(scene["agent_type"][overlap].min())] if overlap.any() else ""

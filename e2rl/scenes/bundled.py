@@ -26,7 +26,8 @@ SHA256 = {  # of the archives of the splits, as tools/generate_scenes.py prints 
 }
 SPLITS = tuple(SHA256)
 FORMAT = "e2rl-scenes/1"
-FRAMES, CURRENT = 111, 10
+FRAMES = 111
+CURRENT = 10
 MILLI = 1e-3
 UNIT = np.array([MILLI, MILLI, 1e-4, MILLI])  # m, m, rad, m/s per stored step of x, y, heading, speed
 MEND = "restore the file from git, or write it again with tools/generate_scenes.py"
@@ -49,7 +50,8 @@ class SceneMap:
     ) -> Recording:
         """Returns a recording of vehicles on this map, whose first frame is frame `first` of the lights."""
         lights = {lane: state[first : first + len(states)] for lane, state in self.lights.items()}
-        where, kind = (scene_id, self.name, "bundled"), np.full(len(size), VEHICLE)
+        where = (scene_id, self.name, "bundled")
+        kind = np.full(len(size), VEHICLE)
         return Recording(*where, states, valid, size, kind, ego, self.lanes, self.drivable, lights, CURRENT)
 
 
@@ -126,7 +128,8 @@ def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
 
 def read_recordings(arrays: dict[str, np.ndarray]) -> list[Recording]:
     """Returns the recordings of an archive."""
-    maps, counts = read_maps(arrays), arrays["scene_agents"]
+    maps = read_maps(arrays)
+    counts = arrays["scene_agents"]
     states = np.cumsum(np.cumsum(arrays["states"], axis=1), axis=1) * UNIT
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
     states[~arrays["valid"]] = 0.0

@@ -118,10 +118,12 @@ def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
     if not tracks:
         raise InputError("no dynamic obstacle; leave it out")
     steps = [state.time_step for track in tracks for state in track]
-    first, count = min(steps), max(steps) - min(steps) + 1
+    first = min(steps)
+    count = max(steps) - min(steps) + 1
     name = str(scenario.scenario_id)
     check({"states": count * max(scenario.dt / DT, 1) * len(obstacles)}, name)
-    states, valid = np.zeros((count, len(obstacles), 4)), np.zeros((count, len(obstacles)), bool)
+    states = np.zeros((count, len(obstacles), 4))
+    valid = np.zeros((count, len(obstacles)), bool)
     boxes = [_box(obstacle.obstacle_shape) for obstacle in obstacles]
     for index, obstacle in enumerate(obstacles):
         moves = index < len(tracks)
@@ -163,7 +165,8 @@ def _state(state: Any, offset: np.ndarray) -> list[float]:
     """x, y of the box's middle, heading and speed; raises InputError where they are intervals."""
     if state.is_uncertain_position or state.is_uncertain_orientation:
         raise InputError(f"a state at time step {state.time_step} is uncertain; give exact positions and orientations")
-    cos, sin = np.cos(state.orientation), np.sin(state.orientation)
+    cos = np.cos(state.orientation)
+    sin = np.sin(state.orientation)
     x, y = state.position[:2] + np.array([[cos, -sin], [sin, cos]]) @ offset
     given = vars(state)  # of some kinds of state velocity_y is a second component, of others only derived
     along = given.get("velocity") or 0.0
@@ -208,11 +211,13 @@ def _ego(states: np.ndarray, present: np.ndarray, there: np.ndarray, begun: list
 
 def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
     """Lanes for cars by lanelet id, and the polygons of what they could drive on."""
-    lanes, drivable = {}, []
+    lanes = {}
+    drivable = []
     for lanelet in network.lanelets:
         kinds = FOR_OTHERS & {kind.value for kind in lanelet.lanelet_type or ()}
         users = {user.value for user in (*(lanelet.user_one_way or ()), *(lanelet.user_bidirectional or ()))}
-        left, right = lanelet.left_vertices[:, :2], lanelet.right_vertices[:, :2]
+        left = lanelet.left_vertices[:, :2]
+        right = lanelet.right_vertices[:, :2]
         if kinds <= PAVED:
             drivable.append(np.concatenate([left, right[::-1]]))
         if kinds or (users and not users & CARS):

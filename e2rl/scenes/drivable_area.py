@@ -22,7 +22,8 @@ class DrivableArea:
 
     def __init__(self, lines: list[np.ndarray], widths: np.ndarray, polygons: list[np.ndarray]) -> None:
         """lines: of lanes, points every 1 m; widths [lanes] m; polygons: [P, 2] each."""
-        self.lanes, self.polygons = LaneCover(lines, widths), polygons
+        self.lanes = LaneCover(lines, widths)
+        self.polygons = polygons
 
     def field(self, origin: np.ndarray, center: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
         """Field [cells, cells] float16 of m beyond the border (negative inside) around center [2] m from the scene's
@@ -56,13 +57,18 @@ def _lower(field: np.ndarray, near: np.ndarray, x: np.ndarray, y: np.ndarray, ri
     The distance from a tile's middle bounds that of its cells, so cells outside which cannot change are not searched.
     """
     rows, columns = _near(x, y, ring, FAR)
-    part, count, x, y = field[rows, columns], near[rows, columns], x[rows], y[columns]
+    part = field[rows, columns]
+    count = near[rows, columns]
+    x = x[rows]
+    y = y[columns]
     if not part.size:
         return
-    tree, cell = cKDTree(dense := _dense(ring)), np.stack(np.meshgrid(x, y, indexing="ij"), -1)
+    tree = cKDTree(dense := _dense(ring))
+    cell = np.stack(np.meshgrid(x, y, indexing="ij"), -1)
     least = tree.query(cell[::TILE, ::TILE] + (TILE - CELL) / 2)[0] - RADIUS - DENSE / 2
     least = least.repeat(TILE, 0).repeat(TILE, 1)[: len(x), : len(y)]
-    inside, box = np.zeros(part.shape, bool), _near(x, y, ring, 0.0)
+    inside = np.zeros(part.shape, bool)
+    box = _near(x, y, ring, 0.0)
     inside[box] = Path(ring).contains_points(cell[box].reshape(-1, 2)).reshape(inside[box].shape)
     change = inside | (least < part)
     border = _border_distance(dense, tree, cell[change])
@@ -112,18 +118,22 @@ def off_road_rows(points: Tensor, field: Tensor, origin: Tensor, row: Tensor) ->
     four = index[..., None] + torch.arange(2, device=index.device) * cells  # rows x and x + 1 of the cell
     four = four[..., None] + torch.arange(2, device=index.device)
     value = field.flatten()[four].to(points.dtype)
-    sx, sy = share[..., 0], share[..., 1:]
+    sx = share[..., 0]
+    sy = share[..., 1:]
     value = (1 - sy) * value[..., 0] + sy * value[..., 1]
     return ((1 - sx) * value[..., 0] + sx * value[..., 1]).masked_fill(outside, FAR)
 
 
 def off_road_at(x: Tensor, y: Tensor, field: Tensor, origin: Tensor) -> Tensor:
     """`off_road` of points x, y [B, K], apart as compiled code wants them."""
-    cells, values = field.shape[-1], field.flatten(1)
+    cells = field.shape[-1]
+    values = field.flatten(1)
     x, y = ((value - origin[:, axis, None]) / CELL for axis, value in enumerate((x, y)))
     outside = (torch.minimum(x, y) < 0) | (torch.maximum(x, y) > cells - 1)
     low_x, low_y = (value.floor().clamp(0, cells - 2) for value in (x, y))
-    index, sx, sy = (low_x * cells + low_y).long(), (x - low_x).clamp(0, 1), (y - low_y).clamp(0, 1)
+    index = (low_x * cells + low_y).long()
+    sx = (x - low_x).clamp(0, 1)
+    sy = (y - low_y).clamp(0, 1)
     first, second, third, fourth = (
         values.gather(1, index + row * cells + column).to(x.dtype) for row in (0, 1) for column in (0, 1)
     )

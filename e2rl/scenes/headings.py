@@ -61,7 +61,8 @@ def hold_headings(states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray)
         valid: where they are recorded [F, A].
         agent_type: their types [A]; pedestrians are left as they are.
     """
-    out, count = states.copy(), 0
+    out = states.copy()
+    count = 0
     standing = standing_frames(states[..., :2], valid) & (agent_type != PEDESTRIAN)
     for agent in np.flatnonzero(standing.any(0)):
         frames = np.flatnonzero(valid[:, agent])
@@ -108,7 +109,8 @@ def _held(frames: np.ndarray, heading: np.ndarray, standing: np.ndarray, positio
     for part in np.split(np.arange(len(frames)), edges):
         if not standing[part[0]]:
             continue
-        first, last = part[0], part[-1]
+        first = part[0]
+        last = part[-1]
         before = slice(max(first - NEIGHBOURS, 0), first)
         after = slice(last + 1, last + 1 + NEIGHBOURS)
         sides = [
@@ -148,10 +150,12 @@ def _motion(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Which headings [F, A] are those of the back: the choice for each track that turns least and drives backwards
     least. Slow motion backwards alone turns nothing round: it is reversing."""
-    heading, velocity = states[..., 2], _motion(states, valid)
+    heading = states[..., 2]
+    velocity = _motion(states, valid)
     speed = np.linalg.norm(velocity, axis=-1)
     along = (velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)) / np.maximum(speed, 1e-9)
-    moves, fast = valid & (speed > MOVES), valid & (speed > BACKWARDS)
+    moves = valid & (speed > MOVES)
+    fast = valid & (speed > BACKWARDS)
     flips = np.abs(wrap(np.diff(heading, axis=0))) > np.pi / 2
     odd = (flips & valid[1:] & valid[:-1]).any(0) | (fast & (along < -AGAINST)).any(0)
     odd |= _flips_in_a_gap(heading, valid)
@@ -180,7 +184,8 @@ def _least_cost(heading: np.ndarray, valid: np.ndarray, own: np.ndarray) -> np.n
     """Whether to turn each heading [F, A] round, at the least sum of turning from frame to frame [rad] and of the costs
     [F, A, 2] of the recorded heading and the turned one (Viterbi's algorithm). Turning in a gap costs less."""
     frames, agents = valid.shape
-    total, last = np.zeros((agents, 2)), np.full(agents, -1)
+    total = np.zeros((agents, 2))
+    last = np.full(agents, -1)
     source = np.zeros((frames, agents, 2), np.int8)
     column = np.arange(agents)
     for frame in range(frames):

@@ -24,7 +24,8 @@ class LaneCover:
         """lines: of lanes, points every 1 m; widths [lanes] m."""
         width = np.round(np.repeat(widths, [len(line) for line in lines]), 1)
         order = np.argsort(-width, kind="stable")
-        self.points, self.reach = np.concatenate([np.zeros((0, 2)), *lines])[order], width[order] / 2 + MARGIN
+        self.points = np.concatenate([np.zeros((0, 2)), *lines])[order]
+        self.reach = width[order] / 2 + MARGIN
         self.low = self.high = np.zeros(2, int)  # of the tiles [low, high) that were looked at: none yet
 
     def beyond(self, origin: np.ndarray, corner: np.ndarray, cells: int) -> np.ndarray:
@@ -40,22 +41,26 @@ class LaneCover:
         rows = np.flatnonzero(((self.tile >= low) & (self.tile < low + size)).all(1))
         i, j = (self.tile[rows] - low).T
         x, y = (corner + (np.arange(size.max() * TILE)[:, None] - lead) * CELL).T.reshape(2, -1, TILE)
-        squared, reach = self._squared(rows, x[i], y[j], origin), self.reach[self.point[self.begin[rows]]]
+        squared = self._squared(rows, x[i], y[j], origin)
+        reach = self.reach[self.point[self.begin[rows]]]
         field = np.full((*size, TILE, TILE), FAR)
         for each in np.unique(reach)[::-1]:
             which = np.flatnonzero(reach == each)
-            old, new = field[i[which], j[which]], np.sqrt(squared[which]) - each
+            old = field[i[which], j[which]]
+            new = np.sqrt(squared[which]) - each
             field[i[which], j[which]] = np.where(old > -INSIDE, np.minimum(old, new), old)
         return field.swapaxes(1, 2).reshape(size * TILE)[lead[0] : lead[0] + cells, lead[1] : lead[1] + cells]
 
     def _squared(self, rows: np.ndarray, x: np.ndarray, y: np.ndarray, origin: np.ndarray) -> np.ndarray:
         """m^2 [R, TILE, TILE] from the nearest point of each row to its cells at x, y [R, TILE] from the origin."""
         (px, py), begin, count = (self.points - origin).T, self.begin[rows], self.count[rows]
-        least, other = np.full((len(rows), TILE, TILE), np.inf), np.empty((len(rows), TILE, TILE))
+        least = np.full((len(rows), TILE, TILE), np.inf)
+        other = np.empty((len(rows), TILE, TILE))
         for k in range(count.max(initial=0)):
             some = np.searchsorted(-count, -k)  # the first rows have more than k points
             point = self.point[begin[:some] + k]
-            dx, dy = x[:some] - px[point, None], y[:some] - py[point, None]
+            dx = x[:some] - px[point, None]
+            dy = y[:some] - py[point, None]
             np.add((dx * dx)[:, :, None], (dy * dy)[:, None, :], out=other[:some])
             np.minimum(least[:some], other[:some], out=least[:some])
         return least
@@ -67,12 +72,15 @@ class LaneCover:
         No point matters that is farther beyond than another in all of the tile, or to which those beside leave none.
         """
         around = AROUND * int((self.low < self.high).all())
-        self.low, self.high = low - around, high + around
+        self.low = low - around
+        self.high = high + around
         tiles = np.mgrid[tuple(map(slice, self.low, self.high))].reshape(2, -1).T
-        tree, more = cKDTree(self.points), self.reach.max(initial=0.0) + RADIUS
+        tree = cKDTree(self.points)
+        more = self.reach.max(initial=0.0) + RADIUS
         distance, nearest = tree.query((tiles + 0.5) * TILE * CELL, distance_upper_bound=FAR + more)
         tiles, distance, nearest = (values[np.isfinite(distance)] for values in (tiles, distance, nearest))
-        middle, most = (tiles + 0.5) * TILE * CELL, np.clip(distance - self.reach[nearest] + RADIUS, -INSIDE, FAR)
+        middle = (tiles + 0.5) * TILE * CELL
+        most = np.clip(distance - self.reach[nearest] + RADIUS, -INSIDE, FAR)
         found = tree.query_ball_point(middle, most + more, return_sorted=True)
         of = np.repeat(np.arange(len(tiles)), [len(points) for points in found])
         point = np.fromiter(chain.from_iterable(found), int, len(of))
@@ -81,8 +89,11 @@ class LaneCover:
         for side in (np.pad(step, ((0, 1), (0, 0))), np.pad(-step, ((1, 0), (0, 0)))):
             bound = (side**2).sum(1) / 2 + HALF * np.abs(side).sum(1) + 1e-9
             keep &= side[point, 0] * x + side[point, 1] * y <= bound[point]
-        of, self.point = of[keep], point[keep]
+        of = of[keep]
+        self.point = point[keep]
         begin = np.flatnonzero(np.diff(of, prepend=-1) | (np.diff(self.reach[self.point], prepend=0.0) != 0))
         count = np.diff(begin, append=len(of))
         order = np.argsort(-count, kind="stable")
-        self.tile, self.begin, self.count = tiles[of[begin]][order], begin[order], count[order]
+        self.tile = tiles[of[begin]][order]
+        self.begin = begin[order]
+        self.count = count[order]

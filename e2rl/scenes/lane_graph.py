@@ -16,7 +16,8 @@ from e2rl.scenes.recording import Lane
 from e2rl.scenes.route import BEHIND, SPACING
 
 START_RADIUS, START_ANGLE = 5.0, 0.8  # m, rad: lanes this close may be a vehicle's own
-MAX_START_LANES, MAX_BRANCHES = 6, 4
+MAX_START_LANES = 6
+MAX_BRANCHES = 4
 AHEAD = 300.0  # m of route ahead of the vehicle
 BUCKET = 20.0  # m to which distances on the start lane are rounded up, so that vehicles share a search
 SMOOTHING, SMOOTHED_ENDS = 1.3, 6  # vertices: standard deviation of the filter, odd extension beyond the ends
@@ -91,7 +92,8 @@ class LaneGraph:
         if away is not None:
             near = near[~away[near]]
         angle = np.abs(wrap(self.heading[near] - heading))
-        near, angle = near[angle < START_ANGLE], angle[angle < START_ANGLE]
+        near = near[angle < START_ANGLE]
+        angle = angle[angle < START_ANGLE]
         distance = np.linalg.norm(self.points[near] - position, axis=1)
         found: dict[int, int] = {}
         for _, point in sorted(zip(distance + 2.5 * angle, near, strict=True)):
@@ -105,7 +107,8 @@ class LaneGraph:
 
     def turn(self, a: str, b: str) -> float:
         """Heading change [rad] from the end of lane a to the end of its successor b."""
-        first, second = self.line[a][-1] - self.line[a][-2], self.line[b][-1] - self.line[b][-2]
+        first = self.line[a][-1] - self.line[a][-2]
+        second = self.line[b][-1] - self.line[b][-2]
         return abs(wrap(np.arctan2(second[1], second[0]) - np.arctan2(first[1], first[0])))
 
     def bend(self, name: str) -> float:
@@ -123,14 +126,16 @@ class LaneGraph:
         key = (lane, fork_end, end)
         if key not in self.branches_of:
             found: list[list[str]] = []
-            queue, pushed = [(0, 0.0, 0, [lane], self.arc[lane])], 0
+            queue = [(0, 0.0, 0, [lane], self.arc[lane])]
+            pushed = 0
             while queue and len(found) < MAX_BRANCHES:
                 turns, _, _, path, length = heappop(queue)
                 while length < end and (nexts := self._successors(path)):
                     for other in nexts[1:] if length < fork_end else ():
                         pushed += 1
                         heappush(queue, (turns + 1, length, pushed, [*path, other], length + self.arc[other]))
-                    path, length = [*path, nexts[0]], length + self.arc[nexts[0]]
+                    path = [*path, nexts[0]]
+                    length = length + self.arc[nexts[0]]
                 found.append(path)
             self.branches_of[key] = found
         return self.branches_of[key]
@@ -172,7 +177,8 @@ class LaneGraph:
         scale = arc[-1] / max(starts[-1], 1e-6)
         at = np.arange(vertices) * SPACING + begin * scale
         length = min(arc[-1] - begin * scale, (vertices - 1) * SPACING)
-        limit, lane_s = np.zeros(vertices, np.float32), []
+        limit = np.zeros(vertices, np.float32)
+        lane_s = []
         for name, start in zip(lanes, starts[:-1] - begin, strict=True):
             limit[max(int(start // SPACING), 0) :] = self.lanes[name].speed_limit
             lane_s.append((name, float(start * scale)))
@@ -251,8 +257,10 @@ def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> 
 
     points [B, M, 2]: of centrelines; lane [B, M]: which one each point is of (-1: padding).
     """
-    start, end = points[:, :-1], points[:, 1:]
-    low, high = xy.amin(1, keepdim=True) - LANE_REACH, xy.amax(1, keepdim=True) + LANE_REACH
+    start = points[:, :-1]
+    end = points[:, 1:]
+    low = xy.amin(1, keepdim=True) - LANE_REACH
+    high = xy.amax(1, keepdim=True) + LANE_REACH
     inside = ((start > low) & (start < high)).all(-1) & (lane[:, 1:] == lane[:, :-1]) & (lane[:, 1:] >= 0)
     place, there = packed(inside)  # maps are large, and vehicles in one part of them
     start, end = (value.gather(1, place[..., None].expand(-1, -1, 2)) for value in (start, end))

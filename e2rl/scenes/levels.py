@@ -32,7 +32,8 @@ class Levels:
     def __init__(self, recording: Recording, graph: LaneGraph, valid: np.ndarray) -> None:
         """valid [F, A]: frames of the tracks that count."""
         self.recording = recording if ego_climbs(recording, valid) else replace(recording, heights=None)
-        self.graph, self.valid = graph, valid
+        self.graph = graph
+        self.valid = valid
         self.lane_height = np.full(len(graph.points), np.nan)
         if self.recording.heights is not None:
             height = np.concatenate([_at_points(graph, name) for name in graph.ids])
@@ -47,12 +48,15 @@ class Levels:
         assert recording.heights is not None
         frame, agent = (self.valid & (recording.agent_type == VEHICLE)).nonzero()
         chosen = np.unique(np.linspace(0, len(frame) - 1, min(SAMPLES, len(frame))).astype(int))
-        frame, agent = frame[chosen], agent[chosen]
+        frame = frame[chosen]
+        agent = agent[chosen]
         near = self.graph.tree.query_ball_point(recording.states[frame, agent, :2], ON_LANE)
         sample = np.repeat(np.arange(len(near)), [len(points) for points in near])
         offset = recording.heights[frame, agent][sample] - height[np.concatenate([*near, []]).astype(int)]
-        sample, offset = sample[np.isfinite(offset)], offset[np.isfinite(offset)]
-        best, explained = np.nan, 0
+        sample = sample[np.isfinite(offset)]
+        offset = offset[np.isfinite(offset)]
+        best = np.nan
+        explained = 0
         for value in sorted(np.unique(np.round(offset)), key=abs):
             count = len(np.unique(sample[np.abs(offset - value) < UNEVEN]))
             best, explained = (value, count) if count > explained else (best, explained)
@@ -69,7 +73,8 @@ class Levels:
         if heights is None or not self.valid[:, ego].any():
             return other
         path, height = self.way(ego)
-        tree, states = cKDTree(path), self.recording.states
+        tree = cKDTree(path)
+        states = self.recording.states
         for agent in np.flatnonzero(self.valid.any(0)).tolist():
             frames = np.flatnonzero(self.valid[:, agent])[::STRIDE]
             _, nearest = tree.query(states[frames, agent, :2])
@@ -85,11 +90,14 @@ class Levels:
     def way(self, agent: int) -> tuple[np.ndarray, np.ndarray]:
         """Places [Q, 2] m that an agent drove, and may yet drive along lanes of known height from its first one on, and
         their heights [Q] m."""
-        recording, graph = self.recording, self.graph
+        recording = self.recording
+        graph = self.graph
         assert recording.heights is not None
         frames = np.flatnonzero(self.valid[:, agent])
-        track, height = recording.states[frames, agent], recording.heights[frames, agent]
-        places, heights = [track[::STRIDE, :2]], [height[::STRIDE]]
+        track = recording.states[frames, agent]
+        height = recording.heights[frames, agent]
+        places = [track[::STRIDE, :2]]
+        heights = [height[::STRIDE]]
         if recording.agent_type[agent] == VEHICLE:
             reach = arc_length(track[:, :2])[-1] + AHEAD
             places_on_lanes = dict(self.near_lanes(track[0, :2], track[0, 2], height[0]))
@@ -120,7 +128,8 @@ class Levels:
 
 def _at_points(graph: LaneGraph, name: str) -> np.ndarray:
     """Heights [P] m at the points of a lane's line, NaN where they are unknown."""
-    lane, line = graph.lanes[name], graph.line[name]
+    lane = graph.lanes[name]
+    line = graph.line[name]
     if lane.heights is None:
         return np.full(len(line), np.nan)
     arc = arc_length(lane.points)

@@ -22,7 +22,8 @@ USED = 0.6  # of a limit, driven by the fastest vehicle, above which it may be o
 GRIP, SHARP = 9.81, 3 * 9.81  # m/s^2 in a bend: the most that tyres hold, and what no road is built for
 # Parts of the limited lanes, by length, that are such bends: at 100 km/h on nuScenes' connectors
 # 0.34 to 0.58 and 0.28 to 0.55, at 137 km/h on all lanes of a town 0.15 to 0.38 and 0.13 to 0.34.
-GRIP_PART, SHARP_PART = 0.2, 0.05
+GRIP_PART = 0.2
+SHARP_PART = 0.05
 BEND, SHORT = 20, 5  # m over which a bend is measured, of a shorter lane all of it; lanes that have none
 MOVES, FAST = 1.0, 95  # m/s, and the percentile of the speeds above it that is the fastest without glitches
 
@@ -54,7 +55,8 @@ def _is_placeholder(recording: Recording, limits: dict[str, float]) -> bool:
     moving = speed[speed > MOVES]
     fastest = np.percentile(moving, FAST) if len(moving) else 0.0
     curvature, metres = map(np.concatenate, zip(*(_bends(recording.lanes[name]) for name in limits), strict=True))
-    lateral, whole = limit**2 * curvature, max(metres.sum(), 1e-6)
+    lateral = limit**2 * curvature
+    whole = max(metres.sum(), 1e-6)
     if metres[lateral > SHARP].sum() > SHARP_PART * whole:
         return fastest < limit
     return fastest < USED * limit and (limit > UNUSUAL or metres[lateral > GRIP].sum() > GRIP_PART * whole)

@@ -58,9 +58,11 @@ def ends_of(lanes: Iterable[Lane]) -> Ends:
     for lane in lanes:
         line = resample(lane.points, 1.0)
         near = min(int(END), len(line) - 1)
-        begin, end = line[near] - line[0], line[-1] - line[-1 - near]
+        begin = line[near] - line[0]
+        end = line[-1] - line[-1 - near]
         low, high = (np.nan, np.nan) if lane.heights is None else (lane.heights[0], lane.heights[-1])
-        into, out = np.arctan2(begin[1], begin[0]), np.arctan2(end[1], end[0])
+        into = np.arctan2(begin[1], begin[0])
+        out = np.arctan2(end[1], end[0])
         rows.append([*line[0], *line[-1], into, out, low, high, plausible_width(lane.width)])
     table = np.array(rows, float).reshape(-1, 9)
     return Ends(table[:, :2], table[:, 2:4], *table[:, 4:].T)
@@ -73,8 +75,10 @@ def drivable(ends: Ends, lane: np.ndarray, other: np.ndarray) -> np.ndarray:
     turned, which smoothing makes the tightest turn of a car, and on the same level.
     """
     x, y = (ends.first[other] - ends.last[lane]).T
-    cos, sin = np.cos(ends.out[lane]), np.sin(ends.out[lane])
-    along, across = x * cos + y * sin, y * cos - x * sin
+    cos = np.cos(ends.out[lane])
+    sin = np.sin(ends.out[lane])
+    along = x * cos + y * sin
+    across = y * cos - x * sin
     half = np.minimum(ends.width[lane], ends.width[other]) / 2
     turn = np.abs(wrap(ends.into[other] - ends.out[lane]))
     return (np.abs(along) <= LINK_GAP) & (np.abs(across) < half) & (turn < LINK_ANGLE) & _level(ends, lane, other)
@@ -93,7 +97,8 @@ def infer_exits(lanes: dict[str, Lane], names: Iterable[str] | None = None) -> d
     """
     if not lanes:
         return {}
-    ids, ends = list(lanes), ends_of(lanes.values())
+    ids = list(lanes)
+    ends = ends_of(lanes.values())
     into, out = (np.array([tangent_angle(resample(lane.points, 1.0))[at] for lane in lanes.values()]) for at in (0, -1))
     tree = cKDTree(ends.first)
     number = {name: index for index, name in enumerate(ids)}
@@ -171,7 +176,8 @@ def _lateral(line: np.ndarray, angle: np.ndarray, other: np.ndarray, other_angle
     """Median distance [m], left positive, of a line [Q, 2] beside a line [P, 2] with points every 1 m; NaN where it
     runs nowhere beside it in the same direction."""
     rows = np.linspace(0, len(line) - 1, SAMPLES).round().astype(int)
-    point, direction = line[rows] @ [1, 1j], np.exp(1j * angle[rows])
+    point = line[rows] @ [1, 1j]
+    direction = np.exp(1j * angle[rows])
     offset = (other @ [1, 1j] - point[:, None]) * direction.conj()[:, None]
     nearest = np.abs(offset).argmin(1)
     offset = offset[np.arange(len(rows)), nearest]

@@ -46,7 +46,8 @@ class _Machine(LIBRARY):
 
     def __init__(self, file: BytesIO, *, encoding: str) -> None:
         super().__init__(file, encoding=encoding)
-        self.read, self.readline = file.read, file.readline
+        self.read = file.read
+        self.readline = file.readline
         self.metastack: list[list] = []
         self.stack: list[Any] = []
         self.append = self.stack.append
@@ -77,7 +78,8 @@ class _Machine(LIBRARY):
     def measure(self, value: Any, level: int) -> tuple[int, int]:
         """Returns (depth, items) of an object at `level` of another one: how deep it nests, and how many items it holds
         if all references are followed. What is shared was measured before, so the walk is over a tree."""
-        kind, known = type(value), self.shared.get(id(value))
+        kind = type(value)
+        known = self.shared.get(id(value))
         if known is not None:
             depth, items = known[1:]
         elif kind not in HOLDING:
@@ -85,15 +87,18 @@ class _Machine(LIBRARY):
         elif level >= MAX_DEPTH:
             raise ValueError(f"nests deeper than {MAX_DEPTH} levels")
         else:
-            depth, items = 1, 1 + (value.size if kind is np.ndarray else len(value))
+            depth = 1
+            items = 1 + (value.size if kind is np.ndarray else len(value))
             if kind is dict:
-                items, value = items + len(value), value.values()
+                items = items + len(value)
+                value = value.values()
             elif kind is np.ndarray:
                 value = value.ravel().tolist() if value.dtype.kind == "O" else ()
             for part in () if HOLDING.isdisjoint(map(type, value)) else value:
                 if type(part) in HOLDING:
                     below, more = self.measure(part, level + 1)
-                    depth, items = max(depth, below + 1), items + more - 1
+                    depth = max(depth, below + 1)
+                    items = items + more - 1
         if level + depth > MAX_DEPTH:
             raise ValueError(f"nests deeper than {MAX_DEPTH} levels")
         if items > MAX_ITEMS:
@@ -134,7 +139,8 @@ class _Machine(LIBRARY):
         self.growing(list).extend(parts)
 
     def set_item(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
+        value = self.stack.pop()
+        key = self.stack.pop()
         self.set_items([key, value])
 
     def set_marked_items(self) -> None:
@@ -162,14 +168,16 @@ class _Machine(LIBRARY):
         return Name(path)
 
     def call(self) -> None:
-        arguments, function = self.stack.pop(), self.stack.pop()
+        arguments = self.stack.pop()
+        function = self.stack.pop()
         if not isinstance(function, Name) or type(arguments) is not tuple:
             raise ValueError("calls what is no name")
         self.counted()
         self.append(called(function.path, arguments))
 
     def build(self) -> None:
-        state, target = self.stack.pop(), self.stack.pop()
+        state = self.stack.pop()
+        target = self.stack.pop()
         if not isinstance(target, Unbuilt) or target.value is not None:
             raise ValueError("gives a state to what has none")
         if target.dtype is not None:

@@ -73,7 +73,8 @@ def check(measures: dict[str, float], scene_id: str) -> None:
 
 def extent(recording: Recording) -> dict[str, float]:
     """Sizes of a validated recording."""
-    valid, points = recording.valid, recording.states[..., :2][recording.valid]
+    valid = recording.valid
+    points = recording.states[..., :2][recording.valid]
     path = recording.states[valid[:, recording.ego], recording.ego, :2]
     ego = np.median(path, axis=0) if len(path) else np.full(2, np.nan)
     rings = [lane.points for lane in recording.lanes.values()] + [ring[:, :2] for ring in recording.drivable]
@@ -112,7 +113,8 @@ def displacements(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndar
     """All displacements [K, 2] m, overlapping ones included, of vehicles that are recorded for FRAMES frames on end and
     drive; the pose [K, 3] in its middle, the mean recorded speed [K] m/s without its sign, and the track [K] whose it
     is."""
-    states, valid = recording.states, recording.valid
+    states = recording.states
+    valid = recording.valid
     count = len(states) - FRAMES
     if count < 1:
         return np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int)
@@ -128,8 +130,10 @@ def displacements(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndar
 def motion(recording: Recording) -> dict[str, float]:
     """Sizes of vehicles, and whether headings and speeds are those of the displacements."""
     moved, pose, speed, track = displacements(recording)
-    distance, ego = np.linalg.norm(moved, axis=-1), track == recording.ego
-    ratio, far = (speed * FRAMES * DT + 0.05) / (distance + 0.05), distance > MOVED
+    distance = np.linalg.norm(moved, axis=-1)
+    ego = track == recording.ego
+    ratio = (speed * FRAMES * DT + 0.05) / (distance + 0.05)
+    far = distance > MOVED
     turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
     turned = np.where(distance < BACKWARDS * FRAMES * DT, np.minimum(turned, pi - turned), turned)  # it may reverse
     single = recording.valid.any(0) & (recording.agent_type == VEHICLE)
@@ -150,7 +154,8 @@ def motion(recording: Recording) -> dict[str, float]:
 
 def _together(recording: Recording, tracks: np.ndarray) -> float:
     """The longest time [s] that two of these tracks [K] are at one place."""
-    place, valid = recording.states[::FRAMES, tracks, :2], recording.valid[::FRAMES, tracks]
+    place = recording.states[::FRAMES, tracks, :2]
+    valid = recording.valid[::FRAMES, tracks]
     pairs = [np.zeros((0, 2), int)]
     for known, points in zip(valid, place, strict=True):
         there = np.flatnonzero(known)
@@ -210,16 +215,20 @@ def lane_spacing(graph: LaneGraph) -> float:
     those tell a map's unit that share a border (`_adjoin`), or that the map names neighbours.
     """
     chosen = np.unique(np.linspace(0, len(graph.points) - 1, SAMPLES).astype(int))
-    place, direction = graph.points @ [1, 1j], np.exp(1j * graph.heading)
+    place = graph.points @ [1, 1j]
+    direction = np.exp(1j * graph.heading)
     width = np.array([lane.width if lane.width > 0 else np.nan for lane in graph.lanes.values()])
-    nearest, named = np.full(len(chosen), inf), graph.named_beside
+    nearest = np.full(len(chosen), inf)
+    named = graph.named_beside
     for row, point in enumerate(chosen):  # one by one: a map may have all its points at one place
         other = np.array(graph.tree.query_ball_point(graph.points[point], BESIDE[1]), dtype=int)
         turn = direction[point].conj()
-        away, along = (place[other] - place[point]) * turn, (direction[other] * turn).real
+        away = (place[other] - place[point]) * turn
+        along = (direction[other] * turn).real
         across = np.abs(away.imag)
         beside = (np.abs(along) > np.cos(PARALLEL)) & (np.abs(away.real) < 1.0) & (across > BESIDE[0])
-        lane, neighbour = graph.lane_of[point], graph.lane_of[other[beside]]
+        lane = graph.lane_of[point]
+        neighbour = graph.lane_of[other[beside]]
         room = (width[lane] + width[neighbour]) / 2
         adjoin = _adjoin(across[beside], room, same=along[beside] > 0)
         beside_it = named.get(graph.ids[lane], ())

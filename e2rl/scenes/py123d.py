@@ -87,7 +87,9 @@ class Py123dSource(Source):
         for file in self.maps().rglob("*.arrow"):
             check_file(file, sys.maxsize)
         scene = ArrowSceneAPI(folder, maps_root=self.maps())
-        frames, about, land = _frames(scene), scene.log_metadata, scene.get_map_api()
+        frames = _frames(scene)
+        about = scene.log_metadata
+        land = scene.get_map_api()
         if len(frames) < 2:
             raise InputError("fewer than two frames with the ego and boxes; leave it out")
         if land is None:
@@ -95,7 +97,8 @@ class Py123dSource(Source):
         for number, piece in enumerate(_pieces(frames)):
             scene_id = about.log_name if len(piece) == len(frames) else f"{about.log_name}#{number}"
             recording = _recording(scene_id, piece)
-            recording.location, recording.dataset = about.location or "", about.dataset
+            recording.location = about.location or ""
+            recording.dataset = about.dataset
             recording.lanes, recording.drivable = _map(land, recording.states[:, 0, :2])
             yield recording
 
@@ -135,13 +138,16 @@ def _frames(scene: Any) -> list[Frame]:
     stride = max(1, round(DT / scene.scene_metadata.iteration_duration_s))
     found = []
     for step in range(0, scene.number_of_iterations, stride):
-        ego, boxes = scene.get_ego_state_se3_at_iteration(step), scene.get_box_detections_se3_at_iteration(step)
+        ego = scene.get_ego_state_se3_at_iteration(step)
+        boxes = scene.get_box_detections_se3_at_iteration(step)
         if ego is None or boxes is None:
             continue
-        pose, box = ego.center_se3, ego.metadata
+        pose = ego.center_se3
+        box = ego.metadata
         agents = {EGO: (VEHICLE, pose.x, pose.y, pose.z, pose.yaw, box.length, box.width)}
         for other in boxes:
-            kind, body = other.attributes.default_label.name, other.bounding_box_se3
+            kind = other.attributes.default_label.name
+            body = other.bounding_box_se3
             if kind not in LEFT_OUT:
                 place = body.center_se3
                 shape = (place.x, place.y, place.z, place.yaw, body.length, body.width)
@@ -178,7 +184,8 @@ def _recording(scene_id: str, frames: list[Frame]) -> Recording:
     names = list(dict.fromkeys(name for frame in frames for name in frame.boxes))  # the ego first
     check({"states": len(frames) * len(names)}, scene_id)
     column = {name: index for index, name in enumerate(names)}
-    states, valid = np.zeros((len(frames), len(names), 4)), np.zeros((len(frames), len(names)), bool)
+    states = np.zeros((len(frames), len(names), 4))
+    valid = np.zeros((len(frames), len(names)), bool)
     sizes: list[list[tuple[float, float]]] = [[] for _ in names]
     heights = np.zeros(valid.shape)
     types = np.full(len(names), OTHER)

@@ -55,7 +55,8 @@ def failed_line(kind: type, trace: TracebackType | None) -> str:
     known = {str(file) for _, file in files}
     line = ""
     while trace is not None:
-        name, trace_line = trace.tb_frame.f_code.co_filename, trace.tb_lineno
+        name = trace.tb_frame.f_code.co_filename
+        trace_line = trace.tb_lineno
         path = Path(name)
         beside = any(path.is_relative_to(folder) and not _is_installed(path, folder) for folder in folders)
         module = trace.tb_frame.f_globals.get("__name__", "")
@@ -138,7 +139,8 @@ def _located(names: Iterator[str]) -> Iterator[tuple[str, Path]]:
     for name in names:
         if _is_standard(name):
             continue
-        parts, folders = name.split("."), None
+        parts = name.split(".")
+        folders = None
         for depth in range(len(parts)):
             part = ".".join(parts[: depth + 1])
             spec = getattr(sys.modules.get(part), "__spec__", None) or PathFinder.find_spec(part, folders)

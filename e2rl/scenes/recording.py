@@ -254,7 +254,8 @@ class Recording:
 
     def validate_start(self) -> "Recording":
         """Returns self; raises InputError naming the scene where the start frame cannot be one."""
-        frames, scene = len(self.states), f"scene {self.scene_id!r}"
+        frames = len(self.states)
+        scene = f"scene {self.scene_id!r}"
         if self.current is None or not 1 <= self.current < frames - 1:
             start = f"start frame {self.current}"
             raise InputError(f"{scene}: {start} leaves no history or no future in {frames} frames")

@@ -206,7 +206,8 @@ def _interpolate(route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | Non
         before, a, b, after = _take(route, four).unflatten(-2, (4, i.shape[-1])).unbind(-3)
         angle, turn = _tangent(before, a, b, after)
     else:
-        a, b = _take(route, i), _take(route, i + 1)
+        a = _take(route, i)
+        b = _take(route, i + 1)
         angle, turn = (values.expand(*i.shape[:-1], last + 1).gather(-1, i) for values in tangents)
     xy = a + t[..., None] * (b - a)
     inside = (t >= 0) & (t <= 1)
@@ -223,6 +224,7 @@ def tangents(route: Tensor) -> tuple[Tensor, Tensor]:
 
 def _tangent(before: Tensor, a: Tensor, b: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
     """`tangents` of segments from a to b [..., 2] and the vertices before and after them."""
-    first, second = b - before, after - a
+    first = b - before
+    second = after - a
     cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
     return torch.atan2(first[..., 1], first[..., 0]), torch.atan2(cross, (first * second).sum(-1))

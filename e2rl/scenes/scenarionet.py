@@ -84,22 +84,26 @@ def safe_load(content: bytes, name: str) -> dict:
 
 def recording_of(data: dict, location: str = "") -> Recording:
     """Returns the whole log of a ScenarioDescription at 10 Hz, with its own start frame if it names one."""
-    metadata, tracks = data["metadata"], data["tracks"]
-    keys, ego = [str(key) for key in tracks], metadata.get("sdc_id")
+    metadata = data["metadata"]
+    tracks = data["tracks"]
+    keys = [str(key) for key in tracks]
+    ego = metadata.get("sdc_id")
     if str(ego) not in keys:
         raise InputError(f"no ego: metadata.sdc_id={ego!r} is none of its {len(tracks)} tracks; leave it out")
     if len(set(keys)) < len(keys):
         twice = next(key for key, count in Counter(keys).items() if count > 1)
         raise InputError(f"two of its tracks have the id {twice!r}; give each its own")
     states, valid, size, repairs = _tracks(tracks)
-    frames, scene_id = len(states), _text(data.get("id") or metadata.get("scenario_id"))
+    frames = len(states)
+    scene_id = _text(data.get("id") or metadata.get("scenario_id"))
     ts = np.asarray(metadata.get("ts", np.arange(frames) * DT), float)
     if len(ts) != frames:
         raise InputError(f"{len(ts)} time stamps for {frames} frames; repair metadata.ts")
     check({"states": (ts.max() - ts.min()) / DT * len(keys)}, scene_id)  # of the grid, whose size they give
     heights = resample_heights(_heights(tracks, valid), valid, ts)
     states, valid = resample_uniform(states, valid, ts)
-    seconds, current = ts - ts[0], metadata.get("current_time_index")
+    seconds = ts - ts[0]
+    current = metadata.get("current_time_index")
     if current is not None and not (np.isreal(current) and 0 <= current < frames and current == int(current)):
         raise InputError(f"current_time_index={current!r} is no frame of {frames}; repair it")
     lanes, drivable = _map(data["map_features"])
@@ -140,7 +144,8 @@ def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray, Counter[s
     """
     frames = len(next(iter(tracks.values()))["state"]["position"])
     check({"states": frames * len(tracks)}, "of this log")
-    states, valid = np.zeros((frames, len(tracks), 4)), np.zeros((frames, len(tracks)), bool)
+    states = np.zeros((frames, len(tracks), 4))
+    valid = np.zeros((frames, len(tracks)), bool)
     size = np.ones((len(tracks), 2))
     repairs: Counter[str] = Counter()
     for index, (key, track) in enumerate(tracks.items()):
@@ -205,7 +210,8 @@ def _are_headings(lines: list[np.ndarray]) -> bool:
 
 def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
     """Lanes for motor vehicles by id, and the drivable polygons that belong to them."""
-    lanes, drivable = {}, []
+    lanes = {}
+    drivable = []
     for key, feature in features.items():
         kind = str(feature["type"])
         if not kind.startswith("LANE_") or "BIKE" in kind or len(feature.get("polyline", ())) < 2:
@@ -272,7 +278,8 @@ def _lights(dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: 
         lane = str(light.get("lane", key))
         if lane not in lanes:
             continue
-        states, last = np.zeros(len(seconds), np.int8), LIGHT_UNKNOWN
+        states = np.zeros(len(seconds), np.int8)
+        last = LIGHT_UNKNOWN
         words = light["state"].get("object_state")
         words = [] if words is None else list(words)[: len(seconds)]
         for frame, word in enumerate(words):  # LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)

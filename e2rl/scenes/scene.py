@@ -145,7 +145,8 @@ class SceneSet:
         whole = len(rows) == len(batch)
         for key, source in self.scenes.items():
             target = batch[key]
-            indices, there = indices.to(source.device), source.device == target.device
+            indices = indices.to(source.device)
+            there = source.device == target.device
             if whole and there:  # a second copy would cost more pages than the first
                 torch.index_select(source, 0, indices, out=target)
             elif there and not source.is_cuda and source[0].numel() > LARGE:  # scene by scene, without a copy between

@@ -56,7 +56,8 @@ class Index:
 
     def places(self) -> tuple[dict[str, slice], int]:
         """Returns the bytes of a file that each key's array has, and how many all have, at least one."""
-        found, begin = {}, 0
+        found = {}
+        begin = 0
         for key, (kind, shape) in self.layout.items():
             size = len(self.scene_id) * prod(shape) * np.dtype(kind).itemsize
             found[key] = slice(begin, begin + size)
@@ -65,7 +66,8 @@ class Index:
 
     def arrays(self, content: np.ndarray) -> dict[str, np.ndarray]:
         """Returns each key's array [S, ...] in the bytes of a file."""
-        layout, count = self.layout, len(self.scene_id)
+        layout = self.layout
+        count = len(self.scene_id)
         places = self.places()[0]
         return {key: content[places[key]].view(kind).reshape(count, *shape) for key, (kind, shape) in layout.items()}
 

@@ -100,7 +100,8 @@ def listed_scenes(
             return _taken(scenes, listed, hashes)
     scenes = load(None)
     hashes = scene_hashes(scenes)
-    known, count = set(scenes.scene_id), f"of {len(listed)} scenes are not"
+    known = set(scenes.scene_id)
+    count = f"of {len(listed)} scenes are not"
     if missing := [line.scene_id for line in listed if line.scene_id not in known]:
         mend = f"whose first is {scenes.scene_id[0]}; pass the data that the list is of (data=, data.path=)"
         raise InputError(f"scenes={path}: {len(missing)} {count} in the data ({_some(missing)}), {mend}")

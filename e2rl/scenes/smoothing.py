@@ -48,12 +48,14 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     if len(ts) < 2:
         raise InputError(FEW_FRAMES)
     step = np.diff(ts)
-    median, in_order = float(np.median(step)), bool((step > 0).all())
+    median = float(np.median(step))
+    in_order = bool((step > 0).all())
     if not (in_order and FRAME_STEPS[0] <= median <= FRAME_STEPS[1] and step.max() < LONGEST_PAUSE):
         raise InputError(f"time stamps do not increase in seconds (median step {median:g}); repair metadata.ts")
     ts = ts - ts[0]
     grid = np.arange(int((ts[-1] + NEAR) / DT) + 1) * DT
-    latest, earliest = _valid_until(valid), _valid_from(valid)
+    latest = _valid_until(valid)
+    earliest = _valid_from(valid)
     before = latest[np.searchsorted(ts, grid + ON_GRID, side="right")]
     after = earliest[np.searchsorted(ts, grid - ON_GRID)]
     between = _bridged(before, after, valid, ts)
@@ -105,7 +107,8 @@ def _merge_equal_stamps(
     repeated = np.flatnonzero(np.diff(ts) == 0)
     if not len(repeated):
         return states, valid, ts
-    states, valid = states.copy(), valid.copy()
+    states = states.copy()
+    valid = valid.copy()
     for frame in repeated:
         kept = valid[frame] & ~valid[frame + 1]
         states[frame + 1, kept], valid[frame + 1, kept] = states[frame, kept], True
@@ -132,7 +135,8 @@ def _bridged(before: np.ndarray, after: np.ndarray, valid: np.ndarray, ts: np.nd
     FRAME_STEPS[1].
     """
     exists = (before >= 0) & (after < len(ts))
-    before, after = np.where(exists, before, 0), np.where(exists, after, 0)
+    before = np.where(exists, before, 0)
+    after = np.where(exists, after, 0)
     gap = ts[after] - ts[before]
     step = np.diff(ts)
     own = np.full(valid.shape[1], np.median(step))
@@ -152,7 +156,8 @@ def _interpolate(
     Headings turn the short way; a heading that flips is the nearer frame's.
     """
     agent = np.arange(states.shape[1])
-    first, last = states[before, agent], states[after, agent]
+    first = states[before, agent]
+    last = states[after, agent]
     span = ts[after] - ts[before]
     weight = np.where(span > 0, (grid[:, None] - ts[before]) / np.where(span > 0, span, 1.0), 0.0)
     out = first + weight[..., None] * (last - first)
@@ -185,7 +190,8 @@ def speeds(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     after, where these are recorded; 0 for a track of one frame."""
     velocity = np.diff(states[..., :2], axis=0) / DT
     known = (valid[1:] & valid[:-1])[..., None]
-    total, count = np.zeros((*valid.shape, 2)), np.zeros((*valid.shape, 1))
+    total = np.zeros((*valid.shape, 2))
+    count = np.zeros((*valid.shape, 1))
     for side in (slice(None, -1), slice(1, None)):
         total[side] += velocity * known
         count[side] += known
@@ -231,7 +237,8 @@ def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     Savitzky-Golay per contiguous run of frames; a run shorter than WINDOW takes the longest odd window that it can. At
     both ends of a run the polynomials of its first and its last window go on.
     """
-    out, velocity = states.copy(), np.full_like(states[..., :2], np.nan)
+    out = states.copy()
+    velocity = np.full_like(states[..., :2], np.nan)
     edge = np.diff(np.pad(valid.T, ((0, 0), (1, 1))).astype(np.int8))
     (agent, start), end = np.nonzero(edge == 1), np.nonzero(edge == -1)[1]
     windows = np.minimum(WINDOW, (end - start - 1) // 2 * 2 + 1)
@@ -278,7 +285,8 @@ def _mean_velocity(position: np.ndarray, valid: np.ndarray, back: int, ahead: in
     total = np.cumsum(np.concatenate([np.zeros_like(position[:1]), step]), axis=0)
     count = np.cumsum(np.concatenate([np.zeros((1, valid.shape[1], 1)), known]), axis=0)
     frame = np.arange(len(valid))
-    first, last = np.maximum(frame - back, 0), np.minimum(frame + ahead, len(valid) - 1)
+    first = np.maximum(frame - back, 0)
+    last = np.minimum(frame + ahead, len(valid) - 1)
     return (total[last] - total[first]) / np.maximum((count[last] - count[first]) * DT, DT)
 
 
@@ -307,7 +315,8 @@ def _fit_runs(
 def polynomial_weights(window: int, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Of the polynomial that fits `window` samples at DT best, the value (order 0) or slope (order 1): at the middle
     sample, for a convolution [window], and at all samples [window, window]: row k times the samples is that at k."""
-    time, power = np.arange(window)[:, None] - window // 2, np.arange(ORDER + 1)
+    time = np.arange(window)[:, None] - window // 2
+    power = np.arange(ORDER + 1)
     basis = power * time ** np.maximum(power - 1, 0) / DT if order else time**power
     return savgol_coeffs(window, ORDER, order, DT), basis @ np.linalg.pinv(time**power)
 
@@ -334,7 +343,8 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     accel = np.clip(2 * (position[:, 2] * unit).sum(-1), -6.0, 4.0)
     single = count < 2
     speed = np.where(single, _signed(states[frame, :, 3], single), speed)
-    accel, yaw_rate = np.where(single | (np.abs(speed) < 0.1), 0.0, accel), np.where(single, 0.0, turn[:, 1, 0])
+    accel = np.where(single | (np.abs(speed) < 0.1), 0.0, accel)
+    yaw_rate = np.where(single, 0.0, turn[:, 1, 0])
     fitted = states[frame, :, :2] + position[:, 0]
     return np.concatenate([fitted, angle[:, None], speed[:, None]], 1), accel, np.clip(yaw_rate, -1.0, 1.0)
 
@@ -350,7 +360,8 @@ def causal_past(states: np.ndarray, valid: np.ndarray, frame: int, speed: np.nda
     known = np.logical_and.accumulate(valid[frames] & (frame >= back)[:, None] & valid[frame], axis=0)
     dx, dy = np.moveaxis(states[frames, :, :2] - states[frame, :, :2], -1, 0)
     angle = states[frame, :, 2]
-    cos, sin = np.cos(angle), np.sin(angle)
+    cos = np.cos(angle)
+    sin = np.sin(angle)
     pose = np.stack([dx * cos + dy * sin, dy * cos - dx * sin, wrap(states[frames, :, 2] - angle)], -1)
     first = np.concatenate([np.zeros_like(pose[:1]), pose])[known.sum(0), np.arange(len(angle))]  # the earliest known
     since = np.maximum(back[:, None] - known.sum(0), 0) * DT

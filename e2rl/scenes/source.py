@@ -196,7 +196,8 @@ class Source(Extension, ABC):
 
     def _read(self, log: str) -> Iterator[Recording]:
         """Yields `read`; raises InputError where that is anything else than recordings."""
-        recordings, mend = self.read(log), "yield e2rl.scenes.recording.Recording objects"
+        recordings = self.read(log)
+        mend = "yield e2rl.scenes.recording.Recording objects"
         name = f"{type(self).__name__}.read"
         if not isinstance(recordings, Iterable):
             raise InputError(f"{name} returns {type(recordings).__name__}; {mend}")

@@ -66,7 +66,8 @@ def _pairs(recording: Recording) -> list[tuple[int, int]]:
         play = np.quantile(np.abs(distances - middle), 0.9)
         if middle < min(REACH, HEADWAY * speed[frames, tractor].max()) and play < PLAY:
             found.append((middle, tractor, trailer))
-    pairs, taken = [], set[int]()
+    pairs = []
+    taken = set[int]()
     for _, tractor, trailer in sorted(found):
         if not taken & {tractor, trailer}:
             pairs.append((tractor, trailer))
@@ -84,7 +85,8 @@ def _near_pairs(front: np.ndarray, rear: np.ndarray, moving: np.ndarray, valid: 
     pairs = set()
     driving = moving.any(0)
     for frame in np.flatnonzero(moving.any(1)):
-        tractors, trailers = np.flatnonzero(moving[frame]), np.flatnonzero(valid[frame] & driving)
+        tractors = np.flatnonzero(moving[frame])
+        trailers = np.flatnonzero(valid[frame] & driving)
         near = cKDTree(front[frame, trailers]).query_ball_point(rear[frame, tractors], REACH)
         pairs |= {
             (int(tractor), int(trailers[index]))
@@ -138,7 +140,9 @@ def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
     other passes from that before to that after, and beyond these to 0 within STRAIGHTENS frames.
     """
     pair = [tractor, trailer]
-    states, valid, size = recording.states.copy(), recording.valid.copy(), recording.size.astype(float)
+    states = recording.states.copy()
+    valid = recording.valid.copy()
+    size = recording.size.astype(float)
     there = valid[:, pair]
     front, rear = _ends(states[:, pair], size[pair, 0])
     both = np.asarray(there.all(1))

@@ -68,7 +68,8 @@ def unlit(recording: Recording) -> Recording:
 
 def unparked(recording: Recording) -> Recording:
     """Without vehicles that never move and stand beside the lanes."""
-    xy, valid = recording.states[..., :2], recording.valid
+    xy = recording.states[..., :2]
+    valid = recording.valid
     low, high = (least(np.where(valid[..., None], xy, far), 0) for least, far in ((np.min, np.inf), (np.max, -np.inf)))
     stands = np.linalg.norm(high - low, axis=-1) <= MOVES
     lines = [resample(lane.points, 1.0) for lane in recording.lanes.values() if len(lane.points) > 1]

@@ -62,9 +62,11 @@ class Portfolio:
         after another, the best first."""
         if not self.learns:
             return torch.rand(self.tried.shape, generator=generator, dtype=torch.float64)
-        chance, cost = torch._standard_gamma(self.found, generator=generator) / self.exposed, self.spent / self.driven
+        chance = torch._standard_gamma(self.found, generator=generator) / self.exposed
+        cost = self.spent / self.driven
         worth = self.share() * chance * cost.amax() / cost
-        count, rank = self.tried.sum(1, keepdim=True), worth.argsort(dim=1, descending=True).argsort(dim=1)
+        count = self.tried.sum(1, keepdim=True)
+        rank = worth.argsort(dim=1, descending=True).argsort(dim=1)
         return worth * (1 + count / SCENE_TRIES) / (1 + (count + rank) / SCENE_TRIES)
 
 

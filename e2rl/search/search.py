@@ -76,7 +76,8 @@ class Search(Extension):
         """The next tries, to be told in this order: one of every scene until it has `cover` of them, then of those
         families in those scenes that are worth the most: as many as there are scenes, or `growth` of the tries so far,
         but no more than a quarter of what could be chosen; ROUND at least. None of scenes that are not `active`."""
-        worth, active = self._portfolio.worth(self._generator), self.active()
+        worth = self._portfolio.worth(self._generator)
+        active = self.active()
         if not active:
             return []
         found = self.settings.bandit & torch.tensor([self._found(scene) for scene in active])

@@ -62,7 +62,8 @@ def step(state: Tensor, action: Tensor) -> Tensor:
     bound = yaw_rate_bound(mean.abs())
     turn = torch.clamp(yaw_rate, -bound, bound) * DT
     heading = heading + turn
-    along, middle = mean * DT, heading - turn / 2
+    along = mean * DT
+    middle = heading - turn / 2
     return torch.stack([x + along * middle.cos(), y + along * middle.sin(), wrap(heading), speed], -1)
 
 
@@ -73,7 +74,8 @@ def rollout(start: Tensor, actions: Tensor) -> Tensor:
     composition: a parallel scan of log2 H levels. Headings and positions are cumulative sums. Who reverses brakes by
     HALTING at least, to a halt: until then its speed is a sum, too, and the bound itself.
     """
-    v0, change = start[..., 3:4], actions[..., 0] * DT
+    v0 = start[..., 3:4]
+    change = actions[..., 0] * DT
     halting = change.clamp(min=HALTING * DT)
     back = v0 + halting.cumsum(-1)
     speed = bounded_speed(v0, torch.where(back < 0, halting, change), back.clamp(max=0))
@@ -113,9 +115,12 @@ def bounded_speed(v0: Tensor, change: Tensor, low: Tensor | float = 0.0, high: f
     change = change.expand(*shape, change.shape[-1])
     lo = low.expand_as(change) if isinstance(low, Tensor) else torch.full_like(change, low)
     hi = torch.full_like(change, high)
-    horizon, width = change.shape[-1], 1
+    horizon = change.shape[-1]
+    width = 1
     while width < horizon:
-        c, low_then, high_then = change[..., width:], lo[..., width:], hi[..., width:]
+        c = change[..., width:]
+        low_then = lo[..., width:]
+        high_then = hi[..., width:]
         moved = [torch.minimum(torch.maximum(bound[..., :-width] + c, low_then), high_then) for bound in (lo, hi)]
         lo, hi = (torch.cat([bound[..., :width], then], -1) for bound, then in zip((lo, hi), moved, strict=True))
         change = torch.cat([change[..., :width], change[..., :-width] + c], -1)
@@ -175,16 +180,23 @@ def arc_places(
     metres driven."""
     accel, curvature = arc
     sign = torch.where(v < 0, -1.0, 1.0)
-    v, accel = v * sign, accel * sign
+    v = v * sign
+    accel = accel * sign
     halt = torch.where(accel < 0, v / (-accel).clamp(min=1e-6), torch.inf)
     held = torch.minimum(times.clamp(max=hold), halt)
     speed = (v + accel * held).clamp(min=0)
     driven = (v + speed) / 2 * held + speed * (times - held)
     bent = driven if turn == torch.inf else torch.minimum(driven, turn * v.clamp(min=SLOW))
-    driven, bent, speed = driven * sign, bent * sign, speed * sign
+    driven = driven * sign
+    bent = bent * sign
+    speed = speed * sign
     angle = curvature * bent
-    chord, middle, end = bent * torch.sinc(angle / (2 * torch.pi)), heading + angle / 2, heading + angle
-    x, y = x + chord * middle.cos(), y + chord * middle.sin()
+    chord = bent * torch.sinc(angle / (2 * torch.pi))
+    middle = heading + angle / 2
+    end = heading + angle
+    x = x + chord * middle.cos()
+    y = y + chord * middle.sin()
     if turn < torch.inf:
-        x, y = x + (driven - bent) * end.cos(), y + (driven - bent) * end.sin()
+        x = x + (driven - bent) * end.cos()
+        y = y + (driven - bent) * end.sin()
     return x, y, wrap(end), speed, driven

@@ -21,7 +21,8 @@ from e2rl.sim.world import AGENT_KEYS, START_KEYS, Agents, Trajectories, World, 
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
 OF_SCENE = (*START_KEYS, "size", "agent_type", "field_origin", "light_state")
-FLAGS, METRICS = ("terminated", "truncated"), (*CONTACTS, "off_road", "progress")
+FLAGS = ("terminated", "truncated")
+METRICS = (*CONTACTS, "off_road", "progress")
 
 
 def touches(metrics: TensorDictBase) -> Tensor:
@@ -78,8 +79,12 @@ class DrivingEnv(EnvBase):
         if hold < 1:
             raise InputError(f"DrivingEnv: hold={hold}; an action lasts at least one step")
         super().__init__(device=device, batch_size=[batch_size])
-        self.scenes, self.settings, self.agents, self.hold = scenes, settings, agents, hold
-        self._look, width = observed, OBSERVATION_SIZE if observed else 0
+        self.scenes = scenes
+        self.settings = settings
+        self.agents = agents
+        self.hold = hold
+        self._look = observed
+        width = OBSERVATION_SIZE if observed else 0
         self._generator = torch.Generator()
         self.generators = {self._generator}
         """All that episodes are drawn with: `set_seed` seeds them alike. A transform adds its own."""
@@ -94,16 +99,19 @@ class DrivingEnv(EnvBase):
         self.clock = 0
         """Steps simulated so far, resets or not."""
         self._trajectories = Trajectories(self.scene)
-        mission, start = mission_of(self.scene), self.scene["start"][:, 0]
+        mission = mission_of(self.scene)
+        start = self.scene["start"][:, 0]
         self._static = static_scene(self.scene, mission)
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
-        action, place = torch.zeros_like(start[:, :2]), start_place(mission, start)
+        action = torch.zeros_like(start[:, :2])
+        place = start_place(mission, start)
         self._ego = placed_ego(mission, flags.long(), start, action, flags, flags, place, self._static.vehicle)
         self._features = torch.zeros(batch_size, width, device=device)  # as last observed
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
     def _make_specs(self, batch: int, agents: int) -> None:
-        low, high = self._config.low, self._config.high
+        low = self._config.low
+        high = self._config.high
         self.action_spec = Bounded(low.repeat(batch, 1), high.repeat(batch, 1), device=self.device)
 
         def flag(size: int = 1) -> Binary:
@@ -122,7 +130,10 @@ class DrivingEnv(EnvBase):
             "metrics": group(**dict.fromkeys(METRICS[:-1], flag()), progress=number()),
         }
         if self.agents:
-            states, valid, accel, turn = number(agents, 4), flag(agents), number(agents), number(agents)
+            states = number(agents, 4)
+            valid = flag(agents)
+            accel = number(agents)
+            turn = number(agents)
             specs["agents"] = group(states=states, valid=valid, accel=accel, turn_rate=turn)
         self.observation_spec = group(**specs)
         self.reward_spec = number()
@@ -155,7 +166,8 @@ class DrivingEnv(EnvBase):
 
     def world(self) -> World:
         """The current World. Its `scene` is the environment's own storage, which the next reset overwrites."""
-        ego, begins = self._ego, (self._ego.step == 0)[:, None]
+        ego = self._ego
+        begins = (self._ego.step == 0)[:, None]
         own = ego.state, ego.present, ego.action[:, 0], ego.action[:, 1]
         start = (self.scene[key] for key in START_KEYS)
         driven = trajectories_at(self._trajectories.states, self._trajectories.valid, ego.step)
@@ -225,7 +237,8 @@ class DrivingEnv(EnvBase):
 
     def _output(self, outcome: Outcome) -> TensorDict:
         """The step's output TensorDict without the reward."""
-        shape, device = self.batch_size, self.device
+        shape = self.batch_size
+        device = self.device
         flags = {name: outcome[name][:, None] for name in FLAGS}
         result = {
             "observation": outcome["observation"],

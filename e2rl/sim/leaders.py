@@ -71,15 +71,18 @@ def ahead_of(
     """Of pairs [Q] of a vehicle and an agent at a moment, by the nearest vertex of the vehicle's route: the gap m, the
     agent's speed along the route m/s, and 1 where it is a leader (see `leaders`), else 0."""
     own = scene, vehicle
-    agent, box = agents[scene, other, moment], size[scene, other]
+    agent = agents[scene, other, moment]
+    box = size[scene, other]
     at, offset, heading = onto_segments(agent[:, :2], vertex, points.shape[2] - 2, lambda index: points[*own, index])
     turn = agent[:, 2] - heading
-    cos, sin = torch.cos(turn), torch.sin(turn)
+    cos = torch.cos(turn)
+    sin = torch.sin(turn)
     length, width = size[scene, vehicle].unbind(-1)
     side = width / 2 + (box[:, 0] * sin.abs() + box[:, 1] * cos.abs()) / 2 + GATE_MARGIN
     ahead = at - s[own]
     gap = ahead - length / 2 - (box[:, 0] * cos.abs() + box[:, 1] * sin.abs()) / 2
-    low, high = d[own].clamp(max=0), d[own].clamp(min=0)
+    low = d[own].clamp(max=0)
+    high = d[own].clamp(min=0)
     offset = offset - torch.minimum(torch.maximum(offset, low), high)
     return gap, agent[:, 3] * cos, torch.where((offset.abs() < side) & (ahead > 0), 1.0, 0.0)
 
@@ -96,11 +99,13 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     to_come = (ends >= s[..., None] - SPACING).to(s.dtype)
     itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)
     counts = present[:, :vehicles, None] & present[:, None] & ~itself
-    far, flat = (room + SPACING / 2).repeat_interleave(moments, -1), xy.flatten(1, 2)
+    far = (room + SPACING / 2).repeat_interleave(moments, -1)
+    flat = xy.flatten(1, 2)
     ends_at = points[:, :, -2], points[:, :, -1]
     some = near_some(low, high, *ends_at, to_come, flat, far) > 0
     b, v, m = (counts.repeat_interleave(moments, -1) & some).nonzero(as_tuple=True)
-    there, within = flat[b, m], far[b, v, m]
+    there = flat[b, m]
+    within = far[b, v, m]
     near = _near(low[b, v], high[b, v], there[:, None], within[:, None]) & (to_come[b, v] > 0)
     near[:, -1] |= _beyond(ends_at[0][b, v], ends_at[1][b, v], there, within)
     pair, stretch = near.nonzero(as_tuple=True)
@@ -184,7 +189,9 @@ def idm_acceleration(
     a (1 - (v / v0)^n). `improved`: above the desired speed v0 it is -b (1 - (v0 / v)^(a n / b)), which brakes by b at
     most (Treiber and Kesting, Traffic Flow Dynamics, 2013, eq. 11.23).
     """
-    a, b, n = driver.acceleration, driver.braking, driver.exponent
+    a = driver.acceleration
+    b = driver.braking
+    n = driver.exponent
     interaction = (desired_gap(speed, leader_speed, driver) / gap.clamp(min=0.1)) ** 2
     if not improved:
         return a * (1 - (speed / desired_speed).clamp(min=0) ** n - interaction)

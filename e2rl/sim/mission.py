@@ -40,7 +40,8 @@ def stop_line_distance(
     light at less than yellow_braking. A vehicle that cannot halt in time continues.
     """
     needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))
-    red, yellow = (state == LIGHT_RED) & (needed < red_braking), (state == LIGHT_YELLOW) & (needed < yellow_braking)
+    red = (state == LIGHT_RED) & (needed < red_braking)
+    yellow = (state == LIGHT_YELLOW) & (needed < yellow_braking)
     return ahead.masked_fill(~((ahead > 0) & (red | yellow)), torch.inf).amin(-1)
 
 

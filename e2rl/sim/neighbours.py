@@ -28,7 +28,8 @@ class Neighbours(NamedTuple):
 
 def rotation_into(ego: Tensor) -> Tensor:
     """Rotation [B, 2, 2] that turns world vectors into the frame of the ego states [B, 4]."""
-    cos, sin = ego[:, 2].cos(), ego[:, 2].sin()
+    cos = ego[:, 2].cos()
+    sin = ego[:, 2].sin()
     return torch.stack([cos, sin, -sin, cos], -1).view(-1, 2, 2)
 
 
@@ -92,12 +93,14 @@ def passed(
     if not torch.compiler.is_compiling() and not asked.is_cuda and not bool(asked.any()):
         return near
     if torch.compiler.is_compiling():
-        scene, agent = row.expand_as(asked), torch.arange(asked.shape[1], device=row.device).expand_as(asked)
+        scene = row.expand_as(asked)
+        agent = torch.arange(asked.shape[1], device=row.device).expand_as(asked)
     else:
         scene, agent = asked.nonzero(as_tuple=True)
     then = step[scene]
     moved = states[scene, agent, :2] - tracks[0][scene, then, agent + 1, :2] - (ego[1] - ego[0])[scene, :2]
-    cos, sin = ego[1][:, 2].cos()[scene], ego[1][:, 2].sin()[scene]
+    cos = ego[1][:, 2].cos()[scene]
+    sin = ego[1][:, 2].sin()[scene]
     x, y = moved.unbind(-1)
     change = torch.stack([cos * x + sin * y, cos * y - sin * x])
     position, direction, half = (

@@ -118,7 +118,8 @@ def observation_config(device: torch.device) -> ObservationConfig:
 
 def observe(static: StaticScene, ego: EgoState, agents: Agents, time: Tensor) -> Observed:
     """The observation of egos at a time [B], the elapsed fraction of the episode."""
-    config, rotation = observation_config(ego.state.device), rotation_into(ego.state)
+    config = observation_config(ego.state.device)
+    rotation = rotation_into(ego.state)
     neighbours = neighbours_of(ego.state, rotation, static.size, static.half_size, agents)
     if torch.compiler.is_compiling():
         ahead, left = config.probes.unbind(1)
@@ -159,7 +160,10 @@ def glance(static: StaticScene, ego: EgoState, agents: Agents, time: Tensor) -> 
 def ego_features(static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor) -> Tensor:
     """[B, 11]: speed, last action (2), offset and heading to the mission (3), speed limit, distance to the map's
     end, size (2), elapsed fraction of the episode."""
-    state, action, pose, size = ego.state, ego.action, ego.pose, static.size
+    state = ego.state
+    action = ego.action
+    pose = ego.pose
+    size = static.size
     turned = state[:, 2] - pose.heading
     left = ((static.mission.end - pose.s) / 100).clamp(0, 1)
     limit = read_as(limit, state[:, 3])
@@ -180,14 +184,16 @@ def route_features(
     limit at the ego [B]."""
     x, y, heading, curvature, limit = look_along(static, ego.pose.s[:, None] + config.ahead)
     x, y = seen_from(ego.state, rotation, x, y)
-    turned, seen = (heading - ego.state[:, 2:3]).sin(), read_as(limit, ego.state[:, 3:])
+    turned = (heading - ego.state[:, 2:3]).sin()
+    seen = read_as(limit, ego.state[:, 3:])
     features = torch.stack([x / FAR, y / NEAR, turned, (10 * curvature).clamp(-2, 2), seen / SPEED], -1)
     return features[:, :-1].clamp(-5, 5).flatten(1), limit[:, -1]
 
 
 def light_features(config: ObservationConfig, static: StaticScene, step: Tensor, s: Tensor) -> Tensor:
     """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and nearness (1 at the line, 0 far)."""
-    light, ahead = static.mission.light, static.mission.light_s - s[:, None]
+    light = static.mission.light
+    ahead = static.mission.light_s - s[:, None]
     seen = (light >= 0) & (ahead > -2)
     state = static.lights[static.row[:, 0], step.clamp(0, static.lights.shape[1] - 1)]
     colours = state[..., None] == config.colours
@@ -221,7 +227,8 @@ def agent_features(config: ObservationConfig, ego: EgoState, near: Tensor) -> Te
     time = (-(local * velocity).sum(1, True) / (velocity.square().sum(1, True) + 1e-3)).clamp(0, 8)
     miss = (local + velocity * time).norm(dim=1, keepdim=True)
     scaled = torch.cat([local, direction, velocity, speed, accel, half, vehicle], 1) / config.agent
-    decay, turning = torch.cat([-time / 2, -miss / 5], 1).exp(), (turn_rate / TURNING).clamp(-5, 5)
+    decay = torch.cat([-time / 2, -miss / 5], 1).exp()
+    turning = (turn_rate / TURNING).clamp(-5, 5)
     features = torch.cat([present, scaled.clamp(-5, 5), (gap / NEAR).clamp(-1, 2), decay, turning], 1) * present
     features = features.transpose(1, 2).flatten(1)
     return torch.nn.functional.pad(features, (0, PER_AGENT * (NEAREST - near.shape[2])))

@@ -20,7 +20,8 @@ def time_inside(offset: Tensor, change: Tensor, direction: Tensor, own: Tensor, 
         Begin and end [...], in [0, 1].
     """
     cos, sin = direction
-    along, across = cos.abs(), sin.abs()
+    along = cos.abs()
+    across = sin.abs()
     turned_offset = offset[0] * cos + offset[1] * sin, offset[1] * cos - offset[0] * sin
     turned_change = change[0] * cos + change[1] * sin, change[1] * cos - change[0] * sin
     axes = (
@@ -29,7 +30,8 @@ def time_inside(offset: Tensor, change: Tensor, direction: Tensor, own: Tensor, 
         (turned_offset[0], turned_change[0], other[0] + along * own[0] + across * own[1]),
         (turned_offset[1], turned_change[1], other[1] + across * own[0] + along * own[1]),
     )
-    begin, end = torch.zeros_like(cos), torch.ones_like(cos)
+    begin = torch.zeros_like(cos)
+    end = torch.ones_like(cos)
     for place, motion, reach in axes:
         pace = motion.abs().clamp(min=PARALLEL)
         middle = -place * torch.where(motion < 0, -1.0, 1.0) / pace

@@ -80,10 +80,12 @@ def manoeuvres(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: T
 
 def later(others: Others, time: Tensor) -> Tensor:
     """x, y, cosine and sine of the direction [4, B, T, K] of others at times [T] s, if they go on along their arcs."""
-    arc, speed = Arc(*(value[:, None] for value in others.arc)), others.speed[:, None]
+    arc = Arc(*(value[:, None] for value in others.arc))
+    speed = others.speed[:, None]
     none = torch.zeros_like(speed)
     ahead, across, heading, *_ = arc_places(none, none, none, speed, arc, time[:, None], HOLD, TURN)
-    cos, sin = heading.cos(), heading.sin()
+    cos = heading.cos()
+    sin = heading.sin()
     (x, y), (ux, uy) = (value[:, :, None].unbind(1) for value in (others.position, others.direction))
     place = x + (ux * ahead - uy * across), y + (uy * ahead + ux * across)
     return torch.stack([*place, ux * cos - uy * sin, uy * cos + ux * sin])
@@ -101,7 +103,8 @@ def gaps(ego: Tensor, size: Tensor, others: Others) -> Tensor:
     shift = (length - width).clamp(min=0)[:, None] * plan.ends  # [B, 3, K]
     own = (size / 2)[:, :, None, None]
     unit = (own[:, 0] - own[:, 1]).clamp(min=SHORTEST)  # half of the capsule's axis: lengths are in this unit below
-    cos, sin = cos / unit, sin / unit
+    cos = cos / unit
+    sin = sin / unit
     centre = place + direction * shift[:, None]  # [2, B, T, 3, K]
     axes = (torch.stack([*axis, -(axis[0] * x + axis[1] * y)], 2) for axis in ((cos, sin), (-sin, cos)))
     ahead, across = (_along(centre, axis) for axis in axes)  # [B, T, 3, K, C]
@@ -127,7 +130,8 @@ def _along(points: Tensor, axes: Tensor) -> Tensor:
 
 def prospects(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Tensor, others: Others) -> Tensor:
     """[B, PROSPECTS] of every manoeuvre: its least gap, then the time of its first gap below TIGHT, in [-1/3, 1]."""
-    gap, end = gaps(manoeuvres(static, state, pose, rotation), static.size, others), TIMES[-1] + TIMES[0]
+    gap = gaps(manoeuvres(static, state, pose, rotation), static.size, others)
+    end = TIMES[-1] + TIMES[0]
     first = torch.where(gap < TIGHT, manoeuvres_on(gap.device).time[:, None], end).amin(1) / end
     return torch.cat([gap.amin(1).clamp(-1, WIDEST) / WIDEST, first], -1)
 

@@ -185,7 +185,9 @@ def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | Non
     sizes: dict[str, int] = {}
     given = [each for each in known if each.name in data]
     for each in given:
-        value, kinds, shape = data[each.name], each.metadata["kinds"], each.metadata["shape"]
+        value = data[each.name]
+        kinds = each.metadata["kinds"]
+        shape = each.metadata["shape"]
         if not shape and (value.shape != () or value.dtype.kind not in kinds):
             return f"{each.name} is no single {'text' if kinds == 'U' else 'number'}"
         if not shape and kinds == "U" and UNPRINTABLE.search(value.item()):
@@ -201,7 +203,8 @@ def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | Non
     if len(data.keys() & {"planners", "plans", "targets"}) not in (0, 3):
         return "of planners, plans, targets some are missing"
     for each in given:
-        low, high = each.metadata["low"], each.metadata["high"]
+        low = each.metadata["low"]
+        high = each.metadata["high"]
         if low is not None:
             most = high + sizes["N"] if high < 0 else high
             if not ((data[each.name] >= low) & (data[each.name] <= most)).all():  # NaN is not, either

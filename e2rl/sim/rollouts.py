@@ -85,7 +85,8 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
             known: further fields, among them adversaries, seed and eta.
         """
         scene = scenes.batch(index) if scene is None else scene
-        start, kind = scene["valid"], scene["agent_type"]
+        start = scene["valid"]
+        kind = scene["agent_type"]
         slots = torch.arange(start.shape[1], device=start.device) < scene["route_log"].shape[1]
         simulated = start & slots & (kind == VEHICLE)
         simulated[:, 0] &= not replays_ego

@@ -83,7 +83,8 @@ def segment_table(points: Tensor, limit: Tensor) -> Tensor:
     first vertex, turn of the tangent to the next vertex (as `scene.route.interpolate` takes them), limits at both
     ends (2).
     """
-    a, b = points[:, :-1], points[:, 1:]
+    a = points[:, :-1]
+    b = points[:, 1:]
     along, length, unit = segment(a, b)
     heading = torch.atan2(unit[..., 1], unit[..., 0])
     tangent, turn = tangents(points)
@@ -101,7 +102,8 @@ def follow(static: StaticScene, xy: Tensor, hint: Tensor) -> FrenetPose:
     """Frenet pose of positions xy [B, 2] on the mission near arc length hint [B]; equals `scene.route.project`."""
     points = static.mission.points
     count = points.shape[1]
-    width, last = int(2 * WINDOW / SPACING) + 1, count - 2
+    width = int(2 * WINDOW / SPACING) + 1
+    last = count - 2
     near = hint.clamp(0, SPACING * (count - 1))  # beyond an end of the route, the end is nearest
     first = ((near - WINDOW) / SPACING).ceil().clamp(max=count - width).clamp(min=0).long()
     index = (first[:, None] + torch.arange(width, device=first.device)).clamp(max=count - 1)
@@ -132,7 +134,8 @@ def look_along(static: StaticScene, s: Tensor) -> tuple[Tensor, Tensor, Tensor, 
 
 def seen_from(ego: Tensor, rotation: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Places x, y [B, K] in the frame of ego states [B, 4], in which `rotation` [B, 2, 2] turns vectors."""
-    x, y = x - ego[:, :1], y - ego[:, 1:2]
+    x = x - ego[:, :1]
+    y = y - ego[:, 1:2]
     if torch.compiler.is_compiling():
         cos, sin = rotation[:, 0].split(1, 1)
         return cos * x + sin * y, cos * y - sin * x

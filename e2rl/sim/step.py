@@ -128,9 +128,11 @@ def _step(
 ) -> tuple[EgoState, Outcome]:
     horizon = tracks[0].shape[1] - 1
     if isinstance(given, Tensor):
-        state, present = dynamics.step(ego.state, torch.clamp(given, config.low, config.high)), ego.present
+        state = dynamics.step(ego.state, torch.clamp(given, config.low, config.high))
+        present = ego.present
     else:
-        state, present = torch.where(given[1][:, None], given[0], ego.state), ego.present & given[1]
+        state = torch.where(given[1][:, None], given[0], ego.state)
+        present = ego.present & given[1]
     action = dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0]
     pose = follow(static, state[:, :2], ego.pose.s + ego.state[:, 3] * DT)
     moved = EgoState(now, state, action, pose, present, ego.been_on_road, ego.start_s, ego.inside)

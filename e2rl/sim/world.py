@@ -63,7 +63,8 @@ class World:
         scene: `without_future` of this World's scene, where it is made already.
         """
         scene = (without_future(self.scene) if scene is None else scene).copy()
-        lights, there = self.scene["light_state"], self.valid
+        lights = self.scene["light_state"]
+        there = self.valid
         last = torch.arange(lights.shape[1], device=there.device).minimum(self.step[:, None])
         scene["light_state"] = lights.gather(1, last[..., None].expand_as(lights))
         scene["size"] = torch.where(there[..., None], self.scene["size"], 1.0)
@@ -112,7 +113,8 @@ class Trajectories:
     """
 
     def __init__(self, scene: TensorDictBase) -> None:
-        self.states, self.valid = scene["logged"].clone(), scene["logged_valid"].clone()
+        self.states = scene["logged"].clone()
+        self.valid = scene["logged_valid"].clone()
         self.vehicles = scene["route_log"].shape[1]
         self._scheduled: list[tuple[Tensor, Tensor, Tensor]] = []
 
@@ -134,7 +136,8 @@ class Trajectories:
         else:
             self.states.index_copy_(0, index, scene["logged"].index_select(0, index))
             self.valid.index_copy_(0, index, scene["logged_valid"].index_select(0, index))
-        waiting, self._scheduled = self._scheduled, []
+        waiting = self._scheduled
+        self._scheduled = []
         for rows, states, valid in waiting:
             now = torch.isin(rows, index)
             self.states[rows[now], :, : self.vehicles] = states[now][:, :, : self.vehicles].to(self.states.dtype)
@@ -146,7 +149,8 @@ class Trajectories:
         """See `DrivingEnv.write_traffic`; from step [b] + 1 on."""
         at = step[:, None] + torch.arange(1, states.shape[2] + 1, device=step.device)
         inside = at < self.states.shape[1]
-        row, at = rows[:, None].expand_as(at)[inside], at[inside]
+        row = rows[:, None].expand_as(at)[inside]
+        at = at[inside]
         self.states[row, at, : self.vehicles] = states.transpose(1, 2)[inside].to(self.states.dtype)
         self.valid[row, at, : self.vehicles] = valid.transpose(1, 2)[inside]
 

@@ -50,7 +50,8 @@ def attempt(
         rows = {row: why for row, why in named.items() if 0 <= row < len(tasks)}
         if len(tasks) > 1 and not rows:
             half = len(tasks) // 2
-            first, second = attempt(roll_out, tasks[:half]), attempt(roll_out, tasks[half:])
+            first = attempt(roll_out, tasks[:half])
+            second = attempt(roll_out, tasks[half:])
             return first[0] + second[0], first[1] + second[1]
         reason = NOT_FINITE if isinstance(error, TrafficNotFinite) else f"raised {type(error).__name__}"
         why = {"reason": reason, "detail": str(error), "traceback": traceback.format_exc(), "raised_by": raiser(error)}

@@ -35,7 +35,8 @@ def prepare_fused(config: DictConfig) -> None:
         raise InputError(f"compile={asked}: choose one of auto, true, false")
     names = {module.__name__ for module in MODULES}
     found = [each for each in FUSED.values() if each.function.__module__ in names]
-    sampler, network = SamplerSettings(), DenoiserSettings()
+    sampler = SamplerSettings()
+    network = DenoiserSettings()
     found += fused_encoding(network), fused_estimate(network)
     found += fused_step(sampler, SIZE), fused_controlled_step(sampler, SIZE, False)
     missing = [each for each in found if not each.file.exists()]

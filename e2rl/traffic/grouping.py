@@ -101,9 +101,12 @@ def group_scenes(world: World) -> list[Group]:
     if used.shape[1] > width:
         others = (used[:, width:] * position[: used.shape[1] - width]).amax(1)
     order = vehicles.argsort(descending=True, stable=True)
-    sizes, begin, groups = vehicles[order].tolist(), 0, []
+    sizes = vehicles[order].tolist()
+    begin = 0
+    groups = []
     for end in range(1, len(sizes) + 1):
-        size, filled = sizes[begin], sizes[begin] * (end - begin)
+        size = sizes[begin]
+        filled = sizes[begin] * (end - begin)
         if end < len(sizes) and filled + size <= ROWS[1] and (filled < ROWS[0] or sizes[end] > SHRUNK * size):
             continue
         rows = order[begin:end]
@@ -119,7 +122,9 @@ class SceneRows:
     """
 
     def __init__(self, scene: TensorDictBase, group: Group) -> None:
-        self._scene, self._group, self._taken = scene, group, dict[str, Tensor]()
+        self._scene = scene
+        self._group = group
+        self._taken = dict[str, Tensor]()
 
     def __getitem__(self, key: Any) -> Any:
         """The tensor of a name, or what rows hold, as SceneRows."""
@@ -130,7 +135,8 @@ class SceneRows:
         return self._taken[key]
 
     def _take(self, key: str) -> Tensor:
-        rows, vehicles = self._group.rows, self._group.vehicles
+        rows = self._group.rows
+        vehicles = self._group.vehicles
         if key in OF_ALL:
             width = self._scene["route_log"].shape[1]
             agents = torch.cat([torch.arange(vehicles), width + torch.arange(self._group.others)])
@@ -140,7 +146,8 @@ class SceneRows:
 
 def crop_world(world: World, group: Group) -> World:
     """The group's World [G]."""
-    width, rows = world.scene["route_log"].shape[1], group.rows
+    width = world.scene["route_log"].shape[1]
+    rows = group.rows
     agents = torch.cat([torch.arange(group.vehicles), width + torch.arange(group.others)]).to(rows.device)
     states, valid, accel = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
     scene = cast(TensorDictBase, SceneRows(world.scene, group))

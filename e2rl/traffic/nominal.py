@@ -87,14 +87,18 @@ class NominalTraffic(Traffic):
         self, state: State, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[State, TrafficPlan]:
         """Returns states and plans of the coming HORIZON steps; scenes of similar size are planned together."""
-        world, ego_plan, noise = self.as_seen(world), ego_plan.detach(), self.noise(state)
+        world = self.as_seen(world)
+        ego_plan = ego_plan.detach()
+        noise = self.noise(state)
         batch, width = state.routed.route.shape
         whole = clone(state)
         states = world.states.new_zeros(batch, width, HORIZON, 4)
         present = torch.zeros(batch, width, HORIZON, dtype=torch.bool, device=states.device)
         for group in group_scenes(world):
-            rows, vehicles = group.rows, group.vehicles
-            part, there = crop_state(state, group, width), crop_world(world, group)
+            rows = group.rows
+            vehicles = group.vehicles
+            part = crop_state(state, group, width)
+            there = crop_world(world, group)
             part = self._expecting(part, there)
             announced = (ego_plan[rows], None)
             known, context = announced if self.knowledge == "plan" else self.predicted_ego(part, there)
@@ -157,7 +161,8 @@ class NominalTraffic(Traffic):
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
         """Returns the current lane states: the ego's from its state and planned yaw rate; the others' places on their
         routes from their states, how they go on from their plans."""
-        lane, routed = state.lane, state.routed
+        lane = state.lane
+        routed = state.routed
         yaw_rate = wrap(ego_plan[:, LOOK - 1, 2] - world.states[:, 0, 2]) / (LOOK * DT)
         ego = torch.zeros_like(routed.parked)
         ego[:, 0] = True
@@ -183,11 +188,13 @@ class NominalTraffic(Traffic):
             numbers = torch.full((count * batch,), number)
             return noise_of(seed.flatten(), numbers, shape, uniform).unflatten(0, (count, batch))
 
-        order, position = draw(0, 2, vehicles, uniform=True).unbind(2), draw(2, 2, vehicles, uniform=True)[0].unbind(1)
+        order = draw(0, 2, vehicles, uniform=True).unbind(2)
+        position = draw(2, 2, vehicles, uniform=True)[0].unbind(1)
         noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
         direction = main_direction(prior.schedule, prior.sampler, noise.device)
         noise = stratified_noise(noise, direction, order[1], position[1])
-        step, plans = torch.zeros(batch, dtype=torch.long, device=seed.device), []
+        step = torch.zeros(batch, dtype=torch.long, device=seed.device)
+        plans = []
         for uniform, one in zip(stratified_uniform(order[0], position[0]), noise, strict=True):
             routed, lane = prior.start(scene, prior.choose_routes(scene, uniform))
             context = prior.encode(routed, lane, scene["start"], scene["valid"], step, None)
@@ -201,6 +208,7 @@ def onto(
     """Returns states [B] with vehicles moved [B, V] on candidates route [B, V], or, off_lane [B, V], on paths
     [B, V, P, 2], and with their poses there."""
     lines = torch.zeros_like(moved) if off_lane is None else off_lane, state.routed.points if paths is None else paths
-    routed, old = reroute(state.routed, world.scene, route, moved, *lines), state.lane
+    routed = reroute(state.routed, world.scene, route, moved, *lines)
+    old = state.lane
     lane = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
     return replace(state, routed=routed, lane=select(moved, lane, old))

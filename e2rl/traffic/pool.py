@@ -27,7 +27,8 @@ class StoredTraffic(NamedTuple):
     span: Tensor
 
 
-TRACKS, EVASIONS = StoredTraffic._fields[:3], StoredTraffic._fields[3:]
+TRACKS = StoredTraffic._fields[:3]
+EVASIONS = StoredTraffic._fields[3:]
 
 
 @dataclass
@@ -71,11 +72,13 @@ class TrafficPool:
 
     def tracks(self, at: Tensor) -> tuple[Tensor, Tensor]:
         """Stored states [b, T+1, N, 4] and valid [b, T+1, N] at positions [b]; only these are read."""
-        first, number = self.parts[0], torch.bucketize(at, self._ends, right=True)
+        first = self.parts[0]
+        number = torch.bucketize(at, self._ends, right=True)
         states = first.states.new_empty(len(at), *first.states.shape[1:])
         valid = first.valid.new_empty(len(at), *first.valid.shape[1:])
         for k in number.unique().tolist():
-            part, rows = self.parts[k], (number == k).nonzero()[:, 0]
+            part = self.parts[k]
+            rows = (number == k).nonzero()[:, 0]
             inside = at[rows] - (self._ends[k] - len(part.states))
             states[rows], valid[rows] = part.states[inside], part.valid[inside]
         return states, valid
@@ -110,7 +113,8 @@ class TrafficPool:
         missing = {"scene_index", *TRACKS} - set(traffic)
         if missing:
             raise InputError(f"synthesized traffic lacks {', '.join(sorted(missing))}; return them from synthesize()")
-        states, index = traffic["states"], traffic["scene_index"].cpu()
+        states = traffic["states"]
+        index = traffic["scene_index"].cpu()
         none = torch.zeros(1, 1, 2).expand(len(states), states.shape[1] - 1, 2), torch.zeros(len(states), 2).long()
         given = dict(zip(EVASIONS, none, strict=True)) | dict(traffic)
         part = StoredTraffic(*(given[name].cpu() for name in StoredTraffic._fields))
@@ -118,7 +122,8 @@ class TrafficPool:
         owes = given.get("owes", torch.ones(len(index))).cpu()
         pool = _rows(index, RECORDED, eta, template=None if template is None else template.cpu())
         pool.decisions[:, OWES] = owes.to(pool.decisions)
-        pool.source, pool.parts = torch.arange(len(index)), [part]
+        pool.source = torch.arange(len(index))
+        pool.parts = [part]
         return pool
 
     def __add__(self, other: "TrafficPool") -> "TrafficPool":
@@ -151,7 +156,9 @@ def _rows(
 ) -> TrafficPool:
     """Fresh rows of weight 1 from one source; by default of seed 0 and template full, by rule."""
     like = torch.zeros(len(scene_index), dtype=torch.int64)
-    seed, template = like if seed is None else seed, like + FULL if template is None else template
+    seed = like if seed is None else seed
+    template = like + FULL if template is None else template
     decisions = torch.tensor(RULE).repeat(len(like), 1) if decisions is None else decisions
-    fresh, weight = torch.ones_like(like).bool(), torch.ones(len(like))
+    fresh = torch.ones_like(like).bool()
+    weight = torch.ones(len(like))
     return TrafficPool(scene_index, like + source, eta, template, seed, decisions, weight, fresh)

@@ -54,7 +54,8 @@ def roll_out(
     pool = TrafficPool.live(index.cpu(), eta.cpu().float(), seed.cpu(), *given)
     looks = type(ego).act is not Ego.act
     base = DrivingEnv(scenes, settings, len(index), device, agents=True, observed=looks)
-    synthesizer, log = AdversarialSynthesizer(pool, torch.arange, traffic, ego), PlanLog()
+    synthesizer = AdversarialSynthesizer(pool, torch.arange, traffic, ego)
+    log = PlanLog()
     synthesizer.on_plan = log
     env = TransformedEnv(base, synthesizer)
     with set_exploration_type(ExplorationType.DETERMINISTIC), counted_nfe(traffic) as nfe:
@@ -68,7 +69,8 @@ def roll_out(
 
 def _driven(steps: TensorDictBase, scene: TensorDictBase, log: PlanLog) -> dict[str, Tensor]:
     """Fields of Rollouts from the frames [B, T] of a rollout."""
-    agents, route = steps["next", "agents"], log.routes(scene)
+    agents = steps["next", "agents"]
+    route = log.routes(scene)
     tracks = {name: torch.cat([steps["agents", name][:, :1], agents[name]], 1) for name in ("states", "valid")}
     return {
         **tracks,
@@ -123,12 +125,14 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
         template = torch.full_like(scene_index, FULL) if template is None else template
 
         def roll_out_rows(rows: Sequence[int]) -> Rollouts:
-            index, at = scene_index[list(rows)], list(rows)
+            index = scene_index[list(rows)]
+            at = list(rows)
             noise = index + seed * 1_000_003
             return roll_out(scenes, index, noise, etas[at], ego, traffic, sim, device, template[at])
 
         done: list[int] = []
-        parts, errored = list[Rollouts](), dict[int, dict]()
+        parts = list[Rollouts]()
+        errored = dict[int, dict]()
         for rows in torch.arange(len(scene_index)).split(batch):
             found, lost = attempt(roll_out_rows, rows.tolist(), begins=not (done or errored))
             done += [row for tasks, _ in found for row in tasks]

@@ -33,9 +33,12 @@ class LogReplay(Traffic):
 
     def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
         """Recorded states and presence of the coming steps."""
-        logged, valid = world.scene["logged"], world.scene["logged_valid"]
-        vehicles, step = world.scene["route_log"].shape[1], steps_ahead(world)
-        row, at = torch.arange(len(step), device=step.device)[:, None], step.clamp(max=logged.shape[1] - 1)
+        logged = world.scene["logged"]
+        valid = world.scene["logged_valid"]
+        vehicles = world.scene["route_log"].shape[1]
+        step = steps_ahead(world)
+        row = torch.arange(len(step), device=step.device)[:, None]
+        at = step.clamp(max=logged.shape[1] - 1)
         known = valid[row, at, :vehicles] & (step < logged.shape[1])[..., None]
         return state, TrafficPlan(logged[row, at, :vehicles].transpose(1, 2), known.transpose(1, 2))
 
@@ -47,7 +50,8 @@ class ConstantVelocity(Traffic):
 
     def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
         """States at the coming steps, from the start frame on."""
-        scene, vehicles = world.scene, world.scene["route_log"].shape[1]
+        scene = world.scene
+        vehicles = world.scene["route_log"].shape[1]
         start = scene["start"][:, :vehicles].clone()
         start[..., 3] = start[..., 3].masked_fill(scene["parked"][:, :vehicles], 0.0)
         states = keep_velocity(start, steps_ahead(world)[:, None])
@@ -121,7 +125,8 @@ class IDM(Traffic):
         length = routed.size[:, :vehicles, 0]
         now = world.states[:, :, None]
         gap, speed, _ = leaders(lane.s, routed.points, now, routed.size, world.valid, lane.d)
-        gap, speed = gap[..., 0], speed[..., 0]
+        gap = gap[..., 0]
+        speed = speed[..., 0]
         gap = torch.where(gap < FREE_GAP, gap, torch.inf)
         at = (lane.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
         limit = routed.limit.gather(-1, at[..., None])[..., 0]

@@ -155,7 +155,8 @@ class PlanLog:
         self.paths.append(points_of(plan.states).cpu())
         self.targets.append(nobody if plan.target is None else plan.target.cpu())
         acts = nobody >= 0 if plan.adversary is None else plan.adversary.cpu()
-        self.acted, self.last = self.acted | acts, plan
+        self.acted = self.acted | acts
+        self.last = plan
 
     def plans(self, ego_plans: Tensor) -> dict[str, Tensor]:
         """Returns plans [B, R, V, K, 2] m, at POINT_STEPS, 2 POINT_STEPS .. steps after each of R replans, and targets
@@ -170,7 +171,8 @@ class PlanLog:
 
     def transport(self) -> dict[str, Tensor]:
         """Returns what control cost each rollout [B]: path KL of adversaries and of others, energy of anchoring."""
-        zero, acted = torch.zeros(self.acted.shape), self.acted
+        zero = torch.zeros(self.acted.shape)
+        acted = self.acted
         kl, jump = (zero if value is None else value.cpu() for value in (self.last.path_kl, self.last.anchor_jump))
         costs = {"adversary": kl * acted, "others": kl * ~acted, "anchor": jump}
         return {f"transport_{name}": value.sum(-1) for name, value in costs.items()}
@@ -185,7 +187,8 @@ def points_of(states: Tensor) -> Tensor:
 def counted_nfe(traffic: Traffic) -> Iterator[list[int]]:
     """Yields the NFE of a method within the block, one number per call of the prior's network: its joint samples, twice
     where a gradient is wanted."""
-    nfe, prior = list[int](), getattr(traffic, "prior", None)
+    nfe = list[int]()
+    prior = getattr(traffic, "prior", None)
     if not isinstance(prior, Prior):
         yield nfe
         return

@@ -48,7 +48,11 @@ class AdversarialSynthesizer(Transform):
         """draw: `env.set_seed` seeds its `generator`, if it has one; traffic: drives LIVE rows; ego: the ego that a
         method with `queries_ego` queries; reaction: None, nobody leaves replayed traffic."""
         super().__init__()
-        self.pool, self.draw, self.traffic, self.ego, self.reaction = pool, draw, traffic, ego, reaction
+        self.pool = pool
+        self.draw = draw
+        self.traffic = traffic
+        self.ego = ego
+        self.reaction = reaction
         self.on_plan: Callable[[TrafficPlan], None] | None = None  # called with every new plan
         self._next_reaction = 0  # the environment's clock at which vehicles react next
         nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
@@ -98,7 +102,8 @@ class AdversarialSynthesizer(Transform):
 
     def _begin_reaction(self, reaction: Reaiming, rows: Tensor) -> None:
         """Who reacts in the new episodes of environments rows [b]."""
-        env, drawn = self._env, self._drawn[rows]
+        env = self._env
+        drawn = self._drawn[rows]
         eta = self.pool.eta[drawn] * (self.pool.source[drawn] != LIVE)
         owes = self.pool.decisions[drawn, OWES] >= 0.5
         attack = eta.to(env.device), self.pool.template[drawn].to(env.device), owes.to(env.device)
@@ -118,8 +123,10 @@ class AdversarialSynthesizer(Transform):
 
     def _begin(self, first: Tensor) -> None:
         """Reset the traffic method's state and the plan in environments first [B] bool, which have just been reset."""
-        env, rows = self._env, first.nonzero()[:, 0]
-        world, drawn = env.world(), self._drawn[rows.cpu()]
+        env = self._env
+        rows = first.nonzero()[:, 0]
+        world = env.world()
+        drawn = self._drawn[rows.cpu()]
         seed, eta = (getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta"))
         begins = not len(self._planned_at)
         whole = begins or len(rows) == len(first)
@@ -129,7 +136,8 @@ class AdversarialSynthesizer(Transform):
         self._state = fresh if whole else put_rows(self._state, rows, fresh)
         if begins:
             shape = (*world.scene["route_log"].shape, HORIZON, 4)
-            self._plan, self._planned_at = torch.zeros(shape, device=env.device), torch.zeros_like(world.step)
+            self._plan = torch.zeros(shape, device=env.device)
+            self._planned_at = torch.zeros_like(world.step)
         self._plan[rows] = keep_velocity(world.states[rows, : self._plan.shape[1]])
         self._planned_at[rows] = -REPLAN_STEPS
 
@@ -199,7 +207,8 @@ class AdversarialSynthesizer(Transform):
 
     def _stored_adversaries(self) -> Tensor:
         """Bool [B, V]: adversaries of stored traffic; false in recorded and live rows."""
-        env, source = self._env, self.pool.source[self._drawn]
+        env = self._env
+        source = self.pool.source[self._drawn]
         vehicles = env.scene["route_log"].shape[1]
         adversaries = torch.zeros(len(source), vehicles, dtype=torch.bool)
         if bool((source > RECORDED).any()):
@@ -240,7 +249,9 @@ class Lookahead:
         whole = len(rows) == len(self.world.step) and bool((rows.diff() > 0).all())
         world = self.world if whole else replace(take_rows(self.world, rows), plan=None)
         world = world.shown() if from_outside(self.ego) else world  # of now: it is asked about steps to come
-        states, vehicles, pieces = world.states, planned.shape[1], []
+        states = world.states
+        vehicles = planned.shape[1]
+        pieces = []
         ends = torch.arange(self.period, HORIZON + self.period, self.period, device=states.device)
         moved = constant_velocity(states[:, vehicles:], DT * ends)
         now = world
@@ -249,7 +260,8 @@ class Lookahead:
                 answer = ask(self.ego, "plan", now, scene=world.scene)
                 plan = checked(answer, (len(now.step), PLAN_STEPS, 4), self.ego, "plan", begins=False)
             pieces.append(plan[:, : self.period])
-            ego, others = pieces[-1][:, -1:], planned[:, 1:, min(after, HORIZON) - 1]
+            ego = pieces[-1][:, -1:]
+            others = planned[:, 1:, min(after, HORIZON) - 1]
             place = None if now.mission_s is None else now.mission_s + DT * pieces[-1][..., 3].sum(1)
             states = torch.cat([ego, others, moved[:, :, number]], 1)
             now = replace(now, step=world.step + after, states=states, mission_s=place)

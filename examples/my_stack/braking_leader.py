@@ -16,7 +16,8 @@ class BrakingLeader(LogReplay):
     replays_log, adversarial = False, True
 
     def __init__(self, prior, reach, braking):
-        self.reach, self.braking = reach, braking
+        self.reach = reach
+        self.braking = braking
 
     def reset(self, scenes, seed, eta):
         """Who brakes, and how hard."""
@@ -31,9 +32,11 @@ class BrakingLeader(LogReplay):
     def replan(self, state, world, ego_plan):
         """The log, but for the leader: where its braked distance is on its recorded path."""
         state, plan = super().replan(state, world, ego_plan)
-        vehicles, leader = plan.states.shape[1], state["leader"]
+        vehicles = plan.states.shape[1]
+        leader = state["leader"]
         path = world.scene["logged"][:, :, :vehicles].transpose(1, 2)  # [B, V, T+1, 4]
-        first, braking = path[:, :, 0, 3].clamp(min=0.1)[..., None], state["braking"][:, None, None].clamp(min=1e-3)
+        first = path[:, :, 0, 3].clamp(min=0.1)[..., None]
+        braking = state["braking"][:, None, None].clamp(min=1e-3)
         time = torch.minimum(DT * steps_ahead(world)[:, None], first / braking)  # until the halt
         gone = first * time - braking * time**2 / 2
         pose = poses(path.flatten(0, 1), gone.flatten(0, 1)).view(*gone.shape, 3)

@@ -13,7 +13,8 @@ class Cruise(Ego):
 
     def __init__(self, time_gap: float, braking: float, replan_every: int = 5) -> None:
         super().__init__(replan_every)
-        self.time_gap, self.braking = time_gap, braking
+        self.time_gap = time_gap
+        self.braking = braking
 
     def plan(self, world):
         """[B, 50, 4] x, y, heading, speed."""

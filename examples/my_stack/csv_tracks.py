@@ -27,7 +27,8 @@ class CsvTracks(LogFiles):
         table = np.atleast_1d(np.genfromtxt(io.BytesIO(self.content(log)), delimiter=",", names=True))
         if list(table.dtype.names or ()) != COLUMNS:
             raise InputError(f"{log}: expected the columns {', '.join(COLUMNS)}, found {table.dtype.names}")
-        frame, track = table["frame"].astype(int), table["track"].astype(int)
+        frame = table["frame"].astype(int)
+        track = table["track"].astype(int)
         states = np.zeros((frame.max() + 1, track.max() + 1, 4))
         valid = np.zeros(states.shape[:2], bool)
         states[frame, track] = np.stack([table[name] for name in COLUMNS[2:]], -1)

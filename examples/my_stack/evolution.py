@@ -19,7 +19,8 @@ class Evolution(Search):
     def __post_init__(self):
         super().__post_init__()
         options = {"bounds": [0, 1], "popsize": POPULATION, "verbose": -9}
-        middle, seeds = np.full(1 + len(DRAWN), 0.5), [1 + self.seed_of(scene) for scene in range(len(self.numbers))]
+        middle = np.full(1 + len(DRAWN), 0.5)
+        seeds = [1 + self.seed_of(scene) for scene in range(len(self.numbers))]
         self._strategies = [cma.CMAEvolutionStrategy(middle, 0.3, options | {"seed": seed}) for seed in seeds]
 
     def ask(self):

@@ -8,7 +8,8 @@ from e2rl.scenes.recording import DT
 
 def hard_braking(batch: dict[str, Tensor]) -> Tensor:
     """1 [B] where the ego does so between two steps, 0 elsewhere."""
-    speed, valid = batch["states"][:, :, 0, 3], batch["valid"][:, :, 0]
+    speed = batch["states"][:, :, 0, 3]
+    valid = batch["valid"][:, :, 0]
     return ((speed.diff(dim=1) / DT < -4.0) & valid[:, 1:] & valid[:, :-1]).any(1).double()
 
 

@@ -10,7 +10,10 @@ class Staircase(CurriculumScheduler):
 
     def __init__(self, num_scenes, rounds, seed=0, stairs=(0.5, 1.0, 2.0, 3.0), coped=0.3, fraction=0.5, **scenes):
         super().__init__(num_scenes, rounds, seed, **scenes)
-        self._stairs, self._coped, self.fraction, self._level = list(stairs), coped, fraction, 0
+        self._stairs = list(stairs)
+        self._coped = coped
+        self.fraction = fraction
+        self._level = 0
 
     @property
     def eta(self) -> float:

@@ -85,7 +85,8 @@ def test_it_writes_a_command_line_of_evaluate(folder, monkeypatch, form):
         assert name == "e2rl.scripts.evaluate"
         raise Ran
 
-    planner, real = form.format(name=folder[1]), try_planner.import_module
+    planner = form.format(name=folder[1])
+    real = try_planner.import_module
     monkeypatch.setattr(try_planner, "import_module", lambda name: ran(name) if "scripts" in name else real(name))
     with pytest.raises(Ran):
         main(["--planner", planner, "--scenes", "3", "eta=1.0", "--set", "replan_every=4", "--out", "a run"])

@@ -65,13 +65,16 @@ def contents(*folders: Path) -> dict[Path, bytes]:
 def test_commands_write_into_their_folder_and_the_cache_alone(world, tmp_path):
     """Every command of the README. Of two at once, the first names a folder and one of them is refused; the last does
     not, and each has its own."""
-    home, here, size = tmp_path / "home", tmp_path / "work", count(1)
+    home = tmp_path / "home"
+    here = tmp_path / "work"
+    size = count(1)
     for path in [*(home / name for name in HOME), *(here / name for name in MINE)]:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"mine" * next(size))
     environment = {name: value for name, value in os.environ.items() if name not in ("XDG_CACHE_HOME", "MPLCONFIGDIR")}
     environment |= {"HOME": str(home), "PYTHONPATH": f"{ROOT}:{ROOT / 'examples'}", "PYTHONDONTWRITEBYTECODE": "1"}
-    before, asked = contents(home, here, world), commands(world)
+    before = contents(home, here, world)
+    asked = commands(world)
     assert len(asked) >= 6 and "hydra.run.dir=" in str(asked[0]) and "hydra.run.dir=" not in str(asked[-1])
     for number, command in enumerate(asked):
         twice = 1 + (number in (0, len(asked) - 1))

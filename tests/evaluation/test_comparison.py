@@ -126,7 +126,8 @@ def tries(scene, *hits, seed=0):
 
 def test_searches_are_compared_by_scene_and_move_where_they_share_no_way(tmp_path):
     """However many tries there are, and in whatever order."""
-    other, slow = {"contact_type": "rear"}, {"ego_speed": 2.0}
+    other = {"contact_type": "rear"}
+    slow = {"ego_speed": 2.0}
     first = [*tries(0, False, True, True), *tries(1, True, other), *tries(2, False), *tries(3, True)]
     second = [*tries(0, False), *tries(1, slow, False, True), *tries(2, False, True), *tries(3, slow, other)]
     (group,), pairs = changes_of(tmp_path, first, second, searched=True)

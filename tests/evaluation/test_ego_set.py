@@ -98,7 +98,8 @@ def test_trainings_that_differ_widen_the_interval_that_places_alone_do_not():
     """Places drive about 10 or 20 m: nearly all that varies is the training."""
     first, features = rows_of([10 + 0.01 * place for place in range(-6, 7)], "a_0")
     second, more = rows_of([20 + 0.01 * place for place in range(-6, 7)], "a_1")
-    rows, samples = first + second, features + more
+    rows = first + second
+    samples = features + more
     pooled, copies = pool_trainings(rows, samples, {"a": ["a_0", "a_1"]})
     result = {row["ego"]: row["metrics"]["progress"] for row in metric_rows(rows + pooled, samples + copies, 200, 2)}
     alone, both = ([result[name][end] for end in ("low", "mean", "high")] for name in ("a_0", "a"))

@@ -26,10 +26,12 @@ class Fails(IDMEgo):
 
     def __init__(self, speed: float, fault: BaseException | float) -> None:
         super().__init__()
-        self.speed, self.fault = speed, fault
+        self.speed = speed
+        self.fault = fault
 
     def plan(self, world):
-        plan, bad = super().plan(world), (world.scene["start"][:, 0, 3] - self.speed).abs() < 1e-6
+        plan = super().plan(world)
+        bad = (world.scene["start"][:, 0, 3] - self.speed).abs() < 1e-6
         if isinstance(self.fault, BaseException):
             if bad.any():
                 raise self.fault
@@ -186,7 +188,8 @@ class From(IDMEgo):
 
     def __init__(self, call):
         super().__init__()
-        self.call, self.calls = call, 0
+        self.call = call
+        self.calls = 0
 
     def plan(self, world):
         self.calls += 1

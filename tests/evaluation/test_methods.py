@@ -70,7 +70,8 @@ def test_several_intensities_are_a_row_each_but_of_what_knows_none():
 
 @pytest.mark.parametrize(("experiment", "rows"), [("table2", 5), ("table3", 20), ("intensity", 4)])
 def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(experiment, rows):
-    config, methods = config_of(f"experiment={experiment}"), methods_of(f"experiment={experiment}")
+    config = config_of(f"experiment={experiment}")
+    methods = methods_of(f"experiment={experiment}")
     assert len(methods) == rows and len(set(named(methods))) == rows
     variants = [method.traffic for method in methods if method.name in config.variants]
     settings = [(settings_in(on), on.prior.sampler, on.prior.bounds) for on in variants]

@@ -68,7 +68,8 @@ def test_who_looks_the_future_up_or_attacks_has_no_row_and_baselines_have_one_sa
 
 
 def test_more_samples_find_better_ones_and_the_joint_choice_is_between():
-    scene_set, method = places(acceleration=0.5), Method("nominal", nominal())
+    scene_set = places(acceleration=0.5)
+    method = Method("nominal", nominal())
     one, few, many = (metrics(scene_set, method, samples) for samples in (1, 2, 5))
     for at in ("_3", "_5"):
         best = [found[f"min_ade{at}"]["mean"] for found in (one, few, many)]
@@ -80,7 +81,9 @@ def test_more_samples_find_better_ones_and_the_joint_choice_is_between():
 
 
 def test_plans_begin_at_the_start_do_not_know_the_future_and_are_the_same_in_any_batch():
-    scene, on, seed = scenes(3).scenes, nominal(), torch.tensor([[4, 5, 6], [7, 8, 9]])
+    scene = scenes(3).scenes
+    on = nominal()
+    seed = torch.tensor([[4, 5, 6], [7, 8, 9]])
     plan = on.open_loop_plans(scene, seed)
     assert plan.shape == (3, 2, 8, 50, 4)
     assert (plan[:, :, :6, 0, :2] - scene["start"][:, None, :6, :2]).norm(dim=-1).max() < 1.5

@@ -14,7 +14,8 @@ from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import Ambush, small_scenes
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
-SCENES, SEEDS = 2, [0, 1]
+SCENES = 2
+SEEDS = [0, 1]
 
 
 def setup_of(scene_set, batch=64):
@@ -58,7 +59,8 @@ def test_methods_share_the_noise_of_a_scene_and_seed():
 
 def test_processes_change_nothing_but_the_time(tmp_path):
     """Two forked processes give the rows, tables and rollouts of one, bit for bit."""
-    scene_set, folders = scenes(3, steps=20), (tmp_path / "one", tmp_path / "two")
+    scene_set = scenes(3, steps=20)
+    folders = (tmp_path / "one", tmp_path / "two")
     for processes, folder in enumerate(folders, 1):
         methods = [Method("nominal", synthesizer(), 0.0), Method("e2", synthesizer(), 3.0)]
         run_protocol(setup_of(scene_set, 2), methods, SEEDS, folder, processes=processes)
@@ -85,7 +87,8 @@ def stopping_run(folder, stops, scene_set):
     done = []
     for left in (*stops, 100):
         setup = Stopped(scene_set, IDMEgo(), "idm", SimSettings(), 2)
-        setup.left, setup.done = left, done
+        setup.left = left
+        setup.done = done
         methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), 2.0)]
         try:
             run_protocol(setup, methods, SEEDS, folder, parts=Parts(folder))

@@ -19,7 +19,8 @@ from e2rl.traffic.rule_based import LogReplay
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import scenes
 
-SIM, STEPS = SimSettings(), 30
+SIM = SimSettings()
+STEPS = 30
 KNOWN = {"linear_speed": STEPS - 2, "angular_speed": STEPS - 2, "linear_accel": STEPS - 4, "angular_accel": STEPS - 4}
 
 
@@ -47,7 +48,9 @@ def setup_of(scene_set, batch=64):
 
 def sampled(scene_set, seeds):
     """[(scene indices, rollouts)] of a random prior, one for each seed."""
-    method, setup, index = Method("nominal", nominal()), setup_of(scene_set), torch.arange(len(scene_set))
+    method = Method("nominal", nominal())
+    setup = setup_of(scene_set)
+    index = torch.arange(len(scene_set))
     return [(index, setup.roll_out(method, [Task(k, seed) for k in range(len(scene_set))])) for seed in seeds]
 
 
@@ -84,7 +87,8 @@ def test_neither_the_order_of_rollouts_nor_their_batches_matter_and_a_weight_is_
     same(found, likelihoods(scene_set, parts[::-1]))
     rows = [(index[k : k + 1], part[k : k + 1]) for index, part in parts for k in range(2)]
     same(found, likelihoods(scene_set, rows))
-    weighed, repeated = Tally(scene_set), likelihoods(scene_set, parts[:1] * 3)
+    weighed = Tally(scene_set)
+    repeated = likelihoods(scene_set, parts[:1] * 3)
     weighed.add(*parts[0], weight=3)
     same(repeated, weighed.likelihoods())
 
@@ -111,7 +115,8 @@ def test_lights_belong_to_ways_so_that_whoever_follows_none_runs_none():
 
 
 def test_the_rows_of_a_run():
-    scene_set, rollouts = places(), 3
+    scene_set = places()
+    rollouts = 3
     methods = [Method("replay", LogReplay()), Method("nominal", nominal())]
     rows = meta_rows(setup_of(scene_set, 4), methods, rollouts)
     assert all((row["stage"], row["n_seeds"], row["n_rollouts"]) == (META_STAGE, 3, 6) for row in rows)
@@ -149,7 +154,8 @@ def test_rollouts_that_end_are_counted_and_weigh_nothing(tmp_path):
                 raise ZeroDivisionError
             return super().plan(world)
 
-    scene_set, methods = places(2), [Method("nominal", nominal()), Method("replay", LogReplay())]
+    scene_set = places(2)
+    methods = [Method("nominal", nominal()), Method("replay", LogReplay())]
     setup = Setup(scene_set, Fails(), "fails", SIM, 4)
     for row, count in zip(meta_rows(setup, methods, 3, Parts(tmp_path)), (3, 1), strict=True):
         assert row["errored"] == {"raised ZeroDivisionError": count} and row["n_rollouts"] == 3
@@ -161,7 +167,8 @@ def test_the_order_of_vehicles_does_not_matter():
     scene_set = places()
     [(index, part)] = sampled(scene_set, [0])
     found = likelihoods(scene_set, [(index, part)])
-    order, all_rows = torch.tensor([0, 4, 2, 5, 1, 3, 7, 6]), torch.tensor([0, 4, 2, 5, 1, 3, 7, 6, 8, 9])
+    order = torch.tensor([0, 4, 2, 5, 1, 3, 7, 6])
+    all_rows = torch.tensor([0, 4, 2, 5, 1, 3, 7, 6, 8, 9])
     other = copy.deepcopy(scene_set)
     scene = other.scenes
     for key in ("start", "valid", "size", "agent_type", "parked"):

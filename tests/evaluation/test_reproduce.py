@@ -178,7 +178,8 @@ def test_a_stranger_s_run_runs_nothing(sent, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(world, tmp_path, monkeypatch, capsys):
     """In its own folder, with its own configuration; what changes its meaning is refused."""
-    score, left = Setup.score, [3]
+    score = Setup.score
+    left = [3]
 
     def stopped(*tasks, **settings):
         left[0] -= 1

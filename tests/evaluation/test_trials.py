@@ -181,6 +181,7 @@ def test_a_trial_is_measured_as_the_protocol_measures_the_method(trials):
 def test_every_attack_has_ranges_round_its_present_values(name):
     """Its first parameter is the gain; a trial of the present parameters is the method of conf/synthesizer."""
     group = load_choice("synthesizer", name)
-    present, ranges = flat(resolved(group)), build_traffic(group, small_prior(0)).tuned
+    present = flat(resolved(group))
+    ranges = build_traffic(group, small_prior(0)).tuned
     assert ranges and all(low <= present[parameter] <= high for parameter, (low, high, *_) in ranges.items())
     assert with_changes(group, {parameter: present[parameter] for parameter in ranges}, "", "") == group

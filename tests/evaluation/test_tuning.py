@@ -21,7 +21,8 @@ OBJECTIVE = PlannerObjective(comfort=0.1, progress=0.1, progress_floor=0.9, comf
 
 def road(parameters):
     """Faster collides more; caution helps and costs comfort; standing still is the safest of all."""
-    speed, caution = parameters["speed"], parameters["caution"]
+    speed = parameters["speed"]
+    caution = parameters["caution"]
     assert parameters["other"] == "same"
     return {"collision": speed / 20 / caution, "comfort": caution, "progress": 8 * speed, "collision e2@2": speed / 20}
 
@@ -50,7 +51,8 @@ def test_a_study_goes_on_as_if_it_had_not_stopped_nor_been_interrupted_in_a_tria
     def dies(parameters):
         raise KeyboardInterrupt
 
-    whole, part = run("whole", 9), run("parts", 5)
+    whole = run("whole", 9)
+    part = run("parts", 5)
     with pytest.raises(KeyboardInterrupt):
         run("parts", 9, evaluate=dies)
     assert len(part) == 5 and run("parts", 9) == whole == run("whole", 9) == tried(trials=9, startup=4)

@@ -31,7 +31,8 @@ def test_torchrl_trains_the_actor(settings, tmp_path, capsys):
     example("torchrl_ppo").main("320", str(tmp_path / "actor.safetensors"), **settings)
     assert "ego.checkpoint=" in capsys.readouterr().out
     torch.manual_seed(0)
-    begun, trained = e2rl.make_ego("actor").network.weights(), read_actor(tmp_path / "actor.safetensors").weights()
+    begun = e2rl.make_ego("actor").network.weights()
+    trained = read_actor(tmp_path / "actor.safetensors").weights()
     assert all(value.isfinite().all() for value in trained.values())
     last = "network.trunk.last.weight"
     assert not torch.equal(begun[last], trained[last]), "it is zero at the start"
@@ -40,7 +41,8 @@ def test_torchrl_trains_the_actor(settings, tmp_path, capsys):
 @pytest.mark.parametrize("name", ["sb3_ppo", "torchrl_sac"])
 def test_a_policy_of_theirs_is_an_ego(settings, tmp_path, capsys, name):
     """It is written with the log of its episodes, whose steps are at most those asked for."""
-    file, module = tmp_path / "policy.onnx", example(name)
+    file = tmp_path / "policy.onnx"
+    module = example(name)
     module.UPDATES = 1
     module.main("256", str(file), num_envs=8, **settings | {"method": "replay"})
     assert f"ego.file={file}" in capsys.readouterr().out

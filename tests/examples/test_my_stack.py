@@ -105,7 +105,8 @@ def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leade
         speed = out.states[scene, :, agent, 3]
         moving = speed[1:] > 0
         assert torch.allclose((speed.diff() / DT)[moving], torch.tensor(-2.0), atol=0.02) and speed[-1] == 0
-        xy, path = out.states[scene, :, agent, :2], logged[scene, :, agent, :2]
+        xy = out.states[scene, :, agent, :2]
+        path = logged[scene, :, agent, :2]
         assert torch.cdist(xy, path).amin(1).max() < 0.8, "on its path, between recorded points"
     others = out.valid & ~out.adversaries[:, None]
     others[:, :, 0] = False

@@ -23,7 +23,8 @@ def brake_check(scenes):
 
     def synthesize(ego, index, eta, seed):
         scene = scenes.batch(index)
-        states, valid = scene["logged"].clone(), scene["logged_valid"].clone()
+        states = scene["logged"].clone()
+        valid = scene["logged_valid"].clone()
         time = 0.1 * torch.arange(states.shape[1])
         speed = states[:, :1, 0, 3] / 2
         eta = torch.as_tensor(eta, dtype=torch.float32).expand(len(index))
@@ -46,7 +47,8 @@ class Ambush(Traffic):
     def replan(self, state, world, ego_plan):
         vehicles = world.scene["route_log"].shape[1]
         states = keep_velocity(world.states[:, :vehicles])
-        attacked, acting = state > 0, torch.zeros_like(world.valid[:, :vehicles])
+        attacked = state > 0
+        acting = torch.zeros_like(world.valid[:, :vehicles])
         states[attacked, 1] = ego_plan[attacked, 4:5]
         acting[:, 1] = attacked
         present = world.valid[:, :vehicles, None].expand(states.shape[:-1])

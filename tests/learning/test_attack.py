@@ -28,7 +28,8 @@ def odd_ones_left_out(traffic):
 @pytest.mark.parametrize("nominal", [True, False])
 @pytest.mark.parametrize("batch", [1, 2, 5])
 def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
-    attack, template = brake_check(small_scenes(5)), torch.tensor([SINGLE, PAIR, FULL, CHAIN, SINGLE])
+    attack = brake_check(small_scenes(5))
+    template = torch.tensor([SINGLE, PAIR, FULL, CHAIN, SINGLE])
 
     def synthesize(ego, index, eta, seed, *limits):
         assert all(torch.equal(each, template[torch.isin(SCENES, index)]) for each in limits)
@@ -57,7 +58,8 @@ class Stumbles(Ambush):
 
 
 def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_them():
-    scenes, index = small_scenes(4), torch.arange(4)
+    scenes = small_scenes(4)
+    index = torch.arange(4)
     order = Order(2, index, torch.full((4,), 2.0), torch.zeros_like(index), 7, IDMEgo())
     made, errored = make_traffic(order, synthesize_traffic(scenes, Stumbles(), SimSettings(), batch=3))
     whole, none = make_traffic(order, synthesize_traffic(scenes, Ambush(), SimSettings(), batch=3))
@@ -90,7 +92,8 @@ def ambush(scenes):
 def test_the_doomed_are_left_out_and_reported():
     scenes = small_scenes(4)
     run = small_run(scenes=scenes)
-    run.synthesize, run.solvable = ambush(scenes), partial(solvable, scenes=scenes, sim=SimSettings())
+    run.synthesize = ambush(scenes)
+    run.solvable = partial(solvable, scenes=scenes, sim=SimSettings())
     run.settings = type(run.settings)(scenes=4, nominal="log")
     metrics = train_round(run)
     kept = run.memory.rounds[-1].traffic["scene_index"]
@@ -109,7 +112,8 @@ def test_a_round_goes_on_where_everything_is_left_out():
 
 def test_evasions_are_kept_with_what_they_avoid():
     """Driven without contact by their actions; marked by the steps in which they act, around the contact."""
-    scenes, index = small_scenes(3, steps=40), torch.arange(3)
+    scenes = small_scenes(3, steps=40)
+    index = torch.arange(3)
     traffic = brake_check(scenes)(None, index, torch.tensor([1.2, 0.5, 3.0]), 0)
     solved = solvable(traffic, scenes, SimSettings())
     assert solved.entered.all() and not solved.span[1].any() and not solved.evasion[1].any(), "not hit, so not searched"
@@ -117,7 +121,8 @@ def test_evasions_are_kept_with_what_they_avoid():
     assert (end - AFTER > 10).all() and (end[1] < end[0]), "the nearer car is met earlier"
     assert (begin < end - AFTER).all()
     found = dynamics.rollout(traffic["states"][:, 0, 0], solved.evasion)
-    size, other = scenes.scenes["size"][index], traffic["states"][:, 1:, 1]
+    size = scenes.scenes["size"][index]
+    other = traffic["states"][:, 1:, 1]
     clear = separation(found, size[:, None, 0], other, size[:, None, 1]) > 0
     hit = separation(traffic["states"][:, 1:, 0], size[:, None, 0], other, size[:, None, 1]) < 0
     assert clear[[0, 2]].all() and hit[[0, 2]].any(1).all()
@@ -135,7 +140,8 @@ def test_an_evasion_acts_from_before_it_departs_until_after_the_contact():
     evasion = driven.clone()
     evasion[0, 19:, 1] = 1.0  # beside the drive from step 20 on
     evasion[1, 4:, 1] = 1.0
-    begin, stop = torch.tensor([0, 2, 0]), torch.tensor([30, 38, 15])
+    begin = torch.tensor([0, 2, 0])
+    stop = torch.tensor([30, 38, 15])
     assert acting(evasion, driven, begin, stop).tolist() == [[10, 35], [2, 40], [5, 20]]
 
 
@@ -158,7 +164,8 @@ def marked(mark, lost=()):
 
 
 def test_rows_come_in_the_order_of_the_scenes_each_by_its_own_method():
-    eta, template = torch.arange(7.0), torch.arange(7)
+    eta = torch.arange(7.0)
+    template = torch.arange(7)
     made = mixture(marked(1), marked(2), 0.5)(None, MIXED, eta, 5, template)
     assert torch.equal(made["scene_index"], MIXED) and torch.equal(made["eta"], eta)
     assert torch.equal(made["template"], template) and not made["errored"]

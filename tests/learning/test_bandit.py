@@ -41,8 +41,10 @@ def test_the_probability_is_a_softmax_of_values_with_exploration():
 def test_an_attack_counts_once_however_many_episodes_are_driven_in_it():
     """Failed, survived, kept and left out; an attack that nobody drove is kept, but neither failed nor survived."""
     curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0], templates=["pair", "full"], forgetting=0.25)
-    eta, template = torch.tensor([1.0, 1.0, 1.0, 2.0]), torch.tensor([PAIR, PAIR, PAIR, FULL])
-    gone, episodes = torch.tensor([False, True, False, False]), torch.tensor([4, 0, 0, 10])
+    eta = torch.tensor([1.0, 1.0, 1.0, 2.0])
+    template = torch.tensor([PAIR, PAIR, PAIR, FULL])
+    gone = torch.tensor([False, True, False, False])
+    episodes = torch.tensor([4, 0, 0, 10])
     for _ in range(2):
         share = torch.tensor([0.5, torch.nan, 0.2, torch.nan])
         curriculum.observe(Outcomes(eta, template, gone, episodes, torch.tensor([1, 0, 0, 10]), share))

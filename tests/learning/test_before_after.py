@@ -16,7 +16,8 @@ def test_both_stages_are_kept_and_the_second_is_compared_with_the_first(tmp_path
     setup = Setup(small_scenes(3), IDMEgo(), "idm", SimSettings())
     methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), 2.0)]
     measure = BeforeAfter(setup, methods, [0], tmp_path)
-    slow, fast = IDMEgo(desired_speed=3.0, use_limits=False), IDMEgo(desired_speed=12.0, use_limits=False)
+    slow = IDMEgo(desired_speed=3.0, use_limits=False)
+    fast = IDMEgo(desired_speed=12.0, use_limits=False)
     measure("before", slow, 0)
     same = {row["method"]: row for row in measure("after", slow, 1) if row["stage"] == "after"}
     rows = measure("after", fast, 2)

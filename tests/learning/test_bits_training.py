@@ -57,7 +57,8 @@ def test_a_vehicle_that_plays_the_ego_sees_the_ego():
 def test_goals_are_where_the_recording_is_5_s_later():
     data = windows(small_scenes(3, steps=60), 0)
     assert len(data) == 2 * 3 * 3 * 3  # exact and disturbed, steps 0, 5 and 10, vehicles, scenes
-    exact, disturbed = data[data["start"][:, 2] == 0], data[data["start"][:, 2] != 0]
+    exact = data[data["start"][:, 2] == 0]
+    disturbed = data[data["start"][:, 2] != 0]
     torch.testing.assert_close(exact["distance"], torch.full((27,), 50.0), atol=1e-2, rtol=0)
     assert exact["offset"].abs().max() < 1e-3 and disturbed["offset"].abs().max() < 1e-3, "each on its own route"
     assert set((exact["start"][:, 1] / LANE_WIDTH).round().tolist()) == {0, 1}
@@ -69,7 +70,8 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
     for name in ("FEATURE_NOISE", "LAST_ACTION_NOISE"):
         monkeypatch.setattr(bits_training, name, 0.05)
     torch.manual_seed(0)
-    data, network = windows(braking_scenes(), 0), BitsNetwork(32)
+    data = windows(braking_scenes(), 0)
+    network = BitsNetwork(32)
     run = BitsTraining(network, data, settings(held_out=0.0, epochs=40))
     before = run.measure(data)
     for _ in range(40):
@@ -108,7 +110,8 @@ def test_the_stage_writes_the_weights_of_the_lowest_held_out_loss_and_goes_on_ex
     log = Path("logs/scalars/train/bits_held_out_loss.csv")
     logged = (tmp_path / "whole" / log).read_text().split()
     assert min(float(line.split(",")[1]) for line in logged) == pytest.approx(row["held_out_loss"])
-    turn, calls = BitsTraining.turn, []
+    turn = BitsTraining.turn
+    calls = []
 
     def stopped(training):
         calls.append(None)

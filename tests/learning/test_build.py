@@ -29,7 +29,8 @@ class Doubling(CurriculumScheduler):
 
     def __init__(self, num_scenes, rounds, seed=0, first=1.0, **scenes):
         super().__init__(num_scenes, rounds, seed, **scenes)
-        self.eta, self.fraction = first, 1.0
+        self.eta = first
+        self.fraction = 1.0
 
     def advance(self, collision_rate=None):
         super().advance(collision_rate)
@@ -93,7 +94,8 @@ def test_groups_that_do_not_fit_are_refused_at_the_start(override, what):
 
 
 def test_the_time_left_is_told_once_each_kind_of_phase_was_measured(monkeypatch):
-    now, left = [0.0], []
+    now = [0.0]
+    left = []
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     progress = build_progress(load_config("train", ["rounds=2"]))
     for kind, seconds in (("measurement", 600), ("round", 60), ("round", 10), ("measurement", 10)):

@@ -19,7 +19,8 @@ def network():
 
 def shown(action, weight):
     """Demonstrations [5] at random observations with labels action [C, 2] and weight [C]."""
-    action, weight = torch.tensor(action), torch.tensor(weight)
+    action = torch.tensor(action)
+    weight = torch.tensor(weight)
     observation = torch.randn(5, OBSERVATION_SIZE, generator=torch.Generator().manual_seed(1))
     labels = {"action": action.expand(5, -1, -1), "weight": weight.expand(5, -1)}
     return TensorDict({"observation": observation, **labels}, [5])
@@ -33,14 +34,17 @@ def gradient(actor, given):
 
 
 def test_one_label_is_the_hard_loss():
-    actor, given = network(), shown([[-3.0, 0.2]], [1.0])
+    actor = network()
+    given = shown([[-3.0, 0.2]], [1.0])
     hard = TensorDict({"observation": given["observation"], "action": given["action"][:, 0]}, [5])
     soft = CloningLoss(actor.actor)(given)["loss_cloning"]
     torch.testing.assert_close(soft, BCLoss(actor.actor)(hard)["loss_bc"])
 
 
 def test_loss_and_gradient_are_the_weighted_means_of_those_of_the_labels():
-    actor, actions, weights = network(), [[-3.0, 0.2], [1.0, -0.4], [2.0, 0.0]], [0.5, 0.3, 0.2]
+    actor = network()
+    actions = [[-3.0, 0.2], [1.0, -0.4], [2.0, 0.0]]
+    weights = [0.5, 0.3, 0.2]
     soft = gradient(actor, shown(actions, weights))
     single = [gradient(actor, shown([action], [1.0])) for action in actions]
     for found, of_each in zip(soft, zip(*single, strict=True), strict=True):
@@ -50,7 +54,8 @@ def test_loss_and_gradient_are_the_weighted_means_of_those_of_the_labels():
 
 @pytest.mark.parametrize("count", [9, 10, 11])
 def test_kinds_share_a_minibatch_evenly_whatever_their_sizes(count):
-    few, many = shown([[-3.0, 0.2]], [1.0])[:1], shown([[1.0, 0.0], [2.0, 0.0]], [0.25, 0.75]).repeat(100)
+    few = shown([[-3.0, 0.2]], [1.0])[:1]
+    many = shown([[1.0, 0.0], [2.0, 0.0]], [0.25, 0.75]).repeat(100)
     found = drawn([few, many], count)
     first = found["action"][:, 0, 0] == -3.0
     assert len(found) == count and abs(int(first.sum()) - count / 2) < 1
@@ -60,7 +65,8 @@ def test_kinds_share_a_minibatch_evenly_whatever_their_sizes(count):
 
 def test_the_teaching_loss_is_that_of_a_mixture_round_the_labels():
     """Each counts by its weight and by its distance in units of the labels' width."""
-    policy, weights = network().network, [0.7, 0.3]
+    policy = network().network
+    weights = [0.7, 0.3]
     given = shown([[-3.0, 0.2], [1.0, -0.4]], weights)
     away = given["action"] - policy.deterministic(given["observation"])[:, None]
     away = away / (policy.reach * torch.tensor([0.25, 0.12]))

@@ -39,14 +39,16 @@ def test_a_drive_counts_until_its_first_contact():
 
 def test_disturbances_are_executed_but_not_intended():
     scenes = small_scenes(2)
-    driver, pool = PoolDriver(scenes, SimSettings(), 2), TrafficPool.recorded(torch.arange(2))
+    driver = PoolDriver(scenes, SimSettings(), 2)
+    pool = TrafficPool.recorded(torch.arange(2))
     frames = driver.drive(IDMEgo(), pool, torch.arange(2), lambda action, step: action + torch.tensor([1.0, 0.0]))
     assert torch.allclose(frames["executed"][..., 0], frames["intended"][..., 0] + 1.0, atol=1e-3)
 
 
 def test_mean_acceleration_is_that_of_the_drive():
     scenes = small_scenes(2, num_vehicles=1, num_vrus=0, limit=30.0)
-    driver, pool = PoolDriver(scenes, SimSettings(), 2), TrafficPool.recorded(torch.arange(2))
+    driver = PoolDriver(scenes, SimSettings(), 2)
+    pool = TrafficPool.recorded(torch.arange(2))
     episodes, _ = driver.drive_all(IDMEgo(acceleration=1.0), pool)
     gained = driver.env.world().states[:, 0, 3] - 10.0
     assert episodes.acceleration.tolist() == pytest.approx((gained / 2.0).tolist(), abs=1e-3)
@@ -61,7 +63,8 @@ def frames(lengths, total, fail=()):
     number = torch.cat([torch.full((n,), k) for k, n in enumerate(lengths)])[:total]
     done = torch.tensor([t == lengths[k] for t, k in zip(timestep.tolist(), number.tolist(), strict=True)])
     contact = done & torch.tensor([k in fail for k in number.tolist()])
-    row, returns = number[None, :, None], timestep.float()
+    row = number[None, :, None]
+    returns = timestep.float()
     return TensorDict(
         {
             "traffic": {"row": row},
@@ -103,7 +106,8 @@ def test_episodes_that_could_not_have_lasted_do_not_count():
 
 def test_decisions_of_several_steps_are_told_from_steps():
     """Episodes of 5, 3 and 5 steps in decisions of 2 are 3, 2 and 3 frames, the last one of each cut short."""
-    steps, number = [2, 4, 5, 2, 3, 2, 4, 5], [0, 0, 0, 1, 1, 2, 2, 2]
+    steps = [2, 4, 5, 2, 3, 2, 4, 5]
+    number = [0, 0, 0, 1, 1, 2, 2, 2]
     data = frames([3, 2, 3], 8, fail=(1,))
     assert data["traffic", "row"][0, :, 0].tolist() == number
     data["next", "timestep"] = torch.tensor(steps)[None, :, None]

@@ -23,7 +23,8 @@ from tests.learning.small import Ambush, brake_check, rounds, small_run, small_s
 
 def test_a_round_improves_moves_on_and_reports():
     run = small_run(nominal="prior")
-    attack, asked = run.synthesize, []
+    attack = run.synthesize
+    asked = []
     run.synthesize = lambda ego, index, eta, seed: asked.append((ego, eta, seed)) or attack(ego, index, eta, seed)
     before = {key: value.clone() for key, value in run.ego.network.weights().items()}
     metrics = train_round(run)
@@ -39,8 +40,10 @@ def test_a_round_improves_moves_on_and_reports():
 
 
 def test_a_data_set_made_once_meets_the_policy_that_the_run_began_with():
-    run, begun = small_run(against="start"), small_run().ego.network.weights()
-    attack, met = run.synthesize, []
+    run = small_run(against="start")
+    begun = small_run().ego.network.weights()
+    attack = run.synthesize
+    met = []
     run.synthesize = lambda ego, *given: met.append(copy.deepcopy(ego.network.weights())) or attack(ego, *given)
     for _ in range(2):
         train_round(run)
@@ -52,7 +55,8 @@ def test_a_data_set_made_once_meets_the_policy_that_the_run_began_with():
 
 def test_templates_are_given_to_the_attack_only_where_one_is_not_full():
     run = small_run(nominal="prior")
-    attack, asked = run.synthesize, []
+    attack = run.synthesize
+    asked = []
     run.synthesize = lambda ego, index, eta, seed, *limits: asked.append(limits) or attack(ego, index, eta, seed)
     train_round(run)
     run.curriculum = BanditCurriculum(4, 4, etas=[0.5, 2.0], templates=["pair", "chain"])
@@ -143,7 +147,8 @@ def test_unfit_combinations_are_refused():
 def test_a_copy_on_another_device_learns_what_the_ego_itself_would():
     """cpu:0 is a device of its own to the code, and the same to arithmetic; attacks meet the ego at home."""
     run = small_run(seed=3)
-    expected, weights = rounds(run, 2), run.ego.network.weights()
+    expected = rounds(run, 2)
+    weights = run.ego.network.weights()
     run = small_run(seed=3, expert={"device": "cpu:0"})
     assert run.improve._learning is not run.ego
     assert rounds(run, 2) == expected

@@ -24,7 +24,8 @@ def attacked(scenes, eta=2.0):
 def test_demonstrations_of_an_evasion_avoid_the_contact_when_replayed(hold):
     """Its decisions, driven in the row's traffic; the logged drive there is hit."""
     scenes = small_scenes(3, steps=40)
-    pool, rows = attacked(scenes), torch.arange(3)
+    pool = attacked(scenes)
+    rows = torch.arange(3)
     pool.parts[0].span[:] = torch.tensor([0, 40])  # all decisions
     driver = PoolDriver(scenes, SIM, 3, hold=hold)
     shown = evasion_demonstrations(driver, pool, 0)
@@ -39,7 +40,8 @@ def test_demonstrations_of_an_evasion_avoid_the_contact_when_replayed(hold):
 
 def test_only_the_decisions_in_the_span_are_cloned_and_each_row_once():
     scenes = small_scenes(3, steps=40)
-    pool, driver = attacked(scenes), PoolDriver(scenes, SIM, 8, hold=2)
+    pool = attacked(scenes)
+    driver = PoolDriver(scenes, SIM, 8, hold=2)
     pool.parts[0].span[:] = torch.tensor([[10, 21], [0, 0], [3, 9]])
     shown = evasion_demonstrations(driver, pool, 0)
     assert torch.bincount(shown["scene_index"]).tolist() == [6, 0, 3], "steps 10..20 and 4..8"
@@ -47,15 +49,18 @@ def test_only_the_decisions_in_the_span_are_cloned_and_each_row_once():
 
 def test_evasions_that_fail_by_decisions_are_left_out():
     scenes = small_scenes(2, steps=40)
-    pool, driver = attacked(scenes), PoolDriver(scenes, SIM, 2, hold=2)
+    pool = attacked(scenes)
+    driver = PoolDriver(scenes, SIM, 2, hold=2)
     pool.parts[0].evasion[0] = 0.0
     assert evasion_demonstrations(driver, pool, 0)["scene_index"].unique().tolist() == [1]
 
 
 def test_demonstrations_of_remembered_evasions_are_made_once_and_leave_with_their_rows():
     scenes = small_scenes(2, steps=40)
-    older, newer = attacked(scenes), attacked(scenes, 3.0)
-    experts, made = Experts(scenes, SIM, 2, evasions=True), []
+    older = attacked(scenes)
+    newer = attacked(scenes, 3.0)
+    experts = Experts(scenes, SIM, 2, evasions=True)
+    made = []
     drive = experts._driver.drive
     experts._driver.drive = lambda *given: made.append(1) or drive(*given)
     first = experts.demonstrations(older)["evasions"]

@@ -46,7 +46,8 @@ def test_the_checkers_of_gymnasium_and_torchrl_pass(given):
 
 def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
     """Through ends and resets: observations, rewards, flags and what ended, from equal seeds and actions."""
-    env, batch = e2rl.make_env(4, **given), e2rl.make_gym_env(4, **given)
+    env = e2rl.make_env(4, **given)
+    batch = e2rl.make_gym_env(4, **given)
     env.set_seed(5)
     td, (seen, info) = env.reset(), batch.reset(seed=5)
     ended = 0
@@ -71,7 +72,8 @@ def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
 
 def test_a_scene_drives_alone_as_in_a_batch(given):
     """In a chosen scene, to the end of the episode, whose observation and info are those of the step."""
-    one, batch = e2rl.make_gym_env(**given), e2rl.make_gym_env(2, **given)
+    one = e2rl.make_gym_env(**given)
+    batch = e2rl.make_gym_env(2, **given)
     name = given["scenes"].scene_id[1]
     (alone, info), (both, _) = one.reset(options={"scene": name}), batch.reset(options={"scene": 1})
     assert info["scene"] == name
@@ -179,7 +181,8 @@ def test_torchrl_is_pointed_to_its_own_environment(given):
 
 
 def test_actions_are_scaled_about_keeping_speed_and_heading(given):
-    low, high = torch.tensor([-8.0, -1.6]), torch.tensor([5.0, 1.6])
+    low = torch.tensor([-8.0, -1.6])
+    high = torch.tensor([5.0, 1.6])
     found = in_units(torch.tensor([[-2.0, -1.0], [-0.5, 0.0], [0.0, 0.5], [1.0, 3.0]]), low, high)
     assert found.tolist() == [pytest.approx(row) for row in ([-8.0, -1.6], [-4.0, 0.0], [0.0, 0.8], [5.0, 1.6])]
     env = e2rl.make_gym_env(**given, max_acceleration=2.0)

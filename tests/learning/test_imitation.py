@@ -37,13 +37,15 @@ def test_disturbed_demonstrations_lead_back(monkeypatch):
     """Where the ego has turned off its track the label turns it back."""
     monkeypatch.setattr(imitation, "DISTURBED", (1.0, 0.2))
     shown = recorded_demonstrations(braking_log(8), SimSettings(), 0)
-    sideways, turned = 3 * shown["observation"][:, 3], shown["observation"][:, 4]
+    sideways = 3 * shown["observation"][:, 3]
+    turned = shown["observation"][:, 4]
     off = (sideways.abs() > 0.1) & (sideways * turned > 0)
     assert off.sum() > 20 and (shown["action"][off, 0, 1].sign() == -sideways[off].sign()).float().mean() > 0.9
 
 
 def test_clipping_keeps_actions_off_the_bounds():
-    low, high = torch.tensor([-8.0, -1.6]), torch.tensor([5.0, 1.6])
+    low = torch.tensor([-8.0, -1.6])
+    high = torch.tensor([5.0, 1.6])
     clipped = clip_expert(torch.tensor([[9.0, -9.0], [0.0, 0.1]]), low, high)
     assert torch.allclose(clipped, torch.tensor([[4.935, -1.584], [0.0, 0.1]]))
 

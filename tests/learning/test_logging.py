@@ -39,7 +39,8 @@ def test_wandb_has_scalars_and_media_of_a_step_in_one_row(tmp_path, monkeypatch)
     """Two rounds, each with pictures after its scalars, read back from the file of the offline run."""
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    picture, video = tmp_path / "choices.png", tmp_path / "attack.gif"
+    picture = tmp_path / "choices.png"
+    video = tmp_path / "attack.gif"
     Image.new("RGB", (8, 8)).save(picture)
     Image.new("RGB", (8, 8)).save(video, save_all=True, append_images=[Image.new("RGB", (8, 8), "red")])
     logger = RunLogger("wandb", tmp_path)
@@ -74,7 +75,8 @@ def history(file):
 def leveldb_records(content):
     """Records of a LevelDB log: fragments of crc, length and kind (1 whole, 2 first, 3 middle, 4 last), none of which
     crosses a block. The first block has a header of WANDB_HEADER bytes."""
-    at, record = 0, b""
+    at = 0
+    record = b""
     while at + FRAGMENT.size <= len(content):
         left = LEVELDB_BLOCK - (at + WANDB_HEADER) % LEVELDB_BLOCK
         if left < FRAGMENT.size:

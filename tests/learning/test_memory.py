@@ -45,7 +45,8 @@ def test_the_pool_holds_every_round_the_newest_first_and_heavier(tmp_path):
 
 def test_evasions_make_the_round_trip(tmp_path):
     """Through make_traffic, the file and the pool; rows that are left out and nominal ones have none."""
-    scenes, index = small_scenes(4), torch.arange(4)
+    scenes = small_scenes(4)
+    index = torch.arange(4)
     actions = torch.arange(4 * 20 * 2).reshape(4, 20, 2).float()
     span = torch.tensor([[3, 9], [0, 0], [2, 5], [1, 4]])
     solved = Solved(torch.tensor([True, True, False, True]), actions, span)

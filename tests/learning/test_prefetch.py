@@ -45,7 +45,8 @@ def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tm
     def begun():
         return small_run(folder=tmp_path, prefetch=True)
 
-    run, attack = begun(), brake_check(small_scenes())
+    run = begun()
+    attack = brake_check(small_scenes())
     run.synthesize = lambda ego, index, eta, seed: (
         os.kill(os.getpid(), signal.SIGKILL) if seed == 1 else attack(ego, index, eta, seed)
     )
@@ -53,7 +54,8 @@ def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tm
     save_checkpoint(tmp_path, run)
     with pytest.raises(InputError, match=r"round 2: .*killed"):
         train_round(run)
-    again, whole = begun(), small_run(prefetch=True)
+    again = begun()
+    whole = small_run(prefetch=True)
     assert load_checkpoint(tmp_path, again) == 1
     train_round(again)
     train_round(whole), train_round(whole)

@@ -45,7 +45,8 @@ def test_the_checker_passes(given):
 
 def test_it_is_the_batch_of_gymnasium(given):
     """What ends has its last observation, and is bootstrapped where it was truncated alone."""
-    env, batch = e2rl.make_sb3_env(3, **given), e2rl.make_gym_env(3, **given)
+    env = e2rl.make_sb3_env(3, **given)
+    batch = e2rl.make_gym_env(3, **given)
     env.seed(2)
     seen, (other, _) = env.reset(), batch.reset(seed=2)
     ends = {"truncated": 0, "terminated": 0}

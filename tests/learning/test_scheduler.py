@@ -45,7 +45,8 @@ def test_priorities_are_by_rank_of_regret_and_by_staleness(monkeypatch):
     weight = torch.tensor([4.0, 3.0, 2.0, 1.0]) ** -0.5
     torch.testing.assert_close(curriculum.priority(), weight / weight.sum())
     monkeypatch.setattr(scheduler, "STALENESS", 0.5)
-    curriculum._drawn, curriculum.round = torch.tensor([0, 1, 2, 3]), 3
+    curriculum._drawn = torch.tensor([0, 1, 2, 3])
+    curriculum.round = 3
     stale = torch.tensor([3.0, 2.0, 1.0, 0.0]) / 6
     torch.testing.assert_close(curriculum.priority(), (weight / weight.sum() + stale) / 2)
     assert curriculum_of(4, prioritised=False).priority().tolist() == [0.25] * 4
@@ -70,9 +71,11 @@ def test_a_drawn_scene_is_not_stale():
 
 
 def test_regret_is_what_a_teacher_would_have_survived_where_one_tells():
-    given, told = [torch.tensor([0, 0, 1, 2])] + [torch.tensor([True, False, True, True])], [0.25, 0.75, torch.nan, 1.0]
+    given = [torch.tensor([0, 0, 1, 2])] + [torch.tensor([True, False, True, True])]
+    told = [0.25, 0.75, torch.nan, 1.0]
     adversarial = torch.tensor([True, True, True, False])
-    curriculum, deaf = curriculum_of(), curriculum_of(regret=False)
+    curriculum = curriculum_of()
+    deaf = curriculum_of(regret=False)
     for each in (curriculum, deaf):
         each.update(*given, adversarial, torch.tensor(told))
     assert curriculum.regret()[:3].nan_to_num(-1).tolist() == [0.5 * 0.5, 0.0, -1.0]
@@ -92,7 +95,8 @@ def test_scenes_left_out_are_not_drawn_first():
 
 
 def test_state_goes_on_exactly():
-    first, second = curriculum_of(), curriculum_of(seed=4)
+    first = curriculum_of()
+    second = curriculum_of(seed=4)
     for _ in range(3):
         first.draw(2)
         episodes(first, [0, 3], [True, False])
@@ -111,8 +115,10 @@ def test_state_goes_on_exactly():
 
 def test_episodes_count_for_the_attack_whose_row_they_drove():
     """Attacks 0 and 2 of three entered D'; rows beyond them are nominal or remembered."""
-    eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
-    row, failed = torch.tensor([0, 0, 1, 2, 5, 1]), torch.tensor([True, False, True, True, True, True])
+    eta = torch.tensor([1.0, 2.0, 2.0])
+    template = torch.tensor([SINGLE, PAIR, PAIR])
+    row = torch.tensor([0, 0, 1, 2, 5, 1])
+    failed = torch.tensor([True, False, True, True, True, True])
     share = torch.tensor([0.5, 0.5, 0.25, torch.nan, 1.0, 0.25])
     outcomes = outcomes_of(eta, template, torch.tensor([0, 2]), row, failed, share)
     assert outcomes.survivable.nan_to_num(-1).tolist() == [0.5, -1.0, 0.25]
@@ -121,7 +127,8 @@ def test_episodes_count_for_the_attack_whose_row_they_drove():
 
 
 def test_the_table_counts_draws_episodes_and_failures_by_arm():
-    eta, template = torch.tensor([1.0, 2.0, 2.0]), torch.tensor([SINGLE, PAIR, PAIR])
+    eta = torch.tensor([1.0, 2.0, 2.0])
+    template = torch.tensor([SINGLE, PAIR, PAIR])
     flags = torch.tensor([False, True, False])
     outcomes = Outcomes(eta, template, flags, torch.tensor([2, 0, 2]), torch.tensor([1, 0, 2]), torch.zeros(3))
     rows = tally(4, eta, outcomes, {(0.5, "full"): 0.2, (1.0, "single"): 0.1})

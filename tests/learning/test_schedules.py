@@ -12,7 +12,8 @@ SCENES = torch.zeros(4000, dtype=torch.int64)
 
 def test_linear_values_rise_to_the_final_ones_and_stay():
     curriculum = LinearCurriculum(6, 10, eta=0.5, eta_final=2.5, ramp=0.5, fraction=0.0, fraction_final=0.9)
-    etas, fractions = [], []
+    etas = []
+    fractions = []
     for _ in range(10):
         etas.append(curriculum.eta), fractions.append(curriculum.fraction)
         curriculum.advance(1.0)
@@ -22,7 +23,8 @@ def test_linear_values_rise_to_the_final_ones_and_stay():
 
 def test_adaptive_intensity_seeks_the_band_within_its_bounds():
     band = {"eta_step": 0.5, "eta_min": 0.5, "eta_max": 2.0, "target_low": 0.2, "target_high": 0.4}
-    curriculum, seen = AdaptiveCurriculum(6, 10, eta=1.0, **band), []
+    curriculum = AdaptiveCurriculum(6, 10, eta=1.0, **band)
+    seen = []
     for rate in (0.0, 0.2, 0.4, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9, 0.9):
         curriculum.advance(rate)
         seen.append(curriculum.eta)
@@ -48,7 +50,8 @@ def test_a_linear_intensity_is_never_below_zero():
 
 
 def test_constant_intensities_take_turns():
-    curriculum, seen = ConstantCurriculum(6, 10, eta=[1.0, 2.0, 3.0], fraction=0.3), []
+    curriculum = ConstantCurriculum(6, 10, eta=[1.0, 2.0, 3.0], fraction=0.3)
+    seen = []
     for _ in range(3):
         seen.append(curriculum.etas(torch.arange(4)).tolist())
         curriculum.advance(0.0)
@@ -58,7 +61,8 @@ def test_constant_intensities_take_turns():
 
 @pytest.mark.parametrize("kind", [AdaptiveCurriculum, LinearCurriculum, ConstantCurriculum])
 def test_the_template_is_full_and_intensities_are_counted_under_multiples_of_a_half(kind):
-    one, other = kind(6, 10), kind(6, 10)
+    one = kind(6, 10)
+    other = kind(6, 10)
     etas, templates = one.choices(torch.arange(6))
     assert torch.equal(etas, other.etas(torch.arange(6))) and templates.tolist() == [FULL] * 6
     assert one.templates == ("full",) and one.values() == {}

@@ -71,13 +71,16 @@ def test_a_label_is_what_the_planner_would_do_in_the_same_state():
     pool = attacked(scenes)
     data, improve = collected(scenes, pool)
     index = data["scene_index"][:, 0, 0]
-    env, planner = DrivingEnv(scenes, SimSettings(), len(index), agents=True, hold=2), SamplingEgo()
+    env = DrivingEnv(scenes, SimSettings(), len(index), agents=True, hold=2)
+    planner = SamplingEgo()
     states, valid = pool.tracks(data["traffic", "row"][:, 0, 0])
     env.set_traffic(torch.arange(len(index)), states, valid)
     env.reset(TensorDict({"scene_index": index[:, None]}, [len(index)]))
-    low, high = env.action_spec.space.low[0], env.action_spec.space.high[0]
+    low = env.action_spec.space.low[0]
+    high = env.action_spec.space.high[0]
     for step in range(8):
-        frames, world = data[:, step], env.world()
+        frames = data[:, step]
+        world = env.world()
         for name in ("states", "valid", "accel", "turn_rate"):
             assert torch.equal(frames["agents", name], getattr(world, name)), name
         labels, _ = improve.teacher.labels(frames, improve.ego)
@@ -117,7 +120,8 @@ def test_a_row_is_survivable_where_the_teacher_gets_away_and_the_policy_does_not
     scenes = small_scenes(3, steps=40)
     pool = attacked(scenes, 3.0)
     data, improve = collected(scenes, pool)
-    teacher, row = improve.teacher, data["traffic", "row"][..., 0].unique()
+    teacher = improve.teacher
+    row = data["traffic", "row"][..., 0].unique()
     teacher.watch(data, pool.adversarial, SamplingEgo(), 1000)
     share = teacher.survivable(len(pool))
     assert (share[row] == 0).all(), "who plans as the teacher does loses nothing that it would survive"
@@ -132,7 +136,8 @@ def test_nominal_episodes_are_not_labelled_and_the_newest_labels_stay():
     scenes = small_scenes(3, steps=40)
     pool = attacked(scenes)
     data, improve = collected(scenes, pool, memory=30)
-    teacher, ego = improve.teacher, improve.ego
+    teacher = improve.teacher
+    ego = improve.ego
     assert teacher.watch(data, torch.zeros(3).bool(), ego, 10) == {"critical": 0, "labels": 0}
     assert teacher.labelled is None
     assert teacher.watch(data, pool.adversarial, ego, 20) == {"critical": data.numel(), "labels": 20}

@@ -132,7 +132,8 @@ def test_advantages_are_those_of_torchrl():
     """Of one pass over the observations, where TorchRL takes two; with episodes that end and are cut off inside."""
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,), room=None, initial_std=(0.9, 0.9))
-    learner, data = Learner(ego.network, settings_of(gamma=0.9, lmbda=0.8)), batch_of(ego, 16, 50)
+    learner = Learner(ego.network, settings_of(gamma=0.9, lmbda=0.8))
+    data = batch_of(ego, 16, 50)
     assert data["next", "terminated"].any() and data["next", "truncated"].any()
     learner.returns.update(5 * torch.randn(100, 1) + 3)
     learner.network.normaliser.observe(data["observation"])
@@ -158,7 +159,8 @@ def test_the_critic_learns_values_of_any_size():
 
 def test_the_learning_rate_falls_to_its_end_over_the_run():
     ego = ActorEgo(hidden=(16,), room=None)
-    settings, data = settings_of(learning_rate=1e-3, final_lr=0.2, epochs=1), batch_of(ego)
+    settings = settings_of(learning_rate=1e-3, final_lr=0.2, epochs=1)
+    data = batch_of(ego)
     learner = Learner(ego.network, settings, total=4)
     rates = [learner.update(data)["learning_rate"] for _ in range(6)]
     assert rates == pytest.approx([1e-3, 8e-4, 6e-4, 4e-4, 2e-4, 2e-4])
@@ -172,7 +174,8 @@ def test_frames_with_little_to_learn_are_left_out():
     ego, learner, data = begun(advantage_filter=0.3, critic_warmup=1, epochs=1)
     assert learner.update(data)["frames_used"] == 1.0
     seen = ego.network.prepared(data["observation"])["seen"]
-    advantage, before = learner.advantages(data, seen)[0].abs(), learner.peak.clone()
+    advantage = learner.advantages(data, seen)[0].abs()
+    before = learner.peak.clone()
     expected = (advantage >= 0.3 * (0.75 * before + 0.25 * advantage.max())).float().mean().item()
     assert learner.update(data)["frames_used"] == pytest.approx(expected) and 0 < expected < 1
     every = Learner(ego.network, settings_of(advantage_filter=0.0, critic_warmup=0, epochs=1))

@@ -44,10 +44,13 @@ def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
     Semi-implicit Euler steps of DT along the road: v' = max(v + a DT, 0), x' = x + v' DT.
     """
     lateral_speed, lateral_gap, start = lateral_motion(cut_in)
-    speed, other = cut_in.speed, cut_in.other_speed
+    speed = cut_in.speed
+    other = cut_in.other_speed
     gap = cut_in.gap + (speed - other) * start * DT
-    crash, length = torch.zeros_like(speed, dtype=torch.bool), torch.full_like(speed, LENGTH)
-    state, acceleration = no_conflict(speed), torch.zeros_like(speed)
+    crash = torch.zeros_like(speed, dtype=torch.bool)
+    length = torch.full_like(speed, LENGTH)
+    state = no_conflict(speed)
+    acceleration = torch.zeros_like(speed)
     for lateral, side in zip(lateral_speed, lateral_gap, strict=True):
         overlaps = side <= 0
         crash |= overlaps & (gap <= 0) & (gap >= -2 * LENGTH)
@@ -55,5 +58,6 @@ def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
         state, wanted = driver.step(state, seen)
         after = (speed + wanted * DT).clamp(min=0)
         acceleration = (after - speed) / DT
-        speed, gap = after, gap + (other - after) * DT
+        speed = after
+        gap = gap + (other - after) * DT
     return crash

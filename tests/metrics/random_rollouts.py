@@ -6,7 +6,10 @@ import torch
 
 from e2rl.sim.rollouts import Rollouts
 
-STEPS, VEHICLES, OTHERS, DT = 80, 32, 16, 0.1
+STEPS = 80
+VEHICLES = 32
+OTHERS = 16
+DT = 0.1
 
 
 def random_rollouts(

@@ -148,7 +148,8 @@ def test_an_object_is_no_pedestrian_or_cyclist(kind, vru, thing):
 
 
 def test_background_pairs_leave_out_those_that_overlap_at_the_start_and_what_comes_after_the_ego_s_contact():
-    ego, far = course(0, 0, 0, 0), course(0, 100, 0, 0)
+    ego = course(0, 0, 0, 0)
+    far = course(0, 100, 0, 0)
     meeting = course(30, 100, math.pi, 10)
     assert row(ego, far, meeting)["cfr_bg"] == 1
     assert row(ego, far, course(1, 100, 0, 0))["cfr_bg"] == 0
@@ -168,7 +169,8 @@ def test_background_pairs_leave_out_those_that_overlap_at_the_start_and_what_com
     ],
 )
 def test_touched_is_a_fraction_of_the_traffic_that_moves(speeds, logged, there, hit, expected):
-    speed, log = torch.tensor(speeds).double(), torch.tensor(logged or speeds).double()
+    speed = torch.tensor(speeds).double()
+    log = torch.tensor(logged or speeds).double()
     count = len(speeds)
     track = torch.zeros(1, 5, count, 4, dtype=torch.float64)
     known = torch.tensor(there or [True] * count).expand(1, 5, count)

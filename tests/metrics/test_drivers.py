@@ -33,7 +33,8 @@ def observe(**fields):
 
 def drive(driver, observations):
     """Accelerations [T, ...] of a driver that sees one observation after the other."""
-    state, actions = no_conflict(observations[0].speed), []
+    state = no_conflict(observations[0].speed)
+    actions = []
     for observation in observations:
         state, acceleration = driver.step(state, observation)
         actions.append(acceleration)
@@ -101,18 +102,22 @@ def test_rss_brakes_within_both_safe_distances():
     assert ahead == pytest.approx(15 + 3 * 0.75**2 / 2 + 22.25**2 / 15.18 - 100 / 15.18, abs=1e-4)
     aside = rss.safe_lateral_distance(torch.tensor([0.5, -2.0])).tolist()
     assert aside == pytest.approx([0.3 + 0.375 + 0.75**2 / 2 + 1.25**2 / 2, 0.3])
-    gap, side = torch.tensor([ahead - 1, ahead - 1, ahead + 1]), torch.tensor([aside[0] - 0.1, aside[0] + 0.1, 0.0])
+    gap = torch.tensor([ahead - 1, ahead - 1, ahead + 1])
+    side = torch.tensor([aside[0] - 0.1, aside[0] + 0.1, 0.0])
     danger = observe(gap=gap, lateral_gap=side, lateral_speed=0.5, overlaps=False)
     assert (drive(rss, [danger] * 10)[-1] < 0).tolist() == [True, False, False]
 
 
 def test_fuzzy_metrics_are_linear_between_unsafe_and_safe():
     fsm = FuzzySafetyModel()
-    speed, other = torch.tensor(20.0), torch.tensor(10.0)
-    unsafe, safe = 15 - 100 / 14 + 400 / 12, 15 - 100 / 14 + 400 / 8 + 2
+    speed = torch.tensor(20.0)
+    other = torch.tensor(10.0)
+    unsafe = 15 - 100 / 14 + 400 / 12
+    safe = 15 - 100 / 14 + 400 / 8 + 2
     gap = 2 + torch.tensor([unsafe - 1, unsafe, (unsafe + safe) / 2, safe, safe + 1])
     assert fsm.proactive(gap, speed, other).tolist() == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-5)
-    unsafe, safe = 7.5 + 100 / 12, 7.5 + 100 / 8
+    unsafe = 7.5 + 100 / 12
+    safe = 7.5 + 100 / 8
     gap = torch.tensor([unsafe - 1, unsafe, (unsafe + safe) / 2, safe, safe + 1])
     assert fsm.critical(gap, speed, torch.tensor(0.0), other).tolist() == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-5)
     # Braking by 4 m/s^2 makes 12 m/s as slow as the other within the reaction: 2 m / 8 decide.
@@ -121,7 +126,9 @@ def test_fuzzy_metrics_are_linear_between_unsafe_and_safe():
 
 
 def test_fsm_anticipates_who_comes_over_before_the_ego_has_passed():
-    gap, side, sideways = torch.tensor([10.0, 10.0, 10.0]), torch.tensor([1.6, 1.6, 1.6]), torch.tensor([0.9, 0.8, 0.0])
+    gap = torch.tensor([10.0, 10.0, 10.0])
+    side = torch.tensor([1.6, 1.6, 1.6])
+    sideways = torch.tensor([0.9, 0.8, 0.0])
     observation = observe(gap=gap, lateral_gap=side, lateral_speed=sideways, overlaps=False)
     # The ego needs 18.6 m / 10 m/s = 1.86 s to pass, with 0.1 s of margin 1.96 s; the other 1.78 s, 2 s or for ever.
     assert (drive(FuzzySafetyModel(), [observation] * 10)[-1] < 0).tolist() == [True, False, False]
@@ -162,7 +169,8 @@ def test_the_human_driver_needs_its_stopping_gap_and_no_more(closing):
     assert HumanDriver().stopping_gap(torch.tensor(closing)).item() == pytest.approx(way, rel=0.03)
 
     def least(gap):
-        state, speed = no_conflict(torch.tensor(0.0).double()), torch.tensor(10.0 + closing).double()
+        state = no_conflict(torch.tensor(0.0).double())
+        speed = torch.tensor(10.0 + closing).double()
         smallest = gap = torch.tensor(gap).double()
         for _ in range(80):
             state, wanted = HumanDriver().step(state, observe(speed=speed, gap=gap, other_speed=10.0))

@@ -112,7 +112,8 @@ def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_
 
 
 def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
-    driven, after = torch.zeros(3, 10, 4), torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
+    driven = torch.zeros(3, 10, 4)
+    after = torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
     found = spliced(driven, after, torch.tensor([0, 4, 10]))[..., 0]
     assert found[0].tolist() == list(range(1, 11))
     assert found[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6] and found[2].tolist() == [0] * 10
@@ -124,7 +125,8 @@ def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkey
     def late_only(scene, states, valid, sim, moment=None):
         asked.append(None if moment is None else moment.tolist())
         found = torch.tensor([moment is not None] * len(states))
-        track, peak = torch.full((len(states), 60, 4), 7.0), torch.full((len(states),), 3.0)
+        track = torch.full((len(states), 60, 4), 7.0)
+        peak = torch.full((len(states),), 3.0)
         return evasion.Evasions(found, track[..., :2], track, peak, batch_size=[len(states)])
 
     monkeypatch.setattr(evasion, "find_evasions", late_only)

@@ -11,7 +11,10 @@ from e2rl.metrics.score import as_doubles, score_rollouts
 from e2rl.sim.dynamics import rollout
 from tests.metrics.test_contact import course, row, scene
 
-EAST, NORTH, WEST, SOUTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
+EAST = 0.0
+NORTH = math.pi / 2
+WEST = math.pi
+SOUTH = -math.pi / 2
 WORDS = ("approach", "ego_manoeuvre", "partner_manoeuvre")
 
 
@@ -79,7 +82,8 @@ def test_a_leader_in_a_sharp_bend_is_ahead_and_the_follower_is_behind():
     def bend(speed, begin):
         return drive(0, 0, EAST, speed, turn=lambda t: -speed / 10 if begin <= t * speed < begin + 5 * math.pi else 0.0)
 
-    slow, fast = bend(5.0, 20), bend(9.0, 20)
+    slow = bend(5.0, 20)
+    fast = bend(9.0, 20)
     slow = (slow[0][38:], slow[1][38:])  # 19 m on its way when the fast one starts
     fast = (fast[0][: len(slow[0])], fast[1][: len(slow[0])])
     assert words(fast, slow)[0] == "ahead" and words(slow, fast)[0] == "from behind"

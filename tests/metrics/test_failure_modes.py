@@ -135,7 +135,8 @@ def expected_labels(labels, places, count):
 
 
 def test_coverage_is_the_expected_number_of_modes_at_so_many_places():
-    labels, places = [1, 1, 2, 3, 1, 4, 2, 2, 5, 1], [0, 0, 0, 1, 2, 2, 3, 4, 5, 5]
+    labels = [1, 1, 2, 3, 1, 4, 2, 2, 5, 1]
+    places = [0, 0, 0, 1, 2, 2, 3, 4, 5, 5]
     given = torch.tensor(labels, dtype=torch.float64), torch.tensor(places)
     for count in (1, 2, 4, 6):
         found = resampled_labels(*given, bootstrap_draws(6, 3), count)

@@ -23,7 +23,8 @@ def polygons(state, size):
 
 
 def test_overlap_area_is_shapely_s():
-    first, second = random_boxes(4000, 1), random_boxes(4000, 2)
+    first = random_boxes(4000, 1)
+    second = random_boxes(4000, 2)
     expected = shapely.area(shapely.intersection(polygons(*first), polygons(*second)))
     area = overlap_area(*first, *second)
     assert (expected > 0).mean() > 0.4
@@ -45,9 +46,12 @@ def test_shared_and_collinear_edges_need_no_special_case(turn):
 
 
 def test_edge_parts_are_shapely_s():
-    first, second = random_boxes(600, 3), random_boxes(600, 4)
-    parts, corner = edge_parts_inside(*first, *second), corners(*first).numpy()
-    other, point = polygons(*second), shapely.points(second[0][:, :2].numpy())
+    first = random_boxes(600, 3)
+    second = random_boxes(600, 4)
+    parts = edge_parts_inside(*first, *second)
+    corner = corners(*first).numpy()
+    other = polygons(*second)
+    point = shapely.points(second[0][:, :2].numpy())
     away = edge_distances(*first, second[0][:, :2])
     for edge in range(4):
         line = shapely.linestrings(corner[:, [edge, (edge + 1) % 4]])

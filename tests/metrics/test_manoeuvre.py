@@ -88,7 +88,8 @@ def evasion_scene(scene_set, moment=0):
 def test_contact_is_what_the_environment_calls_contact():
     scene_set = make_scenes(3, vehicles=[(0, 0, 10.0), (18, 0, 4.0)], num_vrus=0, steps=40, **SMALL)
     env = DrivingEnv(scene_set, SimSettings(end_on_contact=False), 3)
-    td, hit = env.reset(), []
+    td = env.reset()
+    hit = []
     for _ in range(40):
         td["action"] = torch.zeros(3, 2)
         after = env.step(td)["next"]

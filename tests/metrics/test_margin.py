@@ -30,7 +30,8 @@ def test_the_margin_grows_with_nearness_to_contact_to_verdict():
 
 def test_a_contact_has_the_share_of_its_speed_that_the_driver_has_lost_before_it():
     """An ego at 10 m/s whose driver is down to 6 by then; one that creeps; one without a driver; a preventable one."""
-    states, driver = torch.zeros(4, 5, 2, 4), torch.zeros(4, 5, 4)
+    states = torch.zeros(4, 5, 2, 4)
+    driver = torch.zeros(4, 5, 4)
     states[:, :, 0, 3], driver[:, 3, 3] = 10.0, 6.0
     states[1, :, 0, 3], driver[2] = 0.2, torch.nan
     step = torch.full((4,), 3)

@@ -51,7 +51,8 @@ def test_probabilities_of_all_bins_sum_to_one():
 
 
 def test_an_indication_has_the_share_of_rollouts_smoothed():
-    hits, happened = torch.tensor([0.0, 8.0, 2.0, 2.0]), torch.tensor([False, True, True, False])
+    hits = torch.tensor([0.0, 8.0, 2.0, 2.0])
+    happened = torch.tensor([False, True, True, False])
     p = log_bernoulli(hits, 8, happened).exp()
     sure = (8 + SMOOTHING) / (8 + 2 * SMOOTHING)
     assert p.tolist() == pytest.approx([sure, sure, 2.1 / 8.2, 6.1 / 8.2])
@@ -91,7 +92,8 @@ def ttc(*states):
     """Time to collision of the first car, the same wherever the world is turned."""
     found = []
     for turn in (0.0, 2.0):
-        cos, sin = math.cos(turn), math.sin(turn)
+        cos = math.cos(turn)
+        sin = math.sin(turn)
         turned = [(cos * x - sin * y, sin * x + cos * y, heading + turn, speed) for x, y, heading, speed in states]
         found.append(time_to_collision(*cars(*turned)).item())
     assert found[0] == pytest.approx(found[1])
@@ -125,8 +127,10 @@ def test_central_differences_are_exact_for_parabolas_and_need_both_neighbours():
 def test_the_nearest_object_is_the_smallest_signed_distance():
     generator = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
-    track, others = draw(25, 2, 4) * 8, draw(25, 2, 5, 4) * torch.tensor([30, 30, 7, 9]).double()
-    size, other_size = 1 + 5 * draw(25, 2), 0.5 + 11 * draw(25, 5, 2)
+    track = draw(25, 2, 4) * 8
+    others = draw(25, 2, 5, 4) * torch.tensor([30, 30, 7, 9]).double()
+    size = 1 + 5 * draw(25, 2)
+    other_size = 0.5 + 11 * draw(25, 5, 2)
     seen = draw(25, 2, 5) < 0.8
     found = nearest_object(track, size, others, other_size, seen)
     gaps = signed_distance(track[:, :, None], size[:, None, None], others, other_size[:, None])
@@ -181,12 +185,15 @@ def crossing_of(light_state, known=None, light=(0, -1), speed=10.0):
 
 def test_a_red_light_is_run_when_the_front_passes_its_line_while_it_is_red():
     """The front is at 2 m at the start and passes 8 m between steps 6 and 7."""
-    red, green = torch.full((20, 1), LIGHT_RED), torch.full((20, 1), GREEN)
-    early, late = red.clone(), red.clone()
+    red = torch.full((20, 1), LIGHT_RED)
+    green = torch.full((20, 1), GREEN)
+    early = red.clone()
+    late = red.clone()
     early[5:], late[:9] = GREEN, GREEN
     assert crossing_of(red) and not crossing_of(green)
     assert not crossing_of(early) and not crossing_of(late), "red before or after only"
-    only, but = green.clone(), red.clone()
+    only = green.clone()
+    but = red.clone()
     only[7], but[7] = LIGHT_RED, GREEN
     assert crossing_of(only) and not crossing_of(but), "the colour once it is across counts"
     assert not crossing_of(red, light=(-1, -1)), "no light of its route"

@@ -81,7 +81,8 @@ def test_a_track_of_at_most_0_05_m_per_s_stands(creep, expected):
 
 def test_an_object_stands_whatever_its_speed():
     """The same side is touched at 8 m/s: a vehicle did that by itself, an object costs half the score."""
-    ego, other = course(0, 0, 0, 10), course(8, 9.2, -math.pi / 2, 8)
+    ego = course(0, 0, 0, 10)
+    other = course(8, 9.2, -math.pi / 2, 8)
     assert scores(ego, other, kinds=[VEHICLE, VEHICLE], limit=20)["no_ego_at_fault_collisions"] == 1
     assert scores(ego, other, kinds=[VEHICLE, OTHER], limit=20)["no_ego_at_fault_collisions"] == 0.5
 
@@ -95,7 +96,8 @@ def test_two_objects_leave_nothing():
 
 def test_beside_it_is_the_ego_s_fault_where_it_is_in_two_lanes():
     """It drives on the border of two lanes; in one that is twice as wide it is not at fault."""
-    ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
+    ego = course(0, 2, 0, 10)
+    other = course(0.5, 9, -0.35, 10.2)
     two = [([[-500, 0], [500, 0]], 4), ([[-500, 4], [500, 4]], 4)]
     assert scores(ego, other, lanes=two)["no_ego_at_fault_collisions"] == 0
     assert scores(ego, other, lanes=[([[-500, 2], [500, 2]], 8)])["no_ego_at_fault_collisions"] == 1
@@ -103,7 +105,8 @@ def test_beside_it_is_the_ego_s_fault_where_it_is_in_two_lanes():
 
 def test_lanes_that_follow_each_other_are_one():
     """The same with the road cut into pieces of 7 m, at each of which the ego is in two lanes at a time."""
-    ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
+    ego = course(0, 2, 0, 10)
+    other = course(0.5, 9, -0.35, 10.2)
     pieces = [([[x, 2], [x + 7, 2]], 8) for x in range(-21, 200, 7)]
     assert scores(ego, other, lanes=pieces)["no_ego_at_fault_collisions"] == 1
     gaps = [([[x, 2], [x + 6.3, 2]], 8) for x in range(-21, 200, 7)]
@@ -112,14 +115,16 @@ def test_lanes_that_follow_each_other_are_one():
 
 def test_a_short_lane_between_two_others_connects_them():
     """Front corners in the lane after it, rear corners in the lane before it: one lane all the while."""
-    ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
+    ego = course(0, 2, 0, 10)
+    other = course(0.5, 9, -0.35, 10.2)
     pieces = [([[x, 2], [x + 3, 2]], 8) for x in range(-21, 200, 3)]
     assert scores(ego, other, lanes=pieces)["no_ego_at_fault_collisions"] == 1
 
 
 def test_lanes_that_follow_each_other_are_not_one_against_their_direction():
     """Pieces drawn the other way: where the ego is in two, the one ahead does not follow the one behind."""
-    ego, other = course(0, 2, 0, 10), course(0.5, 9, -0.35, 10.2)
+    ego = course(0, 2, 0, 10)
+    other = course(0.5, 9, -0.35, 10.2)
     pieces = [([[x + 3, 2], [x, 2]], 8) for x in range(-21, 200, 3)]
     assert scores(ego, other, lanes=pieces)["no_ego_at_fault_collisions"] == 0
 
@@ -153,7 +158,8 @@ def test_time_to_collision_looks_30_degrees_to_each_side_of_ahead(degrees, expec
     0.4 s later; the ego is in one lane."""
     angle = math.radians(degrees)
     axle = -1.461 / 5.176 * 4.8
-    x, y = axle + 8 * math.cos(angle), 8 * math.sin(angle)
+    x = axle + 8 * math.cos(angle)
+    y = 8 * math.sin(angle)
     time = torch.arange(81, dtype=torch.float64) * 0.1
     heading = math.atan2(-y, 2.0 - x)
     speed = math.hypot(y, 2.0 - x) / 0.4

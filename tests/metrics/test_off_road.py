@@ -58,8 +58,10 @@ def test_inside_overlapping_polygons_is_shapely_s():
 
 
 def test_a_vehicle_off_the_road_at_the_start_is_left_out():
-    ego, stays = course(0, 0, 0, 10), course(50, 0, 0, 10)
-    parked, leaves = course(0, 40, 0, 0), course(100, 0, 0.5, 10)
+    ego = course(0, 0, 0, 10)
+    stays = course(50, 0, 0, 10)
+    parked = course(0, 40, 0, 0)
+    leaves = course(100, 0, 0.5, 10)
     result = row(ego, stays, parked)
     assert (result["aor_step"], result["aor_any"], result["aor_left_out"]) == (0, 0, 1)
     result = row(ego, stays, leaves)
@@ -71,7 +73,9 @@ def test_a_vehicle_off_the_road_at_the_start_is_left_out():
 
 def test_the_ego_leaves_the_road_or_not_and_is_unknown_where_it_starts_beside_it():
     other = course(50, 0, 0, 10)
-    leaves, stays, beside = course(0, 0, 0.5, 10), course(0, 0, 0, 10), course(0, 40, 0, 10)
+    leaves = course(0, 0, 0.5, 10)
+    stays = course(0, 0, 0, 10)
+    beside = course(0, 40, 0, 10)
     assert (row(leaves, other)["ego_off_road"], row(stays, other)["ego_off_road"]) == (1, 0)
     assert np.isnan(row(beside, other)["ego_off_road"])
 

@@ -18,7 +18,8 @@ def track(speed, heading=0.0, start=(0.0, 0.0), steps=80):
     """States [1, steps + 1, 4] of a vehicle at speeds `speed` (a number or one per step), along a fixed heading."""
     speed = torch.as_tensor(speed, dtype=torch.float64).expand(steps + 1)
     way = torch.nn.functional.pad(((speed[1:] + speed[:-1]) / 2 * DT).cumsum(0), (1, 0))
-    x, y = start[0] + way * math.cos(heading), start[1] + way * math.sin(heading)
+    x = start[0] + way * math.cos(heading)
+    y = start[1] + way * math.sin(heading)
     return torch.stack([x, y, torch.full_like(x, heading), speed], -1)[None]
 
 
@@ -69,7 +70,8 @@ def driven_again(driver, cut_in):
     time = DT * (torch.arange(steps + 1, dtype=torch.float64)[:, None] - start)
     zero = torch.zeros_like(time * cut_in.speed)
     ego = torch.stack([time * cut_in.speed, zero, zero, zero + cut_in.speed], -1).transpose(0, 1)
-    x, y = LENGTH + cut_in.gap + time * cut_in.other_speed, side[: steps + 1] + WIDTH
+    x = LENGTH + cut_in.gap + time * cut_in.other_speed
+    y = side[: steps + 1] + WIDTH
     # The oracle's vehicles do not turn: their lateral speed is not in their heading.
     other = torch.stack([x, y, zero, zero + cut_in.other_speed], -1).transpose(0, 1)
     size = torch.tensor([[LENGTH, WIDTH]], dtype=torch.float64).expand(len(ego), 2)

@@ -54,7 +54,8 @@ def test_gaps_of_the_ego_s_track_are_closed_before_measuring():
 def completion(ego, recorded, *others):
     """Route completion of an ego on one course whose recording is on another."""
     rollout = scene(ego, *others)
-    logged, valid = rollout.logged.clone(), rollout.logged_valid.clone()
+    logged = rollout.logged.clone()
+    valid = rollout.logged_valid.clone()
     logged[0, :, 0], valid[0, :, 0] = recorded[0].float(), recorded[1]
     return score_rollouts(rollout.replace(logged=logged, logged_valid=valid))[0][0]["route_completion"]
 
@@ -124,7 +125,8 @@ def values(batch, who=None):
 
 
 def test_everybody_is_counted_once_and_where_it_belongs():
-    batch, who = rollouts(), traffic()
+    batch = rollouts()
+    who = traffic()
     assert values(batch) == {"parked_moved": 0.5, "parked_vehicles": 2, "starters": 1, "starters_log": 1}
     as_logged = values(batch | {"states": batch["logged"]})
     assert as_logged["parked_moved"] == 0 and as_logged["starters"] == as_logged["starters_log"] == 1

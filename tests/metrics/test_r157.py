@@ -27,7 +27,10 @@ TIME = {"human": 0.05, "regulation": 0.15}  # s that simulated drivers, who act 
 
 def human(closing, lateral):
     """The way that the distance shrinks until both are equally fast, from when the other begins."""
-    easing, delay, most, jerk = 0.4, 0.75, 0.774 * 9.81, 0.774 * 9.81 / 0.6
+    easing = 0.4
+    delay = 0.75
+    most = 0.774 * 9.81
+    jerk = 0.774 * 9.81 / 0.6
     ramp = (most - easing) / jerk
     slower = closing - easing * delay - (easing + most) / 2 * ramp  # once the brake is full
     way = closing * delay - easing * delay**2 / 2
@@ -46,7 +49,8 @@ def table():
 
 def test_the_table_is_what_the_regulation_says():
     rows = table()
-    closing, lateral = (rows["ego_kmh"] - rows["cut_in_kmh"]) / 3.6, rows["lateral_mps"]
+    closing = (rows["ego_kmh"] - rows["cut_in_kmh"]) / 3.6
+    lateral = rows["lateral_mps"]
     assert len(lateral) >= 30 and closing.min() >= 5 and closing.max() <= 50 / 3.6, "TTC of 2 s is enough to stop"
     np.testing.assert_allclose(rows["human_m"], human(closing, lateral), atol=0.006)
     np.testing.assert_allclose(rows["regulation_m"], regulation(closing, lateral), atol=0.006)
@@ -55,7 +59,8 @@ def test_the_table_is_what_the_regulation_says():
 @pytest.mark.parametrize("name", TIME)
 def test_a_little_more_room_is_survived_and_a_little_less_is_not(name):
     rows = {key: torch.from_numpy(column) for key, column in table().items()}
-    speed, other = rows["ego_kmh"] / 3.6, rows["cut_in_kmh"] / 3.6
+    speed = rows["ego_kmh"] / 3.6
+    other = rows["cut_in_kmh"] / 3.6
     for sign in (1, -1):
         gap = rows[f"{name}_m"] + sign * TIME[name] * (speed - other)
         crash = simulate_cut_ins(DRIVERS[name], CutIn(speed, other, gap, rows["lateral_mps"]))

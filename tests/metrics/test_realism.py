@@ -34,7 +34,8 @@ def test_pooled_figures_follow_the_definition():
     features = features_of(random_rollouts(8, seed=4))
     draws, cluster = once(8)
     table = realism(features, cluster, draws)
-    distances, scaled = [], []
+    distances = []
+    scaled = []
     for name in KINEMATICS:
         simulated, log = np.concatenate([sample[name].numpy() for sample in features], 1)
         distances.append(wasserstein_distance(simulated, log))
@@ -51,7 +52,8 @@ def test_the_ego_the_parked_and_what_happens_after_the_stop_do_not_count():
     changed = rollouts.clone()
     changed.logged[:, :, 0] += 5 * torch.rand(changed.logged[:, :, 0].shape)  # the ego's own log
     assert all(torch.equal(a[name], b[name]) for a, b in zip(before, features_of(changed), strict=True) for name in a)
-    states, valid = torch.zeros(1, 81, 3, 4, dtype=torch.float64), torch.ones(1, 81, 3, dtype=torch.bool)
+    states = torch.zeros(1, 81, 3, 4, dtype=torch.float64)
+    valid = torch.ones(1, 81, 3, dtype=torch.bool)
     states[:, :, 1, 3] = 5.0
     agents = torch.tensor([[False, True, True]])
     for stop, blocks in ((80, 16), (34, 6), (9, 1)):
@@ -74,7 +76,8 @@ def test_real_adv_is_real_of_a_traffic_of_adversaries_alone():
 def test_a_constant_turn_has_its_lateral_acceleration():
     time = torch.arange(81, dtype=torch.float64) * 0.1
     states = torch.stack([time, time, 3.0 + 0.2 * time, 4.0 + 0.5 * time], -1)[None, :, None].expand(1, 81, 2, 4)
-    valid, agents = torch.ones(1, 81, 2, dtype=torch.bool), torch.tensor([[False, True]])
+    valid = torch.ones(1, 81, 2, dtype=torch.bool)
+    agents = torch.tensor([[False, True]])
     sample = kinematic_samples(states, valid, states, valid, agents, torch.tensor([80]))[0]
     middle = 4.0 + 0.5 * (0.55 + 0.5 * torch.arange(15))
     torch.testing.assert_close(sample["a_lat"][0], (0.2 * middle).double(), atol=1e-6, rtol=0)
@@ -90,7 +93,8 @@ def logs(*samples):
 def test_split_halves_are_scipy_s_whichever_half_is_first_and_keep_clusters_together():
     generator = torch.Generator().manual_seed(4)
     samples = [torch.randn(20 + 9 * k, generator=generator, dtype=torch.float64) * (1 + 0.1 * k) for k in range(6)]
-    cluster, halves = torch.tensor([0, 0, 1, 1, 2, 2]), torch.tensor([[True, False, False], [False, True, True]])
+    cluster = torch.tensor([0, 0, 1, 1, 2, 2])
+    halves = torch.tensor([[True, False, False], [False, True, True]])
     one, other = split_half(logs(*samples), cluster, halves).tolist()
     distance = wasserstein_distance(torch.cat(samples[:2]).numpy(), torch.cat(samples[2:]).numpy())
     assert one == pytest.approx(1 - distance) and other == pytest.approx(one)

@@ -109,7 +109,8 @@ WORLDS = {
 def test_the_world_s_place_direction_and_hand_do_not_matter(world):
     """Mirrored, left and right are the other way round, and so who gives way to whom."""
     rollouts, (change, word) = random_rollouts(24, seed=5, vehicles=24, others=2, extent=30.0), WORLDS[world]
-    before, after = score_rollouts(rollouts)[0], score_rollouts(changed(rollouts, *change))[0]
+    before = score_rollouts(rollouts)[0]
+    after = score_rollouts(changed(rollouts, *change))[0]
     assert len({row["approach"] for row in before}) > 4 and len({row["preventable"] for row in before}) > 2
     for row, other in zip(before, after, strict=True):
         row = {name: word(value) if isinstance(value, str) else value for name, value in row.items()}
@@ -122,5 +123,6 @@ def test_transport_is_the_control_s_energy_and_unknown_without_control():
     rollouts = random_rollouts(3)
     assert all(math.isnan(row["transport"]) for row in score_rollouts(rollouts)[0])
     rollouts.transport_adversary = torch.tensor([1.0, 2, 3])
-    rollouts.transport_others, rollouts.transport_anchor = torch.tensor([0.5, 0, 1]), torch.zeros(3)
+    rollouts.transport_others = torch.tensor([0.5, 0, 1])
+    rollouts.transport_anchor = torch.zeros(3)
     assert [row["transport"] for row in score_rollouts(rollouts)[0]] == [1.5, 2.0, 4.0]

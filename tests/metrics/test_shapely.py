@@ -44,7 +44,8 @@ def boxes(states, size):
 
 def on_road(points, file):
     """Bool [n]: points [n, 2] in a drivable polygon, or at most 1 m beside a lane."""
-    tree, found = shapely.STRtree(shapely.points(points)), np.zeros(len(points), bool)
+    tree = shapely.STRtree(shapely.points(points))
+    found = np.zeros(len(points), bool)
 
     def lines(name):
         parts = zip(file[f"{name}_offsets"][:-1], file[f"{name}_offsets"][1:], strict=True)
@@ -61,16 +62,16 @@ def on_road(points, file):
 
 def score(file):
     """What a rollout file's contacts, distances, progress and road are."""
-    there, simulated = file["valid"], np.flatnonzero(file["simulated"])
+    there = file["valid"]
+    simulated = np.flatnonzero(file["simulated"])
     states = np.where(there[..., None], file["states"], 0).astype(float)
-    box, vehicle = (
-        boxes(states, np.broadcast_to(file["size"].astype(float), (*there.shape, 2))),
-        file["agent_type"] == "vehicle",
-    )
+    box = boxes(states, np.broadcast_to(file["size"].astype(float), (*there.shape, 2)))
+    vehicle = file["agent_type"] == "vehicle"
     area = shapely.area(shapely.intersection(box[:, :1], box)) * there * there[:, :1]
     area[:, 0] = 0
     hits = ((area * vehicle) > 0).any(1)
-    unknown, after = hits[0], np.flatnonzero(hits[1:]) + 1
+    unknown = hits[0]
+    after = np.flatnonzero(hits[1:]) + 1
     hit = bool(len(after)) and not unknown
     stop = after[0] if hit else len(hits) - 1
     seen = there[1 : stop + 1] & there[1 : stop + 1, :1]

@@ -9,7 +9,10 @@ from e2rl.metrics.score import score_rollouts
 from tests.metrics.test_contact import course, scene
 from tests.metrics.test_failure_features import drive
 
-EAST, NORTH, WEST, SOUTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
+EAST = 0.0
+NORTH = math.pi / 2
+WEST = math.pi
+SOUTH = -math.pi / 2
 LANES = (-3.5, 0.0, 3.5)  # y of lanes to the east
 VERDICT = ("cfr", "at_fault", "duty", "approach")
 
@@ -40,7 +43,8 @@ def moving_over(x, y, speed, across, begin=2.0, lasts=10.0, heading=EAST, steps=
     along = speed * time
     slanted = (time >= begin) & (time <= begin + lasts)
     slant = torch.where(slanted, math.atan2(across, speed), 0.0)
-    cos, sin = math.cos(heading), math.sin(heading)
+    cos = math.cos(heading)
+    sin = math.sin(heading)
     pace = torch.hypot(torch.full_like(time, speed), across * slanted)
     states = [x + along * cos - aside * sin, y + along * sin + aside * cos, heading + slant, pace]
     if reverses:
@@ -68,7 +72,8 @@ def test_a_car_that_changes_lanes_into_the_ego_is(side, ahead, across):
 @pytest.mark.parametrize(("own", "others", "fault"), [(1.0, 1.0, 1), (1.0, 0.4, 1), (0.4, 1.0, 0), (0.6, 1.0, 1)])
 def test_where_both_move_into_a_lane_both_are_but_for_a_drift_beside_a_lane_change(own, others, fault):
     """From the outer lanes into the middle one; a drift is less than half as fast."""
-    ego, partner = moving_over(0, -3.5, 12, own, lasts=5.0), moving_over(0, 3.5, 12, -others, lasts=5.0)
+    ego = moving_over(0, -3.5, 12, own, lasts=5.0)
+    partner = moving_over(0, 3.5, 12, -others, lasts=5.0)
     found = verdict(ego, partner)
     assert (found["cfr"], found["at_fault"]) == (1, fault)
     assert (found["duty"] == "entry") == (others > 0.5)
@@ -104,7 +109,8 @@ def rings(*radii):
 @pytest.mark.parametrize(("own", "others", "fault"), [(1.0, 0.0, 1), (0.0, -1.0, 0)])
 def test_in_a_bend_who_leaves_its_lane_is_at_fault_although_both_turn(own, others, fault):
     """The ego is carried outwards; or its neighbour, as fast in angle, comes inwards."""
-    ego, partner = bend(40.0, speed=10.0, drift=own), bend(43.5, speed=10.9, drift=others)
+    ego = bend(40.0, speed=10.0, drift=own)
+    partner = bend(43.5, speed=10.9, drift=others)
     found = verdict(ego, partner, rings(40.0, 43.5))
     assert (found["cfr"], found["at_fault"]) == (1, fault)
 
@@ -123,7 +129,8 @@ def test_who_comes_out_of_a_driveway_cuts_in_whichever_way_its_nose_looks(revers
 
 def test_a_car_that_reverses_towards_the_ego_in_its_lane_is_judged_as_one_that_comes_towards_it():
     """At 2 m/s, from 60 m on: the competent driver brakes, and is struck where it stands."""
-    backs, comes = course(60, 0, WEST, 2.0), course(60, 0, WEST, 2.0)
+    backs = course(60, 0, WEST, 2.0)
+    comes = course(60, 0, WEST, 2.0)
     backs[0][:, 2], backs[0][:, 3] = EAST, -2.0
     names = (
         "cfr",
@@ -143,7 +150,8 @@ def test_a_car_that_reverses_towards_the_ego_in_its_lane_is_judged_as_one_that_c
 
 def test_an_ego_that_runs_into_a_car_that_reverses_away_from_it_is_judged_by_its_motion():
     """The car backs away from the ego, at 3 m/s, slower than the ego comes: a leader as any other."""
-    away, leads = course(30, 0, EAST, 3.0), course(30, 0, EAST, 3.0)
+    away = course(30, 0, EAST, 3.0)
+    leads = course(30, 0, EAST, 3.0)
     away[0][:, 2], away[0][:, 3] = WEST, -3.0
     rows = [verdict(course(0, 0, EAST, 10), partner) for partner in (away, leads)]
     for row in rows:
@@ -200,7 +208,8 @@ def test_a_standing_car_whose_heading_jitters_is_run_into_all_the_same(speed, pl
 @pytest.mark.parametrize("radius", [3.3, 3.5, 3.7])
 def test_a_u_turn_into_the_lane_of_who_comes_is_at_fault_until_its_nose_has_been_there_for_a_second(radius):
     """The ego turns from y = 0 into the lane at y = 7, along which somebody comes from behind it."""
-    speed, begins = 5.0, 2.0
+    speed = 5.0
+    begins = 2.0
     time = 0.1 * torch.arange(81, dtype=torch.float64)
     angle = ((time - begins) * speed / radius).clamp(0, math.pi)
     turned = angle * radius

@@ -37,7 +37,9 @@ def brief(rows, features):
 def test_intervals_cover_the_truth_in_about_95_of_100_cases_when_rollouts_come_in_clusters():
     """Rates that vary between locations; treating the rollouts as independent would cover in about 70 of 100."""
     generator = torch.Generator().manual_seed(0)
-    clusters, members, trials = 40, 8, 400
+    clusters = 40
+    members = 8
+    trials = 400
     rates = torch.distributions.Beta(1.0, 2.0)
     torch.manual_seed(0)
     chance = rates.sample((trials, clusters, 1)).double()
@@ -73,7 +75,8 @@ def test_unknown_values_are_left_out_and_counted_and_never_zero():
 
 def test_a_median_draw_is_the_median_of_the_repeated_values():
     generator = torch.Generator().manual_seed(0)
-    values, cluster = torch.rand(41, generator=generator).double(), torch.randint(6, (41,), generator=generator)
+    values = torch.rand(41, generator=generator).double()
+    cluster = torch.randint(6, (41,), generator=generator)
     values[::7] = torch.nan
     draws = torch.cat([bootstrap_draws(6, 20), torch.zeros(1, 6, dtype=torch.float64)])
     medians = resampled_medians(values, cluster, draws)
@@ -126,7 +129,8 @@ def test_medians_that_agree_and_ratios_of_few_events_have_no_interval():
 
 
 def test_a_difference_of_rare_events_lies_between_the_differences_of_their_bounds():
-    ours, theirs = rows_of([1.0] * 8 + [0.0] * 42), rows_of([0.0] * 49 + [1.0])
+    ours = rows_of([1.0] * 8 + [0.0] * 42)
+    theirs = rows_of([0.0] * 49 + [1.0])
     found = paired_differences(*ours, *theirs, draws=50, realism_draws=2)["cfr"]
     (low, high), (other_low, other_high) = (exact_interval(k / 50, 50, 0.975) for k in (8, 1))
     assert found["difference"] == pytest.approx(0.14)
@@ -140,7 +144,8 @@ def test_a_difference_of_rare_events_lies_between_the_differences_of_their_bound
 @pytest.mark.parametrize("places", [9, 10, 40])
 def test_a_fraction_that_is_the_same_at_each_place_is_bounded_by_that_of_places_that_are_otherwise(places):
     """Half of two rollouts at each; the exact bound u of none of them solves (1 - u)^places = 0.025."""
-    halves, clusters = [0.0, 1.0] * places, [index // 2 for index in range(2 * places)]
+    halves = [0.0, 1.0] * places
+    clusters = [index // 2 for index in range(2 * places)]
     found = brief(*rows_of(halves, clusters))["cfr"]
     u = 1 - 0.025 ** (1 / places)
     expected = (0.5 * (1 - u), 0.5 * (1 + u)) if places >= 10 else (math.nan, math.nan)
@@ -168,7 +173,8 @@ def test_what_has_not_changed_is_bounded_by_the_places_that_may_differ(events):
 def test_a_change_that_is_the_same_at_each_place_is_within_what_others_may_have():
     """One of two rollouts more fails at each of 20 places: others may have lost or won all."""
     clusters = [index // 2 for index in range(40)]
-    ours, theirs = rows_of([1.0, 1.0] * 20, clusters), rows_of([0.0, 1.0] * 20, clusters)
+    ours = rows_of([1.0, 1.0] * 20, clusters)
+    theirs = rows_of([0.0, 1.0] * 20, clusters)
     found = paired_differences(*ours, *theirs, draws=100, realism_draws=2)["cfr"]
     u = exact_interval(0.0, 20)[1]
     assert (found["low"], found["high"]) == pytest.approx((0.5 - 1.5 * u, 0.5 + 0.5 * u))
@@ -216,6 +222,7 @@ def test_a_paired_difference_uses_shared_scenes_and_is_narrower_than_unpaired_on
 
 def test_paired_ratios_compare_the_two_groups_own_collisions():
     nan = math.nan
-    ours, theirs = rows_of([1.0, 1.0, nan, nan], name="rir"), rows_of([nan, 0.0, 1.0, nan], name="rir")
+    ours = rows_of([1.0, 1.0, nan, nan], name="rir")
+    theirs = rows_of([nan, 0.0, 1.0, nan], name="rir")
     result = paired_differences(*ours, *theirs, draws=300, realism_draws=2)["rir"]
     assert result["difference"] == pytest.approx(0.5) and result["n"] == 3

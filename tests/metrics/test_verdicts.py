@@ -41,14 +41,16 @@ def test_without_a_collision_shares_are_zero_and_verdicts_unknown(rows):
 
 
 def test_a_slow_vehicle_far_ahead_in_the_lane_counts_and_a_rammer_does_not():
-    ahead, behind = row_of(course(0, 0, 0, 12), course(40, 0, 0, 3)), row_of(course(0, 0, 0, 8), course(-20, 0, 0, 14))
+    ahead = row_of(course(0, 0, 0, 12), course(40, 0, 0, 3))
+    behind = row_of(course(0, 0, 0, 8), course(-20, 0, 0, 14))
     assert ahead["counted"] == ahead["preventable"] == ahead["at_fault"] == 1 and ahead["duty"] == "none"
     assert behind["counted"] == behind["preventable_fsm"] == behind["preventable_rss"] == 0
     assert behind["duty"] == "rear-end"
 
 
 def test_a_red_light_is_a_duty_where_it_is_known():
-    ego, partner = course(0, 0, 0, 12), course(40, 0, 0, 3)
+    ego = course(0, 0, 0, 12)
+    partner = course(40, 0, 0, 3)
     contact = int(row_of(ego, partner)["contact_step"])
     ran = torch.full((1, 2), -1)
     ran[0, 1] = contact - 5
@@ -239,7 +241,8 @@ def test_the_driver_of_the_verdict_goes_with_the_rollout():
 def test_who_runs_a_red_light_into_crossing_traffic_is_at_fault_and_owed_no_way(from_left, both):
     """The partner crosses at green; at red, too, the light is its own duty, and the rules of contacts decide."""
     sign = 1 if from_left else -1
-    ego, partner = course(0, 0, 0, 10), course(40, sign * 30, -sign * math.pi / 2, 8)
+    ego = course(0, 0, 0, 10)
+    partner = course(40, sign * 30, -sign * math.pi / 2, 8)
     contact = int(row_of(ego, partner)["contact_step"])
     ran = torch.tensor([[contact - 5, contact - 5 if both else -1]])
     row = row_of(ego, partner, ran_light=ran)
@@ -249,7 +252,8 @@ def test_who_runs_a_red_light_into_crossing_traffic_is_at_fault_and_owed_no_way(
 
 
 def test_who_runs_a_red_light_and_is_run_into_from_behind_is_not_at_fault():
-    ego, partner = course(0, 0, 0, 8), course(-20, 0, 0, 14)
+    ego = course(0, 0, 0, 8)
+    partner = course(-20, 0, 0, 14)
     contact = int(row_of(ego, partner)["contact_step"])
     row = row_of(ego, partner, ran_light=torch.tensor([[contact - 5, -1]]))
     assert row["duty"] == "rear-end"
@@ -296,17 +300,20 @@ def test_who_swerves_in_and_brakes_counts_once_two_seconds_are_over(gap, counted
 
 @pytest.mark.parametrize("gap", [5.0, 6.5])
 def test_who_reverses_and_halts_after_the_contact_is_judged_as_the_same_motion_forwards(gap):
-    ego, partner = course(0, 0, 0, 4, accel=-1.0), course(4.5 + gap, 0, 0, 0)
+    ego = course(0, 0, 0, 4, accel=-1.0)
+    partner = course(4.5 + gap, 0, 0, 0)
     backwards = ego[0].clone()
     backwards[:, 2], backwards[:, 3] = math.pi, -ego[0][:, 3]
-    forwards_row, row = row_of(ego, partner), row_of((backwards, ego[1]), partner)
+    forwards_row = row_of(ego, partner)
+    row = row_of((backwards, ego[1]), partner)
     assert forwards_row["cfr"] == 1
     for name in ("at_fault", "preventable", "preventable_fsm", "preventable_rss", "counted", "duty"):
         assert row[name] == forwards_row[name], name
 
 
 def test_who_appears_within_the_ego_and_is_gone_again_changes_nothing():
-    ego, leader = course(0, 0, 0, 12), course(30.5, 0, 0, 5)
+    ego = course(0, 0, 0, 12)
+    leader = course(30.5, 0, 0, 5)
     states, valid = course(0, 0, 0, 12, appears=4)
     valid[9:] = False
     alone = score_rollouts(scene(ego, leader))[0][0]

@@ -44,9 +44,11 @@ class Straight(AbstractPlanner):
         return InterpolatedTrajectory([self.ahead(ego, speed, told, seconds) for seconds in (0.0, self.seconds)])
 
     def ahead(self, ego, speed, told, seconds):
-        pose, way = ego.rear_axle, speed * seconds
+        pose = ego.rear_axle
+        way = speed * seconds
         pose = StateSE2(pose.x + way * math.cos(pose.heading), pose.y + way * math.sin(pose.heading), pose.heading)
-        velocity, zero = StateVector2D(speed if told is None else told, 0.0), StateVector2D(0.0, 0.0)
+        velocity = StateVector2D(speed if told is None else told, 0.0)
+        zero = StateVector2D(0.0, 0.0)
         time = TimePoint(ego.time_point.time_us + round(seconds * SECOND))
         return EgoState.build_from_rear_axle(pose, velocity, zero, 0.0, time, self.vehicle)
 
@@ -56,7 +58,8 @@ class Wrong(Straight):
 
     def __init__(self, how, bad=3.5):
         super().__init__()
-        self.how, self.bad = how, bad
+        self.how = how
+        self.bad = bad
 
     def compute_planner_trajectory(self, current_input):
         ego, _ = current_input.history.current_state
@@ -77,18 +80,21 @@ class Centred(Straight):
 
     def __init__(self, acceleration):
         super().__init__()
-        self.acceleration, self.path = acceleration, None
+        self.acceleration = acceleration
+        self.path = None
 
     def compute_planner_trajectory(self, current_input):
         ego, _ = current_input.history.current_state
         if self.path is None:
             (lane,) = self.initialization.map_api.get_all_map_objects(ego.center, SemanticMapLayer.LANE)
             self.path = lane.baseline_path
-        nearest, speed = self.path.get_nearest_pose_from_position(ego.rear_axle), state_of(ego)[3]
+        nearest = self.path.get_nearest_pose_from_position(ego.rear_axle)
+        speed = state_of(ego)[3]
         return InterpolatedTrajectory([self.later(ego, nearest, speed, step / 10) for step in range(81)])
 
     def later(self, ego, begin, speed, seconds):
-        way, zero = speed * seconds + self.acceleration * seconds**2 / 2, StateVector2D(0.0, 0.0)
+        way = speed * seconds + self.acceleration * seconds**2 / 2
+        zero = StateVector2D(0.0, 0.0)
         pose = StateSE2(begin.x + way * math.cos(begin.heading), begin.y + way * math.sin(begin.heading), begin.heading)
         time = TimePoint(ego.time_point.time_us + round(seconds * SECOND))
         return EgoState.build_from_rear_axle(pose, zero, zero, 0.0, time, ego.car_footprint.vehicle_parameters)
@@ -105,7 +111,8 @@ class Witness(Straight):
     """Turns at a tenth of a radian a second, and writes what it sees, a line a plan, to the file E2RL_WITNESS."""
 
     def compute_planner_trajectory(self, current_input):
-        history, layers = current_input.history, SemanticMapLayer
+        history = current_input.history
+        layers = SemanticMapLayer
         ego, observation = history.current_state
         seen = {
             "index": current_input.iteration.index,
@@ -121,7 +128,8 @@ class Witness(Straight):
             ],
         }
         if current_input.iteration.index == 0:
-            api, blocks = self.initialization.map_api, []
+            api = self.initialization.map_api
+            blocks = []
             for name in self.initialization.route_roadblock_ids:
                 block = api.get_map_object(name, layers.ROADBLOCK)
                 blocks.append(block or api.get_map_object(name, layers.ROADBLOCK_CONNECTOR))
@@ -143,7 +151,8 @@ class Witness(Straight):
 
     def turning(self, ego, rate=0.1):
         """An arc of the centre; the rear axle is where this vehicle's lies."""
-        vehicle, found = ego.car_footprint.vehicle_parameters, []
+        vehicle = ego.car_footprint.vehicle_parameters
+        found = []
         speed = ego.dynamic_car_state.center_velocity_2d.x
         for step in range(51):
             turn = rate * step / 10
@@ -152,7 +161,8 @@ class Witness(Straight):
             x = ego.center.x + chord * math.cos(heading - turn / 2)
             y = ego.center.y + chord * math.sin(heading - turn / 2)
             time = TimePoint(ego.time_point.time_us + step * SECOND // 10)
-            velocity, zero = StateVector2D(speed, 0.0), StateVector2D(0.0, 0.0)
+            velocity = StateVector2D(speed, 0.0)
+            zero = StateVector2D(0.0, 0.0)
             pose = StateSE2(x, y, heading)
             found.append(EgoState.build_from_center(pose, velocity, zero, 0.0, time, vehicle, angular_vel=rate))
         return InterpolatedTrajectory(found)

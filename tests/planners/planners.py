@@ -88,7 +88,10 @@ class SameLaw(Ego):
     """The law of examples/external_planner.py in e2rl, told what the World and the missions hold."""
 
     def plan(self, world):
-        mission, scene, now, actions = mission_of(world.scene), world.scene, world.states, []
+        mission = mission_of(world.scene)
+        scene = world.scene
+        now = world.states
+        actions = []
         for row, there in enumerate(world.valid):
             route = torch.cat([mission.points[row], mission.limit[row, :, None]], 1).tolist()
             lines = list(zip(mission.light[row].tolist(), mission.light_s[row].tolist(), strict=True))

@@ -28,7 +28,8 @@ def test_its_plan_comes_true(vehicles, true):
     """Planning sees what the environment observes: among others the first step is where the action leads; alone on the
     road the whole plan is, with the actions held as in it."""
     env = DrivingEnv(make_scenes(2, num_vehicles=vehicles, num_vrus=2 * (vehicles > 1)), SimSettings(), 2)
-    ego, td = wild(ActorEgo(hidden=(16,), room=None), 0.1), env.reset()
+    ego = wild(ActorEgo(hidden=(16,), room=None), 0.1)
+    td = env.reset()
     for step in range(15):
         if step % true == 0:
             plan = ego.plan(env.world())
@@ -43,7 +44,8 @@ def test_plans_expect_the_others_plans():
     """A leader that plans to halt makes the ego plan to halt; by its velocity alone it would go on."""
     env = DrivingEnv(make_scenes(2, vehicles=[(0.0, 0, 10.0), (25.0, 0, 10.0)]), SimSettings(), 2)
     env.reset()
-    ego, world = ActorEgo(hidden=(8,)), env.world()
+    ego = ActorEgo(hidden=(8,))
+    world = env.world()
     going_on = ego.plan(world)
     world.plan = world.states[:, : env.scene["route_log"].shape[1], None].repeat(1, 1, PLAN_STEPS, 1)
     world.plan[..., 3] = 0.0
@@ -68,7 +70,8 @@ def test_nothing_learned_accelerates_into_a_vehicle_that_is_followed_or_a_pedest
     oncoming.scenes["start"][:, 1, 2] = torch.pi
     walks = make_scenes(2, num_vehicles=1, num_vrus=1)
     walks.scenes["start"][:, 32, :3] = torch.tensor([18.0, 0.0, torch.pi / 2])
-    bounded, free = ActorEgo(hidden=(8,), slack=0.5, room=None), ActorEgo(hidden=(8,), slack=None, room=None)
+    bounded = ActorEgo(hidden=(8,), slack=0.5, room=None)
+    free = ActorEgo(hidden=(8,), slack=None, room=None)
 
     def accelerations(scenes, push):
         observation = DrivingEnv(scenes, SimSettings(), 2).reset()["observation"]
@@ -101,7 +104,8 @@ def test_with_room_ahead_the_reference_drives_and_without_it_the_network():
 
 
 def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise():
-    normaliser, parts = Normaliser(3), [2 + 3 * torch.randn(n, 3) for n in (5, 100, 31)]
+    normaliser = Normaliser(3)
+    parts = [2 + 3 * torch.randn(n, 3) for n in (5, 100, 31)]
     for part in parts:
         normaliser.observe(part)
         normaliser(part)
@@ -131,7 +135,8 @@ def test_file_round_trip(tmp_path):
 def test_a_file_without_the_reference_s_weight_drives_as_it_did(tmp_path):
     """Earlier versions added the network's output to the reference's action, and did not bound it."""
     first = wild(ActorEgo(hidden=(8,), slack=None, room=None))
-    network, file = first.network.network, tmp_path / "actor.safetensors"
+    network = first.network.network
+    file = tmp_path / "actor.safetensors"
     with torch.no_grad():
         for value in network.trunk.last.parameters():
             value[2:] = 0.0
@@ -157,7 +162,8 @@ def test_the_network_can_let_go_of_the_reference():
 
 
 def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatch):
-    file, network = tmp_path / "actor.safetensors", ActorEgo(hidden=(8,)).network
+    file = tmp_path / "actor.safetensors"
+    network = ActorEgo(hidden=(8,)).network
     network.save(file)
     with pytest.raises(InputError, match=r"bounds .*5\.0, .* not .*2\.0.*set sim\.max_"):
         ActorEgo(hidden=(8,), max_acceleration=2.0, checkpoint=str(file))
@@ -173,8 +179,10 @@ def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatc
 
 
 def test_noise_is_the_networks_alone_and_ends_with_the_block():
-    ego, env = wild(ActorEgo(hidden=(8,), room=None)), DrivingEnv(make_scenes(2), SimSettings(), 2)
-    observation, network = env.reset()["observation"], ego.network.network
+    ego = wild(ActorEgo(hidden=(8,), room=None))
+    env = DrivingEnv(make_scenes(2), SimSettings(), 2)
+    observation = env.reset()["observation"]
+    network = ego.network.network
     clean = network.deterministic(observation)
     with network.noisy(0.3, 1.0):
         assert not torch.equal(network.deterministic(observation), clean)

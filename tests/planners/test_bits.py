@@ -36,7 +36,8 @@ def wild_ego(**changes):
 def test_plans_the_cheapest_candidate():
     _, world = worlds(make_scenes(3, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0)]))
     ego = wild_ego()
-    candidates, plan = ego.candidates(world), ego.plan(world)
+    candidates = ego.candidates(world)
+    plan = ego.plan(world)
     costs = ego.costs(world, candidates)
     assert candidates.states.shape == (3, 40, PLAN_STEPS, 4) and costs.std(1).min() > 1
     for k in range(3):
@@ -50,7 +51,8 @@ def test_a_moved_scene_gets_the_moved_candidates():
     _, here = worlds(make_scenes(**make))
     _, there = worlds(quarter_turn(make_scenes(**make), shift))
     ego = wild_ego()
-    first, second = ego.candidates(here), ego.candidates(there)
+    first = ego.candidates(here)
+    second = ego.candidates(there)
     x, y, heading, speed = first.states.unbind(-1)
     moved = torch.stack([shift[0] - y, shift[1] + x, dynamics.wrap(heading + torch.pi / 2), speed], -1)
     torch.testing.assert_close(second.states[..., :2], moved[..., :2], atol=2e-2, rtol=0)
@@ -59,7 +61,8 @@ def test_a_moved_scene_gets_the_moved_candidates():
 
 
 def test_a_file_gives_the_network_back_and_another_is_refused(tmp_path):
-    network, seen = wild_ego().network, torch.randn(4, OBSERVATION_SIZE)
+    network = wild_ego().network
+    seen = torch.randn(4, OBSERVATION_SIZE)
     save_bits(network, tmp_path / "bits.safetensors", {"data": "made"})
     again = load_bits(str(tmp_path))
     for one, other in zip(network.goals(network.encode(seen)), again.goals(again.encode(seen)), strict=True):
@@ -85,7 +88,8 @@ def test_cells_and_places_are_inverses():
 
 
 def test_the_needed_acceleration_drives_the_distance():
-    speed, way = torch.tensor([10.0, 10.0, 10.0, 0.0]), torch.tensor([50.0, 75.0, 20.0, 5.0])
+    speed = torch.tensor([10.0, 10.0, 10.0, 0.0])
+    way = torch.tensor([50.0, 75.0, 20.0, 5.0])
     accel = needed_acceleration(speed, way)
     torch.testing.assert_close(accel, torch.tensor([0.0, 2.0, -2.5, 0.4]))
     time = torch.where(accel < 0, speed / -accel, PLAN_SECONDS).clamp(max=PLAN_SECONDS)  # to the halt

@@ -59,14 +59,18 @@ def make_env(scenes, batch):
 @pytest.mark.parametrize(("kind", "atol"), [(Cruise, 1e-3), (IDMEgo, 0.05)])
 def test_what_a_policy_writes_as_its_plan_is_what_it_then_drives(kind, atol):
     """It plans once in each interval; in between, its plan is the rest of the last one."""
-    env, ego, made = make_env(make_scenes(2, num_vehicles=1, limit=12.0), 2), kind(replan_every=5), []
+    env = make_env(make_scenes(2, num_vehicles=1, limit=12.0), 2)
+    ego = kind(replan_every=5)
+    made = []
     plan = ego.plan
     ego.plan = lambda world: made.append(plan(world)) or made[-1]
     data = env.rollout(30, EgoPolicy(ego, env))
-    told, driven = data["ego", "plan"], data["next", "agents", "states"][:, :, 0]
+    told = data["ego", "plan"]
+    driven = data["next", "agents", "states"][:, :, 0]
     assert len(made) == 6 and told.shape[2] == PLAN_STEPS
     for step in range(30):
-        fresh, age = made[step // 5], step % 5
+        fresh = made[step // 5]
+        age = step % 5
         assert torch.equal(told[:, step, : PLAN_STEPS - age], fresh[:, age:])
         assert torch.equal(told[:, step, PLAN_STEPS - age :], fresh[:, -1:].expand(-1, age, -1)), "its end is held"
     assert torch.allclose(driven, told[:, :, 0], atol=atol)
@@ -229,7 +233,8 @@ def test_code_from_outside_moves_nobody():
 @pytest.mark.parametrize("traffic", [LogReplay(), ConstantVelocity()])
 def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic):
     """Everything that a planner is told, in rollouts and by traffic that asks it beforehand, is of the present."""
-    first, told = make_scenes(2, num_vehicles=3, num_vrus=2, red_light_x=60.0, steps=40), []
+    first = make_scenes(2, num_vehicles=3, num_vrus=2, red_light_x=60.0, steps=40)
+    told = []
     first.scenes["valid"][:, 2] = first.scenes["logged_valid"][:, :, 2] = False
     second = replace(first, scenes=first.scenes.clone())
     later = {key: second.scenes[key][:, 12:] for key in ("logged", "logged_valid", "light_state")}
@@ -241,7 +246,8 @@ def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic
         ego = Meddler()
         roll_out(scenes, torch.arange(2), torch.arange(2), torch.zeros(2), ego, traffic, SimSettings())
         told.append(ego.told[:3])  # at steps 0, 5 and 10
-        ego.told, world = [], worlds(scenes)[1]
+        ego.told = []
+        world = worlds(scenes)[1]
         planned = world.states[:, :3, None].repeat(1, 1, HORIZON, 1)
         Lookahead(ego, replace(world, plan=planned))(torch.arange(2), planned)
         told[-1] += ego.told
@@ -271,7 +277,8 @@ def test_a_planner_of_the_package_needs_no_future(kind):
 @pytest.mark.parametrize("kind", [LaneGraphEgo, SamplingEgo, BitsEgo])
 def test_scenes_of_a_batch_do_not_mix(kind):
     """Planned together, beyond a chunk, or alone, a scene gets the same plan."""
-    ego, count = kind(), 66 if kind is BitsEgo else 10
+    ego = kind()
+    count = 66 if kind is BitsEgo else 10
     scenes = make_scenes(count, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0), (-15.0, 0, 11.0)])
     scenes.scenes["start"][1, 1:4, 0] += 6.0
     scenes.scenes["valid"][2, 1:] = False

@@ -59,7 +59,8 @@ def test_it_drives_as_the_same_law_inside(replan_every, red_light_x):
         for ego in (SameLaw(replan_every), ExternalEgo(command_of(), replan_every=replan_every))
     )
     assert torch.allclose(inside, outside, atol=1e-3)
-    speed, behind = outside[:, -1, 0, 3], torch.arange(4) != BAD
+    speed = outside[:, -1, 0, 3]
+    behind = torch.arange(4) != BAD
     assert (speed[behind] < 9).all() and (speed[BAD] > 10) == (red_light_x is None)
 
 
@@ -232,7 +233,8 @@ def workers_of(process):
 def test_messages_hold_the_world_field_by_field():
     scenes = scene_set(3, red_light_x=45.0).scenes
     world = World.at_start(scenes)
-    mission, scene = mission_of(scenes), scenes[1]
+    mission = mission_of(scenes)
+    scene = scenes[1]
     content = scene_messages(world, [1])
     kind, length, row, index, points, dots, lanes, lights = struct.unpack_from("<8I", content)
     assert (kind, length, row, index) == (2, len(content) - 8, 1, 1)
@@ -279,7 +281,8 @@ def test_what_cannot_be_is_named():
 
 def test_it_is_asked_about_the_present_only():
     """Traffic that looks ahead would give a planner with a memory moments that never come."""
-    ego, world = ExternalEgo(command_of()), World.at_start(scene_set().scenes)
+    ego = ExternalEgo(command_of())
+    world = World.at_start(scene_set().scenes)
     ego.plan(world)
     world.step += 10
     ego.plan(world)

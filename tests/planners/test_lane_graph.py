@@ -7,14 +7,16 @@ from e2rl.planners.lane_graph_planner import LaneGraphEgo, Prediction, circle_ga
 
 def test_off_its_route_it_prefers_the_shortest():
     ego = LaneGraphEgo()
-    hazard, driven = torch.tensor([[0.01, 0.0, 3.0]]), torch.tensor([[30.0, 10.0, 40.0]])
+    hazard = torch.tensor([[0.01, 0.0, 3.0]])
+    driven = torch.tensor([[30.0, 10.0, 40.0]])
     assert ego.choose(hazard, driven, torch.tensor([True])).item() == 0
     assert ego.choose(hazard, driven, torch.tensor([False])).item() == 1
     assert ego.choose(hazard + 1, driven, torch.tensor([True])).item() == 1
 
 
 def test_without_a_safe_profile_it_takes_the_least_hazardous_or_the_shortest():
-    hazard, driven = torch.tensor([[3.0, 2.0, 4.0], [3.0, 0.01, 4.0]]), torch.tensor([[0.0, 40.0, 20.0]]).expand(2, 3)
+    hazard = torch.tensor([[3.0, 2.0, 4.0], [3.0, 0.01, 4.0]])
+    driven = torch.tensor([[0.0, 40.0, 20.0]]).expand(2, 3)
     matched = torch.tensor([True, True])
     assert LaneGraphEgo().choose(hazard, driven, matched).tolist() == [1, 1]
     assert LaneGraphEgo(brake_if_unsafe=True).choose(hazard, driven, matched).tolist() == [0, 1]
@@ -23,8 +25,10 @@ def test_without_a_safe_profile_it_takes_the_least_hazardous_or_the_shortest():
 def test_hazard_equals_its_definition():
     generator = torch.Generator().manual_seed(0)
     ego = torch.rand(2, 3, 4, 3, generator=generator).double() * 20
-    poses, scene = torch.rand(5, 4, 3, generator=generator).double() * 20, torch.tensor([0, 1, 1, 0, 1])
-    size, ego_size = torch.tensor([4.0, 2.0]).double().repeat(5, 1), torch.tensor([4.5, 1.8]).double().repeat(2, 1)
+    poses = torch.rand(5, 4, 3, generator=generator).double() * 20
+    scene = torch.tensor([0, 1, 1, 0, 1])
+    size = torch.tensor([4.0, 2.0]).double().repeat(5, 1)
+    ego_size = torch.tensor([4.5, 1.8]).double().repeat(2, 1)
     found = collision_hazard(ego, ego_size, Prediction(poses, size, scene), 0.3, 0.02)
     safe = torch.ones(2, 3).double()
     for j in range(5):

@@ -59,7 +59,9 @@ def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(nuplan,
 @pytest.mark.parametrize("acceleration", [1.0, -1.0])
 def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_softly_to_its_path(nuplan, replan_every, acceleration):
     """From e beside the path a cubic of length S begins with curvature 6 e / S^2, which is its largest."""
-    scenes, beside, seconds = make_scenes(2), torch.tensor([1.0, -0.6]), DT * torch.arange(51)
+    scenes = make_scenes(2)
+    beside = torch.tensor([1.0, -0.6])
+    seconds = DT * torch.arange(51)
     scenes.scenes["start"][:, 0, 1] = scenes.scenes["logged"][:, 0, 0, 1] = beside
     ego = nuplan(f"--planner nuplan_planners:Centred acceleration={acceleration}", replan_every)
     states = e2rl.roll_out(scenes, ego, LogReplay()).states[:, :51, 0]
@@ -145,10 +147,12 @@ def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(nuplan, tmp_path
 
 def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(nuplan, tmp_path):
     scenes, seen = bundled_seen(nuplan, tmp_path)
-    mission, checked = mission_of(scenes), 0
+    mission = mission_of(scenes)
+    checked = 0
     for row, column in (mission.light >= 0).nonzero().tolist():
         light = int(mission.light[row, column])
-        begin, state = scenes["light_points"][row, light].tolist(), int(scenes["light_state"][row, 0, light])
+        begin = scenes["light_points"][row, light].tolist()
+        state = int(scenes["light_state"][row, 0, light])
         status = {name: what for what, name in seen[row]["lights"]}
         lanes = [lane for block in seen[row]["route"] for lane in block if math.dist(lane["begin"][:2], begin) < 0.5]
         assert not lanes or LIGHTS[state] in [status.get(lane["id"]) for lane in lanes]

@@ -113,7 +113,8 @@ def test_whose_fault_a_collision_is(name):
 def test_whom_it_touched_without_fault_it_may_touch_again():
     """Beside first, by its front then; the first touch alone is judged."""
     states = torch.tensor([0.0, 0.0, 0.0, 10.0]).expand(1, 1, 2, 4)
-    beside, ahead = others_at((0.0, 1.9, 0.0, 9.0)), others_at((4.6, 0.0, 0.0, 9.0))
+    beside = others_at((0.0, 1.9, 0.0, 9.0))
+    ahead = others_at((4.6, 0.0, 0.0, 9.0))
     both = beside._replace(states=torch.cat([beside.states, ahead.states], 2))
     touch = torch.ones(1, 1, 1, 2, dtype=torch.bool)
     loose = torch.zeros(1, 1, 2, dtype=torch.bool)
@@ -145,10 +146,12 @@ def test_the_time_to_collision_looks_30_degrees_to_each_side_in_one_lane(degrees
     """At 8 m from the rear axle, across the ego's way in 0.3 s; in several lanes it counts up to 150 degrees."""
     axle = -1.461 / 5.176 * 4.8
     angle = math.radians(degrees)
-    x, y = axle + 8 * math.cos(angle), 8 * math.sin(angle)
+    x = axle + 8 * math.cos(angle)
+    y = 8 * math.sin(angle)
     heading = math.atan2(-y, 2.0 - x)
     other = others_at((x, y, heading, math.hypot(y, 2.0 - x) / 0.3))
-    states, size = torch.tensor([0.0, 0.0, 0.0, 0.01])[None, None, None], torch.tensor([[4.8, 2.0]])
+    states = torch.tensor([0.0, 0.0, 0.0, 0.01])[None, None, None]
+    size = torch.tensor([[4.8, 2.0]])
     touch = torch.zeros(1, 1, 1, 1, 4, dtype=torch.bool)
     touch[..., 0] = True
     for loose, clear in ((False, expected), (True, 0)):
@@ -186,7 +189,8 @@ def test_the_limit_of_the_present_lane_holds_for_the_whole_plan():
 def test_the_score_is_the_weighted_mean_of_its_terms():
     """Alone on the road: the fastest has all; the slower lose progress in proportion; a hard brake loses comfort."""
     _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
-    start, none = world.states[:, :1], EGO._others(world, range(SCORED_STEPS + 1))
+    start = world.states[:, :1]
+    none = EGO._others(world, range(SCORED_STEPS + 1))
     actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(3, 50, 2)
     states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
     distance = states[0, :, SCORED_STEPS - 1, 0] - start[0, 0, 0]

@@ -105,7 +105,8 @@ def onnx_file(file, *nodes, functions=(), **constants):
 def test_a_graph_of_arithmetic_drives_and_one_that_takes_forever_or_all_memory_is_refused(tmp_path):
     from onnx import helper
 
-    node, file = helper.make_node, tmp_path / "policy.onnx"
+    node = helper.make_node
+    file = tmp_path / "policy.onnx"
     ego = PolicyFileEgo(onnx_file(file, node("Neg", ["two"], ["y"])))
     assert torch.equal(ego.decide(torch.full((3, OBSERVATION_SIZE), 0.5)), torch.full((3, 2), -0.5))
     body = helper.make_graph([], "body", [], [])
@@ -163,7 +164,8 @@ def drive(ego, **options):
     env = DrivingEnv(make_scenes(3, num_vehicles=6, red_light_x=60.0), SimSettings(), 3, agents=True, **options)
     env.reset()
     td = env.reset(env.reset().select("scene_index").set("scene_index", torch.arange(3)[:, None]))
-    policy, states = EgoPolicy(ego, env), []
+    policy = EgoPolicy(ego, env)
+    states = []
     for _ in range(30):
         td = env.step(policy(td))["next"].exclude("reward")
         states.append(env.world().states[:, 0].clone())
@@ -187,5 +189,6 @@ def test_the_same_rollouts(actor, tmp_path, name):
     observation = 2 * torch.randn(200, OBSERVATION_SIZE)
     expected = actor.act(None, observation, None)
     assert torch.allclose(ego.decide(observation), expected, atol=1e-5) and expected.std(0).min() > 0.05
-    driven, own = drive(ego), drive(actor)
+    driven = drive(ego)
+    own = drive(actor)
     assert torch.allclose(driven, own, atol=1e-3) and (own[-1, :, 0] - own[0, :, 0]).min() > 5

@@ -53,9 +53,11 @@ def test_leading_dims_do_not_matter():
 
 def test_the_order_of_the_agents_changes_nothing_and_each_of_them_counts():
     torch.manual_seed(0)
-    trunk, seen = Trunk((32, 16), 8, 2, last_gain=1.0), torch.randn(5, OBSERVATION_SIZE)
+    trunk = Trunk((32, 16), 8, 2, last_gain=1.0)
+    seen = torch.randn(5, OBSERVATION_SIZE)
     agents = seen[:, AGENTS].unflatten(1, (NEAREST, PER_AGENT))
-    shuffled, out = seen.clone(), trunk(seen)
+    shuffled = seen.clone()
+    out = trunk(seen)
     shuffled[:, AGENTS] = agents[:, torch.randperm(NEAREST)].flatten(1)
     assert out.shape == (5, 2) and torch.allclose(trunk(shuffled), out, atol=1e-6)
     for slot in range(NEAREST):

@@ -22,7 +22,8 @@ def test_boxed_in_it_is_never_worse_than_hard_braking():
     box = [(0.0, 0, 12.0), (11.0, 0, 0.0), (0.0, 1, 12.0), (-25.0, 0, 12.0)]
     _, world = world_of(vehicles=box, num_vrus=0)
     plan = SamplingEgo().plan(world)[0]
-    size, wall = world.scene["size"][0, 0], world.states[0, 1]
+    size = world.scene["size"][0, 0]
+    wall = world.states[0, 1]
     braking = dynamics.rollout(world.states[0, 0], torch.tensor([-8.0, 0.0]).expand(PLAN_STEPS, 2))
 
     def impact(states):
@@ -118,10 +119,12 @@ def test_forecasts_of_constant_acceleration_and_turn():
 
 def test_pair_costs_order_situations():
     """Contact costs more than nearness, faster contact more than slower, behind less than ahead, far nothing."""
-    weights, size = SamplingEgo(), torch.tensor([[4.5, 2.0]])
+    weights = SamplingEgo()
+    size = torch.tensor([[4.5, 2.0]])
 
     def cost(x, y, speed, ego_speed=10.0):
-        ego, other = torch.tensor([[0.0, 0.0, 0.0, ego_speed]]), torch.tensor([[x, y, 0.0, speed]])
+        ego = torch.tensor([[0.0, 0.0, 0.0, ego_speed]])
+        other = torch.tensor([[x, y, 0.0, speed]])
         return pair_cost(ego, size, other, size, torch.tensor([1.0]), weights)[0].item()
 
     assert cost(4.0, 0.0, 0.0) > cost(4.0, 0.0, 8.0) > cost(5.0, 0.0, 8.0) > 0

@@ -11,7 +11,8 @@ def denoiser(mean, std):
     """E[x_0 | x_t] of data N(mean, std^2), as a function of x and t."""
 
     def estimate(x, t):
-        alpha, sigma = SCHEDULE.alpha(t), SCHEDULE.sigma(t)
+        alpha = SCHEDULE.alpha(t)
+        sigma = SCHEDULE.sigma(t)
         return mean + std**2 * alpha / (alpha**2 * std**2 + sigma**2) * (x - alpha * mean)
 
     return estimate
@@ -25,7 +26,9 @@ def flow(x, mean, std, high, low):
 
 def run(estimate, sampler, churn, levels, noise):
     """The sampler's x at the last of levels, or x0 where that is 0; noise [len(levels) - 1, ...]."""
-    x, past, step = noise[0], None, SAMPLERS[sampler](SCHEDULE, churn).step
+    x = noise[0]
+    past = None
+    step = SAMPLERS[sampler](SCHEDULE, churn).step
     for k, (high, low) in enumerate(zip(levels[:-1], levels[1:], strict=True)):
         x0 = estimate(x, high)
         if low == 0:

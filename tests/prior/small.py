@@ -83,8 +83,11 @@ def mirrored(scene: TensorDict) -> TensorDict:
 
 def moved(scene: TensorDict, x: float, y: float, angle: float) -> TensorDict:
     """The scene turned by `angle` about the origin and then shifted by (x, y)."""
-    scene, cos, sin = scene.clone(), math.cos(angle), math.sin(angle)
-    rotation, shift = torch.tensor([[cos, sin], [-sin, cos]]), torch.tensor([x, y])
+    scene = scene.clone()
+    cos = math.cos(angle)
+    sin = math.sin(angle)
+    rotation = torch.tensor([[cos, sin], [-sin, cos]])
+    shift = torch.tensor([x, y])
     for key in ("start", "logged"):
         xy = scene[key][..., :2] @ rotation + shift
         scene[key] = torch.cat([xy, scene[key][..., 2:3] + angle, scene[key][..., 3:]], -1)
@@ -96,7 +99,9 @@ def moved(scene: TensorDict, x: float, y: float, angle: float) -> TensorDict:
 def random_state(points: torch.Tensor, generator: torch.Generator, speed=(2.0, 15.0)) -> LaneState:
     """LaneState [V] of vehicles somewhere beside routes points [V, P, 2], within 2 m and 0.3 rad of them."""
     draw = lambda low, high: low + (high - low) * torch.rand(len(points), generator=generator)  # noqa: E731
-    s, d, turn = draw(20, 40), draw(-2, 2), draw(-0.3, 0.3)
+    s = draw(20, 40)
+    d = draw(-2, 2)
+    turn = draw(-0.3, 0.3)
     xy, heading, _ = (value[:, 0] for value in interpolate(points, s[:, None]))
     xy = xy + d[:, None] * torch.stack([-heading.sin(), heading.cos()], -1)
     v = draw(*speed)

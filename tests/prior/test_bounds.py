@@ -77,7 +77,8 @@ def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
 
 
 def test_braking_is_never_harder_than_the_floor_nor_softer_than_gentle():
-    hard, soft = traffic((0, 0, 0, 15), (8, 0, 0, 0)), traffic((0, 0, 0, 1.0), (6.5, 0, 0, 0))
+    hard = traffic((0, 0, 0, 15), (8, 0, 0, 0))
+    soft = traffic((0, 0, 0, 1.0), (6.5, 0, 0, 0))
     assert caps(*hard, floor=-5.0)[0] == -5.0
     assert caps(*soft)[0] == -MIN_BRAKING
 
@@ -90,7 +91,8 @@ def test_of_two_that_cross_the_later_one_brakes():
 
 def test_only_an_exempt_vehicle_may_meet_the_ego():
     cars = (12, 0, 0, 0), (0, 0, 0, 10), (-12, 0, 0, 13)
-    shy, bold = caps(*traffic(*cars)), caps(*traffic(*cars, exempt=[1]))
+    shy = caps(*traffic(*cars))
+    bold = caps(*traffic(*cars, exempt=[1]))
     assert shy[1] < 0 and bold[1] == NO_CAP and bold[2] == shy[2] < 0
 
 
@@ -110,7 +112,8 @@ def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
 
 
 def test_who_drifts_into_the_ego_s_side_falls_behind_it_in_time():
-    ego, angle = (0, 0, 0, 10), 0.1
+    ego = (0, 0, 0, 10)
+    angle = 0.1
     drifting = (2.0, -3.0, angle, 10 / math.cos(angle))  # keeps level with the ego and comes nearer at 1 m/s
     time = contact_time((3.0 - CAR[1] - LATERAL_MARGIN - CAR[0] / 2 * math.sin(angle)) / (10 * math.tan(angle)))
     cap = caps(*traffic(ego, drifting, yields=[1]), floor=-50.0)[1]

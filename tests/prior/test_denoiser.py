@@ -8,7 +8,8 @@ from e2rl.prior.lane_relative import SIZE
 from e2rl.run.fused import switch
 from tests.prior.small import small_prior
 
-BATCH, VEHICLES = 2, 6
+BATCH = 2
+VEHICLES = 6
 
 
 def inputs(seed=0):
@@ -33,7 +34,9 @@ def test_absent_vehicles_do_not_influence_the_others():
     net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
     here = run(net, x, level, nodes, pairs, present)
     hidden = ~present
-    x, nodes, pairs = x.clone(), nodes.clone(), pairs.clone()
+    x = x.clone()
+    nodes = nodes.clone()
+    pairs = pairs.clone()
     x[hidden], nodes[hidden] = 50.0, -9.0
     pairs[hidden[:, None, :].expand(pairs.shape[:3])] = 7.0
     there = run(net, x, level, nodes, pairs, present)

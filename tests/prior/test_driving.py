@@ -64,7 +64,8 @@ def test_a_plan_along_a_straight_route_is_driven_as_it_is(generator):
 @pytest.mark.parametrize("side", [-3.0, 3.0])
 def test_who_keeps_beside_a_bend_drives_a_circle_of_its_own_at_its_own_speed(side):
     """10 m/s at 3 m beside a circle of 40 m: 43 or 37 m, and as much more or less of the route."""
-    radius, speed = 40.0, 10.0
+    radius = 40.0
+    speed = 10.0
     points = arc(0.0, 0.0, 0.0, 1 / radius)[None]
     states = torch.tensor([[[0.0, side, 0.0, speed]]])
     state = lane_relative.locate(states, torch.zeros(1, 1), torch.full((1, 1), speed / (radius - side)), points[None])

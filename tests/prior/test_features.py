@@ -31,7 +31,8 @@ def features(scene, step=None):
 @pytest.mark.parametrize(("kind", "sided"), [(0, SIDED_NODE), (1, SIDED_EDGE)], ids=["nodes", "edges"])
 def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
     scene = curved_scenes()
-    here, there = features(scene)[kind], features(mirrored(scene))[kind]
+    here = features(scene)[kind]
+    there = features(mirrored(scene))[kind]
     sign = torch.ones(here.shape[-1])
     sign[list(sided)] = -1
     torch.testing.assert_close(there, here * sign, rtol=0, atol=2e-3)
@@ -49,7 +50,8 @@ def test_only_estimates_look_at_the_past():
     scene = curved_scenes()
     changed = scene.clone()
     changed["past"] = changed["past"] + 0.3 * torch.arange(1, 11)[:, None]
-    first, now = torch.zeros(1, dtype=torch.long), torch.full((1,), 5)
+    first = torch.zeros(1, dtype=torch.long)
+    now = torch.full((1,), 5)
     assert not torch.equal(features(scene)[0], features(changed)[0])
     assert torch.equal(features(scene, now)[0], features(changed, now)[0])
     alone = features(scene, first)[0][0, 0, 51:61]  # 8 m/s now, 0.4 m/s^2 less and less before

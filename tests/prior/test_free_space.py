@@ -49,7 +49,8 @@ def test_fitting_a_decoded_plan_gives_it_back():
 def test_heading_is_the_direction_of_motion():
     state, generator = random_start()
     plan = decode(0.5 * torch.randn(COUNT, SIZE, generator=generator), state)
-    dx, dy = plan.x.diff(dim=-1), plan.y.diff(dim=-1)
+    dx = plan.x.diff(dim=-1)
+    dy = plan.y.diff(dim=-1)
     middle = (plan.heading[:, 1:] + plan.heading[:, :-1]) / 2
     moving = torch.hypot(dx, dy) > 0.05
     assert (torch.cos(torch.atan2(dy, dx) - middle)[moving] > 0.9999).all()

@@ -60,7 +60,8 @@ def test_the_offset_passes_its_half_way_mark_and_ends_flat_at_its_target(generat
     x = torch.zeros(1, SIZE)
     x[:, KNOTS:] = torch.tensor([0.8, -2.0])
     plan = decode(x, state, arc(0, 0, 0, 0)[None])
-    reach, end = lateral_horizon(state.v).item(), -2.0 * OFFSET_SCALE
+    reach = lateral_horizon(state.v).item()
+    end = -2.0 * OFFSET_SCALE
     way = plan.s - state.s
     assert reach == pytest.approx(32.0)
     half = split(x, state)[1].item()
@@ -146,7 +147,8 @@ def test_the_polynomial_and_its_gradients():
     draw = torch.Generator().manual_seed(2)
     c = torch.randn(3, 2, 7, generator=draw, dtype=torch.float64, requires_grad=True)
     u = torch.rand(3, 2, 5, generator=draw, dtype=torch.float64, requires_grad=True)
-    power, at = torch.arange(7), u[..., None]
+    power = torch.arange(7)
+    at = u[..., None]
     value, first, second = polynomial(c, u)
     assert torch.allclose(value, (c[..., None, :] * at**power).sum(-1))
     assert torch.allclose(first, (c[..., None, 1:] * power[1:] * at ** power[:-1]).sum(-1))

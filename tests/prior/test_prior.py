@@ -13,7 +13,8 @@ from e2rl.prior.sde import SamplerSettings
 from tests.prior.small import VEHICLES, arc, curved_scenes, small_prior
 
 FREE = BoundSettings(meeting=False, curve=False)
-MEAN, STD = 0.4, 0.6
+MEAN = 0.4
+STD = 0.6
 
 
 def context_of(prior, scene):
@@ -35,7 +36,8 @@ def gaussian_prior(**sampler):
     prior = Prior(sampler=SamplerSettings(temperature=1.0, **sampler))
 
     def denoise(x, level, context):
-        alpha, sigma = prior.schedule.alpha(level), prior.schedule.sigma(level)
+        alpha = prior.schedule.alpha(level)
+        sigma = prior.schedule.sigma(level)
         return MEAN + STD**2 * alpha / (alpha**2 * STD**2 + sigma**2) * (x - alpha * MEAN)
 
     prior.denoise = denoise
@@ -57,7 +59,8 @@ def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
     """With a linear denoiser the path (x_K .. x_1) is Gaussian: its law is read off unit noises, one per scene."""
     prior = gaussian_prior(**sampler)
     prior.sampler = SamplerSettings(**{**vars(prior.sampler), "temperature": temperature})
-    steps, push = prior.sampler.steps, 0.3
+    steps = prior.sampler.steps
+    push = 0.3
     noise = torch.zeros(steps, steps + 1, 1, SIZE)
     for k in range(steps):
         noise[k, k + 1] = 1.0  # scene 0 has no noise: the mean
@@ -85,8 +88,10 @@ def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
     """Both laws of the path are products of Gaussian steps, whose densities torch knows."""
     prior = gaussian_prior(steps=4, sampler="ddim")
     noise = torch.randn(4, 6, 1, SIZE, generator=torch.Generator().manual_seed(2)).double()
-    levels, step = prior.sampler.levels(prior.schedule), prior.sampler.on(prior.schedule).step
-    total, before = torch.zeros(6, 1).double(), []
+    levels = prior.sampler.levels(prior.schedule)
+    step = prior.sampler.on(prior.schedule).step
+    total = torch.zeros(6, 1).double()
+    before = []
 
     def control(x, level, k, context, denoise):
         if before:
@@ -124,7 +129,8 @@ def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
 
 
 def test_the_ego_s_row_is_its_plan_in_every_estimate():
-    scene, prior = curved_scenes(2), small_prior()
+    scene = curved_scenes(2)
+    prior = small_prior()
     context = context_of(prior, scene)
     noise = noise_for(prior, scene)
     x0 = prior.denoise(noise[0], torch.tensor(0.7), context)
@@ -156,7 +162,8 @@ def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     tight, loose = (small_prior(bounds=bounds) for bounds in (BoundSettings(curve=False), FREE))
     free = loose.plan(x0, context_of(loose, scene)).motion.v
     shy = tight.plan(x0, context_of(tight, scene)).motion.v
-    context, nobody = context_of(tight, scene), torch.zeros(scene["route_log"].shape, dtype=torch.bool)
+    context = context_of(tight, scene)
+    nobody = torch.zeros(scene["route_log"].shape, dtype=torch.bool)
     exempt = nobody.clone()
     exempt[:, 5] = True
     context.obstacles.duty = Duty(exempt, nobody, torch.zeros_like(free[..., 0]))
@@ -168,7 +175,8 @@ def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
 
 
 def test_parked_absent_and_waiting_vehicles_stay_and_the_ego_is_not_moved():
-    scene, prior = curved_scenes(), small_prior()
+    scene = curved_scenes()
+    prior = small_prior()
     scene["parked"][:, 1] = True
     scene["start"][:, 4, 3] = 0.1
     context = context_of(prior, scene)
@@ -182,7 +190,8 @@ def test_parked_absent_and_waiting_vehicles_stay_and_the_ego_is_not_moved():
 
 
 def test_vehicles_end_where_an_open_route_ends():
-    scene, prior = curved_scenes(), small_prior(bounds=FREE)
+    scene = curved_scenes()
+    prior = small_prior(bounds=FREE)
     scene["route_length"][:, 2] = 30.0  # 10 m ahead, at 7 m/s
     scene["route_length"][:, 3], scene["route_open"][:, 3] = 30.0, False
     plan = prior.plan(torch.zeros(*scene["route_log"].shape, SIZE), context_of(prior, scene))
@@ -192,7 +201,8 @@ def test_vehicles_end_where_an_open_route_ends():
 
 
 def test_samples_do_not_depend_on_the_batch_nor_on_absent_vehicles():
-    scene, prior = curved_scenes(3), small_prior()
+    scene = curved_scenes(3)
+    prior = small_prior()
     for copy in range(3):
         scene["start"][copy, 1, 3] += copy
     noise = noise_for(prior, scene)
@@ -206,7 +216,8 @@ def test_samples_do_not_depend_on_the_batch_nor_on_absent_vehicles():
 
 
 def test_temperature_scales_every_noise():
-    scene, hot = curved_scenes(), small_prior(sampler=SamplerSettings(temperature=1.0))
+    scene = curved_scenes()
+    hot = small_prior(sampler=SamplerSettings(temperature=1.0))
     cold = small_prior(sampler=SamplerSettings(temperature=0.5))
     noise = noise_for(hot, scene)
     context = context_of(hot, scene)
@@ -238,7 +249,8 @@ def test_routes_are_drawn_in_proportion_and_never_where_there_is_none():
 
 
 def test_the_ego_follows_its_mission_whatever_is_drawn():
-    scene, prior = curved_scenes(), small_prior()
+    scene = curved_scenes()
+    prior = small_prior()
     scene["route_valid"][:, :, 1] = scene["route_valid"][:, :, 0]
     scene["route_log"][:, 0] = 1
     chosen = prior.choose_routes(scene, torch.zeros(scene["route_valid"].shape[:2]))
@@ -248,18 +260,21 @@ def test_the_ego_follows_its_mission_whatever_is_drawn():
 @pytest.mark.parametrize("moved", [False, True])
 def test_what_is_known_of_the_moment_changes_no_context(moved):
     """A context of the same moment gives leaders, but not of a vehicle that is elsewhere on its route by now."""
-    scene, prior = curved_scenes(), small_prior()
+    scene = curved_scenes()
+    prior = small_prior()
     before = context_of(prior, scene)
     state = replace(before.state, s=before.state.s + 7.0 * moved)
     given = before.routed, state, scene["start"], scene["valid"], torch.zeros(len(scene), dtype=torch.long), None
-    known, anew = prior.encode(*given, known=before), prior.encode(*given)
+    known = prior.encode(*given, known=before)
+    anew = prior.encode(*given)
     assert torch.equal(known.encoding.nodes, anew.encoding.nodes)
     assert all(torch.equal(one, other) for one, other in zip(known.followed, anew.followed, strict=True))
     assert (known.followed is before.followed) == (not moved)
 
 
 def test_without_a_plan_the_ego_is_sampled_like_everybody_else():
-    prior, scene = small_prior(), curved_scenes(2)
+    prior = small_prior()
+    scene = curved_scenes(2)
     known = context_of(prior, scene)
     step = torch.zeros(len(scene), dtype=torch.long)
     unknown = prior.encode(known.routed, known.state, scene["start"], scene["valid"], step, None)

@@ -21,14 +21,16 @@ def test_rerouting_to_candidates_is_routing_anew():
     add_route(world, 1, 2, 0.5)
     route = world.route.clone()
     route[0, 1] = 2
-    before, who = route_scene(world.scene, world.route), mask(world, 1, 2)
+    before = route_scene(world.scene, world.route)
+    who = mask(world, 1, 2)
     none = torch.zeros_like(who)
     same(reroute(before, world.scene, route, who, none, before.points), route_scene(world.scene, route))
 
 
 def test_a_way_replaces_the_lane_of_those_that_leave_alone_and_the_way_back_is_exact():
     world = make_world(VEHICLES, copies=2)
-    before, who = route_scene(world.scene, world.route), mask(world, 2)
+    before = route_scene(world.scene, world.route)
+    who = mask(world, 2)
     ways = before.points + torch.tensor([0.0, -3.5])  # vehicle 2 comes over to the ego's lane
     left = reroute(before, world.scene, world.route, who, who, ways)
     assert torch.equal(left.points[:, 2], ways[:, 2]) and torch.equal(left.points[:, 3], before.points[:, 3])

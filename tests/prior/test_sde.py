@@ -11,13 +11,11 @@ from tests.prior.gaussian import SCHEDULE, denoiser, flow, moments, run
 
 MEAN, STD, WEIGHT = 1.3, 0.4, 5.0  # data N(1.3, 0.4^2) and V = WEIGHT x^2 / 2
 TILTED = 0.72222, 0.29814  # of exp(-V) times the data: precision 1 / 0.16 + 5, mean 1.3 / 0.16 / precision
-DDPM, DDIM_0, SDE_2M, ODE_2M, EULER = (
-    ("ddim", 1.0),
-    ("ddim", 0.0),
-    ("dpm_solver_pp", 1.0),
-    ("dpm_solver_pp", 0.0),
-    ("euler_maruyama", 1.0),
-)
+DDPM = ("ddim", 1.0)
+DDIM_0 = ("ddim", 0.0)
+SDE_2M = ("dpm_solver_pp", 1.0)
+ODE_2M = ("dpm_solver_pp", 0.0)
+EULER = ("euler_maruyama", 1.0)
 
 
 def beta(t):
@@ -32,7 +30,8 @@ def test_variance_is_preserved_and_beta_is_the_schedule_s():
 
 
 def test_the_integral_of_beta_is_exact():
-    low, high = torch.tensor(0.2, dtype=torch.float64), torch.tensor(0.9, dtype=torch.float64)
+    low = torch.tensor(0.2, dtype=torch.float64)
+    high = torch.tensor(0.9, dtype=torch.float64)
     grid = torch.linspace(0.2, 0.9, 20_001, dtype=torch.float64)
     torch.testing.assert_close(SCHEDULE.beta_integral(high, low), torch.trapezoid(beta(grid), grid), rtol=1e-6, atol=0)
 
@@ -40,22 +39,28 @@ def test_the_integral_of_beta_is_exact():
 def test_the_score_of_the_denoised_estimate_is_the_gradient_of_the_log_density():
     t = torch.tensor(0.4, dtype=torch.float64)
     x = torch.linspace(-2, 2, 9, dtype=torch.float64, requires_grad=True)
-    alpha, sigma = SCHEDULE.alpha(t), SCHEDULE.sigma(t)
+    alpha = SCHEDULE.alpha(t)
+    sigma = SCHEDULE.sigma(t)
     density = -0.5 * (x - alpha * MEAN) ** 2 / (alpha**2 * STD**2 + sigma**2)
     (expected,) = torch.autograd.grad(density.sum(), x)
     torch.testing.assert_close(SCHEDULE.score(x, denoiser(MEAN, STD)(x, t), t), expected)
 
 
 def test_noise_and_clean_estimate_are_two_views_of_the_same_x():
-    t, x0, noise = torch.tensor(0.3), torch.randn(5), torch.randn(5)
+    t = torch.tensor(0.3)
+    x0 = torch.randn(5)
+    noise = torch.randn(5)
     torch.testing.assert_close(SCHEDULE.noise(SCHEDULE.noised(x0, t, noise), x0, t), noise)
 
 
 def test_an_ancestral_step_is_the_posterior_given_both_ends():
     """q(x_low | x_high, x_0) of the forward SDE, by conditioning a joint Gaussian."""
-    high, low, x0 = torch.tensor(0.6, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64), 0.4
+    high = torch.tensor(0.6, dtype=torch.float64)
+    low = torch.tensor(0.3, dtype=torch.float64)
+    x0 = 0.4
     ratio = SCHEDULE.alpha(high) / SCHEDULE.alpha(low)
-    var_low, var_high = SCHEDULE.sigma(low) ** 2, SCHEDULE.sigma(high) ** 2
+    var_low = SCHEDULE.sigma(low) ** 2
+    var_high = SCHEDULE.sigma(high) ** 2
     x = torch.tensor(-1.1, dtype=torch.float64)
     mean = SCHEDULE.alpha(low) * x0 + ratio * var_low / var_high * (x - SCHEDULE.alpha(high) * x0)
     variance = var_low - (ratio * var_low) ** 2 / var_high
@@ -89,7 +94,8 @@ def test_bias_of_the_samplers_at_eight_steps(sampler, mean, std):
 
 
 def test_levels_are_even_in_what_they_are_spaced_by():
-    even, ratio = SCHEDULE.levels(8).double(), SCHEDULE.levels(8, spacing="log_ratio").double()
+    even = SCHEDULE.levels(8).double()
+    ratio = SCHEDULE.levels(8, spacing="log_ratio").double()
     torch.testing.assert_close(even.diff(), torch.full((8,), -SCHEDULE.start / 8, dtype=torch.float64))
     steps = SCHEDULE.log_ratio(ratio[:-1]).diff()
     torch.testing.assert_close(steps, steps[:1].expand(7), rtol=1e-3, atol=0)
@@ -105,10 +111,13 @@ def test_eight_steps_even_in_the_log_ratio_keep_the_spread(std):
 
 def test_eight_steps_draw_a_mixture():
     """Two modes of unequal weight: their shares, and the spread of both together."""
-    means, weights, std = torch.tensor([-1.0, 1.0]), torch.tensor([0.3, 0.7]), 0.35
+    means = torch.tensor([-1.0, 1.0])
+    weights = torch.tensor([0.3, 0.7])
+    std = 0.35
 
     def estimate(x, t):
-        alpha, sigma = SCHEDULE.alpha(t), SCHEDULE.sigma(t)
+        alpha = SCHEDULE.alpha(t)
+        sigma = SCHEDULE.sigma(t)
         parts = torch.distributions.Normal(alpha * means, (alpha**2 * std**2 + sigma**2).sqrt())
         share = (parts.log_prob(x[:, None]) + weights.log()).softmax(-1)
         clean = torch.stack([denoiser(mean, std)(x, t) for mean in means], -1)
@@ -168,7 +177,8 @@ def errors(sampler, counts):
 
 def test_halving_the_step_quarters_the_error_of_2m_and_halves_that_of_ddim():
     counts = (64, 128, 256)
-    second, first = errors(ODE_2M, counts), errors(DDIM_0, counts)
+    second = errors(ODE_2M, counts)
+    first = errors(DDIM_0, counts)
     torch.testing.assert_close(second[:-1] / second[1:], torch.full((2,), 4.0), rtol=0.06, atol=0)
     torch.testing.assert_close(first[:-1] / first[1:], torch.full((2,), 2.0), rtol=0.06, atol=0)
     assert second[0] < first[0] / 30
@@ -176,7 +186,8 @@ def test_halving_the_step_quarters_the_error_of_2m_and_halves_that_of_ddim():
 
 def test_the_first_step_and_a_constant_estimate_are_ddim_s():
     high, low, x, noise = (torch.tensor(v) for v in (0.6, 0.4, 1.7, -0.3))
-    x0, before = torch.tensor(0.2), torch.tensor(0.8)
+    x0 = torch.tensor(0.2)
+    before = torch.tensor(0.8)
     expected = SAMPLERS["ddim"](SCHEDULE).step(x, x0, high, low, noise)
     for past in (None, (x0, before)):
         found = SAMPLERS["dpm_solver_pp"](SCHEDULE).step(x, x0, high, low, noise, past)

@@ -7,7 +7,9 @@ from e2rl.prior.lane_relative import KNOTS, SIZE
 from e2rl.prior.sde import NoiseSchedule, SamplerSettings
 from e2rl.prior.stratified_sampling import impulse_response, main_direction, stratified_noise, stratified_uniform
 
-SCHEDULE, COUNT, SCENES = NoiseSchedule(), 4, 30_000
+SCHEDULE = NoiseSchedule()
+COUNT = 4
+SCENES = 30_000
 
 
 def draws(*shape: int, normal: bool = False) -> torch.Tensor:

@@ -30,7 +30,8 @@ def planned(rollouts: Rollouts) -> Rollouts:
 
 def write_run(folder: Path, rollouts: dict[str, Rollouts]) -> Path:
     """Write all files of a run of {method: rollouts} into a folder."""
-    rows, features = [], []
+    rows = []
+    features = []
     for method, driven in rollouts.items():
         driven.scene_id = [f"{SCENE}{index}" for index in range(len(driven))]
         driven.method = [method] * len(driven)

@@ -74,7 +74,8 @@ def test_methods_stand_by_what_they_find_and_egos_by_how_little():
 
 
 def test_before_and_after_stand_side_by_side():
-    old, new = row("e2", 2.0, cfr=0.5), row("e2", 2.0, cfr=0.25)
+    old = row("e2", 2.0, cfr=0.5)
+    new = row("e2", 2.0, cfr=0.25)
     new["paired"] = {"before": {"cfr": {"difference": -0.25, "low": -0.4, "high": -0.1, "n": 12}}}
     (line,) = [line for line in compared_answer([old], [new]) if line.startswith("hit, ")]
     assert line.split("  ")[-1].strip() == "-25 [-40, -10]" and "50% (6 of 12)" in line and "25% (3 of 12)" in line
@@ -87,14 +88,16 @@ def atlas(failed, **scenes):
 
 
 def test_the_ways_before_and_after_training_stand_side_by_side(tmp_path):
-    old, new = row("e2", 2.0, cfr=0.5), row("e2", 2.0, cfr=0.25)
+    old = row("e2", 2.0, cfr=0.5)
+    new = row("e2", 2.0, cfr=0.25)
     lines = compared_answer([old], [new], (atlas(4, rear=1, oncoming=3), atlas(2, crossing=1, oncoming=1)), tmp_path)
     said = " ".join(" ".join(lines).split())
     assert "in 4 of 12 scenes before training, in 2 ways, and in 2 of 12 scenes after it, in 2 ways" in said
     assert "1 are gone, 1 are new" in said
     ways = [line.split() for line in lines if line.split()[:1] in (["oncoming"], ["rear"], ["crossing"])]
     assert ways == [["oncoming", "3", "1"], ["rear", "1", "0"], ["crossing", "0", "1"]]
-    milder, nominal = row("e2", 1.0, cfr=0.5), row("nominal", 0.0)
+    milder = row("e2", 1.0, cfr=0.5)
+    nominal = row("nominal", 0.0)
     rows = [old, milder, nominal]
     for atlases, shown in ((None, 3), ((atlas(0), atlas(0)), 2)):
         hits = [line for line in compared_answer(rows, rows, atlases, tmp_path) if line.startswith("hit, ")]
@@ -189,7 +192,8 @@ def test_people_touched_are_told_and_named_where_there_is_no_page(report):
 
 
 def test_people_touched_before_or_after_training_have_a_row():
-    old, new = row("e2", 2.0), row("e2", 2.0)
+    old = row("e2", 2.0)
+    new = row("e2", 2.0)
     for each, rate in ((old, 0.25), (new, 0.0)):
         each["metrics"] |= {"cfr_vru": value(rate), "cfr_object": value(0.0)}
     lines = compared_answer([old], [new])

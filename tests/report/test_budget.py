@@ -55,7 +55,8 @@ def test_the_interval_of_scenes_is_that_of_places():
     """Half of the places have failures in both scenes: a binomial share of 20 places, not of 40 scenes."""
     told = searched("search", lambda scene, seed, number: "a" if scene // 2 % 2 else "")
     row = one_row(told, 400)
-    low, high = row["scenes"]["low"], row["scenes"]["high"]
+    low = row["scenes"]["low"]
+    high = row["scenes"]["high"]
     assert row["scenes"]["mean"] == 50 and low == pytest.approx(50 - 196 * (0.25 / 20) ** 0.5, abs=4)
     assert high == pytest.approx(50 + 196 * (0.25 / 20) ** 0.5, abs=4)
 

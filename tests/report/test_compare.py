@@ -22,7 +22,8 @@ STEP = "return comparison.player.time"
 def runs(tmp_path_factory):
     """Two runs of the same scenes: one failure is gone, one new, two are the same."""
     folder = tmp_path_factory.mktemp("runs")
-    first, second = planned(random_rollouts(12, seed=20)), planned(random_rollouts(12, seed=20))
+    first = planned(random_rollouts(12, seed=20))
+    second = planned(random_rollouts(12, seed=20))
     other = random_rollouts(12, seed=21).states.nan_to_num()
     for rollouts, index in ((first, 10), (second, 6)):  # a failure that the other run keeps
         rollouts.states[index] = other[index].where(rollouts.valid[index][..., None], rollouts.states[index])
@@ -52,7 +53,8 @@ def data_of(path) -> dict:
 
 def test_page_json_and_csv_tell_the_same_pairs(made):
     path, said = made
-    whole, page = json.loads(path.with_suffix(".json").read_text()), data_of(path)
+    whole = json.loads(path.with_suffix(".json").read_text())
+    page = data_of(path)
     with path.with_suffix(".csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     (group,) = whole["groups"]

@@ -7,7 +7,8 @@ from e2rl.evaluation.summary import scene_rows
 from e2rl.report.comparison_tables import searched_table
 from e2rl.search.tries import TRIES
 
-TRAINED, OTHERS = ["a_0", "a_1"], ["b_0", "b_1"]
+TRAINED = ["a_0", "a_1"]
+OTHERS = ["b_0", "b_1"]
 EGOS = EgoSet({}, ["a", "b"], [("a", "b")], {"a": TRAINED, "b": OTHERS})
 
 

@@ -62,7 +62,9 @@ def test_everybody_is_where_the_rollout_has_them():
 def test_the_competent_driver_does_what_the_verdict_says(gap, preventable):
     """It brakes for a slower vehicle 30 m ahead; 1 m of gap is too late for it."""
     ((_, row, replay),) = replays_of(scene(course(0, 0, 0, 12), course(gap, 0, 0, 5), adversaries=[1]))
-    motion, driver, ego = motion_of(replay), track_of(replay, "driver"), track_of(replay, "ego")
+    motion = motion_of(replay)
+    driver = track_of(replay, "driver")
+    ego = track_of(replay, "ego")
     assert row["preventable"] == preventable
     assert (motion["gap"][driver].min() > 0) == (preventable == 1)
     assert motion["gap"][ego, replay["contact"]] == 0 and (motion["gap"][ego, : replay["contact"]] > 0).all()
@@ -71,7 +73,8 @@ def test_the_competent_driver_does_what_the_verdict_says(gap, preventable):
 
 def test_plans_and_the_evasion_are_those_of_the_file():
     rollout, _, replay = replays_of(planned(random_rollouts(8, seed=20)))[0]
-    motion, plans = motion_of(replay), replay["plans"]
+    motion = motion_of(replay)
+    plans = replay["plans"]
     steps = motion["x"].shape[1]
     np.testing.assert_allclose(motion["y"][track_of(replay, "evasion")], rollout.evasion[:steps, 1], atol=0.0051)
     agents = np.flatnonzero(rollout.valid[:steps].any(0))

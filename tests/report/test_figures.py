@@ -17,7 +17,10 @@ from e2rl.traffic.e2.skeleton import Selection
 from e2rl.traffic.e2.topology import TopologySettings, pair_weights
 from tests.metrics.test_contact import course, scene
 
-EGO, AHEAD, FAR, ASIDE = course(0, 0, 0, 10), course(25, 0, 0, 6), course(50, 0, 0, 4), course(0, 25, 1.0, 0)
+EGO = course(0, 0, 0, 10)
+AHEAD = course(25, 0, 0, 6)
+FAR = course(50, 0, 0, 4)
+ASIDE = course(0, 25, 1.0, 0)
 
 
 def replay_of(*courses, eta=2.0):
@@ -32,7 +35,8 @@ def test_panels_stand_by_eta_at_their_contacts_and_without_one_at_the_first_of_t
     assert replays[0].contact is None and replays[1].contact > replays[2].contact
     times = [replays[1].contact, replays[1].contact, replays[2].contact]
     for index, (time, phase) in enumerate(zip(times, (None, 0.25, 0.25), strict=True)):
-        left, top = (index % 2) * (SIDE + GAP), (index // 2) * (SIDE + GAP)
+        left = (index % 2) * (SIDE + GAP)
+        top = (index // 2) * (SIDE + GAP)
         panel = np.asarray(figure.crop((left, top, left + SIDE, top + SIDE)))
         different = (panel != np.asarray(replays[index].picture(time, phase=phase))).any(-1)
         assert different.mean() < 1e-4, "where a panel stands changes the rounding of its edges"
@@ -47,7 +51,9 @@ def shown():
     size = torch.as_tensor(rollout.size)[None, None].expand(*reference.shape[:3], 2)
     weights = pair_weights(reference, torch.ones(reference.shape[:3], dtype=torch.bool), size, settings)
     coalition, candidates = (torch.tensor([[False, True, True, third]]) for third in (False, True))
-    zero, moments, target = torch.tensor([0]), 0.5 * torch.arange(10.0)[None], torch.tensor([[-1, 0, 1, -1]])
+    zero = torch.tensor([0])
+    moments = 0.5 * torch.arange(10.0)[None]
+    target = torch.tensor([[-1, 0, 1, -1]])
     who = candidates, coalition, coalition, target
     return SkeletonPicture(rollout, Selection(zero, zero, reference, moments, weights, *who, settings))
 

@@ -47,7 +47,8 @@ def test_of_many_places_the_number_is_that_of_the_normal_law(value, limit):
 
 
 def test_intervals_of_means_shrink_with_the_root():
-    half, gap = 4.0, 1.0
+    half = 4.0
+    gap = 1.0
     assert growth((30.0, 30 - half, 30 + half), 30 - gap, 50, False) == pytest.approx((half / gap) ** 2)
     assert growth((30.0, 26.0, 34.0), 30.0, 50, False) is None
     assert growth((0.2, 0.1, 0.3), 0.2 + 1e-12, 50, True) is None
@@ -55,7 +56,8 @@ def test_intervals_of_means_shrink_with_the_root():
 
 
 def test_the_rollouts_that_it_asks_for_decide(tmp_path, capsys):
-    run, file = run_with(tmp_path / "few", 30, 0), tmp_path / "gate.json"
+    run = run_with(tmp_path / "few", 30, 0)
+    file = tmp_path / "gate.json"
     status, said = gate(capsys, run, "preventable<=0.05", "--json", file)
     (result,) = json.loads(file.read_text())
     assert (
@@ -111,7 +113,8 @@ def test_an_attack_must_be_named_where_there_are_several(tmp_path, capsys):
 
 
 def test_changes_are_measured_against_a_former_run(tmp_path, capsys):
-    before, after = run_with(tmp_path / "before", 200, 60), run_with(tmp_path / "after", 200, 20)
+    before = run_with(tmp_path / "before", 200, 60)
+    after = run_with(tmp_path / "after", 200, 20)
     against = ("--against", before)
     assert gate(capsys, after, "contacts<=+0.02", *against)[0] == 0
     assert gate(capsys, after, "contacts<=-0.1", *against)[0] == 0

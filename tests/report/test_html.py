@@ -86,7 +86,8 @@ def test_the_first_lines_say_what_the_tables_say(tmp_path):
     driven.location = [f"place_{index // 2}" for index in range(24)]
     run = write_run(tmp_path, {"e2": driven, "other": random_rollouts(12, seed=20)})
     data = data_of(write_report(run).read_text())
-    head, lines = data["tables"][0]["head"], {line[0]: line for line in data["tables"][0]["rows"]}
+    head = data["tables"][0]["head"]
+    lines = {line[0]: line for line in data["tables"][0]["rows"]}
     found = 0
     for group in data["groups"]:
         for name, text in group["rates"].items():

@@ -205,7 +205,8 @@ def test_failures_of_a_scene_stand_together_whatever_the_traffic(run, page):
     groups = page.execute_script(
         """return [...document.querySelectorAll("#index tbody tr")].map((row) => [row.className, row.textContent]);"""
     )
-    scenes, under = [], {}
+    scenes = []
+    under = {}
     for kind, text in groups:
         if kind == "scene":
             scenes.append(text)

@@ -14,7 +14,8 @@ def selection(*targets, seed=0, risk=0.5):
     target = torch.tensor(targets)
     count, vehicles = target.shape
     weights = torch.full((count, 2, vehicles, vehicles), risk)
-    moments, acts = torch.tensor([[0.1, 0.6]]).expand(count, 2), target >= 0
+    moments = torch.tensor([[0.1, 0.6]]).expand(count, 2)
+    acts = target >= 0
     what = torch.arange(count) + seed, torch.zeros(count).long(), torch.zeros(count, 2, vehicles, 4), moments, weights
     return Selection(*what, acts, acts, acts, target, TopologySettings())
 

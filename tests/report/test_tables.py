@@ -17,7 +17,8 @@ TERMS = {"e2": ("predicted", "full"), "ctg_adv": ("plan", "none"), "replay": (""
 
 def rows_of(*drawn, rollouts=6, draws=50, **options):
     """Rows of metrics.json of (method, ego, eta), each of rollouts of its own."""
-    rows, samples = [], []
+    rows = []
+    samples = []
     for number_, (method, ego, eta) in enumerate(drawn):
         found, features = score_rollouts(random_rollouts(rollouts, seed=3 + number_))
         rows += [row | {"method": method, "ego_policy": ego, "eta": eta} for row in found]
@@ -91,7 +92,8 @@ def test_they_are_written_in_three_formats(methods, tmp_path):
 
 
 def test_every_ego_has_a_row_and_a_difference_to_the_reference():
-    names, pairs = ["idm", "lane_graph", "actor"], [("idm", "lane_graph"), ("actor", "lane_graph")]
+    names = ["idm", "lane_graph", "actor"]
+    pairs = [("idm", "lane_graph"), ("actor", "lane_graph")]
     rows = rows_of(*(("e2", name, 2.0) for name in names), egos=pairs)
     means, differences = planner_tables(rows, names, ["lane_graph"])
     assert [row[:2] for row in means.rows] == [[ego, "e2 η=2"] for ego in names]

@@ -53,7 +53,8 @@ def test_an_interrupted_command_leaves_no_process(tmp_path, method, how):
     while not all(mark.exists() and mark.read_text() for mark in marks):
         assert run.poll() is None, run.stderr.read()
         time.sleep(0.05)
-    begin, workers = time.monotonic(), [int(mark.read_text()) for mark in marks]
+    begin = time.monotonic()
+    workers = [int(mark.read_text()) for mark in marks]
     if how == "Ctrl-C":
         os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to all
     else:

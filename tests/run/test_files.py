@@ -288,7 +288,8 @@ def test_a_seal_counts_for_files_of_its_folder_only(tmp_path, name):
 
 
 def test_what_is_written_is_read_and_equal_weights_make_equal_bytes(tmp_path):
-    path, header = tmp_path / "x.safetensors", {"architecture": "small", "kind": "actor", "version": "1"}
+    path = tmp_path / "x.safetensors"
+    header = {"architecture": "small", "kind": "actor", "version": "1"}
     assert len({weight_bytes(dict(WEIGHTS), dict(header)) for _ in range(20)}) == 1
     path.write_bytes(weight_bytes(WEIGHTS, header))
     weights, read = read_weights(path)
@@ -299,7 +300,8 @@ def test_what_is_written_is_read_and_equal_weights_make_equal_bytes(tmp_path):
 @pytest.mark.parametrize("seed", range(20))
 def test_a_flipped_bit_changes_no_weight_in_silence(tmp_path, seed):
     """It is noticed wherever it is but in the name of the hash, where it changes nothing else."""
-    content, draw = bytearray(weight_bytes(WEIGHTS, {"architecture": "small"})), random.Random(seed)
+    content = bytearray(weight_bytes(WEIGHTS, {"architecture": "small"}))
+    draw = random.Random(seed)
     content[draw.randrange(len(content))] ^= 1 << draw.randrange(8)
     (tmp_path / "x.safetensors").write_bytes(content)
     try:

@@ -51,7 +51,8 @@ def test_a_part_of_something_else_is_none(tmp_path, file, stage, about, identity
 
 
 def test_every_damage_is_noticed_and_the_part_done_again(tmp_path, file):
-    whole, draw = file.read_bytes(), random.Random(0)
+    whole = file.read_bytes()
+    draw = random.Random(0)
     for cut in (0, 1, len(whole) // 2, len(whole) - 1):
         file.write_bytes(whole[:cut])
         assert Parts(tmp_path).load("a", [1]) is None
@@ -82,7 +83,8 @@ def test_a_strangers_part_runs_nothing(tmp_path, file):
 
 def packed():
     """A part that grows a thousandfold as it is read."""
-    content, small = io.BytesIO(), io.BytesIO()
+    content = io.BytesIO()
+    small = io.BytesIO()
     torch.save({"format": "e2rl-part/1", "about": "", "identity": [1], "value": torch.zeros(10**6)}, content)
     with zipfile.ZipFile(content) as full, zipfile.ZipFile(small, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in full.namelist():

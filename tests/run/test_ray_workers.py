@@ -58,7 +58,8 @@ class Mortal(Setup):
 @needs_ray
 def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path, workers):
     """Nothing is lost, nothing twice: rollouts, rows and metrics, bit for bit."""
-    scene_set, folders = scenes(3, steps=20), (tmp_path / "forked", tmp_path / "ray")
+    scene_set = scenes(3, steps=20)
+    folders = (tmp_path / "forked", tmp_path / "ray")
     for processes, folder in zip((2, workers), folders, strict=True):
         setup = Mortal(scene_set, IDMEgo(), "idm", SimSettings(), 1)
         setup.mark = str(tmp_path / "killed")
@@ -71,13 +72,15 @@ def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path
     parts = [sorted(path.name for path in (folder / "parts").iterdir()) for folder in folders]
     assert parts[0] == parts[1] and len(parts[0]) == 2 * 3 * len(SEEDS)
     for path in (folders[0] / ROLLOUTS).iterdir():
-        one, other = np.load(path), np.load(folders[1] / ROLLOUTS / path.name)
+        one = np.load(path)
+        other = np.load(folders[1] / ROLLOUTS / path.name)
         assert all(np.array_equal(one[key], other[key]) for key in one.files), path.name
 
 
 @needs_ray
 def test_a_search_on_workers_is_that_of_one_process(workers):
-    setup, plan = setup_of(), plan_of()
+    setup = setup_of()
+    plan = plan_of()
     assert known(found(setup, plan, processes=workers)) == known(found(setup, plan))
 
 
@@ -86,7 +89,9 @@ def test_workers_make_the_traffic_of_a_round_while_it_learns(workers):
     """The same D' as of the same order here, made against the policy before learning."""
     scene_set = small_scenes()
     run = small_run(scenes=scene_set, nominal="prior", spread=0.5, prefetch=True)
-    run.synthesize, run.batch, run.workers = synthesize_traffic(scene_set, Ambush(), SimSettings()), 2, workers
+    run.synthesize = synthesize_traffic(scene_set, Ambush(), SimSettings())
+    run.batch = 2
+    run.workers = workers
     train_round(run)
     order = run._next
     expected, _ = make_traffic(order, run.synthesize, batch=2)

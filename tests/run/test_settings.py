@@ -48,7 +48,9 @@ def test_constructors_are_filled_by_name_and_never_overruled():
     @configured("driver/calm", "reach")
     class Guard:
         def __init__(self, name: str, gap: float, look: float) -> None:
-            self.name, self.gap, self.look = name, gap, look
+            self.name = name
+            self.gap = gap
+            self.look = look
 
     assert vars(Guard("a")) == {"name": "a", "gap": 4, "look": 2.5}
     assert vars(Guard("a", 7.0)) == {"name": "a", "gap": 7.0, "look": 2.5}

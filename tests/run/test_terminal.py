@@ -14,7 +14,8 @@ class Terminal(io.StringIO):
 
 
 def test_in_a_file_there_are_lines_at_the_pace_so_far(monkeypatch):
-    output, clock = io.StringIO(), [100.0]
+    output = io.StringIO()
+    clock = [100.0]
     monkeypatch.setattr(sys, "stderr", output)
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     with Bar(total=40, desc="rollouts", unit="rollout", mininterval=0) as bar:

@@ -160,7 +160,8 @@ def test_a_configuration_that_is_none_is_named_before_it_grows(tmp_path, content
 @pytest.mark.parametrize("name", [str(CONFIG), "parts", "rollouts", "checkpoints/round-000001", "parts/a.pt"])
 @pytest.mark.parametrize("kind", ["link", "pipe", "device"])
 def test_links_out_of_the_folder_pipes_and_devices_are_refused(tmp_path, name, kind):
-    folder, outside = written(tmp_path / "run", EVALUATE), tmp_path / "mine"
+    folder = written(tmp_path / "run", EVALUATE)
+    outside = tmp_path / "mine"
     outside.write_text(RUN)
     (folder / "wandb").mkdir()
     (folder / "wandb" / "debug.log").symlink_to(outside)  # as wandb does
@@ -206,7 +207,8 @@ def test_paths_to_write_to_are_in_the_folder_or_on_the_command_line(tmp_path, ch
     def at(path):
         return changed(TUNE, OmegaConf.create(OmegaConf.to_yaml(changes).replace("{}", str(path))))
 
-    run, outside = tmp_path / "run", tmp_path / "else"
+    run = tmp_path / "run"
+    outside = tmp_path / "else"
     run.mkdir()
     outside.mkdir()
     (run / "link").symlink_to(outside)

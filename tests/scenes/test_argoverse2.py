@@ -140,7 +140,8 @@ def test_the_map_arrives(tmp_path):
 def test_boxes_of_a_sensor_log_stand_where_the_vehicle_saw_them(tmp_path):
     turn = 0.6
     (recording,) = Argoverse2Source(str(write_sensor_log(tmp_path, turn))).recordings()
-    ahead, left = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    ahead = np.array([np.cos(turn), np.sin(turn)])
+    left = np.array([-np.sin(turn), np.cos(turn)])
     axle = np.array([20.0, 0.0]) + 8 * TIMES[:, None] * ahead
     assert recording.ego == 0 and recording.location == "pittsburgh" and recording.states.shape[1] == 3
     assert np.allclose(recording.states[:, 0, :2], axle + AHEAD * ahead)

@@ -16,7 +16,8 @@ def boxes():
         pose = torch.rand(10_000, 3, generator=generator, dtype=torch.float64) * torch.tensor([12.0, 12.0, 6.3])
         return pose, 0.3 + torch.rand(10_000, 2, generator=generator, dtype=torch.float64) * torch.tensor([8.0, 3.0])
 
-    first, second = draw(), draw()
+    first = draw()
+    second = draw()
     polygons = [shapely.polygons(corners(*box).numpy()) for box in (first, second)]
     return first, second, polygons
 

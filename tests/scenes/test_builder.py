@@ -50,7 +50,8 @@ def test_scenes_of_one_log_are_those_built_one_by_one():
     windows = list(recorded({"ego": left_turn(), "7": straight(50, 3.5, 0)}).windows([10, 12, 30, 48], 80))
     builder = SceneBuilder(windows[0], SETTINGS)
     for window in windows:
-        scene, alone = builder.scene(window), build_scene(window, SETTINGS)
+        scene = builder.scene(window)
+        alone = build_scene(window, SETTINGS)
         assert all(torch.equal(scene[key], alone[key]) for key in KEYS)
 
 
@@ -70,7 +71,8 @@ def test_a_scene_keeps_the_schema_and_its_frame():
 
 
 def test_the_start_sees_nothing_of_the_future():
-    scene, other = build(), description()
+    scene = build()
+    other = description()
     for agent in other["tracks"].values():
         state = agent["state"]
         state["position"][11:, 0] += np.linspace(0, 20, FRAMES - 11)
@@ -86,7 +88,8 @@ def test_the_start_of_what_stands_sees_nothing_of_the_future():
     parked = track([[60, 3.5]], wobble, 0.0)
     other = track([[60, 3.5]], np.where(ALL > 10, 0.5 + wobble, wobble), 0.0)
     ego = straight(20, 0, 8)
-    scene, changed = build({"ego": ego, "7": parked}), build({"ego": ego, "7": other})
+    scene = build({"ego": ego, "7": parked})
+    changed = build({"ego": ego, "7": other})
     assert torch.equal(scene["start"], changed["start"]) and torch.equal(scene["past"], changed["past"])
     assert len(scene["logged"][:, 1, 2].unique()) == 1, "it never turns"
 
@@ -179,7 +182,8 @@ def test_a_mission_without_lane_is_the_recorded_way_and_ends_with_what_is_known(
     slot = int(scene["route_log"][0])
     assert slot == scene["route_valid"][0].sum() - 1 > 0  # the lane routes stay
     assert scene["route_recorded"].nonzero().tolist() == [[0, slot]]
-    track, points = scene["logged"][:, 0, :2], scene["route_points"][0, slot]
+    track = scene["logged"][:, 0, :2]
+    points = scene["route_points"][0, slot]
     s, offset, _ = project(track, points)
     assert offset.abs().max() < 0.15 and s[0].item() == pytest.approx(20, abs=0.1)
     assert scene["route_open"][0, slot]

@@ -39,12 +39,14 @@ def test_splits_share_no_place_and_are_small(sets):
 
 def test_traffic_is_physical_and_the_ego_drives(recordings):
     for recording in recordings:
-        states, valid = recording.states, recording.valid
+        states = recording.states
+        valid = recording.valid
         assert len(states) == FRAMES and recording.current == CURRENT and valid[:, recording.ego].all()
         assert arc_length(states[CURRENT : CURRENT + 81, recording.ego, :2])[-1] > 20.0
         inner = valid[2:] & valid[1:-1] & valid[:-2]
         velocity = (states[2:, :, :2] - states[:-2, :, :2]) / (2 * DT)
-        speed, heading = states[1:-1, :, 3], states[1:-1, :, 2]
+        speed = states[1:-1, :, 3]
+        heading = states[1:-1, :, 2]
         along = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
         assert np.abs(along - speed)[inner].max() < 0.05  # positions are kept to 1 mm
         aside = velocity[..., 1] * np.cos(heading) - velocity[..., 0] * np.sin(heading)

@@ -28,7 +28,8 @@ def compare(lines, widths, rings, cells: int = 121) -> None:
     shapes = [LineString(line).buffer(w / 2 + MARGIN, quad_segs=64) for line, w in zip(dense, widths, strict=True)]
     area = unary_union(shapes + [Polygon(ring) for ring in rings])
     beyond = distance(points(x, y), area)
-    inside, depth = contains_xy(area, x, y), distance(points(x, y), area.boundary)
+    inside = contains_xy(area, x, y)
+    depth = distance(points(x, y), area.boundary)
     found = field.astype(float).ravel()
     near = ~inside & (beyond < 5)
     assert near.sum() > 100 and inside.sum() > 100
@@ -74,7 +75,9 @@ def test_outside_the_grid_is_far():
 
 def test_points_may_name_the_row_of_their_field():
     torch.manual_seed(0)
-    field, origin, row = torch.randn(3, 12, 12).half(), torch.randn(3, 2), torch.tensor([2, 0, 2, 1])
+    field = torch.randn(3, 12, 12).half()
+    origin = torch.randn(3, 2)
+    row = torch.tensor([2, 0, 2, 1])
     points = 12 * torch.rand(4, 7, 2)
     assert torch.equal(off_road(points, field, origin, row), off_road(points, field[row], origin[row]))
 

@@ -12,7 +12,8 @@ from e2rl.scenes.recording import PEDESTRIAN, VEHICLE
 FRAMES = 91
 TIME = 0.1 * np.arange(FRAMES)
 TYPES = np.array([VEHICLE])
-TURNED, SPIKES = "headings turned round", "heading spikes"
+TURNED = "headings turned round"
+SPIKES = "heading spikes"
 
 
 def driven(speed: np.ndarray | float, curvature: float = 0.0, heading: float = 2.9) -> np.ndarray:
@@ -65,7 +66,8 @@ def test_true_headings_are_left_as_they_are(name):
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_single_frames_turned_round_are_turned_back(name, seed):
-    rng, states = np.random.default_rng(seed), MOTIONS[name]
+    rng = np.random.default_rng(seed)
+    states = MOTIONS[name]
     flipped = rng.choice(FRAMES, size=rng.integers(1, 15), replace=False)
     valid = EVERY.copy()
     valid[rng.integers(FRAMES, size=9)] = False

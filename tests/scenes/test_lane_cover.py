@@ -21,7 +21,8 @@ def lanes(seed: int) -> tuple[list[np.ndarray], np.ndarray]:
 
 def searched(lines: list[np.ndarray], widths: np.ndarray, corner: np.ndarray, cells: int) -> np.ndarray:
     cell = corner + np.stack(np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"), -1)
-    field, widths = np.full((cells, cells), FAR), np.round(widths, 1)
+    field = np.full((cells, cells), FAR)
+    widths = np.round(widths, 1)
     for width in np.unique(widths)[::-1]:
         points = np.concatenate([line for line, own in zip(lines, widths, strict=True) if own == width])
         away = np.sqrt(((cell[:, :, None] - points) ** 2).sum(-1)).min(-1) - width / 2 - MARGIN

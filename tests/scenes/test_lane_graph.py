@@ -139,7 +139,8 @@ def test_a_vehicle_is_against_the_lanes_where_none_runs_with_it():
 
 def test_a_lane_that_crosses_is_no_lane_to_drive_along():
     slope = torch.tensor([[[20.0, 3.5]]]) + torch.linspace(-10, 10, 21)[None, :, None] * torch.tensor([1.0, 1.0])
-    points, lane = torch.cat([ROAD, slope], 1), torch.cat([LANE, torch.full((1, 21), 2)], 1)
+    points = torch.cat([ROAD, slope], 1)
+    lane = torch.cat([LANE, torch.full((1, 21), 2)], 1)
     assert against_lanes(points, lane, torch.tensor([[[20.0, 3.4]]]), AHEAD)[0, 0].tolist() == [True, False, False]
 
 

@@ -187,7 +187,8 @@ def test_arrays_of_both_numpys_are_read(protocol):
     for name in (b"numpy._core.multiarray", b"numpy._core.numeric"):
         shorter = name.replace(b"_core", b"core")
         if protocol > 3:  # its length stands before it
-            name, shorter = bytes([len(name)]) + name, bytes([len(shorter)]) + shorter
+            name = bytes([len(name)]) + name
+            shorter = bytes([len(shorter)]) + shorter
         old = old.replace(name, shorter)
     old = old[:2] + old[11:] if old[2:3] == b"\x95" else old  # without the frame, whose length changed
     assert old != new and b"numpy._core" not in old

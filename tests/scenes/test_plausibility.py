@@ -72,8 +72,10 @@ def one_vehicle(part, change):
 
 def twice(recording):
     every = [*range(recording.states.shape[1]), fastest(recording)]
-    recording.states, recording.valid = recording.states[:, every], recording.valid[:, every]
-    recording.size, recording.agent_type = recording.size[every], recording.agent_type[every]
+    recording.states = recording.states[:, every]
+    recording.valid = recording.valid[:, every]
+    recording.size = recording.size[every]
+    recording.agent_type = recording.agent_type[every]
 
 
 ALL = ("positions", "speeds", "sizes", "map")
@@ -176,7 +178,8 @@ def test_genuine_recordings_stay_well_inside_the_limits():
 
 def test_a_slow_vehicle_may_drive_backwards_and_a_short_way_tells_nothing(genuine):
     recording = copy.deepcopy(genuine)
-    agent, frames = fastest(recording), np.arange(len(recording.states))
+    agent = fastest(recording)
+    frames = np.arange(len(recording.states))
     recording.valid[:], recording.valid[:, agent] = False, True
     for speed, name, other in ((2.5, "slow_direction", "track_direction"), (7.0, "track_direction", "slow_direction")):
         states = [0.1 * speed * frames, 0 * frames, 0 * frames + np.pi, 0 * frames + speed]
@@ -189,7 +192,8 @@ def test_a_slow_vehicle_may_drive_backwards_and_a_short_way_tells_nothing(genuin
 
 def test_the_same_traffic_elsewhere_and_turned_is_as_plausible(genuine):
     recording = copy.deepcopy(genuine)
-    angle, away = 0.7, np.array([30_000.0, -4_000.0])
+    angle = 0.7
+    away = np.array([30_000.0, -4_000.0])
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     recording.states[..., :2] = recording.states[..., :2] @ turn + away
     recording.states[..., 2] += angle

@@ -118,7 +118,8 @@ def test_tracks_arrive_as_they_were_written(made):
     (recording,) = recordings(made)
     assert (recording.scene_id, recording.location, recording.dataset) == ("log", "town", "made")
     assert recording.states.shape == (121, 5, 4) and recording.ego == 0 and recording.current is None
-    row, time = rows_of(recording), 0.1 * np.arange(121)
+    row = rows_of(recording)
+    time = 0.1 * np.arange(121)
     assert set(row) == {VEHICLE, CYCLIST, PEDESTRIAN, OTHER}, "signs are left out"
     assert np.allclose(
         recording.states[:, 0], np.stack([20 + 8 * time, 0 * time, 0 * time, 0 * time + 8], 1), atol=1e-6

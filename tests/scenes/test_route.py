@@ -19,7 +19,8 @@ def wavy(seed: int, count: int = 60) -> torch.Tensor:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_projection_is_shapelys(seed):
-    route, generator = wavy(seed), torch.Generator().manual_seed(seed + 9)
+    route = wavy(seed)
+    generator = torch.Generator().manual_seed(seed + 9)
     s = torch.rand(50, generator=generator, dtype=torch.float64) * (SPACING * (len(route) - 2)) + 1
     base, heading, _ = interpolate(route, s)
     aside = 6 * torch.rand(50, generator=generator, dtype=torch.float64) - 3

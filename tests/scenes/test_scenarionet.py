@@ -64,7 +64,8 @@ def test_what_is_no_regular_file_is_named_or_passed_over(tmp_path):
 )
 def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
     """Neither where the zip says how much would come out, nor where it lies."""
-    path, size = tmp_path / "bomb.zip", 3 * MAX_BYTES
+    path = tmp_path / "bomb.zip"
+    size = 3 * MAX_BYTES
     with zipfile.ZipFile(path, "w", method) as archive:
         archive.writestr("bomb.pkl", bytes(size))
     if claimed:
@@ -238,7 +239,8 @@ def test_sizes_are_read_wherever_converters_write_them(form):
     scene = description()
     for agent in scene["tracks"].values():
         state = agent["state"]
-        length, width = float(state.pop("length")[0]), float(state.pop("width")[0])
+        length = float(state.pop("length")[0])
+        width = float(state.pop("width")[0])
         if form == "columns":
             state["size"] = np.tile([length, width, 1.5], (FRAMES, 1))
         elif form == "three numbers":

@@ -31,7 +31,8 @@ SCENES = st.tuples(KINDS, SHAPES).flatmap(
 
 
 def yielding(scenes, index):
-    index.dataset, index.split = "made", "test"
+    index.dataset = "made"
+    index.split = "test"
     index.dropped["invalid"] = 2
     for number, made in enumerate(scenes):
         index.add(f"scene-{number}", f"place-{number}", made)
@@ -96,7 +97,8 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_rebuilt_and_a_set_in_use_survives_it(tmp_path, capsys, damage):
     path = file_of(tmp_path)
-    first, content = cached(path, build, 1), path.read_bytes()
+    first = cached(path, build, 1)
+    content = path.read_bytes()
     path.unlink()
     path.write_bytes(DAMAGES[damage](content))
     same(cached(path, build, 1), first)

@@ -19,7 +19,8 @@ def scenes_of(count=4):
     """Scenes that differ, of which the last has a larger map than the others; changes to them change their hashes."""
 
     def build(index):
-        index.dataset, index.split = "made", "test"
+        index.dataset = "made"
+        index.split = "test"
         for k in range(count):
             scene = {key: value.numpy() for key, value in make_scenes(1, speed=8 + k, **SMALL).scenes[0].items()}
             del scene["scene_index"]
@@ -78,7 +79,8 @@ def test_a_list_by_hand_names_scenes_only(tmp_path):
 
 
 def test_other_scenes_of_the_same_name_are_refused_unless_their_files_are_the_same(tmp_path, capsys):
-    scenes, moved = scenes_of(), scenes_of()
+    scenes = scenes_of()
+    moved = scenes_of()
     moved.scenes["logged"][1, 3, 2, 0] += 0.01
     (tmp_path / SCENES).write_text(listed(scenes)[0])
     for files in ("", "0" * 64):

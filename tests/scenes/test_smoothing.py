@@ -27,7 +27,8 @@ def accelerating(heading: float = 0.7, speed: float = 4.0, accel: float = 1.5) -
 
 
 def test_constant_acceleration_is_estimated_exactly():
-    states, valid = accelerating(), np.ones((40, 1), bool)
+    states = accelerating()
+    valid = np.ones((40, 1), bool)
     start, accel, yaw_rate = causal_state(states, valid, 20)
     assert np.allclose(start[0, :3], states[20, 0, :3], atol=1e-6)
     assert np.isclose(start[0, 3], 4.0 + 1.5 * 2.0, atol=1e-5) and np.isclose(accel[0], 1.5, atol=1e-4)
@@ -43,7 +44,8 @@ def test_a_steady_turn_is_estimated():
 
 
 def test_the_start_state_is_blind_to_the_future_and_to_gaps_before():
-    states, valid = accelerating(), np.ones((40, 1), bool)
+    states = accelerating()
+    valid = np.ones((40, 1), bool)
     before = causal_state(states, valid, 20)
     states[21:], valid[21:] = np.nan, False
     states[:15], valid[:15] = 1e6, True
@@ -53,7 +55,9 @@ def test_the_start_state_is_blind_to_the_future_and_to_gaps_before():
 
 
 def test_the_past_is_seen_from_the_present_and_blind_to_the_future_and_to_gaps_before():
-    states, valid, speed = accelerating(), np.ones((40, 1), bool), np.array([7.0])
+    states = accelerating()
+    valid = np.ones((40, 1), bool)
+    speed = np.array([7.0])
     back = np.arange(1, 11) * 0.1
     past = causal_past(states, valid, 20, speed)
     assert past.shape == (1, 10, 3)
@@ -84,7 +88,8 @@ def test_smoothing_keeps_quadratics_and_takes_speed_along_the_heading():
 
 
 def test_smoothing_works_run_by_run_and_removes_noise():
-    states, valid = accelerating(), np.ones((40, 1), bool)
+    states = accelerating()
+    valid = np.ones((40, 1), bool)
     valid[18:22] = False
     states[20:, :, :2] += 500.0
     out = smooth(states, valid)
@@ -97,7 +102,8 @@ def test_smoothing_works_run_by_run_and_removes_noise():
 
 
 def test_a_glitch_costs_its_own_frames_only():
-    states, valid = accelerating(accel=0.0), np.ones((40, 1), bool)
+    states = accelerating(accel=0.0)
+    valid = np.ones((40, 1), bool)
     states[10, 0, 0] += 30.0  # one frame elsewhere
     states[25:27, 0, 2] += np.pi  # two frames turned round
     kept = drop_jumps(states, valid)
@@ -105,7 +111,8 @@ def test_a_glitch_costs_its_own_frames_only():
 
 
 def test_the_longer_side_of_a_lasting_jump_is_kept():
-    states, valid = accelerating(accel=0.0), np.ones((40, 1), bool)
+    states = accelerating(accel=0.0)
+    valid = np.ones((40, 1), bool)
     states[30:, 0, 2] += np.pi
     assert drop_jumps(states, valid).all(), "nobody leaves for a heading"
     states[:15, 0, :2] += 100.0
@@ -152,7 +159,8 @@ def test_resampling_turns_the_short_way_and_respects_validity():
 
 def test_long_gaps_are_not_invented_and_other_rates_are_brought_to_ten_hertz():
     stamps = np.concatenate([TIME[:20], TIME[20:] + 1.0])
-    states, valid = accelerating(accel=0.0), np.ones((40, 1), bool)
+    states = accelerating(accel=0.0)
+    valid = np.ones((40, 1), bool)
     _, known = resample_uniform(states, valid, stamps)
     assert len(known) == 50 and not known[20:30].any() and known[:20].all() and known[30:].all()
     out, known = resample_uniform(states, valid, TIME / 2)
@@ -173,17 +181,20 @@ def circle(seconds: np.ndarray) -> np.ndarray:
 @given(rate=st.sampled_from(RATES), jitter=st.floats(0, 0.45), seed=st.integers(0, 2**32 - 1))
 def test_at_every_rate_a_track_is_what_was_recorded_and_no_more(rate, jitter, seed):
     """Each valid frame lies on the motion, near recorded frames; each span recorded without a gap is covered."""
-    rng, count = np.random.default_rng(seed), max(int(6 * rate), 8)
+    rng = np.random.default_rng(seed)
+    count = max(int(6 * rate), 8)
     seconds = (np.arange(count) + rng.uniform(-jitter, jitter, count)) / rate
     seconds = seconds[rng.random(count) > 0.05]
     seconds -= seconds[0]
     valid = np.repeat(rng.random(count) < 0.7, 1 + rng.integers(6))[: len(seconds), None]
     assume(valid.any())
     out, known = resample_uniform(np.where(valid[..., None], circle(seconds), np.nan), valid, seconds)
-    time, recorded = 0.1 * np.flatnonzero(known[:, 0]), seconds[valid[:, 0]]
+    time = 0.1 * np.flatnonzero(known[:, 0])
+    recorded = seconds[valid[:, 0]]
     error = out[known] - circle(time)[:, 0]
     around = np.searchsorted(recorded, time)
-    before, after = recorded[np.maximum(around - 1, 0)], recorded[np.minimum(around, len(recorded) - 1)]
+    before = recorded[np.maximum(around - 1, 0)]
+    after = recorded[np.minimum(around, len(recorded) - 1)]
     nearest = np.minimum(np.abs(time - before), np.abs(time - after))
     inside = (before <= time) & (time <= after)
     assert (inside | (nearest <= 0.02 + 1e-9)).all(), "outside of what was recorded"
@@ -192,7 +203,8 @@ def test_at_every_rate_a_track_is_what_was_recorded_and_no_more(rate, jitter, se
     bend = 6.0 * 0.3 * gap**2 / 8 + 6.0 * nearest * (nearest <= 0.02)
     assert (np.linalg.norm(error[:, :2], axis=-1) <= bend + 1e-6).all()
     assert (np.abs(np.sin(error[:, 2])) <= 0.3 * nearest * (nearest <= 0.02) + 1e-6).all()
-    grid, step = 0.1 * np.arange(len(out))[:, None], np.diff(seconds)
+    grid = 0.1 * np.arange(len(out))[:, None]
+    step = np.diff(seconds)
     whole = valid[1:, 0] & valid[:-1, 0] & (step < 0.55)
     covered = ((seconds[:-1] <= grid) & (grid <= seconds[1:]))[:, whole].any(1)
     assert known[covered, 0].all() and not out[~known].any()
@@ -225,7 +237,8 @@ def test_a_track_annotated_at_a_lower_rate_is_interpolated_and_one_lost_from_sig
 
 def test_frames_of_one_time_stamp_are_one():
     seconds = np.repeat(np.arange(40) / 25, 1 + (np.arange(40) % 3 == 0))
-    states, valid = circle(seconds), np.ones((len(seconds), 1), bool)
+    states = circle(seconds)
+    valid = np.ones((len(seconds), 1), bool)
     first = np.flatnonzero(np.diff(seconds) == 0)
     valid[first[::2]], valid[first[1::2] + 1] = False, False
     out, known = resample_uniform(states, valid, seconds)
@@ -235,8 +248,11 @@ def test_frames_of_one_time_stamp_are_one():
 
 @pytest.mark.parametrize("speed", [0.0, 6.0, -6.0])
 def test_a_frame_beside_the_grid_that_is_alone_is_moved_along_its_speed(speed):
-    seconds, frames, grid = np.arange(50) / 14, [10, 25], [7, 18]
-    states, valid = circle(seconds), np.zeros((50, 1), bool)
+    seconds = np.arange(50) / 14
+    frames = [10, 25]
+    grid = [7, 18]
+    states = circle(seconds)
+    valid = np.zeros((50, 1), bool)
     valid[frames], states[..., 3] = True, speed
     out, known = resample_uniform(np.where(valid[..., None], states, 0.0), valid, seconds)
     assert np.flatnonzero(known[:, 0]).tolist() == grid
@@ -246,7 +262,8 @@ def test_a_frame_beside_the_grid_that_is_alone_is_moved_along_its_speed(speed):
 
 
 def test_a_height_that_is_unknown_is_the_nearest_of_its_track_and_others_stay():
-    heights, valid = np.tile([0.0, 8.0, 4.0], (40, 1)), np.ones((40, 3), bool)
+    heights = np.tile([0.0, 8.0, 4.0], (40, 1))
+    valid = np.ones((40, 3), bool)
     heights[:, 0] = TIME
     heights[[0, 1, 9, 10], 0] = np.nan
     heights[:, 2] = np.nan

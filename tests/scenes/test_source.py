@@ -80,7 +80,8 @@ def test_the_first_scenes_take_no_more_than_their_logs(tmp_path, workers):
 
 
 def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
-    folder, cache = write_folder(tmp_path / "x", scenes_of(1)), tmp_path / "cache"
+    folder = write_folder(tmp_path / "x", scenes_of(1))
+    cache = tmp_path / "cache"
     load_scenes(data_config(folder, cache))
     write_folder(folder, numbered([description({"ego": straight(33, 0, 5)})]))
     assert load_scenes(data_config(folder, cache)).scenes["start"][0, 0, 3].item() == pytest.approx(5.0, abs=1e-4)
@@ -176,10 +177,12 @@ class SpeedSource(Source):
         return sorted(file.name for file in self.root().glob("*.txt"))
 
     def read(self, log: str) -> Iterator[Recording]:
-        speed, frames = float((self.root() / log).read_text()), np.arange(200)
+        speed = float((self.root() / log).read_text())
+        frames = np.arange(200)
         states = np.stack([0.1 * speed * frames, 0 * frames, 0 * frames, 0 * frames + speed], -1)[:, None]
         road = {"road": Lane(np.array([[0.0, 0], [900, 0]]), self.lane_width)}
-        valid, size = np.ones((200, 1), bool), np.array([[4.5, 1.9]])
+        valid = np.ones((200, 1), bool)
+        size = np.array([[4.5, 1.9]])
         yield Recording(log, "road", "speeds", states, valid, size, np.zeros(1, int), 0, road, current=None)
 
     def fingerprint(self) -> bytes:
@@ -389,7 +392,8 @@ class Reader(SpeedSource):
 
 @pytest.mark.parametrize("edited", ["reader.py", "direct.py", "deep/table.py", "deep/__init__.py"])
 def test_an_edited_reader_or_what_it_imports_invalidates_its_cache(tmp_path, monkeypatch, edited):
-    package, logs = tmp_path / "code" / "my_reader", tmp_path / "logs"
+    package = tmp_path / "code" / "my_reader"
+    logs = tmp_path / "logs"
     (package / "deep").mkdir(parents=True)
     logs.mkdir()
     (logs / "a.txt").write_text("5.0")

@@ -15,7 +15,8 @@ def recording(*tracks: np.ndarray, sizes: list[tuple[float, float]]) -> Recordin
     """An ego at 12 m/s beside tracks [F, 4] of vehicles, on a straight road of two lanes."""
     states = np.stack([driving(-60.0, 0.0, 12.0), *tracks], 1)
     lanes = {name: Lane(np.array([[-300.0, y], [600.0, y]]), 3.5) for name, y in (("0", 0.0), ("1", 3.5))}
-    valid, kinds = np.ones(states.shape[:2], bool), np.zeros(states.shape[1], int)
+    valid = np.ones(states.shape[:2], bool)
+    kinds = np.zeros(states.shape[1], int)
     return Recording("towed", "road", "made", states, valid, np.array([(4.5, 1.9), *sizes]), kinds, 0, lanes)
 
 
@@ -60,7 +61,8 @@ def test_a_long_box_stays_on_its_bend_while_one_part_is_hidden(part):
     whole = recording(on_a_circle(0, 70), on_a_circle(9.3, 70), sizes=[(6, 2.4), (12, 2.6)])
     log = recording(on_a_circle(0, 70), on_a_circle(9.3, 70), sizes=[(6, 2.4), (12, 2.6)])
     log.valid[40:55, part] = log.valid[62:64, part] = False
-    expected, found = couple(whole).states[:, 1], couple(log).states[:, 1]
+    expected = couple(whole).states[:, 1]
+    found = couple(log).states[:, 1]
     assert np.abs(found[:, 2] - expected[:, 2]).max() < 0.01
     assert np.linalg.norm(found[:, :2] - expected[:, :2], axis=-1).max() < 0.05
 

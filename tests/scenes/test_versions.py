@@ -85,7 +85,8 @@ def test_a_mirror_in_a_mirror_is_the_log(recordings):
 def test_without_parked_vehicles_everybody_stays_who_moves_or_waits_on_a_lane(recordings):
     left = 0
     for log in recordings:
-        other, gone = version_of(log, "unparked"), []
+        other = version_of(log, "unparked")
+        gone = []
         assert equal(other.states[:, other.ego], log.states[:, log.ego])
         kept = {track.tobytes() for track in other.states.swapaxes(0, 1)}
         beside = LaneGraph(log.lanes).tree.query(log.states[log.valid.argmax(0), np.arange(len(log.size)), :2])[0]
@@ -111,7 +112,8 @@ def test_maps_are_shifted_and_cropped_by_as_much_as_they_say(recordings):
         moved = version_of(log, "shifted")
         steps = [moved.lanes[name].points - lane.points for name, lane in log.lanes.items()]
         assert np.allclose(np.linalg.norm(np.concatenate(steps), axis=1), SHIFT)
-        path, cropped = log.states[log.valid[:, log.ego], log.ego, :2], version_of(log, "cropped").lanes
+        path = log.states[log.valid[:, log.ego], log.ego, :2]
+        cropped = version_of(log, "cropped").lanes
         for name, lane in log.lanes.items():
             gap = np.linalg.norm(lane.points[:, None] - path, axis=-1).min()
             assert (name in cropped) == (gap < CROP)
@@ -132,7 +134,8 @@ def test_another_ego_is_the_one_that_drives_farthest_and_there_must_be_one(recor
 
 
 def test_a_log_without_a_version_makes_the_scenes_of_the_others(monkeypatch, tmp_path):
-    known, asked = VERSIONS["other_ego"], []
+    known = VERSIONS["other_ego"]
+    asked = []
 
     def some(log):
         asked.append(log.scene_id)

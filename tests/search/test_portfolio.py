@@ -25,17 +25,20 @@ def test_a_family_is_worth_its_own_chance_and_less_in_a_scene_where_it_failed():
     found = portfolio()
     torch.testing.assert_close(mean_worth(found), torch.full((2, 1), SURE).double(), rtol=0.01, atol=0)
     found.tell(0, 0, 0.0, 0.0, 100.0)
-    worth, family = mean_worth(found), SURE * CHANCE_TRIES / (CHANCE_TRIES + 1)
+    worth = mean_worth(found)
+    family = SURE * CHANCE_TRIES / (CHANCE_TRIES + 1)
     after = nearness(torch.tensor(0.0)).item() / ((1 + 1 / SCENE_TRIES) * (1 + 1 / FAMILY_TRIES))
     assert close(worth[1].item(), family) and close(worth[0].item(), family * after)
 
 
 def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
-    chance, finds = 0.1, 20
+    chance = 0.1
+    finds = 20
     found = portfolio(chance=chance, nfe=(100.0, 100.0))
     for _ in range(finds):
         found.tell(0, 0, 1.0, 2.0, 100.0)
-    near, tries = nearness(torch.tensor(2.0)), torch.arange(1, finds)
+    near = nearness(torch.tensor(2.0))
+    tries = torch.arange(1, finds)
     exposed = CHANCE_TRIES + 1 + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
     worth = mean_worth(found, 4000)[1]
     assert abs(worth[0].item() / ((CHANCE_TRIES * chance + finds) / exposed) - 1) < 0.05 and worth[0] > 2 * worth[1]
@@ -67,14 +70,16 @@ def test_a_dear_family_is_worth_less_in_proportion():
     assert close(worth[0].item() / worth[1].item(), 4.0 * (1 + 1 / SCENE_TRIES))  # it would be the second, besides
     for _ in range(int(CHANCE_TRIES)):
         found.tell(1, 1, 0.0, 0.0, 200.0)  # it costs less than it was said to: 300 in the mean
-    worth, exposed = mean_worth(found)[0], found.exposed[1].item()
+    worth = mean_worth(found)[0]
+    exposed = found.exposed[1].item()
     assert close(worth[0].item() / worth[1].item(), 3.0 * (1 + 1 / SCENE_TRIES) * exposed / CHANCE_TRIES)
 
 
 def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
     found = portfolio(scenes=1, nfe=(100.0, 110.0, 120.0))
     found.tell(0, 2, 0.0, 0.0, 120.0)
-    share, worth = found.share()[0], mean_worth(found)[0]
+    share = found.share()[0]
+    worth = mean_worth(found)[0]
     alone = share * (found.found / found.exposed) * 120.0 / torch.tensor([100.0, 110.0, 120.0])
     rank = torch.tensor([0.0, 1.0, 2.0])
     torch.testing.assert_close(worth, alone * (1 + 1 / SCENE_TRIES) / (1 + (1 + rank) / SCENE_TRIES), rtol=0.02, atol=0)

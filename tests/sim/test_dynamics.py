@@ -19,7 +19,8 @@ def random_case(batch=64, horizon=50, seed=0):
 
 def test_circle():
     """Constant speed and yaw rate: after a full turn the vehicle is back where it was."""
-    steps, speed = 100, 5.0
+    steps = 100
+    speed = 5.0
     actions = torch.tensor([0.0, 2 * math.pi / (steps * DT)], dtype=torch.float64).expand(steps, 2)
     start = torch.tensor([3.0, -2.0, 0.7, speed], dtype=torch.float64)
     end = dynamics.rollout(start, actions)[-1]
@@ -35,7 +36,8 @@ def test_constant_acceleration_is_exact():
 def test_rollout_equals_recursion_with_clipped_speeds():
     start, actions = random_case()
     parallel = dynamics.rollout(start, actions)
-    state, speeds = start, []
+    state = start
+    speeds = []
     for k in range(actions.shape[1]):
         expected = (state[:, 3] + actions[:, k, 0] * DT).clamp(0, dynamics.MAX_SPEED)
         state = dynamics.step(state, actions[:, k])
@@ -48,7 +50,8 @@ def test_rollout_equals_recursion_with_clipped_speeds():
 @pytest.mark.parametrize(("acceleration", "distance"), [(0.0, -(2.0**2) / 6), (-5.0, -(2.0**2) / 6), (4.0, -0.5)])
 def test_who_reverses_comes_to_a_halt_however_it_is_told_to_go_on(acceleration, distance):
     """From 2 m/s in reverse at 3 m/s^2, or as hard as it is told to; then it stands, or drives on."""
-    start, actions = torch.tensor([0.0, 0.0, 0.0, -2.0]), torch.tensor([acceleration, 0.0]).expand(10, 2)
+    start = torch.tensor([0.0, 0.0, 0.0, -2.0])
+    actions = torch.tensor([acceleration, 0.0]).expand(10, 2)
     states = dynamics.rollout(start, actions)
     state = start
     for expected in states:
@@ -111,7 +114,8 @@ def test_gradients_flow(horizon):
 
 
 def test_the_curvature_that_is_expected_of_a_turn():
-    rate, speed = torch.tensor([0.5, -0.3, 0.05, 2.0]), torch.tensor([10.0, 6.0, 0.2, 5.0])
+    rate = torch.tensor([0.5, -0.3, 0.05, 2.0])
+    speed = torch.tensor([10.0, 6.0, 0.2, 5.0])
     found = dynamics.curvature_of(rate, speed)
     torch.testing.assert_close(found, torch.tensor([0.05, -0.05, 0.05, dynamics.SHARPEST]))
 
@@ -120,13 +124,15 @@ def test_constant_velocity_is_a_rollout_without_actions():
     start, _ = random_case()
     actions = torch.zeros(len(start), 20, 2, dtype=torch.float64)
     times = DT * torch.arange(1, 21, dtype=torch.float64)
-    found, expected = dynamics.constant_velocity(start, times), dynamics.rollout(start, actions)
+    found = dynamics.constant_velocity(start, times)
+    expected = dynamics.rollout(start, actions)
     torch.testing.assert_close(found[..., :2], expected[..., :2])
     assert torch.equal(found[..., 2:], start[:, None, 2:].expand(-1, 20, -1))
 
 
 def test_an_arc_is_the_unicycle_s_motion_at_constant_acceleration_and_curvature():
-    states, given = torch.tensor([1.0, -2.0, 0.4, 9.0]), Arc(torch.tensor(-3.0), torch.tensor(0.04))
+    states = torch.tensor([1.0, -2.0, 0.4, 9.0])
+    given = Arc(torch.tensor(-3.0), torch.tensor(0.04))
     times = DT * torch.arange(1, 51)
     arc, driven = along_arc(states, given, times)
     speed = torch.nn.functional.pad(arc[:, 3], (1, 0), value=9.0)
@@ -154,7 +160,8 @@ def test_an_arc_in_reverse_is_the_arc_forwards_of_who_looks_the_other_way(accel)
 
 
 def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():
-    given, times = Arc(torch.tensor(2.0), torch.tensor(0.05)), torch.tensor([1.0, 2.0, 3.0, 4.0])
+    given = Arc(torch.tensor(2.0), torch.tensor(0.05))
+    times = torch.tensor([1.0, 2.0, 3.0, 4.0])
     arc, driven = along_arc(torch.tensor([0.0, 0.0, 0.0, 10.0]), given, times, hold=1.0, turn=2.0)
     torch.testing.assert_close(arc[:, 3], torch.full((4,), 12.0))
     torch.testing.assert_close(driven, torch.tensor([11.0, 23.0, 35.0, 47.0]))

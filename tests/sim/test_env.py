@@ -58,7 +58,8 @@ def test_what_is_not_observed_drives_alike():
     seen, blind = (DrivingEnv(scenes, SimSettings(), 2, observed=observed) for observed in (True, False))
     check_env_specs(DrivingEnv(scenes, SimSettings(), 2, observed=False), seed=0)
     begin = TensorDict({"scene_index": torch.tensor([[0], [2]])}, batch_size=[2])
-    one, other = seen.reset(begin.clone()), blind.reset(begin.clone())
+    one = seen.reset(begin.clone())
+    other = blind.reset(begin.clone())
     for _ in range(15):
         action = torch.tensor([[1.0, 0.1], [-1.0, 0.2]])
         one, other = (env.step(td.set("action", action))["next"] for env, td in ((seen, one), (blind, other)))
@@ -101,7 +102,8 @@ def test_seed_makes_batches_identical():
         env.set_seed(3)
         return env.rollout(20, lambda td: td.set("action", 3 * torch.randn(4, 2)), break_when_any_done=False)
 
-    first, second = batch(), batch()
+    first = batch()
+    second = batch()
     assert (first["scene_index"] == second["scene_index"]).all()
     assert torch.equal(first["next", "observation"], second["next", "observation"])
 
@@ -252,10 +254,12 @@ def test_a_held_action_is_that_action_at_every_step_until_the_episode_ends(way, 
     assert torch.equal(once.reset(index.clone())["observation"], held.reset(index.clone())["observation"])
     action = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [3.0, 0.0]])
     action[:, 1] = -0.2 if way == "off road" else 0.0
-    alive, rewards = torch.ones(4, dtype=torch.bool), []
+    alive = torch.ones(4, dtype=torch.bool)
+    rewards = []
     last = None
     while alive.any():
-        expected, reward = None, torch.zeros(4, 1)
+        expected = None
+        reward = torch.zeros(4, 1)
         for _ in range(hold):
             now = once.step(TensorDict({"action": action}, [4]))["next"]
             reward = reward + now["reward"] * alive[:, None]

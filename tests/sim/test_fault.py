@@ -43,7 +43,8 @@ def judged(ego, others, since=0, vehicle=True, steps=40):
 )
 def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
     for heading in (0.0, 2.0):  # whichever way the ego looks
-        cos, sin = math.cos(heading), math.sin(heading)
+        cos = math.cos(heading)
+        sin = math.sin(heading)
         there = torch.tensor([[cos, -sin], [sin, cos]]) @ torch.tensor(place) + torch.tensor([10.0, -5.0])
         ego = torch.tensor([[10.0, -5.0, heading, speed]])
         others = torch.tensor([[[*there.tolist(), heading, other_speed], [60.0, 60.0, 0.0, 5.0]]])
@@ -60,12 +61,14 @@ def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
     ],
 )
 def test_what_the_front_hits_must_have_stood(since, vehicle, expected):
-    ego, others = torch.tensor([[0.0, 0.0, 0.0, 5.0]]), torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
+    ego = torch.tensor([[0.0, 0.0, 0.0, 5.0]])
+    others = torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
     assert judged(ego, others, since, vehicle) == [expected]
 
 
 def test_who_stands_since_the_start_has_stood():
-    ego, others = torch.tensor([[0.0, 0.0, 0.0, 5.0]]), torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
+    ego = torch.tensor([[0.0, 0.0, 0.0, 5.0]])
+    others = torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
     assert judged(ego, others, steps=3) == [True] and judged(ego, others, since=1, steps=3) == [False]
 
 

@@ -8,14 +8,16 @@ from e2rl.sim.leaders import FREE_GAP, GATE_MARGIN, IDMParameters, Leaders, desi
 from tests.loops import CROSSING, loop, track
 from tests.prior.small import arc
 
-LENGTH, WIDTH = 4.0, 2.0
+LENGTH = 4.0
+WIDTH = 2.0
 DRIVER = IDMParameters(headway=1.0, standstill_gap=5.0, acceleration=1.0, braking=3.0)
 
 
 def lead(agents):
     """Leaders of the first of agents (x, y, heading, speed), whose route is the x axis."""
     agents = torch.tensor(agents, dtype=torch.float32)[None]
-    size, present = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2), torch.ones(agents.shape[:2]).bool()
+    size = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2)
+    present = torch.ones(agents.shape[:2]).bool()
     found = leaders(agents[:, :1, 0] + 20.0, arc(0.0, 0.0, 0.0, 0.0)[None, None], agents[:, :, None], size, present)
     return tuple(value[0, :, 0] for value in found)
 
@@ -36,7 +38,8 @@ def test_who_stands_at_the_crossing_of_a_loop_leads_at_the_first_passage_to_come
     """Even where it is nearer to the other passage, or to one that lies behind."""
     for x, y in ((35.3, 0.0), (35.0, 0.3), (35.2, -0.2)):
         ego = torch.cat([track(loop(), s, 8.0, 0)[0], torch.tensor([x, y, 0.0, 0.0])]).view(1, 2, 4)
-        size, present = torch.tensor([LENGTH, WIDTH]).expand(1, 2, 2), torch.ones(1, 2, dtype=torch.bool)
+        size = torch.tensor([LENGTH, WIDTH]).expand(1, 2, 2)
+        present = torch.ones(1, 2, dtype=torch.bool)
         found = leaders(torch.tensor([[s]]), loop()[None, None], ego[:, :, None], size, present)
         assert found.index.item() == 1 and abs(found.gap.item() - gap + LENGTH / 2 + 1.5) < 1.0
 
@@ -46,7 +49,8 @@ def all_pairs(s, points, agents, size, present, d, free_gap):
     length, width = size[:, : s.shape[1]].unbind(-1)
     at, offset, heading = project(agents[:, None, :, :2], points)
     turn = agents[:, None, :, 2] - heading
-    cos, sin = turn.cos(), turn.sin()
+    cos = turn.cos()
+    sin = turn.sin()
     side = (size[:, None, :, 0] * sin.abs() + size[:, None, :, 1] * cos.abs()) / 2
     along = (size[:, None, :, 0] * cos.abs() + size[:, None, :, 1] * sin.abs()) / 2
     aside = offset - torch.minimum(torch.maximum(offset, d[..., None].clamp(max=0)), d[..., None].clamp(min=0))
@@ -60,7 +64,8 @@ def all_pairs(s, points, agents, size, present, d, free_gap):
 def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap):
     """Of all vehicles as the traffic asks, and of the ego alone without a horizon as the IDM ego does."""
     generator = torch.Generator().manual_seed(0)
-    batch, count = 40 * 6 // vehicles, 10
+    batch = 40 * 6 // vehicles
+    count = 10
     draw = lambda *shape: torch.rand(shape, generator=generator)  # noqa: E731
     bend = 0.04 * (draw(batch, vehicles, 1) - 0.5) * torch.arange(150) + 6.28 * draw(batch, vehicles, 1)
     step = 2.0 * torch.stack([bend.cos(), bend.sin()], -1)
@@ -69,7 +74,8 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
     place = points[:, 0, torch.randint(0, 150, (count,), generator=generator)] + 8 * (draw(batch, count, 2) - 0.5)
     agents = torch.cat([place, 6.28 * draw(batch, count, 1), 10 * draw(batch, count, 1)], -1)
     size = torch.tensor([4.5, 2.0]).expand(batch, count, 2)
-    present, d = draw(batch, count) < 0.8, 6 * (draw(batch, vehicles) - 0.5) * offsets
+    present = draw(batch, count) < 0.8
+    d = 6 * (draw(batch, vehicles) - 0.5) * offsets
     given = (60 * draw(batch, vehicles), points, agents, size, present)
     expected = all_pairs(*given, d, free_gap)
     at = (*given[:2], agents[:, :, None], *given[3:], d if offsets else None, free_gap)

@@ -81,7 +81,8 @@ def test_a_map_without_limits_looks_like_one_with_the_usual_one_or_that_of_the_e
 def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
     scene = scenes_with_everything().scenes
     scene["light_state"][0], scene["light_state"][1] = LIGHT_RED, LIGHT_GREEN
-    static, last = static_scene(scene, mission_of(scene)), scene["light_state"].shape[1] - 1
+    static = static_scene(scene, mission_of(scene))
+    last = scene["light_state"].shape[1] - 1
     here = torch.full((2,), 20.0)
     at_the_end, beyond = (
         light_features(observation_config(torch.device("cpu")), static, torch.full((2,), step), here)
@@ -92,7 +93,8 @@ def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
 
 def observations(scenes, actions):
     """[B, T, D] of a drive by actions [T, 2] in every scene."""
-    env, seen = DrivingEnv(scenes, SimSettings(), len(scenes)), []
+    env = DrivingEnv(scenes, SimSettings(), len(scenes))
+    seen = []
     td = env.reset()
     for action in actions:
         seen.append(td["observation"])

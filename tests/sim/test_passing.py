@@ -42,7 +42,8 @@ def test_the_interval_is_that_of_a_fine_look():
 
 
 def test_what_moves_no_farther_than_half_of_the_smallest_extent_is_not_looked_at():
-    own, other = torch.tensor([[2.0], [1.0]]), torch.tensor([[2.0], [0.4]])
+    own = torch.tensor([[2.0], [1.0]])
+    other = torch.tensor([[2.0], [0.4]])
     assert not is_fast(torch.tensor([[0.3], [0.2]]), own, other).any()
     assert is_fast(torch.tensor([[0.3], [0.3]]), own, other).all()
 
@@ -50,10 +51,12 @@ def test_what_moves_no_farther_than_half_of_the_smallest_extent_is_not_looked_at
 @pytest.mark.parametrize(("lateral", "known", "hits"), [(0.0, True, True), (0.0, False, False), (2.0, True, False)])
 def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
     """Head-on at 78 m/s: from 4.2 m before the ego to 3.6 m behind it. Who was not there did not pass."""
-    ego_before, ego = torch.tensor([[0.0, 0.0, 0.0, 38.0]]), torch.tensor([[3.8, 0.0, 0.0, 38.0]])
+    ego_before = torch.tensor([[0.0, 0.0, 0.0, 38.0]])
+    ego = torch.tensor([[3.8, 0.0, 0.0, 38.0]])
     before = torch.tensor([[[4.2, lateral, math.pi, 40.0]]])
     now = before - torch.tensor([4.0, 0.0, 0.0, 0.0])
-    size, still = torch.tensor([[4.0, 1.9]]), torch.zeros(1, 1)
+    size = torch.tensor([[4.0, 1.9]])
+    still = torch.zeros(1, 1)
     half = torch.tensor([[[1.1], [0.4]]])
     agents = Agents(now, still == 0, still, still)
     near = neighbours_of(ego, rotation_into(ego), size, half, agents)

@@ -30,7 +30,8 @@ def straight_on(speed, accel=0.0):
 
 
 def test_the_way_is_driven_to_the_halt_and_never_backwards():
-    speed, accel = torch.tensor([10.0, 10.0, 3.0]), torch.tensor([2.0, -5.0, -6.0])
+    speed = torch.tensor([10.0, 10.0, 3.0])
+    accel = torch.tensor([2.0, -5.0, -6.0])
     way = travelled(speed, accel, torch.tensor(4.0))
     assert way.tolist() == pytest.approx([40 + 16, 10**2 / 10, 3**2 / 12])
 
@@ -65,7 +66,10 @@ def test_others_keep_their_acceleration_for_a_second_then_their_speed():
 def test_who_turns_goes_on_turning():
     """The gap to a car in a curve is the one to the same car placed where its arc leads."""
     ego = straight_on(0.0)
-    size, pose, speed, curvature = torch.tensor([CAR]), (12.0, -14.0, 1.4), 6.0, 0.06
+    size = torch.tensor([CAR])
+    pose = (12.0, -14.0, 1.4)
+    speed = 6.0
+    curvature = 0.06
     found = gaps(ego, size, others((*pose, speed, 0.0, curvature)))[0, :, 0]
     arc = Arc(torch.tensor(0.0), torch.tensor(curvature))
     path, _ = along_arc(torch.tensor([*pose, speed]), arc, torch.tensor(TIMES[:4]))

@@ -43,7 +43,8 @@ def test_terms_grow_with_what_they_name():
 
 def test_terms_are_capped_and_squares_of_what_is_felt():
     """Comfort: acceleration / 4, lateral acceleration / 4 and jerk / 20, each squared."""
-    action, before = torch.tensor([[1.0, 0.2]]), torch.tensor([[0.5, 0.0]])
+    action = torch.tensor([[1.0, 0.2]])
+    before = torch.tensor([[0.5, 0.0]])
     expected = (1 / 4) ** 2 + (10 * 0.2 / 4) ** 2 + (0.5 / 0.1 / 20) ** 2
     assert abs(term("comfort", action=action, last_action=before) - expected) < 1e-6
     hard = {"action": torch.tensor([[-8.0, 1.6]]), "speed": torch.tensor([40.0]), "offset": torch.tensor([5.0])}

@@ -85,7 +85,8 @@ def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_le
     rows = rollouts.states.shape[2]
     plans = torch.arange(4.0 * 16 * rows * 10 * 2).reshape(4, 16, rows, 10, 2)
     targets = torch.where(rollouts.adversaries, 0, -1)[:, None].expand(-1, 16, -1)
-    evasion, driver = rollouts.states[:, :, 0].clone(), rollouts.states[:, :, 0] + 1
+    evasion = rollouts.states[:, :, 0].clone()
+    driver = rollouts.states[:, :, 0] + 1
     evasion[1] = driver[2] = torch.nan
     more = rollouts.replace(plans=plans, targets=targets, evasion=evasion, driver=driver)
     for index, path in enumerate(more.to_npz(tmp_path)):
@@ -139,7 +140,8 @@ def test_names_that_no_path_may_hold_are_mended(tmp_path, rollouts):
 def test_a_damaged_rollout_is_refused_by_name(tmp_path, rollouts, changes, kept):
     """Only bytes that say nothing may be changed: then the arrays are the same."""
     path = rollouts[:1].to_npz(tmp_path)[0]
-    whole, content = Rollout.read(path), path.read_bytes()
+    whole = Rollout.read(path)
+    content = path.read_bytes()
     damaged = bytearray(content[: int(kept * len(content)) + 1])
     for where, value in changes:
         damaged[int(where * len(damaged))] = value

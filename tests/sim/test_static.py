@@ -10,7 +10,8 @@ from e2rl.sim.static import follow, look_along, static_scene
 from e2rl.sim.world import Agents
 from tests.synthetic import make_scenes
 
-BATCH, COUNT = 64, 60
+BATCH = 64
+COUNT = 60
 
 
 def winding(seed=0):
@@ -47,11 +48,14 @@ def test_the_way_ahead_is_interpolated_with_its_limit():
 
 def test_others_are_seen_in_the_ego_frame_with_their_gap():
     scene = make_scenes(BATCH, num_vehicles=20, num_vrus=5).scenes
-    static, draw = static_scene(scene, mission_of(scene)), torch.Generator().manual_seed(1)
+    static = static_scene(scene, mission_of(scene))
+    draw = torch.Generator().manual_seed(1)
     scale = torch.tensor([6.0, 6.0, 3.0, 5.0])
     states = scale * torch.randn(BATCH, 48, 4, generator=draw)
-    ego, others = states[:, 0], states[:, 1:]
-    sizes, present = (static.size, static.half_size), scene["valid"][:, 1:]
+    ego = states[:, 0]
+    others = states[:, 1:]
+    sizes = (static.size, static.half_size)
+    present = scene["valid"][:, 1:]
     seen = neighbours_of(ego, rotation_into(ego), *sizes, Agents(others, present, others[..., 0], others[..., 1]))
     assert torch.allclose(seen.position.transpose(1, 2), to_frame(others[..., :2], ego[:, None]), atol=1e-5)
     turned = others[..., 2] - ego[:, None, 2]

@@ -18,7 +18,8 @@ def test_smoothing_solves_its_normal_equations_and_keeps_quadratics():
 
 
 def test_a_body_on_a_circle_reaches_the_steady_angle():
-    radius, wheelbase = 20.0, 3.0
+    radius = 20.0
+    wheelbase = 3.0
     angle = np.arange(0, 4 * np.pi, 0.05 / radius)
     centre, heading = tractrix(radius * np.stack([np.cos(angle), np.sin(angle)], -1), np.array(wheelbase))
     rear = np.sqrt(radius**2 - wheelbase**2)

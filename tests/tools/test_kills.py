@@ -37,7 +37,8 @@ def test_wall_times_and_what_a_run_keeps_for_itself_are_no_difference(tmp_path):
 
 @pytest.mark.parametrize("name", FILES)
 def test_everything_else_is_one(tmp_path, name):
-    one, other = run_of(tmp_path / "one"), run_of(tmp_path / "other")
+    one = run_of(tmp_path / "one")
+    other = run_of(tmp_path / "other")
     (other / name).write_text(FILES[name].replace(*CHANGED[name]))
     assert kills.differences(one, other) == [name]
     (other / name).unlink()
@@ -46,7 +47,8 @@ def test_everything_else_is_one(tmp_path, name):
 
 def test_states_and_weights_are_compared_by_their_tensors(tmp_path):
     for folder, value in (("one", 1.0), ("other", 1.0), ("third", 2.0)):
-        path, about = tmp_path / folder, {"origin": json.dumps({"seconds": len(folder)})}
+        path = tmp_path / folder
+        about = {"origin": json.dumps({"seconds": len(folder)})}
         path.mkdir()
         (path / "training.pt").write_bytes(state_bytes({"a": torch.tensor(value), "seconds": len(folder)}))
         torch.save({"a": torch.tensor(value)}, path / "state.pt")

@@ -10,7 +10,8 @@ from e2rl.traffic.attempt import NOT_FINITE, attempt
 
 
 def whole(tasks):
-    states, valid = torch.zeros(len(tasks), 1, 1, 4), torch.ones(len(tasks), 1, 1, dtype=torch.bool)
+    states = torch.zeros(len(tasks), 1, 1, 4)
+    valid = torch.ones(len(tasks), 1, 1, dtype=torch.bool)
     return TensorDict({"states": states, "valid": valid}, [len(tasks)])
 
 

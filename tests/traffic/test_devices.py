@@ -16,7 +16,8 @@ from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
 def test_tensors_of_two_devices_do_not_meet():
     with pretended_device():
-        here, there = torch.ones(3), torch.ones(3, device="cuda")
+        here = torch.ones(3)
+        there = torch.ones(3, device="cuda")
         assert device_of(there + 1).type == "cuda" and torch.equal((there * 2).cpu(), here * 2)
         for wrong in (
             lambda: here + there,

@@ -38,7 +38,10 @@ def test_whatever_is_fused_is_prepared():
 @pytest.mark.slow
 @pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
 def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
-    scene_set, on, called, ego = scenes(steps=40), synthesizer(), set(), LaneGraphEgo()
+    scene_set = scenes(steps=40)
+    on = synthesizer()
+    called = set()
+    ego = LaneGraphEgo()
     eager = drive(scene_set, on, 2.0, ego=ego)
     assert prepared(True) and is_on()
     for each in FUSED.values():
@@ -46,7 +49,9 @@ def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
         each.__dict__["_run"] = lambda flat, run=run, name=each.name: called.add(name) or run(flat)
     fast = drive(scene_set, on, 2.0, ego=ego)
     torch.manual_seed(0)
-    x, points, moving = torch.rand(1, 2, SIZE), SPACING * torch.arange(40.0), LaneState(*torch.rand(10, 1, 2))
+    x = torch.rand(1, 2, SIZE)
+    points = SPACING * torch.arange(40.0)
+    moving = LaneState(*torch.rand(10, 1, 2))
     given = x, moving, torch.stack([points, 0 * points], -1).expand(1, 2, -1, -1), torch.tensor([[True, False]])
     for one, other in zip(
         *(vars(decode(*given)).values() for decode in (decode_plans, decode_plans.function)), strict=True

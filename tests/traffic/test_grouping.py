@@ -18,7 +18,8 @@ from e2rl.traffic.grouping import (
 )
 from tests.traffic.e2.traffic_scenes import begin, scenes, synthesizer
 
-WIDTH, AGENTS = 32, 40
+WIDTH = 32
+AGENTS = 40
 
 
 def sized(counts, others=0):
@@ -43,19 +44,23 @@ def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_tha
 
 
 def test_what_changes_in_a_crop_arrives_where_it_belongs_and_nothing_else_changes():
-    on, scene = synthesizer(), scenes(3).scenes
+    on = synthesizer()
+    scene = scenes(3).scenes
     state, (group,) = begin(on, scene, 1.0), group_scenes(World.at_start(scene))
-    part, whole = crop_state(state, group, state.routed.route.shape[1]), clone(state)
+    part = crop_state(state, group, state.routed.route.shape[1])
+    whole = clone(state)
     part.routed.conflict_s[0, 1, 2] += 7.0
     part.path_kl[1, 3] += 1.0
     write_state(whole, part, group)
-    rows, changed = group.rows.tolist(), whole.routed.conflict_s != state.routed.conflict_s
+    rows = group.rows.tolist()
+    changed = whole.routed.conflict_s != state.routed.conflict_s
     assert changed.nonzero().tolist() == [[rows[0], 1, 2]] and whole.path_kl.nonzero().tolist() == [[rows[1], 3]]
     assert group.vehicles < changed.shape[1] and torch.equal(whole.lane.s, state.lane.s), "there is padding to crop"
 
 
 def test_noise_is_standard_and_depends_on_seed_and_draw_only():
-    seed, draw = torch.tensor([3, 4, 3]), torch.tensor([1, 1, 2])
+    seed = torch.tensor([3, 4, 3])
+    draw = torch.tensor([1, 1, 2])
     noise = noise_of(seed, draw, (5000,))
     assert noise.mean(1).abs().max() < 0.06 and (noise.std(1) - 1).abs().max() < 0.04
     assert torch.equal(noise[2:], noise_of(seed[2:], draw[2:], (5000,)))

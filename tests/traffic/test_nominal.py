@@ -29,8 +29,10 @@ def nominal(knowledge="predicted"):
 @pytest.mark.parametrize("knowledge", KNOWLEDGE)
 def test_a_plan_is_the_prior_s_sample(knowledge):
     """Padding, which replan crops, changes the order of sums and nothing else."""
-    on, scene = nominal(knowledge), scenes(2).scenes
-    world, state = World.at_start(scene), begin(on, scene)
+    on = nominal(knowledge)
+    scene = scenes(2).scenes
+    world = World.at_start(scene)
+    state = begin(on, scene)
     plan = EGO.plan(world)
     after, found = on.replan(state, world, plan)
     plan = plan if knowledge == "plan" else on.predicted_ego(state, world)[0]
@@ -46,7 +48,8 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
 
 
 def test_plans_continue_where_the_last_one_was_left():
-    on, scene = nominal(), scenes(2).scenes
+    on = nominal()
+    scene = scenes(2).scenes
     world = World.at_start(scene)
     state, plan = on.replan(begin(on, scene), world, EGO.plan(world))
     world = executed(world, plan, EGO.plan(world))
@@ -60,7 +63,8 @@ def test_plans_continue_where_the_last_one_was_left():
 @pytest.mark.parametrize("free_space", [False, True])
 def test_everybody_is_seen_where_it_drives_and_goes_on_as_planned(free_space):
     scene = curved_scenes()
-    on, world = nominal(), World.at_start(scene)
+    on = nominal()
+    world = World.at_start(scene)
     turning = scene["logged"][:, 1 : HORIZON + 1, 0].clone()
     turning[..., 2] = 0.2 * 0.1 * torch.arange(1, HORIZON + 1)  # the ego turns at 0.2 rad/s
     state = begin(on, scene)
@@ -120,8 +124,10 @@ def test_nonsense_in_the_announced_plan_is_believed_only_by_whoever_is_told_the_
 
 
 def test_the_prediction_begins_at_the_ego():
-    on, scene = nominal(), scenes(3).scenes
-    world, state = World.at_start(scene), begin(synthesizer(), scene)
+    on = nominal()
+    scene = scenes(3).scenes
+    world = World.at_start(scene)
+    state = begin(synthesizer(), scene)
     found = on.predicted_ego(state, world)[0]
     assert found.shape == (3, 50, 4) and found.isfinite().all()
     first = world.states[:, 0, 3] * DT
@@ -142,7 +148,8 @@ METHODS = ["nominal", "e2", "e2_pursuit", "ccdiff", "ctg_adv", "strive", "safe_s
 
 def plans_beside(method, scene, times=2):
     """Plans of all but the ego, which keeps its velocity."""
-    state, world = begin(method, scene, 2.0 * method.adversarial), World.at_start(scene)
+    state = begin(method, scene, 2.0 * method.adversarial)
+    world = World.at_start(scene)
     found = []
     for _ in range(times):
         known = keep_velocity(world.states[:, 0])
@@ -157,7 +164,8 @@ def test_who_is_not_told_the_plan_does_not_know_the_mission(name):
     """Of two egos that drive alike and mean to go elsewhere traffic makes the same, where one's way is a candidate, and
     where it is the recorded path, which nobody knows."""
     scene = fork()
-    turns, recorded = scene.clone(), scene.clone()
+    turns = scene.clone()
+    recorded = scene.clone()
     turns["route_log"][:, 0] = 1
     recorded["route_log"][:, 0] = 2
     recorded["route_points"][:, 0, 2] += torch.linspace(0, 30, scene["route_points"].shape[3])[:, None]
@@ -171,7 +179,8 @@ def test_who_is_not_told_the_plan_does_not_know_the_mission(name):
 
 def test_the_ego_is_expected_where_it_turns():
     """Two ways part behind it: it is expected on that on which it drives, whatever its mission is."""
-    method, scene = NominalTraffic(load_prior(), "predicted"), fork()
+    method = NominalTraffic(load_prior(), "predicted")
+    scene = fork()
     assert scene["route_valid"][:, 0, :2].all()
     for way in (0, 1):
         along = interpolate(scene["route_points"][:, 0, way], torch.full((3, 1), 45.0))

@@ -27,7 +27,9 @@ def live(eta=1.0):
 
 def test_joined_rows_keep_their_traffic():
     attack = stored()
-    both, other_way, twice = attack + recorded() + live(), live() + recorded() + attack, attack + attack
+    both = attack + recorded() + live()
+    other_way = live() + recorded() + attack
+    twice = attack + attack
     assert both.source.tolist() == [0, 1, 2] + [RECORDED] * 3 + [LIVE] * 3
     assert other_way.source.tolist() == [LIVE] * 3 + [RECORDED] * 3 + [0, 1, 2]
     assert twice.source.tolist() == list(range(6)) and len(twice.parts) == 2 and len(twice.adversaries) == 6
@@ -59,7 +61,8 @@ def test_tracks_are_gathered_from_the_parts_as_from_one():
 def test_weights_multiply_within_a_kind_and_leave_the_share():
     """Scenes 2, 0, 1 by priorities 3, 1, 1, the first three rows of weight 3."""
     priority = torch.tensor([0.2, 0.2, 0.6])
-    fresh, old = stored(), replace(stored(), fresh=torch.zeros(3, dtype=torch.bool))
+    fresh = stored()
+    old = replace(stored(), fresh=torch.zeros(3, dtype=torch.bool))
     pool = replace(fresh, weight=torch.full((3,), 3.0)) + old + recorded()
     probability = pool.probabilities(priority, 0.8)
     assert probability[:6].tolist() == pytest.approx([0.8 * w / 20 for w in (9, 3, 3, 3, 1, 1)])

@@ -25,7 +25,9 @@ def test_one_period_as_long_as_the_horizon_is_the_ego_s_plan():
 
 def test_the_ego_reacts_to_what_the_others_plan():
     world = World.at_start(scenes(2).scenes)
-    look, rows, halted = Lookahead(EGO, world, 5), torch.arange(2), onward(world)
+    look = Lookahead(EGO, world, 5)
+    rows = torch.arange(2)
+    halted = onward(world)
     halted[:, 1] = world.states[:, 1, None]  # the vehicle ahead stands still from now on
     halted[:, 1, :, 3] = 0.0
     gone = lambda planned: (look(rows, planned)[:, -1, :2] - world.states[:, 0, :2]).norm(dim=-1)  # noqa: E731
@@ -35,5 +37,7 @@ def test_the_ego_reacts_to_what_the_others_plan():
 
 def test_scenes_may_be_asked_about_in_any_order():
     world = World.at_start(scenes(3).scenes)
-    look, planned, rows = Lookahead(EGO, world), onward(world), torch.tensor([2, 0, 1])
+    look = Lookahead(EGO, world)
+    planned = onward(world)
+    rows = torch.tensor([2, 0, 1])
     torch.testing.assert_close(look(rows, planned[rows]), look(torch.arange(3), planned)[rows])

@@ -35,9 +35,12 @@ def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_s
 
 
 def test_zero_intensity_is_the_nominal_rollout_more_of_it_is_not_and_seeds_decide():
-    scene_set, on = scenes(), synthesizer()
-    nominal, zero = drive(scene_set, NominalTraffic(on.prior), 0.0), drive(scene_set, on, 0.0)
-    pushed, again = drive(scene_set, on, 2.0), drive(scene_set, synthesizer(), 2.0)
+    scene_set = scenes()
+    on = synthesizer()
+    nominal = drive(scene_set, NominalTraffic(on.prior), 0.0)
+    zero = drive(scene_set, on, 0.0)
+    pushed = drive(scene_set, on, 2.0)
+    again = drive(scene_set, synthesizer(), 2.0)
     other = drive(scene_set, on, 2.0, seeds=[10, 11, 12])
     assert torch.equal(pushed.states, again.states)
     assert not torch.equal(pushed.states[:, :, 1:5], other.states[:, :, 1:5])
@@ -81,7 +84,8 @@ class Turns(Traffic):
 
     def replan(self, state, world, ego_plan):
         states = keep_velocity(world.states[:, :ROWS])
-        acting, cost = torch.zeros(len(state), ROWS, dtype=torch.bool), torch.zeros(len(state), ROWS)
+        acting = torch.zeros(len(state), ROWS, dtype=torch.bool)
+        cost = torch.zeros(len(state), ROWS)
         acting[:, 1], acting[:, 2] = state == 0, state > 0
         cost[:, 1], cost[:, 2], cost[:, 3] = 1.0, (state > 0).float(), 0.25
         present = world.valid[:, :ROWS, None].expand(states.shape[:-1])
@@ -96,7 +100,8 @@ def test_adversaries_are_whoever_was_one_at_any_time_and_the_transport_is_shared
 
 
 def test_the_traffic_of_a_round_is_the_rollouts_and_its_seeds_are_the_scenes_own():
-    scene_set, rows = scenes(4), torch.tensor([3, 1, 0])
+    scene_set = scenes(4)
+    rows = torch.tensor([3, 1, 0])
     synthesize = synthesize_traffic(scene_set, synthesizer(), SimSettings(), batch=2)
     found = synthesize(EGO, rows, 2.0, 5)
     assert torch.equal(found["scene_index"], rows) and found["states"].shape[:2] == (3, 21)

@@ -18,7 +18,8 @@ from tests.traffic.e2.traffic_scenes import ROWS, begin, drive, scenes
 def recorded(steps=40):
     """Scenes whose vehicles waver, vanish, come back, end early or arrive late."""
     scene_set = scenes(3, steps=steps)
-    logged, valid = scene_set.scenes["logged"], scene_set.scenes["logged_valid"]
+    logged = scene_set.scenes["logged"]
+    valid = scene_set.scenes["logged_valid"]
     generator = torch.Generator().manual_seed(0)
     logged[:, 1:, 1:6] += 0.3 * torch.randn(3, steps, 5, 4, generator=generator)
     valid[:, 7:13, 1], valid[:, 22:, 2], valid[:, :11, 6] = False, False, False
@@ -29,7 +30,8 @@ def recorded(steps=40):
 def test_rollouts_are_the_log_bit_for_bit_with_its_gaps():
     scene_set = recorded()
     rollouts = drive(scene_set, LogReplay(), 0.0)
-    logged, valid = scene_set.scenes["logged"][:, :, 1:], scene_set.scenes["logged_valid"][:, :, 1:]
+    logged = scene_set.scenes["logged"][:, :, 1:]
+    valid = scene_set.scenes["logged_valid"][:, :, 1:]
     assert torch.equal(rollouts.valid[:, :, 1:], valid)
     assert torch.equal(rollouts.states[:, :, 1:][valid], logged[valid])
     assert not rollouts.adversaries.any() and (rollouts.transport_others == 0).all()
@@ -75,8 +77,10 @@ def test_who_reverses_goes_on_at_constant_velocity_and_halts_under_idm():
 
 
 NO_BOUNDS = BoundSettings(meeting=False, curve=False)
-HEADWAY, STANDSTILL_GAP = 1.5, 2.0
-LIMIT, LENGTH = 15.0, 4.5
+HEADWAY = 1.5
+STANDSTILL_GAP = 2.0
+LIMIT = 15.0
+LENGTH = 4.5
 AWAY = (-150, 1, 10.0)  # an ego that nobody meets
 
 
@@ -117,7 +121,9 @@ def test_where_no_limit_is_known_it_wants_its_start_speed_or_the_set_one():
 
 
 def test_closing_in_has_the_model_s_acceleration():
-    v, lead, gap = 10.0, 7.0, 30.0
+    v = 10.0
+    lead = 7.0
+    gap = 30.0
     wanted = 2 + 1.5 * v + v * (v - lead) / (2 * math.sqrt(2))
     expected = 1 - (v / LIMIT) ** 4 - (wanted / gap) ** 2
     assert acceleration([AWAY, (0, 0, v), (gap + LENGTH, 0, lead)]) == pytest.approx(expected, abs=1e-3)
@@ -171,7 +177,8 @@ def test_who_stands_at_the_start_stands_for_good():
 def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
     scene_set = scenes_of([AWAY, (50, 0, 10), (0, 1, 10)], steps=60, road=(-200.0, 80.0))
     rollouts = drive(scene_set, idm(BoundSettings()), 0.0)
-    x, there = rollouts.states[0, :, 1:3, 0], rollouts.valid[0, :, 1:3]
+    x = rollouts.states[0, :, 1:3, 0]
+    there = rollouts.valid[0, :, 1:3]
     assert there[:, 1].all() and not there[-1, 0] and (x[:, 0][there[:, 0]] <= 80.5).all()
     assert (there[1:, 0] <= there[:-1, 0]).all(), "nobody comes back"
 

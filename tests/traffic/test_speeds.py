@@ -22,14 +22,16 @@ def recorded():
 def deviations(rollouts):
     """Distance [n] m by which steps of vehicles differ from the mean speed along the mean heading, but of those on
     their recording, which begins at an estimate of it."""
-    states, logged = rollouts.states.double(), rollouts.logged.double()
+    states = rollouts.states.double()
+    logged = rollouts.logged.double()
     both = rollouts.valid[:, 1:] & rollouts.valid[:, :-1] & rollouts.simulated[:, None]
     both[..., 0] = False
     replays = (states - logged)[..., :2].norm(dim=-1) < 1e-3
     replays[:, 0] = True
     both &= ~(replays[:, 1:] & replays[:, :-1])
     turn = wrap(states[:, 1:, :, 2] - states[:, :-1, :, 2])
-    heading, speed = states[:, :-1, :, 2] + turn / 2, (states[:, 1:, :, 3] + states[:, :-1, :, 3]) / 2
+    heading = states[:, :-1, :, 2] + turn / 2
+    speed = (states[:, 1:, :, 3] + states[:, :-1, :, 3]) / 2
     expected = DT * speed[..., None] * torch.stack([heading.cos(), heading.sin()], -1)
     return (states[..., :2].diff(dim=1) - expected).norm(dim=-1)[both]
 

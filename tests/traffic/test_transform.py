@@ -122,7 +122,8 @@ def test_a_seed_decides_the_episodes(traffic):
         env.set_seed(seed)
         return env.rollout(25, still, break_when_any_done=False)
 
-    first, second = random_environment(0, traffic), random_environment(1, traffic)
+    first = random_environment(0, traffic)
+    second = random_environment(1, traffic)
     once = episodes(first, 3)
     assert same(once, episodes(second, 3)) and same(once, episodes(first, 3))
     assert not torch.equal(once["traffic", "row"], episodes(first, 4)["traffic", "row"])
@@ -255,11 +256,14 @@ def test_traffic_that_is_told_the_plan_refuses_a_policy_that_writes_none():
 
 def test_live_stored_and_recorded_rows_run_side_by_side():
     scene_set = scenes(3)
-    pool, on = replayed(scene_set) + live(1.0, 3), March()
+    pool = replayed(scene_set) + live(1.0, 3)
+    on = March()
     env = environment(pool, on, batch=9, scene_set=scene_set)
-    policy, tensordict = EgoPolicy(IDMEgo(), env), env.reset()
+    policy = EgoPolicy(IDMEgo(), env)
+    tensordict = env.reset()
     for step in range(12):
-        going_on, tensordict = tensordict["agents", "states"][6:, 1:ROWS].clone(), policy(tensordict)
+        going_on = tensordict["agents", "states"][6:, 1:ROWS].clone()
+        tensordict = policy(tensordict)
         going_on[..., 3], planned = (torch.arange(3.0) + step // 5 / 10)[:, None], tensordict["ego", "plan"][6:].clone()
         tensordict = env.step(tensordict)["next"]
         states = tensordict["agents", "states"][:, 1:ROWS]
@@ -281,7 +285,8 @@ def test_vehicles_of_replayed_rows_are_expected_to_keep_their_velocity():
 
 
 def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
-    seen, env = [], environment(live(), March())
+    seen = []
+    env = environment(live(), March())
 
     class Watching(EgoPolicy):
         def forward(self, tensordict):

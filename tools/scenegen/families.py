@@ -7,7 +7,9 @@ import numpy as np
 from scenegen.layout import Arm, Layout, cut, road_axis
 from scenegen.networks import arterial, grid, lane_drop, ramp, roundabout
 
-SIGNAL, PRIORITY, STOP = "traffic_light", "priority", "allway_stop"
+SIGNAL = "traffic_light"
+PRIORITY = "priority"
+STOP = "allway_stop"
 MEDIUM = 13.9  # m/s
 
 
@@ -51,7 +53,8 @@ def cross_angles(rng, arms: int = 4, jitter: float = 0.2) -> np.ndarray:
 def signalled_cross(rng, name: str) -> Layout:
     """Four-way signals with left-turn pockets."""
     roads = [(int(rng.integers(2, 4)), rng.uniform(13, 17.5), 3), (2, MEDIUM, 2)] * 2
-    angles, flow = cross_angles(rng, 4, 0.12), np.array([420, 330] * 2)
+    angles = cross_angles(rng, 4, 0.12)
+    flow = np.array([420, 330] * 2)
     return star(rng, name, SIGNAL, angles, roads, rng.uniform(0.3, 0.8) * flow, pocket=True)
 
 
@@ -62,15 +65,18 @@ def signalled_small(rng, name: str) -> Layout:
 
 def priority_cross(rng, name: str) -> Layout:
     """A main road that side roads cross, by priority or by stop signs."""
-    lanes, kind = int(rng.integers(1, 3)), rng.choice([PRIORITY, "priority_stop"])
-    roads, flow = [(lanes, rng.uniform(11, 16.5), 4), (1, 11.1, 1)] * 2, np.array([560, 260] * 2)
+    lanes = int(rng.integers(1, 3))
+    kind = rng.choice([PRIORITY, "priority_stop"])
+    roads = [(lanes, rng.uniform(11, 16.5), 4), (1, 11.1, 1)] * 2
+    flow = np.array([560, 260] * 2)
     return star(rng, name, kind, cross_angles(rng), roads, rng.uniform(0.4, 0.8) * flow)
 
 
 def t_junction(rng, name: str) -> Layout:
     """A side road that ends at a main road."""
     angles = rng.uniform(0, 2 * np.pi) + np.array([0, np.pi, np.pi / 2 + rng.uniform(-0.35, 0.35)])
-    main, flow = (int(rng.integers(1, 3)), MEDIUM, 4), np.array([600, 600, 380])
+    main = (int(rng.integers(1, 3)), MEDIUM, 4)
+    flow = np.array([600, 600, 380])
     return star(rng, name, PRIORITY, angles, [main, main, (1, 11.1, 1)], rng.uniform(0.4, 0.8) * flow)
 
 
@@ -82,7 +88,8 @@ def allway_stop(rng, name: str) -> Layout:
 def curved_road(rng, name: str) -> Layout:
     """A winding road with a side road or two."""
     layout = Layout(name, rng.uniform(3.3, 3.7))
-    speed, lanes = rng.uniform(11, 16), int(rng.integers(1, 3))
+    speed = rng.uniform(11, 16)
+    lanes = int(rng.integers(1, 3))
     signs = np.resize([1, -1], 6) * rng.choice([-1, 1])
     axis = road_axis(
         np.zeros(2),

@@ -20,7 +20,9 @@ def overlapping_pairs(states: np.ndarray, valid: np.ndarray, size: np.ndarray) -
     distance = np.linalg.norm(states[:, i, :2] - states[:, j, :2], axis=-1)
     both = valid[:, i] & valid[:, j] & (distance < radius[i] + radius[j])
     near = both.any(0)
-    i, j, both = i[near], j[near], both[:, near]
+    i = i[near]
+    j = j[near]
+    both = both[:, near]
     hit = overlap(states[:, i], size[i], states[:, j], size[j]) & both
     return np.stack([i, j], -1)[hit.any(0)]
 
@@ -45,7 +47,8 @@ def interaction_score(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     merges with (within 2 m, headings more than 0.5 rad apart, less than 4 s apart in time), plus 2 for turning by more
     than 0.5 rad.
     """
-    path, seen = states[::5], valid[::5]
+    path = states[::5]
+    seen = valid[::5]
     distance = np.linalg.norm(path[:, :, None, :2] - path[:, None, :, :2], axis=-1)
     moving = (path[..., 3] > 0.5) & seen
     others = ~np.eye(path.shape[1], dtype=bool)

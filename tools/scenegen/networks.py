@@ -58,7 +58,9 @@ def carriageway(layout: Layout, axis: np.ndarray, cuts: list[tuple[float, float,
 def ramp(rng, name: str) -> Layout:
     """A motorway with an on-ramp, and half of the time an off-ramp at the end of the auxiliary lane (a weave)."""
     layout = Layout(name, rng.uniform(3.5, 3.7))
-    speed, lanes, weave = rng.uniform(22, 28), int(rng.integers(2, 4)), bool(rng.random() < 0.5)
+    speed = rng.uniform(22, 28)
+    lanes = int(rng.integers(2, 4))
+    weave = bool(rng.random() < 0.5)
     axis = road_axis(np.zeros(2), rng.uniform(0, 2 * np.pi), 860.0, rng.uniform(-1, 1, 5) / 900)
     cuts = [(0.0, 300.0, lanes), (300.0 + GAP, 540.0, lanes + 1), (540.0 + 1.5 * GAP, 0.0, lanes)]
     main = carriageway(layout, axis, cuts, speed)
@@ -97,8 +99,10 @@ def _ramp_axis(axis: np.ndarray, at: float, right: float, rng, ahead: bool) -> n
 def arterial(rng, name: str) -> Layout:
     """A main road with side streets and driveways on both sides, one of them signalled half of the time."""
     layout = Layout(name, rng.uniform(3.2, 3.6))
-    speed, lanes = rng.uniform(12, 16), 2
-    heading, median = rng.uniform(0, 2 * np.pi), rng.choice([0.0, 0.4])
+    speed = rng.uniform(12, 16)
+    lanes = 2
+    heading = rng.uniform(0, 2 * np.pi)
+    median = rng.choice([0.0, 0.4])
     axis = road_axis(np.zeros(2), heading, 560.0, rng.uniform(-1, 1, 4) / 700)
     stops = np.cumsum(rng.uniform(65, 105, 4)) + 110.0
     signal = int(rng.integers(0, 8))
@@ -175,7 +179,8 @@ def grid(rng, name: str) -> Layout:
 def lane_drop(rng, name: str) -> Layout:
     """A one-way road that loses its right lane."""
     layout = Layout(name, rng.uniform(3.3, 3.7))
-    speed, lanes = rng.uniform(14, 19), int(rng.integers(2, 4))
+    speed = rng.uniform(14, 19)
+    lanes = int(rng.integers(2, 4))
     axis = road_axis(np.zeros(2), rng.uniform(0, 2 * np.pi), 560.0, rng.uniform(-1, 1, 5) / 350)
     road = carriageway(layout, axis, [(0.0, 300.0, lanes), (300.0 + 1.3 * GAP, 0.0, lanes - 1)], speed)
     layout.connect(road[0], road[1], [(k, k - 1) for k in range(1, lanes)])

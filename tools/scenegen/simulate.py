@@ -96,8 +96,10 @@ def ribbon(points: np.ndarray, width: float) -> np.ndarray:
 
 def add_taper(lanes: dict[str, Lane], ending: str, target: str) -> Lane:
     """Add the merging lane from a lane that ends to the lane beside its end, as a smooth shift; returns it."""
-    first, last = lanes[ending], lanes[target]
-    a, b = first.points[-1], last.points[0]
+    first = lanes[ending]
+    last = lanes[target]
+    a = first.points[-1]
+    b = last.points[0]
     u = first.points[-1] - first.points[-2]
     w = last.points[1] - last.points[0]
     reach = np.linalg.norm(b - a)

@@ -88,7 +88,9 @@ def stack_tracks(tracks: list[Track], frames: int, rng) -> tuple[np.ndarray, np.
 def park(net: Net, states: np.ndarray, valid: np.ndarray, size: np.ndarray, rng) -> Parking:
     """Cars at the kerbs that no vehicle ever touches and no lane runs through."""
     fill = rng.uniform(0.1, 0.45)
-    pose, body, strips = [np.zeros((0, 3))], [np.zeros((0, 2))], []
+    pose = [np.zeros((0, 3))]
+    body = [np.zeros((0, 2))]
+    strips = []
     for name in net.kerbs:
         lane = net.lanes[name]
         arc = arc_length(lane.points)
@@ -107,7 +109,8 @@ def park(net: Net, states: np.ndarray, valid: np.ndarray, size: np.ndarray, rng)
         pose.append(np.concatenate([place, (angle + rng.normal(0, 0.02, len(slots)))[:, None]], -1))
         body.append(dims)
         strips.append(kerb_strip(lane.points, arc, lane.width / 2))
-    pose, body = np.concatenate(pose), np.concatenate(body)
+    pose = np.concatenate(pose)
+    body = np.concatenate(body)
     free = ~touched(pose, body, states, valid, size) & ~on_lanes(pose, body, net)
     return Parking(pose[free], body[free], strips)
 

@@ -21,7 +21,8 @@ def candidates(states, valid, border: np.ndarray, rng) -> list[tuple[float, int,
     for first in range(0, len(states) - FRAMES + 1, STRIDE):
         span = slice(first, first + FRAMES)
         here = np.flatnonzero(valid[span].any(0))
-        part, known = states[span, here], valid[span, here]
+        part = states[span, here]
+        known = valid[span, here]
         score = interaction_score(part, known)
         travelled = np.linalg.norm(np.diff(part[CURRENT : CURRENT + 81, :, :2], axis=0), axis=-1).sum(0)
         apart = np.linalg.norm(part[..., None, :2] - border, axis=-1).min(-1).min(0)
@@ -65,7 +66,9 @@ def cut_windows(
     were refused."""
     parked = np.zeros((len(states), len(scene_map.parked), 4))
     parked[..., :3] = scene_map.parked
-    kept, refused, egos = [], Counter(), set()
+    kept = []
+    refused = Counter()
+    egos = set()
     for _, first, ego in candidates(states, valid, border, rng):
         if len(kept) == most or sum(refused.values()) >= ATTEMPTS:
             break

@@ -17,7 +17,8 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-PAGE, REPORT = "gallery.md", "gallery.html"
+PAGE = "gallery.md"
+REPORT = "gallery.html"
 PLACE = "<!-- the report -->"  # of the report in the page
 SHOWN = """[**Open the report**](assets/gallery.html){target=_blank} in a tab of its own.
 

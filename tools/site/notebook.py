@@ -10,7 +10,8 @@ from pathlib import Path
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-NOTEBOOK, PAGE = "tutorial.ipynb", "tutorial.md"
+NOTEBOOK = "tutorial.ipynb"
+PAGE = "tutorial.md"
 PICTURES = ("image/png", "image/gif")
 
 

@@ -83,7 +83,9 @@ def process_group(device: str) -> Iterator[tuple[Processes, str]]:
     if not started_by_torchrun():
         yield ALONE, device
         return
-    on_gpu, local, count = device.startswith("cuda"), int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"])
+    on_gpu = device.startswith("cuda")
+    local = int(os.environ["LOCAL_RANK"])
+    count = int(os.environ["LOCAL_WORLD_SIZE"])
     if on_gpu:
         gpus = torch.cuda.device_count()
         if count > gpus:

@@ -62,7 +62,9 @@ def draw(batch: TensorDictBase, generator: torch.Generator) -> TensorDict:
     feature [W, R, NODE]: standard normal; level [W, L]: in (0.01, 0.99), stratified; clean [W, L] bool: the ego's row
     is nearly noise-free (in half); noise [W, L, R, SIZE]: standard normal.
     """
-    size, count, device = len(batch), LEVELS, batch["x0"].device
+    size = len(batch)
+    count = LEVELS
+    device = batch["x0"].device
     feature = torch.randn(batch["nodes"].shape, generator=generator, device=device)
     u = torch.rand(count, size, generator=generator, device=device)
     level = (torch.arange(count, device=device)[:, None] + u) / count * 0.98 + 0.01
@@ -83,7 +85,8 @@ class DenoisingLoss(nn.Module):
 
     def __init__(self, denoiser: Denoiser, feature_noise: float = FEATURE_NOISE):
         super().__init__()
-        self.denoiser, self.feature_noise = denoiser, feature_noise
+        self.denoiser = denoiser
+        self.feature_noise = feature_noise
 
     def forward(self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(loss, its action term, its trajectory term) of windows [W] with the random numbers of `draw`.
@@ -91,11 +94,13 @@ class DenoisingLoss(nn.Module):
         total: divisor of the weighted sums, the sum of `loss_weight`, averaged over the processes that share a batch so
         that the mean of their gradients is the gradient of the whole batch.
         """
-        net, count = self.denoiser, drawn["level"].shape[1]
+        net = self.denoiser
+        count = drawn["level"].shape[1]
         scale = self.feature_noise * net.node_std * ((net.node_std > MIN_STD) & (net.node_std < CONSTANT_STD))
         nodes = batch["nodes"] + scale * drawn["feature"]
         encoding = net.encode(nodes, batch["pairs"], batch["present"]).repeat(count)
-        weight, tiled = loss_weight(batch, drawn), TensorDict.cat([batch] * count)
+        weight = loss_weight(batch, drawn)
+        tiled = TensorDict.cat([batch] * count)
         level = drawn["level"].T.reshape(-1, 1).expand(-1, weight.shape[1]).clone()
         level[:, 0] = torch.where(drawn["clean"].T.reshape(-1), EGO_LEVEL, level[:, 0])
         x = net.schedule.noised(tiled["x0"], level[..., None], drawn["noise"].transpose(0, 1).flatten(0, 1))
@@ -123,7 +128,8 @@ def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
 def held_out_loss(prior: Prior, windows: TensorDictBase, batch: int, batches: int = 20) -> float:
     """Denoising loss on at most `batches` batches of windows, with a fixed seed and without augmentation."""
     device = next(prior.parameters()).device
-    generator, measure = torch.Generator(device).manual_seed(1), DenoisingLoss(prior.denoiser, feature_noise=0.0)
+    generator = torch.Generator(device).manual_seed(1)
+    measure = DenoisingLoss(prior.denoiser, feature_noise=0.0)
     losses = []
     for part in windows[: batches * batch].split(batch):
         part = part.to(device)

@@ -91,15 +91,21 @@ class PriorTraining(Supervised):
         if settings.batch % processes.count:
             text = f"stage.batch={settings.batch}: {processes.count} processes share the windows of a step"
             raise InputError(f"{text} evenly; choose a multiple of their number")
-        self.prior, self.windows, self.test, self.settings = prior, windows, test, settings
-        self.processes, self.writes = processes, processes.leader
-        self.done, self.part = 0, settings.batch // processes.count
+        self.prior = prior
+        self.windows = windows
+        self.test = test
+        self.settings = settings
+        self.processes = processes
+        self.writes = processes.leader
+        self.done = 0
+        self.part = settings.batch // processes.count
         self.routes: TensorDictBase | None = None  # scenes that the first turn trains the route choice on
         self.accuracy = math.nan  # of the route choice
         self.device = next(prior.parameters()).device
         self.bf16 = has_bf16(self.device) if settings.bf16 is None else settings.bf16
         self.generator = torch.Generator(self.device).manual_seed(settings.seed + RANK_SEED * processes.rank)
-        nodes, causal = windows["nodes"][windows["present"]], windows["causal"]
+        nodes = windows["nodes"][windows["present"]]
+        causal = windows["causal"]
         std = nodes.std(0)
         prior.denoiser.node_mean.copy_(nodes.mean(0))
         prior.denoiser.node_std.copy_(torch.where(std < 1e-6, CONSTANT_STD, std.clamp(min=MIN_STD)))
@@ -175,7 +181,8 @@ class PriorTraining(Supervised):
     @contextmanager
     def averaged(self) -> Iterator[Prior]:
         """Context in which the prior has the averaged weights and is in evaluation mode."""
-        denoiser, average = self.prior.denoiser, self.average.module
+        denoiser = self.prior.denoiser
+        average = self.average.module
         assert isinstance(average, Denoiser)
         self.prior.denoiser = average
         self.prior.eval()
@@ -205,13 +212,15 @@ class PriorTraining(Supervised):
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`. Raises InputError if the number of processes differs."""
-        count, draws = self.processes.count, state["draws"]
+        count = self.processes.count
+        draws = state["draws"]
         if len(draws) != count:
             raise InputError(f"the run was begun by {len(draws)} processes, this is {count}; resume with as many")
         super().load_state_dict(state)
         for name, part in self._stateful().items():
             part.load_state_dict(state[name])
-        self.done, self.accuracy = state["done"], state["accuracy"]
+        self.done = state["done"]
+        self.accuracy = state["accuracy"]
         self.generator.set_state(draws[self.processes.rank].cpu())
 
 
@@ -226,7 +235,8 @@ def train_route_choice(prior: Prior, scenes: TensorDictBase, settings: TrainingS
     """Train by cross-entropy on the driven candidate, over vehicles with several; returns the training accuracy."""
     device = next(prior.route_choice.parameters()).device
     features = torch.cat([candidate_features(part, start_of(part)) for part in scenes.split(64)])
-    valid, label = scenes["route_valid"], scenes["route_log"]
+    valid = scenes["route_valid"]
+    label = scenes["route_log"]
     use = scenes["valid"][:, : label.shape[1]] & ~scenes["parked"][:, : label.shape[1]] & (label >= 0)
     use &= valid.sum(-1) > 1
     features, valid, label = (value[use].to(device) for value in (features, valid, label))

@@ -36,7 +36,8 @@ def make_windows(scenes: TensorDictBase, chunk: int = 32) -> TensorDict:
     for scene in Bar(scenes.split(chunk), "training windows"):
         vehicles = scene["route_log"].shape[1]
         routed = route_scene(scene, scene["route_log"].clamp(min=0))
-        logged, valid = scene["logged"][:, :, :vehicles], scene["logged_valid"][:, :, :vehicles]
+        logged = scene["logged"][:, :, :vehicles]
+        valid = scene["logged_valid"][:, :, :vehicles]
         accel = derivative(logged[..., 3], valid).clamp(-6.0, 4.0)
         heading = torch.where(valid, logged[..., 2], 0.0)
         unwrapped = torch.cumsum(torch.cat([heading[:, :1], wrap(heading.diff(dim=1))], 1), 1)
@@ -59,7 +60,8 @@ def _window(
     lateral knots are no offsets); causal []: start states are a causal observer's estimates, otherwise exact.
     """
     vehicles = routed.route.shape[1]
-    logged, valid = scene["logged"][:, offset], scene["logged_valid"][:, offset] & scene["valid"]
+    logged = scene["logged"][:, offset]
+    valid = scene["logged_valid"][:, offset] & scene["valid"]
     agents = scene["start"] if causal else logged
     state = locate(agents[:, :vehicles], accel, yaw_rate, routed.points)
     step = torch.full((len(logged),), offset, dtype=torch.long, device=logged.device)
@@ -97,7 +99,8 @@ def _future(scene: TensorDictBase, offset: int, vehicles: int) -> tuple[Tensor, 
     tracks = scene["logged"][:, future, :vehicles].transpose(1, 2)
     known = scene["logged_valid"][:, future, :vehicles].transpose(1, 2)
     short = HORIZON - known.shape[2]
-    tracks, known = torch.nn.functional.pad(tracks, (0, 0, 0, short)), torch.nn.functional.pad(known, (0, short))
+    tracks = torch.nn.functional.pad(tracks, (0, 0, 0, short))
+    known = torch.nn.functional.pad(known, (0, short))
     return tracks, known.cumprod(-1).bool()
 
 
@@ -106,7 +109,8 @@ def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tenso
     hint = state.s[..., None] + (torch.where(known, tracks[..., 3], 0.0) * DT).cumsum(-1)
     s, d, _ = project(tracks[..., :2], routed.points, hint)
     x0, error = lane_relative.fit(LaneState.from_states(tracks, s, d), known.float(), state)
-    ahead, lane = s - state.s[..., None], routed.has_lane
+    ahead = s - state.s[..., None]
+    lane = routed.has_lane
     if bool(lane.all()):
         return x0, error, ahead, d
     knots = lane_relative.ACCEL_SCALE * x0[..., :KNOTS]
@@ -117,5 +121,6 @@ def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tenso
     free_error = (gap * known).sum(-1) / known.sum(-1).clamp(min=1) / 2
     before = torch.cat([state.v[..., None], tracks[..., :-1, 3]], -1)
     driven = (torch.where(known, (tracks[..., 3] + before) / 2, 0.0) * DT).cumsum(-1)
-    x0, ahead = torch.where(lane[..., None], x0, free), torch.where(lane[..., None], ahead, driven)
+    x0 = torch.where(lane[..., None], x0, free)
+    ahead = torch.where(lane[..., None], ahead, driven)
     return x0, torch.where(lane, error, free_error), ahead, d

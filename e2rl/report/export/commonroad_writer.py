@@ -90,7 +90,8 @@ def scenario(episode: Episode, number: int, open_ego: bool) -> tuple[Any, Any]:
 def lanelets(episode: Episode, ids: Iterator[int]) -> list:
     """A lanelet for each lane, half its width to both sides of the centreline."""
     number = {name: next(ids) for name in episode.lanes}
-    entries, made = episode.entries(), []
+    entries = episode.entries()
+    made = []
     for name, lane in episode.lanes.items():
         left = beside(episode.lanes, name, "left", "right")
         right = beside(episode.lanes, name, "right", "left")
@@ -232,7 +233,8 @@ def obstacles(episode: Episode, ids: Iterator[int], open_ego: bool) -> list:
 def state(episode: Episode, step: int, row: int, **more: float) -> Any:
     """An agent's state at a step: the middle of its box, heading and speed."""
     x, y, heading, speed = episode.rollout.states[step, row].astype(float).tolist()
-    position, turned = np.array([x, y]), float(wrap(heading))
+    position = np.array([x, y])
+    turned = float(wrap(heading))
     return InitialState(time_step=step, position=position, orientation=turned, velocity=speed, **more)
 
 

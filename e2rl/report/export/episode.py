@@ -82,7 +82,8 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
     """The episode of a row of rollouts.csv in the scene that a recording makes; InputError where it is another one."""
     bare = rollout_episode(run, row)
     builder = SceneBuilder(recording, build)
-    scene, graph = builder.scene(recording), builder.graph
+    scene = builder.scene(recording)
+    graph = builder.graph
     rollout = bare.rollout
     same = len(graph.points) == len(rollout.lane_points) and len(scene["logged"]) == bare.steps + 1
     origin = np.round(graph.points[0] - rollout.lane_points[0]) if same else np.zeros(2)
@@ -151,7 +152,8 @@ def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
             continue
         x, y, heading, _ = start[row]
         ahead, left, turned = past.flip(0).T
-        cos, sin = heading.cos(), heading.sin()
+        cos = heading.cos()
+        sin = heading.sin()
         pose = torch.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turned], -1)
         moved = torch.cat([pose[1:], start[row, None, :3]])[:, :2] - pose[:, :2]
         forwards = (moved * torch.stack([pose[:, 2].cos(), pose[:, 2].sin()], -1)).sum(-1, keepdim=True) >= 0

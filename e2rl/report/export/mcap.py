@@ -105,7 +105,8 @@ def traffic(episode: Episode, step: int) -> Iterator[Entity]:
 
 def plans(episode: Episode, number: int) -> Iterator[Entity]:
     """The plans of a replan."""
-    rollout, step = episode.rollout, number * REPLAN_STEPS
+    rollout = episode.rollout
+    step = number * REPLAN_STEPS
     assert rollout.planners is not None and rollout.plans is not None
     for row, path in zip(rollout.planners.tolist(), rollout.plans[number], strict=True):
         if rollout.valid[step, row] and np.isfinite(path).all():
@@ -117,8 +118,10 @@ def agent(episode: Episode, step: int, row: int) -> Entity:
     """The box of an agent, with what it is."""
     rollout, (length, width) = episode.rollout, episode.size(row)
     x, y, heading, speed = rollout.states[step, row].tolist()
-    kind, role = str(rollout.agent_type[row]), role_of(rollout, row)
-    part, height = role if role in ("ego", "adversary") else kind, HEIGHT[kind]
+    kind = str(rollout.agent_type[row])
+    role = role_of(rollout, row)
+    part = role if role in ("ego", "adversary") else kind
+    height = HEIGHT[kind]
     pose = placed(x, y, heading, "position", "orientation", height / 2)
     cube = {"pose": pose, "size": {"x": length, "y": width, "z": height}, "color": rgba(COLOURS[role])}
     pairs = [{"key": "part", "value": part}, {"key": "speed", "value": f"{speed:.2f} m/s"}]

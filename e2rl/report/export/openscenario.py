@@ -37,7 +37,8 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
 
 def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
     """The xosc.Scenario of an episode on the roads in the file `road`."""
-    entities, init = xosc.Entities(), xosc.Init()
+    entities = xosc.Entities()
+    init = xosc.Init()
     act = xosc.Act("replay", at(0.0, "replay begins"))
     for row in episode.agents:
         name = name_of(row)
@@ -85,7 +86,8 @@ def rear_axle(episode: Episode, row: int) -> float:
 def entity(episode: Episode, row: int) -> Any:
     """The Vehicle, Pedestrian or MiscObject of an agent."""
     kind, (length, width), back = kind_of(episode, row), episode.size(row), rear_axle(episode, row)
-    name, height = f"{name_of(row)} {kind}", HEIGHT[kind]
+    name = f"{name_of(row)} {kind}"
+    height = HEIGHT[kind]
     box = xosc.BoundingBox(width, length, height, back, 0.0, height / 2)
     made: Any
     if kind == "pedestrian":
@@ -105,7 +107,8 @@ def entity(episode: Episode, row: int) -> Any:
 
 def events_of(episode: Episode, row: int) -> list:
     """The events of an agent: it appears and follows its polyline, and it vanishes, as often as the rollout has it."""
-    name, events = name_of(row), []
+    name = name_of(row)
+    events = []
     for first, end in episode.appearances(row):
         begin, gone = (round(step * episode.rollout.dt, 6) for step in (first, end))
         path = places(episode, row, first, end)

@@ -18,7 +18,8 @@ from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_UNKNOWN, LIGHT_Y
 from e2rl.scenes.smoothing import PAST
 
 VERSION = "MetaDrive v0.3.0.1"  # of the format
-SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
+SUMMARY = "dataset_summary.pkl"
+MAPPING = "dataset_mapping.pkl"
 MOVES = 1.0  # m that an object moves at least that counts as moving in ScenarioNet
 PROTOCOL = 4  # of pickle, which every Python 3 reads
 HEIGHT = {"vehicle": 1.6, "cyclist": 1.75, "pedestrian": 1.75, "other": 1.0}  # m; rollouts hold none
@@ -47,7 +48,8 @@ def description(episode: Episode) -> dict[str, Any]:
     """The ScenarioDescription of an episode; track n is the agent of row n, and 0 the ego."""
     history = 0 if episode.scene is None else PAST
     frames = history + episode.steps + 1
-    known, scene_id = {row: states for row, states in past_of(episode)}, episode.path.stem
+    known = {row: states for row, states in past_of(episode)}
+    scene_id = episode.path.stem
     tracks = {str(row): track(episode, row, history, known.get(row)) for row in episode.agents}
     objects = {name: object_summary(name, entry) for name, entry in tracks.items()}
     lights = {name: light(episode, name, history) for name in episode.lights}
@@ -84,8 +86,10 @@ def description(episode: Episode) -> dict[str, Any]:
 def track(episode: Episode, row: int, history: int, past: np.ndarray | None) -> dict[str, Any]:
     """The track of an agent, zero where it is absent. past [history, 4]: its states before the start, None for none."""
     rollout, (length, width) = episode.rollout, episode.size(row)
-    frames, kind = history + episode.steps + 1, str(rollout.agent_type[row])
-    states, valid = np.zeros((frames, 4)), np.zeros(frames, bool)
+    frames = history + episode.steps + 1
+    kind = str(rollout.agent_type[row])
+    states = np.zeros((frames, 4))
+    valid = np.zeros(frames, bool)
     valid[history:] = rollout.valid[:, row]
     states[history:][valid[history:]] = rollout.states[rollout.valid[:, row], row]
     if past is not None:

@@ -53,7 +53,8 @@ class Baseline(NominalTraffic):
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> BaselineState:
         """Returns the states of scenes [B] with routes drawn from the prior and no adversary."""
         nominal = super().reset(scenes, seed, eta)
-        none, zero = torch.zeros_like(nominal.routed.parked), torch.zeros_like(nominal.routed.length)
+        none = torch.zeros_like(nominal.routed.parked)
+        zero = torch.zeros_like(nominal.routed.length)
         return BaselineState(**vars(nominal), eta=eta, adversary=none, path_kl=zero)
 
     def replan(
@@ -98,7 +99,9 @@ def replay_others(state: Own, plan: TrafficPlan, world: World, driven: Tensor) -
     own = driven[..., None]
     states = torch.where(own[..., None], plan.states, logged.states)
     present = torch.where(own, plan.present, logged.present)
-    now, before = logged.states[:, :, REPLAN_STEPS - 1], logged.states[:, :, REPLAN_STEPS - 2]
-    accel, yaw_rate = (now[..., 3] - before[..., 3]) / DT, wrap(now[..., 2] - before[..., 2]) / DT
+    now = logged.states[:, :, REPLAN_STEPS - 1]
+    before = logged.states[:, :, REPLAN_STEPS - 2]
+    accel = (now[..., 3] - before[..., 3]) / DT
+    yaw_rate = wrap(now[..., 2] - before[..., 2]) / DT
     lane = select(driven, state.lane, locate(now, accel, yaw_rate, state.routed.points))
     return replace(state, lane=lane), replace(plan, states=states, present=present)

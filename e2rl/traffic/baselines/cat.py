@@ -46,8 +46,10 @@ class CAT(OpenLoop):
 
     def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The nominal sample with the future of greatest overlap in its vehicle's row, which alone is held."""
-        state, noise = now.state, now.noise
-        count, vehicles = noise.shape[3], context.active.shape[1]
+        state = now.state
+        noise = now.noise
+        count = noise.shape[3]
+        vehicles = context.active.shape[1]
         many = tiled(context, count)
         wide = torch.cat([noise[..., :1, :], self.spread * noise[..., 1:, :]], 3)  # the first is the nominal one
         x0 = self.prior.sample(many, folded(wide)).x0
@@ -69,7 +71,8 @@ class CAT(OpenLoop):
             if now.react is None:
                 return now.ego_plan[None, :, : futures.shape[-2]]
             return torch.stack([now.react(one) for one in futures[: self.tracks]])
-        state, world = now.state, now.world
+        state = now.state
+        world = now.world
         free = self.prior.encode(state.routed, state.lane, world.states, world.valid, world.step, None)
         many = tiled(free, self.tracks)
         x0 = self.prior.sample(many, folded(now.noise[..., : self.tracks, :])).x0
@@ -79,7 +82,8 @@ class CAT(OpenLoop):
 def overlap_value(futures: Tensor, tracks: Tensor, size: Tensor) -> Tensor:
     """Returns DECAY^step of the first contact of futures [S, B, V, H, 4] with each of the ego's tracks [W, B, H, 4] (0
     without one), mean over the tracks: [S, B, V]. size [B, V, 2]."""
-    own, ego = futures[..., STRIDE - 1 :: STRIDE, :], tracks[..., STRIDE - 1 :: STRIDE, :]
+    own = futures[..., STRIDE - 1 :: STRIDE, :]
+    ego = tracks[..., STRIDE - 1 :: STRIDE, :]
     boxes = own[:, None], size[:, :, None], ego[None, :, :, None], size[:, :1, None]
     worth = DECAY ** (STRIDE * torch.arange(1, own.shape[-2] + 1, device=own.device))
     return (overlap(*boxes) * worth).amax(-1).mean(1)

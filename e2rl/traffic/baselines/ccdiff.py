@@ -134,7 +134,8 @@ class CCDiff(MeanGuided):
 
     def loss(self, motion: LaneState, state: CCDiffState, view: View) -> Tensor:
         """Minus the collision cost with the ego, and metres off the road."""
-        states, others = view.with_ego(motion), torch.ones_like(view.routed.conflict)
+        states = view.with_ego(motion)
+        others = torch.ones_like(view.routed.conflict)
         others[:, :, 0] = False
         weights = torch.full_like(discounts(states), 1 / states.shape[-2])
         near = pair_term(states, view, disk_overlap(self.margin), self.margin, weights, others)

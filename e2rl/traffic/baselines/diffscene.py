@@ -38,7 +38,8 @@ class DiffScene(OpenLoop):
 
     def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The guided joint sample of least loss; the adversary alone is held."""
-        view, count = View.of(now.world, context, now.ego_plan), now.noise.shape[3]
+        view = View.of(now.world, context, now.ego_plan)
+        count = now.noise.shape[3]
         adversary = smallest(view.active, view.distance_to_ego(), 1) & (self.strength(now.state) > 0)[:, None]
         loss = partial(self.loss, state=now.state, view=view, adversary=adversary)
         control = CleanGuidance(self.prior, loss, adversary.repeat(count, 1), count, self.step_size, self.clip)

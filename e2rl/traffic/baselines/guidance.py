@@ -52,9 +52,11 @@ class MeanGuidance:
             x0 = denoise(x)
         if k == 1:
             return x, x0, x0
-        sampler, schedule = self.prior.sampler, self.prior.schedule
+        sampler = self.prior.sampler
+        schedule = self.prior.schedule
         past = None if k == sampler.steps else self.past
-        low, zero = sampler.levels(schedule, x.device)[sampler.steps - k + 1], torch.zeros_like(level)
+        low = sampler.levels(schedule, x.device)[sampler.steps - k + 1]
+        zero = torch.zeros_like(level)
         step = partial(sampler.on(schedule).step, high=level, low=low, noise=zero)
         mean, variance = step(x=x, x0=x0, past=past)
         none = None if past is None else (zero, past[1])
@@ -114,12 +116,15 @@ class Guided(Baseline):
 
     def attack(self, now: Replan, context: Context) -> tuple[State, Tensor]:
         """Returns state and chosen joint sample x0 [G, V, SIZE]; scenes without strength keep the nominal one."""
-        state, count = now.state, now.noise.shape[3]
-        view, acts = View.of(now.world, context, now.ego_plan), self.strength(state) > 0
+        state = now.state
+        count = now.noise.shape[3]
+        view = View.of(now.world, context, now.ego_plan)
+        acts = self.strength(state) > 0
         adversary = self.attackers(state, view) & acts[:, None]
         state = replace(state, adversary=adversary)
         guided = (context.active if self.guides_everybody else adversary) & acts[:, None]
-        loss, many = partial(self.loss, state=state, view=view), tiled(context, count)
+        loss = partial(self.loss, state=state, view=view)
+        many = tiled(context, count)
         control = self.guidance(loss, guided.repeat(count, 1), self.strength(state).repeat(count))
         sample = self.prior.sample(many, folded(now.noise), control)
         motion = motion_of(self.prior, sample.x0, many, count)

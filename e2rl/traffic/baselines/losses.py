@@ -40,14 +40,16 @@ def pair_term(
 
     weights [T] of the moments; left_out [B, V, V] bool: pairs (i, j) that cost i nothing. Only near pairs are computed.
     """
-    size, radius = view.size, view.size.norm(dim=-1) / 2
+    size = view.size
+    radius = view.size.norm(dim=-1) / 2
     xy = states[..., :2].detach().transpose(2, 3)
     gap = torch.cdist(xy, xy).amin(2) - radius[:, :, None] - radius[:, None]
     counts = view.valid[:, :, None] & view.valid[:, None]
     counts = counts & ~torch.eye(counts.shape[-1], dtype=torch.bool, device=counts.device)
     counts = counts if left_out is None else counts & ~left_out
     sample, scene, own, other = ((gap < reach) & counts).nonzero(as_tuple=True)
-    mine, them = (sample, scene, own), (sample, scene, other)
+    mine = (sample, scene, own)
+    them = (sample, scene, other)
     value = cost(states[mine], size[scene, own], states.detach()[them], size[scene, other])
     return torch.zeros_like(states[..., 0, 0]).index_put(mine, (value * weights).sum(-1), accumulate=True)
 

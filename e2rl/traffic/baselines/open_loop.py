@@ -71,7 +71,8 @@ class OpenLoop(Baseline):
         x0 = torch.where(state.held[..., None], rest, nominal)
         if not bool(due.any()):
             return state, x0
-        made, rows = self.scenario(now, context, nominal), due[:, None]
+        made = self.scenario(now, context, nominal)
+        rows = due[:, None]
         held = torch.where(rows, made.held, state.held)
         state = replace(
             state,
@@ -97,7 +98,8 @@ def later(x: Tensor, begun: LaneState, lane: LaneState, age: Tensor, has_lane: T
     index = torch.arange(KNOTS, device=x.device) + age[:, None, None]
     knots = x[..., :KNOTS].gather(-1, index.clamp(max=KNOTS - 1).expand(*x.shape[:-1], -1))
     _, half, end = split(x, begun)
-    reach, first_reach = lateral_horizon(lane.v)[..., None], lateral_horizon(begun.v)[..., None]
+    reach = lateral_horizon(lane.v)[..., None]
+    first_reach = lateral_horizon(begun.v)[..., None]
     ahead = (lane.s - begun.s)[..., None] + reach * torch.tensor([0.5, 1.0], device=x.device)
     path = polynomial(offset_coefficients(begun, half, end), (ahead / first_reach).clamp(0, 1))[0]
     bend = (path[..., 0] - 0.5 * (lane.d + path[..., 1])) / BEND_SCALE

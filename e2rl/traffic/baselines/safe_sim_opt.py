@@ -46,7 +46,8 @@ class SafeSimOpt(Guided):
 
     def loss(self, motion: LaneState, state: BaselineState, view: View) -> Tensor:
         """Route and Gaussian terms of all; collision and TTC terms of adversaries, by the strength."""
-        states, strength = view.with_ego(motion), self.strength(state)[:, None] * state.adversary
+        states = view.with_ego(motion)
+        strength = self.strength(state)[:, None] * state.adversary
         calm = self.route * off_route_term(motion, view) + self.gaussian * self._overlap(states, view, state)
         attack = self.collision * collision_term(states) * in_conflict(view) + self.ttc * ttc_term(states)
         return calm + strength * attack
@@ -61,7 +62,8 @@ class SafeSimOpt(Guided):
     def chosen(self, motion: LaneState, state: BaselineState, view: View, guided: Tensor) -> Tensor:
         """Sample [B, V] of each vehicle: the least Gaussian term, for adversaries the least collision term."""
         states = view.with_ego(motion)
-        calm, near = self._overlap(states, view, state), collision_term(states)
+        calm = self._overlap(states, view, state)
+        near = collision_term(states)
         return torch.where(state.adversary, near, calm).argmin(0)
 
     def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> CleanGuidance:
@@ -77,6 +79,7 @@ def collision_term(states: Tensor) -> Tensor:
 
 def in_conflict(view: View) -> Tensor:
     """Bool [B, V]: the vehicle's route and the ego's meet, they are not both past that point, and near enough."""
-    routed, s = view.routed, view.lane.s
+    routed = view.routed
+    s = view.lane.s
     before = (s < routed.conflict_s[:, :, 0]) | (s[:, :1] < routed.conflict_s[:, 0])
     return routed.conflict[:, :, 0] & before & (view.distance_to_ego() < CONFLICT_REACH)

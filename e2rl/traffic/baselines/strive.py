@@ -26,7 +26,8 @@ from e2rl.traffic.nominal import Replan
 
 def decode_latent(prior: Prior, latent: Tensor, context: Context, steps: int) -> Tensor:
     """Returns x0 [B, V, SIZE] of latents [B, V, SIZE], the noise at the highest level, in `steps` evaluations of it."""
-    levels, x = prior.schedule.levels(steps, latent.device), latent
+    levels = prior.schedule.levels(steps, latent.device)
+    x = latent
     zero = torch.zeros_like(levels[0])
     for high, low in zip(levels[:-2], levels[1:-1], strict=True):
         x = DDIM(prior.schedule, churn=0.0).step(x, prior.denoise(x, high, context), high, low, zero)[0]
@@ -61,7 +62,8 @@ class Strive(OpenLoop):
 
     def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The optimised scenario, in which all vehicles are held; the nominal sample where it has no solution."""
-        first, acts = now.noise[0, :, :, 0].contiguous(), self.strength(now.state) > 0
+        first = now.noise[0, :, :, 0].contiguous()
+        acts = self.strength(now.state) > 0
         x0, view = self.attacked(first, now, context)
         motion = motion_of(self.prior, x0, context, 1)
         weight = softmin(view.with_ego(motion), view).sum(-1)  # of each vehicle
@@ -108,7 +110,8 @@ class Strive(OpenLoop):
     def loss(self, motion: LaneState, latent: Tensor, first: Tensor, state: OpenLoopState, view: View) -> Tensor:
         """STRIVE's objective [B] of a decoded motion [1, B, V, T], with weights between bystander and attacker."""
         states = view.with_ego(motion)
-        distance, delta = ego_distance(states)[0], softmin(states, view)
+        distance = ego_distance(states)[0]
+        delta = softmin(states, view)
         attack = (delta * distance.square()).flatten(1).sum(-1)
         fraction = delta.sum(-1)
         even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])

@@ -123,7 +123,8 @@ def _candidates(scene: TensorDictBase, world: World, index: Tensor, keep_route: 
     stop line that binds the vehicle now."""
     vehicles, count = scene["route_points"].shape[1:3]
     assert world.route is not None
-    states, route = take(world.states[:, :vehicles], index), take(world.route, index)[..., None]
+    states = take(world.states[:, :vehicles], index)
+    route = take(world.route, index)[..., None]
     number = route.clamp(min=0) if keep_route else torch.arange(count, device=index.device).expand(*index.shape, -1)
     at = (torch.arange(len(index), device=index.device)[:, None, None], index[..., None], number)
     points, end, valid = (scene[key][at] for key in ("route_points", "route_length", "route_valid"))
@@ -135,7 +136,8 @@ def _candidates(scene: TensorDictBase, world: World, index: Tensor, keep_route: 
         usable = usable & (route >= 0)
     if halt_at_red:
         end = torch.minimum(end, s + distance_to_stop_line(world, index, number))
-    accel, size = take(world.accel[:, :vehicles], index), take(scene["size"], index)
+    accel = take(world.accel[:, :vehicles], index)
+    size = take(scene["size"], index)
     return _Candidates(number, points, usable, end, s, d, _bend_bound(points, s), states[..., 3], accel, size)
 
 
@@ -207,7 +209,8 @@ def _on_lane(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The proposal of least cost on the candidates: candidate [B, M], knots [B, M, 10], cost [B, M] (inf for none)."""
     target = _along(candidates, path, size)
-    low, high = settings.min_accel, settings.max_accel
+    low = settings.min_accel
+    high = settings.max_accel
     limits = path.new_tensor((low, high))
     grid = torch.linspace(low, high, COARSE, device=path.device).expand(*candidates.s.shape, COARSE)
     best = scored(candidates, grid, target, limits)[0].argmin(-1, keepdim=True)  # per candidate
@@ -240,15 +243,19 @@ def propose(
     expected = constant_speed_states(scene, world, times)
     expected[:, 0] = ego_plan[:, :HORIZON].detach()
     assert world.route is not None
-    nobody, cost = torch.zeros_like(skeleton.coalition), expected.new_full(world.route.shape, torch.inf)
-    knots, path = expected.new_zeros(*world.route.shape, KNOTS), torch.zeros_like(scene["route_points"][:, :, 0])
+    nobody = torch.zeros_like(skeleton.coalition)
+    cost = expected.new_full(world.route.shape, torch.inf)
+    knots = expected.new_zeros(*world.route.shape, KNOTS)
+    path = torch.zeros_like(scene["route_points"][:, :, 0])
     anchor = Anchor(world.route.clone(), knots, nobody, cost, nobody, path)
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         target = skeleton.target.gather(1, index).clamp(min=0)
         candidates = _candidates(scene, world, index, keep_route, halt_at_red)
         pick, knots, cost = _on_lane(candidates, take(expected, target), take(scene["size"], target), settings)
-        cost, off_lane, found = cost.masked_fill(~present, torch.inf), torch.zeros_like(present), None
+        cost = cost.masked_fill(~present, torch.inf)
+        off_lane = torch.zeros_like(present)
+        found = None
         if depth == 1 and interception.reach > 0:
             found = intercept(world, index, target, expected, wish, interception, halt_at_red)
             off_lane = present & (found.cost < cost)

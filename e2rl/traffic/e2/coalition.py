@@ -120,7 +120,8 @@ class Coalitions(NominalTraffic):
         nominal = super().reset(scenes, seed, eta)
         near, far = limits_of(torch.full_like(nominal.seed, FULL) if template is None else template, self.skeleton)
         decided = eta.new_tensor(RULE).expand(len(eta), -1) if decisions is None else decisions
-        none, zero = torch.zeros_like(nominal.routed.parked), torch.zeros_like(nominal.routed.length)
+        none = torch.zeros_like(nominal.routed.parked)
+        zero = torch.zeros_like(nominal.routed.length)
         nobody = {name: none for name in ("coalition", "off_lane", "committed", "drawn", "settled")}
         nobody |= {"target": none.long() - 1, "since": zero - 1}
         costs = {"path_kl": zero, "anchor_jump": zero}
@@ -175,13 +176,16 @@ class Coalitions(NominalTraffic):
     def _propose(
         self, skeleton: Skeleton, state: E2State, world: World, ego_plan: Tensor, keep_route: bool = False
     ) -> Anchor:
-        settings, lawful, now = (self.anchor, self.interception), self.responsibility == "full", state.now
+        settings = (self.anchor, self.interception)
+        lawful = self.responsibility == "full"
+        now = state.now
         wish = Wish(state.eta, now.moment, now.wrong_way)
         return propose(world.scene, world, skeleton, ego_plan, *settings, wish, keep_route, lawful)
 
     def _select(self, state: E2State, world: World, ego_plan: Tensor) -> E2State:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
-        scene, vehicles = world.scene, state.routed.route.shape[1]
+        scene = world.scene
+        vehicles = state.routed.route.shape[1]
         context = self.encode(state, world, ego_plan)
         nominal = self.prior.plan(self.prior.estimate(context), context)
         reference = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1).transpose(1, 2)
@@ -192,7 +196,8 @@ class Coalitions(NominalTraffic):
         expected = reference[:, steps - 1 :: steps].transpose(1, 2)
         support, fallback = self._support(state, world, found.candidates, feasible)
         may = eligible(world, state.now.whom, self.responsibility == "full")
-        support, fallback = support & may, fallback & may
+        support = support & may
+        fallback = fallback & may
         anchor = self._propose(direct(support | fallback), state, world, ego_plan)  # its cost chooses the near agents
         cost = anchor.cost + state.now.scatter[:, None] * noise_of(state.seed, SCATTER + state.replans, (vehicles,))
         limits = state.near, state.far
@@ -208,7 +213,8 @@ class Coalitions(NominalTraffic):
         budget = self._budget(state)
         if budget is not None:  # who cannot afford its new route stays on the old one, and out of the coalition
             held = (change.sum(-1) <= budget)[:, None] | (change == 0)
-            acts, change = acts & held, change * held
+            acts = acts & held
+            change = change * held
         for _ in range(self.skeleton.max_chain - 1):
             acts = acts & ((skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0)))
         target = torch.where(acts, skeleton.target, -1)

@@ -129,7 +129,8 @@ class SparseControl:
         x0, adversarial, feasibility = self._gradients(x, level, k, context, denoise)
         if k == 1:
             return x, x0, self._driven(x0)
-        weight, moved = gradient_weight(self.prior.schedule, level, settings.scaling), x0
+        weight = gradient_weight(self.prior.schedule, level, settings.scaling)
+        moved = x0
         if self.has_coalition:
             adversarial = clip_rows(weight * adversarial, settings.adversarial_clip)
             moved = moved - self.eta[:, None, None] * adversarial * self.coalition[..., None]
@@ -181,7 +182,8 @@ class SparseControl:
         """
         with torch.no_grad():
             x0 = denoise(x)
-        schedule, strength = self.prior.schedule, min(self.strength, 1.0)
+        schedule = self.prior.schedule
+        strength = min(self.strength, 1.0)
         proposal = torch.cat([self.anchor.knots / ACCEL_SCALE, x0[..., KNOTS:]], -1)
         blend = (1 - strength) * x + strength * schedule.noised(proposal, level, self.anchor_noise)
         mask = self.anchor.feasible & self.coalition & context.active & (self.eta > 0)[:, None]

@@ -34,7 +34,8 @@ class Decisions(NamedTuple):
     scatter: Any = 0.0
 
 
-RULE, OWES = Decisions(), Decisions._fields.index("owes")
+RULE = Decisions()
+OWES = Decisions._fields.index("owes")
 
 
 def eligible(world: World, whom: Tensor, lawful: bool) -> Tensor:
@@ -42,7 +43,8 @@ def eligible(world: World, whom: Tensor, lawful: bool) -> Tensor:
     how to follow."""
     vehicles = world.scene["route_log"].shape[1]
     along = (world.states[:, :vehicles, 2] - world.states[:, :1, 2]).cos()
-    leads, beside = leading(world, vehicles), place_of(world, vehicles)[1] & ~leading(world, vehicles)
+    leads = leading(world, vehicles)
+    beside = place_of(world, vehicles)[1] & ~leading(world, vehicles)
     oncoming = along < -SAME_DIRECTION
     kinds = torch.stack([~leads if lawful else leads | ~leads, oncoming, along.abs() <= SAME_DIRECTION, beside, leads])
     return kinds[whom.long(), torch.arange(len(whom), device=whom.device)]

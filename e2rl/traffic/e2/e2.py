@@ -53,7 +53,8 @@ class E2(Coalitions):
     @property
     def tuned(self) -> Mapping[str, tuple]:  # type: ignore[override]
         """e2 has no gain: eta multiplies the limits of its interceptions. Where V_adv acts, its clip is the gain."""
-        lateral, clip = {"interception.lateral": (0.5, 4.0, "log")}, {"control.adversarial_clip": (0.05, 4.0, "log")}
+        lateral = {"interception.lateral": (0.5, 4.0, "log")}
+        clip = {"control.adversarial_clip": (0.05, 4.0, "log")}
         if self.skeleton.pursuit:
             return clip | {"potentials.distance": (1.0, 40.0, "log")}
         if self.control.adversarial_clip > 0:
@@ -71,7 +72,8 @@ class E2(Coalitions):
 
     def replan_group(self, now: Replan) -> tuple[E2State, Tensor, Context]:
         """Returns state, guided joint sample x0 [G, V, SIZE] and context of a group."""
-        state, ego_plan = now.state, now.ego_plan
+        state = now.state
+        ego_plan = now.ego_plan
         if not bool((state.eta > 0).any()) or self.control.transport_budget == 0:
             return super().replan_group(now)
         world = replace(now.world, route=state.routed.route)
@@ -84,12 +86,16 @@ class E2(Coalitions):
         if self.kernels.samples == 1 or not bool(self._affords(state).any()):
             control = self._control(state, world, ego_plan, anchor)
             sample = self.prior.sample(context, now.noise, control, self._budget(state))
-            x0, kl, jump, state = sample.x0, sample.kl, control.jump, replace(state, drawn=state.drawn & False)
+            x0 = sample.x0
+            kl = sample.kl
+            jump = control.jump
+            state = replace(state, drawn=state.drawn & False)
         else:
             attack, kernels = self._kernels(state, world, ego_plan, context, acts)
             state, x0, kl, jump = self._best(state, attack, kernels, anchor, context, now.noise)
         members = state.coalition | state.drawn
-        decided, given = state.now, (self.responsibility, self.yielding, world, members)
+        decided = state.now
+        given = (self.responsibility, self.yielding, world, members)
         context.obstacles.duty = duty_of(*given, state.eta, decided.patience, decided.owes >= 0.5)
         return replace(state, path_kl=state.path_kl + kl, anchor_jump=state.anchor_jump + jump), x0, context
 
@@ -101,7 +107,8 @@ class E2(Coalitions):
         if budget is not None:
             held = (cost.sum(-1) <= budget)[:, None]
             anchor = replace(anchor, feasible=anchor.feasible & (held | ~off_lane))
-            off_lane, cost = off_lane & held, cost * held
+            off_lane = off_lane & held
+            cost = cost * held
         state = replace(state, path_kl=state.path_kl + cost)
         return self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path), anchor
 
@@ -115,7 +122,8 @@ class E2(Coalitions):
         free = context.active & ~acts & (state.coalition | more[:, None]) & (state.eta > 0)[:, None]
         free &= eligible(world, state.now.whom, False) | (state.now.whom == ANY)[:, None]
         attack = KernelAttack.of(world, free, ego_plan, plan, state.since, state.settled)
-        gain, count = self.kernels.gain * state.eta, self.kernels.samples - 1
+        gain = self.kernels.gain * state.eta
+        count = self.kernels.samples - 1
         return attack, propose_kernels(attack, state.lane, state.routed.points, mean, gain, count)
 
     def _best(
@@ -130,7 +138,8 @@ class E2(Coalitions):
         count = self.kernels.samples - 1
         rows = ((kernels.vehicle >= 0).any(1) & self._affords(state)).nonzero()[:, 0]
         many, goal, drawn = tries(kernels, rows)
-        copies, context = take_rows(state, many), of_scenes(context, many)
+        copies = take_rows(state, many)
+        context = of_scenes(context, many)
         pull = Pull(goal, drawn, self.kernels.pull * copies.eta)
         given = take_rows(attack.world, many), attack.ego_plan[many], take_rows(anchor, many)
         control = self._control(copies, *given, pull)
@@ -166,7 +175,8 @@ class E2(Coalitions):
     def _control(
         self, state: E2State, world: World, ego_plan: Tensor, anchor: Anchor, kernel: Pull | None = None
     ) -> SparseControl:
-        vehicles, routed = state.routed.route.shape[1], state.routed
+        vehicles = state.routed.route.shape[1]
+        routed = state.routed
         now = world.states[:, :vehicles], state.lane.a, world.valid[:, :vehicles]
         seen = PotentialContext(world.scene, *now, routed.points, routed.has_lane, ego_plan[:, :HORIZON], state.target)
         literal = noise_of(state.seed, LITERAL + state.replans, (*state.target.shape[1:], SIZE))

@@ -80,7 +80,9 @@ def _sample(route: Tensor, s: Tensor, end: Tensor, speed: Tensor, length: Tensor
     """Samples ahead of arc lengths s [Q] on routes [Q, P, 2] that end at `end` [Q]; a vehicle of `length` [Q] m is at a
     point from when its front bumper arrives until its rear bumper has passed."""
     distance = torch.arange(0, SAMPLE_REACH + 1e-3, SAMPLE_SPACING, device=s.device)
-    arc, speed, half = s[:, None] + distance, speed[:, None], length[:, None] / 2
+    arc = s[:, None] + distance
+    speed = speed[:, None]
+    half = length[:, None] / 2
     xy, heading, _ = interpolate(route, arc)
     earliest, _ = arrival_window(distance - half, speed, acceleration)
     _, latest = arrival_window(distance + half, speed, acceleration)
@@ -99,7 +101,8 @@ def _conflict_samples(own: _Samples, ego: _Samples, settings: FeasibilitySetting
     order = torch.arange(time_gap.shape[1], device=time_gap.device)[:, None] * 1e-3  # the first of equals
     separation = (squared.sqrt() - SAMPLE_SPACING).clamp(min=0)
     cost = (time_gap + order + SEPARATION_COST * separation).masked_fill(~meets, torch.inf).flatten(1)
-    pick, count = cost.argmin(-1, keepdim=True), ego.xy.shape[1]
+    pick = cost.argmin(-1, keepdim=True)
+    count = ego.xy.shape[1]
     values = (earliest, latest, time_gap.masked_fill(~meets, torch.inf))
     return pick[:, 0] // count, pick[:, 0] % count, *(value.flatten(1).gather(1, pick)[:, 0] for value in values)
 
@@ -108,7 +111,9 @@ def _to_intersection(points: Tensor, heading: Tensor, ego: Tensor, ego_heading: 
     """Shift [Q] in m along a route from points [Q, 2] to where its tangent crosses that of the ego's route at near
     points `ego` [Q, 2]; 0 where they are near parallel.
     """
-    u, w, gap = direction(heading), direction(ego_heading), ego - points
+    u = direction(heading)
+    w = direction(ego_heading)
+    gap = ego - points
     cross = u[..., 0] * w[..., 1] - u[..., 1] * w[..., 0]
     crossing = cross.abs() > 0.3
     shift = (gap[..., 0] * w[..., 1] - gap[..., 1] * w[..., 0]) / torch.where(crossing, cross, 1.0)
@@ -118,18 +123,22 @@ def _to_intersection(points: Tensor, heading: Tensor, ego: Tensor, ego_heading: 
 def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings: FeasibilitySettings) -> Conflicts:
     """Returns the conflict points of scenes [B]; own_s [B, V, R]: arc length of vehicles on their candidates."""
     vehicles = own_s.shape[1]
-    states, length, mission = world.states[:, :vehicles], scene["size"][..., 0], mission_of(scene)
+    states = world.states[:, :vehicles]
+    length = scene["size"][..., 0]
+    mission = mission_of(scene)
     asked = scene["route_valid"] & world.valid[:, :vehicles, None]
     asked[:, 0] = False
     at = b, v, r = asked.nonzero(as_tuple=True)  # padding would be most of the work
     ego_s = project(states[:, :1, :2], mission.points)[0][:, 0]
     ego = _sample(mission.points, ego_s, mission.end, states[:, 0, 3], length[:, 0], EGO_ACCELERATION)
     ego = _Samples(*(value[b] for value in ego))
-    route, end = scene["route_points"][at], scene["route_length"][at]
+    route = scene["route_points"][at]
+    end = scene["route_length"][at]
     own = _sample(route, own_s[at], end, states[b, v, 3], length[b, v], MAX_ACCELERATION)
     i, j, earliest, latest, time_gap = _conflict_samples(own, ego, settings)
     row = torch.arange(len(b), device=b.device)
-    mine, its = (row, i), (row, j)
+    mine = (row, i)
+    its = (row, j)
     conflict_s = own.s[mine] + _to_intersection(own.xy[mine], own.heading[mine], ego.xy[its], ego.heading[its])
     found = time_gap.isfinite()
 

@@ -49,7 +49,8 @@ def foresee(path: Tensor, size: Tensor, tracks: Tensor, sizes: Tensor, since: Te
     box = sizes[:, None].expand(*tracks.shape[:2], 2)
     along = along_way(path, size[:, 1], Tracks(plans, box, torch.ones_like(plans[..., 0], dtype=torch.bool)))
     hit, time = _contacts(path, size[:, 0], along, since)
-    prevented, horizon = ~hit[0], DT * tracks.shape[2]
+    prevented = ~hit[0]
+    horizon = DT * tracks.shape[2]
     worth = (hit[1:] * path.new_tensor(WEIGHTS)[:, None, None]).sum(0)
     worth = worth * (prevented | settled[:, None]) * (1 - SOON * time.clamp(max=horizon) / horizon)
     return Foresight(worth, prevented, time)
@@ -61,7 +62,8 @@ def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tupl
 
     The competent driver counts any contact as its own.
     """
-    plans, steps = along.rear.shape[1:], path.shape[1] - 1
+    plans = along.rear.shape[1:]
+    steps = path.shape[1] - 1
     delay, braking = (path.new_tensor(values) for values in (DELAYS, BRAKING))
     pace = path[..., 3].abs()
     own = (pace.diff(dim=1) / DT).T[..., None].expand(steps, *plans).flatten(1)
@@ -105,7 +107,9 @@ def meet(
     """
     drivers = HumanDriver(delay=delay[:, None], braking=braking[:, None], release=0.0)  # type: ignore
     length = length.expand_as(speed)
-    hit, front, reacts = hit > 0, front > 0, reacts > 0
+    hit = hit > 0
+    front = front > 0
+    reacts = reacts > 0
     memory = DriverState(since, brakes, hit)
     for t in range(own.shape[0]):
         gap = rear[t] - way - length / 2
@@ -115,7 +119,8 @@ def meet(
         reacts = reacts | (asked < -1.0)
         planned = own[t].expand_as(speed)
         after = (speed + DT * torch.where(reacts, torch.minimum(asked, planned), planned)).clamp(min=0)
-        way, speed = way + (speed + after) / 2 * DT, after
+        way = way + (speed + after) / 2 * DT
+        speed = after
         now = rear[t + 1] - way - length / 2
         touch = (now < 0) & (now > -(length + extent[t + 1])) & (aside[t + 1] < 0) & ~hit
         front = front | (touch & (gap > -FRONT_GAP) & (speed > MOVING))
@@ -126,12 +131,14 @@ def meet(
 
 def time_before(world: World, ego_plan: Tensor, since: Tensor) -> Tensor:
     """`since` [B, V] of the present moment, one replan after `since` was right."""
-    vehicles, size = since.shape[1], world.scene["size"]
+    vehicles = since.shape[1]
+    size = world.scene["size"]
     path = torch.cat([world.states[:, :1], ego_plan[:, :HORIZON]], 1)
     present = world.valid[:, None, :vehicles]
     seen = along_way(path, size[:, 0, 1], Tracks(world.states[:, None, :vehicles], size[:, :vehicles], present))
     gap = seen.rear[0] - size[:, :1, 0] / 2
-    closing, driver = world.states[:, :1, 3].abs() - seen.speed[0], HumanDriver()
+    closing = world.states[:, :1, 3].abs() - seen.speed[0]
+    driver = HumanDriver()
     before = (seen.lateral_gap[0] <= 0) & (closing > 0) & (gap > 0)
     needed = torch.maximum(closing * driver.time_to_collision, driver.stopping_gap(closing))
     begun = torch.where(gap <= needed, 0.0, -1.0)

@@ -89,8 +89,10 @@ def cubic(start: Tensor, heading: Tensor, end: Tensor, end_heading: Tensor, u: T
     chord = end - start
     bearing = wrap(torch.atan2(chord[..., 1], chord[..., 0]) - heading)
     chord = chord.norm(dim=-1)[..., None] / (bearing / 2).cos().square().clamp(min=0.5)[..., None]
-    a, b = start[..., None, :], end[..., None, :]
-    m, n = (chord * direction(heading))[..., None, :], (chord * direction(end_heading))[..., None, :]
+    a = start[..., None, :]
+    b = end[..., None, :]
+    m = (chord * direction(heading))[..., None, :]
+    n = (chord * direction(end_heading))[..., None, :]
     u = u[:, None]
     points = (2 * u**3 - 3 * u**2 + 1) * a + (u**3 - 2 * u**2 + u) * m + (3 * u**2 - 2 * u**3) * b + (u**3 - u**2) * n
     tangents = (6 * u**2 - 6 * u) * (a - b) + (3 * u**2 - 4 * u + 1) * m + (3 * u**2 - 2 * u) * n
@@ -104,7 +106,8 @@ def _paths(states: Tensor, meeting: Tensor) -> _Paths:
     bearing = wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading)
     end_heading = torch.stack([heading + 2 * bearing, heading + bearing, meeting[..., 2]], -1).flatten(2)
     heading, bearing, xy = (x.repeat_interleave(ENDS, 2) for x in (heading, bearing, meeting[..., :2]))
-    start, u = states[:, :, None, :2].expand_as(xy), torch.linspace(0, 1, SAMPLES, device=states.device)
+    start = states[:, :, None, :2].expand_as(xy)
+    u = torch.linspace(0, 1, SAMPLES, device=states.device)
     points, tangents = cubic(start, heading, xy, end_heading, u)
     length = torch.nn.functional.pad(points.diff(dim=3).norm(dim=-1).cumsum(-1), (1, 0))
     return _Paths(points, tangents, length, bearing, wrap(end_heading - heading), end_heading)
@@ -130,7 +133,8 @@ def _within(
 
 def _on_road(paths: _Paths, states: Tensor, scene: TensorDictBase) -> Tensor:
     """Bool [B, M, O]: paths from states [B, M, 4] leave the drivable area by no more than the shoulder, or than now."""
-    field, origin = scene["field"], scene["field_origin"]
+    field = scene["field"]
+    origin = scene["field_origin"]
     allowed = off_road(states[..., :2], field, origin).clamp(min=SHOULDER)[..., None]
     return off_road(paths.points, field, origin).amax(-1) <= allowed
 
@@ -173,12 +177,17 @@ def intercept(
     expected [B, V, H, 4]: states of everybody at steps 1..H; on the path nobody but the target is touched.
     halt_at_red: no path is longer than the distance to a stop line that binds the vehicle now.
     """
-    scene, vehicles = world.scene, expected.shape[1]
-    states, target_states = take(world.states, index), take(expected, target)
-    size, target_size = take(scene["size"], index), take(scene["size"], target)
+    scene = world.scene
+    vehicles = expected.shape[1]
+    states = take(world.states, index)
+    target_states = take(expected, target)
+    size = take(scene["size"], index)
+    target_size = take(scene["size"], target)
     steps = torch.arange(KNOT_STEPS, round(settings.reach / DT) + 1, KNOT_STEPS, device=states.device)
-    meeting, times = target_states[:, :, steps - 1], DT * steps
-    paths, v = _paths(states, meeting), states[:, :, None, 3]
+    meeting = target_states[:, :, steps - 1]
+    times = DT * steps
+    paths = _paths(states, meeting)
+    v = states[:, :, None, 3]
     time = times.repeat_interleave(ENDS).expand_as(paths.bearing)
     # Boxes that move alike touch before their centres meet.
     alike = wrap(paths.end_heading - meeting[..., 2].repeat_interleave(ENDS, -1)).cos().clamp(min=0) ** 2
@@ -258,7 +267,8 @@ def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> T
 def _at(values: Tensor, length: Tensor, s: Tensor) -> Tensor:
     """Values [..., U, 2] at length [..., U] m, linear between them, after s [..., K] m: the last beyond the end."""
     after = torch.searchsorted(length.contiguous(), s.contiguous(), right=True).clamp(1, SAMPLES - 1)
-    low, high = length.gather(-1, after - 1), length.gather(-1, after)
+    low = length.gather(-1, after - 1)
+    high = length.gather(-1, after)
     share = ((s - low) / (high - low).clamp(min=1e-6)).clamp(max=1.0)[..., None]
     first, second = (values.gather(-2, i[..., None].expand(*i.shape, 2)) for i in (after - 1, after))
     return first + share * (second - first)

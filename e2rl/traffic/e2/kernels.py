@@ -67,7 +67,8 @@ class Kernels:
 @cache
 def covariance(device: torch.device) -> Tensor:
     """C [SIZE, SIZE]: knots are correlated like an AR(1) sequence, lateral knots with nothing."""
-    std, lag = torch.tensor(SPREAD, device=device), torch.arange(SIZE, device=device)
+    std = torch.tensor(SPREAD, device=device)
+    lag = torch.arange(SIZE, device=device)
     decay = CORRELATION ** (lag[:, None] - lag).abs()
     knots = (lag < KNOTS)[:, None] & (lag < KNOTS)
     return std[:, None] * torch.where(knots | (lag[:, None] == lag), decay, 0.0) * std
@@ -116,7 +117,8 @@ def sideways(anchor: Anchor, world: World, lane: LaneState, route: Tensor, off_l
     An estimate, not a bound: the prior's law beside a lane is not known, only around it.
     """
     at = off_lane.nonzero(as_tuple=True)
-    points, path = world.scene["route_points"][(*at, route.clamp(min=0)[at])], anchor.off_lane_path[at]
+    points = world.scene["route_points"][(*at, route.clamp(min=0)[at])]
+    path = anchor.off_lane_path[at]
     nats = lateral_nats(world.states[at], lane.map(lambda value: value[at]), points, path, anchor.knots[at])
     return torch.zeros_like(lane.s).index_put(at, nats)
 
@@ -154,7 +156,8 @@ class KernelAttack:
     ) -> "KernelAttack":
         """Of the NEAREST active [B, V] vehicles that move, within REACH of the ego and ASIDE of its path."""
         gap = (world.states[:, : active.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
-        way, points = ego_plan[:, None, 4::5, :2], plan[..., 4::5, :2]
+        way = ego_plan[:, None, 4::5, :2]
+        points = plan[..., 4::5, :2]
         aside = torch.cdist(points, way.expand(*points.shape[:2], -1, -1)).flatten(2).amin(-1)
         near = active & (gap < REACH) & (aside < ASIDE) & (plan[..., 3].amax(-1) > STIRS)
         row, vehicle = smallest(near, gap, NEAREST).nonzero(as_tuple=True)
@@ -165,7 +168,8 @@ class KernelAttack:
         row, vehicle, since, settled = (
             value if rows is None else value[rows] for value in (self.row, self.vehicle, self.since, self.settled)
         )
-        size, states = self.world.scene["size"], self.world.states
+        size = self.world.scene["size"]
+        states = self.world.states
         now = states[row, vehicle, None, None].expand(*tracks.shape[:2], 1, 4)
         path = torch.cat([states[:, :1], self.ego_plan[:, :HORIZON]], 1)[row]
         return foresee(path, size[row, 0], torch.cat([now, tracks], 2), size[row, vehicle], since, settled)
@@ -198,7 +202,8 @@ class KernelAttack:
         place, there = packed(own)
         place = torch.where(there, place, place[:, :1])
         every = pose[place].flatten(1, 2)
-        points, line = self.world.scene["lane_points"][scene], self.world.scene["lane_index"][scene]
+        points = self.world.scene["lane_points"][scene]
+        line = self.world.scene["lane_index"][scene]
         found = against_lanes(points, line, every[..., :2], every[..., 2, None]).view(*place.shape, -1)
         wrong = torch.zeros(pose.shape[:2], dtype=torch.bool, device=pose.device)
         wrong[place[there]] = found[there]
@@ -212,7 +217,8 @@ def propose_kernels(
 
     lane: states [B, V] on routes points [B, V, P, 2]; mean [B, V, SIZE]: the prior's. Those that gain nothing are none.
     """
-    table, at = shifts(mean.device), (attack.row, attack.vehicle)
+    table = shifts(mean.device)
+    at = (attack.row, attack.vehicle)
     if not len(attack.row):
         nobody = gain.new_full((len(mean), count), -1, dtype=torch.int64)
         return Kernels(mean.new_zeros(len(mean), count, SIZE), nobody, mean.shape[1])
@@ -228,11 +234,13 @@ def propose_kernels(
     lawful = best.values.masked_fill(attack.against(tracks, seen.time, best.indices), -torch.inf)
     value = torch.full_like(value, -torch.inf).scatter(1, best.indices, lawful)
     of_scene = mean.new_full((*mean.shape[:2], len(table)), -torch.inf).index_put(at, value)  # [B, V, O]
-    goals, vehicles = [], []
+    goals = []
+    vehicles = []
     row = torch.arange(len(mean), device=mean.device)
     for _ in range(count):
         top, pick = of_scene.flatten(1).max(1)
-        vehicle, option = pick // len(table), pick % len(table)
+        vehicle = pick // len(table)
+        option = pick % len(table)
         goals.append(mean[row, vehicle] + table[option])
         vehicles.append(torch.where(top > 0, vehicle, -1))
         alike = nats(table - table[option][:, None]) < APART  # [B, O]

@@ -145,7 +145,8 @@ def _overlap_term(states: Tensor, context: PotentialContext) -> Tensor:
     size = context.scene["size"][:, : states.shape[1]]
     index, near = _neighbours(states, context, size)
     scene, own, rank = near.nonzero(as_tuple=True)  # most of the nearest are too far to cost anything
-    mine, them = (scene, own), (scene, index[scene, own, rank])
+    mine = (scene, own)
+    them = (scene, index[scene, own, rank])
     gap = box_gap(states[mine], size[mine][:, None], states.detach()[them], size[them][:, None])
     present = box_gap(context.start[mine], size[mine], context.start[them], size[them])
     missing = (present.clamp(max=PAIR_MARGIN)[:, None] - gap).clamp(min=0).square().mean(-1)
@@ -163,7 +164,8 @@ def _road_terms(states: Tensor, context: PotentialContext, settings: PotentialSe
         track = torch.cat([context.start[:, :, None, :2], states[..., :2]], 2)
         hint = s[..., None] + track.diff(dim=2).norm(dim=-1).cumsum(-1)
         xy, heading, _ = interpolate(context.route, project(track[:, :, 1:], context.route, hint, 10.0)[0])
-    cos, sin = heading.cos(), heading.sin()
+    cos = heading.cos()
+    sin = heading.sin()
     delta = states[..., :2] - xy
     offset = (cos * delta[..., 1] - sin * delta[..., 0]).abs()
     bound = d[..., None].abs().clamp(min=LATERAL_BOUND)
@@ -200,7 +202,8 @@ def feasibility_potential(states: Tensor, context: PotentialContext, settings: P
     jerk, wrong way.
     """
     states = with_ego(states, context)
-    road, motion = _road_terms(states, context, settings), _motion_terms(states, context, settings)
+    road = _road_terms(states, context, settings)
+    motion = _motion_terms(states, context, settings)
     value = road + motion + settings.pair * _overlap_term(states, context)
     counted = context.valid.clone()
     counted[:, 0] = False
@@ -218,7 +221,8 @@ def adversarial_potential(
     states = with_ego(states, context)
     index = context.target.clamp(min=0)
     target = states.detach().gather(1, index[..., None, None].expand_as(states))
-    offset, closing = target[..., :2] - states[..., :2], velocity(target) - velocity(states)
+    offset = target[..., :2] - states[..., :2]
+    closing = velocity(target) - velocity(states)
     distance = _length(offset)
     temperature = settings.narrow if temperature is None else temperature
     nearest = -temperature * (torch.logsumexp(-distance / temperature, -1) - math.log(distance.shape[-1]))

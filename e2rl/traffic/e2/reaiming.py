@@ -75,7 +75,8 @@ def best_aim(
     The cheapest of those with a drivable path is taken; NaN where there is none, or the target is not ahead.
     """
     times = moments(states)
-    v, dial = states[:, 3:], eta[:, None]
+    v = states[:, 3:]
+    dial = eta[:, None]
     local = to_frame(target[..., :2], states[:, None])
     bearing = torch.atan2(local[..., 1], local[..., 0])
     chord = local.norm(dim=-1)
@@ -88,7 +89,8 @@ def best_aim(
     fastest = torch.maximum(v, v + accel * times)
     bound = (limits.lateral * dial / fastest.square().clamp(min=1e-3)).clamp(max=SHARPEST)
     curvature = torch.minimum((2 * bearing.sin() / chord.clamp(min=0.1)).maximum(-bound), bound)
-    aim, portions = Arc(accel, curvature), torch.arange(1, CHECKED + 1, device=times.device) / CHECKED
+    aim = Arc(accel, curvature)
+    portions = torch.arange(1, CHECKED + 1, device=times.device) / CHECKED
     looked_at = torch.cat([times[:, None], times[:, None].clamp(min=RUN_ON) * portions], 1)
     path, _ = along_arc(states[:, None], aim, looked_at)
     miss = ((path[:, :, 0, :2] - target[..., :2]).norm(dim=-1) - touch).clamp(min=0)
@@ -113,7 +115,8 @@ def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSe
     steps = torch.arange(STRIDE, round(bounds.look / DT) + 1, STRIDE, device=aim.accel.device)
     own, driven = along_arc(world.states[:, 1], aim, DT * steps)
     index = [0, *range(2, world.states.shape[1])]
-    states, going_on = world.states[:, index], Arc(*(value[:, index] for value in motion))
+    states = world.states[:, index]
+    going_on = Arc(*(value[:, index] for value in motion))
     tracks, _ = along_arc(states, going_on, DT * steps, HOLD, TURN)  # [K, J, T, 4]
     size = world.scene["size"]
     wide = size[:, 1] + size.new_tensor([0.0, 2 * LATERAL_MARGIN])
@@ -170,7 +173,8 @@ def drawn(
     the traffic's own adversaries; reckless [b] bool: they owe the ego nothing; rank [b, V]: random, the lowest react;
     adversaries [b, V]; vehicle [b, MOST] and acts [b, MOST]: who they are, nobody yet; chosen [b].
     """
-    size, device = adversaries.shape, adversaries.device
+    size = adversaries.shape
+    device = adversaries.device
     draws = torch.rand(size[0], 6 + size[1], generator=generator).to(device)
     reacts, others, when, how, many, reckless = draws[:, :6].unbind(1)
     start = (when * LATEST * horizon).long()
@@ -204,7 +208,8 @@ def chosen(part: TensorDict, world: World, responsibility: str) -> tuple[Tensor,
     present = world.valid[:, :vehicles].clone()
     present[:, 0] = False
     near = (states[..., :2] - world.states[:, :1, :2]).norm(dim=-1) < NEAR
-    own, others = present & part["adversaries"], present & near & (states[..., 3] > MOVING)
+    own = present & part["adversaries"]
+    others = present & near & (states[..., 3] > MOVING)
     if responsibility == "full":
         others &= ~leading(world, vehicles)
     others &= ~part["adversaries"]
@@ -219,8 +224,11 @@ class Reaiming:
     """Vehicles of replayed adversarial episodes that re-aim, as the settings say; draws from a generator of its own."""
 
     def __init__(self, settings: ReactSettings, seed: int = 0) -> None:
-        self.settings, self.generator = settings, torch.Generator().manual_seed(seed)
-        self.limits, self.yielding, self.bounds = InterceptionSettings(), YieldingSettings(), BoundSettings()
+        self.settings = settings
+        self.generator = torch.Generator().manual_seed(seed)
+        self.limits = InterceptionSettings()
+        self.yielding = YieldingSettings()
+        self.bounds = BoundSettings()
         self._part: TensorDict | None = None  # [B] `drawn`
 
     def begin(
@@ -253,7 +261,8 @@ class Reaiming:
             return None
         agents = part["vehicle"][row, slot]
         shift = self.settings.scatter * torch.randn(len(row), 2, generator=self.generator).to(row.device)
-        ground, seen = Ground(world.scene["field"], world.scene["field_origin"], row), surroundings(world, row, agents)
+        ground = Ground(world.scene["field"], world.scene["field_origin"], row)
+        seen = surroundings(world, row, agents)
         aim = self.aims(seen, part["eta"][row], shift, ground, part["reckless"][row])
         times = DT * torch.arange(1, 2 * REPLAN_STEPS + 1, device=row.device)
         states, _ = along_arc(seen.states[:, 1], aim, times)
@@ -265,7 +274,8 @@ class Reaiming:
         shift [K, 2]: m by which they misjudge the ego's place; reckless [K] bool: those that owe it nothing. Without an
         aim they halve their curvature and brake gently.
         """
-        states, length = world.states[:, 1], world.scene["size"][..., 0]
+        states = world.states[:, 1]
+        length = world.scene["size"][..., 0]
         motion = Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
         its_motion = Arc(*(value[:, 0] for value in motion))
         expected, _ = along_arc(world.states[:, 0], its_motion, moments(states), HOLD, TURN)

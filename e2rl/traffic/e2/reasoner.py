@@ -117,16 +117,21 @@ def describe(scene: TensorDictBase, world: World, conflicts: Conflicts, row: int
     present = (world.valid[row, :vehicles] & ~scene["parked"][row, :vehicles]).nonzero()[:, 0].tolist()
     texts = {vehicle: describe_vehicle(scene, world, conflicts, row, vehicle) for vehicle in present if vehicle > 0}
     mission = mission_of(scene[row : row + 1])
-    limit, s = float(mission.limit[0, 10]), project(world.states[row : row + 1, :1, :2], mission.points)[0][0, 0]
+    limit = float(mission.limit[0, 10])
+    s = project(world.states[row : row + 1, :1, :2], mission.points)[0][0, 0]
     limited = f" (limit {limit:.0f} m/s)" if limit else ""
-    course, speed = _course(mission.points[0], s), world.states[row, 0, 3]
+    course = _course(mission.points[0], s)
+    speed = world.states[row, 0, 3]
     return f"The ego drives at {speed:.1f} m/s{limited}; its route {course}.", texts
 
 
 def describe_vehicle(scene: TensorDictBase, world: World, conflicts: Conflicts, row: int, vehicle: int) -> str:
     """Position and motion of a vehicle, and where its routes meet the ego's by the rules, whose verdict is not told."""
-    rows, here = slice(row, row + 1), slice(vehicle, vehicle + 1)
-    state, ego, size = world.states[row, vehicle], world.states[row, 0], scene["size"][row, vehicle].tolist()
+    rows = slice(row, row + 1)
+    here = slice(vehicle, vehicle + 1)
+    state = world.states[row, vehicle]
+    ego = world.states[row, 0]
+    size = scene["size"][row, vehicle].tolist()
     sentences = [
         f"Vehicle {vehicle} ({size[0]:.1f} x {size[1]:.1f} m) is {_position(to_frame(state[:2], ego))}, "
         f"{_heading(float(state[2] - ego[2]))}, at {state[3]:.1f} m/s."
@@ -185,7 +190,8 @@ class LanguageReasoner:
             reason = f"{str(error).splitlines()[0]} (for an endpoint without keys any OPENAI_API_KEY will do)"
             raise InputError(f"{where}: {reason}") from error
         self._failures = (openai.OpenAIError, ValueError)
-        self.settings, self._lock = settings, threading.Lock()
+        self.settings = settings
+        self._lock = threading.Lock()
         self.statistics = dict.fromkeys(("lm_scenes", "lm_requests", "lm_cached", "lm_fallbacks"), 0)
 
     def __call__(self, scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Feasibility:

@@ -32,7 +32,8 @@ class YieldingSettings:
 
 def place_of(world: World, vehicles: int) -> tuple[Tensor, Tensor]:
     """Where the ego sees vehicles, m ahead and to the left [B, V, 2]; whether they drive in its direction [B, V]."""
-    states, ego = world.states[:, :vehicles], world.states[:, :1]
+    states = world.states[:, :vehicles]
+    ego = world.states[:, :1]
     return to_frame(states[..., :2], ego), (states[..., 2] - ego[..., 2]).cos() > SAME_DIRECTION
 
 
@@ -70,7 +71,9 @@ def duty_of(
         lateness: [B] factor of the patience, and where it is above 1 of its bound (None: 1).
         owes: [B] bool, false: it owes the ego nothing (None: it does).
     """
-    vehicles, nobody, zero = coalition.shape[1], torch.zeros_like(coalition), torch.zeros_like(eta[:, None] * coalition)
+    vehicles = coalition.shape[1]
+    nobody = torch.zeros_like(coalition)
+    zero = torch.zeros_like(eta[:, None] * coalition)
     if responsibility == "none":
         return Duty(coalition, nobody, zero)
     ahead = coalition & (place_of(world, vehicles)[0][..., 0] > 0)

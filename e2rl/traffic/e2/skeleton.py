@@ -65,7 +65,8 @@ def direct(support: Tensor) -> Skeleton:
 
 def chain_depth(target: Tensor) -> Tensor:
     """Links to the ego [B, V] int64 of targets [B, V] (0 the ego, -1 nobody); 0 for vehicles that act on nobody."""
-    at, depth = target, (target >= 0).long()
+    at = target
+    depth = (target >= 0).long()
     while bool((at > 0).any()) and int(depth.max()) < target.shape[1]:  # a chain is never longer than the vehicles
         depth = depth + (at > 0)
         at = torch.where(at > 0, target.gather(1, at.clamp(min=0)), at)
@@ -74,7 +75,8 @@ def chain_depth(target: Tensor) -> Tensor:
 
 def lane_of(states: Tensor, scene: TensorDictBase) -> Tensor:
     """Index [B, K] of the lane nearest to states [B, K, 4] and within 60 degrees of their heading; -1 for none."""
-    points, lane = scene["lane_points"], scene["lane_index"]
+    points = scene["lane_points"]
+    lane = scene["lane_index"]
     ahead = torch.nn.functional.normalize(torch.diff(points, dim=1), dim=-1)
     ends = torch.nn.functional.pad(lane[:, 1:] != lane[:, :-1], (0, 1), value=True)  # a lane's last point looks back
     ahead = torch.cat([ahead, ahead[:, -1:]], 1)
@@ -92,7 +94,8 @@ def _on_ego_lanes(states: Tensor, asked: Tensor, scene: TensorDictBase) -> Tenso
     rows = asked.any(1).nonzero()[:, 0]
     scene = scene[rows]
     lanes = lane_of(states[rows], scene)
-    lane, ego_lane = lanes[:, 1:], lanes[:, 0]
+    lane = lanes[:, 1:]
+    ego_lane = lanes[:, 0]
     known = ego_lane.clamp(min=0)[:, None]
     across = torch.cat([known, scene["lane_left"].gather(1, known), scene["lane_right"].gather(1, known)], 1)
     exits = take(scene["lane_exits"], across.clamp(min=0)).masked_fill(across[..., None] < 0, -1).flatten(1)
@@ -110,7 +113,8 @@ def influence(
     longitudinal headway between them would be at most tau_long if i kept its speed.
     """
     index, present = slots
-    count, width = expected.shape[2], index.shape[1] + 1
+    count = expected.shape[2]
+    width = index.shape[1] + 1
     times = STEP * torch.arange(1, count + 1, device=index.device)
     states = take(world.states[:, : expected.shape[1]], index)
     s, _, _ = frenet_pose(states, take(scene["route_points"], index))
@@ -118,7 +122,8 @@ def influence(
     route = scene["route_points"][b, index[b, m], r]
     targets = torch.cat([take(expected, index), expected[:, :1]], 1)[..., :2].flatten(1, 2)
     target_s, target_d, _ = (value.view(-1, width, count) for value in project(targets[b], route))
-    speed, length = states[b, m, 3, None, None], scene["size"][b, index[b, m], 0, None, None]
+    speed = states[b, m, 3, None, None]
+    length = scene["size"][b, index[b, m], 0, None, None]
     distance = target_s - s[b, m, r, None, None]
     least, most = reachable_distance(speed, times)
     can_act = (target_d.abs() <= CORRIDOR) & (distance >= least - length) & (distance <= most + length)
@@ -146,9 +151,12 @@ def _shortest_chain(
 
     Breadth-first by the earliest arrival at every slot, since departing later never arrives earlier.
     """
-    slots, never = near.shape[1], after.shape[-1] - 1
+    slots = near.shape[1]
+    never = after.shape[-1] - 1
     arrival = torch.full_like(near, never, dtype=torch.int64).scatter(1, start[:, None], 0)
-    found, last, parents = torch.zeros_like(start), start, []
+    found = torch.zeros_like(start)
+    last = start
+    parents = []
     for link in range(1, links + 1):
         departure = arrival.masked_fill(near | blocked, never)
         reached = after[:, :, :slots].gather(-1, departure[:, :, None, None].expand(-1, -1, slots, 1))[..., 0]
@@ -157,7 +165,8 @@ def _shortest_chain(
         on_ego = after[:, :, slots].gather(-1, arrival[..., None])[..., 0].masked_fill(~near, never)
         when, slot = on_ego.min(-1)
         new = (found == 0) & (when < never)
-        found, last = torch.where(new, link, found), torch.where(new, slot, last)
+        found = torch.where(new, link, found)
+        last = torch.where(new, slot, last)
     return found, last, parents
 
 

@@ -55,7 +55,8 @@ def _overlap_interval(offset: Tensor, closing: Tensor, extent: Tensor) -> tuple[
     """Times during which |offset + closing t| <= extent; (inf, -inf) for never."""
     still = closing.abs() < 1e-6  # then the projections overlap always or never
     inverse = 1 / torch.where(still, 1.0, closing)
-    middle, half = -offset * inverse, extent * inverse.abs()
+    middle = -offset * inverse
+    half = extent * inverse.abs()
     half = torch.where(still, torch.where(offset.abs() <= extent, torch.inf, -torch.inf), half)
     return middle - half, middle + half
 
@@ -67,17 +68,23 @@ def time_to_collision(states: Tensor, size: Tensor, horizon: float = RISK_SECOND
     Separating axis theorem in closed form: the boxes touch while their projections on all four face normals overlap. 0
     where they overlap now (and for i = j), inf without contact within `horizon` s. Exactly symmetric.
     """
-    cos, sin = states[..., 2].cos(), states[..., 2].sin()
+    cos = states[..., 2].cos()
+    sin = states[..., 2].sin()
     moving = (states[..., 0], states[..., 1], cos * states[..., 3], sin * states[..., 3])
     dx, dy, dvx, dvy = (value[..., None, :] - value[..., :, None] for value in moving)
-    ci, si, cj, sj = cos[..., :, None], sin[..., :, None], cos[..., None, :], sin[..., None, :]
-    turn_cos, turn_sin = (ci * cj + si * sj).abs(), (ci * sj - si * cj).abs()
+    ci = cos[..., :, None]
+    si = sin[..., :, None]
+    cj = cos[..., None, :]
+    sj = sin[..., None, :]
+    turn_cos = (ci * cj + si * sj).abs()
+    turn_sin = (ci * sj - si * cj).abs()
     half = size / 2
     (li, wi), (lj, wj) = half[..., :, None, :].unbind(-1), half[..., None, :, :].unbind(-1)
     along = _overlap_interval(ci * dx + si * dy, ci * dvx + si * dvy, li + turn_cos * lj + turn_sin * wj)
     across = _overlap_interval(ci * dy - si * dx, ci * dvy - si * dvx, wi + turn_sin * lj + turn_cos * wj)
     begin, end = torch.maximum(along[0], across[0]), torch.minimum(along[1], across[1])  # on the normals of box i
-    begin, end = torch.maximum(begin, begin.transpose(-1, -2)), torch.minimum(end, end.transpose(-1, -2))
+    begin = torch.maximum(begin, begin.transpose(-1, -2))
+    end = torch.minimum(end, end.transpose(-1, -2))
     first = begin.clamp(min=0)
     return torch.where((begin <= end) & (end >= 0) & (first <= horizon), first, torch.inf)
 
@@ -149,7 +156,8 @@ def topological_candidates(states: Tensor, valid: Tensor, size: Tensor, settings
     never a candidate. Every STRIDE-th step is analysed and counts once.
     """
     steps = torch.arange(0, states.shape[1], STRIDE, device=states.device)
-    states, valid = states[:, steps].detach(), valid[:, steps]
+    states = states[:, steps].detach()
+    valid = valid[:, steps]
     weights = pair_weights(states, valid, size[:, None].expand(*states.shape[:-1], 2), settings)
     distance = (states[..., :2] - states[..., :1, :2]).norm(dim=-1)
     distance = distance.masked_fill(~valid | ~valid[..., :1], torch.inf)

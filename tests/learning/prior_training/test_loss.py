@@ -88,7 +88,9 @@ def test_the_action_term_is_the_weighted_mean_square_over_known_knots(windows):
 
 
 def test_offsets_count_on_lanes_only(windows):
-    prior, free, wrong = small_prior(), windows.clone(), windows["x0"].clone()
+    prior = small_prior()
+    free = windows.clone()
+    wrong = windows["x0"].clone()
     free["on_lane"] = torch.zeros_like(free["on_lane"])
     wrong[..., -1] += 2.0  # 1 m to the left in the end
     prior.denoiser.forward = lambda x, level, encoding: torch.cat([wrong] * loss.LEVELS)

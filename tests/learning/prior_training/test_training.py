@@ -62,7 +62,8 @@ def test_the_average_is_exponential_with_a_decay_that_grows_to_ema(windows, monk
 
 
 def test_the_rate_warms_up_and_ends_at_zero(windows):
-    run, rates = of(windows, settings=replace(SETTINGS, steps=200, learning_rate=1.0)), []
+    run = of(windows, settings=replace(SETTINGS, steps=200, learning_rate=1.0))
+    rates = []
     for run.done in (0, 24, 49, 100, 200):
         rates.append(run.learning_rate())
     cosine = [(1 + torch.tensor(step / 200 * torch.pi).cos().item()) / 2 for step in (0, 24, 49)]

@@ -26,7 +26,8 @@ def test_constant_velocity_along_the_lane_is_zero_x():
 def test_mirrored_scenes_give_mirrored_windows(free):
     scene = curved_scenes()
     scene["route_valid"][:, :FIRST] &= not free
-    here, there = make_windows(scene), make_windows(mirrored(scene))
+    here = make_windows(scene)
+    there = make_windows(mirrored(scene))
     assert len(here) == len(there)
     for key, sided in (("nodes", SIDED_NODE), ("pairs", SIDED_EDGE), ("x0", (KNOTS, KNOTS + 1))):
         sign = torch.ones(here[key].shape[-1])
@@ -53,7 +54,8 @@ def test_free_space_windows_are_not_judged_by_their_offset_from_a_route():
     """Vehicles without a route candidate: the distance is the one driven, not one along a route."""
     scene = curved_scenes()
     scene["route_valid"][:, 2] = False
-    mixed, lane = make_windows(scene), make_windows(curved_scenes())
+    mixed = make_windows(scene)
+    lane = make_windows(curved_scenes())
     assert lane["on_lane"][:, :FIRST].all()
     free = ~mixed["on_lane"] & (mixed["weight"] > 0)
     assert (free[:, :FIRST].sum(1) == 1).all()
@@ -64,7 +66,8 @@ def test_free_space_windows_are_not_judged_by_their_offset_from_a_route():
 
 def test_the_derivative_of_a_parabola_is_exact_inside_and_one_sided_at_gaps():
     time = 0.1 * torch.arange(12.0)
-    values, valid = (time**2)[None, :, None], torch.ones(1, 12, 1, dtype=torch.bool)
+    values = (time**2)[None, :, None]
+    valid = torch.ones(1, 12, 1, dtype=torch.bool)
     found = derivative(values, valid)[0, :, 0]
     torch.testing.assert_close(found[1:-1], 2 * time[1:-1], rtol=0, atol=1e-5)
     valid[:, 6] = False

@@ -55,7 +55,8 @@ def write_run(folder: Path) -> Path:
     data |= {"build": build, "path": "data"}  # relative to where the command ran
     found = load_scenes(data | {"path": str(folder / "data")})
     batch = {key: found.scenes[key] for key in found.scenes.keys()}  # noqa: SIM118 - not a dict
-    states, valid = batch["logged"].clone(), batch["logged_valid"].clone()
+    states = batch["logged"].clone()
+    valid = batch["logged_valid"].clone()
     states[:, 0] = batch["start"]
     states[0, 30:, CUT_IN] = states[0, 30:, 0] + torch.tensor([5.5, 0.6, 0.0, -6.0])
     states[0, 34:, CUT_IN, 0] = states[0, 34, CUT_IN, 0]  # it stops

@@ -39,7 +39,8 @@ def states_of(obstacle):
 def test_every_state_comes_back_and_no_other(run, scenarios):
     for index, (scenario, _) in enumerate(scenarios):
         rollout = rollout_of(run, index)
-        count, seen = len(rollout.size), np.zeros(rollout.valid.shape, bool)
+        count = len(rollout.size)
+        seen = np.zeros(rollout.valid.shape, bool)
         for obstacle in scenario.dynamic_obstacles:
             row = obstacle.obstacle_id - 1 if obstacle.obstacle_id <= count else LATE  # which alone comes back
             for state in states_of(obstacle):

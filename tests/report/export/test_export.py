@@ -35,7 +35,8 @@ def refused(capsys, *arguments) -> str:
 def test_npz_are_the_rollouts_and_their_scenes(run, tmp_path):
     main([str(run), "--to", "npz", "--all", "--out", str(tmp_path / "all")])
     for index, line in enumerate(lines(tmp_path / "all")):
-        ours, theirs = rollout_of(run, index), Rollout.read(tmp_path / "all" / line["file"])
+        ours = rollout_of(run, index)
+        theirs = Rollout.read(tmp_path / "all" / line["file"])
         assert all(np.array_equal(value, getattr(theirs, name)) for name, value in vars(ours).items())
         with np.load(tmp_path / "all" / "scenes" / f"scene-{index}.npz") as scene:
             np.testing.assert_allclose(scene["origin"] + ours.states[0, 0, :2], [28, 0], atol=1e-3)

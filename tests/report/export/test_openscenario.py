@@ -45,7 +45,8 @@ def events_of(scenario):
 
 def test_every_state_comes_back_and_no_other(run, scenarios):
     for index, scenario in enumerate(scenarios):
-        rollout, boxes = rollout_of(run, index), entities_of(scenario)
+        rollout = rollout_of(run, index)
+        boxes = entities_of(scenario)
         seen = np.zeros(rollout.valid.shape, bool)
         for row, start, actions in events_of(scenario):
             ahead = boxes[row].boundingbox.center.x
@@ -74,7 +75,8 @@ def test_who_appears_late_is_added_then_and_deleted_when_gone(scenarios):
 
 
 def test_boxes_types_and_reference_points(run, scenarios):
-    rollout, found = rollout_of(run, 0), entities_of(scenarios[0])
+    rollout = rollout_of(run, 0)
+    found = entities_of(scenarios[0])
     for row, entity in found.items():
         sides = entity.boundingbox.boundingbox
         assert [sides.length, sides.width] == pytest.approx(rollout.size[row].tolist(), abs=1e-5)

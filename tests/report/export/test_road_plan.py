@@ -54,7 +54,8 @@ def test_lanes_that_fork_or_merge_directly_are_cut():
 def test_every_link_is_a_way_and_every_end_has_at_most_one_partner(pairs, length):
     lanes = graph(length, **{name: "".join(b for a, b in sorted(pairs) if a == name) for name in "abcdefgh"})
     plan = road_plan(lanes)
-    between, within = set(), Counter()
+    between = set()
+    within = Counter()
     for first, second in steps(plan):
         if first.end == length and second.begin == 0:
             between.add((first.lane, second.lane))

@@ -33,7 +33,8 @@ def test_tracks_come_back_to_the_centimetre_with_their_types(run, recordings):
     for index, recording in enumerate(recordings):
         rollout = rollout_of(run, index)
         rows = np.flatnonzero(rollout.valid.any(0))
-        driven, valid = recording.states[recording.current :], recording.valid[recording.current :]
+        driven = recording.states[recording.current :]
+        valid = recording.valid[recording.current :]
         assert recording.current == 10 and recording.ego == 0 and (valid == rollout.valid[:, rows]).all()
         np.testing.assert_allclose(driven[valid], rollout.states[:, rows][valid], atol=1e-4)
         np.testing.assert_allclose(recording.size, rollout.size[rows], atol=1e-4)
@@ -41,7 +42,8 @@ def test_tracks_come_back_to_the_centimetre_with_their_types(run, recordings):
 
 
 def test_map_and_lights_come_back(recordings):
-    lanes, lights = recordings[0].lanes, recordings[0].lights
+    lanes = recordings[0].lanes
+    lights = recordings[0].lights
     assert lanes["in"].exits == ["on", "left"] and lanes["near"].exits == []
     np.testing.assert_allclose([lanes["on"].speed_limit, lanes["on"].width], [20, 3.6], rtol=1e-5)
     np.testing.assert_allclose(lanes["in"].points[[0, -1]], [[-28, 0], [72, 0]], atol=1e-3)  # from the ego's start
@@ -72,7 +74,8 @@ def test_the_summary_counts_what_filters_ask_for(run, folder):
     assert list(summary) == list(pickle.loads((folder / MAPPING).read_bytes()))
     for index, (name, facts) in enumerate(summary.items()):
         made = pickle.loads((folder / name).read_bytes())
-        rollout, numbers = rollout_of(run, index), facts["number_summary"]
+        rollout = rollout_of(run, index)
+        numbers = facts["number_summary"]
         types = rollout.agent_type[rollout.valid.any(0)].tolist()
         assert facts["id"] == made["id"]
         assert numbers["num_objects"] == len(types) == sum(numbers["num_objects_each_type"].values())

@@ -36,7 +36,8 @@ def baseline(name: str, steps: int = 4, **settings) -> Baseline:
 
 def first_replan(on: Baseline, scene, eta: float = 2.0):
     """The arguments of `attack` at the first replan of scenes [B] (a Replan and its Context), and their View."""
-    world, state = World.at_start(scene), begin(on, scene, eta)
+    world = World.at_start(scene)
+    state = begin(on, scene, eta)
     ego_plan = EGO.plan(world)
     state = replace(state, lane=on.lane_now(state, world, ego_plan))
     context = on.encode(state, world, ego_plan)

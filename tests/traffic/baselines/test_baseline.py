@@ -13,7 +13,8 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, executed, replanned, sce
 @pytest.mark.parametrize("knowledge", ["plan", "predicted"])
 @pytest.mark.parametrize("name", SMALL)
 def test_without_gain_it_is_the_prior_bit_for_bit(name, knowledge):
-    on, scene = baseline(name, gain=0.0, knowledge=knowledge), scenes(2).scenes
+    on = baseline(name, gain=0.0, knowledge=knowledge)
+    scene = scenes(2).scenes
     _, plan = replanned(on, scene, 2.0, times=3)
     _, nominal = replanned(NominalTraffic(on.prior, knowledge), scene, times=3)
     assert torch.equal(plan.states, nominal.states) and torch.equal(plan.present, nominal.present)
@@ -22,8 +23,10 @@ def test_without_gain_it_is_the_prior_bit_for_bit(name, knowledge):
 
 @pytest.mark.parametrize("name", ADVERSARIES)
 def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_one(name):
-    on, scene = baseline(name), scenes(2).scenes
-    world, eta = World.at_start(scene), torch.tensor([0.0, 2.0])
+    on = baseline(name)
+    scene = scenes(2).scenes
+    world = World.at_start(scene)
+    eta = torch.tensor([0.0, 2.0])
     _, plan = on.replan(on.reset(scene, torch.arange(2), eta), world, EGO.plan(world))
     _, nominal = replanned(NominalTraffic(on.prior, on.knowledge), scene)
     torch.testing.assert_close(plan.states[0], nominal.states[0], rtol=0, atol=5e-3)
@@ -34,7 +37,8 @@ def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_o
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_scene_is_planned_alike_alone_and_in_a_batch(name):
-    on, scene = baseline(name), scenes(3).scenes
+    on = baseline(name)
+    scene = scenes(3).scenes
     _, whole = replanned(on, scene, 2.0, [5, 6, 7], times=2)
     _, alone = replanned(on, scene[1:2], 2.0, [6], times=2)
     torch.testing.assert_close(alone.states, whole.states[1:2], rtol=0, atol=2e-2)
@@ -54,7 +58,8 @@ def test_it_attacks_on_the_authors_terms_and_on_ours(name):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_who_predicts_the_ego_does_not_look_at_its_plan(name):
-    on, scene = baseline(name, knowledge="predicted"), scenes(2).scenes
+    on = baseline(name, knowledge="predicted")
+    scene = scenes(2).scenes
     world = World.at_start(scene)
     plans = [on.replan(begin(on, scene, 2.0), world, EGO.plan(world) + shift)[1].states for shift in (0.0, 50.0)]
     assert torch.equal(*plans)
@@ -62,7 +67,8 @@ def test_who_predicts_the_ego_does_not_look_at_its_plan(name):
 
 def test_the_yielding_rule_binds_the_adversaries():
     """On the authors' terms nobody brakes for the ego; with ours who meets it does."""
-    scene, duties = scenes(2).scenes, []
+    scene = scenes(2).scenes
+    duties = []
     for responsibility in ("none", "full"):
         bound = baseline("ctg_adv", responsibility=responsibility)
         (now, _), _ = first_replan(bound, scene)
@@ -74,8 +80,10 @@ def test_the_yielding_rule_binds_the_adversaries():
 
 @pytest.mark.parametrize("name", ["ccdiff", "cat"])
 def test_who_is_left_alone_replays_and_the_prior_sees_where_they_are(name):
-    on, scene = baseline(name), scenes(3).scenes
-    state, world = begin(on, scene, 2.0), World.at_start(scene)
+    on = baseline(name)
+    scene = scenes(3).scenes
+    state = begin(on, scene, 2.0)
+    world = World.at_start(scene)
     for _ in range(2):
         plan = EGO.plan(world)
         state, traffic = on.replan(state, world, plan)

@@ -22,7 +22,8 @@ def control_inputs():
 
 def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
     on, state, view, context, x, level, low = control_inputs()
-    guided, limit = context.active.clone(), torch.tensor([0.05, 10.0])
+    guided = context.active.clone()
+    limit = torch.tensor([0.05, 10.0])
     guided[1, 1] = False
     control = MeanGuidance(on.prior, partial(on.loss, state=state, view=view), guided, limit, 1, 0.3, 1)
     _, nominal, x0 = control(x, level, 3, context, lambda value: on.prior.denoise(value, level, context))
@@ -62,7 +63,8 @@ def test_samples_go_along_the_batch_and_back():
     for number in range(3):
         one = on.prior.sample(context, now.noise[..., number, :].contiguous()).x0
         torch.testing.assert_close(many[number], one, rtol=1e-4, atol=1e-4)
-    by_scene, by_vehicle = torch.tensor([2, 0]), torch.arange(8).expand(2, -1) % 3
+    by_scene = torch.tensor([2, 0])
+    by_vehicle = torch.arange(8).expand(2, -1) % 3
     assert torch.equal(pick(many, by_scene)[0], many[2, 0]) and torch.equal(pick(many, by_scene)[1], many[0, 1])
     assert torch.equal(pick(many, by_vehicle)[1, 4], many[1, 1, 4])
     assert torch.equal(now.state.lane.v, context.state.v)

@@ -16,7 +16,8 @@ def test_a_plan_goes_on_where_it_was_left():
     points = torch.stack([arc(0.0, 5.0 * i, 0.1 * i, 0.004 * (i - 2)) for i in range(5)])
     begun = random_state(points, generator, speed=(5.0, 12.0)).map(lambda value: value[None])
     x = 0.5 * torch.randn(1, 5, SIZE, generator=generator)
-    whole, on_lane = decode(x, begun, points[None]), torch.ones(1, 5, dtype=torch.bool)
+    whole = decode(x, begun, points[None])
+    on_lane = torch.ones(1, 5, dtype=torch.bool)
     for age in (1, 4, 7):
         lane = whole.map(lambda value, at=5 * age - 1: value[..., at])
         rest = decode(later(x, begun, lane, torch.tensor([age]), on_lane), lane, points[None])
@@ -27,17 +28,21 @@ def test_a_plan_goes_on_where_it_was_left():
 
 
 def test_after_the_plan_speed_is_kept():
-    x, lane = torch.ones(1, 2, SIZE), random_state(torch.stack([arc(0, 0, 0, 0)] * 2), torch.Generator().manual_seed(1))
+    x = torch.ones(1, 2, SIZE)
+    lane = random_state(torch.stack([arc(0, 0, 0, 0)] * 2), torch.Generator().manual_seed(1))
     lane = lane.map(lambda value: value[None])
     rest = later(x, lane, lane, torch.tensor([9]), torch.ones(1, 2, dtype=torch.bool))
     assert (rest[..., 0] == 1).all() and (rest[..., 1:10] == 0).all()
 
 
 def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
-    on, scene, made = baseline("diffscene"), scenes(2).scenes, []
+    on = baseline("diffscene")
+    scene = scenes(2).scenes
+    made = []
     scenario = on.scenario
     on.scenario = lambda now, *rest: made.append(now.state.replans.tolist()) or scenario(now, *rest)
-    state, world = begin(on, scene, 2.0), World.at_start(scene)
+    state = begin(on, scene, 2.0)
+    world = World.at_start(scene)
     for _ in range(EVERY + 1):
         plan = EGO.plan(world)
         state, traffic = on.replan(state, world, plan)
@@ -46,7 +51,8 @@ def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
 
 
 def test_who_is_held_does_not_react_to_the_ego():
-    on, scene = baseline("diffscene"), scenes(2).scenes
+    on = baseline("diffscene")
+    scene = scenes(2).scenes
     world = World.at_start(scene)
     plan = EGO.plan(world)
     state, first = on.replan(begin(on, scene, 2.0), world, plan)

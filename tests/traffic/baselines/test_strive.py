@@ -25,7 +25,8 @@ def test_latents_are_decoded_as_by_ddim_without_noise():
 def test_the_objective_falls_over_the_iterations():
     on = baseline("strive", iterations=12, knowledge="predicted")
     (now, context), view = first_replan(on, scenes(3).scenes)
-    first, values = now.noise[0, :, :, 0], []
+    first = now.noise[0, :, :, 0]
+    values = []
 
     def loss(latent):
         motion = motion_of(on.prior, decode_latent(on.prior, latent, context, on.steps), context, 1)
@@ -37,7 +38,8 @@ def test_the_objective_falls_over_the_iterations():
 
 
 def test_the_planner_is_driven_anew_at_every_iteration_and_not_without_its_plan():
-    scene, asked = scenes(2).scenes, []
+    scene = scenes(2).scenes
+    asked = []
     world = World.at_start(scene)
     look = Lookahead(EGO, world)
     react = lambda rows, planned: asked.append(planned) or look(rows, planned)  # noqa: E731
@@ -62,7 +64,8 @@ def test_nobody_behind_the_ego_is_the_attacker():
 def test_an_ego_that_is_boxed_in_has_no_solution():
     on = baseline("strive", iterations=10)
     (now, context), view = first_replan(on, scenes(1).scenes)
-    first, far = now.noise[0, ..., 0, :], view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
+    first = now.noise[0, ..., 0, :]
+    far = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
     far[..., 1] += 100.0 * (torch.arange(far.shape[2]) > 0)[:, None]
     walled = far.clone()
     walled[:, :, 1, :, :2] = torch.tensor([8.0, 0.0])  # stands a box's length ahead, at 10 m/s

@@ -50,7 +50,8 @@ def add_route(world: World, vehicle: int, candidate: int, heading: float) -> Non
 def decoded(knots: torch.Tensor, speed: float, accel: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Speed and way [50] of one vehicle's knots [10], by the prior's decoder."""
     state = LaneState(*(torch.zeros(()) for _ in range(10)))
-    state.v, state.a = torch.tensor(speed), torch.as_tensor(accel)
+    state.v = torch.tensor(speed)
+    state.a = torch.as_tensor(accel)
     return speeds(state, knots)
 
 

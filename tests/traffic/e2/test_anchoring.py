@@ -17,7 +17,8 @@ LANES = InterceptionSettings(reach=0.0)
 
 
 def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options):
-    settings, wish = settings or AnchorSettings(), wish_of(len(plan), eta)
+    settings = settings or AnchorSettings()
+    wish = wish_of(len(plan), eta)
     return propose(world.scene, world, skeleton, plan, settings, interception, wish, **options)
 
 
@@ -109,7 +110,8 @@ def test_a_chain_s_first_link_meets_its_target_not_the_ego():
 
 def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
     world = make_world([EGO, (60.0, -30.0, UP, 12.0)])
-    arc, radius = 2.0 * torch.arange(150) - 20, 15.0
+    arc = 2.0 * torch.arange(150) - 20
+    radius = 15.0
     bend = (arc - 15).clamp(0, radius * math.pi / 2)  # straight up, then left on to the ego's lane, against it
     rest = (arc - 15 - radius * math.pi / 2).clamp(min=0)
     x = 60 - radius * (1 - (bend / radius).cos()) - rest
@@ -130,12 +132,15 @@ def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_sti
 ):
     """At 10 m/s to a target that stays 30.5 m ahead: the nearest steps are half a metre off it. Acceleration and offset
     from the route have prices of their own."""
-    one, speed = torch.ones(1, 1, 1), torch.full((1, 1), 10.0)
-    ample, size = torch.full((1, 1, 1, anchoring.BEND_VERTICES), 1e4), torch.tensor([[[4.0, 2.0]]])
+    one = torch.ones(1, 1, 1)
+    speed = torch.full((1, 1), 10.0)
+    ample = torch.full((1, 1, 1, anchoring.BEND_VERTICES), 1e4)
+    size = torch.tensor([[[4.0, 2.0]]])
     candidates = anchoring._Candidates(
         one.long(), one, one.bool(), 200 * one, 0 * one, 0 * one, ample, speed, 0 * speed, size
     )
-    steps, limits = torch.ones(1, 1, 1, 50), torch.tensor((-3.0, 2.0))
+    steps = torch.ones(1, 1, 1, 50)
+    limits = torch.tensor((-3.0, 2.0))
     target = anchoring._Target(30.5 * steps, beside * steps, slack * steps, crossing * steps, torch.full((1, 1), 2.0))
     cost, gap, _ = anchoring.scored(candidates, torch.zeros(1, 1, 1, 1), target, limits)
     expected = max(0.5 - slack, 0.0) / 10 + abs(beside) * crossing

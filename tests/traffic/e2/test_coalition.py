@@ -15,7 +15,8 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synth
 
 
 def test_a_coalition_acts_on_the_ego_directly_or_through_members():
-    on, scene = synthesizer(), scenes(4).scenes
+    on = synthesizer()
+    scene = scenes(4).scenes
     state, plan = replanned(on, scene, 2.0)
     assert state.coalition.any(1).all() and not state.coalition[:, 0].any()
     assert torch.equal(state.coalition, state.target >= 0)
@@ -28,10 +29,12 @@ def test_a_coalition_acts_on_the_ego_directly_or_through_members():
 
 def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
     """Vehicle 4 acts on 2, which acts on 1, which has no proposal."""
-    on, scene = synthesizer(), scenes(1).scenes
+    on = synthesizer()
+    scene = scenes(1).scenes
     target = torch.tensor([[-1, 0, 1, 0, 2, -1]])  # the rows in use
     acts = target >= 0
-    build, propose = coalition.build_skeleton, coalition.propose
+    build = coalition.build_skeleton
+    propose = coalition.propose
 
     def chained(*arguments):
         return replace(build(*arguments), coalition=acts, target=target, depth=torch.tensor([[0, 1, 2, 1, 3, 0]]))
@@ -49,7 +52,8 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
 
 def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
     """Without it nobody takes part then, and the plans are the prior's; with it V_adv alone moves the coalition."""
-    scene, propose = scenes(3).scenes, coalition.propose
+    scene = scenes(3).scenes
+    propose = coalition.propose
 
     def nothing(*arguments, **options):
         anchor = propose(*arguments, **options)
@@ -64,7 +68,8 @@ def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
 
 
 def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
-    on, scene = synthesizer(reselect=0), scenes(3).scenes
+    on = synthesizer(reselect=0)
+    scene = scenes(3).scenes
     world = World.at_start(scene)
     lanes = begin(on, scene, 2.0)
     state, _ = on.replan(lanes, world, EGO.plan(world))
@@ -92,9 +97,11 @@ def test_the_other_supports_choose_a_coalition_too(support):
 
 def test_templates_reach_the_rows_of_synthesized_traffic():
     """Equal scenes of equal noise: a vehicle more acts where the template allows it."""
-    scene_set, on = scenes(4), synthesizer(reselect=0, responsibility="none")
+    scene_set = scenes(4)
+    on = synthesizer(reselect=0, responsibility="none")
     synthesize = synthesize_traffic(scene_set, on, SimSettings(), batch=3)
-    index, eta = torch.arange(4), torch.full((4,), 3.0)
+    index = torch.arange(4)
+    eta = torch.full((4,), 3.0)
 
     def acting(*template):
         return synthesize(IDMEgo(), index, eta, 0, *template)["adversaries"].sum(1)

@@ -38,7 +38,8 @@ class Case:
         target = torch.where(self.coalition, 0, -1)
         now = self.scene["start"][:, :ROWS], state.a, self.scene["valid"][:, :ROWS]
         self.where = PotentialContext(self.scene, *now, routed.points, routed.has_lane, plan, target)
-        feasible, none = self.coalition.clone(), self.coalition & False
+        feasible = self.coalition.clone()
+        none = self.coalition & False
         knots = torch.full((count, ROWS, KNOTS), -2.0)
         self.anchor = Anchor(route, knots, feasible, torch.zeros(count, ROWS), none, routed.points)
         self.generator = torch.Generator().manual_seed(0)
@@ -86,18 +87,21 @@ def test_feasibility_acts_once_the_clean_estimate_has_taken_shape(level, monkeyp
 @pytest.mark.parametrize(("scaling", "clips"), [("sigma", (0.02, 0.03)), ("score", (1e6, 1e6))])
 def test_the_shift_is_that_of_the_gradients_scaled_clipped_and_masked(gradient, scaling, clips):
     """x0 - eta M clip(w grad V_adv) - clip(lambda w grad V_feas), w = sigma or sigma^2 / alpha."""
-    case, level = crowded(), torch.tensor(0.4)
+    case = crowded()
+    level = torch.tensor(0.4)
     eta = torch.tensor([0.0, 0.5, 1.0, 2.0])
     x = torch.randn(4, ROWS, SIZE, generator=torch.Generator().manual_seed(3)).requires_grad_(True)
     x0 = case.prior.denoise(x, level, case.context)
     states = case.prior.decode(x0, case.context, steps=SAMPLED_STEPS).states()
-    narrow, wide = PotentialSettings().narrow, PotentialSettings().wide
+    narrow = PotentialSettings().narrow
+    wide = PotentialSettings().wide
     temperature = narrow * (wide / narrow) ** 0.4
     adversarial = adversarial_potential(states, case.where, PotentialSettings(), temperature).sum()
     feasible = feasibility_potential(states, case.where, PotentialSettings()).sum()
     (by_clean,) = torch.autograd.grad(feasible, x0, retain_graph=True)
     (by_adversary,) = torch.autograd.grad(adversarial, x if gradient == "denoiser" else x0)
-    alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
+    alpha = case.prior.schedule.alpha(level)
+    sigma = case.prior.schedule.sigma(level)
     weight = sigma if scaling == "sigma" else sigma**2 / alpha
 
     def clipped(rows, limit):
@@ -133,7 +137,8 @@ def anchored(case, strength, **settings):
     """x at the anchor's level before and after it, for x = alpha x0 + sigma e with the denoiser's own x0."""
     control = case.control(strength=strength, **settings)
     level = case.prior.schedule.levels(case.prior.sampler.steps)[case.prior.sampler.steps - control.anchor_step]
-    alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
+    alpha = case.prior.schedule.alpha(level)
+    sigma = case.prior.schedule.sigma(level)
     x = alpha * 0.3 + sigma * torch.randn(len(case.scene), ROWS, SIZE, generator=case.generator)
     x[:, 0] = case.context.ego_x
     clean = torch.full_like(x, 0.3)
@@ -145,7 +150,8 @@ def test_the_printed_blend_halves_the_noise_and_its_energy_is_booked():
     case = Case(count=600)
     control, level, x, after = anchored(case, 0.5, anchoring="literal", gradient="clean")
     assert torch.equal(after[:, OTHERS], x[:, OTHERS])
-    alpha, sigma = case.prior.schedule.alpha(level), case.prior.schedule.sigma(level)
+    alpha = case.prior.schedule.alpha(level)
+    sigma = case.prior.schedule.sigma(level)
     mean = alpha * (0.5 * 0.3 - 0.5 * 2.0 / ACCEL_SCALE)
     knots = after[:, MEMBER, :KNOTS]
     assert knots.mean().item() == pytest.approx(mean.item(), abs=0.04)
@@ -161,7 +167,8 @@ def test_the_printed_blend_happens_once_at_the_level_nearest_to_the_set_one_and_
         control = case.control(anchor_level=wanted)
         at = levels[case.prior.sampler.steps - control.anchor_step]
         assert (at - wanted).abs() == (levels[:-1] - wanted).abs().min()
-    step, literal = case.control().anchor_step, {"strength": 0.5, "anchoring": "literal"}
+    step = case.control().anchor_step
+    literal = {"strength": 0.5, "anchoring": "literal"}
     moved = [bool((case.shift(k=k, **literal)[1] != 0).any()) for k in range(1, case.prior.sampler.steps + 1)]
     assert moved == [k == step for k in range(1, case.prior.sampler.steps + 1)]
     assert (case.shift(k=step, strength=0.5, anchoring="off")[1] == 0).all()
@@ -170,9 +177,11 @@ def test_the_printed_blend_happens_once_at_the_level_nearest_to_the_set_one_and_
 
 
 def test_raw_proposals_are_driven_as_they_are_and_have_no_budget():
-    case, options = Case(), {"anchoring": "raw", "strength": 8.0, "adversarial_clip": 0.0, "feasibility": 0.0}
+    case = Case()
+    options = {"anchoring": "raw", "strength": 8.0, "adversarial_clip": 0.0, "feasibility": 0.0}
     assert (case.shift(k=3, **options)[1] == 0).all(), "nothing is pulled on the way"
-    x, level = case.noise[0], torch.tensor(0.1)
+    x = case.noise[0]
+    level = torch.tensor(0.1)
     given = level, 1, case.context, lambda y: case.prior.denoise(y, level, case.context)
     _, x0, driven = case.control(**options)(x, *given)
     assert torch.equal(driven[:, OTHERS], x0[:, OTHERS])

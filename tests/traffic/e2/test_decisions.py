@@ -20,12 +20,14 @@ def driven(scene_set, on, decisions):
 
 
 def test_decisions_of_the_rule_are_none():
-    scene_set, on = scenes(3), synthesizer()
+    scene_set = scenes(3)
+    on = synthesizer()
     assert torch.equal(driven(scene_set, on, RULE).states, drive(scene_set, on, 2.0).states)
 
 
 def test_without_strength_nobody_is_controlled_bit_for_bit():
-    scene_set, on = scenes(3), synthesizer()
+    scene_set = scenes(3)
+    on = synthesizer()
     idle = driven(scene_set, on, RULE._replace(strength=0.0))
     assert torch.equal(idle.states, drive(scene_set, NominalTraffic(on.prior), 0.0).states)
     assert not idle.adversaries.any()
@@ -48,7 +50,8 @@ def test_whom_names_one_kind_of_vehicle(vehicle, kind):
 @pytest.mark.parametrize("kind", ["oncoming", "crossing", "beside"])
 def test_nobody_else_acts_by_proposal_or_by_kernel(kind):
     others = [(40.0, 3.5, 3.1, 9.0), (-15.0, 3.5, 0.0, 9.0), (25.0, -20.0, 1.57, 9.0), (60.0, -3.5, 3.1, 9.0)]
-    world, on = make_world([EGO_STATE, *others], 4), synthesizer()
+    world = make_world([EGO_STATE, *others], 4)
+    on = synthesizer()
     given = torch.tensor([RULE._replace(whom=WHOM.index(kind))] * 4)
     state = on.reset(world.scene, torch.arange(4), torch.full((4,), 2.0), decisions=given)
     plan = on.replan(state, world, EGO.plan(world))[1]

@@ -7,7 +7,8 @@ from tests.traffic.e2.traffic_scenes import replanned, scenes, synthesizer
 
 
 def test_a_scene_is_planned_alike_alone_and_in_a_batch():
-    on, scene = synthesizer(), scenes(3).scenes
+    on = synthesizer()
+    scene = scenes(3).scenes
     for eta in (0.0, 2.0):
         _, whole = replanned(on, scene, eta, [5, 6, 7])
         _, alone = replanned(on, scene[1:2], eta, [6])

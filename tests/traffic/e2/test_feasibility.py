@@ -7,7 +7,8 @@ from e2rl.traffic.e2.feasibility import EGO_ACCELERATION, FeasibilitySettings, f
 from e2rl.traffic.e2.motion import MAX_BRAKING, arrival_window, reachable_distance
 from tests.traffic.e2.crossing import add_route, make_world
 
-UP, LEFT = math.pi / 2, math.pi
+UP = math.pi / 2
+LEFT = math.pi
 EGO = (0.0, 0.0, 0.0, 10.0)
 SETTINGS = FeasibilitySettings()
 
@@ -29,7 +30,8 @@ def test_routes_that_cross_meet_where_the_lines_do():
 
 def test_windows_hold_what_both_can_reach():
     table = judge((50.0, -40.0, UP, 10.0))[0].conflicts
-    earliest, latest = table.earliest[0, 1, 0], table.latest[0, 1, 0]
+    earliest = table.earliest[0, 1, 0]
+    latest = table.latest[0, 1, 0]
     push = EGO_ACCELERATION
     alone = (math.sqrt(100 + 2 * push * (50 - 4.5 / 2)) - 10) / push  # the ego flat out, to its front bumper
     assert earliest == pytest.approx(alone, abs=0.15) and latest == SETTINGS.horizon
@@ -112,7 +114,8 @@ def test_absent_vehicles_and_the_ego_are_never_feasible_and_scenes_do_not_mix():
 
 
 def test_arrival_windows_solve_the_equations_of_motion():
-    speed, x = torch.tensor([0.0, 5.0, 10.0, 30.0]), torch.tensor([10.0, 40.0, 9.0, 60.0])
+    speed = torch.tensor([0.0, 5.0, 10.0, 30.0])
+    x = torch.tensor([10.0, 40.0, 9.0, 60.0])
     earliest, latest = arrival_window(x, speed)
     for e, way, v in zip(earliest.tolist(), x.tolist(), speed.tolist(), strict=True):
         most = reachable_distance(torch.tensor(v), torch.tensor(e))[1]

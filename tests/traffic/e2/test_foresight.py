@@ -8,7 +8,8 @@ from e2rl.sim.world import World
 from e2rl.traffic.e2.foresight import foresee, time_before
 from tests.synthetic import make_scenes
 
-STEPS, SPEED = 51, 10.0
+STEPS = 51
+SPEED = 10.0
 SIZE = torch.tensor([[4.0, 2.0]])
 
 
@@ -54,7 +55,8 @@ def mirrored(states):
 
 def test_who_reverses_is_foreseen_as_the_same_motion_forwards():
     """From 10 m/s, braking by 1 m/s^2, towards who stands 20 m ahead."""
-    path, time = torch.zeros(1, STEPS, 4), 0.1 * torch.arange(STEPS)
+    path = torch.zeros(1, STEPS, 4)
+    time = 0.1 * torch.arange(STEPS)
     path[0, :, 0], path[0, :, 3] = SPEED * time - time**2 / 2, SPEED - time
     tracks = torch.zeros(1, 1, STEPS, 4)
     tracks[..., 0] = 24.0

@@ -22,7 +22,8 @@ FREE = replace(InterceptionSettings(), push=2.0, brake=2.0, lateral=2.0)
 def met(vehicles, eta=2.0, settings=FREE, world=None, halt_at_red=False, moment=-1.0, wrong_way=0.0):
     """Vehicle 1's interception of the ego among the others, all of which keep their speed."""
     world = world or make_world(vehicles)
-    scene, expected = world.scene, constant_speed_states(world.scene, world, TIMES)
+    scene = world.scene
+    expected = constant_speed_states(world.scene, world, TIMES)
     index, target = (torch.full((len(scene), 1), vehicle) for vehicle in (1, 0))
     found = intercept(
         world, index, target, expected, wish_of(len(scene), eta, moment, wrong_way), settings, halt_at_red
@@ -116,7 +117,8 @@ def test_no_way_leads_off_the_road_or_through_another_vehicle():
 
 def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
     one = met([EGO, BESIDE])[0]
-    turn, shift = 0.7, torch.tensor([30.0, -12.0])
+    turn = 0.7
+    shift = torch.tensor([30.0, -12.0])
     spin = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     moved = [(*(spin @ torch.tensor(v[:2]) + shift).tolist(), v[2] + turn, v[3]) for v in (EGO, BESIDE)]
     other = met(moved)[0]

@@ -50,8 +50,10 @@ def test_the_covariance_is_one_and_the_price_is_its_quadratic_form():
 @pytest.mark.parametrize("strength", [0.0, 0.3, 4.0])
 def test_the_pull_is_the_posterior_mean_of_a_gaussian_prior(level, strength):
     """x0 ~ N(m, C), x = alpha x0 + sigma e, and a potential strength (x0 - goal)^T C^-1 (x0 - goal) / 2."""
-    schedule, t = NoiseSchedule(), torch.tensor(level, dtype=torch.float64)
-    alpha, sigma = schedule.alpha(t), schedule.sigma(t)
+    schedule = NoiseSchedule()
+    t = torch.tensor(level, dtype=torch.float64)
+    alpha = schedule.alpha(t)
+    sigma = schedule.sigma(t)
     generator = torch.Generator().manual_seed(0)
     m, goal, x = torch.randn(3, SIZE, generator=generator, dtype=torch.float64)
     precision = torch.linalg.inv(covariance(CPU).double())
@@ -69,7 +71,9 @@ def test_what_a_pull_costs_goes_to_the_divergence_of_the_tilted_gaussian(monkeyp
     monkeypatch.setattr(kernels, "SPREAD", (STD,) * SIZE)
     monkeypatch.setattr(kernels, "CORRELATION", 0.0)
     caches = covariance, kernels._axes
-    prior, w, d = gaussian_prior(steps=200), 0.5, 1.5
+    prior = gaussian_prior(steps=200)
+    w = 0.5
+    d = 1.5
     noise = torch.randn(200, 400, 1, SIZE, generator=torch.Generator().manual_seed(1))
 
     def control(x, level, k, context, denoise):
@@ -98,17 +102,20 @@ def test_importance_weights_of_pulled_paths_average_1(recorded):
     options = {"data": "scenarionet", "path": str(TUNE)} if recorded else {"data": "bundled"}
     scene = e2rl.load_scenes(**options, num_scenes=24).scenes
     on = e2rl.make_traffic("e2", e2rl.load_prior())
-    state, world = begin(on, scene, 1.0), World.at_start(scene)
+    state = begin(on, scene, 1.0)
+    world = World.at_start(scene)
     context = on.encode(state, world, EGO.plan(world))
     mean = on.prior.estimate(context)
     gap = (world.states[:, : mean.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
     moves = context.active & (state.lane.v > 1.0)
     near = smallest(moves, gap, 1)
     shift = torch.nn.functional.pad(torch.full((KNOTS,), -1.0 / ACCEL_SCALE), (0, SIZE - KNOTS))
-    pull, generator = Pull(mean + shift, near, torch.full((24,), 0.2)), torch.Generator().manual_seed(0)
+    pull = Pull(mean + shift, near, torch.full((24,), 0.2))
+    generator = torch.Generator().manual_seed(0)
     nobody = on._anchor(state, world, EGO.plan(world))
     control = on._control(state, world, EGO.plan(world), replace(nobody, feasible=nobody.feasible & False), pull)
-    weights, nats = [], []
+    weights = []
+    nats = []
     for _ in range(100):
         noise = torch.randn(on.prior.sampler.steps, *mean.shape, generator=generator)
         sample = on.prior.sample(context, noise, control)
@@ -119,8 +126,10 @@ def test_importance_weights_of_pulled_paths_average_1(recorded):
 
 
 def proposed(gain, count=5):
-    on, scene = synthesizer(), scenes(3).scenes
-    state, world = begin(on, scene, 2.0), World.at_start(scene)
+    on = synthesizer()
+    scene = scenes(3).scenes
+    state = begin(on, scene, 2.0)
+    world = World.at_start(scene)
     context = on.encode(state, world, EGO.plan(world))
     mean = on.prior.estimate(context)
     plan = on.prior.decode(mean, context).states()
@@ -143,7 +152,8 @@ def test_kernels_are_shifts_of_moving_vehicles_that_gain_more_than_they_cost():
 
 
 def test_a_drawn_vehicle_is_an_adversary_that_pays_for_its_shift_and_the_choice():
-    on, scene = synthesizer(kernels={"samples": 4}, interception={"reach": 0}), scenes(4).scenes
+    on = synthesizer(kernels={"samples": 4}, interception={"reach": 0})
+    scene = scenes(4).scenes
     state, plan = replanned(on, scene, 3.0)
     assert state.drawn.any()
     assert (plan.adversary == (state.coalition | state.drawn)).all() and (plan.target[state.drawn] == 0).all()

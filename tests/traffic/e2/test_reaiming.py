@@ -30,7 +30,8 @@ STEPS = 40
 
 def stored(scene_set, eta=2.0):
     """Stored rows that replay the log, with vehicles 2 and 3 as adversaries."""
-    scene, index = scene_set.scenes, torch.arange(len(scene_set))
+    scene = scene_set.scenes
+    index = torch.arange(len(scene_set))
     adversaries = torch.zeros(scene["logged_valid"][:, 0].shape, dtype=torch.bool)
     adversaries[:, 2:4] = True
     traffic = {"scene_index": index, "states": scene["logged"], "valid": scene["logged_valid"]}
@@ -85,7 +86,8 @@ def test_other_vehicles_that_move_near_the_ego_react(scene_set):
 
 
 def test_the_attack_s_intensity_template_and_duty_may_say_how_they_react():
-    eta, template = torch.tensor([0.0, 0.5, 2.5, 2.5]), torch.tensor([PAIR, SINGLE, SINGLE, FULL])
+    eta = torch.tensor([0.0, 0.5, 2.5, 2.5])
+    template = torch.tensor([PAIR, SINGLE, SINGLE, FULL])
     owes = torch.tensor([True, True, False, True])
     given = owes, torch.ones(4, 6, dtype=torch.bool), STEPS, torch.Generator().manual_seed(0)
     part = drawn(ReactSettings(fraction=1.0, eta=None, reckless=None), eta, template, *given)
@@ -98,7 +100,8 @@ def test_the_attack_s_intensity_template_and_duty_may_say_how_they_react():
 
 # --- the law: closed forms, its limits, the drivable area, and what it owes the ego and others
 
-STILL, LAWFUL = torch.zeros(1, 2), torch.tensor([False])
+STILL = torch.zeros(1, 2)
+LAWFUL = torch.tensor([False])
 
 
 def law(responsibility):
@@ -139,12 +142,16 @@ def test_aims_keep_the_limits_at_every_intensity():
     states = torch.stack([*(60 * torch.rand(3, count) - 30), 20 * torch.rand(count)], -1)
     ego = torch.stack([*(60 * torch.rand(3, count) - 30), 15 * torch.rand(count)], -1)
     target = along_arc(ego, Arc(torch.zeros(count), torch.zeros(count)), moments(ego))[0]
-    eta, length = 1 + 2 * torch.rand(count), torch.full((count,), 4.5)
+    eta = 1 + 2 * torch.rand(count)
+    length = torch.full((count,), 4.5)
     ground = Ground(torch.full((1, 200, 200), -5.0), torch.tensor([[-100.0, -100.0]]), torch.zeros(count).long())
     aim = best_aim(states, target, 2 * length, eta, ground, InterceptionSettings())
     some = ~aim.accel.isnan()
     assert 0.2 < some.float().mean() < 0.8, "not where the ego is behind"
-    accel, curvature, eta, v = aim.accel[some], aim.curvature[some].abs(), eta[some], states[some, 3]
+    accel = aim.accel[some]
+    curvature = aim.curvature[some].abs()
+    eta = eta[some]
+    v = states[some, 3]
     assert (accel <= 1.5 * eta + 1e-4).all() and (accel >= -1.2 * eta - 1e-4).all()
     assert (curvature <= SHARPEST + 1e-6).all() and (v**2 * curvature <= 2 * eta + 1e-3).all()
 
@@ -185,7 +192,9 @@ def test_only_paths_on_the_drivable_area_are_taken():
 def followed_for(seconds, responsibility, vehicles):
     """Whether vehicle 1, re-aiming every 0.5 s, touches an ego that keeps its velocity."""
     world = make_world(vehicles)
-    aims, generator, touched = law(responsibility), torch.Generator().manual_seed(0), False
+    aims = law(responsibility)
+    generator = torch.Generator().manual_seed(0)
+    touched = False
     for _ in range(round(seconds / 0.5)):
         seen = surroundings(world, torch.tensor([0]), torch.tensor([1]))
         aim = aims(seen, torch.tensor([3.0]), 0.7 * torch.randn(1, 2, generator=generator), ground_of(world), LAWFUL)

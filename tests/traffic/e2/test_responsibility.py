@@ -28,7 +28,10 @@ def test_in_its_track_ahead_it_is_followed_and_beside_it_leads_only():
 
 
 def test_all_but_those_that_the_ego_follows_give_way_and_only_those_ahead_of_it_wait():
-    ahead, rammer, beside, oncoming = (8, 0, 0, 2.0), (-12, 0, 0, 20.0), (0, 6, 0, 12.0), (40, 0, math.pi, 8.0)
+    ahead = (8, 0, 0, 2.0)
+    rammer = (-12, 0, 0, 20.0)
+    beside = (0, 6, 0, 12.0)
+    oncoming = (40, 0, math.pi, 8.0)
     world, coalition = world_of(ahead, rammer, beside, oncoming)
     duty = duty_of("full", YieldingSettings(), world, coalition, torch.tensor([2.0]))
     assert duty.exempt[0, 1:5].tolist() == [True, False, False, False]
@@ -37,7 +40,9 @@ def test_all_but_those_that_the_ego_follows_give_way_and_only_those_ahead_of_it_
 
 
 def test_who_crosses_from_the_left_gives_way_at_once():
-    from_left, from_right, oncoming = (20, 20, -math.pi / 2, 8.0), (20, -20, math.pi / 2, 8.0), (40, 0, math.pi, 8.0)
+    from_left = (20, 20, -math.pi / 2, 8.0)
+    from_right = (20, -20, math.pi / 2, 8.0)
+    oncoming = (40, 0, math.pi, 8.0)
     world, coalition = world_of(from_left, from_right, oncoming)
     duty = duty_of("full", YieldingSettings(), world, coalition, torch.tensor([2.0]))
     assert duty.patience[0, 1:4].tolist() == [0.0, 2.0, 2.0]

@@ -82,14 +82,16 @@ def test_the_ego_s_own_neighbour_and_following_lanes_hold_no_initiator():
         world.scene["lane_exits"][:] = -1
         if lane is not None:
             world.scene[lane][:, 0] = 1
-        states, asked = world.states[:, [0, 2]], torch.tensor([[True]])
+        states = world.states[:, [0, 2]]
+        asked = torch.tensor([[True]])
         assert skeleton._on_ego_lanes(states, asked, world.scene).item() != counts, lane
 
 
 def test_pursuit_takes_the_nearest_of_the_support_where_nobody_can_meet_the_ego():
     """Of S, or of F where S is empty, by distance; scenes in which somebody can are as without it."""
     world = make_world([EGO, (40.0, -30.0, UP, 8.0), (12.0, 3.5, 0.0, 10.0), (20.0, 3.5, 0.0, 9.0)], copies=3)
-    support, feasible = mask(world, 1, 2), mask(world, 1, 2, 3)
+    support = mask(world, 1, 2)
+    feasible = mask(world, 1, 2, 3)
     support[1] = False
     cost = torch.full(support.shape, torch.inf)
     cost[2, 1] = 1.0
@@ -110,24 +112,28 @@ def random_world(seed, count=7):
 def acts(own, other, time, tau_long):
     """Whether vehicle `own` can act on `other` in `time` s, both states [4], on straight routes (Sec. IV-A3)."""
     there = other[:2] + other[3] * time * torch.stack([other[2].cos(), other[2].sin()])
-    gap, v = there - own[:2], own[3].item()
+    gap = there - own[:2]
+    v = own[3].item()
     along = (own[2].cos() * gap[0] + own[2].sin() * gap[1]).item()
     across = (own[2].cos() * gap[1] - own[2].sin() * gap[0]).item()
     braking = min(time, v / 5.0)
     ramp = min(time, (25.0 - v) / 4.0)
-    least, most = v * braking - 2.5 * braking**2, v * ramp + 2.0 * ramp**2 + 25.0 * (time - ramp)
+    least = v * braking - 2.5 * braking**2
+    most = v * ramp + 2.0 * ramp**2 + 25.0 * (time - ramp)
     reachable = least - LENGTH <= along <= most + LENGTH and along > -LENGTH
     return reachable and abs(across) <= 2.5 and abs(along - v * time) <= tau_long
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_influence_is_that_of_the_equations_of_motion(seed):
-    world, settings = random_world(seed), SkeletonSettings(tau_long=12.0)
+    world = random_world(seed)
+    settings = SkeletonSettings(tau_long=12.0)
     times = STEP * torch.arange(1, 11)
     expected = constant_speed_states(world.scene, world, times)
     slots = torch.arange(1, 8)[None], torch.ones(1, 7, dtype=torch.bool)
     found = influence(world.scene, world, slots, expected, settings)[0]
-    states, wanted = world.states[0], torch.zeros_like(found)
+    states = world.states[0]
+    wanted = torch.zeros_like(found)
     for i in range(7):
         for j in range(8):
             if i != j:
@@ -186,7 +192,8 @@ def test_any_candidate_route_may_lead_to_the_target():
 def test_causal_templates_limit_each_scene_by_itself():
     """A scene for each template, all alike: three vehicles in a column and one beside the ego."""
     world = make_world([EGO, *COLUMN, (12.0, 3.5, 0.0, 10.0)], copies=4)
-    support, settings = mask(world, 1, 2, 3, 4), SkeletonSettings(near=3)
+    support = mask(world, 1, 2, 3, 4)
+    settings = SkeletonSettings(near=3)
     limits = limits_of(torch.tensor([SINGLE, PAIR, CHAIN, FULL]), settings)
     assert limits[0].tolist() == [1, 2, 1, 3] and limits[1].tolist() == [0, 0, 1, settings.far]
     result = skeleton_of(world, support, near=3, limits=limits)

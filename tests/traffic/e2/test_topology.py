@@ -120,7 +120,8 @@ def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypa
     settings = TopologySettings(candidates=3, max_clique=3, top_cliques=2)
     result = topological_candidates(track, valid, size, settings)
     assert result.steps.tolist() == list(range(0, 81, STRIDE)) and STRIDE == 5
-    score, nearest = [0] * 11, [math.inf] * 11
+    score = [0] * 11
+    nearest = [math.inf] * 11
     for number, step in enumerate(result.steps.tolist()):
         distance = (track[0, step, :, :2] - track[0, step, :1, :2]).norm(dim=-1)
         distance = distance.masked_fill(~valid[0, step], math.inf).tolist()

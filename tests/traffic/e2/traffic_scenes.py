@@ -50,7 +50,8 @@ def begin(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None) -> S
 
 def replanned(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None, times: int = 1):
     """State and plan after `times` replans, half a second of perfect execution between two of them."""
-    state, world = begin(on, scene, eta, seeds), World.at_start(scene)
+    state = begin(on, scene, eta, seeds)
+    world = World.at_start(scene)
     for _ in range(times):
         ego_plan = EGO.plan(world)
         state, plan = on.replan(state, world, ego_plan)
@@ -60,7 +61,8 @@ def replanned(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None, 
 
 def executed(world: World, plan: TrafficPlan, ego_plan: torch.Tensor) -> World:
     """The World half a second on, everybody where it planned to be."""
-    states, vehicles = world.states.clone(), plan.states.shape[1]
+    states = world.states.clone()
+    vehicles = plan.states.shape[1]
     states[:, :vehicles] = plan.states[:, :, REPLAN_STEPS - 1]
     states[:, 0] = ego_plan[:, REPLAN_STEPS - 1]
     return replace(world, step=world.step + REPLAN_STEPS, states=states)

@@ -58,8 +58,12 @@ class VehicleParameters:
         vehicle_type,
         height=None,
     ):
-        self.width, self.length, self.height = width, front_length + rear_length, height
-        self.front_length, self.rear_length, self.wheel_base = front_length, rear_length, wheel_base
+        self.width = width
+        self.length = front_length + rear_length
+        self.height = height
+        self.front_length = front_length
+        self.rear_length = rear_length
+        self.wheel_base = wheel_base
         self.rear_axle_to_center = self.length / 2 - rear_length
 
 
@@ -122,7 +126,8 @@ class EgoState:
         is_in_auto_mode=True,
         angular_vel=0.0,
     ):
-        ahead, rear = vehicle_parameters.rear_axle_to_center, rear_axle_velocity_2d
+        ahead = vehicle_parameters.rear_axle_to_center
+        rear = rear_axle_velocity_2d
         velocity = StateVector2D(rear.x, rear.y + ahead * angular_vel)
         dynamic = DynamicCarState(rear, velocity, rear_axle_acceleration_2d, angular_vel)
         return cls(moved(rear_axle_pose, ahead), rear_axle_pose, dynamic, time_point, CarFootprint(vehicle_parameters))
@@ -147,8 +152,12 @@ class SceneObjectMetadata:
 
 class Agent:
     def __init__(self, tracked_object_type, oriented_box, velocity, metadata, angular_velocity=None):
-        self.tracked_object_type, self.box, self.velocity = tracked_object_type, oriented_box, velocity
-        self.metadata, self.track_token, self.angular_velocity = metadata, metadata.track_token, angular_velocity
+        self.tracked_object_type = tracked_object_type
+        self.box = oriented_box
+        self.velocity = velocity
+        self.metadata = metadata
+        self.track_token = metadata.track_token
+        self.angular_velocity = angular_velocity
         self.center = oriented_box.center
 
 
@@ -172,7 +181,9 @@ class DetectionsTracks(Observation):
 
 class SimulationHistoryBuffer:
     def __init__(self, ego_state_buffer, observations_buffer, sample_interval=None):
-        self._egos, self._observations, self.sample_interval = ego_state_buffer, observations_buffer, sample_interval
+        self._egos = ego_state_buffer
+        self._observations = observations_buffer
+        self.sample_interval = sample_interval
 
     @classmethod
     def initialize_from_list(cls, buffer_size, ego_states, observations, sample_interval=None):

@@ -29,7 +29,8 @@ def places(tmp_path_factory):
     batch = {key: scenes.scenes[key] for key in ("start", "logged", "logged_valid")}
     states = batch["logged"].clone()
     states[:, 0] = batch["start"]
-    count, agents = len(states), states.shape[2]
+    count = len(states)
+    agents = states.shape[2]
     rollouts = Rollouts.in_scenes(
         scenes,
         torch.arange(count),

@@ -33,7 +33,8 @@ def lane_pairs(lanes, outside):
     graph = lane_digraph(lanes)
     pairs = set()
     for name in outside:
-        waiting, visited = list(graph.successors(name)), set()
+        waiting = list(graph.successors(name))
+        visited = set()
         while waiting:
             other = waiting.pop()
             if other in outside:
@@ -47,7 +48,8 @@ def lane_pairs(lanes, outside):
 def test_every_link_is_a_connection_at_its_lane_s_limit(places, sumo, tmp_path):
     count = 0
     for episode in episodes_of(places, read_rows(places / TABLE), [], True):
-        roads, net = tmp_path / f"{count}.xodr", tmp_path / f"{count}.net.xml"
+        roads = tmp_path / f"{count}.xodr"
+        net = tmp_path / f"{count}.net.xml"
         write_roads(episode, roads)
         subprocess.run([sumo / "netconvert", "--opendrive-files", roads, "-o", net], check=True, capture_output=True)
         written = ElementTree.parse(roads).iterfind("road")
@@ -71,7 +73,8 @@ def test_the_designer_links_lanelets_as_the_lanes_are(places, tools, tmp_path):
     for episode, path in zip(episodes, paths, strict=True):
         write_roads(episode, path)
     for episode, read in zip(episodes, answer(tools, "designer", *paths), strict=True):
-        lanes, entries = episode.lanes.values(), episode.entries().values()
+        lanes = episode.lanes.values()
+        entries = episode.entries().values()
         assert read["forks"] == sorted(len(lane.exits) for lane in lanes if len(lane.exits) > 1)
         assert read["merges"] == sorted(len(others) for others in entries if len(others) > 1)
         limits = {round(lane.speed_limit, 2) for lane in lanes}

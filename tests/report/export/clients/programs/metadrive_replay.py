@@ -48,7 +48,9 @@ for index, name in enumerate(names):
     theirs = plain(made["metadata"]["number_summary"])
     differing = [key for key in theirs if ours.get(key) != theirs[key]]
     env.reset(seed=index)
-    contacts, step, over = [], 0, False
+    contacts = []
+    step = 0
+    over = False
     while not over:
         _, _, terminated, truncated, info = env.step([0, 0])
         step += 1
