@@ -56,24 +56,24 @@ def load_scenes(
 
     scenes: a list or the folder of a run, whose scenes are taken.
     """
-    return source.load_scenes(_choice("data", data, {"workers": 1} | settings), num_scenes, scenes=scenes)
+    return source.load_scenes(_choice("data", data, settings={"workers": 1} | settings), num_scenes, scenes=scenes)
 
 
 def load_prior(checkpoint: str = "bundled", device: str = "cpu", **settings: Any) -> Prior:
     """Returns the frozen prior of a checkpoint; settings: conf/prior/default.yaml, such as sampler={"steps": 8}."""
-    config = _choice("prior", "default", {"checkpoint": checkpoint} | settings)
+    config = _choice("prior", "default", settings={"checkpoint": checkpoint} | settings)
     return build_prior(OmegaConf.create({"prior": config}), device)[0]
 
 
 def make_traffic(name: str, prior: Prior, **settings: Any) -> Traffic:
     """Returns the traffic method of conf/synthesizer/<name>.yaml on a prior."""
-    return build_traffic(_choice("synthesizer", name, settings), prior)
+    return build_traffic(_choice("synthesizer", name, settings=settings), prior)
 
 
 def make_ego(name: str, **settings: Any) -> Ego:
     """Returns the ego of conf/ego/<name>.yaml."""
     shared = {"sim": load_choice("sim", "default"), "device": "cpu"}  # that some egos refer to
-    return build_ego(OmegaConf.create(shared | {"ego": _choice("ego", name, settings)}))
+    return build_ego(OmegaConf.create(shared | {"ego": _choice("ego", name, settings=settings)}))
 
 
 def roll_out(
@@ -83,9 +83,9 @@ def roll_out(
 
     All are simulated at once. eta: adversarial intensity, 0 to 3.
     """
-    setup = Setup(scenes, ego, type(ego).__name__, SimSettings(), device=device)
+    setup = Setup(scenes, ego, ego_name=type(ego).__name__, sim=SimSettings(), device=device)
     tasks = [Task(scene, seed) for seed in seeds for scene in range(len(scenes))]
-    return setup.roll_out(Method(type(traffic).__name__, traffic, float(eta)), tasks)
+    return setup.roll_out(Method(type(traffic).__name__, traffic, eta=float(eta)), tasks)
 
 
 def find_failures(
@@ -111,13 +111,13 @@ def find_failures(
     planner = make_ego(ego) if isinstance(ego, str) else ego
     traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
     names = [each if isinstance(each, str) else type(each).__name__ for each in (ego, method)]
-    setup = Setup(scenes, planner, names[0], SimSettings())
+    setup = Setup(scenes, planner, ego_name=names[0], sim=SimSettings())
     turns = [scenes.location[:scene].count(place) for scene, place in enumerate(scenes.location)]
     order = sorted(range(len(scenes)), key=lambda scene: (turns[scene], scene))
     failures: list[Failure] = []
     for begin in range(0, len(order), AT_ONCE):
         tasks = [Task(scene, seed) for scene in order[begin : begin + AT_ONCE]]
-        rollouts = setup.roll_out(Method(names[1], traffic, float(eta)), tasks)
+        rollouts = setup.roll_out(Method(names[1], traffic, eta=float(eta)), tasks)
         rows = score_rollouts(rollouts)[0]
         failures += [Failure(rollouts.rollout(k), row) for k, row in enumerate(rows) if row["cfr"]]
         if len(failures) >= most:
@@ -151,13 +151,13 @@ def make_env(
     etas = torch.tensor(eta if isinstance(eta, Sequence) else [eta], dtype=torch.float32)
     scenes = load_scenes("bundled", split="train") if scenes is None else scenes
     traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
-    settings = build_sim(OmegaConf.create({"sim": _choice("sim", "default", sim)}))
+    settings = build_sim(OmegaConf.create({"sim": _choice("sim", "default", settings=sim)}))
     prepare_fused(OmegaConf.create({"compile": compile, "device": "cpu"}))
     row = torch.arange(len(etas) * SEEDS * len(scenes))
-    pool = TrafficPool.live(row % len(scenes), etas.repeat_interleave(SEEDS * len(scenes)), row)
+    pool = TrafficPool.live(row % len(scenes), etas.repeat_interleave(SEEDS * len(scenes)), seed=row)
     draw = RowDraw(torch.ones(len(row), dtype=torch.float64), seed)
     base = DrivingEnv(scenes, settings, num_envs, hold=hold)
-    return TransformedEnv(base, AdversarialSynthesizer(pool, draw, traffic))
+    return TransformedEnv(base, AdversarialSynthesizer(pool, draw, traffic=traffic))
 
 
 def make_gym_env(num_envs: int | None = None, autoreset: str = "same_step", **settings: Any) -> Any:
@@ -168,8 +168,8 @@ def make_gym_env(num_envs: int | None = None, autoreset: str = "same_step", **se
             whose action is ignored, as gymnasium's wrappers of a batch's observations want it.
         settings: of make_env.
     """
-    module = library("e2rl.learning.gym_env", "make_gym_env", "gym")
-    check_choice("autoreset", autoreset, module.AUTORESET)
+    module = library("e2rl.learning.gym_env", "make_gym_env", extra="gym")
+    check_choice("autoreset", autoreset, choices=module.AUTORESET)
     if num_envs is None:
         return module.DrivingGymEnv(make_env(1, **settings))
     return module.DrivingVectorEnv(make_env(num_envs, **settings), module.AUTORESET[autoreset])
@@ -177,7 +177,7 @@ def make_gym_env(num_envs: int | None = None, autoreset: str = "same_step", **se
 
 def make_sb3_env(num_envs: int = 16, **settings: Any) -> Any:
     """Returns the batch as a VecEnv of Stable-Baselines3. settings: of make_env."""
-    return library("e2rl.learning.sb3", "make_sb3_env", "gym").SB3Env(make_gym_env(num_envs, **settings))
+    return library("e2rl.learning.sb3", "make_sb3_env", extra="gym").SB3Env(make_gym_env(num_envs, **settings))
 
 
 def save_policy(policy: Any, path: str | Path, env: Any = None) -> Path:
@@ -188,7 +188,7 @@ def save_policy(policy: Any, path: str | Path, env: Any = None) -> Path:
         env: of a model that was loaded: the VecNormalize that was saved with it (docs/how-to/gym.md).
     """
     if not isinstance(policy, torch.nn.Module):
-        policy = library("e2rl.learning.sb3", "save_policy", "gym").Deterministic(policy, env)
+        policy = library("e2rl.learning.sb3", "save_policy", extra="gym").Deterministic(policy, env)
     write_policy(policy, Path(path))
     return Path(path)
 
@@ -206,4 +206,4 @@ def score(rollouts: Rollouts) -> list[dict]:
 
 def _choice(group: str, name: str, settings: dict[str, Any]) -> DictConfig:
     """A file of the configuration with changes."""
-    return with_changes(load_choice(group, name), settings, f"{group}={name}", group)
+    return with_changes(load_choice(group, name), settings, where=f"{group}={name}", group=group)

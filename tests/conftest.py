@@ -42,7 +42,7 @@ def nothing_compiled():
 def world(tmp_path_factory):
     """Folders of good and bad scenes, checkpoints of several kinds."""
     root = tmp_path_factory.mktemp("input")
-    good = numbered([description({"ego": straight(20 + k, 0, 8), "7": straight(50, 3.5, 6)}) for k in range(2)])
+    good = numbered([description({"ego": straight(20 + k, 0, speed=8), "7": straight(50, 3.5, speed=6)}) for k in range(2)])
     nan = description()
     nan["tracks"]["7"]["state"]["position"][40] = np.nan
     bad = {
@@ -55,7 +55,7 @@ def world(tmp_path_factory):
         write_folder(root / name, [good[0], scene])
     (root / "empty").mkdir()
     torch.manual_seed(0)
-    path = save_prior(Prior(DenoiserSettings(width=16, heads=2, blocks=1, pair=8)), root, {"data": "made"})
+    path = save_prior(Prior(DenoiserSettings(width=16, heads=2, blocks=1, pair=8)), root, origin={"data": "made"})
     path.rename(root / "prior.safetensors")
     _variants(root)
     return root

@@ -61,20 +61,20 @@ class Pretended(TorchFunctionMode):
         if function == Tensor.is_cuda.__get__:
             return device_of(args[0]) == PRETENDED
         if name in ("to", "cpu", "cuda"):
-            return self.moved(function, name, args, kwargs)
+            return self.moved(function, name, args=args, kwargs=kwargs)
         asked = kwargs.pop("device", None)
         if asked is not None:
             asked = torch.device(asked)
         if function == Tensor.data.__set__:
             function(*args)
-            return on(args[0], device_of(args[1]), [])
+            return on(args[0], device_of(args[1]), given=[])
         if name in CREATED or any(part in name for part in LIKE):
             own = device_of(given[0]) if given and (name in TAKEN or name not in CREATED) else CPU
-            return on(function(*args, **kwargs), asked or own, [])
+            return on(function(*args, **kwargs), asked or own, given=[])
         if name in ("numpy", "__array__"):
             assert device_of(args[0]) == CPU, f"{name} of a tensor on {PRETENDED}"
-        device = self.checked(name, args, given)
-        return on(function(*args, **kwargs), device, given)
+        device = self.checked(name, args, given=given)
+        return on(function(*args, **kwargs), device, given=given)
 
     @staticmethod
     def moved(function: Callable, name: str, args: tuple, kwargs: dict) -> Any:
@@ -88,7 +88,7 @@ class Pretended(TorchFunctionMode):
         found = own[0] if name != "to" else function(*own, **own_kwargs)
         if found is args[0] and target != device_of(args[0]):
             found = found.clone()
-        return on(found, target, [args[0]])
+        return on(found, target, given=[args[0]])
 
     @staticmethod
     def checked(name: str, args: tuple, given: list[Tensor]) -> torch.device:

@@ -92,7 +92,7 @@ def rollouts_of(method: str, ego: str) -> Record:
     """Returns the record of a method against an ego in all scenes."""
     scenes, prior = scenes_and_prior()
     traffic = e2rl.make_traffic(method, prior)
-    rollouts = e2rl.roll_out(scenes, e2rl.make_ego(ego), traffic, eta=ETA)
+    rollouts = e2rl.roll_out(scenes, e2rl.make_ego(ego), traffic=traffic, eta=ETA)
     return rollouts_record(rollouts)
 
 

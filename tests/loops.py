@@ -34,5 +34,5 @@ def loop_scenes(speed: float) -> SceneSet:
     scenes = make_scenes(1, num_vehicles=1, num_vrus=0, speed=speed)
     scenes.scenes["route_points"][0, 0] = loop()
     scenes.scenes["route_open"][:] = False
-    scenes.scenes["logged"][0, :, 0] = track(loop(), BACK, speed)
+    scenes.scenes["logged"][0, :, 0] = track(loop(), BACK, speed=speed)
     return scenes

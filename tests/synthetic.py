@@ -75,7 +75,7 @@ def make_scenes(
     cars = start[:, :max_vehicles], valid[:, :max_vehicles]
     scenes |= _routes(*cars, num_routes, num_points, limit, red_light_x, road)
     scenes |= {key: value.expand(num_scenes, *value.shape).clone() for key, value in _map(road).items()}
-    scenes |= _lights(num_scenes, steps, red_light_x)
+    scenes |= _lights(num_scenes, steps, red_light_x=red_light_x)
     return SceneSet(
         scenes=TensorDict(scenes, [num_scenes]),
         scene_id=[f"synthetic-{k}" for k in range(num_scenes)],

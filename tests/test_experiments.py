@@ -21,7 +21,7 @@ def evaluated(world, tmp_path, monkeypatch, capsys):
         given = [*SHORT, f"data.cache={world / 'bundled'}", "seeds=[0]", f"hydra.run.dir={tmp_path / 'run'}"]
         named = {option.partition("=")[0] for option in options}
         kept = [option for option in given if option.partition("=")[0] not in named]
-        status, said = call("evaluate.py", [*kept, *options], monkeypatch, capsys)
+        status, said = call("evaluate.py", [*kept, *options], monkeypatch=monkeypatch, capsys=capsys)
         assert status == 0, said
         return tmp_path / "run"
 
@@ -129,7 +129,7 @@ def test_a_folder_of_somebody_else_adds_methods_to_the_table(world, tmp_path, mo
         f"--config-dir={tmp_path / 'conf'}",
         *arguments(world, tmp_path, "good", "data.build.steps=20", "methods=[replay,straight]", "seeds=[0]"),
     ]
-    status, said = call("evaluate.py", overrides, monkeypatch, capsys)
+    status, said = call("evaluate.py", overrides, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0, said
     rows = read_metrics(tmp_path / "run" / "metrics.json")
     assert [(row["method"], row["eta"]) for row in rows] == [("replay", 0), ("straight", 0)]

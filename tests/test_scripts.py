@@ -46,7 +46,7 @@ def test_bad_input_is_one_line_and_leaves_nothing_but_scenes(
     world, tmp_path, monkeypatch, capsys, script, data, options, what
 ):
     given = arguments(world, tmp_path, data, *(option.replace("=IN/", f"={world}/") for option in options))
-    status, said = call(script, given, monkeypatch, capsys)
+    status, said = call(script, given, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 2 and what in error_line(said)
     assert all(path.startswith("cache/scenes-") and data == "good" for path in left_behind(tmp_path))
     assert not (world / "ran").exists()
@@ -61,7 +61,7 @@ ROUND = [
 
 def test_rounds_of_evolution_from_the_first_command_to_tables_and_a_resume(world, tmp_path, monkeypatch, capsys):
     run = tmp_path / "run"
-    status, said = call("train.py", arguments(world, tmp_path, "good", *ROUND), monkeypatch, capsys)
+    status, said = call("train.py", arguments(world, tmp_path, "good", *ROUND), monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0, said
     rows = read_metrics(run / "metrics.json")
     assert {(row["stage"], row["method"], row["eta"]) for row in rows} == {
@@ -72,7 +72,7 @@ def test_rounds_of_evolution_from_the_first_command_to_tables_and_a_resume(world
     tries = [len((run / stage / "search" / "tries.csv").read_text().splitlines()) for stage in ("before", "after")]
     assert min(tries) > 2, "a header, and a try of each scene at least"
     again = [f"resume={run}", "rounds=2", f"data.cache={tmp_path / 'cache'}", f"hydra.run.dir={tmp_path / 'again'}"]
-    status, said = call("train.py", again, monkeypatch, capsys)
+    status, said = call("train.py", again, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0, said
     rows = read_choices(run / "curriculum.csv")
     assert [row["round"] for row in rows] == [0] * 24 + [1] * 24, "an arm for each template and intensity"

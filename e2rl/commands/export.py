@@ -78,12 +78,12 @@ def main(arguments: list[str] | None = None) -> None:
         if options.open_ego and options.to not in OPEN_EGO:
             others = " or ".join(OPEN_EGO)
             raise InputError(f"--open-ego: {options.to} has no such form; leave it out, or pass --to {others}")
-        write = library(f"e2rl.report.export.{FORMATS[options.to]}", f"--to {options.to}", options.to).write
+        write = library(f"e2rl.report.export.{FORMATS[options.to]}", f"--to {options.to}", extra=options.to).write
         if options.failures is not None and options.failures < 1:
             raise InputError(f"--failures {options.failures}: expected at least 1")
         given = (options.run, options.failures, options.all, options.method)
         rows = [failure_row(options.run, options.failure)] if options.failure else chosen_rows(*given)
-        episodes = episodes_of(options.run, rows, options.plugin, not options.no_scene)
+        episodes = episodes_of(options.run, rows, plugins=options.plugin, scene=not options.no_scene)
         shown = tqdm(episodes, "exporting", len(rows), unit="rollout", leave=False, disable=None)
-        export(shown, write, out, options.open_ego)
+        export(shown, write, out=out, open_ego=options.open_ego)
         print(f"{len(rows)} rollouts written to {out}")

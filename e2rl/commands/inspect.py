@@ -115,8 +115,8 @@ def picture(scene: dict[str, np.ndarray], title: str, metres: float) -> Figure:
     figure = new_figure(SIDE, height)
     axes = figure.add_axes((0, FOOT / height, 1, SIDE / height))
     figure.text(14 / SIDE, 1 - 22 / height, title, fontsize=13, color=drawing.INK)
-    drawing.add_legend(figure, LEGEND, 11)
-    TrafficMap(axes, road_of(TensorDict(scene)), metres).show(scene["start"][0, :2], _trails(scene), _shapes(scene))
+    drawing.add_legend(figure, LEGEND, size=11)
+    TrafficMap(axes, road_of(TensorDict(scene)), metres=metres).show(scene["start"][0, :2], _trails(scene), _shapes(scene))
     return figure
 
 
@@ -124,19 +124,19 @@ def _trails(scene: dict[str, np.ndarray]) -> list[Trail]:
     """The recorded paths, the ego's on top; each fades towards the start frame."""
     agents = np.flatnonzero(scene["valid"])[::-1]
     paths = [scene["logged"][scene["logged_valid"][:, agent], agent, :2] for agent in agents]
-    return [Trail(path, _colour(scene, k), 0.4) for k, path in zip(agents, paths, strict=True) if len(path) > 1]
+    return [Trail(path, _colour(scene, k), width=0.4) for k, path in zip(agents, paths, strict=True) if len(path) > 1]
 
 
 def _shapes(scene: dict[str, np.ndarray]) -> list[Shape]:
     """Lights, then agents, the ego on top."""
     states = scene["light_state"][0].tolist()
     points = zip(scene["light_points"], states, strict=True)
-    shapes = [drawing.disc(point, 0.7, LIGHTS[state], drawing.INK) for point, state in points]
+    shapes = [drawing.disc(point, 0.7, fill=LIGHTS[state], edge=drawing.INK) for point, state in points]
     for agent in np.flatnonzero(scene["valid"])[::-1]:
         state = scene["start"][agent]
         size = scene["size"][agent]
         kind = AGENT_TYPES[scene["agent_type"][agent]]
-        shapes += drawing.agent(kind, state, size, _colour(scene, agent))
+        shapes += drawing.agent(kind, state, size=size, colour=_colour(scene, agent))
     return shapes
 
 
@@ -207,14 +207,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default="runs/inspect/scene.png", help="picture, with a PDF (%(default)s)")
     options = parser.parse_args(arguments)
     with ending():
-        name, source = open_source(options.path, options.data, options.workers)
+        name, source = open_source(options.path, options.data, workers=options.workers)
         rows, contents, drawn = inspect(source, options.scene)
-        print(f"data         {name}, {options.path}", *report(source, rows, contents), sep="\n")
+        print(f"data         {name}, {options.path}", *report(source, rows, contents=contents), sep="\n")
         if drawn is None:
             raise InputError(f"{options.path}: no log makes a scene, the first for this reason: {rows[0].reason}")
         if options.apart:
-            print(check_apart(rows, source, open_source(options.apart, name, options.workers)[1]))
+            print(check_apart(rows, source, other=open_source(options.apart, name, workers=options.workers)[1]))
         assert drawn.scene is not None
         title = f"{drawn.scene_id}   {drawn.location}"
-        save_figure(options.out, picture(drawn.scene, title, options.metres))
+        save_figure(options.out, picture(drawn.scene, title, metres=options.metres))
         print(f"drawn        {drawn.scene_id}: {options.out}")

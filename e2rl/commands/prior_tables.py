@@ -47,23 +47,23 @@ def prior_tables(run: Run) -> None:
     before = []
     after = []
     if asked.open_loop_samples:
-        before = open_loop_rows(plan.scenes, methods, asked.open_loop_samples, config.device, parts)
+        before = open_loop_rows(plan.scenes, methods, samples=asked.open_loop_samples, device=config.device, parts=parts)
     if asked.spread_samples:
-        before += spread_rows(plan.scenes, methods, asked.spread_samples, config.device, parts)
-    work = Work(plan.rollouts(folder), processes_of(config), plan.only, parts)
-    scored = drive_all([setup], methods, plan.asked.seeds, work)
+        before += spread_rows(plan.scenes, methods, samples=asked.spread_samples, device=config.device, parts=parts)
+    work = Work(plan.rollouts(folder), processes_of(config), only=plan.only, parts=parts)
+    scored = drive_all([setup], methods, seeds=plan.asked.seeds, work=work)
     if asked.meta_rollouts:
-        after = meta_rows(setup, methods, asked.meta_rollouts, parts)
+        after = meta_rows(setup, methods, rollouts=asked.meta_rollouts, parts=parts)
 
     def summarise(*found: Any) -> list[dict]:
         return [row | origin_of(run.folder) for row in (*before, *metric_rows(*found), *after)]
 
     rows = record(*scored, folder, summarise)
-    answer = write_results(run, plan, rows)
+    answer = write_results(run, plan, rows=rows)
     print_tables(metric_tables([*before, *after]))
     print("", *answer, sep="\n")
 
 
 def main() -> None:
     """The command."""
-    run_command("prior_tables", prior_tables, MAY_CHANGE)
+    run_command("prior_tables", prior_tables, may_change=MAY_CHANGE)

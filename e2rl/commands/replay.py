@@ -54,8 +54,8 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with ending():
         folder = options.out or own_folder(options.run.parent if options.run.is_file() else options.run, "replays")
-        for title, shown in chosen(options.run, options.failures, options.modes):
+        for title, shown in chosen(options.run, options.failures, modes=options.modes):
             name = f"{shown.rollout.name.removesuffix('.npz')}.{options.to}"
             path = folder / name if options.out else own_folder(folder, name)
-            save_animation(path, Replay(shown.rollout, shown.row, options.metres, options.pixels).frames())
+            save_animation(path, Replay(shown.rollout, shown.row, metres=options.metres, pixels=options.pixels).frames())
             print(*filter(None, [title]), path, sep="\n")

@@ -98,14 +98,14 @@ def check_arguments(kind: type[Ego], settings: Sequence[str], where: str) -> Non
 def overrides_of(options: argparse.Namespace) -> list[str]:
     """Returns the overrides of `e2rl evaluate` for the options; InputError for a planner or logs that are none."""
     kind = planner_class(options.planner)
-    check_arguments(kind, options.settings, f"--planner {options.planner}")
+    check_arguments(kind, options.settings, where=f"--planner {options.planner}")
     logs = [each for each in options.logs if "=" not in each]
     if len(logs) > 1:
         raise InputError(f"{logs[1]}: name one folder or zip of logs, or leave it out for the bundled scenes")
     words = ["ego=class", assigned("ego._target_", f"{kind.__module__}.{kind.__qualname__}")]
     words += [f"+ego.{setting}" for setting in options.settings]
     if logs:
-        data, _ = open_source(Path(logs[0]), options.data, 1)
+        data, _ = open_source(Path(logs[0]), options.data, workers=1)
         words += [f"data={data}", assigned("data.path", logs[0])]
     words += [f"num_scenes={options.scenes}"] if options.scenes else []
     words += [assigned("hydra.run.dir", options.out)] if options.out else []

@@ -37,18 +37,18 @@ def tune(run: Run) -> dict:
     config = run.config
     folder = run.folder
     group = run.config.tuning.group
-    check_choice("tuning.group", group, GROUPS)
+    check_choice("tuning.group", group, choices=GROUPS)
     given = {each.name: config.tuning[each.name] for each in fields(SearchSettings)}
-    settings = settings_of(SearchSettings, given, "tuning")
+    settings = settings_of(SearchSettings, given, where="tuning")
     plan = begin(run)
     objective: Objective
     trials: PlannerTrials | AttackTrials
     if group == "ego":
-        objective = settings_of(PlannerObjective, config.tuning.planner, "tuning.planner")
+        objective = settings_of(PlannerObjective, config.tuning.planner, where="tuning.planner")
         trials = planner_trials(config, plan)
         ranges = plan.setup.ego.tuned
     else:
-        objective = settings_of(AttackObjective, config.tuning.attack, "tuning.attack")
+        objective = settings_of(AttackObjective, config.tuning.attack, where="tuning.attack")
         trials, ranges = attack_trials(config, plan)
 
     def told(rows: list[dict]) -> None:
@@ -64,7 +64,7 @@ def tune(run: Run) -> dict:
     }
     space = resolved(config.tuning.space) or ranges
     file = folder / STUDY_FILE if config.tuning.study is None else Path(config.tuning.study)
-    rows = search(trials, flat(resolved(config[group])), space, settings, objective, file, about, told)
+    rows = search(trials, flat(resolved(config[group])), space=space, settings=settings, objective=objective, file=file, about=about, told=told)
     result = save(rows, folder)
     if group == "synthesizer":
         save_curves(folder, points_of_tuning(result, config.synthesizer.name))
@@ -79,14 +79,14 @@ def planner_trials(config: DictConfig, plan: Evaluation) -> PlannerTrials:
     """Returns trials of the group `ego` against all of `config.methods`, and in the tries of `tuning.failures`."""
 
     def make(parameters: Parameters) -> Any:
-        return build_ego(OmegaConf.create({"ego": with_changes(config.ego, parameters, "tuning.space", "ego")}))
+        return build_ego(OmegaConf.create({"ego": with_changes(config.ego, parameters, where="tuning.space", group="ego")}))
 
     failures: list[Part] = []
     if config.tuning.failures is not None:
-        portfolio = portfolio_plan(SEARCH, config, partial(methods_at(max(plan.asked.eta)), plan.prior))
+        portfolio = portfolio_plan(SEARCH, config, method=partial(methods_at(max(plan.asked.eta)), plan.prior))
         file = Path(config.tuning.failures) / TRIES_FILE
-        failures = failures_of(file, plan.setup.ego_name, portfolio, plan.setup)
-    return PlannerTrials(plan.setup, plan.methods, plan.asked.seeds, make, processes_of(config), failures)
+        failures = failures_of(file, plan.setup.ego_name, plan=portfolio, setup=plan.setup)
+    return PlannerTrials(plan.setup, plan.methods, seeds=plan.asked.seeds, make=make, processes=processes_of(config), failures=failures)
 
 
 def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, Mapping]:
@@ -96,13 +96,13 @@ def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, M
         raise InputError(f"eta={config.eta}: an adversary is tuned at one intensity above 0")
 
     def make(parameters: Parameters) -> Any:
-        return build_traffic(with_changes(config.synthesizer, parameters, "tuning.space", "synthesizer"), plan.prior)
+        return build_traffic(with_changes(config.synthesizer, parameters, where="tuning.space", group="synthesizer"), plan.prior)
 
     present = make({})
     if not present.adversarial:
         raise InputError(f"synthesizer={config.synthesizer.name}: no adversary, so there is no attack to tune")
     nominal = Method(NOMINAL, build_traffic(method_config(config, NOMINAL), plan.prior))
-    trials = AttackTrials(plan.setup, nominal, etas[0], plan.asked.seeds, make, processes_of(config))
+    trials = AttackTrials(plan.setup, nominal, eta=etas[0], seeds=plan.asked.seeds, make=make, processes=processes_of(config))
     return trials, present.tuned
 
 
@@ -116,4 +116,4 @@ def flat(group: Mapping[str, Any], before: str = "") -> Parameters:
 
 def main() -> None:
     """The command."""
-    run_command("tune", tune, MAY_CHANGE)
+    run_command("tune", tune, may_change=MAY_CHANGE)

@@ -74,13 +74,13 @@ def build_plans(config: DictConfig, prior: Prior) -> list[Plan]:
     method = methods_at(eta[0])
     plans = []
     for name in rows_of(config):
-        changed, own = config_and_prior(config, name, prior)
+        changed, own = config_and_prior(config, name, prior=prior)
         if is_search(config, name):
-            plans.append(portfolio_plan(name, changed, partial(method, own)))
+            plans.append(portfolio_plan(name, changed, method=partial(method, own)))
         else:
             synthesizer = changed.synthesizer if name in config.variants else method_config(config, name)
             again = replace(SearchSettings(), cover=TRIES, bandit=False)
-            plans.append(Plan(name, [Family(name, name, {})], {name: method(own, name, synthesizer)}, again))
+            plans.append(Plan(name, [Family(name, name, ranges={})], traffic={name: method(own, name, synthesizer)}, settings=again))
     return plans
 
 
@@ -92,7 +92,7 @@ def methods_at(eta: float) -> Callable[[Prior, str, DictConfig], Method]:
         key = f"{id(prior)} {name} {OmegaConf.to_yaml(synthesizer)}"
         if key not in known:
             built = build_traffic(synthesizer, prior)
-            known[key] = Method(name, built, eta if built.adversarial else 0.0)
+            known[key] = Method(name, built, eta=eta if built.adversarial else 0.0)
         return known[key]
 
     return method
@@ -105,20 +105,20 @@ def portfolio_plan(name: str, config: DictConfig, method: Callable[[str, DictCon
     target = OmegaConf.create({"_target_": given.pop("_target_")})
     if not named:
         raise InputError("search.families: name at least one, such as +search.families.rule={}")
-    families = [family_of(str(key), value, "search.families") for key, value in named.items()]
+    families = [family_of(str(key), value, where="search.families") for key, value in named.items()]
     traffic = {}
     methods = {name: method_config(config, name) for name in {each.method for each in families}}
     for each in families:
         where = f"search.families.{each.name}.changes"
         own = methods[each.method]
-        traffic[each.name] = method(each.method, with_changes(own, each.changes, where, "synthesizer"))
+        traffic[each.name] = method(each.method, with_changes(own, each.changes, where=where, group="synthesizer"))
         if each.ranges and not traffic[each.name].traffic.follows_decisions:
             decision = next(iter(each.ranges))
             raise InputError(
                 f"search.families.{each.name}.{decision}: {each.method} does not decide this; leave it out"
             )
     return Plan(
-        name, families, traffic, settings_of(SearchSettings, given, "search"), partial(built, target, "search", Search)
+        name, families, traffic=traffic, settings=settings_of(SearchSettings, given, where="search"), search=partial(built, target, "search", Search)
     )
 
 
@@ -155,7 +155,7 @@ def spend(searches: Sequence[tuple], work: Work = HERE) -> list[tuple[Scored, li
     while rounds:
         jobs = [(f"search-{number:03}/tries-{job:06}", part) for number, jobs in rounds.items() for job, part in jobs]
         first = first_names(jobs) if first is None else ()  # of the first round
-        scored = score_all(jobs, work, lambda job: len(job[1][2]), first=first)
+        scored = score_all(jobs, work, cost=lambda job: len(job[1][2]), first=first)
         after = {}
         for number, asked in rounds.items():
             found: Scored = ([], [], [])
@@ -219,7 +219,7 @@ def spending(
     search = plan.begin(setup, seed, scenes)
     told = list[dict]()
     found: Scored = ([], [], [])
-    account = Account(budget, unit, {family.name: (family.nfe, 0.0) for family in plan.families})
+    account = Account(budget, unit, cost={family.name: (family.nfe, 0.0) for family in plan.families})
     generator = torch.Generator().manual_seed(seed)
     driven = 0
     with Bar(total=budget, desc=f"{plan.name}: {unit} a scene") as bar:
@@ -231,7 +231,7 @@ def spending(
                 tries = account.affordable(asked[len(outcomes) :], active)
                 if not tries:
                     return found, told
-                scored = yield list(enumerate(batches(setup, plan, seed, scenes, tries), driven))
+                scored = yield list(enumerate(batches(setup, plan, seed=seed, scenes=scenes, tries=tries), driven))
                 driven += len(tries)
                 known = {(row["scene_id"], row["seed"]): row for row in scored[0]}
                 rows = [known[setup.scenes.scene_id[scenes[one.scene]], row_seed(seed, one)] for one in tries]
@@ -241,7 +241,7 @@ def spending(
                         break
                     charged.append(row)
                     outcomes.append(outcome_of(row, account.cost[one.family][0]))
-                    told += [] if lost(row) else [told_of(row, one.family, outcomes[-1]) | account.spent]
+                    told += [] if lost(row) else [told_of(row, one.family, outcome=outcomes[-1]) | account.spent]
                 extend(found, within(scored, charged))
                 timeless = unit == "seconds" and all(row["errored"] == 1 for row in found[0])
                 if len(charged) < len(tries) or timeless:  # nothing tells how long those would take that all errored
@@ -256,8 +256,8 @@ def spending(
 def outcome_of(row: Mapping, nfe: float) -> Outcome:
     """Returns what became of the try of a row; one that errored came nowhere near."""
     if row["errored"] == 1:
-        return Outcome(-FARTHEST, "", nfe, raised(row))
-    return Outcome(row["margin"], ", ".join(cell_of(row) or ()), nfe)
+        return Outcome(-FARTHEST, "", nfe=nfe, raised=raised(row))
+    return Outcome(row["margin"], ", ".join(cell_of(row) or ()), nfe=nfe)
 
 
 def told_of(row: Mapping, family: str, outcome: Outcome) -> dict:
@@ -282,7 +282,7 @@ def batches(setup: Setup, plan: Plan, seed: int, scenes: Sequence[int], tries: S
     by_method: dict[int, list] = {}
     for one in sorted(tries, key=lambda one: (one.scene, one.number)):
         tasks = by_method.setdefault(id(plan.traffic[one.family]), [])  # of one traffic method
-        tasks.append(Task(scenes[one.scene], row_seed(seed, one), one))
+        tasks.append(Task(scenes[one.scene], row_seed(seed, one), one=one))
     parts = []
     for tasks in by_method.values():
         method = replace(plan.traffic[tasks[0].one.family], name=plan.name)
@@ -324,7 +324,7 @@ def failures_of(file: Path, ego_name: str, plan: Plan, setup: Setup) -> list[Par
         scene = setup.scenes.index(scene_id)
         drawn = families[name].draw(scene, number % TRIES, searches[seed].seed_of(scene), plan.settings.stratified)
         tries.setdefault(seed, []).append(drawn)
-    return [part for seed, own in tries.items() for part in batches(setup, plan, seed, every, own)]
+    return [part for seed, own in tries.items() for part in batches(setup, plan, seed=seed, scenes=every, tries=own)]
 
 
 def write_tries(path: Path, told: Sequence[Mapping]) -> None:

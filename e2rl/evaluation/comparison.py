@@ -136,7 +136,7 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
     theirs = second.rollouts()
     others = second.units()
     groups = []
-    pairs = [pair_of(key, ours[key], theirs[key], first.searched) for key in ours if key in theirs]
+    pairs = [pair_of(key, ours[key], others=theirs[key], searched=first.searched) for key in ours if key in theirs]
     found = [pair for pair in pairs if pair]
     found.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))
     for (method, eta), rows in first.units().items():
@@ -162,7 +162,7 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
 def difference(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Paired differences of all metrics that need no samples (`paired_differences`)."""
     samples = [[NO_SAMPLES] * len(each) for each in (rows, others)]
-    return paired_differences(rows, samples[0], others, samples[1], realism_draws=0)
+    return paired_differences(rows, samples[0], other_rows=others, other_samples=samples[1], realism_draws=0)
 
 
 def check_shared(first: Driven, second: Driven) -> None:

@@ -61,7 +61,7 @@ class EgoSet:
         Rows of the first name of a pair are compared with the second's under `ego SECOND` of their `paired`.
         references, fields: see `e2rl.evaluation.summary.metric_rows`.
         """
-        pooled, more = pool_trainings(rows, features, self.trainings)
+        pooled, more = pool_trainings(rows, features, trainings=self.trainings)
         result = metric_rows(rows + pooled, features + more, egos=self.pairs, references=references, **fields)
         counts = {name: len(members) for name, members in self.trainings.items()}
         return [row | {"n_trainings": counts[row["ego"]]} if row["ego"] in counts else row for row in result]
@@ -85,7 +85,7 @@ def recorded_acceleration(scenes: SceneSet) -> float:
     found = []
     for part in scenes.parts():
         stop = torch.full((len(part),), scenes.steps)
-        found.append(mean_acceleration(*ego_path(part["logged"].double(), part["logged_valid"], stop)))
+        found.append(mean_acceleration(*ego_path(part["logged"].double(), part["logged_valid"], stop=stop)))
     return torch.cat(found).nanmean().item()
 
 
@@ -111,11 +111,11 @@ def build_egos(config: DictConfig, name: str) -> EgoSet:
         taken = [own for own in members if own in egos or (own != entry and own in config.egos)]
         if taken:
             raise InputError(f"egos.{entry}: {', '.join(taken)} is the name of another ego, too; choose another name")
-        egos |= {own: one_ego(config, entry, changes) for own, changes in members.items()}
+        egos |= {own: one_ego(config, entry, changes=changes) for own, changes in members.items()}
     counts = {len(members) for members in trainings.values()}
     if len(counts) > 1:
         raise InputError(f"egos: {' and '.join(trainings)} have different numbers of checkpoints; give as many of each")
-    return EgoSet(egos, list(map(str, config.egos)), compared(config), trainings)
+    return EgoSet(egos, list(map(str, config.egos)), pairs=compared(config), trainings=trainings)
 
 
 def trainings_of(config: DictConfig, name: str) -> dict[str, dict[str, Any]]:

@@ -63,9 +63,9 @@ class Tally:
         rollout, agent = evaluated(scenes).nonzero(as_tuple=True)
         for part in torch.arange(len(rollout)).split(TRACKS):
             key = index[rollout[part]] * self.vehicles + agent[part]
-            values, events = track_features(batch, rollout[part], agent[part])
+            values, events = track_features(batch, rollout[part], agent=agent[part])
             for name, (value, known) in values.items():
-                bins = bin_counts(bin_index(value, FEATURES[name]), known, FEATURES[name].bins)
+                bins = bin_counts(bin_index(value, FEATURES[name]), known, bins=FEATURES[name].bins)
                 self.counts[name].index_add_(0, key, bins, alpha=weight)
             for name, event in events.items():
                 self.hits[name].index_add_(0, key, event.double(), alpha=weight)
@@ -82,18 +82,18 @@ class Tally:
             for part in torch.arange(len(row)).split(TRACKS):
                 scene = begin + row[part]
                 key = scene * self.vehicles + agent[part]
-                values, events = track_features(batch, row[part], agent[part])
+                values, events = track_features(batch, row[part], agent=agent[part])
                 for name, (value, known) in values.items():
                     log_p = log_probability(self.counts[name][key], bin_index(value, FEATURES[name]))
                     found[name].append((log_p, known, scene))
                 for name, event in events.items():
-                    log_p = log_bernoulli(self.hits[name][key], self.rollouts[key], event)[:, None]
+                    log_p = log_bernoulli(self.hits[name][key], self.rollouts[key], happened=event)[:, None]
                     found[name].append((log_p, torch.ones_like(log_p, dtype=torch.bool), scene))
             begin += len(scenes)
         result = {}
         for name, parts in found.items():
             log_p, known, scene = map(torch.cat, zip(*parts, strict=True))
-            result[name] = likelihood(log_p, known, scene, len(self.scenes))
+            result[name] = likelihood(log_p, known, scene=scene, scenes=len(self.scenes))
         return result
 
 
@@ -150,7 +150,7 @@ def meta_rows(setup: Setup, methods: Sequence[Method], rollouts: int, parts: Par
             key = (scenes.dataset, scenes.split, method.name, setup.ego_name, method.eta)
             fields = {"stage": META_STAGE, "errored": dict(Counter(errored))}
             rolled = rollouts * len(scenes) - len(errored) * (rollouts // count)
-            rows.append(metric_row(key, len(scenes), rollouts, rolled, metrics, **fields))
+            rows.append(metric_row(key, len(scenes), seeds=rollouts, rollouts=rolled, metrics=metrics, **fields))
     return rows
 
 
@@ -158,7 +158,7 @@ def summarise_meta(likelihoods: dict[str, Tensor], scenes: SceneSet) -> dict[str
     """{metric: {mean, low, high, n}} of likelihoods [S] per scene; n counts the scenes with an evaluated vehicle."""
     cluster, clusters = cluster_index(scenes.location, scenes.scene_id)
     table = torch.stack([meta_metric(likelihoods), *likelihoods.values()], -1)
-    means = resampled_means(table, torch.ones_like(table), cluster, bootstrap_draws(clusters))
+    means = resampled_means(table, torch.ones_like(table), cluster=cluster, draws=bootstrap_draws(clusters))
     known = ~table.isnan()
     return {
         name: interval(means[:, k], len(cluster[known[:, k]].unique())) | {"n": int(known[:, k].sum())}
@@ -178,6 +178,6 @@ def log_split_half(scenes: SceneSet) -> dict[str, float]:
     cluster, clusters = cluster_index(scenes.location, scenes.scene_id)
     generator = torch.Generator().manual_seed(0)
     order = torch.rand(SPLITS, clusters, generator=generator).argsort(1)
-    values = split_half(samples, cluster, order < clusters // 2)
+    values = split_half(samples, cluster, halves=order < clusters // 2)
     low, high = values.nanquantile(values.new_tensor(LEVELS)).tolist()
     return {"mean": values.nanmean().item(), "low": low, "high": high, "n": len(scenes)}

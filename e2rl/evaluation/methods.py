@@ -35,14 +35,14 @@ LISTS = ("methods", "eta", "seeds", "compare", "budget", "shard")
 
 def build_prior(config: DictConfig, device: str = "cpu") -> tuple[Prior, dict]:
     """The frozen prior of `config.prior` and the origin in its checkpoint."""
-    sampler = settings_of(SamplerSettings, config.prior.sampler, "prior.sampler")
-    bounds = settings_of(BoundSettings, config.prior.bounds, "prior.bounds")
-    return load_prior(config.prior.checkpoint, sampler, bounds, device)
+    sampler = settings_of(SamplerSettings, config.prior.sampler, where="prior.sampler")
+    bounds = settings_of(BoundSettings, config.prior.bounds, where="prior.bounds")
+    return load_prior(config.prior.checkpoint, sampler, bounds=bounds, device=device)
 
 
 def build_traffic(synthesizer: DictConfig, prior: Prior) -> Traffic:
     """The traffic method of a `synthesizer` group on a prior."""
-    return built(synthesizer, "synthesizer", Traffic, prior=prior)
+    return built(synthesizer, "synthesizer", kind=Traffic, prior=prior)
 
 
 def rows_of(config: DictConfig) -> list[str]:
@@ -58,10 +58,10 @@ def build_methods(config: DictConfig, prior: Prior) -> list[Method]:
     cannot be."""
     methods = []
     for name in rows_of(config):
-        changed, own = config_and_prior(config, name, prior)
+        changed, own = config_and_prior(config, name, prior=prior)
         traffic = build_traffic(changed.synthesizer if name in config.variants else method_config(config, name), own)
         etas = as_list(config.eta) if traffic.adversarial else [0.0]
-        methods += [Method(name, traffic, float(eta)) for eta in etas]
+        methods += [Method(name, traffic, eta=float(eta)) for eta in etas]
     return methods
 
 
@@ -78,12 +78,12 @@ def method_config(config: DictConfig, name: str) -> DictConfig:
 
 def build_ego(config: DictConfig) -> Ego:
     """The ego of the `ego` group, a class from outside of e2rl included."""
-    return built(config.ego, "ego", Ego)
+    return built(config.ego, "ego", kind=Ego)
 
 
 def build_sim(config: DictConfig) -> SimSettings:
     """The simulator's settings."""
-    return settings_of(SimSettings, config.sim, "sim")
+    return settings_of(SimSettings, config.sim, where="sim")
 
 
 # --- what evaluate.py is asked for
@@ -109,7 +109,7 @@ class EvaluationSettings:
 
     def __post_init__(self) -> None:
         check_settings(self, "")
-        check_choice("metrics", self.metrics, (*table_names(), ALL))
+        check_choice("metrics", self.metrics, choices=(*table_names(), ALL))
         for name in ("eta", "seeds"):
             if not getattr(self, name):
                 raise InputError(f"{name}=[]: name at least one")
@@ -191,7 +191,7 @@ def varied(config: DictConfig, name: str) -> DictConfig:
     for key, value in ((str(key), value) for key, value in changes.items()):
         if key.split(".")[0] not in VARIED:
             raise InputError(f"variants.{name}: {key} is none of {', '.join(VARIED)}, nor in one of them")
-        changed = with_changes(changed, {key: value}, f"variants.{name}: {key}={value}", "")
+        changed = with_changes(changed, {key: value}, where=f"variants.{name}: {key}={value}", group="")
     return changed
 
 

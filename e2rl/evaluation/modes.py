@@ -63,13 +63,13 @@ def find_modes(rows: Sequence[dict]) -> dict:
     if len(large) < len(set(numbers)):
         members[OTHER] = [row for row in failures if row["mode"] not in large]
     groups = [dict(zip(GROUP, key, strict=True)) for key in dict.fromkeys(group_of(row) for row in rows)]
-    counts = [group_counts(group, rows, members) for group in groups]
+    counts = [group_counts(group, rows, members=members) for group in groups]
     return {
         "failures": len(failures),
         "rollouts": sum(not lost(row) for row in rows),
         "unknown": [column for column in FEATURES if failures and column not in used],
         "groups": counts,
-        "modes": [describe(number, ours, counts) for number, ours in members.items()],
+        "modes": [describe(number, ours, groups=counts) for number, ours in members.items()],
     }
 
 

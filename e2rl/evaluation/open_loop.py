@@ -61,7 +61,7 @@ def open_loop_rows(
         done = found["scenes"]
         key = (scenes.dataset, scenes.split, method.name, EGO, method.eta)
         fields = {"stage": OPEN_LOOP_STAGE, "errored": found["errored"]}
-        rows.append(metric_row(key, done, count, done * count, found["metrics"], **fields))
+        rows.append(metric_row(key, done, seeds=count, rollouts=done * count, metrics=found["metrics"], **fields))
     return rows
 
 
@@ -87,10 +87,10 @@ def open_loop_metrics(scenes: SceneSet, method: Method, count: int, device: str)
         found, others = attempt(plan, batch.tolist())
         planned += found
         errored += [why for _, why in others]
-    require_rows(planned, errored, None)
+    require_rows(planned, errored, folder=None)
     done = [scene for tasks, _ in planned for scene in tasks]
     columns = torch.cat([part.exclude("states", "valid") for _, part in planned])
-    return {"metrics": _displacements(columns, scenes, done), "scenes": len(done), "errored": count_reasons(errored)}
+    return {"metrics": _displacements(columns, scenes, done=done), "scenes": len(done), "errored": count_reasons(errored)}
 
 
 def _displacements(columns: TensorDict, scenes: SceneSet, done: Sequence[int]) -> dict[str, dict[str, float]]:
@@ -106,7 +106,7 @@ def _displacements(columns: TensorDict, scenes: SceneSet, done: Sequence[int]) -
         }
         quotients |= {f"{name}_ratio{at}": (columns[name + at], straight) for name in ("min_ade", "mean_ade")}
         totals, weights = (torch.stack(column, -1) for column in zip(*quotients.values(), strict=True))
-        means = resampled_means(totals, weights, cluster, draws)
+        means = resampled_means(totals, weights, cluster=cluster, draws=draws)
         places = len(cluster[vehicles > 0].unique())
         result |= {name: interval(means[:, k], places) | {"n": int(vehicles.sum())} for k, name in enumerate(quotients)}
     return result
@@ -139,15 +139,15 @@ def spread_rows(
         )
         key = (scenes.dataset, scenes.split, method.name, EGO, method.eta)
         count = len(scenes)
-        metrics = _spread(few_sums, many_sums, scenes)
-        rows.append(metric_row(key, count, samples, count * samples, metrics, stage=SPREAD_STAGE))
+        metrics = _spread(few_sums, many_sums, scenes=scenes)
+        rows.append(metric_row(key, count, seeds=samples, rollouts=count * samples, metrics=metrics, stage=SPREAD_STAGE))
     return rows
 
 
 def _sums(prior: Prior, scenes: SceneSet, samples: int, device: str) -> Tensor:
     """Sums [R, 7] of each scene: see `sample_variances`."""
     found = [
-        torch.stack(list(sample_variances(prior, scenes.batch(rows).to(device), samples).values()), -1).cpu()
+        torch.stack(list(sample_variances(prior, scenes.batch(rows).to(device), samples=samples).values()), -1).cpu()
         for rows in torch.arange(len(scenes)).split(BATCH)
     ]
     return torch.cat(found)
@@ -158,12 +158,12 @@ def _spread(few: Tensor, many: Tensor, scenes: SceneSet) -> dict[str, dict[str, 
     cluster, clusters = cluster_index(scenes.location, scenes.scene_id)
     draws = bootstrap_draws(clusters)
     vehicles = few[:, 3:4].expand(-1, 3)
-    of_few, of_many = (resampled_means(sums[:, :3], vehicles, cluster, draws) for sums in (few, many))
+    of_few, of_many = (resampled_means(sums[:, :3], vehicles, cluster=cluster, draws=draws) for sums in (few, many))
     for means in (of_few, of_many):
         means[:, 2] = means[:, 2].sqrt()
     places = len(cluster[few[:, 3] > 0].unique())
     names = [metric.name for metric in STAGES[SPREAD_STAGE]]
-    covered = resampled_means(few[:, 4:6], few[:, 6:].expand(-1, 2), cluster, draws)
+    covered = resampled_means(few[:, 4:6], few[:, 6:].expand(-1, 2), cluster=cluster, draws=draws)
     columns = torch.cat([of_few, of_few / of_many, covered], 1)
     counts = [*[int(few[:, 3].sum())] * 6, *[int(few[:, 6].sum())] * 2]
     return {name: interval(columns[:, k], places) | {"n": counts[k]} for k, name in enumerate(names)}

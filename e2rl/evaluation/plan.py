@@ -62,7 +62,7 @@ class Evaluation:
         methods = [each for each in self.methods if (each.name, each.eta) == (name, row["eta"])]
         parts: list[Part] = [(setup, method, [task]) for method in methods]
         for search in (each for each in self.searches if each.name == name):
-            parts += failures_of(run / TRIES_FILE, setup.ego_name, search, setup)
+            parts += failures_of(run / TRIES_FILE, setup.ego_name, plan=search, setup=setup)
         for _, method, tasks in parts:
             if found := [each for each in tasks if each[:2] == task[:2]]:
                 return setup, method, found
@@ -76,7 +76,7 @@ def begin(run: Run) -> Evaluation:
     set_up(config)
     asked = evaluation_settings(config)
     egos = build_egos(config, ego_name(config.ego, run.choices["ego"]))
-    print(purpose(run, asked, list(egos.egos)), flush=True)
+    print(purpose(run, asked, egos=list(egos.egos)), flush=True)
     prepare_fused(config)
     prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
     methods = [] if asked.budget else build_methods(config, prior)
@@ -84,9 +84,9 @@ def begin(run: Run) -> Evaluation:
     scenes = load_scenes(config.data, asked.num_scenes, scenes=config.scenes, files=files_of_run(config))
     only = None if config.scene is None else [scenes.index(config.scene)]
     name, ego = next(iter(egos.egos.items()))
-    setup = Setup(scenes, ego, name, build_sim(config), config.batch, config.device)
+    setup = Setup(scenes, ego, ego_name=name, sim=build_sim(config), batch=config.batch, device=config.device)
     run.begin({"scenes": listed(scenes)})
-    return Evaluation(asked, egos, prior, origin, methods, searches, setup, only)
+    return Evaluation(asked, egos, prior=prior, origin=origin, methods=methods, searches=searches, setup=setup, only=only)
 
 
 def ego_name(ego: Mapping[str, Any], choice: str) -> str:

@@ -106,13 +106,13 @@ class Setup:
             folder: for the rollouts' files.
             begins: the ego begins the run with them; then InputError where its first plan is none.
         """
-        parts, errored = attempt(partial(self.roll_out, method), tasks, begins)
+        parts, errored = attempt(partial(self.roll_out, method), tasks, begins=begins)
         rows = []
         samples = []
         for done, rollouts in parts:
             found, features = score_rollouts(rollouts)
             if self.evasions:
-                add_avoidable(found, rollouts, self.scenes.batch([task.scene for task in done]), self.sim)
+                add_avoidable(found, rollouts, scene=self.scenes.batch([task.scene for task in done]), sim=self.sim)
             if folder is not None:
                 rollouts.to_npz(folder)
             rows += found
@@ -178,7 +178,7 @@ def run_protocol(
 ) -> list[dict]:
     """The rows of metrics.json of every method on every (scene, seed): `drive_all`, then `record` into a folder (None:
     nothing is written). fields: added to each row, or further arguments of `metric_rows`."""
-    scored = drive_all([setup], methods, seeds, Work(folder and folder / ROLLOUTS, processes, only, parts))
+    scored = drive_all([setup], methods, seeds=seeds, work=Work(folder and folder / ROLLOUTS, processes, only=only, parts=parts))
     return record(*scored, folder, partial(metric_rows, **fields))
 
 
@@ -200,7 +200,7 @@ def drive_all(setups: Sequence[Setup], methods: Sequence[Method], seeds: Sequenc
             bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
             bar.update(len(batch))
 
-        for scored in score_all(jobs, work, lambda job: job[1][1].eta, done, first_names(jobs)):
+        for scored in score_all(jobs, work, cost=lambda job: job[1][1].eta, done=done, first=first_names(jobs)):
             extend(found, scored)
     return found
 
@@ -245,7 +245,7 @@ def score_all(
         score = partial(setup.score, method, batch, into, begins=name in first)
         return parts.result(name, identity, score, partial(has_files, into))
 
-    for scored in in_processes(work, jobs, how.processes, cost, done):
+    for scored in in_processes(work, jobs, processes=how.processes, cost=cost, ended=done):
         if not has_files(into, scored):
             reason = "rollouts that a worker wrote are not here"
             raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
@@ -281,7 +281,7 @@ def record(
     if folder is not None:
         files.write_errored(folder / files.ERRORED_FILE, errored)
         files.write_rows(folder / files.TABLE, rows)
-    files.require_rows([row for row in rows if not lost(row)], errored, folder)
+    files.require_rows([row for row in rows if not lost(row)], errored, folder=folder)
     known = summarise(rows, samples)
     known += empty_rows(known, errored)
     result = [

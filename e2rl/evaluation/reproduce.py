@@ -51,22 +51,22 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     old = Path(config.reproduce).resolve()
     whole = config.copy()
     whole.failure = None
-    saved = saved_configuration(whole, old, where)
+    saved = saved_configuration(whole, old, where=where)
     known = read_provenance(old)
     if missing := [name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()]:
         raise InputError(f"{where}: {missing[0]} is missing; give a finished run of evaluate.py that has tables")
     read_metrics(old / METRICS_FILE)  # what is damaged is told now, and not at the end
     files = {name: value for name, value in known["inputs"].items() if "=" in name and isinstance(value, str)}
-    _move(config, saved, [_key(name) for name in files], known["choices"], where)
+    _move(config, saved, files=[_key(name) for name in files], choices=known["choices"], where=where)
     check_written(saved, old, where, config, load_config())
     saved.plugins = config.plugins
     saved.resume = None
     saved.reproduce = str(old)
     saved.scenes = str(old / SCENES)
     saved.failure = config.failure or saved.failure
-    _check_weights(config, saved, files, where)
-    _tell_versions(saved, known, where)
-    return Run(saved, Run.of(config).folder, known["choices"])
+    _check_weights(config, saved, files=files, where=where)
+    _tell_versions(saved, known, where=where)
+    return Run(saved, Run.of(config).folder, choices=known["choices"])
 
 
 def files_of_run(config: DictConfig) -> str:
@@ -200,7 +200,7 @@ def compare_tables(then: Sequence[Mapping], now: Sequence[Mapping]) -> Compariso
             close += 1
         else:
             different.append((name, old, new))
-    return Comparison(equal, close, different)
+    return Comparison(equal, close, different=different)
 
 
 def _numbers(row: Mapping) -> Iterator[tuple[str, Any]]:

@@ -160,7 +160,7 @@ def read_json(path: Path, wrong: Callable[[Any], str | None], printable: bool = 
         printable: its texts hold no control characters, as those of a traceback do.
     """
     try:
-        found = json.loads(read_regular(path, MAX_JSON, path.parent), parse_int=_whole)
+        found = json.loads(read_regular(path, MAX_JSON, within=path.parent), parse_int=_whole)
         if reason := wrong(found):
             raise ValueError(reason)
         if printable and (odd := next(filter(UNPRINTABLE.search, _texts(found)), None)):
@@ -225,7 +225,7 @@ def add_errored(path: Path, number: int, errored: Sequence[dict]) -> None:
     """Write the entries of round `number` of a training into its errored.json, after those of earlier rounds; a resumed
     run repeats some. A damaged file is begun anew."""
     try:
-        known = json.loads(read_regular(path, MAX_JSON, path.parent))
+        known = json.loads(read_regular(path, MAX_JSON, within=path.parent))
         earlier = [entry for entry in known if entry["round"] < number]
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
         earlier = []

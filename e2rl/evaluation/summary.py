@@ -75,7 +75,7 @@ def metric_rows(
             metrics |= scene_metrics(ours[0], draws)
         scenes = {row["scene_id"] for row in ours[0]}
         seeds = {row["seed"] // (TRIES if searched else 1) for row in ours[0]}
-        row = metric_row(key, len(scenes), len(seeds), len(ours[0]), metrics, paired=paired, **fields)
+        row = metric_row(key, len(scenes), seeds=len(seeds), rollouts=len(ours[0]), metrics=metrics, paired=paired, **fields)
         result.append(row | {"searched": searched, "headline": headline(ours[0], searched)._asdict()})
     return result
 
@@ -104,7 +104,7 @@ def scene_rows(rows: Sequence[Mapping], names: Collection[str] | None = None) ->
 def scene_metrics(rows: Sequence[Mapping], draws: int) -> dict[str, dict[str, float]]:
     """Returns the events of the scenes of tries as `summarise` gives them; rates per kilometre are not known."""
     scenes = scene_rows(rows)
-    found = summarise(scenes, [NO_SAMPLES] * len(scenes), draws, realism_draws=0)
+    found = summarise(scenes, [NO_SAMPLES] * len(scenes), draws=draws, realism_draws=0)
     nothing = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
     per_distance = {name: nothing for name, metric in METRICS.items() if metric.per}
     return {name: found[name] for name in events()} | per_distance
@@ -117,7 +117,7 @@ def empty_rows(known: Sequence[dict], errored: Sequence[dict]) -> list[dict]:
     absent = dict.fromkeys(map(group_of, errored))
     nothing = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
     shared = {name: known[0][name] for name in ("git", "command", "stage") if known and name in known[0]}
-    return [metric_row(key, 0, 0, 0, dict.fromkeys(METRICS, nothing), **shared) for key in absent if key not in present]
+    return [metric_row(key, 0, seeds=0, rollouts=0, metrics=dict.fromkeys(METRICS, nothing), **shared) for key in absent if key not in present]
 
 
 def _method_name(key: Key, keys: Collection[Key]) -> str:

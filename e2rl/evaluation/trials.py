@@ -105,9 +105,9 @@ class PlannerTrials:
         """
         setup = replace(self.setup, ego=self.make(parameters), evasions=False)
         work = Work(processes=self.processes)
-        found = drive_all([setup], self.methods, self.seeds, work)
+        found = drive_all([setup], self.methods, seeds=self.seeds, work=work)
         jobs = [(f"{number}", (setup, method, tasks)) for number, (_, method, tasks) in enumerate(self.failures)]
-        for scored in score_all(jobs, work, lambda job: len(job[1][2])):
+        for scored in score_all(jobs, work, cost=lambda job: len(job[1][2])):
             extend(found, scored)
         every, _, errored = found
         rows = [row for row in every if row["errored"] != 1]
@@ -144,7 +144,7 @@ class AttackTrials:
         """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of SOUGHT, and `errored`, the
         fraction that the traffic lost; and all of them as `NAME nominal` in nominal traffic. A rollout in which the
         planner raised is a failure of the planner."""
-        return self.measure(Method("trial", self.make(parameters), self.eta)) | self.reference
+        return self.measure(Method("trial", self.make(parameters), eta=self.eta)) | self.reference
 
     @cached_property
     def reference(self) -> dict[str, float]:
@@ -154,8 +154,8 @@ class AttackTrials:
     def measure(self, method: Method) -> dict[str, float]:
         """Returns the metrics of a method; InputError where all rollouts errored."""
         setup = replace(self.setup, evasions=False)  # no trial is judged by them
-        rows, samples, errored = drive_all([setup], [method], self.seeds, Work(processes=self.processes))
-        require_rows([row for row in rows if row["errored"] != 1], errored, None)
+        rows, samples, errored = drive_all([setup], [method], seeds=self.seeds, work=Work(processes=self.processes))
+        require_rows([row for row in rows if row["errored"] != 1], errored, folder=None)
         kept = [k for k, row in enumerate(rows) if not lost(row)]
         found = summarise([rows[k] for k in kept], [samples[k] for k in kept], realism_draws=0)
         metrics = {name: found[name]["mean"] for name in MEASURED}

@@ -77,12 +77,12 @@ def search(
         told: called with all rows after each trial.
     """
     ranges = distributions(present, space)
-    given = [{name: present[name] for name in space}, *sweep(present, space, settings.sweep)]
+    given = [{name: present[name] for name in space}, *sweep(present, space, count=settings.sweep)]
     task = {"space": {name: list(space[name]) for name in space}, "parameters": present, "sweep": settings.sweep}
     task = json.loads(json.dumps(nulls(task | {"objective": vars(objective)} | dict(about or {}))))
-    rows = read_study(file, task, ranges, objective)
+    rows = read_study(file, task, ranges=ranges, objective=objective)
     for number in range(len(rows), settings.trials):
-        parameters = given[number] if number < len(given) else proposal(rows, ranges, settings, objective)
+        parameters = given[number] if number < len(given) else proposal(rows, ranges, settings=settings, objective=objective)
         metrics = dict(evaluate(present | parameters))
         value, excess = objective.judge(metrics, rows[0]["metrics"] if rows else metrics)
         if math.isinf(excess) and not rows:
@@ -108,7 +108,7 @@ def read_study(file: Path | None, task: Mapping, ranges: Mapping, objective: Obj
         rows = [nans(row) for row in study["trials"]]
         if differ := sorted(name for name in {*known, *task} if known.get(name) != task.get(name)):
             raise InputError(f"tuning.study={file}: a study that differs in {', '.join(differ)}; name another file")
-        return [_row(row["parameters"], row["metrics"], rows[0]["metrics"], ranges, objective) for row in rows]
+        return [_row(row["parameters"], row["metrics"], reference=rows[0]["metrics"], ranges=ranges, objective=objective) for row in rows]
     except InputError:
         raise
     except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
@@ -207,6 +207,6 @@ def proposal(rows: Sequence[dict], ranges: Mapping, settings: SearchSettings, ob
 
 
 def _optuna() -> Any:
-    optuna = library("optuna", "tuning", "tune")
+    optuna = library("optuna", "tuning", extra="tune")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

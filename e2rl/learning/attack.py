@@ -40,7 +40,7 @@ def unsearched(states: Tensor) -> Solved:
     rows = states.shape[0]
     steps = states.shape[1] - 1
     span = torch.zeros(rows, 2, dtype=torch.int64)
-    return Solved(torch.ones(rows, dtype=torch.bool), torch.zeros(rows, steps, 2), span)
+    return Solved(torch.ones(rows, dtype=torch.bool), torch.zeros(rows, steps, 2), span=span)
 
 
 def solvable(traffic: Mapping[str, Tensor], scenes: SceneSet, sim: SimSettings) -> Solved:
@@ -54,18 +54,18 @@ def solvable(traffic: Mapping[str, Tensor], scenes: SceneSet, sim: SimSettings) 
         states, valid = (traffic[name].cpu()[hit] for name in ("states", "valid"))
         first = first_contact({"states": states, "valid": valid, **{key: scene[key] for key in ("size", "agent_type")}})
         late = (first["stop"] - LATE).clamp(min=0).masked_fill(~first["hit"], 0)
-        result = find_evasions(scene, states, valid, sim, moment=late)
+        result = find_evasions(scene, states, valid=valid, sim=sim, moment=late)
         begin = late
         again = (~result.found & (late > 0)).nonzero()[:, 0]
         if len(again):
-            result[again] = find_evasions(scene[again], states[again], valid[again], sim)
+            result[again] = find_evasions(scene[again], states[again], valid=valid[again], sim=sim)
             begin = begin.index_fill(0, again, 0)
         solved.entered[hit] = result.found
         shown = (result.found & first["hit"]).nonzero()[:, 0]
-        actions = spliced(dynamics.inverse(states[shown, :, 0]), result.actions[shown], begin[shown])
+        actions = spliced(dynamics.inverse(states[shown, :, 0]), result.actions[shown], moment=begin[shown])
         evasion = dynamics.rollout(states[shown, 0, 0], actions)
         solved.evasion[hit[shown]] = actions
-        solved.span[hit[shown]] = acting(evasion, states[shown, 1:, 0], begin[shown], first["stop"][shown])
+        solved.span[hit[shown]] = acting(evasion, states[shown, 1:, 0], begin=begin[shown], stop=first["stop"][shown])
     return solved
 
 
@@ -124,7 +124,7 @@ def make_traffic(
     rows = torch.arange(len(order.scenes)).split(batch)
     jobs = [(part, attack) for attack in ((True, False) if nominal else (True,)) for part in rows]
     work = partial(_make_part, order, synthesize, solvable)
-    parts = list(in_processes(work, jobs, processes, cost=lambda job: job[1]))
+    parts = list(in_processes(work, jobs, processes=processes, cost=lambda job: job[1]))
     errored = [entry for part in parts for entry in part.pop("errored")]
     traffic = {name: torch.cat([part[name] for part in parts]) for name in parts[0] if name not in FLAGS}
     attack, contact, entered = (torch.cat([part[name] for part in parts[: len(rows)]]) for name in FLAGS)
@@ -178,7 +178,7 @@ def mixture(first: Synthesize, second: Synthesize, fraction: float) -> Synthesiz
     """
 
     def synthesize(ego: Ego, scenes: Tensor, eta: Tensor, seed: int, *template: Tensor) -> dict[str, Any]:
-        other = drawn(scenes, seed, fraction)
+        other = drawn(scenes, seed, fraction=fraction)
         parts = []
         places = []
         errored = dict[int, dict]()

@@ -42,13 +42,13 @@ class BanditCurriculum(CurriculumScheduler):
         **scenes: Any,
     ) -> None:
         super().__init__(*run, **scenes)
-        check_range("curriculum.etas: intensities", len(etas), 1)
-        check_range("curriculum.etas", min(etas), 1e-6)
-        check_range("curriculum.templates: names", len(templates), 1)
+        check_range("curriculum.etas: intensities", len(etas), low=1)
+        check_range("curriculum.etas", min(etas), low=1e-6)
+        check_range("curriculum.templates: names", len(templates), low=1)
         for name in templates:
-            check_choice("curriculum.templates", name, TEMPLATES)
-        check_range("curriculum.forgetting", forgetting, 0, 1)
-        check_range("curriculum.fraction", fraction, 0, 1)
+            check_choice("curriculum.templates", name, choices=TEMPLATES)
+        check_range("curriculum.forgetting", forgetting, low=0, high=1)
+        check_range("curriculum.fraction", fraction, low=0, high=1)
         self.templates = tuple(dict.fromkeys(templates))
         levels = torch.tensor(sorted(set(etas)), dtype=torch.float32)
         codes = torch.tensor([TEMPLATES.index(name) for name in self.templates])

@@ -44,12 +44,12 @@ class BeforeAfter:
         """
         setup = replace(self.setup, ego=ego)
         folder = self.folder / stage
-        parts = Parts(self.folder, stage, f"after {rounds} rounds")
+        parts = Parts(self.folder, stage, about=f"after {rounds} rounds")
         measured = Parts(self.folder, "measured")
         work = Work(folder / ROLLOUTS, self.processes, parts=parts)
-        scored = drive_all([setup], self.methods, self.seeds, work)
+        scored = drive_all([setup], self.methods, seeds=self.seeds, work=work)
         if self.search is not None:
-            self._search(self.search, setup, work, folder / SEARCH)
+            self._search(self.search, setup, work=work, folder=folder / SEARCH)
         rows = record(*scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder)))
         if stage == "before":
             measured.save(stage, None, scored[:2])
@@ -64,7 +64,7 @@ class BeforeAfter:
     def _search(self, plan: Plan, setup: Setup, work: Work, folder: Path) -> None:
         """Write the tries of a stage, their rollouts and their atlas into a folder."""
         work = replace(work, into=folder / ROLLOUTS)
-        found, tries = search_all([setup], [plan], self.budget, "nfe", self.seeds[:1], work)
+        found, tries = search_all([setup], [plan], budget=self.budget, unit="nfe", seeds=self.seeds[:1], work=work)
         record(*found, folder, partial(metric_rows, searched=True))
         write_tries(folder / TRIES_FILE, tries)
 

@@ -89,7 +89,7 @@ def world_at(scene: TensorDictBase, step: int) -> World:
     change = torch.where((valid & scene["logged_valid"][:, step - 1])[..., None], now - before, 0.0) / DT
     turn = wrap(change[..., 2] * DT) / DT
     steps = torch.full((len(now),), step)
-    return World(scene, steps, now, valid, change[..., 3], turn_rate=turn)
+    return World(scene, steps, states=now, valid=valid, accel=change[..., 3], turn_rate=turn)
 
 
 def windows(scenes: SceneSet, seed: int, disturbed: Sequence[float] = DISTURBED) -> TensorDict:
@@ -104,10 +104,10 @@ def windows(scenes: SceneSet, seed: int, disturbed: Sequence[float] = DISTURBED)
     rows = (moving & (moved > MOVES)).nonzero()
     parts = []
     for scene, vehicle in Bar([part.unbind(1) for part in rows.split(CHUNK) if len(part)], "windows"):
-        own = as_ego(every, scene, vehicle)
+        own = as_ego(every, scene, vehicle=vehicle)
         for step in range(0, own["logged"].shape[1] - PLAN_STEPS, EVERY):
             exact = world_at(own, step)
-            parts += [_windows(world, scene) for world in (exact, _disturbed(exact, disturbed, generator))]
+            parts += [_windows(world, scene) for world in (exact, _disturbed(exact, disturbed, generator=generator))]
     found = torch.cat(parts) if parts else TensorDict({}, [0])
     if not len(found):
         raise InputError(f"{scenes.dataset}: no vehicle moves and is recorded for {PLAN_STEPS * DT:g} s; pass others")
@@ -135,7 +135,7 @@ def _windows(world: World, scene: Tensor) -> TensorDict:
     known = world.scene["logged_valid"][:, step : ahead.stop, 0].all(1)
     path = RoutePath(world.states[:, 0], route)
     hint = path.s + (future[..., 3] * DT).sum(1)
-    end, offset, _ = (value[:, 0] for value in project(future[:, -1:, :2], route, hint[:, None]))
+    end, offset, _ = (value[:, 0] for value in project(future[:, -1:, :2], route, hint=hint[:, None]))
     columns = {"observation": observed(world), "start": world.states[:, 0], "route": route, "future": future}
     columns |= {"distance": (end - path.s).clamp(min=0), "offset": offset, "scene_index": scene}
     follows = known & world.valid[:, 0] & (torch.maximum(offset.abs(), path.d.abs()) < FARTHEST)
@@ -153,11 +153,11 @@ def losses(network: BitsNetwork, batch: TensorDictBase, noise: Tensor | None = N
     offset = batch["offset"]
     path = RoutePath(start, batch["route"])
     code = network.encode(batch["observation"], noise)
-    cell, residual = cell_of(start[:, 3], distance, offset)
+    cell, residual = cell_of(start[:, 3], distance, side=offset)
     logits, residuals = network.goals(code)
     guessed = residuals.gather(1, cell[:, None, None].expand(-1, 1, 2))[:, 0]
     controls = network.controls(code, start[:, 3], path.d, distance[:, None], offset[:, None])
-    states = drive_controls(controls, start, path).states[:, 0]
+    states = drive_controls(controls, start, path=path).states[:, 0]
     gap = (states[..., :2] - batch["future"][..., :2]).square().sum(-1)
     return {
         "goal": F.cross_entropy(logits, cell),
@@ -179,7 +179,7 @@ class BitsTraining(Epochs):
     def loss(self, batch: TensorDictBase) -> Tensor:
         """The sum [] of the losses under noise on the input."""
         self.network.train()
-        parts = losses(self.network, batch, self.noise * torch.randn_like(batch["observation"]))
+        parts = losses(self.network, batch, noise=self.noise * torch.randn_like(batch["observation"]))
         return torch.stack(list(parts.values())).sum()
 
     def step(self, loss: Tensor) -> None:
@@ -216,10 +216,10 @@ def run_bits_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
     network = BitsNetwork(settings.hidden, DROPOUT).to(config.device)
     data = windows(scenes, settings.seed)
-    training = BitsTraining(network, data, settings)
+    training = BitsTraining(network, data, settings=settings)
     run.begin({"scenes": listed(scenes)})
     row = training.fit("bits", settings.epochs, run.parts("bits"), vars(settings), logger)
     origin = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), **origin_of(run.folder)}
     given = {"windows": len(data), "settings": vars(settings), "result": row}
-    save_bits(network, run.folder / WEIGHTS, origin | given)
+    save_bits(network, run.folder / WEIGHTS, origin=origin | given)
     return row

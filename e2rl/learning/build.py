@@ -53,13 +53,13 @@ def build_evolution(
     made_by = partial(synthesize_traffic, scenes, sim=sim, batch=config.batch, device=config.device)
     synthesize = synthesize or made_by(traffic)
     given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
-    curriculum = built(config.curriculum, "curriculum", CurriculumScheduler, **given)
-    check_templates(curriculum, config.synthesizer.name, traffic)
-    settings = settings_of(RoundSettings, _with_prefetch(config, ego), "learner.round")
+    curriculum = built(config.curriculum, "curriculum", kind=CurriculumScheduler, **given)
+    check_templates(curriculum, config.synthesizer.name, traffic=traffic)
+    settings = settings_of(RoundSettings, _with_prefetch(config, ego), where="learner.round")
     if settings.second:
         second = build_traffic(load_choice("synthesizer", settings.second), build_prior(config, config.device)[0])
-        check_templates(curriculum, settings.second, second)
-        synthesize = mixture(synthesize, made_by(second), settings.second_fraction)
+        check_templates(curriculum, settings.second, traffic=second)
+        synthesize = mixture(synthesize, made_by(second), fraction=settings.second_fraction)
     learner = OmegaConf.create({key: value for key, value in config.learner.items() if key != "round"})
     parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
     live = traffic if settings.traffic == "live" else None
@@ -67,7 +67,7 @@ def build_evolution(
     given["device"] = device = learner.pop("device", config.device)
     if live is not None and device != config.device:
         raise InputError(f"learner.device={device}: live traffic is made where the policy drives; set device={device}")
-    improve = built(learner, "learner", Improvement, **given)
+    improve = built(learner, "learner", kind=Improvement, **given)
     keep = partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
     workers = processes_of(config)
     how = (keep, Memory(folder, settings.memory), config.batch, workers if isinstance(workers, RayWorkers) else None)
@@ -88,7 +88,7 @@ def _with_prefetch(config: DictConfig, ego: Ego) -> dict:
     options = {"traffic": "replay", "prefetch": None} | resolved(config.learner.round)
     learns = config.learner.get("device", "cpu")
     device = str(learns if config.device == "cpu" else config.device)
-    reason = why_no_prefetch(device, config.threads, ego, options["traffic"])
+    reason = why_no_prefetch(device, config.threads, ego=ego, traffic=options["traffic"])
     if options["prefetch"] and reason:
         raise InputError(f"learner.round.prefetch=true: {reason}; set it to null or false")
     return options | ({"prefetch": not reason} if options["prefetch"] is None else {})
@@ -118,7 +118,7 @@ class MeasureSettings:
 def measure_settings(config: DictConfig) -> MeasureSettings:
     """Returns `config.measure`, checked."""
     lists = {name: as_list(config.measure[name]) for name in ("seeds", "eta")}
-    return settings_of(MeasureSettings, {**config.measure, **lists}, "measure")
+    return settings_of(MeasureSettings, {**config.measure, **lists}, where="measure")
 
 
 def check_training(config: DictConfig) -> MeasureSettings:
@@ -132,7 +132,7 @@ def check_training(config: DictConfig) -> MeasureSettings:
 
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:
     """The logger of config.logger, writing under a run's folder."""
-    return RunLogger(config.logger.kind, folder, config.logger.project, config.logger.name)
+    return RunLogger(config.logger.kind, folder, project=config.logger.project, name=config.logger.name)
 
 
 def build_measure(
@@ -152,14 +152,14 @@ def build_measure(
             data.split = None
     apart = options.path or source_of(data).has_splits
     scenes = load_scenes(data, options.scenes, split="tune", scenes=None if apart else config.scenes)
-    nominal = built(load_choice("synthesizer", "nominal"), "synthesizer", Traffic, prior=prior)
-    methods = [Method("nominal", nominal), *(Method(config.synthesizer.name, traffic, eta) for eta in options.eta)]
-    setup = Setup(scenes, ego, ego_name, build_sim(config), config.batch, config.device)
+    nominal = built(load_choice("synthesizer", "nominal"), "synthesizer", kind=Traffic, prior=prior)
+    methods = [Method("nominal", nominal), *(Method(config.synthesizer.name, traffic, eta=eta) for eta in options.eta)]
+    setup = Setup(scenes, ego, ego_name=ego_name, sim=build_sim(config), batch=config.batch, device=config.device)
     given = (setup, methods, options.seeds, folder, processes_of(config))
     if not options.budget:
         return BeforeAfter(*given)
 
-    search = portfolio_plan(SEARCH, config, partial(methods_at(max(options.eta)), prior))
+    search = portfolio_plan(SEARCH, config, method=partial(methods_at(max(options.eta)), prior))
     return BeforeAfter(*given, search, options.budget)
 
 

@@ -38,7 +38,7 @@ def demonstrations_of(
 
     action [B, T, C, 2], clipped here, all C of the same weight; scene_index [B].
     """
-    action = clip_expert(action[kept], env.action_spec.space.low[0], env.action_spec.space.high[0])
+    action = clip_expert(action[kept], env.action_spec.space.low[0], high=env.action_spec.space.high[0])
     weight = torch.full_like(action[..., 0], 1 / action.shape[1])
     scene = scene_index[:, None].to(kept.device).expand(kept.shape)[kept]
     found = {"observation": frames["observation"][kept], "action": action, "weight": weight, "scene_index": scene}

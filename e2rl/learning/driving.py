@@ -83,13 +83,13 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
     return Episodes(
         row,
         data["scene_index"][ended][:, 0],
-        adversarial[row],
-        contact[ended][:, 0],
-        metrics["off_road"][ended][:, 0],
-        after["episode_reward"][ended][:, 0],
-        metrics["progress"][ended][:, 0],
-        unknown,
-        unknown.clone(),
+        adversarial=adversarial[row],
+        contact=contact[ended][:, 0],
+        off_road=metrics["off_road"][ended][:, 0],
+        returns=after["episode_reward"][ended][:, 0],
+        progress=metrics["progress"][ended][:, 0],
+        acceleration=unknown,
+        survivable=unknown.clone(),
         batch_size=[len(row)],
     )
 
@@ -149,8 +149,8 @@ class PoolDriver:
         errored: list[dict] = []
         for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):
             begins = len(parts) == 1 and not errored
-            found, failed = attempt(lambda tasks: self._frames(ego, pool, tasks), rows.tolist(), begins)
-            parts += [episodes_of(frames, pool, torch.tensor(done)) for done, frames in found]
+            found, failed = attempt(lambda tasks: self._frames(ego, pool, rows=tasks), rows.tolist(), begins=begins)
+            parts += [episodes_of(frames, pool, rows=torch.tensor(done)) for done, frames in found]
             errored += [{"row": row, **why} for row, why in failed]
         every = torch.cat(parts)
         return every[every.row.argsort()], errored

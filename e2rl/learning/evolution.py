@@ -160,7 +160,7 @@ class Evolution:
         curriculum.update(episodes.scene_index, episodes.failed, episodes.adversarial, episodes.survivable)
         curriculum.observe(outcomes)
         curriculum.leave_out(order.scenes[outcomes.left_out])
-        self.choices = tally(order.number, curriculum.level(order.eta), outcomes, curriculum.values())
+        self.choices = tally(order.number, curriculum.level(order.eta), outcomes=outcomes, value=curriculum.values())
         curriculum.advance(contact)
         not_made = sum(entry["during"] == ATTACK for entry in attack.errored)
         attacked = {
@@ -213,18 +213,18 @@ class Evolution:
             pool = pool + TrafficPool.recorded(order.scenes)
         metrics = {"attacked": made.traffic["attacked"].item()}
         drawn = made.traffic["entered"].nonzero()[:, 0]
-        return RoundTraffic(pool, drawn, metrics, spent, made.traffic["contact"].item(), made.errored)
+        return RoundTraffic(pool, drawn, metrics=metrics, spent=spent, contact=made.traffic["contact"].item(), errored=made.errored)
 
     def _live(self, order: Order) -> RoundTraffic:
         """Rows whose traffic is replanned against the learning ego, attacked and nominal."""
         index, eta, template = (each.repeat(NOISES) for each in (order.scenes, order.eta, order.template))
         noise = index + (order.seed * NOISES + torch.arange(NOISES).repeat_interleave(len(order.scenes))) * 1_000_003
-        pool = TrafficPool.live(index, eta, noise, template)
+        pool = TrafficPool.live(index, eta, seed=noise, template=template)
         if self.settings.nominal == "prior":
-            pool = pool + TrafficPool.live(index, torch.zeros_like(eta), noise)
+            pool = pool + TrafficPool.live(index, torch.zeros_like(eta), seed=noise)
         elif self.settings.nominal == "log":
             pool = pool + TrafficPool.recorded(order.scenes)
-        return RoundTraffic(pool, torch.arange(len(order.scenes)).repeat(NOISES), {}, {"synthesize": 0.0})
+        return RoundTraffic(pool, torch.arange(len(order.scenes)).repeat(NOISES), metrics={}, spent={"synthesize": 0.0})
 
     def state_dict(self) -> dict:
         """Curriculum, improvement and the order of the coming round; the checkpoint adds weights, the memory's index

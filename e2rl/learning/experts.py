@@ -55,10 +55,10 @@ def evasion_demonstrations(driver: PoolDriver, pool: TrafficPool, number: int) -
         frames = driver.drive(GivenActions(actions[picked], hold), pool, rows[picked])
         step = hold * torch.arange(frames.shape[1])
         acts = (step >= span[picked, :1]) & (step < span[picked, 1:])
-        survived = ~episodes_of(frames, pool, rows[picked]).failed
+        survived = ~episodes_of(frames, pool, rows=rows[picked]).failed
         kept = frames["alive"] & (acts & (survived & once)[:, None]).to(frames.device)
         action = frames["executed"][:, :, None]
-        parts.append(demonstrations_of(frames, kept, pool.scene_index[rows[picked]], driver.env, action))
+        parts.append(demonstrations_of(frames, kept, scene_index=pool.scene_index[rows[picked]], env=driver.env, action=action))
     return torch.cat(parts) if parts else None
 
 
@@ -77,7 +77,7 @@ class Experts:
         """hold: steps of the policy's decisions, by which evasions are driven; recorded: demonstrations of the recorded
         egos; evasions: clone those in the pool's traffic."""
         self.recorded = recorded
-        self._driver = PoolDriver(scenes, sim, BATCH, device, hold) if evasions else None
+        self._driver = PoolDriver(scenes, sim, batch=BATCH, device=device, hold=hold) if evasions else None
         self._evaded: list[tuple[weakref.ref[Tensor], TensorDict | None]] = []
 
     def demonstrations(self, pool: TrafficPool) -> dict[str, TensorDictBase]:
@@ -92,7 +92,7 @@ class Experts:
         now = []
         for number, part in enumerate(pool.parts):
             made = [shown for of, shown in self._evaded if of() is part.evasion]
-            shown = made[0] if made else evasion_demonstrations(self._driver, pool, number)
+            shown = made[0] if made else evasion_demonstrations(self._driver, pool, number=number)
             now.append((weakref.ref(part.evasion), shown))
         self._evaded = now
         every = [shown for _, shown in now if shown is not None]

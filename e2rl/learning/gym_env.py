@@ -83,7 +83,7 @@ class DrivingVectorEnv(VectorEnv):
         last = stepped["next"]
         reward, terminated, truncated = (last[key][:, 0].numpy() for key in ("reward", "terminated", "truncated"))
         if self.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP:
-            return self._begun_in_next_step(last, reward, terminated, truncated)
+            return self._begun_in_next_step(last, reward, terminated=terminated, truncated=truncated)
         observation, info = self._shown(self._now)
         done = terminated | truncated
         if done.any():

@@ -62,14 +62,14 @@ def recorded_demonstrations(scenes: SceneSet, sim: SimSettings, seed: int, drive
     pool = TrafficPool.recorded(torch.arange(len(scenes)))
     parts = []
     batch = min(BATCH, len(scenes))
-    exact = PoolDriver(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch)
-    free = PoolDriver(scenes, replace(sim, replay_ego=False), batch)
+    exact = PoolDriver(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch=batch)
+    free = PoolDriver(scenes, replace(sim, replay_ego=False), batch=batch)
     todo = [(rows, number) for number in range(drives + 1) for rows in filled_batches(len(pool), batch)]
     for rows, number in Bar(todo, "demonstrations", unit="batch", leave=False):
         driver, label = (free, "intended") if number else (exact, "executed")
         frames = driver.drive(ReplayEgo(), pool, rows, _bursts(len(rows), generator) if number else None)
         action = frames[label][:, :, None]
-        parts.append(demonstrations_of(frames, frames["alive"], pool.scene_index[rows], driver.env, action))
+        parts.append(demonstrations_of(frames, frames["alive"], scene_index=pool.scene_index[rows], env=driver.env, action=action))
     return torch.cat(parts)
 
 
@@ -131,8 +131,8 @@ def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
         raise InputError("stage=imitation trains ego=actor; set it")
     settings = stage_settings(config, ImitationSettings)
     scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
-    shown = recorded_demonstrations(scenes, build_sim(config), settings.seed)
-    training = Imitation(ego.network, shown, settings)
+    shown = recorded_demonstrations(scenes, build_sim(config), seed=settings.seed)
+    training = Imitation(ego.network, shown, settings=settings)
     run.begin({"scenes": listed(scenes)})
     row = training.fit("imitation", settings.epochs, run.parts("imitation"), vars(settings), logger)
     ego.network.save(run.folder / WEIGHTS)

@@ -27,7 +27,7 @@ class RunLogger:
         """kind: csv (folder/logs/scalars/<group>/<name>.csv), tensorboard (folder/tensorboard), wandb (offline,
         folder/wandb), none. Choices are in folder/curriculum.csv in either case but none."""
         self._folder = Path(folder)
-        self._logger = _logger(kind, self._folder, project, name)
+        self._logger = _logger(kind, self._folder, project=project, name=name)
 
     def log(self, metrics: Mapping[str, float], step: int, choices: Sequence[Choice] = ()) -> None:
         """Write the metrics of a step, and the rows of a round's choices beside those of earlier rounds; raises
@@ -90,14 +90,14 @@ class RunLogger:
 
 def _logger(kind: str, folder: Path, project: str, name: str | None) -> Logger | None:
     """TorchRL's logger of a kind; None for none. Raises InputError for one that is unknown or not installed."""
-    check_choice("logger.kind", kind, KINDS)
+    check_choice("logger.kind", kind, choices=KINDS)
     if kind == "csv":
         return CSVLogger("logs", log_dir=str(folder))
     if kind == "wandb":
         given = {"offline": True, "save_dir": str(folder), "project": project, "log_env_packages": False}
         return WandbLogger(name or folder.name, **given)
     if kind == "tensorboard":
-        library("tensorboard", "logger=tensorboard", "tensorboard")
+        library("tensorboard", "logger=tensorboard", extra="tensorboard")
         return TensorboardLogger("tensorboard", log_dir=str(folder))
     return None
 

@@ -77,7 +77,7 @@ class Memory:
         """Rows of all rounds, the newest first, whose rows weigh `fresh` times as much as the others'. The tracks stay
         in their files."""
         made = [one.traffic for one in self.rounds]
-        *older, newest = (TrafficPool.stored(each, each["eta"], each["template"]) for each in made)
+        *older, newest = (TrafficPool.stored(each, each["eta"], template=each["template"]) for each in made)
         joined = replace(newest, weight=newest.weight * fresh)
         for pool in reversed(older):
             joined = joined + replace(pool, fresh=torch.zeros_like(pool.fresh))
@@ -111,4 +111,4 @@ class Memory:
                 errored = json.loads((file.metadata() or {}).get(ERRORED, "[]"))
         except (SafetensorError, OSError, ValueError) as error:
             raise InputError(f"{path}: damaged ({error}); restore it or begin a new run") from None
-        return Remembered(number, traffic, errored, zlib.crc32(path.read_bytes()))
+        return Remembered(number, traffic, errored=errored, crc32=zlib.crc32(path.read_bytes()))

@@ -51,9 +51,9 @@ class PlannerImprovement(Improvement):
         self.ego = ego
         self.present = dict(parameters)
         self.space = dict(space) or dict(ego.tuned)
-        self.search = settings_of(SearchSettings, {"seed": seed, "sweep": 0} | dict(search), "learner.search")
-        self.objective = settings_of(PlannerObjective, objective, "learner.objective")
-        self.driver = PoolDriver(scenes, sim, batch, device)
+        self.search = settings_of(SearchSettings, {"seed": seed, "sweep": 0} | dict(search), where="learner.search")
+        self.objective = settings_of(PlannerObjective, objective, where="learner.objective")
+        self.driver = PoolDriver(scenes, sim, batch=batch, device=device)
         self.trials: list[dict] = []
 
     def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
@@ -68,7 +68,7 @@ class PlannerImprovement(Improvement):
             own = sum(entry["raised_by"] == EGO for entry in errored)
             return named | summary | counted(errored) | {"errored": float(own)}
 
-        self.trials = search(evaluate, self.present, self.space, self.search, self.objective)
+        self.trials = search(evaluate, self.present, space=self.space, settings=self.search, objective=self.objective)
         first = self.trials[0]
         best = best_of(self.trials) or self.trials[0]
         self.present, episodes, errored = driven[self.trials.index(best)]

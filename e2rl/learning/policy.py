@@ -121,8 +121,8 @@ class PolicyImprovement(Improvement):
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
-        self.settings = settings_of(CollectSettings, collect, "learner.collect")
-        update = settings_of(UpdateSettings, ppo, "learner.ppo")
+        self.settings = settings_of(CollectSettings, collect, where="learner.collect")
+        update = settings_of(UpdateSettings, ppo, where="learner.ppo")
         batch = self.settings.batch
         self.horizon = scenes.steps
         hold = self.settings.hold
@@ -134,25 +134,25 @@ class PolicyImprovement(Improvement):
             )
         self.ego = ego
         self._learning = on_device(ego, device)
-        self.learner = Learner(self._learning.network, update, rounds * iterations)
+        self.learner = Learner(self._learning.network, update, total=rounds * iterations)
         self.frames = 0
         placed = scenes.to(device)
         self.experts: Experts | None = None
         self.teacher: Teacher | None = None
         if update.cloning > 0:
-            known = recorded_demonstrations(scenes, sim, seed) if recorded else None
-            self.experts = Experts(scenes, sim, hold, device, known, evasions)
+            known = recorded_demonstrations(scenes, sim, seed=seed) if recorded else None
+            self.experts = Experts(scenes, sim, hold=hold, device=device, recorded=known, evasions=evasions)
         if update.teaching > 0:
-            planner = teacher if isinstance(teacher, Ego) else built(OmegaConf.create(dict(teacher)), "teacher", Ego)
+            planner = teacher if isinstance(teacher, Ego) else built(OmegaConf.create(dict(teacher)), "teacher", kind=Ego)
             bounds = self._learning.network.low, self._learning.network.high
-            self.teacher = Teacher(planner, placed, bounds, hold, teaching)
+            self.teacher = Teacher(planner, placed, bounds=bounds, hold=hold, settings=teaching)
         every = torch.arange(len(scenes))
         self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
         self.reaction = None
         if react is not None:
-            self.reaction = Reaiming(settings_of(ReactSettings, react, "learner.react"), seed)
+            self.reaction = Reaiming(settings_of(ReactSettings, react, where="learner.react"), seed)
         pool = TrafficPool.recorded(every)
-        self.synthesizer = AdversarialSynthesizer(pool, self.draw, traffic, self._learning, self.reaction)
+        self.synthesizer = AdversarialSynthesizer(pool, self.draw, traffic=traffic, ego=self._learning, reaction=self.reaction)
         agents = traffic is not None or self.teacher is not None
         base = DrivingEnv(placed, sim, batch, device, agents=agents, hold=hold)
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
@@ -200,7 +200,7 @@ class PolicyImprovement(Improvement):
             rows.append(self.learner.update(data, [*experts.values()], labels) | made)
             bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
         self.ego.network.set_weights(self._learning.network.weights())
-        episodes = finished_episodes(outcomes, pool.adversarial, self.horizon, self.settings.hold)
+        episodes = finished_episodes(outcomes, pool.adversarial, horizon=self.horizon, hold=self.settings.hold)
         if self.teacher is not None:
             episodes.survivable = self.teacher.survivable(len(pool))[episodes.row]
         counts |= {"frames": float(self.frames), "collect": collecting}

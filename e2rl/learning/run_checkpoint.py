@@ -81,7 +81,7 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
             damages.append(str(error))
             print(f"passed over: {error}", file=sys.stderr)
             continue
-        _restore(folder, state, run)
+        _restore(folder, state, run=run)
         return run.round
     missing = f"{path}: holds no checkpoint; give a run's folder or one of its checkpoints/round-*"
     raise InputError(damages[0] if damages else missing)

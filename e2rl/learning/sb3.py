@@ -95,7 +95,7 @@ class Deterministic(nn.Module):
         for mean, scale, clip in self.normalisers:
             observation = ((observation - mean) / scale).clamp(-clip, clip)
         action = self.policy._predict(observation, deterministic=True)
-        return in_units(action, self.low, self.high)
+        return in_units(action, self.low, high=self.high)
 
 
 def check_spaces(model: BaseAlgorithm) -> None:

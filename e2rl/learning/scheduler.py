@@ -59,7 +59,7 @@ def outcomes_of(
     left_out = torch.ones(count, dtype=torch.bool).index_fill(0, drawn, False)
     episodes, failures = (torch.bincount(each, minlength=count) for each in (attack, attack[failed]))
     share = torch.full((count,), torch.nan).index_copy(0, attack, told)  # the same in all episodes of a row
-    return Outcomes(eta, template, left_out, episodes, failures, share)
+    return Outcomes(eta, template, left_out=left_out, episodes=episodes, failures=failures, survivable=share)
 
 
 def tally(number: int, level: Tensor, outcomes: Outcomes, value: Mapping[tuple[float, str], float]) -> list[Choice]:
@@ -153,7 +153,7 @@ class CurriculumScheduler(Extension):
     def draw(self, count: int) -> Tensor:
         """Scenes [count] to synthesize for: each scene count // S times, the rest by priority without replacement."""
         total = len(self._failing)
-        check_range("learner.round.scenes", count, 1)
+        check_range("learner.round.scenes", count, low=1)
         chosen = torch.arange(total).repeat(count // total)
         if count % total:
             rest = torch.multinomial(self.priority().double(), count % total, generator=self._generator)

@@ -16,10 +16,10 @@ class ConstantCurriculum(CurriculumScheduler):
 
     def __init__(self, *run: int, eta: float | Sequence[float], fraction: float, **scenes: Any) -> None:
         super().__init__(*run, **scenes)
-        check_range("curriculum.fraction", fraction, 0, 1)
+        check_range("curriculum.fraction", fraction, low=0, high=1)
         self._cycle = torch.tensor([eta] if isinstance(eta, int | float) else list(eta), dtype=torch.float32)
-        check_range("curriculum.eta: intensities", len(self._cycle), 1)
-        check_range("curriculum.eta", float(self._cycle.min()), 0)
+        check_range("curriculum.eta: intensities", len(self._cycle), low=1)
+        check_range("curriculum.eta", float(self._cycle.min()), low=0)
         self.eta = self._cycle.mean().item()
         self.fraction = fraction
 
@@ -45,9 +45,9 @@ class LinearCurriculum(CurriculumScheduler):
         **scenes: Any,
     ) -> None:
         super().__init__(*run, **scenes)
-        check_range("curriculum.fraction", fraction, 0, 1)
-        check_range("curriculum.fraction_final", fraction_final, 0, 1)
-        check_range("curriculum.spread", spread, 0)
+        check_range("curriculum.fraction", fraction, low=0, high=1)
+        check_range("curriculum.fraction_final", fraction_final, low=0, high=1)
+        check_range("curriculum.spread", spread, low=0)
         self._etas = (eta, eta_final)
         self._fractions = (fraction, fraction_final)
         self._ramp = ramp
@@ -92,10 +92,10 @@ class AdaptiveCurriculum(CurriculumScheduler):
         **scenes: Any,
     ) -> None:
         super().__init__(*run, **scenes)
-        check_range("curriculum.target_low", target_low, 0, target_high)
-        check_range("curriculum.target_high", target_high, target_low, 1)
-        check_range("curriculum.fraction", fraction, 0, 1)
-        check_range("curriculum.spread", spread, 0)
+        check_range("curriculum.target_low", target_low, low=0, high=target_high)
+        check_range("curriculum.target_high", target_high, low=target_low, high=1)
+        check_range("curriculum.fraction", fraction, low=0, high=1)
+        check_range("curriculum.spread", spread, low=0)
         self.eta = eta
         self.fraction = fraction
         self._band = (target_low, target_high)

@@ -26,7 +26,7 @@ MAX_GRAD_NORM = 1.0
 def stage_settings(config: DictConfig, kind: type[Settings]) -> Settings:
     """Returns the settings of the stage that a configuration has chosen, with the run's seed."""
     own = {key: value for key, value in resolved(config.stage).items() if key != "name"}
-    return settings_of(kind, own | {"seed": config.seed}, "stage")
+    return settings_of(kind, own | {"seed": config.seed}, where="stage")
 
 
 class Supervised(ABC):
@@ -142,7 +142,7 @@ class Epochs(Supervised):
 
     def step(self, loss: Tensor) -> None:
         """One step of the optimiser."""
-        take_step(self.optimiser, loss, MAX_GRAD_NORM)
+        take_step(self.optimiser, loss, max_grad_norm=MAX_GRAD_NORM)
 
     def state_dict(self) -> dict:
         own = {"optimiser": self.optimiser.state_dict(), "order": self._generator.get_state()}

@@ -80,7 +80,7 @@ class Teacher:
                 f"learner.teacher={type(planner).__name__}: it cannot tell what its candidates cost; take an "
                 "ScoringEgo such as e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
             )
-        self.settings = settings_of(TeachingSettings, settings, "learner.teaching")
+        self.settings = settings_of(TeachingSettings, settings, where="learner.teaching")
         self.planner = planner
         self.scenes = scenes
         self.bounds = bounds
@@ -99,7 +99,7 @@ class Teacher:
         """Look at up to `count` critical decisions, drawn evenly, of adversarial episodes in a batch [B, T] that `ego`
         drove. adversarial [R] bool: of the pool's rows. Returns how many there were, and the labels that they made."""
         attacked = adversarial.to(data.device)[data["traffic", "row"][..., 0]]
-        places = (attacked & critical(data, self.settings.window, self.settings.near)).nonzero()
+        places = (attacked & critical(data, self.settings.window, near=self.settings.near)).nonzero()
         row, column = places[torch.randperm(len(places), device=places.device)[:count]].unbind(1)
         frames = data.select("observation", "timestep", "scene_index", "agents")[row, column]
         if not len(frames):
@@ -119,8 +119,8 @@ class Teacher:
         and ego's plan does not."""
         settings = self.settings
         world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0]))
-        action, cost = ranked_actions(self.planner, world, CANDIDATES, self.hold)
-        own = self.planner.rated(world, ask(ego, "plan", world)[:, None])[:, 0]
+        action, cost = ranked_actions(self.planner, world, count=CANDIDATES, hold=self.hold)
+        own = self.planner.rated(world, ask(ego, "plan", world=world)[:, None])[:, 0]
         weight = torch.softmax(-cost / TEMPERATURE, -1)
         found = {"observation": frames["observation"], "action": clip_expert(action, *self.bounds), "weight": weight}
         kept = (own - cost[:, 0] >= settings.regret) & (cost[:, 0] < settings.survivable)

@@ -103,7 +103,7 @@ class Learner:
         for _ in range(settings.epochs):
             moved = []
             for minibatch in minibatches:  # every frame once
-                losses = self._step(minibatch, experts, labels, warming)
+                losses = self._step(minibatch, experts, labels=labels, warming=warming)
                 moved.append(losses["kl"])
                 for name, value in losses.items():
                     sums[name].append(value)
@@ -197,7 +197,7 @@ class Learner:
             shown = torch.cat([mirrored_demonstrations(shown[::2]), shown[1::2]])  # it holds for both sides
             losses |= self.teaching(shown).items()
             total = total + settings.teaching * losses["loss_teaching"]
-        take_step(self.optimiser, total, MAX_GRAD_NORM)
+        take_step(self.optimiser, total, max_grad_norm=MAX_GRAD_NORM)
         return {name: value.detach().mean() for name, value in losses.items()}
 
     def state_dict(self) -> dict:

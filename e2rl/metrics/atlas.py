@@ -19,7 +19,7 @@ def cell_of(row: Row) -> Cell | None:
     """The cell of a row of rollouts.csv, "" for a word that it does not know; None if it has no preventable failure."""
     if row.get("cfr_preventable") != 1 or not is_failure(row):
         return None
-    words = {name: word(row, name) for name in CELL} | {"speed_band": speed_band(number(row, "ego_speed", math.nan))}
+    words = {name: word(row, name) for name in CELL} | {"speed_band": speed_band(number(row, "ego_speed", unknown=math.nan))}
     return tuple(words[name] for name in CELL)
 
 
@@ -35,8 +35,8 @@ def by_likelihood(row: Row) -> tuple:
     """Sorts failures, the likeliest first: by the path KL [nats] that moved the traffic away from the prior, infinite
     where it is unknown (`transport`), then by the realism of the adversaries, the higher first, then by scene and
     seed."""
-    cost = number(row, "transport", math.inf)
-    realism = number(row, "real_adv", -math.inf)
+    cost = number(row, "transport", unknown=math.inf)
+    realism = number(row, "real_adv", unknown=-math.inf)
     return (cost, -realism, row["scene_id"], row["seed"], *identity(row))  # the last tells methods and egos apart
 
 

@@ -50,9 +50,9 @@ def first_contact(batch: Batch) -> Batch:
     ego_size = size[:, None, :1]
     everybody = states
     sizes = size[:, None]
-    area = pair_overlap(ego, ego_size, everybody, sizes, possible)
+    area = pair_overlap(ego, ego_size, second=everybody, second_size=sizes, possible=possible)
     born_inside = since_birth(area > 0, valid)
-    area, moment = with_passing(ego, ego_size, everybody, sizes, possible, area)
+    area, moment = with_passing(ego, ego_size, second=everybody, second_size=sizes, possible=possible, area=area)
     area = area * ~born_inside
     vehicle_area = area * (batch["agent_type"] == VEHICLE)[:, None]
     overlaps = (vehicle_area > 0).any(-1)
@@ -64,7 +64,7 @@ def first_contact(batch: Batch) -> Batch:
     kind = torch.full_like(stop, -1)
     latest = moment[row, stop, partner.clamp(min=0)]
     if hit.any():
-        boxes = boxes_at_contact(states[hit], size[hit], partner[hit], before[hit], stop[hit], latest[hit])
+        boxes = boxes_at_contact(states[hit], size[hit], partner=partner[hit], before=before[hit], stop=stop[hit], latest=latest[hit])
         kind[hit] = contact_kind(*boxes)
     contact = {"area": area, "start_overlap": overlaps[:, 0], "hit": hit, "stop": stop, "touching": at_stop > 0}
     contact |= {"partner": partner, "kind": kind, "before": before, "passes": hit & (latest < 1)}
@@ -95,17 +95,17 @@ def with_passing(
     one, one_size, two, two_size = (value[rollout, step, agent] for value in boxes)
     one_before, two_before = (boxes[index][rollout, step - 1, agent] for index in (0, 2))
     middle = [
-        between(then, now, torch.full_like(now[:, 0], 0.5)) for then, now in ((one_before, one), (two_before, two))
+        between(then, now, fraction=torch.full_like(now[:, 0], 0.5)) for then, now in ((one_before, one), (two_before, two))
     ]
     frame = torch.cat([torch.zeros_like(one[:, :2]), middle[0][:, 2:3]], -1)
     offset = to_frame(two_before[:, :2] - one_before[:, :2], frame).T
     moved = to_frame(change[rollout, step, agent], frame).T
     turn = middle[1][:, 2] - middle[0][:, 2]
     direction = torch.stack([turn.cos(), turn.sin()])
-    begin, end = time_inside(offset, moved, direction, own=(one_size / 2).T, other=(two_size / 2).T)
+    begin, end = time_inside(offset, moved, direction=direction, own=(one_size / 2).T, other=(two_size / 2).T)
     at = (begin + end) / 2
     inside = begin < end
-    shared = pair_overlap(between(one_before, one, at), one_size, between(two_before, two, at), two_size, inside)
+    shared = pair_overlap(between(one_before, one, fraction=at), one_size, second=between(two_before, two, fraction=at), second_size=two_size, possible=inside)
     area = area.clone()
     touched = shared > 0
     area[rollout[touched], step[touched], agent[touched]] = shared[touched]
@@ -163,11 +163,11 @@ def boxes_at_contact(
     high = latest
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        now = between(start, end, middle[:, None])
-        meet = separation(now[:, 0], sizes[:, 0], now[:, 1], sizes[:, 1]) <= 0
+        now = between(start, end, fraction=middle[:, None])
+        meet = separation(now[:, 0], sizes[:, 0], second=now[:, 1], second_size=sizes[:, 1]) <= 0
         low = torch.where(meet, low, middle)
         high = torch.where(meet, middle, high)
-    now = between(start, end, high[:, None])
+    now = between(start, end, fraction=high[:, None])
     return now[:, 0], sizes[:, 0], now[:, 1], sizes[:, 1]
 
 
@@ -176,8 +176,8 @@ def contact_kind(ego: Tensor, ego_size: Tensor, other: Tensor, other_size: Tenso
 
     Where no edge is inside (the other box lies wholly within the ego's) the edge nearest to its centre decides.
     """
-    parts = edge_parts_inside(ego, ego_size, other, other_size)
-    nearness = -edge_distances(ego, ego_size, other[..., :2])
+    parts = edge_parts_inside(ego, ego_size, other=other, other_size=other_size)
+    nearness = -edge_distances(ego, ego_size, point=other[..., :2])
     chosen = torch.where(parts.amax(-1, keepdim=True) > 1e-9, parts, nearness).argmax(-1)
     return torch.tensor(EDGE_KIND, device=ego.device)[chosen]
 
@@ -185,7 +185,7 @@ def contact_kind(ego: Tensor, ego_size: Tensor, other: Tensor, other_size: Tenso
 def kinds_at_stop(batch: Batch) -> Tensor:
     """Bool [B, 3] per KINDS: an edge of this kind has a part inside any vehicle that the ego touches at `stop`."""
     states = batch["states"][torch.arange(len(batch["stop"])), batch["stop"]]
-    parts = edge_parts_inside(states[:, :1], batch["size"][:, :1], states, batch["size"])
+    parts = edge_parts_inside(states[:, :1], batch["size"][:, :1], other=states, other_size=batch["size"])
     inside = ((parts > 1e-9) & batch["touching"][..., None]).any(1)
     left, rear, right, front = inside.unbind(-1)
     kinds = torch.arange(len(KINDS), device=states.device)
@@ -208,14 +208,14 @@ def kinds_at_stop(batch: Batch) -> Tensor:
     Metric(
         "relvel",
         "impact speed: of the ego relative to its partner, before contact",
-        "m/s",
+        unit="m/s",
         per_collision=True,
         tables="main adversaries methods egos",
     ),
     Metric(
         "contact_time",
         "median time of the first contact",
-        "s",
+        unit="s",
         median=True,
         per_collision=True,
         tables="main adversaries egos",
@@ -271,7 +271,7 @@ def traffic_contact_columns(batch: Batch) -> Batch:
     traffic = batch["traffic"]
     used = traffic.any(0).nonzero()[:, 0]
     one, two = used[torch.triu_indices(len(used), len(used), 1, device=states.device)]
-    index = nearby(states, size, one, two, batch["valid"] & traffic[:, None])
+    index = nearby(states, size, one=one, two=two, present=batch["valid"] & traffic[:, None])
     row, step, pair = index
     first, second = ((states[row, step, agent], size[row, agent]) for agent in (one[pair], two[pair]))
     overlap = torch.zeros(*states.shape[:2], len(one), dtype=torch.bool, device=states.device)

@@ -58,7 +58,7 @@ def scene_displacements(
     columns: dict[str, Tensor] = {}
     for horizon in HORIZONS:
         last = round(horizon / DT)
-        counted = moving_vehicles(logged, logged_valid, simulated, last)
+        counted = moving_vehicles(logged, logged_valid, simulated=simulated, steps=last)
         ade = torch.where(counted[:, None], planned[..., last - 1], 0.0)
         found = {
             "min_ade": ade.amin(1).sum(-1),

@@ -55,7 +55,7 @@ class DriverState(NamedTuple):
 
 def no_conflict(like: Tensor) -> DriverState:
     """State of a driver without a conflict, of the shape, dtype and device of `like` [...]."""
-    return DriverState(torch.full_like(like, -1), torch.zeros_like(like), torch.zeros_like(like, dtype=torch.bool))
+    return DriverState(torch.full_like(like, -1), torch.zeros_like(like), decided=torch.zeros_like(like, dtype=torch.bool))
 
 
 def elapsed(since: Tensor, perceived: Tensor) -> Tensor:
@@ -92,7 +92,7 @@ class HumanDriver(NamedTuple):
         since = elapsed(state.since, risk).masked_fill(~intrudes | o.resolved, -1)
         rising = (state.braking + self.jerk * DT).clamp(max=self.braking)
         braking = torch.where(since >= self.delay, rising, self.release * (since >= 0).to(since))
-        return DriverState(since, braking, state.decided), -braking
+        return DriverState(since, braking, decided=state.decided), -braking
 
 
 class RegulationLimit(NamedTuple):
@@ -120,7 +120,7 @@ class RegulationLimit(NamedTuple):
         enters = (o.lateral_gap <= self.release_gap) & (o.lateral_speed > 0) & (o.closing > 0) & (o.gap > 0)
         release = self.release * (enters & ~decided).to(since)
         braking = torch.where(since >= self.delay + self.lag, self.braking, release)
-        return DriverState(since, braking, decided), -braking
+        return DriverState(since, braking, decided=decided), -braking
 
 
 class ResponsibilitySensitiveSafety(NamedTuple):
@@ -159,7 +159,7 @@ class ResponsibilitySensitiveSafety(NamedTuple):
         since = elapsed(state.since, danger).masked_fill(~danger, -1)
         rising = (state.braking + self.jerk * DT).clamp(max=self.braking)
         braking = rising * (since >= self.response)
-        return DriverState(since, braking, state.decided), -braking
+        return DriverState(since, braking, decided=state.decided), -braking
 
 
 class FuzzySafetyModel(NamedTuple):
@@ -203,13 +203,13 @@ class FuzzySafetyModel(NamedTuple):
         passing = (o.gap + o.length + o.other_length) / o.closing + self.lateral_margin
         comes_over = (o.lateral_speed > 0) & (o.closing > 0) & (o.lateral_gap < passing * o.lateral_speed)
         checked = (o.overlaps | comes_over) & o.other_is_ahead
-        critical = self.critical(o.gap, o.speed, o.acceleration, o.other_speed)
+        critical = self.critical(o.gap, o.speed, acceleration=o.acceleration, other_speed=o.other_speed)
         hard = self.comfortable_braking + (self.braking - self.comfortable_braking) * critical
-        soft = self.comfortable_braking * self.proactive(o.gap, o.speed, o.other_speed)
+        soft = self.comfortable_braking * self.proactive(o.gap, o.speed, other_speed=o.other_speed)
         wanted = torch.where(critical > 0, hard, soft) * checked
         since = elapsed(state.since, wanted > 0).masked_fill(wanted <= 0, -1)
         braking = torch.minimum(wanted, state.braking + self.jerk * DT) * (since >= self.reaction)
-        return DriverState(since, braking, state.decided), -braking
+        return DriverState(since, braking, decided=state.decided), -braking
 
 
 Driver = HumanDriver | RegulationLimit | ResponsibilitySensitiveSafety | FuzzySafetyModel

@@ -45,7 +45,7 @@ declare(
         tables="main adversaries",
     ),
     rate("avoidable_1s", "the same, acting only 1 s before contact", per_collision=True),
-    Metric("evasion_accel", "peak acceleration of the mildest evasion found", "m/s²", per_collision=True),
+    Metric("evasion_accel", "peak acceleration of the mildest evasion found", unit="m/s²", per_collision=True),
 )
 
 
@@ -78,7 +78,7 @@ class Trials(TensorClass):
     def evasions(self) -> Evasions:
         """The best of each rollout."""
         best = self.best(1)[:, 0]
-        return Evasions(best.violation == 0, best.actions, best.states, best.peak, batch_size=best.batch_size)
+        return Evasions(best.violation == 0, best.actions, states=best.states, peak=best.peak, batch_size=best.batch_size)
 
 
 def find_evasions(
@@ -91,7 +91,7 @@ def find_evasions(
     """
     moment = torch.zeros(len(states), dtype=torch.int64, device=states.device) if moment is None else moment
     rows = torch.arange(len(states), device=states.device).split(CHUNK)
-    parts = [_search(scene[row], states[row].float(), valid[row], moment[row], sim) for row in rows]
+    parts = [_search(scene[row], states[row].float(), valid=valid[row], moment=moment[row], sim=sim) for row in rows]
     return Evasions.cat(parts)
 
 
@@ -99,8 +99,8 @@ def _search(scene: TensorDictBase, states: Tensor, valid: Tensor, moment: Tensor
     steps = states.shape[1] - 1
     driven = dynamics.inverse(states[:, :, 0])[..., 0].masked_fill(~valid[:, 1:, 0], 0.0)
     driven = driven.gather(1, (moment[:, None] + torch.arange(steps, device=moment.device)).clamp(max=steps - 1))
-    task = EvasionScene.after(moment, scene, states, valid)
-    pool = _try(task, *grid(driven, scene["route_valid"][:, 0], scene["route_log"][:, 0]), sim)
+    task = EvasionScene.after(moment, scene, states=states, valid=valid)
+    pool = _try(task, *grid(driven, scene["route_valid"][:, 0], mission=scene["route_log"][:, 0]), sim)
     result = pool.evasions()
     row = torch.arange(len(states), device=states.device)
     generator = torch.Generator().manual_seed(0)
@@ -162,10 +162,10 @@ def _try(task: EvasionScene, route: Tensor, accel: Tensor, shift: Tensor, sim: S
     """The manoeuvres of these knots, executed and judged."""
     row = torch.arange(len(route), device=route.device)[:, None]
     start = task.start[:, None].expand(*route.shape, 4)
-    actions, states = execute(start, task.routes[row, route], accel, shift, task.inside.shape[1], sim)
-    violation = violations(states, task, CLEARANCE, ROAD_MARGIN).sum(-1)
+    actions, states = execute(start, task.routes[row, route], accel=accel, shift=shift, steps=task.inside.shape[1], sim=sim)
+    violation = violations(states, task, clearance=CLEARANCE, road_margin=ROAD_MARGIN).sum(-1)
     peak = peak_acceleration(start, states)
-    return Trials(route, accel, shift, actions, states, violation, peak, batch_size=route.shape)
+    return Trials(route, accel, shift=shift, actions=actions, states=states, violation=violation, peak=peak, batch_size=route.shape)
 
 
 def _mutated(parents: Trials, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
@@ -218,7 +218,7 @@ def add_avoidable(rows: list[dict], rollouts: Rollouts, scene: TensorDictBase, s
     start = given[1][:, :1, 0]
     driven = given[1][:, 1:, 0]
     for evasion, begin in ((late, moment), (early, torch.zeros_like(moment))):
-        whole = torch.cat([start, spliced(driven, evasion.states, begin)], 1)
+        whole = torch.cat([start, spliced(driven, evasion.states, moment=begin)], 1)
         rollouts.evasion[picked[evasion.found]] = whole[evasion.found]
 
 

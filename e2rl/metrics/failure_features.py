@@ -53,10 +53,10 @@ def failure_columns(batch: Batch) -> Batch:
     speeds = batch["states"].new_full((len(hit), 2), torch.nan)
     if hit.any():
         window, known, size = last_seconds(batch)
-        manoeuvres = manoeuvre(window, known, lane_headings(batch, window, LANE_EVERY))
+        manoeuvres = manoeuvre(window, known, lanes=lane_headings(batch, window, every=LANE_EVERY))
         stands = manoeuvres[:, 1] == STANDS
         came, went = batch["moved_into"][hit].unbind(1)
-        words["approach"][hit] = approach(window, size, stands, came & ~went)
+        words["approach"][hit] = approach(window, size, stands=stands, entered=came & ~went)
         words["ego_manoeuvre"][hit], words["partner_manoeuvre"][hit] = manoeuvres.unbind(-1)
         speeds[hit] = window[:, -1, :, 3].abs()
     return words | {"ego_speed": speeds[:, 0], "partner_speed": speeds[:, 1]}
@@ -116,8 +116,8 @@ def approach(window: Tensor, size: Tensor, stands: Tensor, entered: Tensor) -> T
     relative = wrap(way[:, early, 1] - way[:, early, 0])
     ego = window[:, :, 0]
     other = window[:, :, 1]
-    (first, follows, side), (second, _, later_side) = (on_way(ego, other, size, step) for step in (early, late))
-    _, followed, _ = on_way(other, ego, size.flip(1), early)
+    (first, follows, side), (second, _, later_side) = (on_way(ego, other, size=size, step=step) for step in (early, late))
+    _, followed, _ = on_way(other, ego, size=size.flip(1), step=early)
     facing = torch.stack([*ego[:, late, :2].unbind(-1), way[:, late, 0]], -1)
     place = to_frame(other[:, late, :2], facing)
     angle = way[:, late, 1] - way[:, late, 0]
@@ -139,7 +139,7 @@ def on_way(ego: Tensor, other: Tensor, size: Tensor, step: int) -> tuple[Tensor,
     way = ego[:, step:]
     other = other[:, step]
     boxes, sizes = ego_path_boxes(way, size[:, 0])
-    touches = (separation(other[:, None], size[:, None, 1], boxes, sizes) <= 0).any(-1)
+    touches = (separation(other[:, None], size[:, None, 1], second=boxes, second_size=sizes) <= 0).any(-1)
     nearest = (way[..., :2] - other[:, None, :2]).norm(dim=-1).argmin(-1)
     pose = way[torch.arange(len(way), device=way.device), nearest]
     pose = torch.cat([pose[:, :2], travel_heading(pose)[:, None]], -1)

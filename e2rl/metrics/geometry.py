@@ -47,7 +47,7 @@ def overlap_area(first: Tensor, first_size: Tensor, second: Tensor, second_size:
     box, encloses exactly the intersection, so area = sum over edges of the integral of clamp(x) d clamp(y). The
     integrand is continuous in the boxes, hence shared or collinear edges need no special case.
     """
-    start, change, half, bounds = _edges_in_frame(first, first_size, second, second_size, 1.0)
+    start, change, half, bounds = _edges_in_frame(first, first_size, other=second, other_size=second_size, zero=1.0)
     begin, end = bounds[..., 1].clamp(0, 1)  # where y is inside the second box's width
     knots = torch.stack([begin, *(bounds[..., 0].maximum(begin).minimum(end)), end], -1)
     x = start[..., 0, None] + knots * change[..., 0, None]
@@ -58,7 +58,7 @@ def overlap_area(first: Tensor, first_size: Tensor, second: Tensor, second_size:
 
 def edge_parts_inside(box: Tensor, size: Tensor, other: Tensor, other_size: Tensor) -> Tensor:
     """Length [..., 4] [m] of each of the box's edges (order `EDGES`) that lies inside the other box."""
-    _, change, _, (enter, leave) = _edges_in_frame(box, size, other, other_size, torch.finfo(box.dtype).tiny)
+    _, change, _, (enter, leave) = _edges_in_frame(box, size, other=other, other_size=other_size, zero=torch.finfo(box.dtype).tiny)
     part = (leave.amin(-1).clamp(0, 1) - enter.amax(-1).clamp(0, 1)).clamp(min=0)
     return part * change.norm(dim=-1)
 
@@ -79,7 +79,7 @@ def _edges_in_frame(
 def edge_distances(box: Tensor, size: Tensor, point: Tensor) -> Tensor:
     """Distance [..., 4] [m] from each of the box's edges (order `EDGES`) to a point [..., 2]."""
     start = corners(box, size)
-    return from_segment(point[..., None, :], start, start.roll(-1, -2) - start).norm(dim=-1)
+    return from_segment(point[..., None, :], start, along=start.roll(-1, -2) - start).norm(dim=-1)
 
 
 def from_segment(point: Tensor, start: Tensor, along: Tensor) -> Tensor:
@@ -118,8 +118,8 @@ def candidates(
     for axis in range(points.shape[1]):
         covered.append(first[item, axis] + index % span[item, axis])
         index = index // span[item, axis]
-    item_key, order = cell_key(item_group[item], torch.stack(covered, -1), extent).sort()
-    point_key = cell_key(point_group, cells, extent)
+    item_key, order = cell_key(item_group[item], torch.stack(covered, -1), extent=extent).sort()
+    point_key = cell_key(point_group, cells, extent=extent)
     begin = torch.searchsorted(item_key, point_key)
     point, index = ragged(torch.searchsorted(item_key, point_key, right=True) - begin)
     return point, item[order[begin[point] + index]]

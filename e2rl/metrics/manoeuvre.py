@@ -136,7 +136,7 @@ class EvasionScene(TensorClass):
         others = states[row[:, None], step, 1:].masked_fill(~present[..., None], AWAY)[:, :, ever]
         agents = {"ego_size": scene["size"][:, 0], "others": others, "other_size": scene["size"][:, 1:][:, ever]}
         road = {"field": scene["field"], "origin": scene["field_origin"], "routes": scene["route_points"][:, 0]}
-        s = project_track(states[:, :, 0, :2], mission.points, valid[:, :, 0], start=BEHIND)[0][row, moment]
+        s = project_track(states[:, :, 0, :2], mission.points, known=valid[:, :, 0], start=BEHIND)[0][row, moment]
         road |= {"mission": mission.points, "s": s, "end": mission.end}
         return EvasionScene(start=start, inside=inside, **agents, **road, batch_size=[len(states)])
 
@@ -147,9 +147,9 @@ def violations(states: Tensor, scene: EvasionScene, clearance: float, road_margi
     0 at a step that keeps both, and after the episode. As in DrivingEnv, contact counts with everybody at every step,
     the road from the first time on it, and nothing once the map has ended.
     """
-    missed = clearance_violation(states, scene, clearance) + road_violation(states, scene, road_margin)
+    missed = clearance_violation(states, scene, clearance=clearance) + road_violation(states, scene, margin=road_margin)
     missed = missed * scene.inside[:, None]
-    return missed.masked_fill(past_end(states, missed > 0, scene)[..., None], 0.0)
+    return missed.masked_fill(past_end(states, missed > 0, scene=scene)[..., None], 0.0)
 
 
 def clearance_violation(states: Tensor, scene: EvasionScene, clearance: float) -> Tensor:
@@ -165,7 +165,7 @@ def clearance_violation(states: Tensor, scene: EvasionScene, clearance: float) -
         gap_y = part[..., None, 1] - others[:, None, ..., 1]
         near = gap_x.square_().add_(gap_y.square_()) < reach.square()[:, None, None]
         row, trial, step, other = near.nonzero(as_tuple=True)
-        apart = separation(part[row, trial, step], size[row], others[row, step, other], other_size[row, other])
+        apart = separation(part[row, trial, step], size[row], second=others[row, step, other], second_size=other_size[row, other])
         index = (row * part.shape[1] + trial) * part.shape[2] + step
         missed = part.new_zeros(part.shape[:-1]).view(-1)
         parts.append(missed.index_add(0, index, (clearance - apart).clamp(min=0)).view(part.shape[:-1]))
@@ -174,8 +174,8 @@ def clearance_violation(states: Tensor, scene: EvasionScene, clearance: float) -
 
 def road_violation(states: Tensor, scene: EvasionScene, margin: float) -> Tensor:
     """Metres [B, C, T] beyond a line `margin` m inside the drivable border, from the first time within it."""
-    first = off_road(scene.start[:, None, :2], scene.field, scene.origin) + margin
-    beyond = off_road(states[..., :2], scene.field, scene.origin) + margin
+    first = off_road(scene.start[:, None, :2], scene.field, origin=scene.origin) + margin
+    beyond = off_road(states[..., :2], scene.field, origin=scene.origin) + margin
     before = torch.cat([first[..., None].expand_as(beyond[..., :1]), beyond[..., :-1]], -1)
     return beyond.clamp(min=0) * (before.cummin(-1).values <= 0)
 
@@ -190,5 +190,5 @@ def past_end(states: Tensor, wrong: Tensor, scene: EvasionScene) -> Tensor:
     at = states.gather(2, last[..., None, None].expand(*last.shape, 1, 4))[:, :, 0, :2]
     speed = torch.cat([scene.start[:, None, None, 3].expand_as(states[:, :, :1, 3]), states[..., 3]], -1)
     driven = ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1).gather(2, last[..., None])[..., 0]
-    s = project(at, scene.mission, scene.s[:, None] + driven)[0]
+    s = project(at, scene.mission, hint=scene.s[:, None] + driven)[0]
     return (s >= scene.end[:, None]) & (first > 0)

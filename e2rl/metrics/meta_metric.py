@@ -51,7 +51,7 @@ def track_features(
     road = (batch["field"], batch["field_origin"])
     beyond = beyond_road(states[:, :, :vehicles], size[:, :vehicles], *road)[rollout, :, agent]
     route, light, light_s = (batch[key][rollout, agent] for key in ("route_points", "route_light", "route_light_s"))
-    red = runs_red_light(track, known, own, route, light, light_s, batch["light_state"][rollout, 1:])
+    red = runs_red_light(track, known, size=own, route=route, light=light, light_s=light_s, state=batch["light_state"][rollout, 1:])
     values = kinematics(track, known) | {
         "nearest_object": (gap, known),
         "time_to_collision": (time_to_collision(*pairs), known),
@@ -95,7 +95,7 @@ def nearest_object(track: Tensor, size: Tensor, others: Tensor, other_size: Tens
     inner = (size.amin(-1)[:, None] + other_size.amin(-1))[:, None] / 2
     upper = (apart - inner).masked_fill(~seen, FAR).amin(-1, keepdim=True)
     m, t, n = (seen & ((apart - outer <= upper) | (apart <= outer))).nonzero(as_tuple=True)
-    gap = signed_distance(track[m, t], size[m], others[m, t, n], other_size[m, n])
+    gap = signed_distance(track[m, t], size[m], second=others[m, t, n], second_size=other_size[m, n])
     flat = gap.new_full((apart.shape[0] * apart.shape[1],), FAR)
     return flat.scatter_reduce(0, m * apart.shape[1] + t, gap, "amin").view(apart.shape[:2])
 
@@ -129,7 +129,7 @@ def beyond_road(states: Tensor, size: Tensor, field: Tensor, origin: Tensor) -> 
 
     states [B, T, V, 4], size [B, V, 2]; field [B, G, G], origin [B, 2] as in `scenes.drivable_area.off_road`.
     """
-    return off_road(corners(states, size[:, None]), field, origin).amax(-1)
+    return off_road(corners(states, size[:, None]), field, origin=origin).amax(-1)
 
 
 def runs_red_light(
@@ -143,13 +143,13 @@ def runs_red_light(
     if not state.shape[-1] or not (light >= 0).any():
         return torch.zeros(len(track), dtype=torch.bool, device=track.device)
     front = (
-        project_track(track[..., :2], route, known, start=BEHIND)[0][:, :, None]
+        project_track(track[..., :2], route, known=known, start=BEHIND)[0][:, :, None]
         + size[:, None, :1] / 2
         - light_s[:, None]
     )
     light = light[:, None].expand(*state.shape[:2], -1)  # [M, T, K]: each step is a row of its own in the look-up
     first = torch.zeros_like(light[..., 0]).flatten()
-    red = light_state_at(state.flatten(0, 1)[:, None], light.flatten(0, 1), first).view(light.shape) == LIGHT_RED
+    red = light_state_at(state.flatten(0, 1)[:, None], light.flatten(0, 1), step=first).view(light.shape) == LIGHT_RED
     passes = (front[:, :-1] <= 0) & (front[:, 1:] > 0) & red[:, 1:]
     return (passes & (known[:, 1:] & known[:, :-1])[..., None]).any(1).any(-1)
 
@@ -168,14 +168,14 @@ class Feature:
 
 
 FEATURES = {
-    "linear_speed": Feature(0.05, 0.0, 25.0, 10),
-    "linear_accel": Feature(0.05, -12.0, 12.0, 11),
-    "angular_speed": Feature(0.05, -0.628, 0.628, 11),
-    "angular_accel": Feature(0.05, -3.14, 3.14, 11),
-    "nearest_object": Feature(0.10, -5.0, 40.0, 10),
+    "linear_speed": Feature(0.05, 0.0, high=25.0, bins=10),
+    "linear_accel": Feature(0.05, -12.0, high=12.0, bins=11),
+    "angular_speed": Feature(0.05, -0.628, high=0.628, bins=11),
+    "angular_accel": Feature(0.05, -3.14, high=3.14, bins=11),
+    "nearest_object": Feature(0.10, -5.0, high=40.0, bins=10),
     "collision": Feature(0.25),
-    "time_to_collision": Feature(0.10, 0.0, 5.0, 10),
-    "road_edge": Feature(0.05, -20.0, 40.0, 10),
+    "time_to_collision": Feature(0.10, 0.0, high=5.0, bins=10),
+    "road_edge": Feature(0.05, -20.0, high=40.0, bins=10),
     "offroad": Feature(0.25),
     "red_light": Feature(0.05),
 }

@@ -81,7 +81,7 @@ def nuplan_columns(batch: Batch) -> Batch:
         "drivable_area_compliance": drivable_area(batch),
         "driving_direction_compliance": driving_direction(batch),
         "ego_is_making_progress": (progress >= MIN_PROGRESS).to(progress),
-        "time_to_collision_within_bound": time_to_collision(batch, places, fault, new),
+        "time_to_collision_within_bound": time_to_collision(batch, places, fault=fault, new=new),
         "ego_progress_along_expert_route": progress,
         "speed_limit_compliance": speed_limit(batch),
         "ego_is_comfortable": comfort(batch["states"][:, :, 0], batch["size"][:, 0, 0]),
@@ -157,7 +157,7 @@ def lanes_at(points: Tensor, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     owner, lane, ends = line_segments(batch["lane_points"], batch["lane_index"])
     rollout = torch.arange(len(points)).repeat_interleave(points.shape[1])
     points = points.flatten(0, 1)
-    point, near = near_segments(points, rollout, owner, ends, batch["lane_width"][owner, lane] / 2)
+    point, near = near_segments(points, rollout, owner=owner, ends=ends, reach=batch["lane_width"][owner, lane] / 2)
     along = torch.nn.functional.normalize(ends[near, 1] - ends[near, 0], dim=-1)
     begins = torch.ones(len(lane) + 1, dtype=torch.bool)  # the last row: after the end of the last lane
     begins[1:-1] = (lane.diff() != 0) | (owner.diff() != 0)
@@ -201,8 +201,8 @@ def at_fault(batch: Batch, places: Places) -> tuple[Tensor, Tensor]:
     other = batch["states"][row, step, agent]
     size = batch["size"][row, 0]
     other_size = batch["size"][row, agent]
-    behind = angle_at(rear_axle(ego, size), ego[:, 2], other[:, :2]) > BEHIND
-    front = edge_parts_inside(ego, size, other, other_size)[:, 3] > 0
+    behind = angle_at(rear_axle(ego, size), ego[:, 2], centre=other[:, :2]) > BEHIND
+    front = edge_parts_inside(ego, size, other=other, other_size=other_size)[:, 3] > 0
     moves = ego[:, 3].abs() > STOPPED
     stands = batch["track_speed"][row, step, agent] <= STOPPED
     guilty = moves & (stands | (~behind & (front | places.loose[row, step])))
@@ -228,12 +228,12 @@ def drivable_area(batch: Batch) -> Tensor:
     where = corners(states, size)
     points = where.flatten(0, 2)
     rollout = torch.arange(len(states)).repeat_interleave(where[0, ..., 0].numel())
-    inside = near_lane(points, rollout, batch["lane_points"], batch["lane_index"], batch["lane_width"], MAX_OUTSIDE)
+    inside = near_lane(points, rollout, lane_points=batch["lane_points"], lane_index=batch["lane_index"], lane_width=batch["lane_width"], margin=MAX_OUTSIDE)
     polygons = batch["drivable_points"], batch["drivable_index"]
     rest = (~inside).nonzero()[:, 0]
     inside[rest] = inside_polygon(points[rest], rollout[rest], *polygons)
     owner, _, ends = line_segments(*polygons, closed=True)
-    near, _ = near_segments(points, rollout, owner, ends, ends.new_full(owner.shape, MAX_OUTSIDE))
+    near, _ = near_segments(points, rollout, owner=owner, ends=ends, reach=ends.new_full(owner.shape, MAX_OUTSIDE))
     inside[near] = True
     mapped = has_lines(batch["lane_index"]) | has_lines(batch["drivable_index"])
     return inside.view(len(states), -1).all(1).to(states).masked_fill(~mapped, torch.nan)
@@ -264,7 +264,7 @@ def time_to_collision(batch: Batch, places: Places, fault: Tensor, new: Tensor) 
     speed = batch["track_speed"]
     ego = states[:, :, :1]
     length = size[:, None, :1]
-    angle = angle_at(rear_axle(ego, length), ego[..., 2], states[..., :2])
+    angle = angle_at(rear_axle(ego, length), ego[..., 2], centre=states[..., :2])
     beside = (places.loose | places.crossing)[..., None] & (angle <= BEHIND)
     counted = batch["valid"] & ~(new.cumsum(1) > 0) & ((angle < AHEAD) | beside) & (speed[..., :1] > MOVING)
     counted[..., 0] = False
@@ -273,9 +273,9 @@ def time_to_collision(batch: Batch, places: Places, fault: Tensor, new: Tensor) 
     row, step, agent = counted.nonzero(as_tuple=True)
     seconds = torch.arange(DT, LEAST_TTC, DT, dtype=states.dtype)[:, None]  # [K, 1]
     touches = overlap(
-        first=projected(states[row, step, 0], speed[row, step, 0], seconds),
+        first=projected(states[row, step, 0], speed[row, step, 0], seconds=seconds),
         first_size=size[row, 0],
-        second=projected(states[row, step, agent], speed[row, step, agent], seconds),
+        second=projected(states[row, step, agent], speed[row, step, agent], seconds=seconds),
         second_size=size[row, agent],
     )
     meets = torch.zeros(len(states), dtype=torch.bool).index_fill(0, row[touches.any(0)], True)
@@ -298,8 +298,8 @@ def expert_progress(batch: Batch) -> Tensor:
     0 where the ego ends more than f behind its start.
     """
     last = torch.full_like(batch["stop"], batch["states"].shape[1] - 1)
-    path, count = ego_path(batch["states"], batch["valid"], last)
-    recorded, known = ego_path(batch["logged"], batch["logged_valid"], last)
+    path, count = ego_path(batch["states"], batch["valid"], stop=last)
+    recorded, known = ego_path(batch["logged"], batch["logged_valid"], stop=last)
     fraction = route_completion(path, count, logged=batch["logged"], logged_valid=batch["logged_valid"])
     pieces = torch.arange(1, recorded.shape[1]) < known[:, None]
     distance = (recorded[:, 1:, :2] - recorded[:, :-1, :2]).norm(dim=-1).mul(pieces).sum(-1)

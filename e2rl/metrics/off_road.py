@@ -48,7 +48,7 @@ def near_lane(
     lane_points [B, M, 2], lane_index [B, M] (-1 padding), lane_width [B, L].
     """
     owner, lane, ends = line_segments(lane_points, lane_index)
-    point, _ = near_segments(points, rollout, owner, ends, lane_width[owner, lane] / 2 + margin)
+    point, _ = near_segments(points, rollout, owner=owner, ends=ends, reach=lane_width[owner, lane] / 2 + margin)
     return torch.zeros(len(points), dtype=torch.bool).index_fill(0, point, True)
 
 
@@ -57,10 +57,10 @@ def near_segments(points: Tensor, rollout: Tensor, owner: Tensor, ends: Tensor, 
     that is at most reach [m] m away."""
     low = ends.amin(1) - reach[:, None]
     high = ends.amax(1) + reach[:, None]
-    point, segment = candidates(points, rollout, low, high, owner, LANE_CELL)
+    point, segment = candidates(points, rollout, low=low, high=high, item_group=owner, cell=LANE_CELL)
     start = ends[segment, 0]
     along = (ends[:, 1] - ends[:, 0])[segment]
-    near = from_segment(points[point], start, along).square().sum(-1) <= reach[segment].square()
+    near = from_segment(points[point], start, along=along).square().sum(-1) <= reach[segment].square()
     return point[near], segment[near]
 
 
@@ -71,7 +71,7 @@ def inside_polygon(points: Tensor, rollout: Tensor, polygon_points: Tensor, poly
     """
     owner, polygon, ends = line_segments(polygon_points, polygon_index, closed=True)
     y = ends[..., 1]
-    point, edge = candidates(points[:, 1:], rollout, y.amin(1)[:, None], y.amax(1)[:, None], owner, ROW)
+    point, edge = candidates(points[:, 1:], rollout, low=y.amin(1)[:, None], high=y.amax(1)[:, None], item_group=owner, cell=ROW)
     x, height = points[point].unbind(-1)
     (x0, y0), (x1, y1) = ends[edge, 0].unbind(-1), ends[edge, 1].unbind(-1)
     straddles = (y0 > height) != (y1 > height)
@@ -88,7 +88,7 @@ def in_seam(points: Tensor, rollout: Tensor, polygon_points: Tensor, polygon_ind
     polygon_points [B, D, 2], polygon_index [B, D] (-1 padding). Many maps draw polygons that adjoin with a gap.
     """
     owner, polygon, ends = line_segments(polygon_points, polygon_index, closed=True)
-    point, segment = near_segments(points, rollout, owner, ends, ends.new_full(owner.shape, SEAM))
+    point, segment = near_segments(points, rollout, owner=owner, ends=ends, reach=ends.new_full(owner.shape, SEAM))
     pairs = torch.stack([point, polygon[segment]], 1).unique(dim=0)
     return torch.bincount(pairs[:, 0], minlength=len(points)) > 1
 
@@ -101,7 +101,7 @@ def has_lines(index: Tensor) -> Tensor:
 def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:
     """Bool [n]: points [n, 2] of rollouts [n] int64 are on the road of the batch's maps."""
     polygons = batch["drivable_points"], batch["drivable_index"]
-    near = near_lane(points, rollout, batch["lane_points"], batch["lane_index"], batch["lane_width"])
+    near = near_lane(points, rollout, lane_points=batch["lane_points"], lane_index=batch["lane_index"], lane_width=batch["lane_width"])
     for holds in (inside_polygon, in_seam):
         rest = (~near).nonzero()[:, 0]
         near[rest] = holds(points[rest], rollout[rest], *polygons)
@@ -135,7 +135,7 @@ def off_road_columns(batch: Batch) -> Batch:
     asked = batch["valid"] & looked_at[:, None] & (steps <= stop[:, None])[..., None]
     index = asked.nonzero(as_tuple=True)
     road_here = torch.zeros_like(asked)
-    road_here[index] = on_road(states[index][:, :2], index[0], batch)
+    road_here[index] = on_road(states[index][:, :2], index[0], batch=batch)
     ego_off = (asked & ~road_here)[..., 0]
     seen = asked & counted[:, None] & road_here[:, :1] & steps_until(stop, states.shape[1])[..., None]
     mapped = has_lines(batch["lane_index"]) | has_lines(batch["drivable_index"])

@@ -197,7 +197,7 @@ def nearest_first(collision: Collision) -> Collision:
     times = torch.arange(states.shape[1], device=states.device)[None, :, None]
     at = row[..., None], times, order[:, None]
     partner = torch.ones_like(collision.partner)
-    return Collision(held(states[at], present[at]), present[at], collision.size[row, order], partner, collision.stop)
+    return Collision(held(states[at], present[at]), present[at], size=collision.size[row, order], partner=partner, stop=collision.stop)
 
 
 def seen_out(collision: Collision) -> Collision:
@@ -223,11 +223,11 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
     """What becomes of collisions sorted by `nearest_first` with a driver in the ego's place; along: the others seen
     along the ego's way."""
     states, present, size, _, stop = collision
-    others = Tracks(states[:, :, 1:], size[:, 1:], present[:, :, 1:])
-    driven = redrive(driver, states[:, :, 0], size[:, 0], along)
+    others = Tracks(states[:, :, 1:], size[:, 1:], present=present[:, :, 1:])
+    driven = redrive(driver, states[:, :, 0], size=size[:, 0], others=along)
     steps = torch.arange(states.shape[1], device=states.device)
     counts = (steps >= 1) & (steps <= stop[:, None] + AFTER)
-    touched = contacts(driven, size[:, 0], others) & counts[..., None]
+    touched = contacts(driven, size[:, 0], others=others) & counts[..., None]
     avoided = ~touched[:, :, 0].any(1)
     followers = torch.zeros_like(stop)
     first = touched[:, :, 0].int().argmax(1)
@@ -242,23 +242,23 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
             break
         first = touched.int().argmax(1).masked_fill(~blamed, len(steps)).argmin(1)
         row = torch.arange(len(stop), device=stop.device)
-        follows = _follows(leader, others, touched, first) & (blamed.sum(1) == 1)
+        follows = _follows(leader, others, touched=touched, index=first) & (blamed.sum(1) == 1)
         avoided = avoided & (~hits | follows)
         track = others.states[row, :, first]
         track_size = others.size[row, first]
-        ahead = Tracks(leader[:, :, None], leader_size[:, None], torch.ones_like(touched[..., :1]))
-        braked = redrive(DRIVERS["human"], track, track_size, along_way(track, track_size[:, 1], ahead))
-        still = (contacts(braked, track_size, ahead)[..., 0] & counts).any(1)
+        ahead = Tracks(leader[:, :, None], leader_size[:, None], present=torch.ones_like(touched[..., :1]))
+        braked = redrive(DRIVERS["human"], track, size=track_size, others=along_way(track, track_size[:, 1], others=ahead))
+        still = (contacts(braked, track_size, others=ahead)[..., 0] & counts).any(1)
         avoided = avoided & (~hits | ~still)
         followers = followers + (hits & avoided).long()
         itself = torch.nn.functional.one_hot(first, blamed.shape[1]).bool()
-        before = contacts(track, track_size, others) & counts[..., None]
-        touched = contacts(braked, track_size, others) & counts[..., None] & ~before.any(1, keepdim=True)
+        before = contacts(track, track_size, others=others) & counts[..., None]
+        touched = contacts(braked, track_size, others=others) & counts[..., None] & ~before.any(1, keepdim=True)
         blamed = touched.any(1) & ~itself & hits[:, None] & avoided[:, None]
         touched = touched & ~itself[:, None]
         leader = braked
         leader_size = track_size
-    return Prevention(avoided, followers, driven, struck)
+    return Prevention(avoided, followers, states=driven, struck=struck)
 
 
 def _follows(leader: Tensor, others: Tracks, touched: Tensor, index: Tensor) -> Tensor:
@@ -277,7 +277,7 @@ def preventions(collision: Collision, drivers: dict[str, Driver] = DRIVERS) -> d
     """The Prevention of B collisions by each driver."""
     until = collision.states.shape[1]
     collision = seen_out(nearest_first(collision))
-    others = Tracks(collision.states[:, :, 1:], collision.size[:, 1:], collision.present[:, :, 1:])
-    along = along_way(collision.states[:, :, 0], collision.size[:, 0, 1], others)
-    found = {name: prevention(driver, collision, along) for name, driver in drivers.items()}
+    others = Tracks(collision.states[:, :, 1:], collision.size[:, 1:], present=collision.present[:, :, 1:])
+    along = along_way(collision.states[:, :, 0], collision.size[:, 0, 1], others=others)
+    found = {name: prevention(driver, collision, along=along) for name, driver in drivers.items()}
     return {name: each._replace(states=each.states[:, :until]) for name, each in found.items()}

@@ -42,11 +42,11 @@ def motion_columns(batch: Batch) -> Batch:
     stop = batch["stop"]
     seen = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
     seen[..., 0] = False
-    gap = distance(states[:, :, :1], batch["size"][:, None, :1], states, batch["size"][:, None])
+    gap = distance(states[:, :, :1], batch["size"][:, None, :1], second=states, second_size=batch["size"][:, None])
     gap = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
     moving = velocity(states)
     cost = closest_approach_cost(states[..., :2] - states[..., :1, :2], moving - moving[..., :1, :])
-    path, count = ego_path(states, valid, stop)
+    path, count = ego_path(states, valid, stop=stop)
     driven = progress(path, count)
     return {
         "min_dtc": gap.masked_fill(gap.isinf(), torch.nan).masked_fill(batch["hit"], 0.0),
@@ -55,7 +55,7 @@ def motion_columns(batch: Batch) -> Batch:
         "macc": mean_acceleration(path, count),
         "progress": driven,
         "driven_km": driven / 1000,
-        "route_completion": route_completion(path, count, batch["logged"], batch["logged_valid"]),
+        "route_completion": route_completion(path, count, logged=batch["logged"], logged_valid=batch["logged_valid"]),
     }
 
 
@@ -110,11 +110,11 @@ def route_completion(path: Tensor, count: Tensor, logged: Tensor, logged_valid: 
     way is shorter than LEAST_WAY.
     """
     steps = torch.full_like(count, logged.shape[1] - 1)
-    recorded, known = ego_path(logged, logged_valid, steps)
+    recorded, known = ego_path(logged, logged_valid, stop=steps)
     piece = torch.arange(recorded.shape[1] - 1, device=path.device) < (known - 1)[:, None]
     length = recorded[..., :2].diff(dim=1).norm(dim=-1) * piece
     end = length.cumsum(-1)
-    place = _place_on(path[..., :2], count, recorded[..., :2], piece, torch.stack([end - length, end], -1))
+    place = _place_on(path[..., :2], count, way=recorded[..., :2], piece=piece, ends=torch.stack([end - length, end], -1))
     whole = length.sum(-1)
     return (place / whole).clamp(max=1).masked_fill((count == 0) | (whole < LEAST_WAY), torch.nan)
 
@@ -137,7 +137,7 @@ def _place_on(points: Tensor, count: Tensor, way: Tensor, piece: Tensor, ends: T
     before = torch.nn.functional.pad(nearest[:, :-1], (1, 0))
     rows = ((((nearest - before).abs() - moved) > WINDOW) & inside).any(1).nonzero()[:, 0]
     if len(rows):
-        nearest[rows] = _followed(place[rows], gap[rows], ends[rows], moved[rows])
+        nearest[rows] = _followed(place[rows], gap[rows], ends=ends[rows], moved=moved[rows])
     return nearest.gather(1, (count - 1).clamp(min=0)[:, None])[:, 0]
 
 

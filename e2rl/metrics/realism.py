@@ -36,9 +36,9 @@ declare(
         tables="main adversaries methods public",
     ),
     _real("real_norm", "realism, W1 over the log's range", samples="a_lon", tables="main traffic"),
-    Metric("w1_a_lon", "W1 of longitudinal acceleration", "m/s²", samples="a_lon", tables="traffic"),
-    Metric("w1_a_lat", "W1 of lateral acceleration", "m/s²", samples="a_lon", tables="traffic"),
-    Metric("w1_jerk", "W1 of |jerk|", "m/s³", samples="a_lon", tables="traffic"),
+    Metric("w1_a_lon", "W1 of longitudinal acceleration", unit="m/s²", samples="a_lon", tables="traffic"),
+    Metric("w1_a_lat", "W1 of lateral acceleration", unit="m/s²", samples="a_lon", tables="traffic"),
+    Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon", tables="traffic"),
 )
 
 
@@ -124,8 +124,8 @@ def realism(samples: list[Samples], cluster: Tensor, draws: Tensor) -> dict[str,
     samples: one entry of `traffic_samples` per rollout, cluster [R] int64: the rollouts' clusters, draws [D, C]: the
     multiplicities of clusters in each draw. NaN where a quantity has no sample.
     """
-    return _pooled(samples, cluster, draws, KINEMATICS) | {
-        "real_adv": _pooled(samples, cluster, draws, OF_ADVERSARIES)["real"]
+    return _pooled(samples, cluster, draws=draws, names=KINEMATICS) | {
+        "real_adv": _pooled(samples, cluster, draws=draws, names=OF_ADVERSARIES)["real"]
     }
 
 
@@ -138,7 +138,7 @@ def _pooled(samples: list[Samples], cluster: Tensor, draws: Tensor, names: tuple
         if not pair.shape[1]:
             return dict.fromkeys(("real", "real_norm", *W1), draws.new_full((len(draws),), torch.nan))
         counts = torch.tensor([sample[name].shape[1] for sample in samples], device=pair.device)
-        distances.append(wasserstein(pair, cluster.repeat_interleave(counts), draws.to(pair)))
+        distances.append(wasserstein(pair, cluster.repeat_interleave(counts), draws=draws.to(pair)))
         log = pair[1].sort().values
         ranges.append((quantile_of_sorted(log, 0.95) - quantile_of_sorted(log, 0.05)).clamp(min=1e-9))
     distance = torch.stack(distances)

@@ -20,7 +20,7 @@ CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
     Metric("transport_adversary", "path KL of the control, adversaries"),
     Metric("transport_others", "path KL of the control, other vehicles"),
     Metric("transport_anchor", "anchor jump"),
-    Metric("seconds_per_rollout", "wall time", "s", column="seconds", cost=True, tables="main traffic methods"),
+    Metric("seconds_per_rollout", "wall time", unit="s", column="seconds", cost=True, tables="main traffic methods"),
     Metric(
         "nfe",
         "evaluations of the prior's network per rollout, one with a gradient twice",
@@ -88,7 +88,7 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     samples = traffic_samples(batch)
     once = torch.ones(1, 1, dtype=torch.float64)
     owner = torch.zeros(1, dtype=torch.int64)
-    single = [realism([sample], owner, once) for sample in samples]
+    single = [realism([sample], owner, draws=once) for sample in samples]
     return result | {name: torch.cat([values[name] for values in single]) for name in single[0]}, samples, driver
 
 

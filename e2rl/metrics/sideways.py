@@ -44,9 +44,9 @@ def _moved_within(batch: Batch, steps: int) -> Tensor:
     across, aside = sideways(states, lanes)
     held = torch.cat([states[..., :2] - across[..., None] * aside, lanes[..., None], states[..., 3:]], -1)
     towards = ((states.flip(2)[:, -1, :, :2] - held[:, -1, :, :2]) * aside[:, -1]).sum(-1).sign() * across[:, -1]
-    gaps = [separation(held[:, :, k], size[:, None, k], states[:, :, 1 - k], size[:, None, 1 - k]) for k in (0, 1)]
+    gaps = [separation(held[:, :, k], size[:, None, k], second=states[:, :, 1 - k], second_size=size[:, None, 1 - k]) for k in (0, 1)]
     avoids = torch.stack([(gap > 0).all(1) for gap in gaps], 1)
-    enters = (beside(states, size, lanes, aside)[:, :-1] > 0).any(1)
+    enters = (beside(states, size, lanes=lanes, aside=aside)[:, :-1] > 0).any(1)
     return avoids & enters & (towards > LEAST) & (towards >= PART * towards.flip(1))
 
 
@@ -127,7 +127,7 @@ def lanes_along(batch: Batch, moments: Tensor) -> tuple[Tensor, Tensor]:
     if points.shape[1] < 2:
         return heading, torch.zeros_like(heading, dtype=torch.bool)
     place = moments.flatten(1, 2)[..., :2]
-    points, along, index = _near(points, lane_directions(points, index), index, place)
+    points, along, index = _near(points, lane_directions(points, index), index=index, places=place)
     off = torch.cdist(place, points, compute_mode="donot_use_mm_for_euclid_dist")
     angle = wrap(along[:, None] - heading.flatten(1, 2)[..., None]).abs()
     possible = (angle < ALIGNED) & (off < LANE_REACH) & (index >= 0)[:, None]

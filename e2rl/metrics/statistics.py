@@ -196,15 +196,15 @@ class Bootstrap:
 
     def resampled(self, totals: Tensor, weights: Tensor, samples: Sequence[Samples]) -> dict[str, Tensor]:
         """{metric: values [D] in each draw}, from the results of `metric_table` and the realism samples."""
-        means = resampled_means(totals, weights, self.cluster, self.draws)
+        means = resampled_means(totals, weights, cluster=self.cluster, draws=self.draws)
         for column, metric in enumerate(row_metrics()):
             if metric.median:
-                means[:, column] = resampled_medians(totals[:, column], self.cluster, self.draws)
+                means[:, column] = resampled_medians(totals[:, column], self.cluster, draws=self.draws)
             if metric.places:
                 labels = totals[:, column] / weights[:, column]  # 0 / 0 is NaN
-                means[:, column] = resampled_labels(labels, self.place, self.place_draws, metric.places)
+                means[:, column] = resampled_labels(labels, self.place, draws=self.place_draws, places=metric.places)
         values = {metric.name: means[:, column] for column, metric in enumerate(row_metrics())}
-        return values | realism(list(samples), self.cluster, self.realism_draws)
+        return values | realism(list(samples), self.cluster, draws=self.realism_draws)
 
     def places(self, chosen: Tensor) -> int:
         """Number of places of the rollouts chosen [R] bool."""
@@ -233,7 +233,7 @@ class Bootstrap:
                 places = self.places(~total.isnan() & (weight > 0))
                 known = places >= LEAST and not metric.per
                 mean = values[metric.name][0].item()
-                found[metric.name] = exact_interval(mean, places, level) if known else (torch.nan, torch.nan)
+                found[metric.name] = exact_interval(mean, places, level=level) if known else (torch.nan, torch.nan)
         return found
 
     def agreed(
@@ -259,7 +259,7 @@ class Bootstrap:
                 and len(drawn)
                 and bool(((drawn - mean).abs() <= SAME * max(1, abs(mean))).all())
             ):
-                found[metric.name] = bounds_of_alike(mean, places, least) if metric.fraction else (mean, mean)
+                found[metric.name] = bounds_of_alike(mean, places, least=least) if metric.fraction else (mean, mean)
         return found
 
     def intervals(self, values: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
@@ -290,7 +290,7 @@ def summarise(
     """
     if len(rows) != len(samples):
         raise ValueError(f"{len(rows)} rows but {len(samples)} samples; they are made together by score_rollouts")
-    bootstrap = Bootstrap(rows, draws, realism_draws)
+    bootstrap = Bootstrap(rows, draws, realism_draws=realism_draws)
     totals, weights = metric_table(rows, row_metrics())
     known = known_rollouts(~totals.isnan() & (weights > 0), samples)
     values = bootstrap.resampled(totals, weights, samples)
@@ -330,7 +330,7 @@ def paired_differences(
     first = first.masked_fill(unmatched, torch.nan)
     second = second.masked_fill(unmatched, torch.nan)
     shared = [{**other, **own} for own, other in zip(rows, other_rows, strict=True)]  # either may tell the training
-    bootstrap = Bootstrap(shared, draws, realism_draws)
+    bootstrap = Bootstrap(shared, draws, realism_draws=realism_draws)
     ours = bootstrap.resampled(first, first_weights, samples)
     theirs = bootstrap.resampled(second, second_weights, other_samples)
     known = known_rollouts(~first.isnan() | ~second.isnan(), samples)

@@ -79,7 +79,7 @@ def duties(
     before = (stop - 1).clamp(min=0)
     turned = torch.stack([_turn(track, stop) for track in (ego, other)])
     angle = wrap(ahead[row, before] - way[row, before])
-    entered, safe = _entry(ego, other, size, stop)
+    entered, safe = _entry(ego, other, size=size, stop=stop)
     crosses = angle.abs() > SAME_WAY
     oncoming = angle.abs() > ONCOMING
     unsafe = entered & (~safe | (oncoming & struck))  # a driver who stands cannot lose the speed of who comes
@@ -89,8 +89,8 @@ def duties(
     result = torch.full_like(stop, NONE)
     result = torch.where(unsafe & ~crosses, ENTRY, result)
     result = torch.where(unsafe & crosses & priority, RIGHT_OF_WAY, result)
-    against = _against(ego, stop, lanes)
-    other_against = _against(other, stop, lanes)
+    against = _against(ego, stop, lanes=lanes)
+    other_against = _against(other, stop, lanes=lanes)
     ran, other_ran = ((red >= 0) & (stop[:, None] - red <= LIGHT_STEPS) & (red <= stop[:, None])).unbind(1)
     ego_broke = ((ran & crosses) | (against & oncoming)) & ~other_against & ~other_ran
     result = result.masked_fill(ego_broke, NONE)
@@ -110,8 +110,8 @@ def _turn(track: Tensor, stop: Tensor) -> Tensor:
 def _entry(ego: Tensor, other: Tensor, size: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
     """Whether the other came into the ego's way, and whether the gap has at some time since the last entry been what a
     competent driver needs; each [B] bool."""
-    tracks = Tracks(other[:, :, None], size[:, 1:], torch.ones_like(other[..., :1], dtype=torch.bool))
-    along = along_way(ego, size[:, 0, 1], tracks)
+    tracks = Tracks(other[:, :, None], size[:, 1:], present=torch.ones_like(other[..., :1], dtype=torch.bool))
+    along = along_way(ego, size[:, 0, 1], others=tracks)
     outside = along.lateral_gap[..., 0].T > 0
     steps = torch.arange(ego.shape[1], device=stop.device)
     last = torch.where(outside & (steps <= stop[:, None]), steps, -1).amax(1, keepdim=True)
@@ -189,7 +189,7 @@ def turned_on_the_spot(batch: Batch) -> Tensor:
     later = (stop[:, None] + torch.arange(CUT_IN_STEPS + 1, device=stop.device)).clamp(max=states.shape[1] - 1)
     ego = states[row[:, None], later, 0]
     size = batch["size"]
-    apart = separation(ego, size[:, :1], held[:, None], size[row, partner][:, None]) > 0
+    apart = separation(ego, size[:, :1], second=held[:, None], second_size=size[row, partner][:, None]) > 0
     return batch["hit"] & (since < stop) & ~moves[row, stop] & turned & apart.all(1)
 
 
@@ -236,7 +236,7 @@ def cuts_in(batch: Batch, steps: int) -> Tensor:
     other_size = size[row, partner]
     known = known & batch["valid"][row, window, partner]
     path, path_size = ego_path_boxes(states[row, window, 0], size[:, 0])
-    meet = separation(other[:, :, None], other_size[:, :, None], path[:, None], path_size[:, None]) <= 0
+    meet = separation(other[:, :, None], other_size[:, :, None], second=path[:, None], second_size=path_size[:, None]) <= 0
     later = torch.ones(meet.shape[-2:], dtype=torch.bool, device=meet.device).triu()
     return (known & ~(meet & later).any(-1)).any(-1)
 
@@ -308,7 +308,7 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor
     """COLUMNS, duty [C], whether the ego broke one [C], and the human driver's Prevention of the C collisions hit [B]
     bool."""
     vehicles = (batch["valid"] & (batch["agent_type"] == VEHICLE)[:, None])[hit]
-    collision = Collision(batch["states"][hit], vehicles, batch["size"][hit], batch["partner"][hit], batch["stop"][hit])
+    collision = Collision(batch["states"][hit], vehicles, size=batch["size"][hit], partner=batch["partner"][hit], stop=batch["stop"][hit])
     row = torch.arange(len(collision.stop))
     ran = batch.get("ran_light")
     pair = torch.stack([torch.zeros_like(collision.partner), collision.partner], 1)
@@ -317,7 +317,7 @@ def collision_verdicts(batch: Batch, hit: Tensor) -> tuple[Batch, Tensor, Tensor
     result = preventions(collision)
     leads = leading_edge(batch)[hit]
     trailing = batch["kind"][hit] == torch.where(leads == FRONT, REAR, FRONT)
-    duty, ego_broke = duties(collision, trailing, red, lanes, result["human"].struck)
+    duty, ego_broke = duties(collision, trailing, red=red, lanes=lanes, struck=result["human"].struck)
     ego_moved, partner_moved = batch["moved_into"][hit].unbind(1)
     kept_its_way = ego_moved & ~partner_moved & (duty != LIGHT) & (duty != WRONG_WAY)
     duty = duty.masked_fill(kept_its_way, NONE)

@@ -50,8 +50,8 @@ class ObservingEgo(Ego):
         pieces = []
         place = world.mission_s
         for done in range(0, PLAN_STEPS, HOLD):
-            ego = placed_ego(static.mission, world.step + done, state, action, present, present, place, static.vehicle)
-            seen = features(static, ego, others_at(world, expected, done), ego.step / horizon)
+            ego = placed_ego(static.mission, world.step + done, state=state, action=action, present=present, on_road=present, place=place, agents=static.vehicle)
+            seen = features(static, ego, others_at(world, expected, step=done), ego.step / horizon)
             action = self.decide(seen)
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
@@ -68,7 +68,7 @@ def others_at(world: World, expected: Tensor, step: int) -> Agents:
         return world.others()
     states = expected[:, 1:, step]
     change = states - expected[:, 1:, step - 1]
-    return Agents(states, world.valid[:, 1:], change[..., 3] / DT, dynamics.wrap(change[..., 2]) / DT)
+    return Agents(states, world.valid[:, 1:], accel=change[..., 3] / DT, turn_rate=dynamics.wrap(change[..., 2]) / DT)
 
 
 def expected_states(world: World) -> Tensor:

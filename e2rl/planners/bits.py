@@ -48,7 +48,7 @@ class BitsEgo(ScoringEgo):
         code = network.encode(observed(world))
         distance, side = self.drawn(*network.goals(code), start[:, 3])
         distance = torch.minimum(distance, path.stop_distance().clamp(min=0)[:, None])
-        return drive_controls(network.controls(code, start[:, 3], path.d, distance, side), start, path)
+        return drive_controls(network.controls(code, start[:, 3], path.d, distance, side), start, path=path)
 
     def drawn(self, logits: Tensor, residual: Tensor, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Distances and sides [B, goals] m of goals drawn without replacement (the Gumbel-max trick).
@@ -56,7 +56,7 @@ class BitsEgo(ScoringEgo):
         The noise is the same in every scene and replan, so a plan depends on nothing but its World.
         """
         cell = (logits / self.temperature + self.noise.to(logits.device)).topk(self.goals, 1).indices
-        return place(speed, cell, residual.gather(1, cell[..., None].expand(-1, -1, 2)))
+        return place(speed, cell, residual=residual.gather(1, cell[..., None].expand(-1, -1, 2)))
 
 
 def observed(world: World) -> Tensor:
@@ -65,7 +65,7 @@ def observed(world: World) -> Tensor:
     state = world.states[:, 0]
     present = world.valid[:, 0]
     ego = placed_ego(
-        static.mission, world.step, state, world.ego_action(), present, present, world.mission_s, static.vehicle
+        static.mission, world.step, state=state, action=world.ego_action(), present=present, on_road=present, place=world.mission_s, agents=static.vehicle
     )
     seen = features(static, ego, world.others(), world.step.to(state.dtype))
     return seen.index_fill(1, torch.tensor([ELAPSED], device=state.device), 0.0)

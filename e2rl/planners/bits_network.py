@@ -94,10 +94,10 @@ class BitsNetwork(nn.Module):
         super().__init__()
         self.architecture = {"observation": OBSERVATION_SIZE, "hidden": int(hidden), "cells": CELLS, "knots": KNOTS}
         self.normaliser = Normaliser(OBSERVATION_SIZE)
-        layers = perceptron(OBSERVATION_SIZE, [2 * hidden], hidden, last_gain=2**0.5)
+        layers = perceptron(OBSERVATION_SIZE, [2 * hidden], out=hidden, last_gain=2**0.5)
         self.encoder = nn.Sequential(layers, nn.SiLU(), nn.Dropout(dropout))
-        self.goal_head = perceptron(hidden, [hidden], 3 * CELLS, last_gain=0.0)
-        self.policy = perceptron(hidden + GOAL_FEATURES, [hidden, hidden], KNOTS + 2, last_gain=0.0)
+        self.goal_head = perceptron(hidden, [hidden], out=3 * CELLS, last_gain=0.0)
+        self.policy = perceptron(hidden + GOAL_FEATURES, [hidden, hidden], out=KNOTS + 2, last_gain=0.0)
 
     def encode(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
         """Codes [B, hidden] of observations [B, D]; noise [B, D] is added to the normalised ones, in training."""
@@ -119,7 +119,7 @@ class BitsNetwork(nn.Module):
         code = code[:, None].expand(-1, distance.shape[1], -1)
         out = self.policy(torch.cat([code, torch.stack(features, -1)], -1))
         shift = side + AROUND * out[..., KNOTS].tanh()
-        return Controls(between(out[..., :KNOTS], *ACCELERATION, 0.0), shift, between(out[..., -1], *TIME, 1.4))
+        return Controls(between(out[..., :KNOTS], *ACCELERATION, 0.0), shift, time=between(out[..., -1], *TIME, 1.4))
 
     @property
     def device(self) -> torch.device:

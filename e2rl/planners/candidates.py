@@ -39,7 +39,7 @@ def speed_profiles(speed: Tensor, accelerations: Tensor, caps: Tensor, braking: 
     rate = torch.where(node < FIRST, accelerations[:, :1], accelerations[:, 1:])
     start = speed[:, None, None].expand(-1, len(accelerations), 1)
     wanted = dynamics.bounded_speed(start, rate * PLAN_DT)
-    return upsample(capped(torch.cat([start, wanted], -1), caps, braking * PLAN_DT))
+    return upsample(capped(torch.cat([start, wanted], -1), caps, slope=braking * PLAN_DT))
 
 
 def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Tensor) -> Candidates:
@@ -60,7 +60,7 @@ def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Te
     length = (time * start[:, 3, None, None]).clamp(min=RETURN_LENGTH)[..., None]
     beside = shift[..., None]
     turned = path.turned[:, None, None]
-    offset, slope = fading(path.d[:, None, None, None] - beside, turned[..., None], length, driven)
+    offset, slope = fading(path.d[:, None, None, None] - beside, turned[..., None], length=length, ahead=driven)
     table = heading_table(path)
     before, after, _ = between_entries(table, driven / CELL)
     inner = (1 - (after - before) / CELL * (beside + offset)).clamp(min=0.2)
@@ -69,10 +69,10 @@ def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Te
     aimed = torch.lerp(*between_entries(table, along / CELL)) + torch.atan(slope[..., 1:] / inner[..., 1:])
     grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-3)
     bound = torch.minimum(grip, dynamics.yaw_rate_bound(mean)).clamp(max=MAX_YAW_RATE)
-    yaw_rate = steer(turned.expand_as(shift), aimed, bound * DT) / DT
+    yaw_rate = steer(turned.expand_as(shift), aimed, bound=bound * DT) / DT
     actions = torch.stack([accel.expand_as(yaw_rate), yaw_rate], -1).flatten(1, 2)
     states = dynamics.rollout(start[:, None].expand(-1, actions.shape[1], 4), actions)
-    return Candidates(states, along[..., -1].flatten(1), shift.flatten(1))
+    return Candidates(states, along[..., -1].flatten(1), shift=shift.flatten(1))
 
 
 def steer(heading: Tensor, aimed: Tensor, bound: Tensor) -> Tensor:

@@ -51,7 +51,7 @@ class Ego(Extension):
     tuned: ClassVar[Mapping[str, tuple]] = {}
 
     def __init__(self, replan_every: int = 5) -> None:
-        check_range("ego.replan_every", replan_every, 1, PLAN_STEPS)
+        check_range("ego.replan_every", replan_every, low=1, high=PLAN_STEPS)
         self.replan_every = replan_every
 
     def reset(self, world: World) -> None:  # noqa: B027 - most egos have no memory
@@ -76,7 +76,7 @@ class Ego(Extension):
         observation [B, D]: the environment's; plan [B, 1 + PLAN_STEPS, 4]: states of the last plan, now and at the
         coming steps.
         """
-        return track(world.states[:, 0], plan[:, 0], plan[:, 1])
+        return track(world.states[:, 0], plan[:, 0], following=plan[:, 1])
 
 
 def return_length(speed: Tensor) -> Tensor:
@@ -287,7 +287,7 @@ class EgoPlanner(TensorDictModuleBase):
             now = world.states[:, 0]
             answer = self._ask("plan", world)
             begins = bool((world.step == 0).all())
-            fresh = checked(answer, (len(now), PLAN_STEPS, 4), self.ego, "plan", begins).to(now)
+            fresh = checked(answer, (len(now), PLAN_STEPS, 4), ego=self.ego, method="plan", begins=begins).to(now)
             self._refuse(due & ~drivable(now, fresh), JUMPS)
             astray = due & strays(now, fresh[:, 0])
             self._refuse(astray & reverses(now, fresh), BACKWARDS)
@@ -319,7 +319,7 @@ class EgoPolicy(EgoPlanner):
             plan = self.plan(world)
             answer = self._ask("act", world, tensordict["observation"], plan)
             begins = bool((world.step == 0).all())
-            action = checked(answer, (len(plan), 2), self.ego, "act", begins)
+            action = checked(answer, (len(plan), 2), ego=self.ego, method="act", begins=begins)
             wild = (action.abs() > LARGEST).any(1)
             self._refuse(wild & reverses(world.states[:, 0], plan[:, 1:]), BACKWARDS)
             self._refuse(wild, WILD)

@@ -65,7 +65,7 @@ class ExternalEgo(Ego):
         begun = self._begun(world)
         content = scene_messages(world, begun) + plan_message(world)
         replies = self._ask(content, len(world.step))
-        plans = plans_of(world.states[:, 0].cpu().float(), replies, self.replan_every)
+        plans = plans_of(world.states[:, 0].cpu().float(), replies, steps=self.replan_every)
         return plans.to(world.states)
 
     def _begun(self, world: World) -> list[int]:
@@ -98,11 +98,11 @@ class ExternalEgo(Ego):
                 replies[row] = kind, payload
         except TimeoutError:
             why = f"no reply within {self.timeout:g} s a scene ({len(replies)} of {count} scenes answered)"
-            raise self._dropped(PlannerTimedOut, f"{why}; see ego.timeout", replies, count) from None
+            raise self._dropped(PlannerTimedOut, f"{why}; see ego.timeout", replies=replies, count=count) from None
         except (OSError, EOFError):
-            raise self._dropped(PlannerDied, link.ending(), replies, count) from None
+            raise self._dropped(PlannerDied, link.ending(), replies=replies, count=count) from None
         except BadReply as error:
-            raise self._dropped(BadReply, str(error), {}, count) from None
+            raise self._dropped(BadReply, str(error), replies={}, count=count) from None
         return [replies[row] for row in range(count)]
 
     def _connected(self, count: int) -> PlannerLink:
@@ -117,7 +117,7 @@ class ExternalEgo(Ego):
             raise self._gone(f"it was restarted {self.restarts} times; see ego.restarts", count)
         self._starts += 1
         try:
-            self._link = PlannerLink(self.command, self.address, self.replan_every, self.start_timeout)
+            self._link = PlannerLink(self.command, self.address, replan_every=self.replan_every, timeout=self.start_timeout)
         except InputError as error:
             if self._starts == 1:
                 raise
@@ -167,7 +167,7 @@ def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tenso
     for why, wrong in {
         WILD: acts & ~(actions.abs() <= LARGEST).all(1),
         f"a TRAJECTORY of fewer than the {steps} steps until the next plan": known < steps,
-        JUMPS: ~drivable(now, given, known),
+        JUMPS: ~drivable(now, given, known=known),
     }.items():
         bad = dict.fromkeys(wrong.nonzero()[:, 0].tolist(), why) | bad
     if bad:

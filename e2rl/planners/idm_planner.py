@@ -38,7 +38,7 @@ class IDMEgo(Ego):
         caps = path.speed_caps(self.desired_speed, self.braking, self.use_limits, lights=False)
         now = world.states[:, :, None]
         size = world.scene["size"]
-        found = leaders(path.s[:, None], path.route[:, None], now, size, world.valid, free_gap=torch.inf)
+        found = leaders(path.s[:, None], path.route[:, None], agents=now, size=size, present=world.valid, free_gap=torch.inf)
         gap = found.gap[:, 0, 0]
         leading = found.speed[:, 0, 0].clamp(min=0)
         light = path.stop_distance(self.braking) + self.standstill_gap
@@ -47,11 +47,11 @@ class IDMEgo(Ego):
         if self.use_limits:
             limit = limit_at(path.mission, path.s)
             desired = torch.where(limit > 0, limit, desired)
-        driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking)
-        accel = idm_acceleration(speed, desired, gap, leading, driver, improved=True)
+        driver = IDMParameters(self.headway, self.standstill_gap, acceleration=self.acceleration, braking=self.braking)
+        accel = idm_acceleration(speed, desired, gap=gap, leader_speed=leading, driver=driver, improved=True)
         allowed = look_up(caps, (REACTION * speed)[:, None])[:, 0]
         accel = torch.minimum(accel, ((allowed - speed) / REACTION).clamp(max=self.acceleration))
         accel = accel.clamp(-self.hardest_braking, self.acceleration)
-        future = bounded_speed(speed[:, None], (accel * DT)[:, None].expand(-1, PLAN_STEPS), 0.0, MAX_SPEED)
+        future = bounded_speed(speed[:, None], (accel * DT)[:, None].expand(-1, PLAN_STEPS), low=0.0, high=MAX_SPEED)
         future = torch.minimum(future, torch.maximum(desired, speed)[:, None])
         return path.drive(torch.cat([speed[:, None], future], 1))

@@ -56,13 +56,13 @@ def predict(world: World, speed_factors: Sequence[float], acceleration: float) -
     rest_batch, rest_agent = straight.nonzero(as_tuple=True)
     path = RoutePath(states[batch, agent], world.scene["route_points"][batch, agent, candidate])
     rest = states[rest_batch, rest_agent]
-    on_route = path.at(ahead(states[batch, agent, 3], speed_factors, acceleration).flatten(1))
-    poses = torch.cat([on_route, straight_on(rest, ahead(rest[:, 3], speed_factors, acceleration).flatten(1))])
+    on_route = path.at(ahead(states[batch, agent, 3], speed_factors, acceleration=acceleration).flatten(1))
+    poses = torch.cat([on_route, straight_on(rest, ahead(rest[:, 3], speed_factors, acceleration=acceleration).flatten(1))])
     batch = torch.cat([batch, rest_batch])
     agent = torch.cat([agent, rest_agent])
     count = len(speed_factors)
     size = world.scene["size"][batch, agent].repeat_interleave(count, 0)
-    return Prediction(poses.view(-1, sum(HALVES) + 1, 3), size, batch.repeat_interleave(count))
+    return Prediction(poses.view(-1, sum(HALVES) + 1, 3), size, scene=batch.repeat_interleave(count))
 
 
 def matched(path: RoutePath) -> Tensor:
@@ -132,7 +132,7 @@ def profiles_near(ego: Tensor, other: Tensor, cut: Tensor, j: Tensor, t: Tensor,
 @fused("Q 3", "Q 2", "Q 3", "Q 2", "Q")
 def hazard_of(ego: Tensor, ego_size: Tensor, other: Tensor, size: Tensor, weight: Tensor) -> Tensor:
     """-log(1 - p) [Q] of pairs of boxes."""
-    gap = circle_gap(ego, ego_size, other, size)
+    gap = circle_gap(ego, ego_size, second=other, second_size=size)
     return -torch.tanh(gap.clamp(min=0) * weight).clamp(min=CERTAIN).log()
 
 
@@ -198,10 +198,10 @@ class LaneGraphEgo(Ego):
         speed = self.profiles(world, path)
         driven = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * PLAN_DT).cumsum(-1), (1, 0))
         poses = path.at(path.ahead(driven.transpose(0, 1))).transpose(0, 1)
-        others = predict(world, self.predicted_speeds, self.predicted_acceleration * self.max_acceleration)
-        hazard = collision_hazard(poses, world.scene["size"][:, 0], others, self.risk_slope, self.risk_growth)
+        others = predict(world, self.predicted_speeds, acceleration=self.predicted_acceleration * self.max_acceleration)
+        hazard = collision_hazard(poses, world.scene["size"][:, 0], others=others, slope=self.risk_slope, growth=self.risk_growth)
         distance = driven[..., -1] + EARLIER * driven.mean(-1)
-        best = self.choose(hazard, distance, matched(path))
+        best = self.choose(hazard, distance, matched=matched(path))
         chosen = speed[torch.arange(len(best), device=best.device), best]
         return path.drive(upsample(chosen))
 
@@ -216,13 +216,13 @@ class LaneGraphEgo(Ego):
         slope = self.max_acceleration * PLAN_DT
         caps = path.speed_caps(self.max_speed)
         top = caps.amax(1).clamp(min=0).sqrt()
-        one = approach(start[:, None], targets(start, top, first * slope, self.speeds), slope, first)
+        one = approach(start[:, None], targets(start, top, reach=first * slope, count=self.speeds), slope=slope, steps=first)
         begin = one[..., -1]
-        aims = targets(begin, top[:, None], second * slope, self.speeds)
-        two = approach(begin[..., None], aims, slope, second)
+        aims = targets(begin, top[:, None], reach=second * slope, count=self.speeds)
+        two = approach(begin[..., None], aims, slope=slope, steps=second)
         one = one[:, :, None].expand(-1, -1, self.speeds, -1)
         wanted = torch.cat([start[:, None, None, None].expand(*one.shape[:3], 1), one, two], -1).flatten(1, 2)
-        return capped(wanted, caps, slope)
+        return capped(wanted, caps, slope=slope)
 
     def choose(self, hazard: Tensor, driven: Tensor, matched: Tensor) -> Tensor:
         """Profile [B] by hazard [B, C] = -log(1 - probability of collision) and distance [B, C]: the longest below

@@ -94,7 +94,7 @@ class ActorNetwork(nn.Module):
         self.reference = reference
         self.slack = slack
         self.room = room
-        self.trunk = Trunk(hidden, agent_units, 4 if reference else 2, last_gain=0.0)
+        self.trunk = Trunk(hidden, agent_units, out=4 if reference else 2, last_gain=0.0)
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
         self.noise: Tensor | None = None  # [D], set by `noisy`
         self.register_buffer("middle", (high + low) / 2, persistent=False)
@@ -189,7 +189,7 @@ class ActorCritic(nn.Module):
         self.normaliser = Normaliser(OBSERVATION_SIZE, least_scale)
         sizes = hidden, agent_units, reference, slack, room, initial_std
         self.network = ActorNetwork(self.normaliser, *sizes, low.cpu(), high.cpu())
-        values = nn.Sequential(self.normaliser, Trunk(hidden, agent_units, 1, last_gain=1.0))
+        values = nn.Sequential(self.normaliser, Trunk(hidden, agent_units, out=1, last_gain=1.0))
         self.to(device)
         self.actor = self._sampler(TensorDictModule(self.network, ["observation"], ["loc", "scale"]))
         self.critic = ValueOperator(values.to(device), in_keys=["observation"])

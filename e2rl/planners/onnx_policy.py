@@ -42,7 +42,7 @@ class OnnxPolicy:
         self._open()
 
     def _open(self) -> None:
-        onnxruntime = library("onnxruntime", self.where, "onnx")
+        onnxruntime = library("onnxruntime", self.where, extra="onnx")
         bound_memory()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -84,7 +84,7 @@ def check_arithmetic(content: memoryview) -> None:
             tag, at = _varint(message, at)
             number = tag >> 3
             written = tag & 7
-            length, start = _length(message, at, written)
+            length, start = _length(message, at, written=written)
             at = start + length
             if tag >= 1 << 14 or not number or at > len(message):
                 raise ValueError("its bytes are no ONNX")

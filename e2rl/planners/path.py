@@ -32,7 +32,7 @@ class RoutePath:
         """state [..., 4], route [..., P, 2]; place [...]: arc length [m] near which the vehicles are, where known."""
         self.route = route
         hint = None if place is None else place[..., None]
-        s, d, heading = (value[..., 0] for value in project(state[..., None, :2], route, hint))
+        s, d, heading = (value[..., 0] for value in project(state[..., None, :2], route, hint=hint))
         self.s = s
         self.d = d
         self.turned = wrap(state[..., 2] - heading)
@@ -42,7 +42,7 @@ class RoutePath:
 
     def offset(self, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """Lateral offset and its slope at `ahead` [..., K] metres along the route."""
-        return fading(self.d[..., None], self.turned[..., None], self.length[..., None], ahead)
+        return fading(self.d[..., None], self.turned[..., None], length=self.length[..., None], ahead=ahead)
 
     def at(self, ahead: Tensor) -> Tensor:
         """Poses [..., K, 3] at `ahead` [..., K] metres along the route."""
@@ -110,10 +110,10 @@ class MissionPath(RoutePath):
         """
         scene = self.world.scene
         mission = self.mission
-        lights = light_state_at(scene["light_state"], mission.light, self.world.step)
+        lights = light_state_at(scene["light_state"], mission.light, step=self.world.step)
         ahead = mission.light_s
         speed = self.world.states[:, 0, 3]
-        line = stop_line_distance(lights, ahead - self.s[:, None], speed, 2 * braking, braking)
+        line = stop_line_distance(lights, ahead - self.s[:, None], speed=speed, red_braking=2 * braking, yellow_braking=braking)
         return line - scene["size"][:, 0, 0] / 2 - STOP_GAP
 
 

@@ -80,11 +80,11 @@ class PDMClosedEgo(Ego):
     def plan(self, world: World) -> Tensor:
         """The states [B, PLAN_STEPS, 4] of the best proposal, or of an emergency brake."""
         rows = torch.arange(len(world.step), device=world.step.device)
-        return torch.cat([self._plan(take(world, part, KEYS)) for part in rows.split(CHUNK)])
+        return torch.cat([self._plan(take(world, part, keys=KEYS)) for part in rows.split(CHUNK)])
 
     def _plan(self, world: World) -> Tensor:
         proposals = self.proposals(world)
-        scores, collides = score(world, proposals, self._others(world, range(SCORED_STEPS + 1)))
+        scores, collides = score(world, proposals, others=self._others(world, range(SCORED_STEPS + 1)))
         best = scores.argmax(1)
         row = torch.arange(len(best), device=best.device)
         brake = torch.tensor([-self.emergency_braking, 0.0], device=best.device).expand(len(best), PLAN_STEPS, 2)
@@ -97,20 +97,20 @@ class PDMClosedEgo(Ego):
         path = MissionPath(world)
         start = world.states[:, 0]
         offset = start.new_tensor(OFFSETS).repeat_interleave(len(FRACTIONS))
-        speed = self.speeds(world, path, offset, start.new_tensor(FRACTIONS).repeat(len(OFFSETS)))
+        speed = self.speeds(world, path, offset=offset, fraction=start.new_tensor(FRACTIONS).repeat(len(OFFSETS)))
         shift = offset[:, None].expand(len(start), -1, 1)
         return drive(start, path, speed, shift, torch.full_like(shift, self.shift_time)).states
 
     def speeds(self, world: World, path: MissionPath, offset: Tensor, fraction: Tensor) -> Tensor:
         """Speeds [B, P, PLAN_STEPS + 1] m/s by IDM behind leaders on the offsets [P] m, and before red lights, at
         fractions [P] of the speed limit where the ego is."""
-        driver = IDMParameters(self.headway, self.standstill_gap, self.acceleration, self.braking, EXPONENT)
+        driver = IDMParameters(self.headway, self.standstill_gap, acceleration=self.acceleration, braking=self.braking, exponent=EXPONENT)
         others = self._others(world, range(PLAN_STEPS))
         half = world.scene["size"][:, 0] / 2
         onto = project(others.states[..., :2].flatten(1, 2), path.route)
         s, d, heading = (x.unflatten(1, others.states.shape[1:3]) for x in onto)
         turn = others.states[..., 2] - heading
-        along, side = (_extent(others.size, turn, axis) for axis in (0, 1))
+        along, side = (_extent(others.size, turn, axis=axis) for axis in (0, 1))
         leads = (d[:, None] - offset[:, None, None]).abs() < (side + half[:, 1, None, None])[:, None]
         leads &= others.seen[:, None, :, None]  # [B, P, M, T]
         rear = (s - along)[:, None]
@@ -128,7 +128,7 @@ class PDMClosedEgo(Ego):
             pace = leading[..., t].expand(ahead.shape).gather(-1, nearest[..., None])[..., 0]
             pace = torch.where(light - way < gap, 0.0, pace)
             gap = torch.minimum(gap, light - way).clamp(min=self.standstill_gap)
-            asked = idm_acceleration(now, wanted, gap, pace, driver, improved=False)
+            asked = idm_acceleration(now, wanted, gap=gap, leader_speed=pace, driver=driver, improved=False)
             after = (now + DT * asked.clamp(-self.braking, self.acceleration)).clamp(0, dynamics.MAX_SPEED)
             way = way + (now + after) / 2 * DT
             now = after
@@ -143,9 +143,9 @@ class PDMClosedEgo(Ego):
         states = world.states[row, agents]
         size = world.scene["size"][row, agents]
         states = torch.cat([states[..., :3], states[..., 3:].masked_fill(objects[..., None], 0.0)], -1)
-        touches = overlap(world.states[:, :1], world.scene["size"][:, :1], states, size)
+        touches = overlap(world.states[:, :1], world.scene["size"][:, :1], second=states, second_size=size)
         times = DT * torch.tensor(steps, device=agents.device)
-        return Others(constant_velocity(states, times), size, seen & ~touches, objects)
+        return Others(constant_velocity(states, times), size, seen=seen & ~touches, objects=objects)
 
 
 def _extent(size: Tensor, turn: Tensor, axis: int) -> Tensor:
@@ -173,16 +173,16 @@ def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tens
     size = world.scene["size"][:, 0]
     now = world.states[:, None, None, 0].expand_as(proposals[:, :, :1])
     scored = torch.cat([now, proposals[:, :, :SCORED_STEPS]], 2)
-    contacts = contacts_of(scored, size, others)
-    loose = in_several_lanes(world, scored, size)
-    fault = at_fault(scored, size, others, contacts[..., 0], loose)
+    contacts = contacts_of(scored, size, others=others)
+    loose = in_several_lanes(world, scored, size=size)
+    fault = at_fault(scored, size, others=others, touch=contacts[..., 0], loose=loose)
     hit = fault & ~others.objects[:, None, :, None]
     factor = torch.where(hit.any((2, 3)), 0.0, torch.where(fault.any((2, 3)), OBJECT_HIT, 1.0))
-    factor = factor * on_road(scored, size, world)
+    factor = factor * on_road(scored, size, world=world)
     times = DT * torch.arange(SCORED_STEPS + 1, device=fault.device)
     collides = torch.where(fault.any(2), times, torch.inf).amin(-1)
-    clear = ~runs_into(scored, size, others, contacts, loose)
-    driven = progress(world, scored, factor)
+    clear = ~runs_into(scored, size, others=others, touch=contacts, loose=loose)
+    driven = progress(world, scored, factor=factor)
     smooth = comfortable(world, scored)
     weighted = PROGRESS * driven + TIME_TO_COLLISION * clear + COMFORT * smooth
     return factor * weighted / (PROGRESS + TIME_TO_COLLISION + COMFORT), collides
@@ -192,7 +192,7 @@ def progress(world: World, scored: Tensor, factor: Tensor) -> Tensor:
     """Metres along the mission of scored [B, P, T, 4], times factor [B, P], as a fraction [B, P] of the most."""
     path = MissionPath(world)
     length = scored[..., :2].diff(dim=2).norm(dim=-1).sum(-1)
-    s = project(scored[:, :, -1, :2], path.route, path.s[:, None] + length)[0]
+    s = project(scored[:, :, -1, :2], path.route, hint=path.s[:, None] + length)[0]
     distance = (s - path.s[:, None]).clamp(min=0) * factor
     farthest = distance.amax(1, keepdim=True)
     relative = distance / farthest.clamp(min=LEAST_PROGRESS)
@@ -204,7 +204,7 @@ def contacts_of(states: Tensor, size: Tensor, others: Others) -> Tensor:
     looks = states.new_tensor(LOOKS)
     own, theirs = (constant_velocity(track, looks) for track in (states, others.states))
     touch = overlap(
-        own[:, :, None], size[:, None, None, None, None], theirs[:, None], others.size[:, None, :, None, None]
+        own[:, :, None], size[:, None, None, None, None], second=theirs[:, None], second_size=others.size[:, None, :, None, None]
     )
     return touch & others.seen[:, None, :, None, None]
 
@@ -242,8 +242,8 @@ def at_fault(states: Tensor, size: Tensor, others: Others, touch: Tensor, loose:
     other_size = others.size[scene, agent]
     direction = torch.stack([own[:, 2].cos(), own[:, 2].sin()], -1)
     bumper = torch.cat([own[:, :2] + box[:, :1] / 2 * direction, own[:, 2:]], -1)
-    front = overlap(bumper, box * box.new_tensor([0.0, 1.0]), other, other_size)
-    behind = angle_at_axle(own, box, other[:, :2]) > BEHIND
+    front = overlap(bumper, box * box.new_tensor([0.0, 1.0]), second=other, second_size=other_size)
+    behind = angle_at_axle(own, box, centre=other[:, :2]) > BEHIND
     moves = own[:, 3] > STANDS
     stands = other[:, 3].abs() <= STANDS
     fault = torch.zeros_like(touch)
@@ -263,7 +263,7 @@ def runs_into(states: Tensor, size: Tensor, others: Others, touch: Tensor, loose
     step = event // len(LOOKS)
     seconds = states.new_tensor(LOOKS)[event % len(LOOKS)]
     centre = constant_velocity(others.states[scene, agent, step], seconds[:, None])[:, 0, :2]
-    angle = angle_at_axle(states[scene, proposal, step], size[scene], centre)
+    angle = angle_at_axle(states[scene, proposal, step], size[scene], centre=centre)
     counts = (angle < AHEAD) | loose[scene, proposal, step] & (angle <= BEHIND)
     result = torch.zeros_like(states[..., 0, 0], dtype=torch.bool)
     result[scene[counts], proposal[counts]] = True
@@ -276,7 +276,7 @@ def in_several_lanes(world: World, states: Tensor, size: Tensor) -> Tensor:
     centres = states[..., :2]
     driven = torch.nn.functional.pad(centres.diff(dim=2).norm(dim=-1).cumsum(-1), (1, 0))
     near = (path.s[:, None, None] + driven).flatten(1, 2)
-    beside = project(centres.flatten(1, 2), path.route, near)[1].view(driven.shape)
+    beside = project(centres.flatten(1, 2), path.route, hint=near)[1].view(driven.shape)
     return beside.abs() + size[:, None, None, 1] / 2 > LANE_WIDTH / 2
 
 
@@ -284,7 +284,7 @@ def on_road(states: Tensor, size: Tensor, world: World) -> Tensor:
     """Bool [B, P]: no corner of states [B, P, T, 4] leaves the drivable area."""
     field = world.scene["field"]
     origin = world.scene["field_origin"]
-    beyond = off_road(corners(states, size[:, None, None]).flatten(1, 3), field, origin).view(*states.shape[:3], 4)
+    beyond = off_road(corners(states, size[:, None, None]).flatten(1, 3), field, origin=origin).view(*states.shape[:3], 4)
     return beyond.amax((-2, -1)) <= 0
 
 
@@ -301,7 +301,7 @@ def comfortable(world: World, scored: Tensor) -> Tensor:
     whole = SCORED_STEPS + 1
 
     def filtered(values: Tensor, window: int, order: int, derivative: int = 0) -> Tensor:
-        return values @ savitzky_golay(window, order, derivative).to(values).mT
+        return values @ savitzky_golay(window, order, derivative=derivative).to(values).mT
 
     longitudinal = filtered(accel, whole, order=2)
     smooth, total = (filtered(values, 8, order=2) for values in (accel, accel.abs()))

@@ -48,7 +48,7 @@ def message(kind: int, payload: bytes) -> bytes:
 def scene_messages(world: World, rows: list[int]) -> bytes:
     """SCENE of the given rows of a World: map, mission and the ego's size."""
     mission = mission_of(world.scene)
-    return b"".join(_scene(world, mission, row) for row in rows)
+    return b"".join(_scene(world, mission, row=row) for row in rows)
 
 
 def _scene(world: World, mission: Mission, row: int) -> bytes:
@@ -77,7 +77,7 @@ def plan_message(world: World) -> bytes:
     scene = world.scene
     row = torch.arange(count, device=world.step.device)
     lights = torch.arange(scene["light_state"].shape[-1], device=row.device).expand(count, -1)
-    state = light_state_at(scene["light_state"], lights, world.step)
+    state = light_state_at(scene["light_state"], lights, step=world.step)
     number = torch.arange(agents, device=row.device).expand(count, -1)
     fields = [number[..., None], scene["agent_type"][..., None], world.states, scene["size"]]
     fields += [world.accel[..., None], world.turn_rate[..., None]]
@@ -144,11 +144,11 @@ class PlannerLink:
         deadline = begun + timeout
         try:
             if command is None:
-                self._socket = connect(str(address), None, begun + min(timeout, ANSWERS), self._name)
+                self._socket = connect(str(address), None, deadline=begun + min(timeout, ANSWERS), name=self._name)
             else:  # a connection does not need its path
                 with tempfile.TemporaryDirectory(prefix="e2rl-", ignore_cleanup_errors=True) as folder:
                     self._process = start(command, f"unix:{folder}/planner")
-                    self._socket = connect(f"unix:{folder}/planner", self._process, deadline, self._name)
+                    self._socket = connect(f"unix:{folder}/planner", self._process, deadline=deadline, name=self._name)
         except BaseException:
             close(None, self._process)
             raise

@@ -101,7 +101,7 @@ def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
         raise InputError(f"{where}: cannot be read ({error.strerror}); pass a file of a policy") from error
     policy = kinds[file.suffix](content, where)
     for count in PROBED:
-        probe(policy, where, count)
+        probe(policy, where, count=count)
     return policy
 
 
@@ -121,7 +121,7 @@ def write_policy(policy: nn.Module, file: Path) -> None:
     if file.suffix not in writers:
         raise InputError(f"{file}: no kind of policy; name it {ONNX}, or {TORCHSCRIPT} for TorchScript")
     if file.suffix == ONNX:
-        library("onnxscript", str(file), "onnx")
+        library("onnxscript", str(file), extra="onnx")
     write_atomically(file, partial(writers[file.suffix], policy.eval()))
 
 

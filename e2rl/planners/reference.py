@@ -31,7 +31,7 @@ MILD = slice(ACCELERATIONS.index(-1.0), ACCELERATIONS.index(1.0) + 1)
 PURSUIT_TIME, PURSUIT_MIN, PURSUIT_MAX = 1.5, 6.0, 30.0  # s, m, m: look-ahead of the pursuit
 ACCELERATION, BRAKING, HARDEST_BRAKING = 1.5, 2.5, 7.0  # m/s^2
 HEADWAY, STANDSTILL_GAP, EXPONENT = 1.2, 3.0, 4.0  # s, m
-DRIVER = IDMParameters(HEADWAY, STANDSTILL_GAP, ACCELERATION, BRAKING, EXPONENT)
+DRIVER = IDMParameters(HEADWAY, STANDSTILL_GAP, acceleration=ACCELERATION, braking=BRAKING, exponent=EXPONENT)
 COOLNESS = 0.99  # of the ACC model: 0 is IDM
 LATERAL = 2.5  # m/s^2 in curves
 REACTION = 0.5  # s in which a speed cap is met
@@ -73,7 +73,7 @@ def _following(speed: Tensor, desired: Tensor, gap: Tensor, leading: Tensor, acc
     After a cut-in, IDM brakes fully for a short gap even if the leader pulls away. An IDM acceleration below that of
     the constant-acceleration heuristic, which only avoids the crash, is therefore raised towards it.
     """
-    own = idm_acceleration(speed, desired, gap, leading, DRIVER, improved=True)
+    own = idm_acceleration(speed, desired, gap=gap, leader_speed=leading, driver=DRIVER, improved=True)
     space = gap.clamp(0.5, 1e3)
     steady = acceleration.clamp(-HARDEST_BRAKING, ACCELERATION)
     stops_first = leading * (speed - leading) <= -2 * space * steady
@@ -196,7 +196,7 @@ class Trunk(nn.Module):
         self.rest = nn.Sequential(*_layer(OBSERVATION_SIZE - PER_AGENT * NEAREST, rest))
         deeper = zip(sizes[:-1], sizes[1:], strict=True)
         self.joint = nn.Sequential(*(module for pair in deeper for module in _layer(*pair)))
-        self.last = linear(sizes[-1], out, last_gain)
+        self.last = linear(sizes[-1], out, gain=last_gain)
 
     def forward(self, seen: Tensor) -> Tensor:
         """[..., out]."""
@@ -207,7 +207,7 @@ class Trunk(nn.Module):
 
 
 def _layer(fan_in: int, fan_out: int, norm: bool = True) -> list[nn.Module]:
-    return [linear(fan_in, fan_out, 2**0.5), *([nn.LayerNorm(fan_out)] if norm else []), nn.SiLU()]
+    return [linear(fan_in, fan_out, gain=2**0.5), *([nn.LayerNorm(fan_out)] if norm else []), nn.SiLU()]
 
 
 def linear(fan_in: int, fan_out: int, gain: float) -> nn.Linear:

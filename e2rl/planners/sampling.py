@@ -68,8 +68,8 @@ class ScoringEgo(Weights, Ego):
         """Costs [B, C] of candidates."""
         steps = torch.arange(STRIDE, round(self.horizon / DT) + 1, STRIDE, device=world.step.device)
         agents, seen = nearest(world, self.agents)
-        others = forecast(world, agents, seen, steps * DT, self.hold, self.turn)
-        return score(world, candidates, others, steps, self)
+        others = forecast(world, agents, seen=seen, times=steps * DT, hold=self.hold, turn=self.turn)
+        return score(world, candidates, others=others, steps=steps, weights=self)
 
     def plan(self, world: World) -> Tensor:
         """The states [B, PLAN_STEPS, 4] of the candidate that costs least."""
@@ -102,13 +102,13 @@ class ScoringEgo(Weights, Ego):
         path = MissionPath(world)
         driven = torch.cat([world.states[:, None, :1, :2].expand_as(states[:, :, :1, :2]), states[..., :2]], 2)
         length = driven.diff(dim=2).norm(dim=-1).sum(-1)
-        end, shift, _ = project(states[:, :, -1, :2], path.route, path.s[:, None] + length)
-        return self.costs(world, Candidates(states, end - path.s[:, None], shift))
+        end, shift, _ = project(states[:, :, -1, :2], path.route, hint=path.s[:, None] + length)
+        return self.costs(world, Candidates(states, end - path.s[:, None], shift=shift))
 
     def _chunks(self, world: World) -> list[World]:
         rows = torch.arange(len(world.step), device=world.step.device)
         size = GPU_CHUNK if rows.is_cuda else self.CHUNK
-        return [take(world, part, self.READS) for part in rows.split(size)]
+        return [take(world, part, keys=self.READS) for part in rows.split(size)]
 
 
 def take(world: World, rows: Tensor, keys: tuple[str, ...] = SCENE_KEYS) -> World:
@@ -154,7 +154,7 @@ class SamplingEgo(ScoringEgo):
         path = MissionPath(world)
         start = world.states[:, 0]
         caps = path.speed_caps(self.max_speed)
-        speed = speed_profiles(start[:, 3], start.new_tensor(PROFILES), caps, BRAKING + BRAKING_MORE)
+        speed = speed_profiles(start[:, 3], start.new_tensor(PROFILES), caps=caps, braking=BRAKING + BRAKING_MORE)
         beside = start.new_tensor(SHIFTS).expand(len(start), -1)
         shift = torch.cat([beside, beside, path.d[:, None]], 1)
         time = start.new_tensor([self.swift] * len(SHIFTS) + [self.calm] * len(SHIFTS) + [self.swift])

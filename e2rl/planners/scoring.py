@@ -60,7 +60,7 @@ def forecast(world: World, agents: Tensor, seen: Tensor, times: Tensor, hold: fl
     middle = (heading[..., 1:] + heading[..., :-1]) / 2
     x = state[..., 0:1] + (moved * middle.cos()).cumsum(-1)
     y = state[..., 1:2] + (moved * middle.sin()).cumsum(-1)
-    return Forecast(torch.stack([x, y, heading[..., 1:]], -1), speed[..., 1:], world.scene["size"][row, agents], seen)
+    return Forecast(torch.stack([x, y, heading[..., 1:]], -1), speed[..., 1:], size=world.scene["size"][row, agents], seen=seen)
 
 
 MOVING = 3.0  # m/s from which on an agent's place becomes uncertain at the full rate
@@ -94,8 +94,8 @@ class Weights:
 def score(world: World, candidates: Candidates, others: Forecast, steps: Tensor, weights: Weights) -> Tensor:
     """Costs [B, C]; steps [T]: those that are scored, of the candidates (1 is the next) and of the forecast."""
     states = candidates.states[:, :, steps - 1]
-    cost = meeting_cost(states, world.scene["size"][:, 0], others, steps * DT, weights)
-    cost = cost + weights.off_road * beyond_border(states[:, :, ::ROAD_STRIDE], world, weights.border)
+    cost = meeting_cost(states, world.scene["size"][:, 0], others=others, times=steps * DT, weights=weights)
+    cost = cost + weights.off_road * beyond_border(states[:, :, ::ROAD_STRIDE], world, border=weights.border)
     cost = cost + weights.comfort * discomfort(candidates.states, world)
     return cost + weights.lateral_offset * candidates.shift.abs() - weights.progress * candidates.distance
 
@@ -121,10 +121,10 @@ def meeting_cost(ego: Tensor, ego_size: Tensor, others: Forecast, times: Tensor,
     cost, ends = pair_cost(
         ego.reshape(-1, 4)[mine * steps + time],
         ego_size[scene],
-        torch.cat([others.poses, others.speed[..., None]], -1).view(-1, 4)[pair * steps + time],
-        others.size.view(-1, 2)[pair],
-        margin.view(-1)[pair * steps + time],
-        weights,
+        other=torch.cat([others.poses, others.speed[..., None]], -1).view(-1, 4)[pair * steps + time],
+        other_size=others.size.view(-1, 2)[pair],
+        margin=margin.view(-1)[pair * steps + time],
+        weights=weights,
     )
     end = torch.full((batch * count,), steps, device=ego.device)
     end.scatter_reduce_(0, mine[ends], time[ends], "amin")
@@ -180,8 +180,8 @@ def beyond_border(states: Tensor, world: World, border: float) -> Tensor:
     leave it; only what exceeds the ego's present place counts."""
     field = world.scene["field"]
     origin = world.scene["field_origin"]
-    now = off_road(world.states[:, :1, :2], field, origin).clamp(min=-border)
-    return (off_road(states[..., :2], field, origin) - now[..., None]).clamp(0, FARTHEST).sum(-1)
+    now = off_road(world.states[:, :1, :2], field, origin=origin).clamp(min=-border)
+    return (off_road(states[..., :2], field, origin=origin) - now[..., None]).clamp(0, FARTHEST).sum(-1)
 
 
 def discomfort(states: Tensor, world: World) -> Tensor:

@@ -82,7 +82,7 @@ def bounded(
     motion = decode(None, None)
     cap = torch.full_like(state.v, NO_CAP)
     for _ in range(2):
-        cap = torch.minimum(cap, acceleration_caps(settings, motion, state, obstacles))
+        cap = torch.minimum(cap, acceleration_caps(settings, motion, state=state, obstacles=obstacles))
         rows = (cap < NO_CAP).nonzero(as_tuple=True)
         if len(rows[0]):
             motion = motion.put(rows, decode(rows, cap[rows]))
@@ -95,9 +95,9 @@ def acceleration_caps(settings: BoundSettings, motion: LaneState, state: LaneSta
     steps = torch.arange(STRIDE - 1, round(settings.look / DT), STRIDE, device=state.v.device)
     braking = torch.full_like(state.v, -NO_CAP)
     if settings.meeting:
-        braking = torch.maximum(braking, _meeting_braking(motion, state, obstacles, steps))
+        braking = torch.maximum(braking, _meeting_braking(motion, state, obstacles=obstacles, steps=steps))
     if settings.curve:
-        braking = torch.maximum(braking, _curve_braking(settings, motion, state, steps))
+        braking = torch.maximum(braking, _curve_braking(settings, motion, state=state, steps=steps))
     return (-braking).clamp(min=settings.floor)
 
 
@@ -124,7 +124,7 @@ def _meeting_braking(motion: LaneState, state: LaneState, obstacles: Obstacles, 
     length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2
     if duty is None:  # nobody is behind the ego by any duty
         none = torch.zeros_like(here)
-        duty = Duty(none, none, torch.zeros_like(length))
+        duty = Duty(none, none, patience=torch.zeros_like(length))
         length = torch.full_like(length, -torch.inf)
     return braking_for_meetings(plans, state.v, length, duty)
 
@@ -149,7 +149,7 @@ PLANS = ("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool"
 @fused(PLANS, "B V", "B V", ("B V:bool", "B V:bool", "B V"))
 def braking_for_meetings(plans: Plans, speed: Tensor, length: Tensor, duty: Duty) -> Tensor:
     """`meeting_braking` [B, V] for the `first_meeting`."""
-    return meeting_braking(first_meeting(plans), speed, length, duty)
+    return meeting_braking(first_meeting(plans), speed, length=length, duty=duty)
 
 
 class Meeting(NamedTuple):
@@ -168,7 +168,7 @@ def first_meeting(plans: Plans) -> Meeting:
     own, everybody, driven, own_size, size, here, present, steps = plans
     vehicles = own.shape[1]
     wide = torch.stack([own_size[..., 0], own_size[..., 1] + 2 * LATERAL_MARGIN], -1)
-    meets = overlap(own[:, :, None], wide[:, :, None, None], everybody[:, None], size[:, None, :, None])
+    meets = overlap(own[:, :, None], wide[:, :, None, None], second=everybody[:, None], second_size=size[:, None, :, None])
     other = torch.arange(present.shape[1], device=present.device)
     itself = other == torch.arange(vehicles, device=own.device)[:, None]
     counts = present[:, None, :] & here[..., None] & ~itself
@@ -180,7 +180,7 @@ def first_meeting(plans: Plans) -> Meeting:
     they = everybody[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
     mine = own[:, :, None].expand(-1, -1, first.shape[2], -1, -1).gather(3, index)[..., 0, :]
     way = driven[:, :, None].expand(-1, -1, first.shape[2], -1).gather(3, first[..., None])[..., 0]
-    return Meeting(mine, they, way, steps[first], left > 0)
+    return Meeting(mine, they, driven=way, steps=steps[first], happens=left > 0)
 
 
 def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty) -> Tensor:
@@ -203,7 +203,7 @@ def meeting_braking(meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty)
     room = (driven - GAP - u * DT * steps).clamp(min=0.3)
     closing = (speed[..., None] - u).clamp(min=0)
     braking = closing**2 / (2 * room)
-    to_ego = _towards_ego(duty, happens[..., 0], yields[..., 0], room[..., 0], closing[..., 0])
+    to_ego = _towards_ego(duty, happens[..., 0], yields=yields[..., 0], room=room[..., 0], closing=closing[..., 0])
     yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
     back = 2 * (length + GAP - ahead[..., 0]).clamp(min=0) / (DT * steps[..., 0]) ** 2
     back = back * (along[..., 0] > ALONGSIDE)  # who comes into the ego's side is behind it when they would touch

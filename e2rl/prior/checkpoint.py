@@ -68,7 +68,7 @@ def load_prior(
         origin = json.loads(header["origin"])
         if architecture["features"] != FEATURES:
             raise ValueError(f"made for {architecture['features']} features, this version has {FEATURES}")
-        settings = settings_of(DenoiserSettings, architecture["denoiser"], "denoiser")
+        settings = settings_of(DenoiserSettings, architecture["denoiser"], where="denoiser")
         if max(settings.width, settings.blocks, settings.pair) > LARGEST:
             raise ValueError(f"a size above {LARGEST} in {settings}")
         if architecture.get("free_space"):

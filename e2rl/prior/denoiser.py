@@ -49,7 +49,7 @@ class Encoding:
     def map(self, function: Callable[[Tensor], Tensor]) -> "Encoding":
         """An Encoding with `function` applied to every tensor."""
         biases, modulations = ([function(value) for value in values] for values in (self.biases, self.modulations))
-        return Encoding(function(self.nodes), function(self.pairs), biases, modulations)
+        return Encoding(function(self.nodes), function(self.pairs), biases=biases, modulations=modulations)
 
     def repeat(self, count: int) -> "Encoding":
         """The same scenes `count` times along the batch."""
@@ -127,9 +127,9 @@ class Denoiser(nn.Module):
     def encode(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
         """Encoding of node features [B, V, NODE], pair features [B, V, V, EDGE] and presence [B, V]."""
         if self._learns() or not is_on():
-            return self.encoding(nodes, pairs, present)
+            return self.encoding(nodes, pairs, present=present)
         node, pair, *rest = fused_encoding(self.settings)(nodes, pairs, present, *self._read)
-        return Encoding(node, pair, rest[: self.settings.blocks], rest[self.settings.blocks :])
+        return Encoding(node, pair, biases=rest[: self.settings.blocks], modulations=rest[self.settings.blocks :])
 
     def encoding(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
         """`encode`, operation by operation."""
@@ -139,7 +139,7 @@ class Denoiser(nn.Module):
         bias = self.bias(pair).permute(0, 3, 1, 2) + absent
         # The modulation is linear in node and level: the nodes' part is the same for all levels.
         modulations = [node @ block.modulation.weight.T for block in self.blocks]
-        return Encoding(node, pair, [part.contiguous() for part in bias.chunk(self.settings.blocks, 1)], modulations)
+        return Encoding(node, pair, biases=[part.contiguous() for part in bias.chunk(self.settings.blocks, 1)], modulations=modulations)
 
     def modulated(self, level: Tensor) -> list[Tensor]:
         """The level's part of each block's modulation [..., V, 6 W], of level [..., V]; scales are around 1."""
@@ -150,7 +150,7 @@ class Denoiser(nn.Module):
     def forward(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
         """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or [1, V] for all scenes."""
         if self._learns() or len(level) > 1 or not is_on() or (torch.is_grad_enabled() and x.requires_grad):
-            return self.estimate(x, level, encoding)
+            return self.estimate(x, level, encoding=encoding)
         scene = encoding.nodes, encoding.pairs, *encoding.biases, *encoding.modulations
         return fused_estimate(self.settings)(x, level, *scene, *self._read)
 
@@ -199,7 +199,7 @@ def fused_estimate(settings: DenoiserSettings) -> Fused:
     blocks = settings.blocks
 
     def denoise(x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *given: Tensor) -> Tensor:
-        encoding = Encoding(nodes, pairs, list(given[:blocks]), list(given[blocks : 2 * blocks]))
+        encoding = Encoding(nodes, pairs, biases=list(given[:blocks]), modulations=list(given[blocks : 2 * blocks]))
         return module.call(given[2 * blocks :], x, level, encoding)
 
     scene = [f"B V {settings.width}", f"B V V {settings.pair}", *[f"B {settings.heads} V V"] * blocks]

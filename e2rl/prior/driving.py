@@ -36,12 +36,12 @@ def as_driven(motion: LaneState, state: LaneState, on_lane: Tensor) -> LaneState
     motion = replace(motion, v=torch.where(back < 0, back, motion.v))
     before = torch.cat([state.v[..., None], motion.v[..., :-1]], -1)
     driven = ((before + motion.v) / 2 * DT).cumsum(-1)
-    placed = _placed(motion, state, driven, on_lane)
-    placed = select(state.v < 0, motion, placed)  # there is no line behind the vehicle
+    placed = _placed(motion, state, driven=driven, on_lane=on_lane)
+    placed = select(state.v < 0, motion, other=placed)  # there is no line behind the vehicle
     headings = torch.cat([state.heading[..., None], placed.heading], -1)
     bound = turn_bound((before + motion.v) / 2)
     turn = torch.maximum(torch.minimum(wrap(headings.diff(dim=-1)), bound), -bound)
-    x, y, heading, _ = steered(state.states(), motion.v, turn).unbind(-1)
+    x, y, heading, _ = steered(state.states(), motion.v, turn=turn).unbind(-1)
     return replace(placed, x=x, y=y, heading=heading)
 
 

@@ -42,15 +42,15 @@ def node_features(routed: RoutedScene, state: LaneState, followed: Leaders, step
     gap = followed.gap[..., 0]
     gap_speed = followed.speed[..., 0]
     desired_speed = torch.where(known, limit, 15.0).clamp(min=1.0)
-    idm = idm_acceleration(v, desired_speed, gap, gap_speed, DRIVER, improved=False).clamp(-6.0, 2.0)
+    idm = idm_acceleration(v, desired_speed, gap=gap, leader_speed=gap_speed, driver=DRIVER, improved=False).clamp(-6.0, 2.0)
     motion = [v / 10, state.a / 2, state.d, state.d1 * 5, state.d2 * 20, (v < 0.5).float()]
     speed_limit = [known.float(), torch.where(known, (limit - v) / 10, 0.0), torch.where(known, limit / 15, 0.0)]
     kind = [length / 5, width / 2, routed.parked.float(), routed.has_lane.float()]
     need = (v * v / (2 * gap.clamp(min=1.0))).clamp(max=8) / 4
     speed = [(v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3, estimated[:, None].float().expand_as(v)]
     features = [*motion, *speed_limit, *_route_features(routed, state), *lead, idm / 2]
-    features += [*_light_features(routed, state, step), *kind, (gap < FREE_GAP).float(), need, *speed]
-    return torch.stack([*features, *past_features(routed.past, state.v, estimated)], -1)
+    features += [*_light_features(routed, state, step=step), *kind, (gap < FREE_GAP).float(), need, *speed]
+    return torch.stack([*features, *past_features(routed.past, state.v, estimated=estimated)], -1)
 
 
 def _route_features(routed: RoutedScene, state: LaneState) -> list[Tensor]:
@@ -59,7 +59,7 @@ def _route_features(routed: RoutedScene, state: LaneState) -> list[Tensor]:
     _, heading, curvature = interpolate(routed.points, state.s[..., None] + offsets)
     count = len(CURVATURE_AT)
     turn = (heading[..., count:-1] - heading[..., -1:] + torch.pi) % (2 * torch.pi) - torch.pi
-    curve = curve_speed(state, routed.points, COMFORT_LATERAL, COMFORT_BRAKE)
+    curve = curve_speed(state, routed.points, lateral=COMFORT_LATERAL, brake=COMFORT_BRAKE)
     rest = torch.where(routed.open, routed.length - state.s, 200.0).clamp(-10.0, 200.0)
     ahead = [*(curvature[..., :count] * 15).clamp(-3, 3).unbind(-1), *turn.unbind(-1)]
     ahead += [state.kappa * state.v, ((curve - state.v) / 5).clamp(-2, 2)]
@@ -77,12 +77,12 @@ def leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tenso
     """Leaders [B, V, 3] of vehicles at arc lengths s [B, V] once agents [B, N, 4] have kept their velocity for
     LEADER_AT."""
     there = constant_velocity(agents, torch.tensor(LEADER_AT, device=agents.device))
-    return leaders(s, routed.points, there, routed.size, present)
+    return leaders(s, routed.points, agents=there, size=routed.size, present=present)
 
 
 def _light_features(routed: RoutedScene, state: LaneState, step: Tensor) -> list[Tensor]:
     """Of each light of the route: nearness, red, yellow, green, and the braking that stops at it."""
-    colours = light_state_at(routed.light_state, routed.light, step)
+    colours = light_state_at(routed.light_state, routed.light, step=step)
     ahead = routed.light_s - state.s[..., None]
     seen = (routed.light >= 0) & (ahead > -1.0) & (ahead < 120.0)
     need = (state.v[..., None] ** 2 / (2 * ahead.clamp(min=1.0))).clamp(max=8.0)

@@ -50,13 +50,13 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     accel = (v - torch.cat([state.v[..., None], v[..., :-1]], -1)) / DT
     s = state.s[..., None] + travelled
     zero = torch.zeros_like(v)
-    return LaneState(s, state.d[..., None] + zero, zero, zero, v, accel, xs, ys, heading, kappa)
+    return LaneState(s, state.d[..., None] + zero, d1=zero, d2=zero, v=v, a=accel, x=xs, y=ys, heading=heading, kappa=kappa)
 
 
 @fused(f"B V {SIZE}", "B V", "B V P 2!", "B V:bool")
 def decode_plans(x: Tensor, state: LaneState, points: Tensor, on_lane: Tensor) -> LaneState:
     """Planned motion of every vehicle, on its route where on_lane [B, V], in free space elsewhere."""
-    return select(on_lane, lane_relative.decode(x, state, points), decode(x, state))
+    return select(on_lane, lane_relative.decode(x, state, points=points), other=decode(x, state))
 
 
 def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tensor:
@@ -73,4 +73,4 @@ def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tens
     given = 0.5 * reach * state.kappa[..., None] * (first - first**2 / 2)
     turn = wrap(heading - state.heading[..., None])
     unit = torch.stack([scale * half, scale * end], -1) * known[..., None]
-    return ridge(unit, (turn - given) * known, 1e-3 * torch.eye(2, device=unit.device)).clamp(-6.0, 6.0)
+    return ridge(unit, (turn - given) * known, damping=1e-3 * torch.eye(2, device=unit.device)).clamp(-6.0, 6.0)

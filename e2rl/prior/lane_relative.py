@@ -86,24 +86,24 @@ def locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint
 @fused("B V 4", "B V", "B V", "B V P 2!")
 def locate_anywhere(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor) -> LaneState:
     """`locate` without a hint."""
-    return _locate(states, accel, yaw_rate, points, None)
+    return _locate(states, accel, yaw_rate=yaw_rate, points=points, hint=None)
 
 
 @fused("B V 4", "B V", "B V", "B V P 2!", "B V")
 def locate_near(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor) -> LaneState:
     """`locate` with a hint."""
-    return _locate(states, accel, yaw_rate, points, hint[..., None])
+    return _locate(states, accel, yaw_rate=yaw_rate, points=points, hint=hint[..., None])
 
 
 def _locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor | None) -> LaneState:
-    s, d, _ = (value[..., 0] for value in project(states[..., None, :2], points, hint))
+    s, d, _ = (value[..., 0] for value in project(states[..., None, :2], points, hint=hint))
     heading, curvature = (value[..., 0] for value in interpolate(points, s[..., None])[1:])
     turn = wrap(states[..., 2] - heading)
     v = states[..., 3]
     kappa = (yaw_rate / at_least(v, 1.0)).clamp(-0.25, 0.25)
     d1 = torch.tan(turn.clamp(-1.0, 1.0)) * (1 - curvature * d).clamp(min=LEAST_STRETCH)
     d2 = (kappa - curvature).clamp(-0.1, 0.1)
-    return LaneState(s, d, d1, d2, v, accel, states[..., 0], states[..., 1], states[..., 2], kappa)
+    return LaneState(s, d, d1=d1, d2=d2, v=v, a=accel, x=states[..., 0], y=states[..., 1], heading=states[..., 2], kappa=kappa)
 
 
 @cache
@@ -183,28 +183,28 @@ def decode(
     v = v[..., steps]
     travelled = travelled[..., steps]
     reach = lateral_horizon(state.v)[..., None]
-    d, d1, d2 = polynomial(offset_coefficients(state, half, end), (travelled / reach).clamp(max=1.0))
+    d, d1, d2 = polynomial(offset_coefficients(state, half, end=end), (travelled / reach).clamp(max=1.0))
     d1 = d1 / reach
     d2 = d2 / reach**2
     s = state.s[..., None] + travelled
-    xy, heading, curvature = interpolate(points, s, along)
+    xy, heading, curvature = interpolate(points, s, tangents=along)
     normal = torch.stack([-torch.sin(heading), torch.cos(heading)], -1)
     xy = xy + d[..., None] * normal
     heading = heading + torch.atan(d1 / (1 - curvature * d).clamp(min=LEAST_STRETCH))
-    return LaneState(s, d, d1, d2, v, accel, xy[..., 0], xy[..., 1], heading, curvature + d2)
+    return LaneState(s, d, d1=d1, d2=d2, v=v, a=accel, x=xy[..., 0], y=xy[..., 1], heading=heading, kappa=curvature + d2)
 
 
 @fused(f"B V {SIZE}", "B V", "B V P 2!")
 def decode_plans(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     """`decode` of every vehicle's plan."""
-    return decode(x, state, points)
+    return decode(x, state, points=points)
 
 
 @fused(f"G O {SIZE}", "G O", "G P 2!")
 def decode_options(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     """`decode` of O plans of each of G vehicles on its route."""
     routes = points[:, None]
-    return decode(x, state, routes, along=tangents(routes))
+    return decode(x, state, points=routes, along=tangents(routes))
 
 
 class _Polynomial(torch.autograd.Function):
@@ -250,12 +250,12 @@ def fit(track: LaneState, known: Tensor | None, state: LaneState) -> tuple[Tenso
     track: fields s, d, v [..., V, HORIZON] of the steps ahead; known: their mask, None: all; state: at the start. Ridge
     least squares on speed and distance for the knots (second differences damped), on offset for the lateral knots.
     """
-    knots = _fit_knots(track, known, state)
+    knots = _fit_knots(track, known, state=state)
     known = torch.ones_like(track.v) if known is None else known
     _, travelled = speeds(state, knots)
     u = (travelled / lateral_horizon(state.v)[..., None]).clamp(max=1.0)
     zero = torch.zeros_like(state.d)
-    base = polynomial(offset_coefficients(state, zero, zero), u)[0]
+    base = polynomial(offset_coefficients(state, zero, end=zero), u)[0]
     still = state.map(torch.zeros_like)
     still.v = state.v
     parts = [polynomial(offset_coefficients(still, *pair), u)[0] for pair in ((zero + 1, zero), (zero, zero + 1))]
@@ -263,7 +263,7 @@ def fit(track: LaneState, known: Tensor | None, state: LaneState) -> tuple[Tenso
     # In units of x: half = (d + end) / 2 + BEND_SCALE x_0, end = OFFSET_SCALE x_1.
     unit = torch.stack([BEND_SCALE * basis[..., 0], OFFSET_SCALE * (basis[..., 1] + 0.5 * basis[..., 0])], -1)
     rest = (track.d - base - 0.5 * state.d[..., None] * parts[0]) * known
-    lateral = ridge(unit, rest, torch.diag(unit.new_tensor([0.05, 0.02])))
+    lateral = ridge(unit, rest, damping=torch.diag(unit.new_tensor([0.05, 0.02])))
     left = (rest - (unit * lateral[..., None, :]).sum(-1)).abs() + (track.s - state.s[..., None] - travelled).abs()
     error = (left * known).sum(-1) / known.sum(-1).clamp(min=1)
     return torch.cat([knots / ACCEL_SCALE, lateral], -1), error

@@ -97,7 +97,7 @@ class Prior(nn.Module):
     @torch.no_grad()
     def choose_routes(self, scene: TensorDictBase, uniform: Tensor) -> Tensor:
         """A route candidate [B, V] for each vehicle, drawn by uniform [B, V]; the ego's is its mission."""
-        chosen = sample_route(self.route_choice(scene), self.sampler.route_temperature, uniform)
+        chosen = sample_route(self.route_choice(scene), self.sampler.route_temperature, uniform=uniform)
         return torch.cat([scene["route_log"][:, :1], chosen[:, 1:]], 1)
 
     @torch.no_grad()
@@ -124,15 +124,15 @@ class Prior(nn.Module):
         of scenes in which everybody is at the same place of the same route.
         """
         here = present[:, : state.s.shape[1]]
-        followed = _leaders_ahead(routed, state.s, agents, present, known)
+        followed = _leaders_ahead(routed, state.s, agents=agents, present=present, known=known)
         nodes = node_features(routed, state, followed, step, step == 0)
         encoding = self.denoiser.encode(nodes, edge_features(routed, state), here)
-        obstacles = Obstacles(agents, routed.size, present)
+        obstacles = Obstacles(agents, routed.size, present=present)
         active = here & routed.modelled
         active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
-        ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed)
+        ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed=routed)
         all_on_lane = bool((routed.has_lane | ~here).all())
-        return Context(routed, state, followed, encoding, ego_x, obstacles, active, all_on_lane)
+        return Context(routed, state, followed=followed, encoding=encoding, ego_x=ego_x, obstacles=obstacles, active=active, all_on_lane=all_on_lane)
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; a known plan of the ego replaces its row, nearly noise-free."""
@@ -148,21 +148,21 @@ class Prior(nn.Module):
     def estimate(self, context: Context) -> Tensor:
         """x0 [B, V, SIZE] at the highest noise level without noise (one NFE): nearly the mean of the samples."""
         x = torch.zeros(*context.state.v.shape, SIZE, device=context.state.v.device)
-        return self.denoise(x, self.schedule.levels(1, x.device)[0], context)
+        return self.denoise(x, self.schedule.levels(1, x.device)[0], context=context)
 
     def decode(self, x0: Tensor, context: Context, cap: Tensor | None = None, steps: slice = slice(None)) -> LaneState:
         """Planned motion of x0, fields [B, V, HORIZON] or those `steps` of it; cap [B, V]: of the acceleration in the
         executed part."""
-        x0, state = apply_cap(cap, x0, context.state)
+        x0, state = apply_cap(cap, x0, state=context.state)
         if steps == slice(None) and not context.all_on_lane:
             return free_space.decode_plans(x0, state, context.routed.points, context.routed.has_lane)
         if steps == slice(None):
             lane = lane_relative.decode_plans(x0, state, context.routed.points)
         else:
-            lane = lane_relative.decode(x0, state, context.routed.points, steps)
+            lane = lane_relative.decode(x0, state, points=context.routed.points, steps=steps)
         if context.all_on_lane:
             return lane
-        return select(context.routed.has_lane, lane, free_space.decode(x0, state).map(lambda value: value[..., steps]))
+        return select(context.routed.has_lane, lane, other=free_space.decode(x0, state).map(lambda value: value[..., steps]))
 
     def sample(
         self, context: Context, noise: Tensor, control: Control | None = None, budget: Tensor | None = None
@@ -190,7 +190,7 @@ class Prior(nn.Module):
             low = levels[index + 1]
             if control is None:
                 with torch.no_grad():
-                    x0 = nominal = self.denoise(x, high, context)
+                    x0 = nominal = self.denoise(x, high, context=context)
             else:
                 x, nominal, x0 = control(x, high, k, context, partial(self.denoise, level=high, context=context))
             if k > 1:  # the last step takes x0 itself
@@ -199,13 +199,13 @@ class Prior(nn.Module):
                 if control is None:
                     x = fused_step(settings, SIZE)(x, x0, before[0], *walk)
                 else:
-                    step = fused_controlled_step(settings, SIZE, budget is not None)
+                    step = fused_controlled_step(settings, SIZE, limited=budget is not None)
                     x, x0, kl, log_ratio = step(x, x0, nominal, *before, *walk, kl, log_ratio, any_budget)
                 past = (x0, nominal)
                 last = high
             elif budget is not None and control is not None:  # without noise there is no KL to count
                 x0 = torch.where((kl.sum(-1) < BUDGET_SPENT * budget)[:, None, None], x0, nominal)
-        return Sample(x0, kl, log_ratio)
+        return Sample(x0, kl, log_ratio=log_ratio)
 
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> Plan:
@@ -217,16 +217,16 @@ class Prior(nn.Module):
 
         def decode(rows: Rows | None, cap: Tensor | None) -> LaneState:
             if rows is None:
-                motion = as_driven(self.decode(x0, context), state, routed.has_lane)
-                return _held(motion, state, held)
+                motion = as_driven(self.decode(x0, context), state, on_lane=routed.has_lane)
+                return _held(motion, state, always=held)
             some = {name: getattr(routed, name)[rows][:, None] for name in ("points", "has_lane")}
             now = state.map(lambda value: value[rows][:, None])
             part = replace(context, routed=replace(routed, **some), state=now)
             assert cap is not None
-            motion = as_driven(self.decode(x0[rows][:, None], part, cap[:, None]), now, part.routed.has_lane)
-            return _held(motion, now, held[rows][:, None]).map(lambda value: value[:, 0])
+            motion = as_driven(self.decode(x0[rows][:, None], part, cap=cap[:, None]), now, on_lane=part.routed.has_lane)
+            return _held(motion, now, always=held[rows][:, None]).map(lambda value: value[:, 0])
 
-        motion = bounded(self.bounds, decode, state, context.obstacles)
+        motion = bounded(self.bounds, decode, state=state, obstacles=context.obstacles)
         ended = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         return Plan(motion, ~(ended.cumsum(-1) > 0))
 
@@ -237,13 +237,13 @@ def _held(motion: LaneState, state: LaneState, always: Tensor) -> LaneState:
     short = (motion.s[..., -1] - state.s) < HOLD_DISTANCE
     held = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
     zero = torch.zeros_like(held.v)
-    return select(((state.v.abs() < STANDING_SPEED) & short) | always, replace(held, v=zero, a=zero), motion)
+    return select(((state.v.abs() < STANDING_SPEED) & short) | always, replace(held, v=zero, a=zero), other=motion)
 
 
 def _leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tensor, known: Context | None) -> Leaders:
     """`leaders_ahead`, of scenes in which nobody has moved those of a Context."""
     if known is None:
-        return leaders_ahead(routed, s, agents, present)
+        return leaders_ahead(routed, s, agents=agents, present=present)
     moved = s != known.state.s
     if routed.points is not known.routed.points:
         moved = moved | (routed.points != known.routed.points).flatten(2).any(-1)
@@ -251,7 +251,7 @@ def _leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tens
     if not len(rows):
         return known.followed
     there = replace(routed, points=routed.points[rows], size=routed.size[rows])
-    new = leaders_ahead(there, s[rows], agents[rows], present[rows])
+    new = leaders_ahead(there, s[rows], agents=agents[rows], present=present[rows])
     return Leaders(*(old.index_copy(0, rows, now) for old, now in zip(known.followed, new, strict=True)))
 
 
@@ -267,7 +267,7 @@ def mission_x(plan: Tensor, ego: LaneState, points: Tensor, on_lane: Tensor) -> 
     """`plan_to_x` of an ego on a route [B, P, 2], or, where it is not on_lane [B, 1], in free space."""
     before = torch.cat([ego.v[:, None], plan[..., :-1, 3]], 1)
     hint = ego.s[:, None] + ((plan[..., 3] + before) / 2 * DT).cumsum(-1)
-    s, d, _ = project(plan[..., :2], points, hint)
-    x = lane_relative.fit(LaneState.from_states(plan, s, d), None, ego)[0]
-    lateral = free_space.fit(plan[..., 2], torch.ones_like(s), ego, ACCEL_SCALE * x[..., :KNOTS])
+    s, d, _ = project(plan[..., :2], points, hint=hint)
+    x = lane_relative.fit(LaneState.from_states(plan, s, d=d), None, state=ego)[0]
+    lateral = free_space.fit(plan[..., 2], torch.ones_like(s), state=ego, knots=ACCEL_SCALE * x[..., :KNOTS])
     return torch.where(on_lane, x, torch.cat([x[..., :KNOTS], lateral], -1))

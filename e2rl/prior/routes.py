@@ -87,7 +87,7 @@ def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
     start, accel, yaw_rate = (
         scene[key][:, : routed.route.shape[1]] for key in ("start", "start_accel", "start_yaw_rate")
     )
-    return locate(start, accel, yaw_rate, routed.points, torch.full_like(routed.length, START))
+    return locate(start, accel, yaw_rate=yaw_rate, points=routed.points, hint=torch.full_like(routed.length, START))
 
 
 def reroute(
@@ -170,7 +170,7 @@ def start_of(scene: TensorDictBase) -> Moment:
     """The vehicles at the start of scenes [B]."""
     vehicles = scene["route_log"].shape[1]
     step = torch.zeros(len(scene["start"]), dtype=torch.long, device=scene["start"].device)
-    return Moment(scene["start"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles], step)
+    return Moment(scene["start"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles], step=step)
 
 
 def candidate_features(scene: TensorDictBase, now: Moment) -> Tensor:
@@ -189,7 +189,7 @@ def candidate_features(scene: TensorDictBase, now: Moment) -> Tensor:
     at = (s / SPACING).long().clamp(0, points.shape[3] - 1)[..., None]
     limit = scene["route_limit"][:, :vehicles].gather(-1, at)[..., 0]
     light = scene["route_light"][:, :vehicles, :, 0]
-    colour = light_state_at(scene["light_state"], light, now.step)
+    colour = light_state_at(scene["light_state"], light, step=now.step)
     green, red = ((light >= 0) & (colour == state) for state in (LIGHT_GREEN, LIGHT_RED))
     rank = torch.arange(s.shape[-1], device=s.device).expand_as(s)
     rest = (length - s).clamp(0, 100) / 50

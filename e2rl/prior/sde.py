@@ -158,7 +158,7 @@ def fused_step(settings: SamplerSettings, size: int) -> Fused:
         return sampler.step(x, x0, high, low, noise, (past, last))[0]
 
     each = f"B V {size}"
-    return Fused(step, (each, each, each, "", "", "", each), settings)
+    return Fused(step, (each, each, each, "", "", "", each), settings=settings)
 
 
 @cache
@@ -178,15 +178,15 @@ def fused_controlled_step(settings: SamplerSettings, size: int, limited: bool) -
         variance = variance * temperature**2
         added = path_kl(moved - plain, variance)
         if limited:
-            fraction = within_budget(budget, kl, added)[:, None, None]
+            fraction = within_budget(budget, kl, added=added)[:, None, None]
             moved = plain + fraction * (moved - plain)
             x0 = nominal + fraction * (x0 - nominal)
             added = fraction[..., 0] ** 2 * added
-        martingale = path_martingale(moved - plain, noise, variance, temperature)
+        martingale = path_martingale(moved - plain, noise, variance=variance, temperature=temperature)
         return moved, x0, kl + added, log_ratio + added + martingale
 
     each = f"B V {size}"
-    return Fused(step, (*[each] * 5, "", "", "", each, "B V", "B V", "B"), (settings, limited))
+    return Fused(step, (*[each] * 5, "", "", "", each, "B V", "B V", "B"), settings=(settings, limited))
 
 
 def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:

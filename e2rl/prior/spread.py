@@ -49,9 +49,9 @@ def sample_variances(prior: Prior, scene: TensorDictBase, samples: int, seed: in
     vehicles = shape[1]
     recorded = counted & (scene["route_log"] >= 0) & scene["logged_valid"][:, at, :vehicles] & (at == HORIZON)
     logged = torch.where(recorded[..., None], scene["logged"][:, at, :vehicles, :2], scene["start"][:, :vehicles, :2])
-    way = project(logged[:, :, None], routed.points, (lane.s + travel.mean(0))[..., None])[0][..., 0] - lane.s
+    way = project(logged[:, :, None], routed.points, hint=(lane.s + travel.mean(0))[..., None])[0][..., 0] - lane.s
     rank = (travel < way).sum(0)
-    inside = {name: (central(rank, samples, part) * recorded).sum(-1).double() for name, part in REGIONS.items()}
+    inside = {name: (central(rank, samples, part=part) * recorded).sum(-1).double() for name, part in REGIONS.items()}
     return sums | {"vehicles": counted.sum(-1).double()} | inside | {"recorded": recorded.sum(-1).double()}
 
 

@@ -45,7 +45,7 @@ def main_direction(schedule: NoiseSchedule, sampler: SamplerSettings, device: to
     gain = torch.zeros(SIZE, device=device)
     weights = distance_weights(device)
     gain[: len(weights)] = weights
-    direction = impulse_response(schedule, sampler, device)[:, None] * gain
+    direction = impulse_response(schedule, sampler, device=device)[:, None] * gain
     return direction / direction.norm()
 
 

@@ -60,7 +60,7 @@ def answer_lines(
     elif driven:
         lines += compared(driven)
     lines += weaknesses(modes if driven else None)
-    last = closing(rows, folder, report, notes)
+    last = closing(rows, folder, report=report, notes=notes)
     return [*lines[: LINES - len(last)], *last]
 
 

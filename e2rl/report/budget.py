@@ -108,7 +108,7 @@ class Found:
         of = torch.tensor([int(place[number[row["scene_id"]]]) for row in known], dtype=torch.int64)
         drawn, self.places["real_adv"] = bootstrap_draws(count, REALISM_DRAWS), len(of.unique())
         theirs = [samples[row["scene_id"], row["seed"]] for row in known]
-        self.draws["real_adv"] = realism(theirs, of, drawn)["real_adv"]
+        self.draws["real_adv"] = realism(theirs, of, draws=drawn)["real_adv"]
 
     def value(self, name: str) -> dict[str, float]:
         """Mean and interval; exact, or none, where few places have or lack a failure (`metrics.statistics`); NaN where
@@ -159,7 +159,7 @@ def budget_rows(
             for plan in plans:
                 own = [row for row in told if row["ego_policy"] == ego and row["method"] == plan]
                 of_plan = {key[2:]: value for key, value in samples.items() if key[:2] == (ego, plan)}
-                found[plan] = Found(own, scenes, budget, unit, of_plan)
+                found[plan] = Found(own, scenes, budget=budget, unit=unit, samples=of_plan)
             first = next(iter(found.values()))
             for plan, one in found.items():
                 values = {name: one.value(name) for name in (*FOUND, "real_adv")}
@@ -204,7 +204,7 @@ def budget_tables(rows: Sequence[Mapping], scenes: int, knowledge: str) -> list[
             values = [cell(row[name], count) for name, count in digits.items()]
             lines.append([row["method"], f"{row['budget']:g}", *spent, *values, *over])
         title = f"Failures of {ego} within a budget, in {own[0]['unit']} a scene"
-        tables.append(Table(f"{scenes} scenes. {CAPTION} {knowledge}", head, lines, title))
+        tables.append(Table(f"{scenes} scenes. {CAPTION} {knowledge}", head, rows=lines, title=title))
     return tables
 
 
@@ -233,7 +233,7 @@ def budget_figure(told: Sequence[Mapping], scenes: int) -> Figure:
                 axis = axes[2 * line + row][column]
                 for plan in dict.fromkeys(each["method"] for each in told):
                     own = [each for each in told if each["ego_policy"] == ego and each["method"] == plan]
-                    axis.plot(*curve(own, unit, name, scenes), label=plan, linewidth=1.2)
+                    axis.plot(*curve(own, unit, name=name, scenes=scenes), label=plan, linewidth=1.2)
                 if any(each[unit] > 0 for each in told):
                     axis.set_xscale("log")
                 axis.set_xlabel(f"{unit} a scene")
@@ -271,10 +271,10 @@ def save_budget(
     keys = [tuple(row[name] for name in ("ego_policy", "method", "scene_id", "seed")) for row in rows]
     by_try = dict(zip(keys, samples, strict=True))
     names = [each.name for each in plan.searches]
-    found = budget_rows(told, places, plan.asked.budget, plan.asked.budget_unit, by_try, names)
+    found = budget_rows(told, places, budgets=plan.asked.budget, unit=plan.asked.budget_unit, samples=by_try, plans=names)
     write_tries(folder / TRIES_FILE, told)
     write_budget(folder / "budget.csv", found)
-    tables = budget_tables(found, len(places), knowledge_text(plan.searches))
+    tables = budget_tables(found, len(places), knowledge=knowledge_text(plan.searches))
     tables += [searched_table(rows, plan.egos)] if len(plan.egos.egos) > 1 else []
     save_tables(folder / "budget.md", tables)
     save_figure(folder / "budget.png", budget_figure(told, len(places)))

@@ -39,7 +39,7 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
     groups, pairs = compared(first, second)
     names = [f"{one.ego} of {one.run}" if first.ego == second.ego else one.ego for one in (first, second)]
     rows = [pair | {side: facts(pair[side]) for side in SIDES} for pair in pairs]
-    told = [*sentences(groups, first.searched), *notes(first, second, groups), *facts_of(names, (first, second))]
+    told = [*sentences(groups, first.searched), *notes(first, second, groups=groups), *facts_of(names, (first, second))]
     changed = [pair for pair in pairs if pair["change"] != "same"]
     runs = first.run, second.run
     ended = [pair for pair in changed if all(pair[side]["errored"] != 1 for side in SIDES)]  # which have files
@@ -48,12 +48,12 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
     replays = replay_data(replayed(runs, shown), 2 * len(shown))
     content = {**about, "told": told, "pairs": rows[: len(changed)], **replays}
     scripts = [*(ASSETS / f"{name}.js" for name in SCRIPTS), FOLDER / "compare.js"]
-    write_atomically(path, page(FOLDER / PAGE, " against ".join(names[::-1]), scripts, content))
-    write_beside(path, ".json", json_text(about))
+    write_atomically(path, page(FOLDER / PAGE, " against ".join(names[::-1]), scripts=scripts, content=content))
+    write_beside(path, ".json", content=json_text(about))
     columns = [*PAIR, "change", "what", *(f"{name}_{side}" for side in SIDES for name in (*FACTS, "file", "error"))]
     flat = [row | {f"{name}_{side}": cell(row[side][name]) for side in SIDES for name in row[side]} for row in rows]
     lines = [[" ".join(row[name]) if name == "what" else row[name] for name in columns] for row in flat]
-    write_beside(path, ".csv", csv_text([columns, *lines]))
+    write_beside(path, ".csv", content=csv_text([columns, *lines]))
     ends = [f"Watch both: {path}", f"All pairs: {path.with_suffix('.csv')} and .json"]
     return [line for text in (f"{names[1]} against {names[0]}:", *told, *ends) for line in wrapped(text, "  ")]
 
@@ -70,7 +70,7 @@ def facts_of(names: Sequence[str], sides: Sequence[Driven]) -> Iterator[str]:
     """The headline of both in each traffic, then whom else they touched, and what errored."""
     for name, driven in zip(names, sides, strict=True):
         for rows in driven.traffic().values():
-            yield headline_text(headline(rows, driven.searched), name, traffic_name(rows[0]))
+            yield headline_text(headline(rows, driven.searched), name, traffic=traffic_name(rows[0]))
     for name, driven in zip(names, sides, strict=True):
         yield from (f"{name}: {line}" for line in touched_lines(driven.rows))
         yield from (f"{name}: {line}" if line.endswith(":") else line for line in errored_lines(driven.rows))
@@ -124,4 +124,4 @@ def main(arguments: list[str] | None = None) -> None:
         if options.out is not None and options.out.suffix != ".html":
             raise InputError(f"--out {options.out}: name a file that ends in .html; .csv and .json come beside it")
         first, second = (Driven.read(run, ego) for run, ego in zip((runs[0], runs[-1]), egos, strict=True))
-        print(*compare(first, second, options.out or own_folder(runs[-1], PAGE)), sep="\n")
+        print(*compare(first, second, path=options.out or own_folder(runs[-1], PAGE)), sep="\n")

@@ -62,7 +62,7 @@ def method_tables(
     difference = f"{text} Difference of each method to {' and to '.join(references)}"
     head = ["method", "knowledge", "duty"]
     keys = {name: name for name in references}
-    return tables_of(group, labels, head, table, "Methods", f"{text} {note}", difference, keys)
+    return tables_of(group, labels, head=head, table=table, title="Methods", caption=f"{text} {note}", difference=difference, references=keys)
 
 
 def planner_tables(
@@ -74,12 +74,12 @@ def planner_tables(
     group = list(cells.values())
     labels = [list(key) for key in cells]
     text = f"{group[0]['dataset']}/{group[0]['split']}. "
-    text += counts(group, [f"{ego} under {traffic}" for ego, traffic in labels], "ego and traffic")
+    text += counts(group, [f"{ego} under {traffic}" for ego, traffic in labels], per="ego and traffic")
     difference = f"{text} Difference of each ego to {' and to '.join(references)} in the same traffic"
     pooled = f" {TRAININGS}" if any(row.get("n_trainings", 1) > 1 for row in group) else ""
     caption = f"{text} {MEANS}{pooled} {settings}"
     keys = {name: f"ego {name}" for name in references}
-    return tables_of(group, labels, ["ego", "traffic"], table, "Egos", caption, difference, keys)
+    return tables_of(group, labels, head=["ego", "traffic"], table=table, title="Egos", caption=caption, difference=difference, references=keys)
 
 
 def tables_of(
@@ -98,7 +98,7 @@ def tables_of(
     labelled = list(zip(labels, group, strict=True))
     means = [[*cells, *(mean_cell(metric, row) for metric in metrics)] for cells, row in labelled]
     caption = " ".join(filter(None, (f"{caption.strip().rstrip('.')}.", notes_on(group))))
-    found = [Table(caption, [*head, *map(heading, metrics)], means, title)]
+    found = [Table(caption, [*head, *map(heading, metrics)], rows=means, title=title)]
     pairs = [
         [*cells, name, *(difference_cell(metric, row["paired"][key].get(metric.name)) for metric in metrics)]
         for name, key in references.items()
@@ -106,7 +106,7 @@ def tables_of(
         if key in row["paired"]
     ]
     heads = [*head, "minus", *(heading(metric, points=True) for metric in metrics)]
-    return [*found, Table(f"{difference} {PAIRED}", heads, pairs)] if pairs else found
+    return [*found, Table(f"{difference} {PAIRED}", heads, rows=pairs)] if pairs else found
 
 
 def save_compared(folder: Path, tables: Sequence[Table], name: str = METHODS) -> None:
@@ -148,7 +148,7 @@ def searched_table(rows: Sequence[Mapping], egos: EgoSet) -> Table:
     (reference,) = set(others.values()) or {""}
     head = ["ego", *(f"{name} [%]" for name in EVENTS), *(f"{name} minus {reference}" for name in EVENTS)]
     head.append(f"{EVENTS[0]} relative to {reference} [%]")
-    return Table(SEARCHED, head, lines, "Scenes in which each ego fails")
+    return Table(SEARCHED, head, rows=lines, title="Scenes in which each ego fails")
 
 
 def relative_cell(value: dict | None) -> str:
@@ -184,7 +184,7 @@ def guard_table(rows: Sequence[dict], before: str, after: str, planner: str, rec
     ]
     text = f"Guards of {after}, in nominal traffic: what must not be given up for fewer collisions. The estimate "
     text += "decides, the 95% interval stands beside it; differences are paired by (scene, seed)."
-    return Table(text, ["", "limit", "found", ""], lines)
+    return Table(text, ["", "limit", "found", ""], rows=lines)
 
 
 def verdict(value: float, most: float) -> str:

@@ -49,7 +49,7 @@ def grids(rows: Sequence[Choice]) -> tuple[list[int], list[tuple[str, float]], n
 def choice_map(rows: Sequence[Choice]) -> Figure:
     """The heat map of a table of choices."""
     rounds, arms, *tables = grids(rows)
-    figure = new_figure(WIDTH, MARGIN + LINE * max(len(arms), 6), DPI)
+    figure = new_figure(WIDTH, MARGIN + LINE * max(len(arms), 6), dpi=DPI)
     figure.set_layout_engine("constrained")
     panels = list(figure.subplots(1, len(PANELS), sharey=True))
     for axes, table, (title, colours) in zip(panels, tables, PANELS, strict=True):
@@ -59,7 +59,7 @@ def choice_map(rows: Sequence[Choice]) -> Figure:
         mesh = axes.pcolormesh(*edges, np.ma.masked_invalid(table), cmap=colours, vmin=0, vmax=top)
         figure.colorbar(mesh, ax=axes)
         axes.set_title(title, fontsize=10)
-        _label(axes, rounds, arms)
+        _label(axes, rounds, arms=arms)
     panels[0].set_ylabel("causal template, η")
     return figure
 

@@ -59,7 +59,7 @@ class Point(NamedTuple):
 def points_of_rows(rows: Sequence[dict]) -> list[Point]:
     """The points of the closed-loop rows of metrics.json; the dial is eta, 0 for traffic without an adversary."""
     return [
-        Point(row["method"], "eta", row["eta"], True, row["eta"] in (0, TABLES_ETA), row["metrics"])
+        Point(row["method"], "eta", value=row["eta"], on_curve=True, chosen=row["eta"] in (0, TABLES_ETA), metrics=row["metrics"])
         for row in closed_loop(rows)
     ]
 
@@ -76,9 +76,9 @@ def points_of_tuning(result: Mapping, method: str) -> list[Point]:
         chosen = trial["parameters"] == best and not any(point.chosen for point in points)
         if on_curve or chosen:
             found = intervals(trial["metrics"])
-            points.append(Point(method, dial, trial["parameters"][dial], on_curve, chosen, found))
+            points.append(Point(method, dial, value=trial["parameters"][dial], on_curve=on_curve, chosen=chosen, metrics=found))
     nominal = {name: first["metrics"].get(f"{name} {NOMINAL}", math.nan) for name in COLUMNS}
-    return [*points, Point(NOMINAL, dial, 0.0, True, True, intervals(nominal))]
+    return [*points, Point(NOMINAL, dial, value=0.0, on_curve=True, chosen=True, metrics=intervals(nominal))]
 
 
 def intervals(metrics: Mapping[str, float]) -> dict[str, dict[str, float]]:
@@ -133,13 +133,13 @@ def by_method(points: Sequence[Point]) -> dict[str, list[Point]]:
 
 def curves_figure(points: Sequence[Point]) -> Figure:
     """PANELS, with a line a method: dots grow with the gain, the chosen setting is filled and has its intervals."""
-    figure = new_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), DPI)
+    figure = new_figure(SIDE * len(PANELS[0]), RISE * len(PANELS), dpi=DPI)
     methods = by_method(points)
     figure.set_layout_engine("tight")
     panels = figure.subplots(len(PANELS), len(PANELS[0])).ravel()
     for axes, (across, up) in zip(panels, (pair for row in PANELS for pair in row), strict=True):
         for number, (name, own) in enumerate(methods.items()):
-            draw_curve(axes, own, across, up, COLOURS.get(name, APART[number % len(APART)]))
+            draw_curve(axes, own, across=across, up=up, colour=COLOURS.get(name, APART[number % len(APART)]))
         if up != "cfr" and across == "cfr":
             most = max(axes.get_xlim()[1], axes.get_ylim()[1])
             axes.plot([0, most], [0, most], color=drawing.MUTED, linewidth=0.8, linestyle="dotted")

@@ -122,17 +122,17 @@ def placed(outline: Sequence[tuple[float, float]], state: np.ndarray, size: np.n
 
 def vehicle(state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
     """A car's body, and its windscreen, which shows where its front is."""
-    body = Shape(placed(BODY, state, size), colour, ("black", 0.4), 0.12)
-    return [body, Shape(placed(WINDSCREEN, state, size), ("black", 0.45))]
+    body = Shape(placed(BODY, state, size=size), colour, edge=("black", 0.4), width=0.12)
+    return [body, Shape(placed(WINDSCREEN, state, size=size), ("black", 0.45))]
 
 
 def agent(kind: str, state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
     """An agent of one of the kinds of `recording.AGENT_TYPES`: a pedestrian as a disc, a cyclist as a slim box with a
     disc, and all others as vehicles of a colour."""
     if kind not in ("pedestrian", "cyclist"):
-        return vehicle(state, size, colour)
-    bicycle = Shape(placed(BOX, state, np.maximum(size, (1.7, 0.5))), VULNERABLE, ("black", 0.4))
-    return [*([bicycle] if kind == "cyclist" else []), disc(state[:2], 0.45, VULNERABLE, ("black", 0.4))]
+        return vehicle(state, size, colour=colour)
+    bicycle = Shape(placed(BOX, state, size=np.maximum(size, (1.7, 0.5))), VULNERABLE, edge=("black", 0.4))
+    return [*([bicycle] if kind == "cyclist" else []), disc(state[:2], 0.45, fill=VULNERABLE, edge=("black", 0.4))]
 
 
 def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:
@@ -140,14 +140,14 @@ def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:
     radius = 1.9 + 2.6 * phase
     width = 0.34 - 0.18 * phase
     return [
-        disc(point, radius, "none", PANEL, width + 0.24),
-        disc(point, radius, "none", CONTACT, width),
-        disc(point, 0.5, CONTACT, PANEL, 0.16),
+        disc(point, radius, fill="none", edge=PANEL, width=width + 0.24),
+        disc(point, radius, fill="none", edge=CONTACT, width=width),
+        disc(point, 0.5, fill=CONTACT, edge=PANEL, width=0.16),
     ]
 
 
 def disc(centre: np.ndarray, radius: float, fill: Colour, edge: Colour, width: float = 0.1) -> Shape:
-    return Shape(centre + radius * np.array(CIRCLE), fill, edge, width)
+    return Shape(centre + radius * np.array(CIRCLE), fill, edge=edge, width=width)
 
 
 def new_figure(width: float, height: float, dpi: float = 72) -> Figure:
@@ -188,4 +188,4 @@ def save_figure(path: Path, figure: Figure) -> None:
     """Write a figure as PNG and, beside it, as PDF: vectors with their fonts. The same figure makes the same bytes."""
     write_atomically(path, partial(image_of(figure).save, format="PNG", optimize=True))
     with rc_context({"pdf.fonttype": 42}):  # TrueType, which journals ask for
-        write_beside(path, ".pdf", partial(figure.savefig, format="pdf", metadata=UNDATED))
+        write_beside(path, ".pdf", content=partial(figure.savefig, format="pdf", metadata=UNDATED))

@@ -90,7 +90,7 @@ def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str,
         "tracks": [[track.role, *(round(float(side), 2) for side in track.size)] for track in tracks],
         "partner": other,
         "contact": steps - 1 if contact is None else contact,
-        "point": None if contact is None else contact_point(rollout, contact, partner).round(2).tolist(),
+        "point": None if contact is None else contact_point(rollout, contact, partner=partner).round(2).tolist(),
         "dt": rollout.dt,
         "motion": encode(second_difference(quantised(motion, quanta))),
         "plans": encoded_plans(rollout, rows) if rollout.plans is not None else None,
@@ -131,7 +131,7 @@ def other_egos(rollout: Rollout, steps: int) -> list[Track]:
         "evasion": (rollout.evasion, always),
     }
     return [
-        Track(role, rollout.size[ego], states[:steps], present)
+        Track(role, rollout.size[ego], states=states[:steps], present=present)
         for role, (states, present) in known.items()
         if states is not None
     ]
@@ -145,7 +145,7 @@ def channels_of(track: Track, partner: Track) -> np.ndarray:
     if track.role in ("ego", "driver", "evasion", "recorded"):
         boxes = (states, track.size, held(partner.states, partner.present), partner.size)
         first, first_size, second, second_size = (torch.as_tensor(box, dtype=torch.float64) for box in boxes)
-        gap = separation(first, first_size, second, second_size).clamp(min=0).numpy()
+        gap = separation(first, first_size, second=second, second_size=second_size).clamp(min=0).numpy()
     return np.concatenate([states.T, [track.present, gap]])
 
 

@@ -47,7 +47,7 @@ def unit_of(row: Mapping[str, Any], count: int = 2) -> str:
 
 def row_headline(row: Mapping[str, Any]) -> str:
     """The headline of a row of metrics.json, "" where it has none."""
-    return headline_text(Headline(**row["headline"]), row["ego"], traffic_name(row)) if row.get("headline") else ""
+    return headline_text(Headline(**row["headline"]), row["ego"], traffic=traffic_name(row)) if row.get("headline") else ""
 
 
 def errored_lines(rows: Sequence[Mapping[str, Any]], named: int = NAMED) -> list[str]:
@@ -82,7 +82,7 @@ def touched_lines(rows: Sequence[Mapping[str, Any]], shown: bool = False) -> lis
         shown: of a run with a failure report, which lacks them; else their scenes are named.
     """
     return [
-        touched_text([row for row in rows if row["ego_policy"] == ego and row.get(column) in (0, 1)], column, shown)
+        touched_text([row for row in rows if row["ego_policy"] == ego and row.get(column) in (0, 1)], column, shown=shown)
         for column in TOUCHED
         for ego in dict.fromkeys(row["ego_policy"] for row in rows if row.get(column) == 1)
     ]
@@ -100,7 +100,7 @@ def touched_text(rows: Sequence[Mapping[str, Any]], column: str, shown: bool) ->
     if shown:
         return f"{text}; the failure report lacks them, see {column} in {TABLE}."
     named = NAMED if len(told) <= 2 else MESSAGES
-    places = {name: scenes_text(touching[name], named, TABLE) for name in told if touching[name]}
+    places = {name: scenes_text(touching[name], named, file=TABLE) for name in told if touching[name]}
     return f"{text}: {'; '.join(places.values() if len(told) == 1 else map(' in '.join, places.items()))}."
 
 

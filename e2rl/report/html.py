@@ -87,13 +87,13 @@ def write_report(
     metrics = read_metrics(run / METRICS_FILE) if metrics is None else metrics
     modes = read_modes(run / MODES_FILE) if modes is None else modes
     tables = [*metric_tables(metrics), *mode_tables(modes)] if tables is None else tables
-    content = page_content(run, metrics, modes, methods) | {"tables": [vars(table) for table in tables]}
-    content |= add_replays(run, content.pop("rows"), content["failures"], replays)
+    content = page_content(run, metrics, modes=modes, methods=methods) | {"tables": [vars(table) for table in tables]}
+    content |= add_replays(run, content.pop("rows"), index=content["failures"], count=replays)
     path = path or own_folder(run, PAGE)
-    write_beside(path, ".csv", failure_list(content, path.name))
+    write_beside(path, ".csv", content=failure_list(content, path.name))
     scripts = sorted(ASSETS.glob("*.js"), key=lambda script: script.stem == "page")  # which uses all others
     title = f"Failures of {', '.join(dict.fromkeys(group['ego'] for group in content['groups']))}"
-    write_atomically(path, page(ASSETS / "page.html", title, scripts, content))
+    write_atomically(path, page(ASSETS / "page.html", title, scripts=scripts, content=content))
     return path
 
 
@@ -139,7 +139,7 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
     searched = (run / TRIES_FILE).is_file()
     groups = {
         group_key(group): {"ego": group["ego_policy"], "label": label}
-        | {"rates": rates(group, metrics, searched), "summary": summary(group, metrics, every, searched)}
+        | {"rates": rates(group, metrics, searched=searched), "summary": summary(group, metrics, rows=every, searched=searched)}
         | {name: group[name] for name in ("method", "eta", "rollouts", "failures")}
         | {"raised": sum(raised(row) for row in every if group_key(row) == group_key(group))}
         for group, label in labels
@@ -159,7 +159,7 @@ def page_content(run: Path, metrics: Sequence[dict], modes: Mapping, methods: Se
         "modes": names,
         "cells": [dict(zip(CELL, cell, strict=True)) for cell in cells],
         "failures": [
-            failure(row, names, typical) | place | {"worst": rollout_key(row) in worst}
+            failure(row, names, typical=typical) | place | {"worst": rollout_key(row) in worst}
             for row, place in zip(rows, places, strict=True)
         ],
         "errored": [{name: row[name] for name in (*COLUMNS, *ENDINGS)} | {"key": rollout_key(row)} for row in errored],
@@ -192,9 +192,9 @@ def summary(group: Mapping, metrics: Sequence[dict], rows: Sequence[dict], searc
         searched: they are tries.
     """
     own = [row for row in rows if group_key(row) == group_key(group)]
-    known = rates(group, metrics, searched)
+    known = rates(group, metrics, searched=searched)
     crashed = any(map(raised, own))
-    lines = [headline_text(headline(own, searched), group["ego_policy"], traffic_name(group))]
+    lines = [headline_text(headline(own, searched), group["ego_policy"], traffic=traffic_name(group))]
     if "cfr" in known:
         lines.append(f"It was hit{', or raised,' if crashed else ''} in {known['cfr']}.")
     if "cfr_counted" in known:

@@ -82,7 +82,7 @@ class Replay:
         for agent in sorted(range(self.rollout.states.shape[1]), key=self.layer):
             path = self.rollout.states[recent, agent, :2][self.rollout.valid[recent, agent]]
             if len(path) > 1 and np.ptp(path, axis=0).max() > 0.5:
-                trails.append(Trail(path, self.colour(agent), 0.5 if self.layer(agent) >= 2 else 0.3))
+                trails.append(Trail(path, self.colour(agent), width=0.5 if self.layer(agent) >= 2 else 0.3))
         return trails
 
     def shapes(self, time: float, phase: float | None) -> list[Shape]:
@@ -90,12 +90,12 @@ class Replay:
         rollout = self.rollout
         step = math.floor(time)
         shapes = []
-        states = interpolated(rollout.states, rollout.valid, time)
+        states = interpolated(rollout.states, rollout.valid, time=time)
         size = rollout.size
         for agent in sorted(np.flatnonzero(rollout.valid[step]).tolist(), key=self.layer):
-            shapes += drawing.agent(rollout.agent_type[agent], states[agent], size[agent], self.colour(agent))
+            shapes += drawing.agent(rollout.agent_type[agent], states[agent], size=size[agent], colour=self.colour(agent))
         if phase is not None:
-            shapes += drawing.contact_mark(contact_point(rollout, step, self.row["partner"]), phase)
+            shapes += drawing.contact_mark(contact_point(rollout, step, partner=self.row["partner"]), phase)
         return shapes
 
     def layer(self, agent: int) -> int:
@@ -125,7 +125,7 @@ class Panel:
             f"{shorten(rollout.scene_id)}   seed {rollout.seed}   intensity {rollout.eta:g}",
         )
         axes = self.figure.add_axes((0, foot / SIDE, 1, 1 - (head + foot) / SIDE))
-        self.map = TrafficMap(axes, rollout, replay.metres)
+        self.map = TrafficMap(axes, rollout, metres=replay.metres)
         first, second = (26, 20) if large else (16, 11)  # points, of the letters
         left = 14 / SIDE
         right = 706 / SIDE
@@ -140,7 +140,7 @@ class Panel:
         badge = contact_text(replay.row) if large else f"{contact_text(replay.row)}\n{verdict_text(replay.row)}"
         self.badge = text(0.5, 1 - (head + 40) / SIDE, badge, fontsize=22 if large else 13, color="w", bbox=box)
         self.badge.set(ha="center", va="center")
-        add_legend(self.figure, dict(list(LEGEND.items())[:3]) if large else LEGEND, 20 if large else 11)
+        add_legend(self.figure, dict(list(LEGEND.items())[:3]) if large else LEGEND, size=20 if large else 11)
         bar = (right - 10 / replay.metres, right)
         self.figure.add_artist(Line2D(bar, (10 / SIDE, 10 / SIDE), color=drawing.INK, linewidth=2))
         text(sum(bar) / 2, 14 / SIDE, "10 m", fontsize=second - 1, color=drawing.MUTED, ha="center")
@@ -150,7 +150,7 @@ class Panel:
         rollout = self.replay.rollout
         centre = np.array([np.interp(time, np.arange(len(replay.centres)), axis) for axis in replay.centres.T])
         self.map.show(centre, replay.trails(time), replay.shapes(time, phase))
-        speed = interpolated(rollout.states, rollout.valid, time)[rollout.ego, 3]
+        speed = interpolated(rollout.states, rollout.valid, time=time)[rollout.ego, 3]
         self.clock.set_text(f"{time * rollout.dt:.1f} s")
         self.speed.set_text(f"ego {speed:.1f} m/s")
         self.badge.set_visible(replay.contact is not None and time >= replay.contact)
@@ -197,7 +197,7 @@ def shorten(name: str, limit: int = 42) -> str:
 def intensity_figure(sweep: Sequence[Failure]) -> Figure:
     """Returns a panel for each rollout, in the order of intensity, at the moment of its contact; one without contact is
     shown when the next one that has a contact has it, else at its end."""
-    replays = [Replay(each.rollout, each.row, SWEEP_METRES) for each in sweep]
+    replays = [Replay(each.rollout, each.row, metres=SWEEP_METRES) for each in sweep]
     sizes = SWEEP_COLUMNS, math.ceil(len(replays) / SWEEP_COLUMNS)
     figure = new_figure(*(count * (SIDE + SWEEP_GAP) - SWEEP_GAP for count in sizes))
     wide, high = ([SIDE, *[SWEEP_GAP, SIDE] * (count - 1)] for count in sizes)

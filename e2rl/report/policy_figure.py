@@ -40,7 +40,7 @@ def policy_figure(rows: Sequence[dict], before: str, after: str, method: str) ->
         row for row in rows if (row["ego"], row["method"]) == (after, method) and row["eta"] and key in row["paired"]
     ]
     splits, etas = ({pick(row): None for row in own} for pick in (split_of, lambda row: row["eta"]))
-    figure = new_figure(2 * SIDE, 2 * RISE, DPI)
+    figure = new_figure(2 * SIDE, 2 * RISE, dpi=DPI)
     figure.set_layout_engine("tight")
     for axes, (name, (title, sign)) in zip(figure.subplots(2, 2).ravel(), PANELS.items(), strict=True):
         for place, eta in enumerate(etas):
@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with ending():
         rows = [row for run in options.runs for row in read_metrics(run / METRICS_FILE)]
-        figure = policy_figure(rows, options.before, options.after, options.method)
+        figure = policy_figure(rows, options.before, after=options.after, method=options.method)
         if not figure.axes[0].patches:
             raise InputError(f"policy-figure: no rows of {options.after} after {options.before} under {options.method}")
         save_figure(options.out / NAME, figure)

@@ -36,8 +36,8 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
     notes = [f"left out: {count} scenes ({reason})" for reason, count in plan.scenes.dropped.items()]
     notes += ["tries go where failures are: rates of tries are no rates of the planner"] if plan.searches else []
     methods = [*plan.methods, *(next(iter(one.traffic.values())) for one in plan.searches if len(one.traffic) == 1)]
-    text = "; ".join([caption(run.config, plan.origin, methods), search_effort(plan.scenes.steps), *notes])
-    tables = [*tables_of(plan, rows, text, folder), *mode_tables(modes), *egos_tables(run, plan, rows, text)]
+    text = "; ".join([caption(run.config, plan.origin, methods=methods), search_effort(plan.scenes.steps), *notes])
+    tables = [*tables_of(plan, rows, text=text, folder=folder), *mode_tables(modes), *egos_tables(run, plan, rows=rows, text=text)]
     save_tables(folder / "tables.md", tables)
     if asked.metrics == ALL:
         print_tables(tables)
@@ -48,8 +48,8 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
     rollouts = read_rows(folder / TABLE)
     failed = modes["failures"] or any(row["errored"] == 1 for row in rollouts)
     shown = asked.report and asked.save_rollouts and failed
-    page = write_report(folder, rows, modes, tables) if shown else None
-    return answer_lines(rows, modes, folder, page, notes, rollouts)
+    page = write_report(folder, rows, modes=modes, tables=tables) if shown else None
+    return answer_lines(rows, modes, folder=folder, report=page, notes=notes, rollouts=rollouts)
 
 
 def references(plan: Evaluation) -> tuple[str, ...] | None:
@@ -66,14 +66,14 @@ def tables_of(plan: Evaluation, rows: Sequence[dict], text: str, folder: Path) -
     """Returns the tables of metrics; those with a row a method or an ego also become files of their own."""
     metrics = MAIN if plan.asked.metrics == ALL else plan.asked.metrics
     if not compares(plan.asked):
-        return metric_tables(rows, text, metrics)
+        return metric_tables(rows, text, table=metrics)
     others = plan.asked.compare or (NOMINAL,)
     egos = plan.egos
     if egos.pairs:
-        tables = planner_tables(rows, egos.names, others, text, metrics)
+        tables = planner_tables(rows, egos.names, references=others, settings=text, table=metrics)
     else:
-        tables = method_tables(rows, terms_by_method(plan.methods), others, text, metrics)
-    save_compared(folder, tables, EGOS if egos.pairs else METHODS)
+        tables = method_tables(rows, terms_by_method(plan.methods), references=others, settings=text, table=metrics)
+    save_compared(folder, tables, name=EGOS if egos.pairs else METHODS)
     return tables
 
 
@@ -85,10 +85,10 @@ def egos_tables(run: Run, plan: Evaluation, rows: Sequence[dict], text: str) -> 
     if not egos.pairs or plan.asked.compare:
         return []
     others = dict.fromkeys(second for _, second in egos.pairs)
-    tables = planner_tables(rows, egos.names, others, text, MAIN if plan.asked.metrics == ALL else plan.asked.metrics)
+    tables = planner_tables(rows, egos.names, references=others, settings=text, table=MAIN if plan.asked.metrics == ALL else plan.asked.metrics)
     if roles is None:
         return tables
-    figure = policy_figure(rows, roles.before, roles.after, run.config.synthesizer.name)
+    figure = policy_figure(rows, roles.before, after=roles.after, method=run.config.synthesizer.name)
     save_figure(run.folder / POLICY_FIGURE, figure)
     recorded = recorded_acceleration(plan.scenes)
-    return [*tables, guard_table(rows, roles.before, roles.after, roles.planner, recorded)]
+    return [*tables, guard_table(rows, roles.before, after=roles.after, planner=roles.planner, recorded=recorded)]

@@ -46,7 +46,7 @@ def save_videos(
     """
     for k, row in enumerate(hits(traffic, scenes)[:count].tolist()):
         path = folder / "videos" / f"round-{number:03d}-{k + 1}.gif"
-        save_animation(path, replay_of(traffic, row, scenes, method).frames())
+        save_animation(path, replay_of(traffic, row, scenes=scenes, method=method).frames())
         yield path
 
 
@@ -72,4 +72,4 @@ def replay_of(traffic: Mapping[str, Tensor], row: int, scenes: SceneSet, method:
     names: dict[str, Any] = {name: [value] for name, value in about.items()}
     rollouts = Rollouts.in_scenes(scenes, index, **own, seed=index, eta=eta, seconds=torch.zeros(1), **names)
     rows, _ = score_rollouts(rollouts)
-    return Replay(rollouts.rollout(0), rows[0], METRES, PIXELS)
+    return Replay(rollouts.rollout(0), rows[0], metres=METRES, pixels=PIXELS)

@@ -80,7 +80,7 @@ class SkeletonPicture:
         count = min(selection.weights.shape[-1], rollout.states.shape[1])
         steps = np.arange(start, min(start + SHOWN_STEPS, len(rollout.states) - 1) + 1, STRIDE)
         states, valid = (torch.as_tensor(value[steps, :count]) for value in (rollout.states, rollout.valid))
-        weights = pair_weights(states, valid, torch.as_tensor(rollout.size[:count]), selection.settings)
+        weights = pair_weights(states, valid, size=torch.as_tensor(rollout.size[:count]), settings=selection.settings)
         moments = torch.as_tensor((steps - start) * rollout.dt)
         return cls(rollout, replace(selection, reference=states[None], weights=weights[None], moments=moments[None]))
 
@@ -150,7 +150,7 @@ class SkeletonPicture:
 
     def graph(self, axes: Axes) -> None:
         """The reference rollout at the time of the risk, with the edges of the risk graph."""
-        self.draw_map(axes, self.risky, [])
+        self.draw_map(axes, self.risky, trails=[])
         for i, j in np.argwhere(np.tril(self.weights, -1) >= self.settings.edge_threshold):
             ends = self.risky[[i, j]]
             weight = float(self.weights[i, j])
@@ -161,8 +161,8 @@ class SkeletonPicture:
         states = self.rollout.states[self.step :, :, :2]
         valid = self.rollout.valid[self.step :]
         own = [*self.members, 0]
-        trails = [Trail(states[valid[:, agent], agent], self.colour(agent), 0.6) for agent in own]
-        self.draw_map(axes, self.now, trails)
+        trails = [Trail(states[valid[:, agent], agent], self.colour(agent), width=0.6) for agent in own]
+        self.draw_map(axes, self.now, trails=trails)
         head = {"arrowstyle": "-|>", "mutation_scale": 30, "color": drawing.INK, "shrinkA": 0, "shrinkB": 0}
         for agent in self.members:
             start = self.now[agent, :2]
@@ -181,8 +181,8 @@ class SkeletonPicture:
         shown = [agent for agent in range(len(states)) if self.rollout.valid[self.step, agent]]
         shown.sort(key=lambda agent: (self.colour(agent) != drawing.BACKGROUND, -agent))
         sizes = self.rollout.size
-        shapes = [shape for i in shown for shape in drawing.vehicle(states[i], sizes[i], self.colour(i))]
-        TrafficMap(axes, self.rollout, side).show((points.min(0) + points.max(0)) / 2, trails, shapes)
+        shapes = [shape for i in shown for shape in drawing.vehicle(states[i], sizes[i], colour=self.colour(i))]
+        TrafficMap(axes, self.rollout, metres=side).show((points.min(0) + points.max(0)) / 2, trails, shapes)
         outline = [withStroke(linewidth=4, foreground=drawing.PANEL)]
         for agent in self.nodes():
             x, y = states[agent, :2]
@@ -226,7 +226,7 @@ class LongestChain:
                 f"skeleton: {self.method.name} at eta={self.method.eta:g} chose no adversary in any scene; name e2 "
                 "first in methods, at an eta above 0, and evaluate more scenes, or name one with scene="
             )
-        return SkeletonPicture(rollout_of(self.longest, self.method, scenes, ego_name, folder), self.longest).figure()
+        return SkeletonPicture(rollout_of(self.longest, self.method, scenes=scenes, ego_name=ego_name, folder=folder), self.longest).figure()
 
     def beside(self, other: Method, scenes: SceneSet, ego_name: str, folder: Path) -> Figure | None:
         """The coalition of `first` in the rollouts of another method (left) and of this one: times to collision and
@@ -235,7 +235,7 @@ class LongestChain:
             return None
         parts: list[Part] = []
         for method in (other, self.method):
-            picture = SkeletonPicture.driven(rollout_of(self.first, method, scenes, ego_name, folder), self.first)
+            picture = SkeletonPicture.driven(rollout_of(self.first, method, scenes=scenes, ego_name=ego_name, folder=folder), self.first)
             parts.append((f"{method.name}: TTC {picture.time:.1f} s after the start [s]", picture.matrix))
             parts.append(("chain, and the paths driven", picture.chain))
         title = f"{shorten(picture.rollout.scene_id)}   the same coalition under {other.name} and {self.method.name}"
@@ -244,12 +244,12 @@ class LongestChain:
 
 def panels(title: str, parts: Sequence[Part]) -> Figure:
     """The parts beside each other under their captions; above them a title, below them what the colours mean."""
-    figure, axes = new_panels(len(parts), SIDE, GAP, HEAD, FOOT)
+    figure, axes = new_panels(len(parts), SIDE, gap=GAP, head=HEAD, foot=FOOT)
     figure.suptitle(title, x=0.004, y=0.985, ha="left", fontsize=15, color=drawing.INK)
     for panel, (caption, draw) in zip(axes, parts, strict=True):
         panel.set_title(caption, loc="left", x=8 / SIDE, fontsize=14, color=drawing.MUTED)
         draw(panel)
-    add_legend(figure, LEGEND, 13)
+    add_legend(figure, LEGEND, size=13)
     return figure
 
 
@@ -273,7 +273,7 @@ def draw(run: Run) -> None:
     also the longest one of the start under both."""
     plan = begin(run)
     chain = LongestChain(plan.methods[0])
-    run_protocol(plan.setup, plan.methods, plan.asked.seeds, run.folder, only=plan.only)
+    run_protocol(plan.setup, plan.methods, seeds=plan.asked.seeds, folder=run.folder, only=plan.only)
     where = plan.scenes, plan.setup.ego_name, run.folder
     figures = {"skeleton": chain.figure(*where)}
     for other in plan.methods[1:2]:

@@ -78,7 +78,7 @@ class Table:
 
 def escaped(text: str) -> str:
     """The text for LaTeX."""
-    return "".join(LATEX_ESCAPE_RULES.get(sign, sign) for sign in text).translate(SYMBOLS)
+    return "".join(LATEX_ESCAPE_RULES.get(sign, rows=sign) for sign in text).translate(SYMBOLS)
 
 
 def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main") -> list[Table]:
@@ -97,7 +97,7 @@ def metric_tables(rows: Sequence[dict], settings: str = "", table: str = "main")
     tables = []
     for (*_, stage), group in groups.items():
         metrics = STAGES.get(stage, table_metrics(table))
-        tables += [means_table(group, settings, metrics), paired_table(group, metrics)]
+        tables += [means_table(group, settings, metrics=metrics), paired_table(group, metrics)]
     return [table for table in tables if table.rows]
 
 
@@ -113,7 +113,7 @@ def means_table(group: Sequence[dict], settings: str, metrics: Sequence[Metric])
     caption += f" {settings.rstrip('.')}." if settings else ""
     caption += f" Not computable here: {', '.join(unknown)}." if unknown else ""
     rows = [[heading(metric), *(mean_cell(metric, row) for row in group)] for metric in known]
-    return Table(caption, ["", *names], rows)
+    return Table(caption, ["", *names], rows=rows)
 
 
 def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
@@ -134,7 +134,7 @@ def paired_table(group: Sequence[dict], metrics: Sequence[Metric]) -> Table:
         for metric in metrics
     }
     rows = [[name, *line] for name, line in cells.items() if any(cell != UNKNOWN for cell in line)]
-    return Table(f"{origin(first)}. Difference to {reference} {PAIRED}", ["", *columns], rows)
+    return Table(f"{origin(first)}. Difference to {reference} {PAIRED}", ["", *columns], rows=rows)
 
 
 def known_metrics(group: Sequence[dict], metrics: Iterable[Metric]) -> list[Metric]:
@@ -208,7 +208,7 @@ def mode_tables(found: Mapping) -> list[Table]:
     Of several egos the modes are common, and so are their verdicts and speeds.
     """
     egos = dict.fromkeys(group["ego_policy"] for group in found["groups"])
-    return [table for ego in egos if (table := mode_table(found, ego, len(egos) > 1)).rows]
+    return [table for ego in egos if (table := mode_table(found, ego, several=len(egos) > 1)).rows]
 
 
 def mode_table(found: Mapping, ego: str, several: bool) -> Table:
@@ -240,7 +240,7 @@ def mode_table(found: Mapping, ego: str, several: bool) -> Table:
     if found["unknown"]:
         text += f" Grouped without {', '.join(found['unknown'])}, which the rollouts do not know."
     absent = [title for name, title in VERDICTS.items() if name not in known]
-    return Table(text + (f" Not computable here: {', '.join(absent)}." if absent else ""), head, rows)
+    return Table(text + (f" Not computable here: {', '.join(absent)}." if absent else ""), head, rows=rows)
 
 
 # --- cells
@@ -256,7 +256,7 @@ def mean_cell(metric: Metric, row: dict) -> str:
     value = row["metrics"].get(metric.name)
     if not value or not value["n"]:
         return UNKNOWN
-    return estimate(metric, value, "mean") + (f" ({value['n']})" if value["n"] != row["n_rollouts"] else "")
+    return estimate(metric, value, name="mean") + (f" ({value['n']})" if value["n"] != row["n_rollouts"] else "")
 
 
 def difference_cell(metric: Metric, value: dict | None) -> str:
@@ -264,12 +264,12 @@ def difference_cell(metric: Metric, value: dict | None) -> str:
     if not value or math.isnan(value["difference"]):
         return UNKNOWN
     certain = not metric.cost and (value["low"] > 0 or value["high"] < 0)
-    return estimate(metric, value, "difference", "+") + ("*" if certain else "")
+    return estimate(metric, value, name="difference", sign="+") + ("*" if certain else "")
 
 
 def estimate(metric: Metric, value: dict, name: str, sign: str = "") -> str:
     """The value called `name` and, where it is known and no point, its interval."""
-    centre, low, high = (number(metric, value[key], sign) for key in (name, "low", "high"))
+    centre, low, high = (number(metric, value[key], sign=sign) for key in (name, "low", "high"))
     return f"{centre} [{low}, {high}]" if value["low"] < value["high"] else centre
 
 

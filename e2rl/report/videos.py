@@ -30,7 +30,7 @@ def save_animation(path: Path, frames: Iterable[Image.Image], colours: int = COL
     if path.suffix not in (".gif", ".mp4"):
         raise InputError(f"{path}: no such kind of video; choose a name that ends in .gif or .mp4")
     if path.suffix == ".mp4":
-        library("imageio_ffmpeg", str(path), "mp4")  # before the frames are drawn
+        library("imageio_ffmpeg", str(path), extra="mp4")  # before the frames are drawn
     write = write_mp4 if path.suffix == ".mp4" else partial(write_gif, colours=colours)
     write_atomically(path, partial(write, list(frames)))
 
@@ -49,7 +49,7 @@ def write_gif(frames: Sequence[Image.Image], path: Path, colours: int) -> None:
 def write_mp4(frames: Sequence[Image.Image], path: Path) -> None:
     """Write an MP4 by the program of imageio-ffmpeg, or another that it finds."""
     try:
-        command = [library("imageio_ffmpeg", "MP4", "mp4").get_ffmpeg_exe(), *MP4.format(*frames[0].size).split(), path]
+        command = [library("imageio_ffmpeg", "MP4", extra="mp4").get_ffmpeg_exe(), *MP4.format(*frames[0].size).split(), path]
         subprocess.run(command, input=b"".join(map(Image.Image.tobytes, frames)), capture_output=True, check=True)
     except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", b"").decode(errors="replace") or str(error)

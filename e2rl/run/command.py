@@ -77,7 +77,7 @@ def run_command(
         try:
             command()
         except HydraException as error:
-            raise InputError(told(name, arguments, str(error))) from error
+            raise InputError(told(name, arguments, said=str(error))) from error
         sweep.end()
 
 
@@ -163,7 +163,7 @@ def help_text(name: str, arguments: Sequence[str]) -> str:
     chosen = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
     for group, file in _groups(name).items():
         if file := chosen.get(group, file):
-            parts += _file_texts(folders, group, file)
+            parts += _file_texts(folders, group, name=file)
     return "\n\n".join(part.rstrip() for part in parts)
 
 
@@ -177,7 +177,7 @@ def _file_texts(folders: Sequence[Path], group: str, name: str) -> Iterator[str]
     yield f"### {group}={name} (of: {others})\n\n{file.read_text()}"
     for base in _content(file).get("defaults", ()):
         if isinstance(base, str) and base != "_self_":
-            yield from _file_texts(folders, group, base)
+            yield from _file_texts(folders, group, name=base)
 
 
 DATA = dict.fromkeys(("waymo", "nuscenes", "nuplan", "lyft"), "scenarionet") | {"av2": "argoverse2"}  # their readers
@@ -190,7 +190,7 @@ def told(name: str, arguments: Sequence[str], said: str) -> str:
         known = choices(group)
         near = [DATA[file]] if group == "data" and file in DATA else get_close_matches(file, known, 1, 0.5)
         own = f"one of your own is FOLDER/{group}/{file}.yaml, with --config-dir FOLDER"
-        return _told(f"{group}={file}", [f"{group}={each}" for each in near], f"of {', '.join(known)}; {own}")
+        return _told(f"{group}={file}", [f"{group}={each}" for each in near], otherwise=f"of {', '.join(known)}; {own}")
     if found := re.search("Ambiguous value for argument '(.+?)=(.*?)'", said):
         return f"{found[1]}={found[2]}: {as_a_list(found[1], found[2])}; a sweep, a run for each, is -m"
     if found := re.search("Could not override '(.+?)'", said):
@@ -200,7 +200,7 @@ def told(name: str, arguments: Sequence[str], said: str) -> str:
         if found[1] in known:
             return f"{found[1]}: what it does not have yet is added by +: '+{found[1]}=...'"
         group = found[1].partition(".")[0]
-        others = [f"{group}={each}" for each in choices(group) if group in groups and _has(name, group, each, found[1])]
+        others = [f"{group}={each}" for each in choices(group) if group in groups and _has(name, group, choice=each, key=found[1])]
         return _told(found[1], others and [f"{found[1]} with {', '.join(others)}"] or _near(found[1], known))
     return said
 

@@ -63,21 +63,21 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
     except (Exception, KeyboardInterrupt) as error:
         if arrived or isinstance(error, KeyboardInterrupt):
             number = signal.Signals(arrived[0] if arrived else signal.SIGINT)
-            _end(f"\ninterrupted ({number.name}); go on with: {go_on()}", 128 + number, others)
+            _end(f"\ninterrupted ({number.name}); go on with: {go_on()}", 128 + number, others=others)
         if isinstance(error, InputError):
-            _end(f"error: {' '.join(str(error).split())}", REFUSED, others)
+            _end(f"error: {' '.join(str(error).split())}", REFUSED, others=others)
         if isinstance(error, BrokenPipeError) and _is_unread():
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the end of python complains, too
-            _end(f"\nerror: nobody reads the output any more; go on with: {go_on()}", 1, others)
+            _end(f"\nerror: nobody reads the output any more; go on with: {go_on()}", 1, others=others)
         failed = error.__cause__ if isinstance(error.__cause__, OSError) else error  # of logging that is set up
         if isinstance(failed, OSError) and failed.errno in WRITING:
             where = failed.filename or "a file"
             reason = f"{where}: cannot be written ({failed.strerror}); what was written before is whole"
-            _end(f"\nerror: {reason}. Mend that, then go on with: {go_on()}", 1, others)
+            _end(f"\nerror: {reason}. Mend that, then go on with: {go_on()}", 1, others=others)
         memory = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
         if memory or (isinstance(error, RuntimeError) and any(words in str(error) for words in MEMORY)):
             reason = "out of memory; what was written before is whole"
-            _end(f"\nerror: {reason}. Free memory, or use fewer processes, then go on with: {go_on()}", 1, others)
+            _end(f"\nerror: {reason}. Free memory, or use fewer processes, then go on with: {go_on()}", 1, others=others)
         raise
     finally:
         for number, handler in before.items():

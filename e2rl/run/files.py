@@ -85,7 +85,7 @@ def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) 
 
 def read_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) -> bytes:
     """Returns the bytes of a file as `open_regular` opens it; raises as it does."""
-    with open_regular(path, limit, within) as file:
+    with open_regular(path, limit, within=within) as file:
         return file.read()
 
 
@@ -291,7 +291,7 @@ def seal(folder: Path) -> None:
 def altered(folder: Path) -> str | None:
     """The name of the first file of a sealed folder that is not what was written; None: all are."""
     try:
-        hashes = json.loads(read_regular(folder / SEAL, MAX_RECORD, folder))
+        hashes = json.loads(read_regular(folder / SEAL, MAX_RECORD, within=folder))
         return next((name for name, known in hashes.items() if sha256_of(folder / name, folder) != known), None)
     except FileNotFoundError as error:
         return Path(error.filename).name
@@ -301,7 +301,7 @@ def altered(folder: Path) -> str | None:
 
 def sha256_of(path: Path, within: Path | None = None) -> str:
     """SHA-256 of a file's content, in hex; raises OSError as `open_regular` does."""
-    with open_regular(path, MAX_HASHED, within) as file:
+    with open_regular(path, MAX_HASHED, within=within) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -392,11 +392,11 @@ def misfit(value: Any, shape: Any, where: str = "it") -> str | None:
         if missing:
             return f"{missing} is missing"
         others = [(f"{where}.{name}", name, shape[...]) for name in value if name not in shape] if ... in shape else []
-        return next((found for at, name, each in parts + others if (found := misfit(value[name], each, at))), None)
+        return next((found for at, name, each in parts + others if (found := misfit(value[name], each, where=at))), None)
     if isinstance(shape, list):
         if not isinstance(value, list):
             return f"{where} is no list"
-        each = (misfit(part, shape[0], f"{where}[{index}]") for index, part in enumerate(value))
+        each = (misfit(part, shape[0], where=f"{where}[{index}]") for index, part in enumerate(value))
         return next((found for found in each if found), None)
     return None if isinstance(value, shape) else f"{where} is {str(value)[:40]!r}"
 

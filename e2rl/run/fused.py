@@ -126,7 +126,7 @@ class Fused:
                 names = [int(size) if size.isdigit() else size for size in sizes.split()]
                 apart = len(names) > 1 and isinstance(names[-1], int) and names[-1] <= VECTOR and shape[-1] != "!"
                 truth = name == "bool" and shape[-1] != "!"
-                found.append(_Declared(names, getattr(torch, name or "float32"), apart, truth))
+                found.append(_Declared(names, getattr(torch, name or "float32"), apart=apart, truth=truth))
         return found
 
     @cached_property

@@ -39,7 +39,7 @@ class Parts:
         found = self.load(name, identity)
         if found is None or not valid(found):
             found = compute()
-            self.save(name, identity, found)
+            self.save(name, identity, value=found)
         return found
 
     def load(self, name: str, identity: Any) -> Any:

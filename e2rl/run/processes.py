@@ -61,7 +61,7 @@ def in_processes(
         return
     order = sorted(range(len(jobs)), key=lambda k: -cost(jobs[k]))
     work = partial(_packed, function)
-    with _forked(work, jobs, processes) if isinstance(processes, int) else processes.tasks(work, jobs) as submit:
+    with _forked(work, jobs, processes=processes) if isinstance(processes, int) else processes.tasks(work, jobs) as submit:
         with interrupts_held():
             futures = {submit(k): k for k in order}
         early = {}

@@ -62,7 +62,7 @@ class Run:
             return cls(config, Path(hydra.runtime.output_dir), dict(hydra.runtime.choices), free)
         folder = Path(config.resume).resolve()
         where = f"resume={config.resume}"
-        saved = saved_configuration(config, folder, where)
+        saved = saved_configuration(config, folder, where=where)
         known = read_provenance(folder)
         given = {item.split("=", 1)[0].lstrip("+~") for item in hydra.overrides.task}
         default = load_config(str(hydra.job.config_name))
@@ -99,7 +99,7 @@ class Run:
 
     def parts(self, stage: str = "", about: str = "") -> Parts:
         """Returns the parts of a stage that are done."""
-        return Parts(self.folder, stage, about)
+        return Parts(self.folder, stage, about=about)
 
     def begin(self, scenes: Mapping[str, tuple[str, str]]) -> None:
         """Write what the run was begun with; or where it goes on, compare with that. Raises InputError for other inputs
@@ -165,7 +165,7 @@ def read_provenance(folder: Path) -> dict[str, Any]:
     file = Path(folder) / PROVENANCE
     damaged = InputError(f"{file}: damaged, or of another version; restore it, or begin a new run")
     try:
-        known = json.loads(read_regular(file, MAX_RECORD, Path(folder)))
+        known = json.loads(read_regular(file, MAX_RECORD, within=Path(folder)))
         kinds = {"command": str, "cwd": str, "choices": dict, "inputs": dict, "settings": dict, "files": dict}
         wrong = [name for name, kind in kinds.items() if not isinstance(known[name], kind)]
         if not wrong and known["versions"] and all(isinstance(each["git"], str) for each in known["versions"]):

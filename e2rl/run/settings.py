@@ -114,11 +114,11 @@ def check_settings(made: Any, where: str) -> None:
         if "low" not in rule or (value is None and rule["optional"]):
             continue
         if rule["choices"]:
-            check_choice(_dotted(where, each.name), value, rule["choices"])
+            check_choice(_dotted(where, each.name), value, choices=rule["choices"])
             continue
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, int | float):
-                check_range(_dotted(where, each.name), number, rule["low"], rule["high"])
+                check_range(_dotted(where, each.name), number, low=rule["low"], high=rule["high"])
 
 
 def _dotted(where: str, key: object) -> str:

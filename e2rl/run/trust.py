@@ -50,7 +50,7 @@ def saved_configuration(config: DictConfig, folder: Path, where: str) -> DictCon
         reason = "of the other command, of another version, or cut off"
         raise InputError(f"{file}: {reason} ({', '.join(missing)}: missing); give another run, or begin a new one")
     saved.update(dict.fromkeys(absent))
-    check_code(saved, [str(name) for name in config.plugins], where)
+    check_code(saved, [str(name) for name in config.plugins], where=where)
     named = {str(value) for key, value in leaves(OmegaConf.to_container(saved)) if key.endswith("base_url") and value}
     if unknown := sorted(named - {str(OmegaConf.select(config, ENDPOINT))}):
         raise InputError(

@@ -117,7 +117,7 @@ def _scenario(path: Path) -> Recording:
     size = np.array([SIZES.get(kind, SMALL) for kind in kinds])
     size[ego] = EGO_SIZE
     seconds = (np.asarray(scenario.timestamps_ns, float) - scenario.timestamps_ns[0]) / 1e9
-    arrays = (*resample_uniform(states, valid, seconds), size, _types(kinds))
+    arrays = (*resample_uniform(states, valid, ts=seconds), size, _types(kinds))
     return Recording(scenario.scenario_id, scenario.city_name, "argoverse2", *arrays, ego, {}, current=None)
 
 
@@ -160,8 +160,8 @@ def _sensor_log(path: Path) -> Recording:
     states[:, 0, :2], states[:, 0, 2] = (place + AHEAD * turn[..., 0])[:, :2], _heading(turn[..., 0])
     valid[frame, track + 1], valid[:, 0] = True, True
     seconds = (stamps - stamps[0]) / 1e9
-    resampled = resample_heights(heights, valid, seconds)
-    states, valid = resample_uniform(states, valid, seconds)
+    resampled = resample_heights(heights, valid, ts=seconds)
+    states, valid = resample_uniform(states, valid, ts=seconds)
     states[..., 3] = speeds(states, valid)
     size = np.stack([EGO_SIZE, *table[["length_m", "width_m"]].to_numpy(float)[first]])
     kinds = ["regular_vehicle", *table["category"].to_numpy()[first]]
@@ -200,6 +200,6 @@ def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
         exits = [str(other) for other in segment.successors]
         lanes[key] = Lane(points[:, :2], float(width), exits=exits, heights=points[:, 2])
     for key, lane in lanes.items():
-        lane.left = same_way(lanes, lane, segments[key].left_neighbor_id)
-        lane.right = same_way(lanes, lane, segments[key].right_neighbor_id)
+        lane.left = same_way(lanes, lane, neighbour=segments[key].left_neighbor_id)
+        lane.right = same_way(lanes, lane, neighbour=segments[key].right_neighbor_id)
     return lanes, [np.asarray(area.xyz[:, :2], float) for area in static_map.vector_drivable_areas.values()]

@@ -67,7 +67,7 @@ def overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tens
 
 def distance(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
     """Distance [...] [m] between two boxes, 0 where they overlap; the nearest points include a corner of one."""
-    return signed_distance(first, first_size, second, second_size).clamp(min=0)
+    return signed_distance(first, first_size, second=second, second_size=second_size).clamp(min=0)
 
 
 def signed_distance(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ def signed_distance(first: Tensor, first_size: Tensor, second: Tensor, second_si
         local = to_frame(corners(other, other_size), box[..., None, :]).abs() - size[..., None, :] / 2
         return local.clamp(min=0).square().sum(-1).amin(-1)
 
-    apart = separation(first, first_size, second, second_size)
+    apart = separation(first, first_size, second=second, second_size=second_size)
     squared = torch.minimum(
         corner_gap(first, first_size, second, second_size), corner_gap(second, second_size, first, first_size)
     )

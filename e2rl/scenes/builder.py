@@ -70,10 +70,10 @@ class SceneBuilder:
         self.valid = drop_jumps(recording.states, recording.valid)
         egos = recording.all_egos()
         self.valid[:, egos] = recording.valid[:, egos]  # without the ego there is no scene
-        self.mended, turned = mend_headings(recording.states, recording.valid, recording.agent_type)
+        self.mended, turned = mend_headings(recording.states, recording.valid, agent_type=recording.agent_type)
         recording = replace(recording, states=self.mended)
         check(motion(recording), recording.scene_id)
-        held, count = hold_headings(self.mended, self.valid, recording.agent_type)
+        held, count = hold_headings(self.mended, self.valid, agent_type=recording.agent_type)
         self.repairs += Counter(turned) + Counter({"headings held while standing": count})
         lanes, limits = known_limits(recording)
         self.graph = LaneGraph(lanes)
@@ -81,14 +81,14 @@ class SceneBuilder:
         if not self.graph.ids:
             raise InputError(f"scene {recording.scene_id!r}: no lane is at least 0.5 m long; leave the scene out")
         check(map_fit(recording, self.graph), recording.scene_id)
-        self.levels = Levels(recording, self.graph, self.valid)
+        self.levels = Levels(recording, self.graph, valid=self.valid)
         self.elsewhere = {recording.ego: self.levels.elsewhere(recording.ego)}
         self.repairs[OTHER_LEVEL] += int(self.elsewhere[recording.ego].sum())
         self.repairs = +self.repairs
         self.states = smooth(held, self.valid)
         widths = np.array([plausible_width(lane.width) for lane in self.graph.lanes.values()])
         rings = [ring for ring in recording.drivable if len(ring) >= 3]
-        self.drivable = DrivableArea(list(self.graph.line.values()), widths, rings)
+        self.drivable = DrivableArea(list(self.graph.line.values()), widths, polygons=rings)
         self.settings = settings
 
     def scene(self, recording: Recording) -> TensorDict:
@@ -101,13 +101,13 @@ class SceneBuilder:
         valid = self.valid & ~self.elsewhere[recording.ego]
         valid[: frame + 1, [*recording.towed]] = False  # as of one that appears later
         # what stands is held by what was recorded of it until the start frame
-        held, _ = hold_headings(self.mended[: frame + 1], self.valid[: frame + 1], recording.agent_type)
-        scene, origin = _agents(replace(recording, states=held), frame, self.states, valid, self.settings)
+        held, _ = hold_headings(self.mended[: frame + 1], self.valid[: frame + 1], agent_type=recording.agent_type)
+        scene, origin = _agents(replace(recording, states=held), frame, states=self.states, valid=valid, settings=self.settings)
         elsewhere = self.levels.lanes_elsewhere(scene.pop("height"))
         lights = {name: index for index, name in enumerate(recording.lights)}
-        scene |= _routes(scene, self.graph, origin, lights, self.settings, elsewhere)
-        scene |= _lights(recording, frame, origin, self.settings.steps)
-        scene |= _map(self.graph, self.drivable, scene, origin, self.settings)
+        scene |= _routes(scene, self.graph, origin=origin, lights=lights, settings=self.settings, elsewhere=elsewhere)
+        scene |= _lights(recording, frame, origin=origin, steps=self.settings.steps)
+        scene |= _map(self.graph, self.drivable, scene=scene, origin=origin, settings=self.settings)
         left_out = scene.pop("left_out")
         tensors = {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in scene.items()}
         doubles = {key: value.float() for key, value in tensors.items() if value.dtype == torch.float64}
@@ -121,11 +121,11 @@ def _agents(
     """Start states, past and recorded future of the agents that take part, their heights at the start, which are not
     part of a scene, and the scene's origin [2]; states, valid: the smoothed tracks; recording: its tracks until the
     start frame."""
-    start, accel, yaw_rate = causal_state(recording.states, valid, frame)
+    start, accel, yaw_rate = causal_state(recording.states, valid, frame=frame)
     start = np.where(valid[frame, :, None], start, 0.0)
     origin = np.round(start[recording.ego, :2])
     shift = np.array([*origin, 0.0, 0.0])
-    tracks, left_out = _participants(recording, frame, states, valid, settings)
+    tracks, left_out = _participants(recording, frame, states=states, valid=valid, settings=settings)
     rows = np.flatnonzero(tracks >= 0)
     chosen = tracks[rows]
     cars = rows[rows < settings.vehicles]
@@ -154,7 +154,7 @@ def _agents(
         "left_out": np.array(left_out),
         "height": padded(np.full(len(rows), np.nan) if recording.heights is None else recording.heights[frame, chosen]),
     }
-    past = causal_past(recording.states[:, tracks[cars]], valid[:, tracks[cars]], frame, start[tracks[cars], 3])
+    past = causal_past(recording.states[:, tracks[cars]], valid[:, tracks[cars]], frame=frame, speed=start[tracks[cars], 3])
     scene["past"][cars] = past
     return scene, origin
 
@@ -179,7 +179,7 @@ def _participants(
     vehicle = recording.agent_type == VEHICLE
     span = slice(frame, frame + settings.steps + 1)
     distance = np.linalg.norm(states[span, :, :2] - states[span, [ego], :2], axis=-1)
-    path_distance, moves = _approach(states[span], valid[span], vehicle, ego)
+    path_distance, moves = _approach(states[span], valid[span], vehicle=vehicle, ego=ego)
     present = valid[frame] & vehicle
     start_distance = np.where(present, distance[0], np.inf)
     start_distance[ego] = path_distance[ego] = -1.0
@@ -259,17 +259,17 @@ def _routes(
         position = np.array([x, y]) + origin
         found = graph.candidates(position, heading, max(speed, 0.0), settings.routes, settings.vertices, elsewhere(row))
         for index, route in enumerate(found):
-            _write_route(out, (row, index), route, origin, lights)
+            _write_route(out, (row, index), route=route, origin=origin, lights=lights)
         scene["parked"][row] = abs(speed) < STANDING
         standing += [(row, route) for route in found if abs(speed) < STANDING]
     if standing:
         rows, routes = map(list, zip(*standing, strict=True))
-        scene["parked"][np.array(rows)[_on_lane(graph, routes, scene["start"][rows, :2] + origin)]] = False
+        scene["parked"][np.array(rows)[_on_lane(graph, routes, position=scene["start"][rows, :2] + origin)]] = False
     out["route_log"] = _driven(scene, out)
     if out["route_log"][0] < 0:  # no lane route fits the ego's recorded path: it becomes the last candidate
         slot = min(int(out["route_valid"][0].sum()), settings.routes - 1)
         track = scene["logged"][scene["logged_valid"][:, 0], 0] + [*origin, 0.0, 0.0]
-        _write_route(out, (0, slot), route_from_log(graph, track, settings.vertices), origin, lights)
+        _write_route(out, (0, slot), route=route_from_log(graph, track, vertices=settings.vertices), origin=origin, lights=lights)
         out["route_log"][0], out["route_recorded"][0, slot] = slot, True
     return out
 
@@ -286,7 +286,7 @@ def _write_route(out: Arrays, at: tuple[int, int], route: Route, origin: np.ndar
 def _on_lane(graph: LaneGraph, routes: list[Route], position: np.ndarray) -> np.ndarray:
     """Whether positions [R, 2] on the map lie within the lane of the route of each there [R]."""
     points = torch.from_numpy(np.stack([route.points for route in routes]))
-    along, across, _ = project(torch.from_numpy(position[:, None]), points, torch.full((len(routes), 1), BEHIND))
+    along, across, _ = project(torch.from_numpy(position[:, None]), points, hint=torch.full((len(routes), 1), BEHIND))
     width = []
     for route, s in zip(routes, along[:, 0].tolist(), strict=True):
         lane = [name for name, start in route.lanes if start <= s + 1e-6][-1:] or [route.lanes[0][0]]
@@ -371,5 +371,5 @@ def ego_overlaps(scene: TensorDict) -> str:
     others[0] = False
     pose = scene["start"].double()
     size = scene["size"].double()
-    overlap = boxes.overlap(pose[:1], size[:1], pose, size) & others
+    overlap = boxes.overlap(pose[:1], size[:1], second=pose, second_size=size) & others
     return AGENT_WORDS[int(scene["agent_type"][overlap].min())] if overlap.any() else ""

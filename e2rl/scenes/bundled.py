@@ -106,7 +106,7 @@ def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
     ids = [str(name) for name in arrays["lane_id"]]
     centrelines = _split(arrays["lane_points"] * MILLI, arrays["lane_counts"])
     rows = zip(centrelines, arrays["lane_width"] * MILLI, arrays["lane_speed"] * MILLI, strict=True)
-    lanes = [Lane(points, float(width), float(speed)) for points, width, speed in rows]
+    lanes = [Lane(points, float(width), speed_limit=float(speed)) for points, width, speed in rows]
     for kind in ("exits", "left", "right"):
         for a, b in arrays[kind]:
             getattr(lanes[a], kind).append(ids[b])
@@ -119,8 +119,8 @@ def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
         SceneMap(
             str(name),
             {ids[k]: lanes[k] for k in own["lanes"][m]},
-            [polygons[k] for k in own["polygons"][m]],
-            {ids[arrays["light_lane"][k]]: arrays["light_states"][k] for k in own["lights"][m]},
+            drivable=[polygons[k] for k in own["polygons"][m]],
+            lights={ids[arrays["light_lane"][k]]: arrays["light_states"][k] for k in own["lights"][m]},
         )
         for m, name in enumerate(arrays["map_name"])
     ]

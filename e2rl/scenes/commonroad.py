@@ -51,7 +51,7 @@ class CommonRoadSource(LogFiles):
 
     def read(self, log: str) -> Iterator[Recording]:
         with bounded_memory():
-            recording = read_scenario(self.content(log), self.starts, self.build.steps)
+            recording = read_scenario(self.content(log), self.starts, steps=self.build.steps)
         if len(recording.states) - self.build.steps // 2 >= min(self.starts or (HISTORY,)):
             yield recording
 
@@ -75,7 +75,7 @@ def read_scenario(content: bytes, starts: Sequence[int] | None = None, steps: in
     for start in frames:
         span = slice(start, start + steps + 1) if len(frames) > 1 else slice(None)
         there = present[min(start, len(present) - 1)]
-        recording.egos[start] = _ego(recording.states[span], present[span], there, begun)
+        recording.egos[start] = _ego(recording.states[span], present[span], there=there, begun=begun)
     return replace(recording, ego=next((ego for ego in recording.egos.values() if ego >= 0), -1))
 
 
@@ -131,9 +131,9 @@ def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
             at = state.time_step - first if moves else slice(None)
             states[at, index], valid[at, index] = _state(state, boxes[index][1]), True
     kinds = np.array([TYPES.get(obstacle.obstacle_type.value, OTHER) for obstacle in obstacles])
-    started = [_started(problem.initial_state, states, valid, first) for problem in problems]
+    started = [_started(problem.initial_state, states, valid=valid, first=first) for problem in problems]
     seconds = np.arange(count) * scenario.dt
-    states, valid = resample_uniform(states, valid, seconds)
+    states, valid = resample_uniform(states, valid, ts=seconds)
     lanes, drivable = _map(scenario.lanelet_network)
     steps_at = first + latest_frames(seconds, len(states))
     recording = Recording(
@@ -147,7 +147,7 @@ def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
         ego=-1,
         lanes=lanes,
         drivable=drivable,
-        lights=_lights(scenario.lanelet_network, lanes, steps_at),
+        lights=_lights(scenario.lanelet_network, lanes, steps=steps_at),
         current=None,
     )
     return recording, [track for track in started if track is not None]

@@ -37,7 +37,7 @@ class DrivableArea:
         field = self.lanes.beyond(origin, corner, cells)
         near = np.zeros(field.shape, np.int16)  # polygons whose border is within SEAM
         for polygon in self.polygons:
-            _lower(field, near, x, y, polygon - origin)
+            _lower(field, near, x=x, y=y, ring=polygon - origin)
         seam = near > 1
         field[seam] = np.minimum(field[seam], -SEAM)
         return field.astype(np.float16), corner
@@ -56,7 +56,7 @@ def _lower(field: np.ndarray, near: np.ndarray, x: np.ndarray, y: np.ndarray, ri
 
     The distance from a tile's middle bounds that of its cells, so cells outside which cannot change are not searched.
     """
-    rows, columns = _near(x, y, ring, FAR)
+    rows, columns = _near(x, y, points=ring, reach=FAR)
     part = field[rows, columns]
     count = near[rows, columns]
     x = x[rows]
@@ -68,10 +68,10 @@ def _lower(field: np.ndarray, near: np.ndarray, x: np.ndarray, y: np.ndarray, ri
     least = tree.query(cell[::TILE, ::TILE] + (TILE - CELL) / 2)[0] - RADIUS - DENSE / 2
     least = least.repeat(TILE, 0).repeat(TILE, 1)[: len(x), : len(y)]
     inside = np.zeros(part.shape, bool)
-    box = _near(x, y, ring, 0.0)
+    box = _near(x, y, points=ring, reach=0.0)
     inside[box] = Path(ring).contains_points(cell[box].reshape(-1, 2)).reshape(inside[box].shape)
     change = inside | (least < part)
-    border = _border_distance(dense, tree, cell[change])
+    border = _border_distance(dense, tree, points=cell[change])
     part[change] = np.minimum(part[change], np.where(inside[change], -border, border))
     count[change] += border <= SEAM
 

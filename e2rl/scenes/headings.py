@@ -67,7 +67,7 @@ def hold_headings(states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray)
     for agent in np.flatnonzero(standing.any(0)):
         frames = np.flatnonzero(valid[:, agent])
         heading = np.unwrap(states[frames, agent, 2])
-        held = _held(frames, heading, standing[frames, agent], states[frames, agent, :2])
+        held = _held(frames, heading, standing=standing[frames, agent], position=states[frames, agent, :2])
         out[frames, agent, 2] = np.where(standing[frames, agent], wrap(held), states[frames, agent, 2])
         count += bool((np.abs(held - heading) > HELD).any())
     return out, count
@@ -165,7 +165,7 @@ def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     cost = fast * FAST_COST + slow * np.minimum(SLOW_COST, SLOW / np.maximum(slow.sum(0), 1))
     turning = np.minimum(TURNED_COST, TURNED / np.maximum(valid.sum(0), 1))
     backwards = np.stack([cost * (along < -AGAINST), cost * (along > AGAINST) + turning], -1)
-    turned[:, agents] = _least_cost(heading[:, agents], valid[:, agents], backwards[:, agents])
+    turned[:, agents] = _least_cost(heading[:, agents], valid[:, agents], own=backwards[:, agents])
     drives = fast.any(0)
     whole = drives & ((turned & fast).sum(0) > 0.5 * fast.sum(0))
     if whole.sum() >= CONVENTION and whole.sum() > 0.5 * drives.sum():

@@ -41,7 +41,7 @@ class LaneCover:
         rows = np.flatnonzero(((self.tile >= low) & (self.tile < low + size)).all(1))
         i, j = (self.tile[rows] - low).T
         x, y = (corner + (np.arange(size.max() * TILE)[:, None] - lead) * CELL).T.reshape(2, -1, TILE)
-        squared = self._squared(rows, x[i], y[j], origin)
+        squared = self._squared(rows, x[i], y=y[j], origin=origin)
         reach = self.reach[self.point[self.begin[rows]]]
         field = np.full((*size, TILE, TILE), FAR)
         for each in np.unique(reach)[::-1]:

@@ -182,7 +182,7 @@ class LaneGraph:
         for name, start in zip(lanes, starts[:-1] - begin, strict=True):
             limit[max(int(start // SPACING), 0) :] = self.lanes[name].speed_limit
             lane_s.append((name, float(start * scale)))
-        return Route(smooth_vertices(points_at(line, arc, at)), float(length), bool(at[-1] > arc[-1]), lane_s, limit)
+        return Route(smooth_vertices(points_at(line, arc, at=at)), float(length), open=bool(at[-1] > arc[-1]), lanes=lane_s, limit=limit)
 
     def candidates(
         self,
@@ -201,12 +201,12 @@ class LaneGraph:
         reach = float(np.clip(5.0 * speed + 25.0, 40.0, 120.0))
         found: list[Route] = []
         points = np.empty((count, vertices, 2))
-        for lane, s in self.near_lanes(position, heading, away):
+        for lane, s in self.near_lanes(position, heading, away=away):
             behind = self.behind(lane, BEHIND - s)
             before = sum(self.arc[name] for name in behind)
             begin = max(before + s - BEHIND, 0.0)
-            for branch in self.branches(lane, s, reach):
-                route = self.route([*behind, *branch], begin, vertices)
+            for branch in self.branches(lane, s, reach=reach):
+                route = self.route([*behind, *branch], begin, vertices=vertices)
                 route.vehicle_s = before + s - begin
                 probes = np.clip(PROBES + int(round(route.vehicle_s / SPACING)), 0, vertices - 1)
                 dx, dy = (route.points[probes, axis, None] - points[: len(found), None, :, axis] for axis in range(2))

@@ -100,8 +100,8 @@ class Levels:
         heights = [height[::STRIDE]]
         if recording.agent_type[agent] == VEHICLE:
             reach = arc_length(track[:, :2])[-1] + AHEAD
-            places_on_lanes = dict(self.near_lanes(track[0, :2], track[0, 2], height[0]))
-            for name in _reached(graph, places_on_lanes, reach):
+            places_on_lanes = dict(self.near_lanes(track[0, :2], track[0, 2], height=height[0]))
+            for name in _reached(graph, places_on_lanes, reach=reach):
                 rows = slice(*graph.first_point[[graph.number[name], graph.number[name] + 1]])
                 known = np.isfinite(self.lane_height[rows])
                 places.append(graph.points[rows][known])

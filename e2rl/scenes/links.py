@@ -81,7 +81,7 @@ def drivable(ends: Ends, lane: np.ndarray, other: np.ndarray) -> np.ndarray:
     across = y * cos - x * sin
     half = np.minimum(ends.width[lane], ends.width[other]) / 2
     turn = np.abs(wrap(ends.into[other] - ends.out[lane]))
-    return (np.abs(along) <= LINK_GAP) & (np.abs(across) < half) & (turn < LINK_ANGLE) & _level(ends, lane, other)
+    return (np.abs(along) <= LINK_GAP) & (np.abs(across) < half) & (turn < LINK_ANGLE) & _level(ends, lane, other=other)
 
 
 def _level(ends: Ends, lane: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ def infer_exits(lanes: dict[str, Lane], names: Iterable[str] | None = None) -> d
         gap = np.linalg.norm(ends.first[other] - ends.last[lane], axis=1)
         follows = (other != lane) & (np.abs(wrap(into[other] - out[lane])) < JOIN_ANGLE)
         follows &= gap <= np.linalg.norm(ends.first[other] - ends.first[lane], axis=1)
-        follows &= _level(ends, np.full_like(other, lane), other)
+        follows &= _level(ends, np.full_like(other, lane), other=other)
         exits[name] = [ids[index] for index in other[follows]]
     return exits
 
@@ -126,7 +126,7 @@ def drivable_exits(lanes: dict[str, Lane]) -> tuple[dict[str, list[str]], Counte
     known = [(number[name], number[other]) for name, other in recorded if other in number and other != name]
     repairs[ABSENT] = len(recorded) - len(known) - repairs[ITSELF]
     lane, other = np.array(known, int).reshape(-1, 2).T
-    kept = drivable(ends_of(lanes.values()), lane, other)
+    kept = drivable(ends_of(lanes.values()), lane, other=other)
     repairs[UNDRIVABLE] = int((~kept).sum())
     ids = list(lanes)
     exits: dict[str, list[str]] = {name: [] for name in lanes}
@@ -147,9 +147,9 @@ def adjacent(lanes: dict[str, Lane], lines: dict[str, np.ndarray]) -> tuple[dict
     angle = {name: tangent_angle(line) for name, line in lines.items()}
 
     def lateral(name: str, other: str) -> float:
-        distance = _lateral(lines[name], angle[name], lines[other], angle[other])
+        distance = _lateral(lines[name], angle[name], other=lines[other], other_angle=angle[other])
         if np.isnan(distance):  # the other may be short, between two places that were compared
-            distance = -_lateral(lines[other], angle[other], lines[name], angle[name])
+            distance = -_lateral(lines[other], angle[other], other=lines[name], other_angle=angle[name])
         return distance
 
     def nearest(name: str, recorded: list[str], side: int) -> list[str]:

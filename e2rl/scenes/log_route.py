@@ -30,9 +30,9 @@ def route_from_log(graph: LaneGraph, track: np.ndarray, vertices: int) -> Route:
         known = max(known, arc_length(line)[-1])
     line = np.concatenate([line, line[-1:] + vertices * SPACING * _end_direction(line)])
     at = np.arange(vertices) * SPACING
-    points = smooth_vertices(points_at(line, arc_length(line), at))
-    lanes, limit = _lanes_along(graph, points, known)
-    return Route(points, min(known, at[-1]), bool(known < at[-1]), lanes, limit, BEHIND)
+    points = smooth_vertices(points_at(line, arc_length(line), at=at))
+    lanes, limit = _lanes_along(graph, points, length=known)
+    return Route(points, min(known, at[-1]), open=bool(known < at[-1]), lanes=lanes, limit=limit, vehicle_s=BEHIND)
 
 
 def _end_direction(line: np.ndarray) -> np.ndarray:

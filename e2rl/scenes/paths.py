@@ -39,7 +39,7 @@ def resample(points: np.ndarray, spacing: float) -> np.ndarray:
     count = max(int(np.ceil(arc[-1] / spacing)), 1) + 1
     at = np.arange(count) * (arc[-1] / (count - 1))
     at[-1] = arc[-1]
-    return points_at(points, arc, at)
+    return points_at(points, arc, at=at)
 
 
 def tangent_angle(points: np.ndarray) -> np.ndarray:

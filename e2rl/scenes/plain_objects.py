@@ -62,11 +62,11 @@ def called(path: str, arguments: tuple) -> Any:
         case "dtype", [str(name), *_] if DTYPE.fullmatch(name):
             return Unbuilt(name)
         case "scalar", [np.dtype(kind=kind) as dtype, bytes() | str() as data] if kind != "O":
-            return array_of(data, dtype, (), "C")[()]
+            return array_of(data, dtype, shape=(), order="C")[()]
         case "_frombuffer", [bytes() | bytearray() as data, np.dtype() as dtype, tuple(shape), "C" | "F" as order]:
-            return array_of(data, dtype, shape, order)
+            return array_of(data, dtype, shape=shape, order=order)
         case "_frombuffer", [bytes() | bytearray() as data, np.dtype() as dtype, tuple(shape), "K", tuple(axes)]:
-            return array_of(data, dtype, shape, "C").transpose(axes)
+            return array_of(data, dtype, shape=shape, order="C").transpose(axes)
         case "encode", [str(text), "latin1" | "latin-1"]:
             return text.encode("latin-1")
         case "bytes" | "bytearray", []:

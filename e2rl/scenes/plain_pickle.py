@@ -184,7 +184,7 @@ class _Machine(LIBRARY):
             target.value = dtype_of(target.dtype, state)
         else:
             _, shape, dtype, fortran, data = state
-            target.value = array_of(data, dtype, shape, "F" if fortran else "C")
+            target.value = array_of(data, dtype, shape=shape, order="F" if fortran else "C")
         self.append(target.value)
 
 

@@ -148,7 +148,7 @@ def motion(recording: Recording) -> dict[str, float]:
         "ego_speed_ratio": _median(ratio[ego]),
         "ego_direction": _median(turned[far & ego]),
         "twins": _together(recording, np.unique(track[far])),
-        **_worst(distance[far], turned[far], ratio[far], track[far]),
+        **_worst(distance[far], turned[far], ratio=ratio[far], track=track[far]),
     }
 
 

@@ -154,7 +154,7 @@ def _frames(scene: Any) -> list[Frame]:
                 agents[other.attributes.track_token] = (TYPES.get(kind, OTHER), *shape)
         lights = scene.get_traffic_light_detections_at_iteration(step) or ()
         states = {str(light.lane_id): light_colour(light.status.name) for light in lights}
-        found.append(Frame(boxes.timestamp.time_us / 1e6, agents, states))
+        found.append(Frame(boxes.timestamp.time_us / 1e6, agents, lights=states))
     return found
 
 
@@ -199,12 +199,12 @@ def _recording(scene_id: str, frames: list[Frame]) -> Recording:
     seconds -= seconds[0]
     lanes = dict.fromkeys(lane for frame in frames for lane in frame.lights)
     lights = {lane: np.array([frame.lights.get(lane, LIGHT_UNKNOWN) for frame in frames]) for lane in lanes}
-    resampled = resample_heights(heights, valid, seconds)
-    states, valid = resample_uniform(states, valid, seconds)
+    resampled = resample_heights(heights, valid, ts=seconds)
+    states, valid = resample_uniform(states, valid, ts=seconds)
     states[..., 3] = speeds(states, valid)
     latest = latest_frames(seconds, len(states))
     size = np.array([np.median(found, axis=0) for found in sizes])
-    recording = Recording(scene_id, "", "", states, valid, size, types, 0, {}, current=None, heights=resampled)
+    recording = Recording(scene_id, "", dataset="", states=states, valid=valid, size=size, agent_type=types, ego=0, lanes={}, current=None, heights=resampled)
     recording.lights = {lane: values[latest] for lane, values in lights.items()}
     return recording
 
@@ -222,8 +222,8 @@ def _map(land: Any, path: np.ndarray) -> tuple[dict[str, Lane], list[np.ndarray]
     lanes = {name: _lane(segment, land.map_has_z) for name, segment in segments.items()}
     for name, lane in lanes.items():
         lane.exits = [str(other) for other in segments[name].successor_ids if str(other) in lanes]
-        lane.left = same_way(lanes, lane, segments[name].left_lane_id)
-        lane.right = same_way(lanes, lane, segments[name].right_lane_id)
+        lane.left = same_way(lanes, lane, neighbour=segments[name].left_lane_id)
+        lane.right = same_way(lanes, lane, neighbour=segments[name].right_lane_id)
     areas = [area.outline_2d.array for layer in surfaces for area in found.get(layer, ())]
     return lanes, [np.asarray(area, float)[:, :2] for area in areas]
 
@@ -235,4 +235,4 @@ def _lane(segment: Any, has_z: bool) -> Lane:
     width = segment.shapely_polygon.area / length if length > 0 else 0.0
     limit = segment.speed_limit_mps
     heights = points[:, 2] if has_z else None
-    return Lane(points[:, :2], float(width), float(limit) if limit else 0.0, heights=heights)
+    return Lane(points[:, :2], float(width), speed_limit=float(limit) if limit else 0.0, heights=heights)

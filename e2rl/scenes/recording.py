@@ -188,23 +188,23 @@ class Recording:
         frames, agents = self.valid.shape if isinstance(self.valid, np.ndarray) and self.valid.ndim == 2 else (-1, -1)
         shape = f"{frames} frames, {agents} agents"
         if agents < 0 or self.valid.dtype != bool:
-            raise self._wrong("valid", self.valid, "a bool array [frames, agents]")
+            raise self._wrong("valid", self.valid, expected="a bool array [frames, agents]")
         for name, kinds, columns, text in ARRAYS:
             value = getattr(self, name)
             sizes = (frames, agents, columns) if name == "states" else (agents, columns)[: 1 + (columns > 0)]
             if not isinstance(value, np.ndarray) or value.dtype.kind not in kinds or value.shape != sizes:
-                raise self._wrong(name, value, f"{text}, as valid is of {shape}")
+                raise self._wrong(name, value, expected=f"{text}, as valid is of {shape}")
         if not ((self.agent_type >= VEHICLE) & (self.agent_type <= OTHER)).all():
-            raise self._wrong("agent_type", self.agent_type, f"numbers from {VEHICLE} to {OTHER}")
+            raise self._wrong("agent_type", self.agent_type, expected=f"numbers from {VEHICLE} to {OTHER}")
         for name, types, text in FIELDS:
             value = getattr(self, name)
             if not isinstance(value, types) or isinstance(value, bool):
-                raise self._wrong(name, value, text)
+                raise self._wrong(name, value, expected=text)
         if self.heights is not None and not _are_numbers(self.heights, (frames, agents)):
-            raise self._wrong("heights", self.heights, f"numbers [frames, agents], as valid is of {shape}")
+            raise self._wrong("heights", self.heights, expected=f"numbers [frames, agents], as valid is of {shape}")
         for name in ("towed", "coupled"):
             if not all(_is_index(track, agents) for track in getattr(self, name)):
-                raise self._wrong(name, getattr(self, name), f"a tuple of tracks from 0 to {agents - 1}")
+                raise self._wrong(name, getattr(self, name), expected=f"a tuple of tracks from 0 to {agents - 1}")
         self._validate_map(frames)
         return self
 
@@ -212,29 +212,29 @@ class Recording:
         """Raises InputError for lanes, polygons and lights that are of another kind, type or length."""
         for name, lane in self.lanes.items():
             if not isinstance(name, str) or not isinstance(lane, Lane):
-                raise self._wrong("lanes", {name: lane}, "a Lane by a text each")
+                raise self._wrong("lanes", {name: lane}, expected="a Lane by a text each")
             for part in ("points", "heights"):
                 value = getattr(lane, part)
                 if not isinstance(value, np.ndarray) and not (part == "heights" and value is None):
-                    raise self._wrong(f"lanes[{name!r}].{part}", value, "an array")
+                    raise self._wrong(f"lanes[{name!r}].{part}", value, expected="an array")
             if lane.heights is not None and not _are_numbers(lane.heights, lane.points.shape[:1]):
                 count = len(lane.points) if lane.points.ndim else 0
-                raise self._wrong(f"lanes[{name!r}].heights", lane.heights, f"{count} numbers, one of each point")
+                raise self._wrong(f"lanes[{name!r}].heights", lane.heights, expected=f"{count} numbers, one of each point")
             for part in ("width", "speed_limit"):
                 if not isinstance(getattr(lane, part), int | float | np.number):
-                    raise self._wrong(f"lanes[{name!r}].{part}", getattr(lane, part), "a number")
+                    raise self._wrong(f"lanes[{name!r}].{part}", getattr(lane, part), expected="a number")
             for part in ("exits", "left", "right"):
                 value = getattr(lane, part)
                 if not isinstance(value, list | tuple) or not all(isinstance(other, str) for other in value):
-                    raise self._wrong(f"lanes[{name!r}].{part}", value, "a list of ids of lanes, which are texts")
+                    raise self._wrong(f"lanes[{name!r}].{part}", value, expected="a list of ids of lanes, which are texts")
         for ring in self.drivable:
             if not isinstance(ring, np.ndarray):
-                raise self._wrong("drivable", ring, "a list of arrays [points, 2]")
+                raise self._wrong("drivable", ring, expected="a list of arrays [points, 2]")
         for name, light in self.lights.items():
             known = isinstance(light, np.ndarray) and light.dtype.kind in "iu" and light.shape == (frames,)
             if name not in self.lanes or not known:
                 raise self._wrong(
-                    f"lights[{name!r}]", light, f"an integer array of {frames} states, by the id of a lane"
+                    f"lights[{name!r}]", light, expected=f"an integer array of {frames} states, by the id of a lane"
                 )
 
     def _wrong(self, name: str, value: object, expected: str) -> InputError:

@@ -66,18 +66,18 @@ def project(
     if is_on() and hint is None and torch.broadcast_shapes(points.shape[:-2], lead) == lead:
         rows = points.expand(*lead, *points.shape[-2:]).flatten(0, -3)
         return tuple(value.view(*lead, points.shape[-2]) for value in project_rows(rows, route.flatten(0, -3)))
-    return _project(points, route, hint, window)
+    return _project(points, route, hint=hint, window=window)
 
 
 def _project(points: Tensor, route: Tensor, hint: Tensor | None, window: float) -> tuple[Tensor, Tensor, Tensor]:
-    vertex = nearest_vertex(points, route, hint, window)
-    return onto_segments(points, vertex, route.shape[-2] - 2, lambda index: _take(route, index))
+    vertex = nearest_vertex(points, route, hint=hint, window=window)
+    return onto_segments(points, vertex, last=route.shape[-2] - 2, take=lambda index: _take(route, index))
 
 
 @fused("R K 2", "R P 2!")
 def project_rows(points: Tensor, route: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`project` of points [R, K, 2] on routes [R, P, 2]."""
-    return _project(points, route, None, WINDOW)
+    return _project(points, route, hint=None, window=WINDOW)
 
 
 def project_track(
@@ -114,7 +114,7 @@ def project_track(
     poses = []
     for frame in range(points.shape[1]):
         hint = place if frame == 0 else place + moved[rows, frame - 1]
-        pose = project(points[rows, frame : frame + 1], route[rows], hint[:, None])
+        pose = project(points[rows, frame : frame + 1], route[rows], hint=hint[:, None])
         place = pose[0][:, 0]
         poses.append(torch.stack(pose, -1))
     fresh = torch.cat(poses, 1).unbind(-1)
@@ -142,7 +142,7 @@ def onto_segments(
     start = torch.stack([vertex - 1, vertex]).clamp(0, last)
     a = take(start)
     along, length, unit = segment(a, take(start + 1))
-    s, d, second = onto_nearer(points, start, last, a, along, length, unit)
+    s, d, second = onto_nearer(points, start, last=last, a=a, along=along, length=length, unit=unit)
     x, y = torch.where(second[..., None], unit[1], unit[0]).unbind(-1)
     return s, d, torch.atan2(y, x)
 
@@ -187,13 +187,13 @@ def interpolate(
     if is_on() and tangents is None and route.shape[:-2] == s.shape[:-1]:
         xy, heading, curvature = interpolate_rows(route.flatten(0, -3), s.flatten(0, -2))
         return xy.view(*s.shape, 2), heading.view(s.shape), curvature.view(s.shape)
-    return _interpolate(route, s, tangents)
+    return _interpolate(route, s, tangents=tangents)
 
 
 @fused("R P 2!", "R K")
 def interpolate_rows(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`interpolate` of routes [R, P, 2] at s [R, K]."""
-    return _interpolate(route, s, None)
+    return _interpolate(route, s, tangents=None)
 
 
 def _interpolate(route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -204,7 +204,7 @@ def _interpolate(route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | Non
     if tangents is None:
         four = torch.cat([i - 1, i, i + 1, i + 2], -1).clamp(0, last + 1)
         before, a, b, after = _take(route, four).unflatten(-2, (4, i.shape[-1])).unbind(-3)
-        angle, turn = _tangent(before, a, b, after)
+        angle, turn = _tangent(before, a, b=b, after=after)
     else:
         a = _take(route, i)
         b = _take(route, i + 1)
@@ -219,7 +219,7 @@ def tangents(route: Tensor) -> tuple[Tensor, Tensor]:
     """Angle [..., P - 1] rad of a route's tangent at the first vertex of each segment, and its turn to the next."""
     before = torch.cat([route[..., :1, :], route[..., :-2, :]], -2)
     after = torch.cat([route[..., 2:, :], route[..., -1:, :]], -2)
-    return _tangent(before, route[..., :-1, :], route[..., 1:, :], after)
+    return _tangent(before, route[..., :-1, :], b=route[..., 1:, :], after=after)
 
 
 def _tangent(before: Tensor, a: Tensor, b: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:

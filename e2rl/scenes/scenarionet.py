@@ -100,8 +100,8 @@ def recording_of(data: dict, location: str = "") -> Recording:
     if len(ts) != frames:
         raise InputError(f"{len(ts)} time stamps for {frames} frames; repair metadata.ts")
     check({"states": (ts.max() - ts.min()) / DT * len(keys)}, scene_id)  # of the grid, whose size they give
-    heights = resample_heights(_heights(tracks, valid), valid, ts)
-    states, valid = resample_uniform(states, valid, ts)
+    heights = resample_heights(_heights(tracks, valid), valid, ts=ts)
+    states, valid = resample_uniform(states, valid, ts=ts)
     seconds = ts - ts[0]
     current = metadata.get("current_time_index")
     if current is not None and not (np.isreal(current) and 0 <= current < frames and current == int(current)):
@@ -118,7 +118,7 @@ def recording_of(data: dict, location: str = "") -> Recording:
         ego=keys.index(str(ego)),
         lanes=lanes,
         drivable=drivable,
-        lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds, len(states)),
+        lights=_lights(data.get("dynamic_map_states", {}), lanes, seconds=seconds, frames=len(states)),
         current=None if current is None else int(round(seconds[int(current)] / DT)),
         repairs=repairs,
         heights=heights,

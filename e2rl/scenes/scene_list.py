@@ -63,7 +63,7 @@ def read_list(path: str | Path) -> list[Listed]:
         rows = CsvReader(content)
         if "scene_id" not in (rows.fieldnames or ()):
             raise InputError(f"scenes={file}: no column scene_id; give the {SCENES} of a run, or a table with one")
-        found = dict.fromkeys(_line(file, rows.line_num, row) for row in rows)
+        found = dict.fromkeys(_line(file, rows.line_num, row=row) for row in rows)
     except (OSError, ValueError, csv.Error) as error:
         if isinstance(error, InputError):
             raise
@@ -79,7 +79,7 @@ def _line(file: Path, number: int, row: dict[str, str | None]) -> Listed:
         raise InputError(f"scenes={file}, line {number}: no scene_id; name a scene, or remove the line")
     if noise and not (noise.isascii() and noise.isdigit() and int(noise) < LARGEST):
         raise InputError(f"scenes={file}, line {number}: number {noise}: expected a whole number of at least 0")
-    return Listed(name, int(noise) if noise else None, sha256 or None)
+    return Listed(name, int(noise) if noise else None, sha256=sha256 or None)
 
 
 def listed_scenes(
@@ -97,7 +97,7 @@ def listed_scenes(
         scenes = load(max(numbers) + 1)
         hashes = scene_hashes(scenes)
         if {line.sha256 for line in listed} <= set(hashes):
-            return _taken(scenes, listed, hashes)
+            return _taken(scenes, listed, hashes=hashes)
     scenes = load(None)
     hashes = scene_hashes(scenes)
     known = set(scenes.scene_id)
@@ -111,7 +111,7 @@ def listed_scenes(
             cause = "the data, data.build or e2rl's version are others"
             raise InputError(f"{message}: {cause}; restore them, or leave the column sha256 out to run these")
         tqdm.write(f"{message}, though the data files are: another version or machine", sys.stderr)
-    return _taken(scenes, listed, hashes)
+    return _taken(scenes, listed, hashes=hashes)
 
 
 def _taken(scenes: SceneSet, listed: Sequence[Listed], hashes: Sequence[str]) -> SceneSet:

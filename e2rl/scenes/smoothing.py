@@ -44,7 +44,7 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     Raises:
         InputError: fewer than two time stamps, or such as descend or are not in seconds.
     """
-    states, valid, ts = _merge_equal_stamps(states, valid, ts)
+    states, valid, ts = _merge_equal_stamps(states, valid, ts=ts)
     if len(ts) < 2:
         raise InputError(FEW_FRAMES)
     step = np.diff(ts)
@@ -58,15 +58,15 @@ def resample_uniform(states: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> t
     earliest = _valid_from(valid)
     before = latest[np.searchsorted(ts, grid + ON_GRID, side="right")]
     after = earliest[np.searchsorted(ts, grid - ON_GRID)]
-    between = _bridged(before, after, valid, ts)
+    between = _bridged(before, after, valid=valid, ts=ts)
     nearest = latest_frames(ts, len(grid))[:, None]
     offset = grid[:, None] - ts[nearest]
     near = (np.abs(offset) <= NEAR) & np.take_along_axis(valid, nearest, axis=0)
     inner = np.where(offset > 0, latest[nearest[:, 0]], earliest[nearest[:, 0] + 1])
-    inner = np.where(_bridged(np.minimum(inner, nearest), np.maximum(inner, nearest), valid, ts), inner, nearest)
+    inner = np.where(_bridged(np.minimum(inner, nearest), np.maximum(inner, nearest), valid=valid, ts=ts), inner, nearest)
     before = np.where(between, before, np.minimum(inner, nearest))
     after = np.where(between, after, np.maximum(inner, nearest))
-    out = _interpolate(states, ts, grid, before, after)
+    out = _interpolate(states, ts, grid=grid, before=before, after=after)
     alone = near & ~between & (before == after)
     way = np.where(alone, np.clip(out[..., 3], -TOP_SPEED, TOP_SPEED) * offset, 0.0)
     out[..., 0] += way * np.cos(out[..., 2])
@@ -97,7 +97,7 @@ def resample_heights(heights: np.ndarray, valid: np.ndarray, ts: np.ndarray) -> 
             continue
         nearest = np.searchsorted((ts[frames[1:]] + ts[frames[:-1]]) / 2, ts)
         states[:, agent, 0] = heights[frames[nearest], agent]
-    return resample_uniform(states, valid, ts)[0][..., 0]
+    return resample_uniform(states, valid, ts=ts)[0][..., 0]
 
 
 def _merge_equal_stamps(
@@ -209,7 +209,7 @@ def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     jump &= valid[1:] & valid[:-1]
     for agent in np.flatnonzero(jump.any(0)):
         run = np.concatenate([[0], np.cumsum(jump[:, agent])])
-        valid[:, agent] = _consistent(states[:, agent, :2], valid[:, agent], run)
+        valid[:, agent] = _consistent(states[:, agent, :2], valid[:, agent], run=run)
     return valid
 
 
@@ -334,8 +334,8 @@ def causal_state(states: np.ndarray, valid: np.ndarray, frame: int) -> tuple[np.
     shift = states[first : frame + 1, :, :2] - states[frame, :, :2]  # small numbers, so that the fit is exact
     turned = np.unwrap(np.where(known > 0, states[first : frame + 1, :, 2] - states[frame, :, 2], 0.0), axis=0)
     basis = np.stack([np.ones_like(time), time, time**2], 1)
-    position = _fit(basis, known, shift, quadratic=count >= 5)
-    turn = _fit(basis, known, turned[..., None], quadratic=np.zeros_like(count, bool))
+    position = _fit(basis, known, value=shift, quadratic=count >= 5)
+    turn = _fit(basis, known, value=turned[..., None], quadratic=np.zeros_like(count, bool))
     angle = states[frame, :, 2]
     unit = np.stack([np.cos(angle), np.sin(angle)], -1)
     lately = _mean_velocity(states[first : frame + 1, :, :2], known > 0, back=LATELY - 1, ahead=0)[-1]

@@ -101,7 +101,7 @@ class Source(Extension, ABC):
 
     def __post_init__(self) -> None:
         if isinstance(self.build, Mapping):
-            self.build = settings_of(BuildSettings, self.build, "data.build")
+            self.build = settings_of(BuildSettings, self.build, where="data.build")
         check_settings(self, "data")
         check_versions(self.versions)
 
@@ -150,9 +150,9 @@ class Source(Extension, ABC):
         folder = Path(self.cache) if self.cache else cache_folder()
         every = folder / self._file(content, None)
         if most is None or every.exists():
-            scenes = cached(every, partial(self._built, None), self.cache_gb).first(most)
+            scenes = cached(every, partial(self._built, None), gigabytes=self.cache_gb).first(most)
         else:
-            scenes = cached(folder / self._file(content, most), partial(self._built, most), self.cache_gb)
+            scenes = cached(folder / self._file(content, most), partial(self._built, most), gigabytes=self.cache_gb)
         return replace(scenes, files=hashlib.sha256(content).hexdigest())
 
     def log_names(self) -> list[str]:
@@ -243,7 +243,7 @@ class Source(Extension, ABC):
         """Yields what recordings of the same tracks and map make."""
         builder = None
         for window in windows:
-            row = Row(window.scene_id, window.location, window.dataset)
+            row = Row(window.scene_id, window.location, dataset=window.dataset)
             if len(windows) > 1 and not window.has_ego():
                 yield row._replace(reason=NO_EGO, usual=True)
                 continue
@@ -273,7 +273,7 @@ class Source(Extension, ABC):
         known: set[str] = set()
         with closing(self._rows_of_logs(logs, most)) as rows_of_logs:
             for log, rows in zip(logs, show(rows_of_logs), strict=False):
-                yield from _told_apart(log, rows, known)
+                yield from _told_apart(log, rows, known=known)
 
     def _rows_of_logs(self, logs: list[str], most: int | None) -> Generator[list[Row]]:
         """Yields what each log makes; most: see `rows`."""
@@ -342,14 +342,14 @@ def load_scenes(
         files: see `listed_scenes`.
     """
     if num_scenes is not None:
-        check_range("num_scenes", num_scenes, 1)
+        check_range("num_scenes", num_scenes, low=1)
     source = data if isinstance(data, Source) else source_of(data)
     if split and source.has_splits:
         source = replace(source, split=split)
     if starts is not None:
         source = replace(source, starts=tuple(starts))
     if scenes is not None:
-        return listed_scenes(scenes, source.load, num_scenes, files)
+        return listed_scenes(scenes, source.load, most=num_scenes, files=files)
     return source.load(num_scenes)
 
 
@@ -363,7 +363,7 @@ def source_of(data: Mapping) -> Source:
         raise InputError(f"data={target}: cannot be built: {reason}; name a subclass of Source as _target_") from error
     if not issubclass(kind, Source):
         raise InputError(f"data={target}: is no e2rl.scenes.source.Source; subclass it, and define logs() and read()")
-    return settings_of(kind, {key: value for key, value in data.items() if key != "_target_"}, "data")
+    return settings_of(kind, {key: value for key, value in data.items() if key != "_target_"}, where="data")
 
 
 def _told_apart(log: str, rows: list[Row], known: set[str]) -> Iterator[Row]:

@@ -39,8 +39,8 @@ def couple(recording: Recording) -> Recording:
         if not pairs:
             break
         for tractor, trailer in pairs:
-            turns = _turns(recording, tractor, trailer)
-            recording = _marked(recording, tractor, trailer) if turns else _joined(recording, tractor, trailer)
+            turns = _turns(recording, tractor, trailer=trailer)
+            recording = _marked(recording, tractor, trailer=trailer) if turns else _joined(recording, tractor, trailer=trailer)
             repairs[TURNING if turns else JOINED] += 1
     return replace(recording, repairs=repairs)
 
@@ -56,11 +56,11 @@ def _pairs(recording: Recording) -> list[tuple[int, int]]:
     front, rear = _ends(recording.states, recording.size[:, 0])
     fixed = {*recording.all_egos(), *recording.towed}  # no trailers
     found = []
-    for tractor, trailer in sorted(_near_pairs(front, rear, moving, recording.valid)):
+    for tractor, trailer in sorted(_near_pairs(front, rear, moving=moving, valid=recording.valid)):
         frames = np.flatnonzero(moving[:, tractor] & recording.valid[:, trailer])
         offset = front[frames, trailer] - rear[frames, tractor]
         distances = np.linalg.norm(offset, axis=-1)
-        if len(frames) < FRAMES or trailer in fixed or not _behind(recording, tractor, trailer, frames, offset=offset):
+        if len(frames) < FRAMES or trailer in fixed or not _behind(recording, tractor, trailer=trailer, frames=frames, offset=offset):
             continue
         middle = np.median(distances)
         play = np.quantile(np.abs(distances - middle), 0.9)
@@ -150,7 +150,7 @@ def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
     length = float(np.median(reach))
     alone = np.where(there[:, :1], states[:, tractor], states[:, trailer])
     chord = front[:, 0] - rear[:, 1]
-    angles = [_angle_to_chord(chord, states[:, each, 2], both) for each in pair]
+    angles = [_angle_to_chord(chord, states[:, each, 2], known=both) for each in pair]
     along = alone[:, 2] + np.where(there[:, 0], *angles)
     direction = np.stack([np.cos(along), np.sin(along)], -1)
     direction = np.where(both[:, None], chord / np.maximum(np.linalg.norm(chord, axis=-1), 1e-6)[:, None], direction)

@@ -69,7 +69,7 @@ class Search(Extension):
         self.tries: list[list[Try]] = [[] for _ in self.numbers]  # of each scene
         self.outcomes: list[list[Outcome]] = [[] for _ in self.numbers]
         self.cells: set[str] = set()
-        self._portfolio = Portfolio(self.families, len(self.numbers), self.settings.bandit)
+        self._portfolio = Portfolio(self.families, len(self.numbers), learns=self.settings.bandit)
         self._generator = torch.Generator().manual_seed(self.seed)
 
     def ask(self) -> list[Try]:
@@ -96,7 +96,7 @@ class Search(Extension):
         drawn = []
         for scene, family in ((active[position], family) for position, family in chosen):
             if rest[scene] > 0:
-                drawn.append(self._draw(scene, family, next(number[scene])))
+                drawn.append(self._draw(scene, family, number=next(number[scene])))
                 rest[scene] -= 1
         return drawn
 

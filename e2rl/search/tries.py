@@ -59,7 +59,7 @@ class Family:
         u = torch.rand(len(DRAWN), generator=generator, dtype=torch.float64)
         if stratified:
             u = (u + number * torch.tensor(PRIMES, dtype=torch.float64).sqrt()) % 1
-        return self.attempt(scene, number, seed, u)
+        return self.attempt(scene, number, seed=seed, draw=u)
 
     def attempt(self, scene: int, number: int, seed: int, draw: Tensor) -> Try:
         """The try `number` of a scene whose decisions are those of uniform numbers draw [len(DRAWN)] in [0, 1)."""
@@ -68,7 +68,7 @@ class Family:
             if name in self.ranges:
                 span = self.ranges[name]
                 found[name] = span[0] + u * (span[1] - span[0]) if isinstance(span, tuple) else float(span)
-        return Try(scene, number, self.name, seed * TRIES + number, tuple(RULE._replace(**found)))
+        return Try(scene, number, family=self.name, seed=seed * TRIES + number, decisions=tuple(RULE._replace(**found)))
 
 
 def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
@@ -80,9 +80,9 @@ def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
     for key, value in given.items():
         if key in ("method", "changes", "chance", "nfe"):
             continue
-        check_choice(f"{where}.{name}: decision {key}", key, DRAWN)
+        check_choice(f"{where}.{name}: decision {key}", key, choices=DRAWN)
         if key == "whom":
-            check_choice(f"{where}.{name}.whom", value, WHOM)
+            check_choice(f"{where}.{name}.whom", value, choices=WHOM)
             value = WHOM.index(value)
         numbers = value if isinstance(value, list | tuple) else [value]
         known = len(numbers) in (1, 2) and all(isinstance(number, int | float) for number in numbers)
@@ -94,4 +94,4 @@ def family_of(name: str, given: Mapping[str, Any], where: str) -> Family:
         most = {"chance": 1.0, "nfe": 1e9}[key]
         if not isinstance(value, int | float) or not 0 < value <= most:
             raise InputError(f"{where}.{name}.{key}={value}: expected a number above 0, at most {most:g}")
-    return Family(name, str(given.get("method", "e2")), ranges, dict(given.get("changes", {})), **about)
+    return Family(name, str(given.get("method", "e2")), ranges=ranges, changes=dict(given.get("changes", {})), **about)

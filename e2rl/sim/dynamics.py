@@ -78,11 +78,11 @@ def rollout(start: Tensor, actions: Tensor) -> Tensor:
     change = actions[..., 0] * DT
     halting = change.clamp(min=HALTING * DT)
     back = v0 + halting.cumsum(-1)
-    speed = bounded_speed(v0, torch.where(back < 0, halting, change), back.clamp(max=0))
+    speed = bounded_speed(v0, torch.where(back < 0, halting, change), low=back.clamp(max=0))
     before = torch.cat([v0.expand_as(speed[..., :1]), speed[..., :-1]], -1)
     bound = yaw_rate_bound(((before + speed) / 2).abs())
     turn = torch.maximum(torch.minimum(actions[..., 1], bound), -bound) * DT
-    return steered(start, speed, turn)
+    return steered(start, speed, turn=turn)
 
 
 def steered(start: Tensor, speed: Tensor, turn: Tensor) -> Tensor:
@@ -169,7 +169,7 @@ def along_arc(
     """
     x, y, heading, v = (value[..., None] for value in states.unbind(-1))
     arc = Arc(*(value[..., None] for value in arc))
-    *places, driven = arc_places(x, y, heading, v, arc, times, hold, turn)
+    *places, driven = arc_places(x, y, heading=heading, v=v, arc=arc, times=times, hold=hold, turn=turn)
     return torch.stack(torch.broadcast_tensors(*places), -1), driven
 
 

@@ -95,7 +95,7 @@ class DrivingEnv(EnvBase):
         high = torch.tensor([settings.max_acceleration, settings.max_yaw_rate], device=device)
         weights = torch.tensor(check_weights(settings.reward), device=device)
         ends = settings.end_on_contact, settings.end_off_road, settings.end_when_gone
-        self._config = StepConfig(torch.tensor(ends, device=device), weights, low, high)
+        self._config = StepConfig(torch.tensor(ends, device=device), weights, low=low, high=high)
         self.clock = 0
         """Steps simulated so far, resets or not."""
         self._trajectories = Trajectories(self.scene)
@@ -105,7 +105,7 @@ class DrivingEnv(EnvBase):
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
         action = torch.zeros_like(start[:, :2])
         place = start_place(mission, start)
-        self._ego = placed_ego(mission, flags.long(), start, action, flags, flags, place, self._static.vehicle)
+        self._ego = placed_ego(mission, flags.long(), state=start, action=action, present=flags, on_road=flags, place=place, agents=self._static.vehicle)
         self._features = torch.zeros(batch_size, width, device=device)  # as last observed
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
@@ -170,7 +170,7 @@ class DrivingEnv(EnvBase):
         begins = (self._ego.step == 0)[:, None]
         own = ego.state, ego.present, ego.action[:, 0], ego.action[:, 1]
         start = (self.scene[key] for key in START_KEYS)
-        driven = trajectories_at(self._trajectories.states, self._trajectories.valid, ego.step)
+        driven = trajectories_at(self._trajectories.states, self._trajectories.valid, step=ego.step)
         agents = {}
         for key, mine, first, later in zip(AGENT_KEYS, own, start, driven, strict=True):
             known = torch.where(begins[..., None] if first.ndim > 2 else begins, first, later)
@@ -190,9 +190,9 @@ class DrivingEnv(EnvBase):
         self.scenes.copy_into(self.scene, index, rows)
         fresh = self.scene if len(index) == batch else self._beginning(index)
         static = static_scene(fresh, mission_of(fresh))
-        write_rows(self._static, index, static)
+        write_rows(self._static, index, new=static)
         self._trajectories.reset(self.scene, index)
-        begun = self._restart(index, fresh, static.mission)
+        begun = self._restart(index, fresh, mission=static.mission)
         if len(index) < batch:
             static = static._replace(field=self.scene["field"].index_select(0, index))
         others = Agents(*(fresh[name][:, 1:] for name in START_KEYS))
@@ -214,7 +214,7 @@ class DrivingEnv(EnvBase):
     def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> EgoState:
         """Write, and return, the start states [b] of environments index [b] in scenes scene [b]."""
         start = self.scene["start"][:, :1, :2]  # of all environments: the fields stay where they are
-        on_road = off_road(start, self.scene["field"], self.scene["field_origin"])[index, 0] <= 0
+        on_road = off_road(start, self.scene["field"], origin=self.scene["field_origin"])[index, 0] <= 0
         action = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
         flags = torch.ones_like(on_road), on_road
         state = scene["start"][:, 0]
@@ -231,7 +231,7 @@ class DrivingEnv(EnvBase):
         tracks = self._trajectories.states, self._trajectories.valid
         recording = self.scene["logged"], self.scene["logged_valid"]
         given = recording if self.settings.replay_ego else tensordict["action"]
-        self._ego, outcome = hold_step(self.hold, self._look, self._ego, given, tracks, self._static, self._config)
+        self._ego, outcome = hold_step(self.hold, self._look, ego=self._ego, given=given, tracks=tracks, static=self._static, config=self._config)
         self._features = outcome["observation"]
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 

@@ -44,7 +44,7 @@ def leaders(
     moments = agents.shape[2]
     reach = size[:, : s.shape[1], 1] / 2 + GATE_MARGIN + (torch.zeros_like(s) if d is None else d.abs())
     room = reach[..., None] + size.norm(dim=-1)[:, None] / 2
-    pairs = scene, vehicle, other, moment, _ = _near_pairs(points, s, agents[..., :2], room, present)
+    pairs = scene, vehicle, other, moment, _ = _near_pairs(points, s, xy=agents[..., :2], room=room, present=present)
     aside = torch.zeros_like(s) if d is None else d
     gap, along, leads = ahead_of(s, aside, agents, size, points, *pairs)
     table = gap.new_full((*s.shape, moments, agents.shape[1]), free_gap)
@@ -52,7 +52,7 @@ def leaders(
     nearest, index = table.index_put(pair, torch.where(leads > 0, gap, free_gap)).min(-1)
     speed = torch.zeros_like(table).index_put(pair, along).gather(-1, index[..., None])[..., 0]
     speed = torch.where(nearest < free_gap, speed, agents[:, : s.shape[1], :, 3])
-    return Leaders(nearest.clamp(max=free_gap), speed, index)
+    return Leaders(nearest.clamp(max=free_gap), speed, index=index)
 
 
 @fused("B V", "B V", "B X T 4!", "B X 2!", "B V P 2!", *["Q:int64"] * 5)
@@ -73,7 +73,7 @@ def ahead_of(
     own = scene, vehicle
     agent = agents[scene, other, moment]
     box = size[scene, other]
-    at, offset, heading = onto_segments(agent[:, :2], vertex, points.shape[2] - 2, lambda index: points[*own, index])
+    at, offset, heading = onto_segments(agent[:, :2], vertex, last=points.shape[2] - 2, take=lambda index: points[*own, index])
     turn = agent[:, 2] - heading
     cos = torch.cos(turn)
     sin = torch.sin(turn)
@@ -106,8 +106,8 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     b, v, m = (counts.repeat_interleave(moments, -1) & some).nonzero(as_tuple=True)
     there = flat[b, m]
     within = far[b, v, m]
-    near = _near(low[b, v], high[b, v], there[:, None], within[:, None]) & (to_come[b, v] > 0)
-    near[:, -1] |= _beyond(ends_at[0][b, v], ends_at[1][b, v], there, within)
+    near = _near(low[b, v], high[b, v], xy=there[:, None], far=within[:, None]) & (to_come[b, v] > 0)
+    near[:, -1] |= _beyond(ends_at[0][b, v], ends_at[1][b, v], xy=there, far=within)
     pair, stretch = near.nonzero(as_tuple=True)
     gap = stretches[b[pair], v[pair], stretch] - flat[b, m][pair][..., None]
     nearest, index = gap.square().sum(1).min(-1)
@@ -135,8 +135,8 @@ def near_some(
 ) -> Tensor:
     """1 where points xy [B, Q, 2] are within far [B, V, Q] m of the box, low to high, of a stretch that is to come (1,
     else 0), or of the route's straight continuation beyond its last two vertices; else 0."""
-    near = _near(low[..., None, :], high[..., None, :], xy[:, None, None], far[:, :, None])
-    beyond = _beyond(before[:, :, None], last[:, :, None], xy[:, None], far)
+    near = _near(low[..., None, :], high[..., None, :], xy=xy[:, None, None], far=far[:, :, None])
+    beyond = _beyond(before[:, :, None], last[:, :, None], xy=xy[:, None], far=far)
     return torch.maximum(torch.where(near, to_come[..., None], 0.0).amax(2), torch.where(beyond, 1.0, 0.0))
 
 
@@ -192,7 +192,7 @@ def idm_acceleration(
     a = driver.acceleration
     b = driver.braking
     n = driver.exponent
-    interaction = (desired_gap(speed, leader_speed, driver) / gap.clamp(min=0.1)) ** 2
+    interaction = (desired_gap(speed, leader_speed, driver=driver) / gap.clamp(min=0.1)) ** 2
     if not improved:
         return a * (1 - (speed / desired_speed).clamp(min=0) ** n - interaction)
     below = a * (1 - (speed / desired_speed).clamp(0, 1) ** n)

@@ -81,13 +81,13 @@ def mission_of(scene: TensorDictBase) -> Mission:
         return scene[key][row, 0, pick]
 
     end = of("route_length").masked_fill(~of("route_open"), torch.inf)
-    return Mission(of("route_points"), of("route_limit"), end, of("route_light"), of("route_light_s"))
+    return Mission(of("route_points"), of("route_limit"), end=end, light=of("route_light"), light_s=of("route_light_s"))
 
 
 def start_place(mission: Mission, state: Tensor) -> Tensor:
     """Arc length [B] m of egos at their start states [B, 4] on their missions, which begin at most BEHIND m before."""
     hint = torch.full_like(state[:, :1], BEHIND)
-    return project(state[:, None, :2], mission.points, hint)[0][:, 0]
+    return project(state[:, None, :2], mission.points, hint=hint)[0][:, 0]
 
 
 def limit_at(mission: Mission, s: Tensor) -> Tensor:

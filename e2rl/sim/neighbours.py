@@ -42,8 +42,8 @@ def neighbours_of(ego: Tensor, rotation: Tensor, size: Tensor, half_size: Tensor
     poses = torch.stack([x - ego[:, :1], heading.cos(), y - ego[:, 1:2], heading.sin()], 1)
     seen = product(rotation, poses.view(ego.shape[0], 2, -1)).view(ego.shape[0], 2, 2, -1)
     position, direction = seen.unbind(2)
-    gap = separation_in_frame(position, direction, size[..., None] / 2, half_size)
-    return Neighbours(position, direction, gap, agents)
+    gap = separation_in_frame(position, direction, own=size[..., None] / 2, half_size=half_size)
+    return Neighbours(position, direction, gap=gap, agents=agents)
 
 
 def separation_in_frame(position: Tensor, direction: Tensor, own: Tensor, half_size: Tensor) -> Tensor:
@@ -108,8 +108,8 @@ def passed(
         for value in (near.position, near.direction, half_size)
     )
     own = torch.stack([size[:, 0][scene], size[:, 1][scene]]) / 2
-    begin, end = time_inside(position - change, change, direction, own, half)
-    passes = is_fast(change, own, half) & tracks[1][scene, then, agent + 1] & (begin > 0) & (begin < end)
+    begin, end = time_inside(position - change, change, direction=direction, own=own, other=half)
+    passes = is_fast(change, own, other=half) & tracks[1][scene, then, agent + 1] & (begin > 0) & (begin < end)
     passes = passes & asked[scene, agent]
     touch = torch.where(passes, position - (1 - begin) * change, position)
     gap = torch.where(passes, TOUCHING, near.gap[scene, agent])
@@ -166,5 +166,5 @@ def own_fault(
     ahead, across = (position.abs() - static.size / 2 - extent).unbind(1)
     front = ((position[:, 0] > 0) == (speed >= -STANDING)) & (ahead > across)
     vehicle = static.vehicle.gather(1, partner[:, None])[:, 0]
-    moves, stood = standing(tracks, static.row, before, partner + 1, vehicle)
+    moves, stood = standing(tracks, static.row, step=before, agent=partner + 1, long=vehicle)
     return some(hit) & (speed.abs() > STANDING) & (stood | (front & moves))

@@ -74,9 +74,9 @@ def placed_ego(
     place [B]: arc length [m] near which they are, None where it is unknown; agents [B, M]: any tensor of the others.
     """
     hint = None if place is None else place[:, None]
-    pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points, hint)))
+    pose = FrenetPose(*(value[:, 0] for value in project(state[:, None, :2], mission.points, hint=hint)))
     inside = torch.zeros_like(agents, dtype=torch.bool)
-    return EgoState(step, state, action, pose, present, on_road, pose.s, inside)
+    return EgoState(step, state, action=action, pose=pose, present=present, been_on_road=on_road, start_s=pose.s, inside=inside)
 
 
 EGO_STATE = ("B:int64", "B 4!", "B 2!", "B", "B", "B", "B:bool", "B:bool", "B", "B M:bool")
@@ -113,48 +113,48 @@ def observation_config(device: torch.device) -> ObservationConfig:
 
     scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[:, None]
     probes = torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y))
-    return ObservationConfig(numbers(*LOOK_AHEAD, 0.0), probes, scales, numbers(1, 2, 3))
+    return ObservationConfig(numbers(*LOOK_AHEAD, 0.0), probes, agent=scales, colours=numbers(1, 2, 3))
 
 
 def observe(static: StaticScene, ego: EgoState, agents: Agents, time: Tensor) -> Observed:
     """The observation of egos at a time [B], the elapsed fraction of the episode."""
     config = observation_config(ego.state.device)
     rotation = rotation_into(ego.state)
-    neighbours = neighbours_of(ego.state, rotation, static.size, static.half_size, agents)
+    neighbours = neighbours_of(ego.state, rotation, size=static.size, half_size=static.half_size, agents=agents)
     if torch.compiler.is_compiling():
         ahead, left = config.probes.unbind(1)
         x, y = (
             ego.state[:, k, None] + ahead * rotation[:, 0, k, None] + left * rotation[:, 1, k, None] for k in (0, 1)
         )
-        border = off_road_at(x, y, static.field, static.origin)
+        border = off_road_at(x, y, field=static.field, origin=static.origin)
     else:
         probes = torch.baddbmm(ego.state[:, None, :2], config.probes.expand(len(rotation), -1, -1), rotation)
-        border = off_road(probes, static.field, static.origin)
-    route, limit = route_features(config, static, ego, rotation)
+        border = off_road(probes, static.field, origin=static.origin)
+    route, limit = route_features(config, static, ego=ego, rotation=rotation)
     near = nearest(static, neighbours)
     blocks = [
-        ego_features(static, ego, limit, time),
+        ego_features(static, ego, limit=limit, time=time),
         route,
-        light_features(config, static, ego.step, ego.pose.s),
+        light_features(config, static, step=ego.step, s=ego.pose.s),
         (border / 4).clamp(-1, 1),
-        agent_features(config, ego, near),
-        prospects(static, ego.state, ego.pose, rotation, others_of(near)),
+        agent_features(config, ego, near=near),
+        prospects(static, ego.state, pose=ego.pose, rotation=rotation, others=others_of(near)),
     ]
-    return Observed(neighbours, border[:, CENTRE], limit, torch.cat(blocks, -1))
+    return Observed(neighbours, border[:, CENTRE], limit=limit, features=torch.cat(blocks, -1))
 
 
 @fused(STATIC, EGO_STATE, AGENTS, "B")
 def features(static: StaticScene, ego: EgoState, agents: Agents, time: Tensor) -> Tensor:
     """The features [B, OBSERVATION_SIZE] of `observe`, alone."""
-    return observe(static, ego, agents, time).features
+    return observe(static, ego, agents=agents, time=time).features
 
 
 def glance(static: StaticScene, ego: EgoState, agents: Agents, time: Tensor) -> Observed:
     """`observe` without the features: what events and reward need, at a moment at which no policy looks."""
-    neighbours = neighbours_of(ego.state, rotation_into(ego.state), static.size, static.half_size, agents)
-    beyond = off_road(ego.state[:, None, :2], static.field, static.origin)[:, 0]
+    neighbours = neighbours_of(ego.state, rotation_into(ego.state), size=static.size, half_size=static.half_size, agents=agents)
+    beyond = off_road(ego.state[:, None, :2], static.field, origin=static.origin)[:, 0]
     nothing = ego.state[:, :0]
-    return Observed(neighbours, beyond, limit_at(static.mission, ego.pose.s), nothing)
+    return Observed(neighbours, beyond, limit=limit_at(static.mission, ego.pose.s), features=nothing)
 
 
 def ego_features(static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor) -> Tensor:
@@ -183,7 +183,7 @@ def route_features(
     """[B, 12 * 5]: mission points ahead in the ego's frame (2), relative heading, curvature, speed limit; and the speed
     limit at the ego [B]."""
     x, y, heading, curvature, limit = look_along(static, ego.pose.s[:, None] + config.ahead)
-    x, y = seen_from(ego.state, rotation, x, y)
+    x, y = seen_from(ego.state, rotation, x=x, y=y)
     turned = (heading - ego.state[:, 2:3]).sin()
     seen = read_as(limit, ego.state[:, 3:])
     features = torch.stack([x / FAR, y / NEAR, turned, (10 * curvature).clamp(-2, 2), seen / SPEED], -1)
@@ -238,7 +238,7 @@ def others_of(near: Tensor) -> Others:
     """The LOOKED_AT nearest agents of the table `nearest`."""
     near = near[..., :LOOKED_AT]
     local, direction, half, _, speed, accel, turn_rate, _, present = (x.squeeze(1) for x in near.split(COLUMNS, 1))
-    return Others(local, direction, half, speed, Arc(accel, curvature_of(turn_rate, speed)), present > 0)
+    return Others(local, direction, half_size=half, speed=speed, arc=Arc(accel, curvature_of(turn_rate, speed)), present=present > 0)
 
 
 class Entry(NamedTuple):
@@ -250,43 +250,43 @@ class Entry(NamedTuple):
 
 
 EGO = (
-    Entry("speed", "m/s", SPEED),
-    Entry("acceleration", "m/s^2", 4.0),
+    Entry("speed", "m/s", scale=SPEED),
+    Entry("acceleration", "m/s^2", scale=4.0),
     Entry("yaw_rate", "rad/s"),
-    Entry("offset", "m", 3.0),
+    Entry("offset", "m", scale=3.0),
     Entry("heading_sin"),
     Entry("heading_cos"),
-    Entry("limit", "m/s", SPEED),
-    Entry("left", "m", 100.0),
-    Entry("length", "m", 5.0),
-    Entry("width", "m", 2.0),
+    Entry("limit", "m/s", scale=SPEED),
+    Entry("left", "m", scale=100.0),
+    Entry("length", "m", scale=5.0),
+    Entry("width", "m", scale=2.0),
     Entry("elapsed"),
 )
 POINT = (
-    Entry("x", "m", FAR),
-    Entry("y", "m", NEAR),
+    Entry("x", "m", scale=FAR),
+    Entry("y", "m", scale=NEAR),
     Entry("heading_sin"),
-    Entry("curvature", "1/m", 0.1),
-    Entry("limit", "m/s", SPEED),
+    Entry("curvature", "1/m", scale=0.1),
+    Entry("limit", "m/s", scale=SPEED),
 )
 LIGHT = (Entry("red"), Entry("yellow"), Entry("green"), Entry("nearness"))
 AGENT = (
     Entry("present"),
-    Entry("x", "m", FAR),
-    Entry("y", "m", NEAR),
+    Entry("x", "m", scale=FAR),
+    Entry("y", "m", scale=NEAR),
     Entry("heading_cos"),
     Entry("heading_sin"),
-    Entry("velocity_x", "m/s", SPEED),
-    Entry("velocity_y", "m/s", SPEED),
-    Entry("speed", "m/s", SPEED),
-    Entry("acceleration", "m/s^2", 4.0),
-    Entry("half_length", "m", 2.5),
-    Entry("half_width", "m", 1.0),
+    Entry("velocity_x", "m/s", scale=SPEED),
+    Entry("velocity_y", "m/s", scale=SPEED),
+    Entry("speed", "m/s", scale=SPEED),
+    Entry("acceleration", "m/s^2", scale=4.0),
+    Entry("half_length", "m", scale=2.5),
+    Entry("half_width", "m", scale=1.0),
     Entry("vehicle"),
-    Entry("gap", "m", NEAR),
+    Entry("gap", "m", scale=NEAR),
     Entry("approach_time"),
     Entry("approach_distance"),
-    Entry("turn_rate", "rad/s", TURNING),
+    Entry("turn_rate", "rad/s", scale=TURNING),
 )
 
 
@@ -297,10 +297,10 @@ def observation_layout() -> list[Entry]:
         _named("ego", EGO),
         *(_named(f"route.{k}", POINT) for k in range(len(LOOK_AHEAD))),
         *(_named(f"light.{k}", LIGHT) for k in range(2)),
-        [Entry(f"border.{x:+g}.{y:+g}", "m", 4.0) for x in PROBE_X for y in PROBE_Y],
+        [Entry(f"border.{x:+g}.{y:+g}", "m", scale=4.0) for x in PROBE_X for y in PROBE_Y],
         *(_named(f"agent.{k}", AGENT) for k in range(NEAREST)),
-        [Entry(f"manoeuvre.{name}.gap", "m", WIDEST) for name in manoeuvres],
-        [Entry(f"manoeuvre.{name}.contact", "s", TIMES[-1] + TIMES[0]) for name in manoeuvres],
+        [Entry(f"manoeuvre.{name}.gap", "m", scale=WIDEST) for name in manoeuvres],
+        [Entry(f"manoeuvre.{name}.contact", "s", scale=TIMES[-1] + TIMES[0]) for name in manoeuvres],
     ]
     found = [entry for block in blocks for entry in block]
     assert len(found) == OBSERVATION_SIZE

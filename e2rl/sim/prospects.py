@@ -68,10 +68,10 @@ def manoeuvres(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: T
     """x, y, cosine and sine of the direction [4, B, T, C] of egos [B, 4] in their own frames; C: accelerations x
     offsets."""
     plan = manoeuvres_on(state.device)
-    distance = travelled(state[:, 3:].clamp(min=0), plan.accel, plan.moment)  # [B, T A]
+    distance = travelled(state[:, 3:].clamp(min=0), plan.accel, time=plan.moment)  # [B, T A]
     x, y, heading, *_ = look_along(static, pose.s[:, None] + distance)
     turned = heading - state[:, 2:3]
-    places = *seen_from(state, rotation, x, y), turned.cos(), turned.sin()
+    places = *seen_from(state, rotation, x=x, y=y), turned.cos(), turned.sin()
     x, y, cos, sin = (value.unflatten(1, (len(TIMES), -1))[..., None] for value in places)
     across = (pose.d[:, None, None] * (1 - plan.fraction) + plan.offset * plan.fraction).transpose(1, 2)[:, :, None]
     found = torch.broadcast_tensors(x - across * sin, y + across * cos, cos, sin)
@@ -83,7 +83,7 @@ def later(others: Others, time: Tensor) -> Tensor:
     arc = Arc(*(value[:, None] for value in others.arc))
     speed = others.speed[:, None]
     none = torch.zeros_like(speed)
-    ahead, across, heading, *_ = arc_places(none, none, none, speed, arc, time[:, None], HOLD, TURN)
+    ahead, across, heading, *_ = arc_places(none, none, heading=none, v=speed, arc=arc, times=time[:, None], hold=HOLD, turn=TURN)
     cos = heading.cos()
     sin = heading.sin()
     (x, y), (ux, uy) = (value[:, :, None].unbind(1) for value in (others.position, others.direction))
@@ -130,7 +130,7 @@ def _along(points: Tensor, axes: Tensor) -> Tensor:
 
 def prospects(static: StaticScene, state: Tensor, pose: FrenetPose, rotation: Tensor, others: Others) -> Tensor:
     """[B, PROSPECTS] of every manoeuvre: its least gap, then the time of its first gap below TIGHT, in [-1/3, 1]."""
-    gap = gaps(manoeuvres(static, state, pose, rotation), static.size, others)
+    gap = gaps(manoeuvres(static, state, pose=pose, rotation=rotation), static.size, others=others)
     end = TIMES[-1] + TIMES[0]
     first = torch.where(gap < TIGHT, manoeuvres_on(gap.device).time[:, None], end).amin(1) / end
     return torch.cat([gap.amin(1).clamp(-1, WIDEST) / WIDEST, first], -1)

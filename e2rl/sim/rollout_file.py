@@ -70,10 +70,10 @@ class Rollout(Road):
     split: str = array("U", "")
     method: str = array("U", "")
     ego_policy: str = array("U", "")
-    seed: int = array("iu", "", 0, np.inf)
-    eta: float = array("iuf", "", 0, MOST)
-    dt: float = array("iuf", "", 1e-3, 1, default=DT)
-    ego: int = array("iu", "", 0, -1, default=0)
+    seed: int = array("iu", "", low=0, high=np.inf)
+    eta: float = array("iuf", "", low=0, high=MOST)
+    dt: float = array("iuf", "", low=1e-3, high=1, default=DT)
+    ego: int = array("iu", "", low=0, high=-1, default=0)
     states: np.ndarray = array("f", "TN4")
     valid: np.ndarray = array("b", "TN")
     size: np.ndarray = array("f", "N2")
@@ -85,9 +85,9 @@ class Rollout(Road):
     ran_light: np.ndarray | None = array("iu", "N", default=None)
     evasion: np.ndarray | None = array("f", "T4", default=None)
     driver: np.ndarray | None = array("f", "T4", default=None)
-    planners: np.ndarray | None = array("iu", "P", 0, -1, default=None)
+    planners: np.ndarray | None = array("iu", "P", low=0, high=-1, default=None)
     plans: np.ndarray | None = array("f", "KPH2", default=None)
-    targets: np.ndarray | None = array("iu", "KP", -1, -1, default=None)
+    targets: np.ndarray | None = array("iu", "KP", low=-1, high=-1, default=None)
 
     @property
     def name(self) -> str:
@@ -100,7 +100,7 @@ class Rollout(Road):
         the file, where it is none."""
         path = Path(path)
         try:
-            with open_regular(path, MAX_BYTES, within) as file:
+            with open_regular(path, MAX_BYTES, within=within) as file:
                 data = read_arrays(file, MAX_BYTES)
         except (OSError, ValueError) as error:
             raise InputError(f"{path}: no readable rollout ({error}); run evaluate.py again to rewrite it") from error

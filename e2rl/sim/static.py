@@ -56,15 +56,15 @@ def static_scene(scene: TensorDictBase, mission: Mission) -> StaticScene:
     return StaticScene(
         mission,
         segment_table(mission.points, mission.limit),
-        row,
-        lights_of(scene["light_state"], mission.light),
-        scene["field"],
-        scene["field_origin"],
-        scene["size"][:, 0],
-        half_size,
-        scene["agent_type"][:, 1:] == VEHICLE,
-        scene["agent_type"][:, 1:] == OTHER,
-        (scene["logged"][:, :, 0, 3] * scene["logged_valid"][:, :, 0]).amax(1),
+        row=row,
+        lights=lights_of(scene["light_state"], mission.light),
+        field=scene["field"],
+        origin=scene["field_origin"],
+        size=scene["size"][:, 0],
+        half_size=half_size,
+        vehicle=scene["agent_type"][:, 1:] == VEHICLE,
+        plain=scene["agent_type"][:, 1:] == OTHER,
+        top_speed=(scene["logged"][:, :, 0, 3] * scene["logged_valid"][:, :, 0]).amax(1),
     )
 
 
@@ -107,14 +107,14 @@ def follow(static: StaticScene, xy: Tensor, hint: Tensor) -> FrenetPose:
     near = hint.clamp(0, SPACING * (count - 1))  # beyond an end of the route, the end is nearest
     first = ((near - WINDOW) / SPACING).ceil().clamp(max=count - width).clamp(min=0).long()
     index = (first[:, None] + torch.arange(width, device=first.device)).clamp(max=count - 1)
-    gap = rows_at(points, static.row, index) - xy[:, None]
+    gap = rows_at(points, static.row, index=index) - xy[:, None]
     outside = (SPACING * index - near[:, None]).abs() > WINDOW
     vertex = first + first_least(gap.square().sum(-1).masked_fill(outside, torch.inf))
     start = torch.stack([vertex - 1, vertex], 1).clamp(0, last)
-    table = rows_at(static.segments, static.row, start).transpose(0, 1)
+    table = rows_at(static.segments, static.row, index=start).transpose(0, 1)
     a, along, unit, length, heading, _ = table.split((2, 2, 2, 1, 1, 4), -1)
-    s, d, second = onto_nearer(xy, start.T, last, a, along, length[..., 0], unit)
-    return FrenetPose(s, d, torch.where(second, heading[1, :, 0], heading[0, :, 0]))
+    s, d, second = onto_nearer(xy, start.T, last=last, a=a, along=along, length=length[..., 0], unit=unit)
+    return FrenetPose(s, d, heading=torch.where(second, heading[1, :, 0], heading[0, :, 0]))
 
 
 def look_along(static: StaticScene, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -122,7 +122,7 @@ def look_along(static: StaticScene, s: Tensor) -> tuple[Tensor, Tensor, Tensor, 
     of the nearest vertices; each [B, K]."""
     u = s / SPACING
     index = u.floor().clamp(0, static.segments.shape[1] - 1)
-    table = rows_at(static.segments, static.row, index.long())
+    table = rows_at(static.segments, static.row, index=index.long())
     x, y, ahead_x, ahead_y, _, _, _, _, tangent, turn, before, after = table.unbind(-1)
     t = u - index
     within = t.clamp(0, 1)

@@ -88,12 +88,12 @@ def step(
         stay = torch.zeros_like(ego.present) if ended is None else ended
         driven = drive(ego, given, now, others, *tracks, static, config, stay)
         *flags, present, on_road = (driven.truths > 0).unbind()
-        pose = FrenetPose(driven.s, driven.d, driven.heading)
-        moved = EgoState(now, driven.state, driven.action, pose, present, on_road, ego.start_s, driven.inside > 0)
+        pose = FrenetPose(driven.s, driven.d, heading=driven.heading)
+        moved = EgoState(now, driven.state, action=driven.action, pose=pose, present=present, been_on_road=on_road, start_s=ego.start_s, inside=driven.inside > 0)
         seen = features(static, moved, others, now / horizon) if look else ego.state[:, :0]
         numbers = {"observation": seen, "reward": driven.reward, "progress": driven.progress}
         return moved, numbers | dict(zip(FLAGS, flags, strict=True))
-    return _step(ego, given, now, others, tracks, static, config, look, ended)
+    return _step(ego, given, now=now, others=others, tracks=tracks, static=static, config=config, look=look, ended=ended)
 
 
 @fused(EGO_STATE, "B 2!", "B:int64", AGENTS, "B T N 4!", "B T N:bool!", STATIC, ("3:bool!", "8", "2", "2"), "B:bool")
@@ -109,7 +109,7 @@ def drive(
     ended: Tensor,
 ) -> Driven:
     """`step` of actions without a look; now [B] is the step that the egos come to, at which others are met."""
-    moved, of = _step(ego, given, now, others, (states, known), static, config, False, ended)
+    moved, of = _step(ego, given, now=now, others=others, tracks=(states, known), static=static, config=config, look=False, ended=ended)
     truths = torch.stack([*(of[name] for name in FLAGS), moved.present, moved.been_on_road]).to(given.dtype)
     inside = moved.inside.to(given.dtype)
     return Driven(moved.state, moved.action, *moved.pose, of["reward"], of["progress"], truths, inside)
@@ -134,17 +134,17 @@ def _step(
         state = torch.where(given[1][:, None], given[0], ego.state)
         present = ego.present & given[1]
     action = dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0]
-    pose = follow(static, state[:, :2], ego.pose.s + ego.state[:, 3] * DT)
-    moved = EgoState(now, state, action, pose, present, ego.been_on_road, ego.start_s, ego.inside)
+    pose = follow(static, state[:, :2], hint=ego.pose.s + ego.state[:, 3] * DT)
+    moved = EgoState(now, state, action=action, pose=pose, present=present, been_on_road=ego.been_on_road, start_s=ego.start_s, inside=ego.inside)
     if ended is not None:
         stay = ended
         moved = ego.merged(moved, lambda old, new: torch.where(stay.view(-1, *[1] * (new.ndim - 1)), old, new))
         _, state, action, pose, present, *_ = moved
     seen = (observe if look else glance)(static, moved, others, now / horizon)
     both = ego.state, state
-    near = passed(seen.neighbours, both, tracks, static.row, ego.step, static.size, static.half_size)
+    near = passed(seen.neighbours, both, tracks=tracks, row=static.row, step=ego.step, size=static.size, half_size=static.half_size)
     hit = (near.gap < 0) & others.present & present[:, None]
-    inside = since_birth(hit, ego.inside, others.present, tracks[1], static.row, now)
+    inside = since_birth(hit, ego.inside, present=others.present, valid=tracks[1], row=static.row, now=now)
     hit = hit & ~inside
     kinds = static.vehicle, ~(static.vehicle | static.plain), static.plain
     contacts = [some(hit & kind) for kind in kinds]
@@ -152,9 +152,9 @@ def _step(
     off_road = off & ego.been_on_road & present
     gone = ~present | (pose.s >= static.mission.end)
     touched = contacts[0] | contacts[1] | contacts[2]
-    fault = own_fault(ego.state[:, 3], near, hit, static, tracks, ego.step)
-    progress = rewarded_progress(pose.s - ego.pose.s, seen.limit, static.top_speed)
-    terms = reward_terms(progress, touched, fault, off_road, action, ego.action, state[:, 3], seen.limit, pose.d)
+    fault = own_fault(ego.state[:, 3], near, hit=hit, static=static, tracks=tracks, before=ego.step)
+    progress = rewarded_progress(pose.s - ego.pose.s, seen.limit, top_speed=static.top_speed)
+    terms = reward_terms(progress, touched, fault=fault, off_road=off_road, action=action, last_action=ego.action, speed=state[:, 3], limit=seen.limit, offset=pose.d)
     on_contact, off_the_road, when_gone = config.ends.unbind()
     outcome = {
         "observation": seen.features,
@@ -198,10 +198,10 @@ def hold_step(
 
     Egos whose episode ends stay at that moment, which is also the one they observe; the others observe the last one.
     """
-    ego, outcome = step(ego, given, tracks, static, config, look and hold == 1)
+    ego, outcome = step(ego, given, tracks=tracks, static=static, config=config, look=look and hold == 1)
     for last in range(2, hold + 1):
         ended = outcome["terminated"] | outcome["truncated"]
-        ego, later = step(ego, given, tracks, static, config, look and last == hold, ended)
+        ego, later = step(ego, given, tracks=tracks, static=static, config=config, look=look and last == hold, ended=ended)
         flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
         outcome = later | flags | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
     return ego, outcome

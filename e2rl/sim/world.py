@@ -174,4 +174,4 @@ def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> Agents:
     there, was = valid.flatten(0, 1).index_select(0, at).chunk(2)
     change = now[..., 2:] - before[..., 2:]
     known = there & was
-    return Agents(now, there, change[..., 1] / DT * known, wrap(change[..., 0]) / DT * known)
+    return Agents(now, there, accel=change[..., 1] / DT * known, turn_rate=wrap(change[..., 0]) / DT * known)

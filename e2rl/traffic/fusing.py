@@ -38,7 +38,7 @@ def prepare_fused(config: DictConfig) -> None:
     sampler = SamplerSettings()
     network = DenoiserSettings()
     found += fused_encoding(network), fused_estimate(network)
-    found += fused_step(sampler, SIZE), fused_controlled_step(sampler, SIZE, False)
+    found += fused_step(sampler, SIZE), fused_controlled_step(sampler, SIZE, limited=False)
     missing = [each for each in found if not each.file.exists()]
     on = asked is not False and config.device == "cpu"
     if on and missing and asked == "auto":
@@ -48,7 +48,7 @@ def prepare_fused(config: DictConfig) -> None:
             print(told, file=sys.stderr)
     elif on and missing:
         check_compiler("compile")
-        done = in_processes(Fused.compile, missing, cores(), lambda each: 1.0)
+        done = in_processes(Fused.compile, missing, processes=cores(), cost=lambda each: 1.0)
         for _ in Bar(done, "compiling", len(missing), unit="function"):
             pass
     if asked == "auto":

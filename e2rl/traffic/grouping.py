@@ -110,7 +110,7 @@ def group_scenes(world: World) -> list[Group]:
         if end < len(sizes) and filled + size <= ROWS[1] and (filled < ROWS[0] or sizes[end] > SHRUNK * size):
             continue
         rows = order[begin:end]
-        groups.append(Group(rows, size, int(others[rows].max())))
+        groups.append(Group(rows, size, others=int(others[rows].max())))
         begin = end
     return groups
 
@@ -153,14 +153,14 @@ def crop_world(world: World, group: Group) -> World:
     scene = cast(TensorDictBase, SceneRows(world.scene, group))
     mission_s = None if world.mission_s is None else world.mission_s[rows]
     turn_rate = world.turn_rate[rows][:, agents]
-    return World(scene, world.step[rows], states, valid, accel, turn_rate, mission_s=mission_s)
+    return World(scene, world.step[rows], states=states, valid=valid, accel=accel, turn_rate=turn_rate, mission_s=mission_s)
 
 
 def crop_state(value: Any, group: Group, width: int, axes: int | None = 1) -> Any:
     """Returns the group's part of a state of scenes of `width` vehicle rows; axes: of a tensor, see `no_vehicles`."""
     if is_dataclass(value) and not isinstance(value, type):
         parts = {
-            each.name: crop_state(getattr(value, each.name), group, width, axes_of(each)) for each in fields(value)
+            each.name: crop_state(getattr(value, each.name), group, width=width, axes=axes_of(each)) for each in fields(value)
         }
         return replace(value, **parts)
     value = value[group.rows]
@@ -173,7 +173,7 @@ def write_state(full: Any, part: Any, group: Group, axes: int | None = 1) -> Non
     """Writes the group's part of a state back, in place."""
     if is_dataclass(full):
         for each in fields(full):
-            write_state(getattr(full, each.name), getattr(part, each.name), group, axes_of(each))
+            write_state(getattr(full, each.name), getattr(part, each.name), group=group, axes=axes_of(each))
     elif axes == 2:
         index = torch.arange(group.vehicles)
         full[group.rows[:, None, None], index[:, None], index] = part

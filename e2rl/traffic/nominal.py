@@ -78,10 +78,10 @@ class NominalTraffic(Traffic):
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
         """Returns the states of scenes [B] with routes drawn from the prior."""
-        uniform = noise_of(seed, torch.zeros_like(seed), tuple(scenes["route_valid"].shape[1:2]), uniform=True)
+        uniform = noise_of(seed, torch.zeros_like(seed), shape=tuple(scenes["route_valid"].shape[1:2]), uniform=True)
         scenes = self.as_seen(World.at_start(scenes)).scene
         routed, lane = self.prior.start(scenes, self.prior.choose_routes(scenes, uniform))
-        return PriorState(seed, torch.zeros_like(seed), routed, lane)
+        return PriorState(seed, torch.zeros_like(seed), routed=routed, lane=lane)
 
     def replan(
         self, state: State, world: World, ego_plan: Tensor, react: React | None = None
@@ -97,18 +97,18 @@ class NominalTraffic(Traffic):
         for group in group_scenes(world):
             rows = group.rows
             vehicles = group.vehicles
-            part = crop_state(state, group, width)
+            part = crop_state(state, group, width=width)
             there = crop_world(world, group)
             part = self._expecting(part, there)
             announced = (ego_plan[rows], None)
             known, context = announced if self.knowledge == "plan" else self.predicted_ego(part, there)
-            part = replace(part, lane=self.lane_now(part, there, known))
+            part = replace(part, lane=self.lane_now(part, there, ego_plan=known))
             answer = None if react is None else partial(react, rows)
-            now = Replan(part, there, known, noise[:, rows, :vehicles], answer, context)
+            now = Replan(part, there, ego_plan=known, noise=noise[:, rows, :vehicles], react=answer, before=context)
             part, x0, context = self.replan_group(now)
             plan = self.prior.plan(x0, context)
             part = replace(part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS))
-            write_state(whole, part, group)
+            write_state(whole, part, group=group)
             states[rows, :vehicles] = plan.states()
             valid = world.valid[rows, :vehicles, None]  # a vehicle that has left does not return
             present[rows, :vehicles] = plan.on_map & valid
@@ -122,7 +122,7 @@ class NominalTraffic(Traffic):
             return world
         scene = world.scene.copy()
         scene["route_valid"] = scene["route_valid"] & ~scene["route_recorded"]
-        ego = Moment(world.states[:, :1], world.turn_rate[:, :1], world.step)
+        ego = Moment(world.states[:, :1], world.turn_rate[:, :1], step=world.step)
         route = self.prior.route_choice(scene, ego).argmax(-1)
         scene["route_log"] = torch.cat([route, scene["route_log"][:, 1:]], 1)
         return replace(world, scene=scene)
@@ -131,11 +131,11 @@ class NominalTraffic(Traffic):
         """Returns the state with the ego on the route that it is expected to follow."""
         expected = torch.cat([world.scene["route_log"][:, :1], state.routed.route[:, 1:]], 1)
         moved = expected != state.routed.route
-        return onto(state, world, expected, moved) if bool(moved.any()) else state
+        return onto(state, world, route=expected, moved=moved) if bool(moved.any()) else state
 
     def replan_group(self, now: Replan) -> tuple[State, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
-        context = self.encode(now.state, now.world, now.ego_plan, now.before)
+        context = self.encode(now.state, now.world, ego_plan=now.ego_plan, known=now.before)
         return now.state, self.prior.sample(context, now.noise).x0, context
 
     @torch.no_grad()
@@ -144,14 +144,14 @@ class NominalTraffic(Traffic):
         estimate, which is nearer to what egos drive than a sample; and the context of that."""
         action = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1)
         seen = dynamics.rollout(world.states[:, 0], action[:, None].expand(-1, HORIZON, -1))
-        lane = self.lane_now(state, world, seen)
+        lane = self.lane_now(state, world, ego_plan=seen)
         context = self.prior.encode(state.routed, lane, world.states, world.valid, world.step, None)
         return self.prior.decode(self.prior.estimate(context), context).states()[:, 0], context
 
     def noise(self, state: State) -> Tensor:
         """Returns standard normal noise [K, B, V, SIZE] of the next replan."""
         shape = (self.prior.sampler.steps, state.routed.route.shape[1], SIZE)
-        return noise_of(state.seed, 1 + state.replans, shape).transpose(0, 1)
+        return noise_of(state.seed, 1 + state.replans, shape=shape).transpose(0, 1)
 
     def encode(self, state: State, world: World, ego_plan: Tensor, known: Context | None = None) -> Context:
         """Returns the prior's context of a replan; known: see `Prior.encode`."""
@@ -169,7 +169,7 @@ class NominalTraffic(Traffic):
         v = torch.where(ego, world.states[:, :1, 3], lane.v)
         accel = torch.where(ego, world.accel[:, :1], lane.a)
         turning = torch.where(ego, yaw_rate[:, None], lane.kappa * lane.v)
-        now = locate(world.states[:, : ego.shape[1]], accel, turning, routed.points, lane.s + ego * v / 2)
+        now = locate(world.states[:, : ego.shape[1]], accel, yaw_rate=turning, points=routed.points, hint=lane.s + ego * v / 2)
         projected = {name: torch.ones_like(ego) for name in ("s", "d", "d1")}
         projected["d2"] = ego | ~routed.has_lane
 
@@ -186,13 +186,13 @@ class NominalTraffic(Traffic):
 
         def draw(number: int, *shape: int, uniform: bool = False) -> Tensor:
             numbers = torch.full((count * batch,), number)
-            return noise_of(seed.flatten(), numbers, shape, uniform).unflatten(0, (count, batch))
+            return noise_of(seed.flatten(), numbers, shape=shape, uniform=uniform).unflatten(0, (count, batch))
 
         order = draw(0, 2, vehicles, uniform=True).unbind(2)
         position = draw(2, 2, vehicles, uniform=True)[0].unbind(1)
         noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
-        direction = main_direction(prior.schedule, prior.sampler, noise.device)
-        noise = stratified_noise(noise, direction, order[1], position[1])
+        direction = main_direction(prior.schedule, prior.sampler, device=noise.device)
+        noise = stratified_noise(noise, direction, order=order[1], position=position[1])
         step = torch.zeros(batch, dtype=torch.long, device=seed.device)
         plans = []
         for uniform, one in zip(stratified_uniform(order[0], position[0]), noise, strict=True):
@@ -210,5 +210,5 @@ def onto(
     lines = torch.zeros_like(moved) if off_lane is None else off_lane, state.routed.points if paths is None else paths
     routed = reroute(state.routed, world.scene, route, moved, *lines)
     old = state.lane
-    lane = locate(world.states[:, : route.shape[1]], old.a, old.kappa * old.v, routed.points)
-    return replace(state, routed=routed, lane=select(moved, lane, old))
+    lane = locate(world.states[:, : route.shape[1]], old.a, yaw_rate=old.kappa * old.v, points=routed.points)
+    return replace(state, routed=routed, lane=select(moved, lane, other=old))

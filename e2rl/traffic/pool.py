@@ -94,7 +94,7 @@ class TrafficPool:
     @staticmethod
     def recorded(scene_index: Tensor) -> "TrafficPool":
         """Rows that replay the recordings of scenes [R]."""
-        return _rows(scene_index, RECORDED, torch.zeros(len(scene_index)))
+        return _rows(scene_index, RECORDED, eta=torch.zeros(len(scene_index)))
 
     @staticmethod
     def live(
@@ -102,7 +102,7 @@ class TrafficPool:
     ) -> "TrafficPool":
         """Rows of scenes [R] that are replanned against the ego; eta [R], seed [R], template [R] (None: full),
         decisions [R, D] (None: by rule)."""
-        return _rows(scene_index, LIVE, eta, seed, template, decisions)
+        return _rows(scene_index, LIVE, eta=eta, seed=seed, template=template, decisions=decisions)
 
     @staticmethod
     def stored(traffic: Mapping[str, Tensor], eta: Tensor | float, template: Tensor | None = None) -> "TrafficPool":
@@ -120,7 +120,7 @@ class TrafficPool:
         part = StoredTraffic(*(given[name].cpu() for name in StoredTraffic._fields))
         eta = torch.as_tensor(eta, dtype=torch.float32).cpu().expand(len(index))
         owes = given.get("owes", torch.ones(len(index))).cpu()
-        pool = _rows(index, RECORDED, eta, template=None if template is None else template.cpu())
+        pool = _rows(index, RECORDED, eta=eta, template=None if template is None else template.cpu())
         pool.decisions[:, OWES] = owes.to(pool.decisions)
         pool.source = torch.arange(len(index))
         pool.parts = [part]
@@ -161,4 +161,4 @@ def _rows(
     decisions = torch.tensor(RULE).repeat(len(like), 1) if decisions is None else decisions
     fresh = torch.ones_like(like).bool()
     weight = torch.ones(len(like))
-    return TrafficPool(scene_index, like + source, eta, template, seed, decisions, weight, fresh)
+    return TrafficPool(scene_index, like + source, eta=eta, template=template, seed=seed, decisions=decisions, weight=weight, fresh=fresh)

@@ -54,13 +54,13 @@ def roll_out(
     pool = TrafficPool.live(index.cpu(), eta.cpu().float(), seed.cpu(), *given)
     looks = type(ego).act is not Ego.act
     base = DrivingEnv(scenes, settings, len(index), device, agents=True, observed=looks)
-    synthesizer = AdversarialSynthesizer(pool, torch.arange, traffic, ego)
+    synthesizer = AdversarialSynthesizer(pool, torch.arange, traffic=traffic, ego=ego)
     log = PlanLog()
     synthesizer.on_plan = log
     env = TransformedEnv(base, synthesizer)
     with set_exploration_type(ExplorationType.DETERMINISTIC), counted_nfe(traffic) as nfe:
         steps = env.rollout(base.horizon, EgoPolicy(ego, env))
-    known = _driven(steps, base.scene, log) | log.plans(steps["ego", "plan"])
+    known = _driven(steps, base.scene, log=log) | log.plans(steps["ego", "plan"])
     cost = {"seconds": time.perf_counter() - begin, "nfe": float(sum(nfe))}
     known |= {name: torch.full((len(index),), value / len(index)) for name, value in cost.items()}
     known |= {"seed": seed, "eta": eta.double()}
@@ -76,8 +76,8 @@ def _driven(steps: TensorDictBase, scene: TensorDictBase, log: PlanLog) -> dict[
         **tracks,
         "adversaries": torch.nn.functional.pad(log.acted, (0, tracks["states"].shape[2] - route.shape[1])),
         "routes": route,
-        "ran_light": red_lights(tracks, scene, route),
-        "speed_limit": limits(tracks["states"][:, :, 0, :2], tracks["valid"][:, :, 0], mission_of(scene)),
+        "ran_light": red_lights(tracks, scene, route=route),
+        "speed_limit": limits(tracks["states"][:, :, 0, :2], tracks["valid"][:, :, 0], mission=mission_of(scene)),
         **log.transport(),
         "contact": steps["next", "metrics", "contact"].any(1)[:, 0],
     }
@@ -86,7 +86,7 @@ def _driven(steps: TensorDictBase, scene: TensorDictBase, log: PlanLog) -> dict[
 def limits(points: Tensor, known: Tensor, mission: Mission) -> Tensor:
     """Speed limit [B, K] [m/s] along missions at the places of egos at points [B, K, 2], the last known one where they
     are unknown; 0 unknown."""
-    s, _, _ = project_track(points, mission.points, known, start=BEHIND)
+    s, _, _ = project_track(points, mission.points, known=known, start=BEHIND)
     return mission.limit.gather(1, (s / SPACING).long().clamp(0, mission.limit.shape[1] - 1))
 
 
@@ -98,10 +98,10 @@ def red_lights(tracks: dict[str, Tensor], scene: TensorDictBase, route: Tensor) 
     if len(b):
         chosen = b, v, route[b, v]
         seen = tracks["valid"][b, :, v]
-        s, _, _ = project_track(tracks["states"][b, :, v, :2], scene["route_points"][chosen], seen, start=BEHIND)
+        s, _, _ = project_track(tracks["states"][b, :, v, :2], scene["route_points"][chosen], known=seen, start=BEHIND)
         front = (s + scene["size"][b, v, :1] / 2).cummax(1).values
         front = front.masked_fill(~tracks["valid"][b, :, v], -torch.inf)
-        result[b, v] = ran_red(scene["light_state"][b], lights[b, v], scene["route_light_s"][chosen], front)
+        result[b, v] = ran_red(scene["light_state"][b], lights[b, v], line=scene["route_light_s"][chosen], front=front)
     return result
 
 
@@ -128,7 +128,7 @@ def synthesize_traffic(scenes: SceneSet, traffic: Traffic, sim: SimSettings, bat
             index = scene_index[list(rows)]
             at = list(rows)
             noise = index + seed * 1_000_003
-            return roll_out(scenes, index, noise, etas[at], ego, traffic, sim, device, template[at])
+            return roll_out(scenes, index, seed=noise, eta=etas[at], ego=ego, traffic=traffic, sim=sim, device=device, template=template[at])
 
         done: list[int] = []
         parts = list[Rollouts]()

@@ -100,21 +100,21 @@ class IDM(Traffic):
         routed = state.routed
         vehicles = routed.route.shape[1]
         present = world.valid[:, :vehicles]
-        lane = located(state.lane, world, routed)
-        wanted = self._wanted(routed, lane, world).clamp(min=self.bounds.floor)
+        lane = located(state.lane, world, routed=routed)
+        wanted = self._wanted(routed, lane, world=world).clamp(min=self.bounds.floor)
         x = (wanted / ACCEL_SCALE)[..., None].expand(*lane.v.shape, KNOTS)
         x = torch.cat([x, x.new_zeros(*lane.v.shape, SIZE - KNOTS)], -1)
         frozen = routed.parked | (world.scene["start"][:, :vehicles, 3] < STANDING_SPEED) | ~present
 
         def decoded(rows: Rows | None, cap: Tensor | None) -> LaneState:
             if rows is None:
-                return _driven(decode(x, lane, routed.points), lane, frozen)
+                return _driven(decode(x, lane, points=routed.points), lane, frozen=frozen)
             now = lane.map(lambda value: value[rows])
-            motion = decode(*apply_cap(cap, x[rows], now), routed.points[rows])
-            return _driven(motion, now, frozen[rows])
+            motion = decode(*apply_cap(cap, x[rows], state=now), routed.points[rows])
+            return _driven(motion, now, frozen=frozen[rows])
 
-        obstacles = Obstacles(world.states, routed.size, world.valid)
-        motion = bounded(self.bounds, decoded, lane, obstacles)
+        obstacles = Obstacles(world.states, routed.size, present=world.valid)
+        motion = bounded(self.bounds, decoded, state=lane, obstacles=obstacles)
         gone = routed.open[..., None] & (motion.s >= routed.length[..., None]) & routed.has_lane[..., None]
         plan = TrafficPlan(motion.states(), present[..., None] & ~(gone.cumsum(-1) > 0), route=routed.route)
         return IDMState(routed, motion.map(lambda value: value[..., REPLAN_STEPS - 1])), plan
@@ -124,28 +124,28 @@ class IDM(Traffic):
         vehicles = lane.v.shape[1]
         length = routed.size[:, :vehicles, 0]
         now = world.states[:, :, None]
-        gap, speed, _ = leaders(lane.s, routed.points, now, routed.size, world.valid, lane.d)
+        gap, speed, _ = leaders(lane.s, routed.points, agents=now, size=routed.size, present=world.valid, d=lane.d)
         gap = gap[..., 0]
         speed = speed[..., 0]
         gap = torch.where(gap < FREE_GAP, gap, torch.inf)
         at = (lane.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
         limit = routed.limit.gather(-1, at[..., None])[..., 0]
         desired = torch.where(limit > 0, limit, world.scene["start"][:, :vehicles, 3].clamp(min=self.speed))
-        light = light_state_at(routed.light_state, routed.light, world.step)
+        light = light_state_at(routed.light_state, routed.light, step=world.step)
         brake = 2 * self.braking
-        line = stop_line_distance(light, routed.light_s - lane.s[..., None], lane.v, brake, brake)
+        line = stop_line_distance(light, routed.light_s - lane.s[..., None], speed=lane.v, red_braking=brake, yellow_braking=brake)
         line = line - length / 2 - STOP_GAP + self.standstill_gap
-        behind = idm_acceleration(lane.v, desired, gap.clamp(min=0.1), speed.clamp(min=0), self.driver, True)
-        halting = idm_acceleration(lane.v, desired, line.clamp(min=0.1), torch.zeros_like(line), self.driver, True)
+        behind = idm_acceleration(lane.v, desired, gap=gap.clamp(min=0.1), leader_speed=speed.clamp(min=0), driver=self.driver, improved=True)
+        halting = idm_acceleration(lane.v, desired, gap=line.clamp(min=0.1), leader_speed=torch.zeros_like(line), driver=self.driver, improved=True)
         return torch.minimum(behind, halting)
 
 
 def located(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
     """The lane states where the vehicles are in the world; the ego as it is simulated, without a curvature."""
     accel = world.accel[:, :1]
-    ego = locate(world.states[:, :1], accel, torch.zeros_like(accel), routed.points[:, :1])
+    ego = locate(world.states[:, :1], accel, yaw_rate=torch.zeros_like(accel), points=routed.points[:, :1])
     others = world.states[:, 1 : lane.v.shape[1]]
-    there = locate(others, lane.a[:, 1:], (lane.kappa * lane.v)[:, 1:], routed.points[:, 1:], lane.s[:, 1:])
+    there = locate(others, lane.a[:, 1:], yaw_rate=(lane.kappa * lane.v)[:, 1:], points=routed.points[:, 1:], hint=lane.s[:, 1:])
     rest = {name: value[:, 1:] for name, value in vars(lane).items()} | {name: getattr(there, name) for name in PLACE}
     return LaneState(**{name: torch.cat([getattr(ego, name), value], 1) for name, value in rest.items()})
 
@@ -154,6 +154,6 @@ def _driven(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:
     """The motion [B, V, HORIZON] `as_driven`, with frozen [B, V] vehicles at standstill, once they do not reverse."""
     still = lane.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
     zero = torch.zeros_like(still.v)
-    motion = select(frozen, replace(still, v=zero, a=zero), motion)
+    motion = select(frozen, replace(still, v=zero, a=zero), other=motion)
     on_lane = torch.ones_like(frozen)  # who has none keeps straight on
-    return select(frozen & (lane.v >= 0), motion, as_driven(motion, lane, on_lane))
+    return select(frozen & (lane.v >= 0), motion, other=as_driven(motion, lane, on_lane=on_lane))

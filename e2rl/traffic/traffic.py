@@ -117,7 +117,7 @@ class Traffic(Extension, ABC):
         world = World.at_start(scene)
         ego_plan = keep_velocity(world.states[:, 0])
         eta = torch.zeros(len(world.step), device=seed.device)
-        plans = [self.replan(self.reset(scene, one, eta), world, ego_plan)[1].states for one in seed]
+        plans = [self.replan(self.reset(scene, one, eta=eta), world, ego_plan=ego_plan)[1].states for one in seed]
         return torch.stack(plans, 1)
 
 

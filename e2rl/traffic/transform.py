@@ -133,7 +133,7 @@ class AdversarialSynthesizer(Transform):
         names = {"template": self._method.follows_template, "decisions": self._method.follows_decisions}
         given = {name: getattr(self.pool, name)[drawn].to(env.device) for name, follows in names.items() if follows}
         fresh = self._method.reset(world.scene if whole else world.scene[rows], seed, eta, **given)
-        self._state = fresh if whole else put_rows(self._state, rows, fresh)
+        self._state = fresh if whole else put_rows(self._state, rows, new=fresh)
         if begins:
             shape = (*world.scene["route_log"].shape, HORIZON, 4)
             self._plan = torch.zeros(shape, device=env.device)
@@ -173,7 +173,7 @@ class AdversarialSynthesizer(Transform):
         queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}
         with renumbered(rows):
             state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
-        self._state = state if whole else put_rows(self._state, rows, state)
+        self._state = state if whole else put_rows(self._state, rows, new=state)
         self._plan[rows] = plan.states.to(self._plan.dtype)
         if self.on_plan is not None:
             self.on_plan(plan)
@@ -257,8 +257,8 @@ class Lookahead:
         now = world
         for number, after in enumerate(ends.tolist()):
             with renumbered(rows), answering(now):
-                answer = ask(self.ego, "plan", now, scene=world.scene)
-                plan = checked(answer, (len(now.step), PLAN_STEPS, 4), self.ego, "plan", begins=False)
+                answer = ask(self.ego, "plan", world=now, scene=world.scene)
+                plan = checked(answer, (len(now.step), PLAN_STEPS, 4), ego=self.ego, method="plan", begins=False)
             pieces.append(plan[:, : self.period])
             ego = pieces[-1][:, -1:]
             others = planned[:, 1:, min(after, HORIZON) - 1]

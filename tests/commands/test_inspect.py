@@ -26,7 +26,7 @@ def number(text: str, name: str) -> str:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Two scenes, the second with lights and three pedestrians more, one that is too short, and one in degrees."""
-    crowd = {f"p{index}": straight(60 + index, -6, 1, kind="PEDESTRIAN", size=(0.6, 0.6)) for index in range(3)}
+    crowd = {f"p{index}": straight(60 + index, -6, speed=1, kind="PEDESTRIAN", size=(0.6, 0.6)) for index in range(3)}
     lit = description(description()["tracks"] | crowd, scenario_id="lit") | {"id": "lit"}
     lit["dynamic_map_states"] = {"on": {"state": {"object_state": ["LANE_STATE_STOP"] * len(ALL)}}}
     turned = description(scenario_id="turned") | {"id": "turned"}
@@ -79,7 +79,7 @@ def test_what_is_not_there_ends_with_one_line_and_writes_nothing(folder, tmp_pat
 
 
 def test_where_no_log_makes_a_scene_the_reasons_are_told(tmp_path, capsys):
-    folder = write_folder(tmp_path / "x", [description({"ego": straight(20, 0, 8), "7": straight(23, 0.5, 8)})])
+    folder = write_folder(tmp_path / "x", [description({"ego": straight(20, 0, speed=8), "7": straight(23, 0.5, speed=8)})])
     with pytest.raises(SystemExit):
         run(folder, "--out", tmp_path / "x.png", capsys=capsys)
     shown = capsys.readouterr()

@@ -49,6 +49,6 @@ def test_the_prior_s_tables_have_rows_of_all_stages(world, tmp_path, monkeypatch
 
 
 def test_the_skeleton_is_drawn(world, tmp_path, monkeypatch, capsys):
-    run(skeleton_figure, tmp_path / "run", world, monkeypatch)
+    run(skeleton_figure, tmp_path / "run", world=world, monkeypatch=monkeypatch)
     drawn = {path.name for path in (tmp_path / "run").glob("*.p*") if path.suffix in (".png", ".pdf")}
     assert drawn == {f"{name}.{suffix}" for name in ("skeleton", "anchoring") for suffix in ("png", "pdf")}

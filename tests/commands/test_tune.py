@@ -18,7 +18,7 @@ def tune(tmp_path, monkeypatch, capsys):
         runs.append(folder)
         study = [f"tuning.study={tmp_path / 's'}", "prior.sampler.steps=2", "processes=1"]
         given = [*SHORT, *study, f"hydra.run.dir={folder}", *options]
-        status, said = call("e2rl/commands/cli.py", ["tune", *given], monkeypatch, capsys)
+        status, said = call("e2rl/commands/cli.py", ["tune", *given], monkeypatch=monkeypatch, capsys=capsys)
         assert status == (2 if wrong else 0), said
         return error_line(said) if wrong else folder
 

@@ -12,8 +12,8 @@ from tests.metrics.test_failure_modes import CROSSING, REAR_END
 def run_rows():
     sure = {"cfr_preventable": 1.0, "duty": "none", "real_adv": 0.5}
     rows = crashes(CROSSING, 3, transport=9.0, **sure) + crashes(REAR_END, 2, transport=float("nan"), **sure)
-    rows += crashes(CROSSING, 1, "random", transport=4.0, **sure) + crashes(REAR_END, 1, "random", cfr_preventable=0.0)
-    return rows + crashes(CROSSING, 2, "nominal", 0.0, cfr=0.0, approach="")
+    rows += crashes(CROSSING, 1, method="random", transport=4.0, **sure) + crashes(REAR_END, 1, method="random", cfr_preventable=0.0)
+    return rows + crashes(CROSSING, 2, method="nominal", eta=0.0, cfr=0.0, approach="")
 
 
 def test_every_group_has_its_own_atlas(tmp_path):

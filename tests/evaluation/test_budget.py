@@ -19,18 +19,18 @@ from e2rl.traffic.rule_based import ConstantVelocity
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 
-RULE = Family("rule", "e2", {})
-LATE = Family("late", "e2", {"patience": 2.0})
+RULE = Family("rule", "e2", ranges={})
+LATE = Family("late", "e2", ranges={"patience": 2.0})
 
 
 def setup_of():
-    return Setup(scenes(3, steps=30), IDMEgo(), "idm", SimSettings(), 2, evasions=False)
+    return Setup(scenes(3, steps=30), IDMEgo(), ego_name="idm", sim=SimSettings(), batch=2, evasions=False)
 
 
 def plan_of():
-    on = Method("e2", synthesizer(), 2.0)
+    on = Method("e2", synthesizer(), eta=2.0)
     settings = replace(SearchSettings(), cover=1)
-    return Plan("search", [RULE, LATE], {"rule": on, "late": on}, settings)
+    return Plan("search", [RULE, LATE], traffic={"rule": on, "late": on}, settings=settings)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_the_tries_that_hit_an_ego_are_driven_again_as_they_were(setup, plan, tm
     (((rows, _, _), told),) = spend([(setup, plan, 3, range(3), 4.0, "tries")])
     chosen = [k for k in range(len(told)) if k % 3 != 1]
     write_tries(tmp_path / "tries.csv", [row | {"margin": 0.5 if k in chosen else -1.0} for k, row in enumerate(told)])
-    parts = failures_of(tmp_path / "tries.csv", "idm", plan, setup)
+    parts = failures_of(tmp_path / "tries.csv", "idm", plan=plan, setup=setup)
     again = {}
     for part, method, tasks in parts:
         again |= {(row["scene_id"], row["seed"]): row for row in part.score(method, tasks)[0]}
@@ -139,7 +139,7 @@ def test_the_tries_that_hit_an_ego_are_driven_again_as_they_were(setup, plan, tm
     for key, row in before.items():
         for name in ("progress", "min_dtc", "transport"):
             assert again[key][name] == pytest.approx(row[name], rel=1e-3, abs=1e-3), name
-    measured = PlannerTrials(setup, [], [0], lambda _: setup.ego, failures=parts)({})
+    measured = PlannerTrials(setup, [], seeds=[0], make=lambda _: setup.ego, failures=parts)({})
     assert measured["progress"] == pytest.approx(
         sum(row["progress"] for row in before.values()) / len(before), rel=1e-3
     )
@@ -149,24 +149,24 @@ def test_tries_that_are_not_of_this_search_are_refused(setup, plan, tmp_path):
     (((rows, _, _), told),) = spend([(setup, plan, 3, range(3), 1.0, "tries")])
     file = tmp_path / "tries.csv"
     with pytest.raises(InputError, match="no table of a search's tries"):
-        failures_of(file, "idm", plan, setup)
+        failures_of(file, "idm", plan=plan, setup=setup)
     write_tries(file, [row | {"margin": -1.0} for row in told])
     with pytest.raises(InputError, match="no try of search hits idm"):
-        failures_of(file, "idm", plan, setup)
+        failures_of(file, "idm", plan=plan, setup=setup)
     for change, what in (({"family": "other"}, "family other"), ({"scene_id": "elsewhere"}, "scene=elsewhere")):
         write_tries(file, [row | {"margin": 1.0} | change for row in told])
         with pytest.raises(InputError, match=what):
-            failures_of(file, "idm", plan, setup)
+            failures_of(file, "idm", plan=plan, setup=setup)
     write_tries(file, [row | {"margin": 1.0} for row in told])
     with pytest.raises(InputError, match="a try of Own depends on those before it"):
-        failures_of(file, "idm", replace(plan, search=type("Own", (Search,), {})), setup)
+        failures_of(file, "idm", plan=replace(plan, search=type("Own", (Search,), {})), setup=setup)
 
 
 def test_a_method_that_evaluates_no_network_has_no_budget_of_evaluations(setup):
-    traffic = {"still": Method("still", ConstantVelocity(), 0.0)}
-    still = Plan("still", [Family("still", "still", {})], traffic, SearchSettings())
+    traffic = {"still": Method("still", ConstantVelocity(), eta=0.0)}
+    still = Plan("still", [Family("still", "still", ranges={})], traffic=traffic, settings=SearchSettings())
     with pytest.raises(InputError, match="still evaluate no network.*budget_unit=tries"):
-        search_all([setup], [plan_of(), still], 640.0, "nfe", [0])
+        search_all([setup], [plan_of(), still], budget=640.0, unit="nfe", seeds=[0])
 
 
 def test_a_line_for_each_try(setup, plan, tmp_path):
@@ -203,8 +203,8 @@ class Broken(ConstantVelocity):
 
 
 def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
-    broken = Method("broken", Broken(), 0.0)
-    plan = Plan("search", [Family("broken", "broken", {}, nfe=100.0)], {"broken": broken}, SearchSettings())
+    broken = Method("broken", Broken(), eta=0.0)
+    plan = Plan("search", [Family("broken", "broken", ranges={}, nfe=100.0)], traffic={"broken": broken}, settings=SearchSettings())
     for budget, unit, tries in ((400.0, "nfe", 4), (3.0, "tries", 3), (1.0, "seconds", 1)):
         (((rows, _, errored), told),) = spend([(setup, plan, 0, range(3), budget, unit)])
         assert not told and len(rows) == len(errored) == 3 * tries and all(row["errored"] == 1 for row in rows)

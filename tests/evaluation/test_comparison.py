@@ -23,7 +23,7 @@ def changes_of(folder, rows, others, searched=False):
 def test_each_failure_is_new_gone_moved_or_the_same(tmp_path):
     first = [row_of(0), row_of(1, hit=True), row_of(2, hit=True), row_of(3, hit=True), row_of(4), row_of(5, seed=1)]
     second = [row_of(0, hit=True), row_of(1), row_of(2, hit=True), row_of(3, hit={"partner": 4}), row_of(4)]
-    (group,), pairs = changes_of(tmp_path, first, second)
+    (group,), pairs = changes_of(tmp_path, first, others=second)
     found = {pair["scene_id"]: pair["change"] for pair in pairs}
     assert found == {"scene_0": "new", "scene_1": "gone", "scene_2": "same", "scene_3": "moved"}
     assert [pair["change"] for pair in pairs] == list(CHANGES), "in this order"
@@ -44,15 +44,15 @@ def test_each_failure_is_new_gone_moved_or_the_same(tmp_path):
     ],
 )
 def test_a_failure_moves_with_its_verdict_side_counterpart_or_time(tmp_path, change, what):
-    _, (pair,) = changes_of(tmp_path, [row_of(0, hit=True)], [row_of(0, hit=change)])
+    _, (pair,) = changes_of(tmp_path, [row_of(0, hit=True)], others=[row_of(0, hit=change)])
     assert pair["what"] == what and pair["change"] == ("moved" if what else "same")
 
 
 def test_exchanging_the_two_exchanges_new_and_gone_and_turns_differences_round(tmp_path):
     first = [row_of(k, hit=k % 3 == 0, progress=30.0 + k) for k in range(24)]
     second = [row_of(k, hit=k % 4 == 0) for k in range(24)]
-    (group,), _ = changes_of(tmp_path / "there", first, second)
-    (back,), _ = changes_of(tmp_path / "back", second, first)
+    (group,), _ = changes_of(tmp_path / "there", first, others=second)
+    (back,), _ = changes_of(tmp_path / "back", second, others=first)
     assert (group["new"], group["gone"], group["same"]) == (back["gone"], back["new"], back["same"]) == (4, 6, 2)
     for name, value in group["differences"].items():
         other = back["differences"][name]
@@ -64,7 +64,7 @@ def test_exchanging_the_two_exchanges_new_and_gone_and_turns_differences_round(t
 
 def test_a_run_has_no_difference_to_itself(tmp_path):
     rows = [row_of(k, hit=k % 2 == 0, progress=float(k)) for k in range(24)]
-    (group,), _ = changes_of(tmp_path, rows, rows)
+    (group,), _ = changes_of(tmp_path, rows, others=rows)
     assert group["same"] == 12 and not any(group[name] for name in CHANGES[:3])
     for name, value in group["differences"].items():
         assert value["difference"] == 0 and not (value["low"] > 0 or value["high"] < 0), name
@@ -102,21 +102,21 @@ def test_two_egos_of_one_run_and_none_by_chance(tmp_path):
 )
 def test_runs_that_are_no_pairs_are_refused_by_what_differs(tmp_path, settings, inputs, told):
     one = run_of(tmp_path / "one", [row_of(k) for k in range(3)])
-    two = run_of(tmp_path / "two", [row_of(k) for k in (2, 9)], settings, inputs)
+    two = run_of(tmp_path / "two", [row_of(k) for k in (2, 9)], settings=settings, inputs=inputs)
     with pytest.raises(InputError, match=f"two: no pairs with .*one, which has other {told}"):
         compared(Driven.read(one), Driven.read(two))
 
 
 def test_contacts_with_people_are_compared_where_there_are_any(tmp_path):
     first, second = ([row_of(k, cfr_vru=float(k < count)) for k in range(12)] for count in (1, 4))
-    (group,), pairs = changes_of(tmp_path / "some", first, second)
+    (group,), pairs = changes_of(tmp_path / "some", first, others=second)
     assert group["differences"]["contacts_vru"]["difference"] == pytest.approx(3 / 12) and not pairs
     assert "contacts_object" not in group["differences"]
 
 
 def test_another_planner_version_or_machine_may_differ(tmp_path):
     one = run_of(tmp_path / "one", [row_of(0)])
-    two = run_of(tmp_path / "two", [row_of(0, ego="b")], {"ego": {"x": 1}, "processes": 8}, {"ego.file=b.onnx": "9"})
+    two = run_of(tmp_path / "two", [row_of(0, ego="b")], settings={"ego": {"x": 1}, "processes": 8}, inputs={"ego.file=b.onnx": "9"})
     assert compared(Driven.read(one), Driven.read(two))[0][0]["of"] == 1
 
 
@@ -130,7 +130,7 @@ def test_searches_are_compared_by_scene_and_move_where_they_share_no_way(tmp_pat
     slow = {"ego_speed": 2.0}
     first = [*tries(0, False, True, True), *tries(1, True, other), *tries(2, False), *tries(3, True)]
     second = [*tries(0, False), *tries(1, slow, False, True), *tries(2, False, True), *tries(3, slow, other)]
-    (group,), pairs = changes_of(tmp_path, first, second, searched=True)
+    (group,), pairs = changes_of(tmp_path, first, others=second, searched=True)
     assert {pair["scene_id"]: pair["change"] for pair in pairs} == {
         **{"scene_0": "gone", "scene_1": "same", "scene_2": "new", "scene_3": "moved"}
     }
@@ -140,7 +140,7 @@ def test_searches_are_compared_by_scene_and_move_where_they_share_no_way(tmp_pat
 
 def test_a_search_shows_its_failure_or_what_came_nearest(tmp_path):
     nearest = [row_of(0, seed=number, margin=margin) for number, margin in enumerate((-9.0, -0.5, -3.0))]
-    _, (pair,) = changes_of(tmp_path, nearest, tries(0, False, False, True), searched=True)
+    _, (pair,) = changes_of(tmp_path, nearest, others=tries(0, False, False, True), searched=True)
     assert pair["first"]["seed"] == 1 and pair["second"]["seed"] == 2
 
 
@@ -152,7 +152,7 @@ def raised(scene, seed=0, by="ego"):
 def test_a_planner_that_raises_is_a_failure_of_its_own_kind(tmp_path, searched):
     first = [row_of(0), raised(1), raised(2), row_of(3, hit=True), raised(4, by="traffic")]
     second = [raised(0), row_of(1), raised(2), raised(3), row_of(4)]
-    (group,), pairs = changes_of(tmp_path, first, second, searched)
+    (group,), pairs = changes_of(tmp_path, first, others=second, searched=searched)
     found = {pair["scene_id"]: (pair["change"], pair["what"]) for pair in pairs}
     assert found == {
         **{"scene_0": ("new", []), "scene_1": ("gone", []), "scene_2": ("same", []), "scene_3": ("moved", ["ending"])}

@@ -29,7 +29,7 @@ def slow(speed=3.0):
 
 
 def setup_of(scenes, ego=None):
-    return Setup(scenes, ego or slow(), "idm", SimSettings())
+    return Setup(scenes, ego or slow(), ego_name="idm", sim=SimSettings())
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +38,10 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     egos = {"one": slow(), "same": slow(), "fast_0": slow(12.0), "fast_1": slow(9.0)}
     pairs = [("same", "one"), ("fast", "one"), ("fast", "same")]
-    chosen = EgoSet(egos, ["one", "same", "fast"], pairs, {"fast": ["fast_0", "fast_1"]})
+    chosen = EgoSet(egos, ["one", "same", "fast"], pairs=pairs, trainings={"fast": ["fast_0", "fast_1"]})
     scenes = small_scenes(3)
     scenes.location[:] = ["a", "b", "c"]
-    scored = drive_all(chosen.setups(setup_of(scenes)), METHODS, [0], Work(folder / ROLLOUTS))
+    scored = drive_all(chosen.setups(setup_of(scenes)), METHODS, seeds=[0], work=Work(folder / ROLLOUTS))
     return record(*scored, folder, chosen.metric_rows), folder
 
 
@@ -51,7 +51,7 @@ def test_every_ego_has_its_rows_and_files_and_drives_as_if_alone(run, tmp_path):
     lines = read_rows(folder / TABLE)
     assert [line["ego_policy"] for line in lines] == ["one"] * 3 + ["same"] * 3 + ["fast_0"] * 3 + ["fast_1"] * 3
     assert len(list((folder / ROLLOUTS).glob("*.npz"))) == 12
-    (alone,) = run_protocol(setup_of(small_scenes(3), slow(12.0)), METHODS, [0], tmp_path)
+    (alone,) = run_protocol(setup_of(small_scenes(3), slow(12.0)), METHODS, seeds=[0], folder=tmp_path)
     assert alone["metrics"]["progress"]["mean"] == rows[2]["metrics"]["progress"]["mean"]
 
 
@@ -78,7 +78,7 @@ def test_trainings_are_pooled_and_compared_with_the_same_rollouts_of_another(run
 
 def test_a_guard_is_missed_where_the_trained_ego_accelerates_more_than_the_recorded(run):
     rows = run[0]
-    strict, loose = (guard_table(rows, "one", "fast", "same", recorded) for recorded in (0.0, 100.0))
+    strict, loose = (guard_table(rows, "one", after="fast", planner="same", recorded=recorded) for recorded in (0.0, 100.0))
     verdicts = [{row[0].split(" ")[0]: row[-1] for row in table.rows} for table in (strict, loose)]
     assert [verdict["macc"] for verdict in verdicts] == ["missed", "met"] and verdicts[0]["progress"] == "met"
 
@@ -90,7 +90,7 @@ def rows_of(values, ego, training=None):
         row | {"progress": value, "scene_id": str(index), "location": "", "seed": 0}
         for index, (row, value) in enumerate(zip(scored, values, strict=True))
     ]
-    rows = labelled(rows, "made", "test", "nominal", ego)
+    rows = labelled(rows, "made", split="test", method="nominal", ego=ego)
     return [row | ({} if training is None else {"training": training}) for row in rows], features
 
 
@@ -100,8 +100,8 @@ def test_trainings_that_differ_widen_the_interval_that_places_alone_do_not():
     second, more = rows_of([20 + 0.01 * place for place in range(-6, 7)], "a_1")
     rows = first + second
     samples = features + more
-    pooled, copies = pool_trainings(rows, samples, {"a": ["a_0", "a_1"]})
-    result = {row["ego"]: row["metrics"]["progress"] for row in metric_rows(rows + pooled, samples + copies, 200, 2)}
+    pooled, copies = pool_trainings(rows, samples, trainings={"a": ["a_0", "a_1"]})
+    result = {row["ego"]: row["metrics"]["progress"] for row in metric_rows(rows + pooled, samples + copies, draws=200, realism_draws=2)}
     alone, both = ([result[name][end] for end in ("low", "mean", "high")] for name in ("a_0", "a"))
     assert alone == pytest.approx([10, 10, 10], abs=0.05) and alone[0] < alone[2]
     assert both == pytest.approx([10, 15, 20], abs=0.05)

@@ -92,15 +92,15 @@ def scene_set(count: int = 4):
 
 
 def run(ego, folder=None, batch=64, processes=1, count=4):
-    setup = Setup(scene_set(count), ego, "fails", SimSettings(), batch)
-    return run_protocol(setup, METHODS, [0, 1], folder, processes=processes)
+    setup = Setup(scene_set(count), ego, ego_name="fails", sim=SimSettings(), batch=batch)
+    return run_protocol(setup, METHODS, seeds=[0, 1], folder=folder, processes=processes)
 
 
 @pytest.mark.parametrize("processes", [1, 2])
 @pytest.mark.parametrize("name", FAULTS)
 def test_the_others_are_scored_and_the_count_stands_everywhere(tmp_path, name, processes):
     (fault, detail), reason = FAULTS[name], f"raised {name}"
-    (row,) = run(Fails(8.0, fault), tmp_path, 4, processes)
+    (row,) = run(Fails(8.0, fault), tmp_path, batch=4, processes=processes)
     assert row["n_rollouts"] == 8 and row["errored"] == {reason: 2} and row["n_scenes"] == 4
     assert row["metrics"]["errored"]["mean"] == 0.25 and row["metrics"]["real"]["n"] == 6
     assert row["metrics"]["cfr_preventable"]["mean"] >= 0.25, "to raise is to fail"
@@ -114,15 +114,15 @@ def test_the_others_are_scored_and_the_count_stands_everywhere(tmp_path, name, p
     ends = {(row["scene_id"], row["seed"], row["raised_by"]) for row in rows if row["errored"] == 1}
     assert ends == {(scene_set().scene_id[2], seed, "ego") for seed in (0, 1)}
     assert all(re.search(detail, row["error"]) for row in rows if row["errored"] == 1)
-    (whole,) = run(IDMEgo(), tmp_path, 4, processes)
+    (whole,) = run(IDMEgo(), tmp_path, batch=4, processes=processes)
     assert whole["errored"] == {} and whole["n_rollouts"] == 8 and not (tmp_path / ERRORED_FILE).exists()
 
 
 def test_where_the_traffic_loses_all_the_message_says_why(tmp_path):
-    setup = Setup(scene_set(3), IDMEgo(), "idm", SimSettings(), 4)
+    setup = Setup(scene_set(3), IDMEgo(), ego_name="idm", sim=SimSettings(), batch=4)
     setup.scenes.scenes["start"][:, 0, 3] = 8.0
     with pytest.raises(InputError, match="no rollout could be scored: 3 raised KeyError .'route'.*traceb"):
-        run_protocol(setup, [Method("refuses", Refuses())], [0], tmp_path)
+        run_protocol(setup, [Method("refuses", Refuses())], seeds=[0], folder=tmp_path)
     with pytest.raises(InputError, match="no metrics.json: .*errored.json says then; `e2rl gate` and `e2rl compare`"):
         write_report(tmp_path)
 
@@ -147,8 +147,8 @@ def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
         def replan(self, *rest):
             raise ZeroDivisionError("no way out")
 
-    setup = Setup(scene_set(2), IDMEgo(), "idm", SimSettings(), 4)
-    rows = run_protocol(setup, [*METHODS, Method("lost", Lost(), 0.0)], [0], tmp_path, stage="before")
+    setup = Setup(scene_set(2), IDMEgo(), ego_name="idm", sim=SimSettings(), batch=4)
+    rows = run_protocol(setup, [*METHODS, Method("lost", Lost(), eta=0.0)], seeds=[0], folder=tmp_path, stage="before")
     assert [(row["method"], row["n_rollouts"]) for row in rows] == [("replay", 2), ("lost", 0)]
     assert rows[1]["errored"] == {"raised ZeroDivisionError": 2} and rows[1]["metrics"]["cfr"]["n"] == 0
     assert "lost: 0 scenes, 0 seeds, 0 rollouts, 2 rollouts without a score" in metric_tables(rows)[0].caption
@@ -158,7 +158,7 @@ def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
 def test_what_ended_in_a_training_is_kept_by_round_and_not_doubled_by_a_resumed_one(tmp_path):
     path = tmp_path / ERRORED_FILE
     for number, reasons in ((0, "ab"), (1, ""), (2, "c"), (1, "d")):
-        add_errored(path, number, [{"round": number, "reason": reason} for reason in reasons])
+        add_errored(path, number, errored=[{"round": number, "reason": reason} for reason in reasons])
     assert [entry["reason"] for entry in json.loads(path.read_text())] == ["a", "b", "d"]
 
 
@@ -175,8 +175,8 @@ def test_what_ended_in_a_training_is_kept_by_round_and_not_doubled_by_a_resumed_
 )
 def test_whose_error_it_is(tmp_path, ego, traffic, blamed):
     """An ego that cannot answer about vehicles that are NaN is not to blame; it is asked before the traffic."""
-    setup = Setup(scene_set(), ego, "e", SimSettings(), 4)
-    (row,) = run_protocol(setup, [Method("m", traffic)], [0], tmp_path)
+    setup = Setup(scene_set(), ego, ego_name="e", sim=SimSettings(), batch=4)
+    (row,) = run_protocol(setup, [Method("m", traffic)], seeds=[0], folder=tmp_path)
     (errored,) = [row for row in read_rows(tmp_path / TABLE) if row["errored"] == 1]
     assert (errored["scene_id"], errored["raised_by"]) == (scene_set().scene_id[2], blamed)
     assert row["n_rollouts"] == (4 if blamed == "ego" else 3)
@@ -201,13 +201,13 @@ class From(IDMEgo):
 def test_a_wrong_shape_of_the_very_first_plan_is_a_mistake_of_the_code(tmp_path, batch, processes):
     said = rf"From.plan: returns torch.float32 \[{min(batch, 8)}, 10, 4\], expected a tensor of floats"
     with pytest.raises(InputError, match=said):
-        run(From(1), tmp_path, batch, processes)
+        run(From(1), tmp_path, batch=batch, processes=processes)
 
 
 @pytest.mark.parametrize(("call", "batch", "raise_in"), [(2, 64, 8), (21, 2, 6)])
 def test_a_wrong_shape_later_on_ends_rollouts_and_not_the_run(tmp_path, call, batch, raise_in):
     """A rollout has 20 plans: of batches of two, those after the first raise from their start on."""
-    (row,) = run(From(call), tmp_path, batch)
+    (row,) = run(From(call), tmp_path, batch=batch)
     assert row["n_rollouts"] == 8 and sum(row["errored"].values()) == raise_in
     rows = [row for row in read_rows(tmp_path / TABLE) if row["errored"] == 1]
     assert {row["raised_by"] for row in rows} == {"ego"}

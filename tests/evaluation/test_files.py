@@ -44,7 +44,7 @@ def test_rows_read_back_are_those_written(tmp_path, rollouts):
 def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_path, rollouts, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "eta=[1, 2]"])
     rows, features = score_rollouts(rollouts)
-    both = rows + [row | {"eta": 0.0} for row in labelled(rows, "synthetic", "test", "nominal", "idm")]
+    both = rows + [row | {"eta": 0.0} for row in labelled(rows, "synthetic", split="test", method="nominal", ego="idm")]
     write_json(tmp_path / "metrics.json", metric_rows(both, features * 2, draws=50, realism_draws=5, stage="after"))
     first, _ = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)
     assert (first["n_scenes"], first["n_seeds"], first["n_rollouts"]) == (3, 2, 6)
@@ -57,8 +57,8 @@ def test_metrics_are_strict_json_with_counts_command_and_paired_differences(tmp_
 def test_several_intensities_of_one_method_are_told_apart(rollouts):
     rows, features = score_rollouts(rollouts)
     many = [row | {"eta": eta} for eta in (1.0, 2.0) for row in rows]
-    many += labelled(rows, "synthetic", "test", "nominal", "idm")
-    many += labelled(rows, "synthetic", "test", "nominal", "lane_graph")
+    many += labelled(rows, "synthetic", split="test", method="nominal", ego="idm")
+    many += labelled(rows, "synthetic", split="test", method="nominal", ego="lane_graph")
     result = metric_rows(many, features * 4, draws=10, realism_draws=2)
     assert [list(row["paired"]) for row in result] == [["e2@2", "nominal"], ["e2@1", "nominal"], ["e2@1", "e2@2"], []]
 
@@ -107,6 +107,6 @@ def test_scenes_of_one_id_or_with_odd_names_are_refused_at_the_door(names, said)
     scenes = make_scenes(2)
     scenes.scene_id[:] = names
     with pytest.raises(InputError, match=said):
-        Setup(scenes, IDMEgo(), "idm", SimSettings())
+        Setup(scenes, IDMEgo(), ego_name="idm", sim=SimSettings())
     with pytest.raises(InputError, match="control"):
         Method("e2\nlast", ConstantVelocity())

@@ -18,9 +18,9 @@ def crashes(kind, number, method="e2", eta=2.0, **changes):
 
 def run_rows():
     rows = crashes(CROSSING, 6, counted=1.0, preventable=1.0, at_fault=0.0)
-    rows += crashes(CROSSING, 2, "random", counted=0.0, preventable=math.nan, at_fault=0.0)
-    rows += crashes(REAR_END, 4, "random", counted=1.0, preventable=0.0, at_fault=1.0)
-    return rows + crashes(CROSSING, 5, "nominal", 0.0, cfr=0.0, approach="")
+    rows += crashes(CROSSING, 2, method="random", counted=0.0, preventable=math.nan, at_fault=0.0)
+    rows += crashes(REAR_END, 4, method="random", counted=1.0, preventable=0.0, at_fault=1.0)
+    return rows + crashes(CROSSING, 5, method="nominal", eta=0.0, cfr=0.0, approach="")
 
 
 def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):

@@ -33,7 +33,7 @@ def places(count=4, acceleration=0.0, steps=60):
 
 
 def metrics(scene_set, method=STRAIGHT, samples=3):
-    return open_loop_rows(scene_set, [method], samples)[0]["metrics"]
+    return open_loop_rows(scene_set, [method], samples=samples)[0]["metrics"]
 
 
 def test_constant_velocity_is_off_by_what_the_log_accelerates():
@@ -59,9 +59,9 @@ def test_who_looks_the_future_up_or_attacks_has_no_row_and_baselines_have_one_sa
         STRAIGHT,
         Method("idm", IDM(small_prior())),
         Method("nominal", nominal()),
-        Method("e2", synthesizer(), 2.0),
+        Method("e2", synthesizer(), eta=2.0),
     ]
-    rows = open_loop_rows(places(2), methods, 3)
+    rows = open_loop_rows(places(2), methods, samples=3)
     known = {row["method"]: (row["n_seeds"], row["n_rollouts"]) for row in rows}
     assert known == {"constant_velocity": (1, 2), "idm": (1, 2), "nominal": (3, 6)}
     assert all(row["stage"] == OPEN_LOOP_STAGE and row["ego"] == "unknown" and row["n_scenes"] == 2 for row in rows)
@@ -70,7 +70,7 @@ def test_who_looks_the_future_up_or_attacks_has_no_row_and_baselines_have_one_sa
 def test_more_samples_find_better_ones_and_the_joint_choice_is_between():
     scene_set = places(acceleration=0.5)
     method = Method("nominal", nominal())
-    one, few, many = (metrics(scene_set, method, samples) for samples in (1, 2, 5))
+    one, few, many = (metrics(scene_set, method, samples=samples) for samples in (1, 2, 5))
     for at in ("_3", "_5"):
         best = [found[f"min_ade{at}"]["mean"] for found in (one, few, many)]
         assert best[0] > best[1] > best[2], "samples are added, not drawn anew"
@@ -108,7 +108,7 @@ class Stumbles(ConstantVelocity):
 
 def test_scenes_without_a_plan_are_counted_and_the_others_keep_their_figures():
     scene_set = places(acceleration=1.2)
-    (row,) = open_loop_rows(scene_set, [Method("stumbles", Stumbles())], 1)
+    (row,) = open_loop_rows(scene_set, [Method("stumbles", Stumbles())], samples=1)
     assert row["errored"] == {"raised ZeroDivisionError": 1, "a state was NaN or infinite": 1}
     assert row["n_scenes"] == row["n_rollouts"] == 2 and row["metrics"]["cv_ade_5"]["n"] == 2 * 4
     assert row["metrics"]["min_ade_5"]["mean"] == pytest.approx(metrics(scene_set)["min_ade_5"]["mean"])

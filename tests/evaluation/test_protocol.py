@@ -19,7 +19,7 @@ SEEDS = [0, 1]
 
 
 def setup_of(scene_set, batch=64):
-    return Setup(scene_set, IDMEgo(), "idm", SimSettings(), batch)
+    return Setup(scene_set, IDMEgo(), ego_name="idm", sim=SimSettings(), batch=batch)
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +27,8 @@ def run(tmp_path_factory):
     """(rows, folder) of two methods on two scenes and seeds, in batches that do not divide them evenly."""
     folder = tmp_path_factory.mktemp("run")
     on = synthesizer()
-    methods = [Method("nominal", on), Method("e2", on, 3.0)]
-    rows = run_protocol(setup_of(scenes(SCENES, steps=80), 3), methods, SEEDS, folder, stage="test")
+    methods = [Method("nominal", on), Method("e2", on, eta=3.0)]
+    rows = run_protocol(setup_of(scenes(SCENES, steps=80), 3), methods, seeds=SEEDS, folder=folder, stage="test")
     return rows, folder
 
 
@@ -49,7 +49,7 @@ def test_a_row_for_each_method_and_a_line_and_a_file_for_each_rollout(run):
 def test_methods_share_the_noise_of_a_scene_and_seed():
     assert scene_seed(3, 1) == scene_seed(3, 1) and len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
     methods = [Method("one", synthesizer()), Method("two", synthesizer())]
-    twice = run_protocol(setup_of(scenes(SCENES)), methods, [4])
+    twice = run_protocol(setup_of(scenes(SCENES)), methods, seeds=[4])
     one, two = (row["metrics"] for row in twice)
     for name in one:
         if not name.startswith("seconds"):
@@ -62,8 +62,8 @@ def test_processes_change_nothing_but_the_time(tmp_path):
     scene_set = scenes(3, steps=20)
     folders = (tmp_path / "one", tmp_path / "two")
     for processes, folder in enumerate(folders, 1):
-        methods = [Method("nominal", synthesizer(), 0.0), Method("e2", synthesizer(), 3.0)]
-        run_protocol(setup_of(scene_set, 2), methods, SEEDS, folder, processes=processes)
+        methods = [Method("nominal", synthesizer(), eta=0.0), Method("e2", synthesizer(), eta=3.0)]
+        run_protocol(setup_of(scene_set, 2), methods, seeds=SEEDS, folder=folder, processes=processes)
     same_runs(*folders)
 
 
@@ -86,12 +86,12 @@ def stopping_run(folder, stops, scene_set):
     """A run that is interrupted after so many batches each time, and then ends; returns what was rolled out."""
     done = []
     for left in (*stops, 100):
-        setup = Stopped(scene_set, IDMEgo(), "idm", SimSettings(), 2)
+        setup = Stopped(scene_set, IDMEgo(), ego_name="idm", sim=SimSettings(), batch=2)
         setup.left = left
         setup.done = done
-        methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), 2.0)]
+        methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), eta=2.0)]
         try:
-            run_protocol(setup, methods, SEEDS, folder, parts=Parts(folder))
+            run_protocol(setup, methods, seeds=SEEDS, folder=folder, parts=Parts(folder))
         except KeyboardInterrupt:
             assert left < 100 and not (folder / TABLE).exists(), "no table of half a run"
     return done
@@ -114,7 +114,7 @@ def same_runs(one, other):
 def test_a_run_that_was_interrupted_equals_one_that_was_not(tmp_path):
     """However often it stops; no rollout is done twice, and none has two rows."""
     scene_set = small_scenes(3)
-    whole = stopping_run(tmp_path / "whole", (), scene_set)
-    done = stopping_run(tmp_path / "parts", (3, 0, 1), scene_set)
+    whole = stopping_run(tmp_path / "whole", (), scene_set=scene_set)
+    done = stopping_run(tmp_path / "parts", (3, 0, 1), scene_set=scene_set)
     assert sorted(done) == sorted(set(done)) == sorted(whole)
     same_runs(tmp_path / "whole", tmp_path / "parts")

@@ -43,7 +43,7 @@ def logs_of(scene_set):
 
 
 def setup_of(scene_set, batch=64):
-    return Setup(scene_set, ReplayEgo(), "replay", SIM, batch)
+    return Setup(scene_set, ReplayEgo(), ego_name="replay", sim=SIM, batch=batch)
 
 
 def sampled(scene_set, seeds):
@@ -118,7 +118,7 @@ def test_the_rows_of_a_run():
     scene_set = places()
     rollouts = 3
     methods = [Method("replay", LogReplay()), Method("nominal", nominal())]
-    rows = meta_rows(setup_of(scene_set, 4), methods, rollouts)
+    rows = meta_rows(setup_of(scene_set, 4), methods, rollouts=rollouts)
     assert all((row["stage"], row["n_seeds"], row["n_rollouts"]) == (META_STAGE, 3, 6) for row in rows)
     replay, sampling = (row["metrics"] for row in rows)
     assert set(replay) == {metric.name for metric in STAGES[META_STAGE]} == {*sampling, "real_split_half"}
@@ -156,11 +156,11 @@ def test_rollouts_that_end_are_counted_and_weigh_nothing(tmp_path):
 
     scene_set = places(2)
     methods = [Method("nominal", nominal()), Method("replay", LogReplay())]
-    setup = Setup(scene_set, Fails(), "fails", SIM, 4)
-    for row, count in zip(meta_rows(setup, methods, 3, Parts(tmp_path)), (3, 1), strict=True):
+    setup = Setup(scene_set, Fails(), ego_name="fails", sim=SIM, batch=4)
+    for row, count in zip(meta_rows(setup, methods, rollouts=3, parts=Parts(tmp_path)), (3, 1), strict=True):
         assert row["errored"] == {"raised ZeroDivisionError": count} and row["n_rollouts"] == 3
         assert {row["metrics"][name]["n"] for name in FEATURES} == {1}
-    assert meta_rows(setup, methods, 3, Parts(tmp_path))[0]["errored"] == {"raised ZeroDivisionError": 3}
+    assert meta_rows(setup, methods, rollouts=3, parts=Parts(tmp_path))[0]["errored"] == {"raised ZeroDivisionError": 3}
 
 
 def test_the_order_of_vehicles_does_not_matter():

@@ -72,7 +72,7 @@ def then(world, tmp_path_factory):
     said = SimpleNamespace(readouterr=lambda: SimpleNamespace(out="", err=""))  # capsys is none for a module
     with monkeypatch.context():
         given = [*arguments(world, folder, "good", *QUICK), "data.build.steps=20"]
-        status, _ = call("evaluate.py", given, monkeypatch, said)
+        status, _ = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=said)
     assert status == 0
     return folder / "run"
 
@@ -90,7 +90,7 @@ def sent(then, tmp_path):
 
 def test_one_command_makes_the_same_table_in_a_new_folder(then, tmp_path, monkeypatch, capsys):
     before = {path: path.read_bytes() for path in then.rglob("*") if path.is_file()}
-    status, said = call("evaluate.py", again(then, tmp_path / "now"), monkeypatch, capsys)
+    status, said = call("evaluate.py", again(then, tmp_path / "now"), monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0, said
     found = json.loads((tmp_path / "now" / "reproduced.json").read_text())
     assert found["different"] == [] and found["close"] == 0 and found["equal"] > 50, found
@@ -110,12 +110,12 @@ def test_data_and_weights_may_lie_elsewhere(world, sent, tmp_path, monkeypatch, 
         for path in sorted((world / "good").iterdir()):
             archive.write(path, path.name)
     other = again(sent, tmp_path / "a", f"prior.checkpoint={sent / 'provenance.json'}")
-    status, said = call("evaluate.py", other, monkeypatch, capsys)
+    status, said = call("evaluate.py", other, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 2 and "prior.checkpoint is another file than the run's prior.checkpoint=" in error_line(said)
-    status, said = call("evaluate.py", again(sent, tmp_path / "a"), monkeypatch, capsys)
+    status, said = call("evaluate.py", again(sent, tmp_path / "a"), monkeypatch=monkeypatch, capsys=capsys)
     assert status == 2 and "not there; say where the file lies that the run used, by prior.checkpoint=FILE" in said
     here = ["data=scenarionet", f"data.path={tmp_path / 'data.zip'}", f"prior.checkpoint={weights}"]
-    status, said = call("evaluate.py", again(sent, tmp_path / "b", *here), monkeypatch, capsys)
+    status, said = call("evaluate.py", again(sent, tmp_path / "b", *here), monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0, said
     assert json.loads((tmp_path / "b" / "reproduced.json").read_text())["different"] == []
 
@@ -125,19 +125,19 @@ def test_other_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, ca
     shutil.copytree(world / "good", tmp_path / "good")
     (tmp_path / "good" / "sd_00.pkl").write_bytes((world / "good" / "sd_01.pkl").read_bytes())
     given = again(then, tmp_path / "now", "data=scenarionet", f"data.path={tmp_path / 'good'}")
-    status, said = call("evaluate.py", given, monkeypatch, capsys)
+    status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 2 and "scenes are not" in error_line(said) and "scene-0" in error_line(said)
     assert not left_behind(tmp_path / "now")
 
 
 def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, capsys):
-    status, said = call("evaluate.py", again(then, tmp_path / "now", "seeds=[1]"), monkeypatch, capsys)
+    status, said = call("evaluate.py", again(then, tmp_path / "now", "seeds=[1]"), monkeypatch=monkeypatch, capsys=capsys)
     assert status == 2 and "leave out seeds (only" in error_line(said) and not left_behind(tmp_path / "now")
 
 
 def test_a_failure_that_the_run_does_not_have_is_refused(then, tmp_path, monkeypatch, capsys):
     for given in (again(then, tmp_path / "now", "failure=none"), ["failure=none"]):
-        status, said = call("evaluate.py", given, monkeypatch, capsys)
+        status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
         assert status == 2 and ("none of the 0 failures" in said or "reproduce=RUN_DIR" in said)
 
 
@@ -147,7 +147,7 @@ def test_the_command_of_a_failure_drives_the_same_contact(more, tmp_path, monkey
     """In its folder's failures.csv; also that of the run that it makes."""
     (tmp_path / "list.csv").write_text("scene_id,number\nallway_stop_043_0200,7\n")
     given = [f"scenes={tmp_path / 'list.csv'}", "seeds=[0]", "processes=1", *more]
-    assert call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'then'}"], monkeypatch, capsys)[0] == 0
+    assert call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'then'}"], monkeypatch=monkeypatch, capsys=capsys)[0] == 0
     rows = {rollout_key(row): row for row in read_rows(tmp_path / "then" / TABLE)}
     lines = list(csv.DictReader((tmp_path / "then" / "failures.csv").open(newline="")))
     assert lines
@@ -155,7 +155,7 @@ def test_the_command_of_a_failure_drives_the_same_contact(more, tmp_path, monkey
         folder = tmp_path / str(number)
         program, command, *options = shlex.split(line["again"])
         assert (program, command) == ("e2rl", "evaluate")
-        assert call("evaluate.py", [*options, f"hydra.run.dir={folder}"], monkeypatch, capsys)[0] == 0
+        assert call("evaluate.py", [*options, f"hydra.run.dir={folder}"], monkeypatch=monkeypatch, capsys=capsys)[0] == 0
         (row,) = read_rows(folder / TABLE)
         known = rows[line["failure"]]
         for name in ("scene_id", "method", "eta", "seed", "partner", "contact_step", "contact_type"):
@@ -170,7 +170,7 @@ def test_a_stranger_s_run_runs_nothing(sent, tmp_path, monkeypatch, capsys):
     for target in ("os.system", "e2rl.planners.external.ExternalEgo"):
         ego = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
         OmegaConf.save(OmegaConf.merge(config, {"ego": ego}), file)
-        status, said = call("evaluate.py", again(sent, tmp_path / "now"), monkeypatch, capsys)
+        status, said = call("evaluate.py", again(sent, tmp_path / "now"), monkeypatch=monkeypatch, capsys=capsys)
         assert status == 2 and "runs code that is no extension of e2rl" in error_line(said)
     assert not (tmp_path / "ran").exists()
 
@@ -189,15 +189,15 @@ def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(world, t
 
     small = ["seeds=[0]", "batch=1", "processes=1", "methods=[constant_velocity,replay]", "data.build.steps=20"]
     given = [*arguments(world, tmp_path, "good", *small), "ego=idm"]
-    status, said = call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'whole'}"], monkeypatch, capsys)
+    status, said = call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'whole'}"], monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0, said
     monkeypatch.setattr(Setup, "score", stopped)
     run = tmp_path / "run"
-    status, said = call("evaluate.py", given, monkeypatch, capsys)
+    status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 130 and f"evaluate.py resume={run}" in said and "interrupted (SIGINT)" in said
     left[0], named = 1, shlex.split(said.rpartition("evaluate.py ")[2])
-    status, said = call("evaluate.py", [*named, "seeds=[1]"], monkeypatch, capsys)
+    status, said = call("evaluate.py", [*named, "seeds=[1]"], monkeypatch=monkeypatch, capsys=capsys)
     assert status == 2 and "leave out seeds (only processes, launcher, shard can change)" in error_line(said)
-    status, said = call("evaluate.py", named, monkeypatch, capsys)
+    status, said = call("evaluate.py", named, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0 and left == [0], said
     same_runs(tmp_path / "whole", run)

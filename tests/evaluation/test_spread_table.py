@@ -17,7 +17,7 @@ def test_the_prior_alone_has_a_row_and_many_steps_are_their_own_measure(monkeypa
     monkeypatch.setattr(open_loop, "MANY", 6)
     few, many = (NominalTraffic(small_prior(sampler=SamplerSettings(steps=steps))) for steps in (2, 6))
     methods = [Method("cv", ConstantVelocity()), Method("few", few), Method("many", many)]
-    rows = spread_rows(scenes(3), [*methods, Method("e2", synthesizer(), 2.0)], 4)
+    rows = spread_rows(scenes(3), [*methods, Method("e2", synthesizer(), eta=2.0)], samples=4)
     assert [row["method"] for row in rows] == ["few", "many"]
     for row in rows:
         assert row["stage"] == SPREAD_STAGE and set(row["metrics"]) == {each.name for each in STAGES[SPREAD_STAGE]}

@@ -65,11 +65,11 @@ def test_every_trial_meets_traffic_made_against_it():
             return super().replan(state, world, ego_plan)
 
     on = Watched(synthesizer().prior)
-    setup = Setup(scenes(2, steps=20), Cruise(), "cruise", SimSettings(), batch=4)
-    methods = [Method("nominal", on), Method("e2", on, 2.0)]
-    trials = PlannerTrials(setup, methods, [0], lambda parameters: Cruise(**parameters))
+    setup = Setup(scenes(2, steps=20), Cruise(), ego_name="cruise", sim=SimSettings(), batch=4)
+    methods = [Method("nominal", on), Method("e2", on, eta=2.0)]
+    trials = PlannerTrials(setup, methods, seeds=[0], make=lambda parameters: Cruise(**parameters))
     settings = SearchSettings(trials=3, startup=1, sweep=0)
-    first, *others = search(trials, {"gain": 1.0}, {"gain": [0.0, 1.0]}, settings, PlannerObjective())
+    first, *others = search(trials, {"gain": 1.0}, space={"gain": [0.0, 1.0]}, settings=settings, objective=PlannerObjective())
     assert {*DRIVING, "collision nominal@0", "collision e2@2", "errored"} <= set(first["metrics"])
     assert first["admissible"] and first["metrics"]["progress"] > 15
     both = [first["metrics"][f"progress {label}"] for label in ("nominal@0", "e2@2")]
@@ -111,23 +111,23 @@ def stumbling():
     for name in ("start", "logged"):
         scene_set.scenes[name][0, ..., 0] += 100.0
         scene_set.scenes[name][1:3, ..., 0] -= 100.0
-    return Setup(scene_set, Stumbles(), "stumbles", SimSettings(), batch=5)
+    return Setup(scene_set, Stumbles(), ego_name="stumbles", sim=SimSettings(), batch=5)
 
 
 def test_a_planner_s_trial_counts_what_it_raised_itself(stumbling):
     """One of the three that the traffic did not lose."""
     methods = [Method("nominal", Loses(small_prior(0), "plan"))]
-    metrics = PlannerTrials(stumbling, methods, [0], lambda parameters: Stumbles())({})
+    metrics = PlannerTrials(stumbling, methods, seeds=[0], make=lambda parameters: Stumbles())({})
     assert metrics["errored"] == pytest.approx(1 / 3) and metrics["errored: raised ValueError"] == 3 / 5
     assert metrics["progress"] > 15, "of the two that were driven"
 
 
 def test_an_attack_s_trial_counts_what_its_traffic_lost_and_what_the_planner_raised_as_failed(stumbling):
     nominal = Method("nominal", NominalTraffic(small_prior(0), "plan"))
-    trials = AttackTrials(stumbling, nominal, 2.0, [0], lambda parameters: Loses(small_prior(0), "plan"))
+    trials = AttackTrials(stumbling, nominal, eta=2.0, seeds=[0], make=lambda parameters: Loses(small_prior(0), "plan"))
     metrics = trials({})
     assert metrics["errored"] == pytest.approx(2 / 5) and metrics["errored nominal"] == 0
-    (row,) = run_protocol(stumbling, [Method("same", trials.make({}), 2.0)], [0])
+    (row,) = run_protocol(stumbling, [Method("same", trials.make({}), eta=2.0)], seeds=[0])
     for name in SOUGHT:
         assert metrics[name] == pytest.approx(row["metrics"][name]["mean"]) and metrics[name] >= 1 / 3
         assert metrics[f"{name} nominal"] >= 1 / 5
@@ -159,15 +159,15 @@ def test_the_limits_of_an_attack_belong_to_it():
 def trials():
     """Real rollouts of a dense attack on a small random prior."""
     prior = small_prior(0)
-    setup = Setup(scenes(2, steps=20), EGO, "idm", SimSettings(), batch=4)
+    setup = Setup(scenes(2, steps=20), EGO, ego_name="idm", sim=SimSettings(), batch=4)
     nominal = Method("nominal", NominalTraffic(prior, "plan"))
     make = lambda own: CTGAdv(prior, samples=2, **own)  # noqa: E731
-    return AttackTrials(setup, nominal, 2.0, [0, 1], make)
+    return AttackTrials(setup, nominal, eta=2.0, seeds=[0, 1], make=make)
 
 
 def test_a_trial_is_measured_as_the_protocol_measures_the_method(trials):
     found = trials({"gain": 0.5})
-    (row,) = run_protocol(trials.setup, [Method("same", trials.make({"gain": 0.5}), 2.0)], trials.seeds)
+    (row,) = run_protocol(trials.setup, [Method("same", trials.make({"gain": 0.5}), eta=2.0)], seeds=trials.seeds)
     for name in MEASURED:
         assert found[name] == pytest.approx(row["metrics"][name]["mean"], nan_ok=True)
     for name in SOUGHT:
@@ -184,4 +184,4 @@ def test_every_attack_has_ranges_round_its_present_values(name):
     present = flat(resolved(group))
     ranges = build_traffic(group, small_prior(0)).tuned
     assert ranges and all(low <= present[parameter] <= high for parameter, (low, high, *_) in ranges.items())
-    assert with_changes(group, {parameter: present[parameter] for parameter in ranges}, "", "") == group
+    assert with_changes(group, {parameter: present[parameter] for parameter in ranges}, where="", group="") == group

@@ -29,11 +29,11 @@ def road(parameters):
 
 def tried(space=SPACE, evaluate=road, present=PRESENT, objective=OBJECTIVE, file=None, about=None, **settings):
     settings = SearchSettings(**{"trials": 2, "startup": 10, "sweep": 0} | settings)
-    return search(evaluate, present, space, settings, objective, file, about)
+    return search(evaluate, present, space=space, settings=settings, objective=objective, file=file, about=about)
 
 
 def test_standing_still_and_rough_driving_are_refused_and_the_best_of_the_rest_is_kept():
-    trials = tried(trials=25, startup=15, objective=PlannerObjective(0.1, 0.1, 0.9, comfort_ceiling=2.0))
+    trials = tried(trials=25, startup=15, objective=PlannerObjective(0.1, 0.1, progress_floor=0.9, comfort_ceiling=2.0))
     assert len(trials) == 25 and trials[0]["parameters"] == {name: PRESENT[name] for name in SPACE}
     for trial in trials:
         refused = trial["metrics"]["progress"] < 0.9 * 80 or trial["metrics"]["comfort"] > 2
@@ -58,7 +58,7 @@ def test_a_study_goes_on_as_if_it_had_not_stopped_nor_been_interrupted_in_a_tria
     assert len(part) == 5 and run("parts", 9) == whole == run("whole", 9) == tried(trials=9, startup=4)
     for what, more in (
         ("space", {"space": {"speed": [5.0, 20.0]}}),
-        ("objective", {"objective": PlannerObjective(1.0, 0.1, 0.9, 2.0)}),
+        ("objective", {"objective": PlannerObjective(1.0, 0.1, progress_floor=0.9, comfort_ceiling=2.0)}),
         ("scenes", {"about": {"scenes": ["a"]}}),
     ):
         with pytest.raises(InputError, match=f"differs in {what}; name another file"):
@@ -152,13 +152,13 @@ def test_a_ladder_is_even_on_its_scale_and_leaves_the_others_as_they_are():
     """Ratios of a logarithmic sweep and differences of a linear one are constant; both ends are on it, the present
     value is not tried again."""
     space = {"speed": [0.5, 8.0, "log"], "caution": [1.0, 3.0]}
-    rungs = sweep(PRESENT, space, 5)
+    rungs = sweep(PRESENT, space, count=5)
     assert [rung["speed"] for rung in rungs] == pytest.approx([0.5, 1, 2, 4, 8])
     assert {rung["caution"] for rung in rungs} == {PRESENT["caution"]}
-    assert sweep(PRESENT, {"speed": [1, 4]}, 4) == [{"speed": value} for value in (1, 2, 3, 4)]
-    assert sweep(PRESENT, space, 0) == []
-    assert [rung["speed"] for rung in sweep(PRESENT, SPACE, 3)] == [0.0, 20.0]
-    rungs = sweep(PRESENT, {"speed": [10 / 7.3, 10 * 7.3, "log"]}, 3)
+    assert sweep(PRESENT, {"speed": [1, 4]}, count=4) == [{"speed": value} for value in (1, 2, 3, 4)]
+    assert sweep(PRESENT, space, count=0) == []
+    assert [rung["speed"] for rung in sweep(PRESENT, SPACE, count=3)] == [0.0, 20.0]
+    rungs = sweep(PRESENT, {"speed": [10 / 7.3, 10 * 7.3, "log"]}, count=3)
     assert [rung["speed"] for rung in rungs] == pytest.approx([10 / 7.3, 73])
 
 

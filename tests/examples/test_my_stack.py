@@ -97,7 +97,7 @@ def braking_leader(monkeypatch):
 
 def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leader):
     scenes, traffic = braking_leader
-    out = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic, eta=2.0)
+    out = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic=traffic, eta=2.0)
     logged = scenes.scenes["logged"]
     braked = out.adversaries.nonzero()
     assert len(braked) == 2, "one in each log"
@@ -111,7 +111,7 @@ def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leade
     others = out.valid & ~out.adversaries[:, None]
     others[:, :, 0] = False
     assert torch.equal(out.states[others], logged[others])
-    calm = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic, eta=0.0)
+    calm = e2rl.roll_out(scenes, e2rl.make_ego("idm"), traffic=traffic, eta=0.0)
     assert not calm.adversaries.any()
 
 

@@ -22,7 +22,7 @@ def test_jobs_of_submitit_give_the_run_of_one_machine(tmp_path, monkeypatch, cap
     added to is refused."""
     pytest.importorskip("submitit")
     options = [*OPTIONS, f"data.cache={tmp_path / 'cache'}"]
-    assert call("evaluate.py", [*options, f"hydra.run.dir={tmp_path / 'one'}"], monkeypatch, capsys)[0] == 0
+    assert call("evaluate.py", [*options, f"hydra.run.dir={tmp_path / 'one'}"], monkeypatch=monkeypatch, capsys=capsys)[0] == 0
     command = [sys.executable, str(ROOT / "examples" / "slurm.py"), "--cluster", "local", "--jobs", "2"]
     done = subprocess.run(
         [*command, "--into", str(tmp_path / "jobs"), "--", *options],
@@ -38,7 +38,7 @@ def test_jobs_of_submitit_give_the_run_of_one_machine(tmp_path, monkeypatch, cap
     same_runs(tmp_path / "one", tmp_path / "jobs" / "whole")
 
     other = [*options, "eta=1", "shard=[1,2]", f"hydra.run.dir={tmp_path / 'other'}"]
-    assert call("evaluate.py", other, monkeypatch, capsys)[0] == 0
+    assert call("evaluate.py", other, monkeypatch=monkeypatch, capsys=capsys)[0] == 0
     with pytest.raises(InputError, match="began with another eta"):
         merge([shards[0], tmp_path / "other"], tmp_path / "mixed")
     assert not (tmp_path / "mixed").exists()

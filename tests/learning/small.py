@@ -78,9 +78,9 @@ def small_run(
     improve = PolicyImprovement(
         ActorEgo(hidden=hidden, room=None),
         scenes,
-        SimSettings(),
-        live,
-        seed,
+        sim=SimSettings(),
+        traffic=live,
+        seed=seed,
         collect={"batch": 4, "steps": 20, "hold": 1, "iterations": 2} | (collect or {}),
         ppo={"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | ppo,
         rounds=rounds,
@@ -90,7 +90,7 @@ def small_run(
     given = {"traffic": traffic, "against": against, "memory": memory, "prefetch": prefetch}
     settings = RoundSettings(scenes=3, nominal=nominal, **given)
     curriculum = AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread)
-    return Evolution(curriculum, improve, brake_check(scenes), settings, seed, memory=Memory(folder, memory))
+    return Evolution(curriculum, improve, synthesize=brake_check(scenes), settings=settings, seed=seed, memory=Memory(folder, memory))
 
 
 def steady(metrics):

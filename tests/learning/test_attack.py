@@ -35,8 +35,8 @@ def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
         assert all(torch.equal(each, template[torch.isin(SCENES, index)]) for each in limits)
         return attack(ego, index, eta, seed)
 
-    order = Order(0, SCENES, ETA, template, 7, None)
-    traffic, _ = make_traffic(order, synthesize, odd_ones_left_out, nominal, batch)
+    order = Order(0, SCENES, eta=ETA, template=template, seed=7, ego=None)
+    traffic, _ = make_traffic(order, synthesize, solvable=odd_ones_left_out, nominal=nominal, batch=batch)
     kept = [0, 4, 2]
     every = kept + SCENES.tolist() * nominal
     assert traffic["scene_index"].tolist() == every and traffic["entered"].tolist() == (SCENES % 2 == 0).tolist()
@@ -44,7 +44,7 @@ def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
     assert traffic["template"].tolist() == [PAIR, FULL, SINGLE] + [FULL] * (len(every) - 3)
     assert traffic["span"][:3, 0].tolist() == kept and not traffic["span"][3:].any()
     assert traffic["attacked"] == 4 / 5 and traffic["contact"] == 3 / 5  # of all that were attacked
-    whole, _ = make_traffic(order, synthesize, odd_ones_left_out, nominal)
+    whole, _ = make_traffic(order, synthesize, solvable=odd_ones_left_out, nominal=nominal)
     assert all(torch.equal(traffic[name], whole[name]) for name in whole) and set(traffic) == set(whole)
 
 
@@ -60,9 +60,9 @@ class Stumbles(Ambush):
 def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_them():
     scenes = small_scenes(4)
     index = torch.arange(4)
-    order = Order(2, index, torch.full((4,), 2.0), torch.zeros_like(index), 7, IDMEgo())
-    made, errored = make_traffic(order, synthesize_traffic(scenes, Stumbles(), SimSettings(), batch=3))
-    whole, none = make_traffic(order, synthesize_traffic(scenes, Ambush(), SimSettings(), batch=3))
+    order = Order(2, index, eta=torch.full((4,), 2.0), template=torch.zeros_like(index), seed=7, ego=IDMEgo())
+    made, errored = make_traffic(order, synthesize_traffic(scenes, Stumbles(), sim=SimSettings(), batch=3))
+    whole, none = make_traffic(order, synthesize_traffic(scenes, Ambush(), sim=SimSettings(), batch=3))
     assert made["entered"].tolist() == [True, True, False, True] and whole["entered"].all() and not none
     (entry,) = errored
     assert (entry["round"], entry["during"], entry["scene"], entry["eta"]) == (2, ATTACK, 2, 2.0)
@@ -115,7 +115,7 @@ def test_evasions_are_kept_with_what_they_avoid():
     scenes = small_scenes(3, steps=40)
     index = torch.arange(3)
     traffic = brake_check(scenes)(None, index, torch.tensor([1.2, 0.5, 3.0]), 0)
-    solved = solvable(traffic, scenes, SimSettings())
+    solved = solvable(traffic, scenes, sim=SimSettings())
     assert solved.entered.all() and not solved.span[1].any() and not solved.evasion[1].any(), "not hit, so not searched"
     begin, end = solved.span[[0, 2]].unbind(1)
     assert (end - AFTER > 10).all() and (end[1] < end[0]), "the nearer car is met earlier"
@@ -123,8 +123,8 @@ def test_evasions_are_kept_with_what_they_avoid():
     found = dynamics.rollout(traffic["states"][:, 0, 0], solved.evasion)
     size = scenes.scenes["size"][index]
     other = traffic["states"][:, 1:, 1]
-    clear = separation(found, size[:, None, 0], other, size[:, None, 1]) > 0
-    hit = separation(traffic["states"][:, 1:, 0], size[:, None, 0], other, size[:, None, 1]) < 0
+    clear = separation(found, size[:, None, 0], second=other, second_size=size[:, None, 1]) > 0
+    hit = separation(traffic["states"][:, 1:, 0], size[:, None, 0], second=other, second_size=size[:, None, 1]) < 0
     assert clear[[0, 2]].all() and hit[[0, 2]].any(1).all()
     stop = hit.int().argmax(1) + 1
     assert torch.equal(end, stop[[0, 2]] + AFTER) and (begin >= stop[[0, 2]] - LATE).all()
@@ -142,7 +142,7 @@ def test_an_evasion_acts_from_before_it_departs_until_after_the_contact():
     evasion[1, 4:, 1] = 1.0
     begin = torch.tensor([0, 2, 0])
     stop = torch.tensor([30, 38, 15])
-    assert acting(evasion, driven, begin, stop).tolist() == [[10, 35], [2, 40], [5, 20]]
+    assert acting(evasion, driven, begin=begin, stop=stop).tolist() == [[10, 35], [2, 40], [5, 20]]
 
 
 # --- two attackers
@@ -166,24 +166,24 @@ def marked(mark, lost=()):
 def test_rows_come_in_the_order_of_the_scenes_each_by_its_own_method():
     eta = torch.arange(7.0)
     template = torch.arange(7)
-    made = mixture(marked(1), marked(2), 0.5)(None, MIXED, eta, 5, template)
+    made = mixture(marked(1), marked(2), fraction=0.5)(None, MIXED, eta, 5, template)
     assert torch.equal(made["scene_index"], MIXED) and torch.equal(made["eta"], eta)
     assert torch.equal(made["template"], template) and not made["errored"]
-    assert torch.equal(made["mark"] == 2, drawn(MIXED, 5, 0.5)) and set(made["mark"].tolist()) == {1, 2}
+    assert torch.equal(made["mark"] == 2, drawn(MIXED, 5, fraction=0.5)) and set(made["mark"].tolist()) == {1, 2}
 
 
 def test_who_attacks_a_scene_does_not_depend_on_its_batch():
-    whole = drawn(MIXED, 5, 0.5)
-    assert torch.equal(whole, torch.cat([drawn(part, 5, 0.5) for part in MIXED.split(2)]))
-    assert any(not torch.equal(whole, drawn(MIXED, seed, 0.5)) for seed in range(6, 12))
+    whole = drawn(MIXED, 5, fraction=0.5)
+    assert torch.equal(whole, torch.cat([drawn(part, 5, fraction=0.5) for part in MIXED.split(2)]))
+    assert any(not torch.equal(whole, drawn(MIXED, seed, fraction=0.5)) for seed in range(6, 12))
 
 
 def test_the_fraction_is_that_of_the_scenes():
     scenes = torch.arange(4000)
-    assert abs(drawn(scenes, 1, 0.3).float().mean() - 0.3) < 0.03
-    assert not drawn(scenes, 1, 0.0).any() and drawn(scenes, 1, 1.0).all()
+    assert abs(drawn(scenes, 1, fraction=0.3).float().mean() - 0.3) < 0.03
+    assert not drawn(scenes, 1, fraction=0.0).any() and drawn(scenes, 1, fraction=1.0).all()
 
 
 def test_rows_that_a_method_cannot_make_are_named_by_their_place():
-    made = mixture(marked(1, lost=[4]), marked(2, lost=[4]), 0.5)(None, MIXED, torch.ones(7), 5)
+    made = mixture(marked(1, lost=[4]), marked(2, lost=[4]), fraction=0.5)(None, MIXED, torch.ones(7), 5)
     assert made["scene_index"].tolist() == [3, 0, 1, 2, 9, 7] and set(made["errored"]) == {2}

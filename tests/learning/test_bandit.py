@@ -23,7 +23,7 @@ def told(curriculum, eta, template, rate, attacks=20, left_out=0, survivable=tor
 def test_arms_that_never_or_always_fail_are_drawn_less_than_those_in_between():
     curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0, 3.0], templates=["single"], forgetting=0.0)
     for eta, rate in ((1.0, 0.0), (2.0, 0.5), (3.0, 1.0)):
-        told(curriculum, eta, SINGLE, rate)
+        told(curriculum, eta, template=SINGLE, rate=rate)
     etas, _ = curriculum.choices(torch.zeros(4000, dtype=torch.int64))
     drawn = [(etas == eta).float().mean().item() for eta in (1.0, 2.0, 3.0)]
     assert curriculum.probability().tolist() == pytest.approx(drawn, abs=0.03) and drawn[1] > 0.8
@@ -31,7 +31,7 @@ def test_arms_that_never_or_always_fail_are_drawn_less_than_those_in_between():
 
 def test_the_probability_is_a_softmax_of_values_with_exploration():
     curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0], templates=["pair"], forgetting=0.0)
-    told(curriculum, 1.0, PAIR, 0.5)
+    told(curriculum, 1.0, template=PAIR, rate=0.5)
     value = curriculum.value()
     expected = 0.9 * (10 * value / 0.25).softmax(0) + 0.1 / 2
     torch.testing.assert_close(curriculum.probability(), expected)
@@ -47,7 +47,7 @@ def test_an_attack_counts_once_however_many_episodes_are_driven_in_it():
     episodes = torch.tensor([4, 0, 0, 10])
     for _ in range(2):
         share = torch.tensor([0.5, torch.nan, 0.2, torch.nan])
-        curriculum.observe(Outcomes(eta, template, gone, episodes, torch.tensor([1, 0, 0, 10]), share))
+        curriculum.observe(Outcomes(eta, template, left_out=gone, episodes=episodes, failures=torch.tensor([1, 0, 0, 10]), survivable=share))
     counts = [[0.25, 0, 0, 1], [0.75, 0, 0, 0], [2, 0, 0, 1], [1, 0, 0, 0], [2, 0, 0, 0], [0.7, 0, 0, 0]]
     counts = 1.75 * torch.tensor(counts)
     torch.testing.assert_close(curriculum._counts, counts.double())
@@ -55,8 +55,8 @@ def test_an_attack_counts_once_however_many_episodes_are_driven_in_it():
 
 def test_failures_that_nobody_prevents_teach_nothing():
     curriculum = BanditCurriculum(6, 10, etas=[1.0, 2.0], templates=["full"], forgetting=0.0)
-    told(curriculum, 1.0, FULL, 0.5)
-    told(curriculum, 2.0, FULL, 0.5, attacks=40, left_out=20)
+    told(curriculum, 1.0, template=FULL, rate=0.5)
+    told(curriculum, 2.0, template=FULL, rate=0.5, attacks=40, left_out=20)
     value = curriculum.values()
     assert value[2.0, "full"] == pytest.approx(value[1.0, "full"] * (21 / 41), rel=1e-6)
 
@@ -66,14 +66,14 @@ def test_of_failures_those_that_the_teacher_would_survive_are_drawn():
     for regret in (True, False):
         curriculum = BanditCurriculum(6, 10, regret=regret, **arms)
         for eta, rate, survivable in ((1.0, 0.5, 0.1), (2.0, 0.9, 0.8), (3.0, 0.5, torch.nan)):
-            told(curriculum, eta, SINGLE, rate, survivable=survivable)
+            told(curriculum, eta, template=SINGLE, rate=rate, survivable=survivable)
         hopeless, survived, untold = curriculum.value().tolist()
         assert (hopeless < untold < survived) if regret else (survived < hopeless == untold)
 
 
 def test_the_value_is_the_expected_learnability_under_the_posterior():
     curriculum = BanditCurriculum(6, 10, etas=[1.0], templates=["pair"], forgetting=0.0)
-    told(curriculum, 1.0, PAIR, 0.3)
+    told(curriculum, 1.0, template=PAIR, rate=0.3)
     posterior = torch.distributions.Beta(torch.tensor(7.0), torch.tensor(15.0))
     torch.manual_seed(0)
     p = posterior.sample((200_000,))

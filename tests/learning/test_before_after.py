@@ -13,9 +13,9 @@ from tests.learning.small import Ambush, small_scenes
 
 def test_both_stages_are_kept_and_the_second_is_compared_with_the_first(tmp_path):
     torch.manual_seed(0)
-    setup = Setup(small_scenes(3), IDMEgo(), "idm", SimSettings())
-    methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), 2.0)]
-    measure = BeforeAfter(setup, methods, [0], tmp_path)
+    setup = Setup(small_scenes(3), IDMEgo(), ego_name="idm", sim=SimSettings())
+    methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), eta=2.0)]
+    measure = BeforeAfter(setup, methods, seeds=[0], folder=tmp_path)
     slow = IDMEgo(desired_speed=3.0, use_limits=False)
     fast = IDMEgo(desired_speed=12.0, use_limits=False)
     measure("before", slow, 0)

@@ -39,7 +39,7 @@ def test_a_window_sees_what_the_environment_shows_a_replayed_ego():
     env = DrivingEnv(scenes, SimSettings(replay_ego=True, end_on_contact=False), 2, agents=True)
     env.reset(env.reset().select("scene_index").set("scene_index", torch.arange(2)[:, None]))
     frames = env.rollout(11, break_when_any_done=False)
-    own = as_ego(scenes.scenes, torch.arange(2), torch.zeros(2, dtype=torch.long))
+    own = as_ego(scenes.scenes, torch.arange(2), vehicle=torch.zeros(2, dtype=torch.long))
     for step in (0, 10):
         expected = frames["observation"][:, step].clone()
         expected[:, ELAPSED] = 0
@@ -48,7 +48,7 @@ def test_a_window_sees_what_the_environment_shows_a_replayed_ego():
 
 def test_a_vehicle_that_plays_the_ego_sees_the_ego():
     scenes = small_scenes(2, steps=60)
-    own = as_ego(scenes.scenes, torch.tensor([1]), torch.tensor([1]))
+    own = as_ego(scenes.scenes, torch.tensor([1]), vehicle=torch.tensor([1]))
     world = world_at(own, 3)
     assert torch.equal(world.states[0, [1, 0, 2]], scenes.scenes["logged"][1, 3, :3])
     assert torch.equal(own["route_points"][0, 0, 0], scenes.scenes["route_points"][1, 1, 0])
@@ -72,7 +72,7 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
     torch.manual_seed(0)
     data = windows(braking_scenes(), 0)
     network = BitsNetwork(32)
-    run = BitsTraining(network, data, settings(held_out=0.0, epochs=40))
+    run = BitsTraining(network, data, settings=settings(held_out=0.0, epochs=40))
     before = run.measure(data)
     for _ in range(40):
         run.turn()
@@ -84,13 +84,13 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
     controls = network.controls(
         code, start["start"][:, 3], path.d, start["distance"][:, None], start["offset"][:, None]
     )
-    driven = drive_controls(controls, start["start"], path)
+    driven = drive_controls(controls, start["start"], path=path)
     assert driven.states[0, 0, -1, 3] < 1.0 and abs(driven.distance.item() - 10.0) < 1.5
 
 
 def test_a_loss_of_zero_is_the_recording():
     """A vehicle at constant speed on its goal: the untrained policy keeps its speed, so its plan is the recording."""
-    data = windows(small_scenes(2, steps=60), 0, (0.0, 0.0, 0.0))
+    data = windows(small_scenes(2, steps=60), 0, disturbed=(0.0, 0.0, 0.0))
     found = losses(BitsNetwork(16).eval(), data)
     assert found["trajectory"] < 1e-3 and found["goal"] > 5
 
@@ -102,7 +102,7 @@ def small_stage(monkeypatch, folder, scenes=None):
     monkeypatch.setattr(Run, "begin", lambda run, inputs: None)
     monkeypatch.setattr(bits_training, "origin_of", lambda folder: {})
     torch.manual_seed(0)
-    return run_bits_stage(Run(load_config("train", options), folder, {}), RunLogger("csv", folder))
+    return run_bits_stage(Run(load_config("train", options), folder, choices={}), RunLogger("csv", folder))
 
 
 def test_the_stage_writes_the_weights_of_the_lowest_held_out_loss_and_goes_on_exactly(tmp_path, monkeypatch):

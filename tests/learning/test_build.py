@@ -44,7 +44,7 @@ def config_of(*overrides):
 
 def built(config, folder=None):
     scenes = small_scenes(3)
-    return build_evolution(config, scenes, build_ego(config), Ambush(), brake_check(scenes), folder)
+    return build_evolution(config, scenes, ego=build_ego(config), traffic=Ambush(), synthesize=brake_check(scenes), folder=folder)
 
 
 @pytest.mark.parametrize("curriculum", CURRICULA)
@@ -61,7 +61,7 @@ def test_the_experiment_of_training_is_of_options_that_exist():
 
 def test_without_a_synthesizer_given_the_traffic_method_attacks():
     config = config_of("learner.round.nominal=log", "curriculum.solvable_only=false", *POLICY)
-    run = build_evolution(config, small_scenes(3), build_ego(config), Ambush())
+    run = build_evolution(config, small_scenes(3), ego=build_ego(config), traffic=Ambush())
     metrics = train_round(run)
     assert metrics["synthesizer/attacked"] == metrics["synthesizer/contact"] == 1.0
     assert run.memory.rows == 2

@@ -19,7 +19,7 @@ def attacked(scenes, eta=1.0):
 def test_outcomes_do_not_depend_on_the_batch():
     scenes = small_scenes(5, steps=40)
     pool = attacked(scenes)
-    parts = [PoolDriver(scenes, SimSettings(), batch).drive_all(IDMEgo(), pool)[0] for batch in (10, 4, 16)]
+    parts = [PoolDriver(scenes, SimSettings(), batch=batch).drive_all(IDMEgo(), pool)[0] for batch in (10, 4, 16)]
     for name in ("row", "scene_index", "contact", "returns", "progress", "acceleration"):
         for part in parts[1:]:
             assert torch.equal(getattr(parts[0], name), getattr(part, name)), name
@@ -30,8 +30,8 @@ def test_a_drive_counts_until_its_first_contact():
     scenes = small_scenes(2, steps=40)
     pool = attacked(scenes, eta=7.0)
     rows = torch.tensor([0, 2])
-    frames = PoolDriver(scenes, SimSettings(), 2).drive(IDMEgo(hardest_braking=0.1, braking=0.1), pool, rows)
-    episodes = episodes_of(frames, pool, rows)
+    frames = PoolDriver(scenes, SimSettings(), batch=2).drive(IDMEgo(hardest_braking=0.1, braking=0.1), pool, rows)
+    episodes = episodes_of(frames, pool, rows=rows)
     assert episodes.contact.tolist() == [True, False]
     assert frames["alive"][1].all() and frames["alive"][0].sum() < 40
     assert frames["contact"][0].sum() == 1 and not frames["reward"][0][~frames["alive"][0]].any()
@@ -39,7 +39,7 @@ def test_a_drive_counts_until_its_first_contact():
 
 def test_disturbances_are_executed_but_not_intended():
     scenes = small_scenes(2)
-    driver = PoolDriver(scenes, SimSettings(), 2)
+    driver = PoolDriver(scenes, SimSettings(), batch=2)
     pool = TrafficPool.recorded(torch.arange(2))
     frames = driver.drive(IDMEgo(), pool, torch.arange(2), lambda action, step: action + torch.tensor([1.0, 0.0]))
     assert torch.allclose(frames["executed"][..., 0], frames["intended"][..., 0] + 1.0, atol=1e-3)
@@ -47,7 +47,7 @@ def test_disturbances_are_executed_but_not_intended():
 
 def test_mean_acceleration_is_that_of_the_drive():
     scenes = small_scenes(2, num_vehicles=1, num_vrus=0, limit=30.0)
-    driver = PoolDriver(scenes, SimSettings(), 2)
+    driver = PoolDriver(scenes, SimSettings(), batch=2)
     pool = TrafficPool.recorded(torch.arange(2))
     episodes, _ = driver.drive_all(IDMEgo(acceleration=1.0), pool)
     gained = driver.env.world().states[:, 0, 3] - 10.0
@@ -88,7 +88,7 @@ def frames(lengths, total, fail=()):
 
 def test_returns_outcomes_and_scenes_of_episodes_across_batches():
     data = frames([10, 4, 10, 10], 34, fail=(1,))
-    episodes = finished_episodes([data[:, :12], data[:, 12:]], torch.tensor([False, True, True, False]), 10)
+    episodes = finished_episodes([data[:, :12], data[:, 12:]], torch.tensor([False, True, True, False]), horizon=10)
     assert episodes.row.tolist() == [0, 1, 2, 3] and episodes.scene_index.tolist() == [10, 11, 12, 13]
     assert episodes.returns.tolist() == [10.0, 4.0, 10.0, 10.0]
     assert episodes.progress.tolist() == [20.0, 8.0, 20.0, 20.0]
@@ -101,7 +101,7 @@ def test_returns_outcomes_and_scenes_of_episodes_across_batches():
 def test_episodes_that_could_not_have_lasted_do_not_count():
     """The second begins 5 steps before the end: only a failure could be finished by then."""
     data = frames([10, 3, 10], 15, fail=(1,))
-    assert finished_episodes([data], torch.zeros(3, dtype=torch.bool), 10).row.tolist() == [0]
+    assert finished_episodes([data], torch.zeros(3, dtype=torch.bool), horizon=10).row.tolist() == [0]
 
 
 def test_decisions_of_several_steps_are_told_from_steps():
@@ -112,6 +112,6 @@ def test_decisions_of_several_steps_are_told_from_steps():
     assert data["traffic", "row"][0, :, 0].tolist() == number
     data["next", "timestep"] = torch.tensor(steps)[None, :, None]
     adversarial = torch.zeros(3, dtype=torch.bool)
-    assert finished_episodes([data], adversarial, 5, hold=2).row.tolist() == [0, 1, 2]
-    assert finished_episodes([data[:, :7]], adversarial, 5, hold=2).row.tolist() == [0, 1]
-    assert finished_episodes([data[:, :5]], adversarial, 5, hold=2).row.tolist() == [0], "the second might have lasted"
+    assert finished_episodes([data], adversarial, horizon=5, hold=2).row.tolist() == [0, 1, 2]
+    assert finished_episodes([data[:, :7]], adversarial, horizon=5, hold=2).row.tolist() == [0, 1]
+    assert finished_episodes([data[:, :5]], adversarial, horizon=5, hold=2).row.tolist() == [0], "the second might have lasted"

@@ -115,8 +115,8 @@ def planner_run(space, live=None):
     scenes = small_scenes(3, steps=40)
     present = {"desired_speed": 10.0, "headway": 1.0, "use_limits": False}
     given = {"search": {"trials": 3, "startup": 3}, "space": space, "batch": 3, "traffic": live}
-    improve = PlannerImprovement(IDMEgo(**present), present, scenes, SimSettings(), **given)
-    return Evolution(AdaptiveCurriculum(3, 2), improve, brake_check(scenes), RoundSettings(scenes=3, nominal="log"))
+    improve = PlannerImprovement(IDMEgo(**present), present, scenes=scenes, sim=SimSettings(), **given)
+    return Evolution(AdaptiveCurriculum(3, 2), improve, synthesize=brake_check(scenes), settings=RoundSettings(scenes=3, nominal="log"))
 
 
 def test_planners_are_tuned_and_attacked_as_tuned():
@@ -137,7 +137,7 @@ def test_planners_are_tuned_and_attacked_as_tuned():
 def test_unfit_combinations_are_refused():
     scenes = small_scenes()
     with pytest.raises(InputError, match="improves ego=actor"):
-        PolicyImprovement(LaneGraphEgo(), scenes, SimSettings())
+        PolicyImprovement(LaneGraphEgo(), scenes, sim=SimSettings())
     with pytest.raises(InputError, match="cannot hold an episode"):
         small_run(collect={"steps": 5})
     with pytest.raises(InputError, match="traffic=live"):

@@ -183,7 +183,7 @@ def test_torchrl_is_pointed_to_its_own_environment(given):
 def test_actions_are_scaled_about_keeping_speed_and_heading(given):
     low = torch.tensor([-8.0, -1.6])
     high = torch.tensor([5.0, 1.6])
-    found = in_units(torch.tensor([[-2.0, -1.0], [-0.5, 0.0], [0.0, 0.5], [1.0, 3.0]]), low, high)
+    found = in_units(torch.tensor([[-2.0, -1.0], [-0.5, 0.0], [0.0, 0.5], [1.0, 3.0]]), low, high=high)
     assert found.tolist() == [pytest.approx(row) for row in ([-8.0, -1.6], [-4.0, 0.0], [0.0, 0.8], [5.0, 1.6])]
     env = e2rl.make_gym_env(**given, max_acceleration=2.0)
     assert env.bounds.tolist() == [pytest.approx([-8.0, -1.6]), pytest.approx([2.0, 1.6])]

@@ -26,7 +26,7 @@ def settings(**changes):
 
 
 def test_replayed_demonstrations_are_the_inverse_dynamics_of_the_log():
-    shown = recorded_demonstrations(braking_log(), SimSettings(), 0, drives=0)
+    shown = recorded_demonstrations(braking_log(), SimSettings(), seed=0, drives=0)
     assert len(shown) == 4 * 20 and shown["scene_index"].unique().tolist() == [0, 1, 2, 3]
     assert torch.allclose(shown["action"], torch.tensor([-2.0, 0.0]).expand(80, 1, 2), atol=2e-3)
     last = (shown["observation"][:, 1:3] * torch.tensor([4.0, 1.0])).view(4, 20, 2)  # as the observation reports it
@@ -36,7 +36,7 @@ def test_replayed_demonstrations_are_the_inverse_dynamics_of_the_log():
 def test_disturbed_demonstrations_lead_back(monkeypatch):
     """Where the ego has turned off its track the label turns it back."""
     monkeypatch.setattr(imitation, "DISTURBED", (1.0, 0.2))
-    shown = recorded_demonstrations(braking_log(8), SimSettings(), 0)
+    shown = recorded_demonstrations(braking_log(8), SimSettings(), seed=0)
     sideways = 3 * shown["observation"][:, 3]
     turned = shown["observation"][:, 4]
     off = (sideways.abs() > 0.1) & (sideways * turned > 0)
@@ -46,15 +46,15 @@ def test_disturbed_demonstrations_lead_back(monkeypatch):
 def test_clipping_keeps_actions_off_the_bounds():
     low = torch.tensor([-8.0, -1.6])
     high = torch.tensor([5.0, 1.6])
-    clipped = clip_expert(torch.tensor([[9.0, -9.0], [0.0, 0.1]]), low, high)
+    clipped = clip_expert(torch.tensor([[9.0, -9.0], [0.0, 0.1]]), low, high=high)
     assert torch.allclose(clipped, torch.tensor([[4.935, -1.584], [0.0, 0.1]]))
 
 
 def test_cloning_reduces_the_held_out_loss_and_takes_the_best_weights():
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(32,), room=None)
-    shown = recorded_demonstrations(braking_log(), SimSettings(), 0, drives=1)
-    training = Imitation(ego.network, shown, settings())
+    shown = recorded_demonstrations(braking_log(), SimSettings(), seed=0, drives=1)
+    training = Imitation(ego.network, shown, settings=settings())
     before = training.measure(training.held_out)
     best = training.fit("imitation", 8)
     assert best["held_out_loss"] < before["loss"] - 0.3 and best["held_out_miss"] < before["miss"] / 2

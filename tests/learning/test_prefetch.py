@@ -17,7 +17,7 @@ from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 
 def real(run, scenes):
     """Closed-loop synthesis, in which the ego's weights matter."""
-    run.synthesize = synthesize_traffic(scenes, Ambush(), SimSettings())
+    run.synthesize = synthesize_traffic(scenes, Ambush(), sim=SimSettings())
     return run
 
 

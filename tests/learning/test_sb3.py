@@ -80,7 +80,7 @@ def test_a_saved_policy_does_what_the_model_predicts(given, tmp_path, kind, suff
     normaliser = model.get_vec_normalize_env()
     seen = normaliser.normalize_obs(observation) if normaliser else observation
     predicted = torch.tensor(model.predict(seen, deterministic=True)[0])
-    wanted = in_units(predicted, torch.tensor([-8.0, -1.6]), torch.tensor([5.0, 1.6]))
+    wanted = in_units(predicted, torch.tensor([-8.0, -1.6]), high=torch.tensor([5.0, 1.6]))
     assert torch.allclose(ego.decide(torch.tensor(observation)), wanted, atol=1e-4) and wanted.std(0).min() > 5e-3
 
 
@@ -125,7 +125,7 @@ def test_statistics_of_several_normalisers_are_applied_in_turn(given, tmp_path):
     observation = np.random.default_rng(0).normal(size=(50, OBSERVATION_SIZE)).astype(np.float32)
     seen = env.normalize_obs(env.venv.normalize_obs(observation))
     predicted = torch.tensor(model.predict(seen, deterministic=True)[0])
-    wanted = in_units(predicted, torch.tensor([-8.0, -1.6]), torch.tensor([5.0, 1.6]))
+    wanted = in_units(predicted, torch.tensor([-8.0, -1.6]), high=torch.tensor([5.0, 1.6]))
     assert torch.allclose(ego.decide(torch.tensor(observation)), wanted, atol=1e-4)
 
 

@@ -23,17 +23,17 @@ def episodes(curriculum, scenes, failed, adversarial=True):
 def failing(curriculum, *rates):
     """Ten episodes in each of the first scenes, which fail at these rates."""
     for scene, rate in enumerate(rates):
-        episodes(curriculum, [scene] * 10, [k < round(10 * rate) for k in range(10)])
+        episodes(curriculum, [scene] * 10, failed=[k < round(10 * rate) for k in range(10)])
 
 
 def test_regret_is_the_variance_of_recent_failures_in_adversarial_traffic(monkeypatch):
     monkeypatch.setattr(scheduler, "SMOOTHING", 0.25)
     curriculum = curriculum_of()
-    episodes(curriculum, [0, 1, 1], [True, False, True], adversarial=False)
+    episodes(curriculum, [0, 1, 1], failed=[True, False, True], adversarial=False)
     assert curriculum.regret().isnan().all(), "nothing is known of adversarial traffic yet"
     failing(curriculum, 0.2, 1.0, 0.0)
     torch.testing.assert_close(curriculum.regret()[:3], torch.tensor([0.16, 0.0, 0.0]))
-    episodes(curriculum, [1], [False])
+    episodes(curriculum, [1], failed=[False])
     assert curriculum.regret()[1] == pytest.approx(0.75 * 0.25), "the rate is a moving average"
 
 
@@ -99,7 +99,7 @@ def test_state_goes_on_exactly():
     second = curriculum_of(seed=4)
     for _ in range(3):
         first.draw(2)
-        episodes(first, [0, 3], [True, False])
+        episodes(first, [0, 3], failed=[True, False])
         first.advance(0.1)
     second.load_state_dict(first.state_dict())
     for curriculum in (first, second):
@@ -120,7 +120,7 @@ def test_episodes_count_for_the_attack_whose_row_they_drove():
     row = torch.tensor([0, 0, 1, 2, 5, 1])
     failed = torch.tensor([True, False, True, True, True, True])
     share = torch.tensor([0.5, 0.5, 0.25, torch.nan, 1.0, 0.25])
-    outcomes = outcomes_of(eta, template, torch.tensor([0, 2]), row, failed, share)
+    outcomes = outcomes_of(eta, template, drawn=torch.tensor([0, 2]), row=row, failed=failed, survivable=share)
     assert outcomes.survivable.nan_to_num(-1).tolist() == [0.5, -1.0, 0.25]
     assert outcomes.left_out.tolist() == [False, True, False]
     assert outcomes.episodes.tolist() == [2, 0, 2] and outcomes.failures.tolist() == [1, 0, 2]
@@ -130,8 +130,8 @@ def test_the_table_counts_draws_episodes_and_failures_by_arm():
     eta = torch.tensor([1.0, 2.0, 2.0])
     template = torch.tensor([SINGLE, PAIR, PAIR])
     flags = torch.tensor([False, True, False])
-    outcomes = Outcomes(eta, template, flags, torch.tensor([2, 0, 2]), torch.tensor([1, 0, 2]), torch.zeros(3))
-    rows = tally(4, eta, outcomes, {(0.5, "full"): 0.2, (1.0, "single"): 0.1})
+    outcomes = Outcomes(eta, template, left_out=flags, episodes=torch.tensor([2, 0, 2]), failures=torch.tensor([1, 0, 2]), survivable=torch.zeros(3))
+    rows = tally(4, eta, outcomes=outcomes, value={(0.5, "full"): 0.2, (1.0, "single"): 0.1})
     plain = [tuple(-1 if value != value else value for value in row.values()) for row in rows]
     assert plain == [
         (4, 1.0, "single", 1, 0, 2, 1, 0.5, 0.1),

@@ -84,8 +84,8 @@ def test_a_label_is_what_the_planner_would_do_in_the_same_state():
         for name in ("states", "valid", "accel", "turn_rate"):
             assert torch.equal(frames["agents", name], getattr(world, name)), name
         labels, _ = improve.teacher.labels(frames, improve.ego)
-        actions, costs = ranked_actions(planner, world, 48, 2)
-        assert torch.equal(labels["action"], clip_expert(actions, low, high))
+        actions, costs = ranked_actions(planner, world, count=48, hold=2)
+        assert torch.equal(labels["action"], clip_expert(actions, low, high=high))
         assert torch.equal(labels["weight"], torch.softmax(-costs / 5.0, -1))
         assert torch.equal(labels["observation"], frames["observation"])
         env.step(TensorDict({"action": frames["action"]}, [len(index)]))
@@ -107,7 +107,7 @@ def test_only_what_the_teacher_does_better_by_far_and_survives_is_labelled():
     scenes = small_scenes(3, steps=40)
     data, improve = collected(scenes, attacked(scenes, 3.0))
     start = data[:, 2]  # the leader is there from the first step on
-    strict = Teacher(SamplingEgo(), scenes, BOUNDS, 2, {})
+    strict = Teacher(SamplingEgo(), scenes, bounds=BOUNDS, hold=2, settings={})
     assert len(strict.labels(start, Blind())[0]) == len(start)
     assert len(strict.labels(start, SamplingEgo())[0]) == 0
     hopeless = start.clone()
@@ -151,4 +151,4 @@ def test_nominal_episodes_are_not_labelled_and_the_newest_labels_stay():
 def test_what_cannot_teach_is_refused():
     scenes = small_scenes(1)
     with pytest.raises(InputError, match=r"learner\.teacher=.*ScoringEgo"):
-        Teacher(IDMEgo(), scenes, BOUNDS, 2, {})
+        Teacher(IDMEgo(), scenes, bounds=BOUNDS, hold=2, settings={})

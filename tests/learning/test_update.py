@@ -34,7 +34,7 @@ def settings_of(**changes):
 
 
 def batch_of(ego, batch=8, steps=20):
-    collector = collector_of(DrivingEnv(small_scenes(4), SimSettings(), batch), ego, steps)
+    collector = collector_of(DrivingEnv(small_scenes(4), SimSettings(), batch), ego, steps=steps)
     data = next(iter(collector))
     collector.shutdown()
     return data
@@ -64,7 +64,7 @@ def test_ppo_learns_to_drive_from_standing():
         ego.network,
         settings_of(learning_rate=1e-3, minibatch=240, gamma=0.95, critic_warmup=0, target_kl=0.2, epochs=6),
     )
-    collector = collector_of(DrivingEnv(scenes, SimSettings(), 16), ego, 30)
+    collector = collector_of(DrivingEnv(scenes, SimSettings(), 16), ego, steps=30)
     progress = []
     for _, data in zip(range(15), collector, strict=False):
         learner.update(data)
@@ -133,7 +133,7 @@ def test_advantages_are_those_of_torchrl():
     torch.manual_seed(0)
     ego = ActorEgo(hidden=(16,), room=None, initial_std=(0.9, 0.9))
     learner = Learner(ego.network, settings_of(gamma=0.9, lmbda=0.8))
-    data = batch_of(ego, 16, 50)
+    data = batch_of(ego, 16, steps=50)
     assert data["next", "terminated"].any() and data["next", "truncated"].any()
     learner.returns.update(5 * torch.randn(100, 1) + 3)
     learner.network.normaliser.observe(data["observation"])

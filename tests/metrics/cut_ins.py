@@ -54,7 +54,7 @@ def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
     for lateral, side in zip(lateral_speed, lateral_gap, strict=True):
         overlaps = side <= 0
         crash |= overlaps & (gap <= 0) & (gap >= -2 * LENGTH)
-        seen = Observation(speed, acceleration, gap, other, side, lateral, overlaps, length, length)
+        seen = Observation(speed, acceleration, gap=gap, other_speed=other, lateral_gap=side, lateral_speed=lateral, overlaps=overlaps, length=length, other_length=length)
         state, wanted = driver.step(state, seen)
         after = (speed + wanted * DT).clamp(min=0)
         acceleration = (after - speed) / DT

@@ -27,8 +27,8 @@ def random_rollouts(
     """
     generator = torch.Generator().manual_seed(seed)
     count = vehicles + others
-    states = random_tracks(rollouts, count, steps, extent, generator)
-    valid = random_validity(rollouts, count, steps, generator)
+    states = random_tracks(rollouts, count, steps=steps, extent=extent, generator=generator)
+    valid = random_validity(rollouts, count, steps=steps, generator=generator)
     kind = torch.zeros(rollouts, count, dtype=torch.int64)
     kind[:, vehicles:] = torch.randint(1, 4, (rollouts, others), generator=generator)
     simulated = (torch.arange(count) > 0) & (torch.arange(count) < vehicles) & valid.any(1)
@@ -47,7 +47,7 @@ def random_rollouts(
         adversaries=adversaries,
         logged=logged,
         logged_valid=valid & (torch.rand(valid.shape, generator=generator) > 0.01),
-        **random_map(rollouts, extent, generator),
+        **random_map(rollouts, extent, generator=generator),
         seed=torch.arange(rollouts) % 2,
         eta=torch.full((rollouts,), 2.0, dtype=torch.float64),
         scene_id=[f"scene_{index // 2}" for index in range(rollouts)],

@@ -13,7 +13,7 @@ DUTIES = ("none", "wrong way")
 
 def found(scene="a", seed=0, **changes):
     """A preventable failure of one and the same cell."""
-    return failure(CROSSING | {"duty": "none", "cfr_preventable": 1.0}, scene, seed, **changes)
+    return failure(CROSSING | {"duty": "none", "cfr_preventable": 1.0}, scene, seed=seed, **changes)
 
 
 def many(number=300):

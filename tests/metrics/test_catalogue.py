@@ -35,8 +35,8 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
     values, weights = metric_table(rows, [fast])
     assert torch.equal(values / weights, torch.tensor([[row["fast"]] for row in rows], dtype=torch.float64))
     expected = sum(row["fast"] * row["fast_steps"] for row in rows) / sum(row["fast_steps"] for row in rows)
-    assert summarise(rows, samples, 20, 2)["fast"]["mean"] == pytest.approx(expected)
-    assert paired_differences(rows, samples, rows, samples, 20, 2)["fast"]["difference"] == 0
+    assert summarise(rows, samples, draws=20, realism_draws=2)["fast"]["mean"] == pytest.approx(expected)
+    assert paired_differences(rows, samples, other_rows=rows, other_samples=samples, draws=20, realism_draws=2)["fast"]["difference"] == 0
     write_rows(tmp_path / "rollouts.csv", rows)
     assert read_rows(tmp_path / "rollouts.csv")[7]["fast"] == pytest.approx(rows[7]["fast"])
     summaries = metric_rows(rows, samples, draws=20, realism_draws=2)

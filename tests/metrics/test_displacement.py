@@ -25,7 +25,7 @@ def sampled(logged, samples, noise=1.0, seed=1):
 
 
 def columns(plans, logged, valid, simulated):
-    return scene_displacements(plans, sampled(logged, 1, 0.5, seed=9)[:, 0], logged, valid, simulated)
+    return scene_displacements(plans, sampled(logged, 1, noise=0.5, seed=9)[:, 0], logged=logged, logged_valid=valid, simulated=simulated)
 
 
 def test_a_steady_drift_has_its_mean_distance_at_every_horizon():
@@ -41,8 +41,8 @@ def test_a_steady_drift_has_its_mean_distance_at_every_horizon():
 def test_best_of_each_is_below_best_of_all_is_below_mean_and_one_sample_makes_them_equal():
     logged, valid, simulated = logs(8)
     plans = sampled(logged, 5)
-    many, one = (columns(part, logged, valid, simulated) for part in (plans, plans[:, :1]))
-    more = columns(torch.cat([plans, sampled(logged, 3, seed=4)], 1), logged, valid, simulated)
+    many, one = (columns(part, logged, valid=valid, simulated=simulated) for part in (plans, plans[:, :1]))
+    more = columns(torch.cat([plans, sampled(logged, 3, seed=4)], 1), logged, valid=valid, simulated=simulated)
     for at in ("_3", "_5"):
         best, joint, mean = (many[name + at] for name in ("min_ade", "joint_ade", "mean_ade"))
         assert (best <= joint).all() and (joint <= mean).all() and (best < joint).any() and (joint < mean).any()
@@ -59,11 +59,11 @@ def test_only_simulated_moving_vehicles_recorded_throughout_count_and_never_the_
     valid[0, 0, 4] = False
     valid[0, 60, 5] = False  # after every horizon
     for steps, length, expected in ((30, 81, [3, 5, 6]), (50, 81, [5, 6]), (50, 51, [5, 6]), (50, 50, [])):
-        found = moving_vehicles(logged[:, :length], valid[:, :length], simulated, steps)
+        found = moving_vehicles(logged[:, :length], valid[:, :length], simulated=simulated, steps=steps)
         assert found[0].nonzero()[:, 0].tolist() == expected
     plans = sampled(logged, 2)
-    found = columns(plans, logged, valid, simulated)
+    found = columns(plans, logged, valid=valid, simulated=simulated)
     assert found["vehicles_3"].item() == 3 and found["vehicles_5"].item() == 2
     wrong = plans.clone()
     wrong[:, :, [0, 1, 2, 4]] = torch.nan  # whoever does not count may hold anything
-    assert columns(wrong, logged, valid, simulated)["mean_ade_5"].item() == found["mean_ade_5"].item()
+    assert columns(wrong, logged, valid=valid, simulated=simulated)["mean_ade_5"].item() == found["mean_ade_5"].item()

@@ -25,7 +25,7 @@ EACH = pytest.mark.parametrize("name", DRIVERS)
 
 def observe(**fields):
     """One conflict: an ego at 20 m/s, 5 m behind the overlapping rear of a vehicle at 10 m/s, unless said otherwise."""
-    usual = Observation(20.0, 0.0, 5.0, 10.0, -1.9, 0.0, True, 4.3, 4.3)._asdict()
+    usual = Observation(20.0, 0.0, gap=5.0, other_speed=10.0, lateral_gap=-1.9, lateral_speed=0.0, overlaps=True, length=4.3, other_length=4.3)._asdict()
     values = {key: torch.as_tensor(value) for key, value in (usual | fields).items()}
     values = {k: v.double() if v.is_floating_point() else v for k, v in values.items()}
     return Observation(**dict(zip(values, torch.broadcast_tensors(*values.values()), strict=True)))
@@ -147,7 +147,7 @@ def oracle(model):
     with open(ORACLE, newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["model"] == model]
     ego, other, gap, lateral = torch.tensor([[float(row[f]) for f in FIELDS] for row in rows], dtype=torch.float64).T
-    return CutIn(ego / 3.6, other / 3.6, gap, lateral), torch.tensor([int(row["crash_type"]) > 0 for row in rows])
+    return CutIn(ego / 3.6, other / 3.6, gap=gap, lateral_speed=lateral), torch.tensor([int(row["crash_type"]) > 0 for row in rows])
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

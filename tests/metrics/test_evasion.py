@@ -27,7 +27,7 @@ def search(vehicles, moment=None, count=1, sim=None, width=2.0, **options):
     scene_set = make_scenes(count, vehicles=vehicles, num_vrus=0, steps=60, **(SIZES | options))
     scene = scene_set.scenes
     scene["size"][:, 1:, 1] = width
-    found = find_evasions(scene, scene["logged"], scene["logged_valid"], sim or SimSettings(), moment)
+    found = find_evasions(scene, scene["logged"], valid=scene["logged_valid"], sim=sim or SimSettings(), moment=moment)
     return found, scene_set
 
 
@@ -59,7 +59,7 @@ def test_the_boxed_in_have_no_way_out_and_nothing_is_claimed():
     scene_set = make_scenes(1, vehicles=BOXED, num_vrus=0, steps=60, **SIZES)
     scene = scene_set.scenes
     scene["logged"][:, :, 1, 0] += torch.linspace(0, 6, 61)  # the one behind pushes
-    result = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings())
+    result = find_evasions(scene, scene["logged"], valid=scene["logged_valid"], sim=SimSettings())
     assert not result.found.any()
 
 
@@ -81,7 +81,7 @@ def test_the_strategy_finds_what_the_grid_does_not(monkeypatch):
 def test_a_rollout_s_result_does_not_depend_on_the_batch():
     together, scene_set = search(CUT, count=3)
     scene = scene_set.scenes[2:]
-    alone = find_evasions(scene, scene["logged"], scene["logged_valid"], SimSettings())
+    alone = find_evasions(scene, scene["logged"], valid=scene["logged_valid"], sim=SimSettings())
     torch.testing.assert_close(together.states[2], alone.states[0], atol=1e-4, rtol=0)
 
 
@@ -93,28 +93,28 @@ def collided():
     scene_set = make_scenes(2, vehicles=SLOW_AHEAD, num_vrus=0, steps=60, max_vehicles=8, max_agents=10)
     scene = scene_set.scenes
     more = {"adversaries": scene["valid"] & False, "seed": torch.arange(2), "eta": torch.zeros(2).double()}
-    return scene, Rollouts.in_scenes(scene_set, torch.arange(2), scene["logged"], scene["logged_valid"], **more)
+    return scene, Rollouts.in_scenes(scene_set, torch.arange(2), states=scene["logged"], valid=scene["logged_valid"], **more)
 
 
 def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_none():
     scene, rollouts = collided()
     rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 0, "contact_step": float("nan")}]
-    add_avoidable(rows, rollouts, scene, SimSettings())
+    add_avoidable(rows, rollouts, scene=scene, sim=SimSettings())
     evasions = rollouts.evasion
     assert rows[0]["avoidable"] == 1 and "avoidable" not in rows[1]
     assert evasions.shape == (2, 61, 4) and evasions[1].isnan().all()
     torch.testing.assert_close(evasions[0, 0], scene["logged"][0, 0, 0])
     size = scene["size"][0]
-    gap = separation(evasions[0][:, None], size[:1], scene["logged"][0, :, 1:], size[1:])
+    gap = separation(evasions[0][:, None], size[:1], second=scene["logged"][0, :, 1:], second_size=size[1:])
     assert (gap[scene["logged_valid"][0, :, 1:]] > 0).all()
-    driven = separation(scene["logged"][0, :, :1], size[:1], scene["logged"][0, :, 1:2], size[1:2])
+    driven = separation(scene["logged"][0, :, :1], size[:1], second=scene["logged"][0, :, 1:2], second_size=size[1:2])
     assert (driven < 0).any(), "the ego as driven has the collision"
 
 
 def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
     driven = torch.zeros(3, 10, 4)
     after = torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
-    found = spliced(driven, after, torch.tensor([0, 4, 10]))[..., 0]
+    found = spliced(driven, after, moment=torch.tensor([0, 4, 10]))[..., 0]
     assert found[0].tolist() == list(range(1, 11))
     assert found[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6] and found[2].tolist() == [0] * 10
 
@@ -127,11 +127,11 @@ def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkey
         found = torch.tensor([moment is not None] * len(states))
         track = torch.full((len(states), 60, 4), 7.0)
         peak = torch.full((len(states),), 3.0)
-        return evasion.Evasions(found, track[..., :2], track, peak, batch_size=[len(states)])
+        return evasion.Evasions(found, track[..., :2], states=track, peak=peak, batch_size=[len(states)])
 
     monkeypatch.setattr(evasion, "find_evasions", late_only)
     rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 1, "contact_step": 4.0}]
-    add_avoidable(rows, rollouts, scene, SimSettings())
+    add_avoidable(rows, rollouts, scene=scene, sim=SimSettings())
     assert asked == [None, [30, 0]]
     assert [(row["avoidable"], row["avoidable_1s"], row["evasion_accel"]) for row in rows] == [(1, 1, 3.0)] * 2
     assert torch.equal(rollouts.evasion[0, :31], scene["logged"][0, :31, 0]) and (rollouts.evasion[0, 31:] == 7).all()

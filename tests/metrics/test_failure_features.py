@@ -36,30 +36,30 @@ def swerve(sign, begin, seconds=1.0, rate=0.2):
     return lambda t: sign * rate * ((begin <= t < begin + seconds) - (begin + seconds <= t < begin + 2 * seconds))
 
 
-EGO = course(0, 0, EAST, 12)
+EGO = course(0, 0, heading=EAST, speed=12)
 STRAIGHT = ("keeps speed", "keeps speed")
 CASES = [
-    (EGO, course(30.5, 0, EAST, 5), ("ahead", *STRAIGHT)),
+    (EGO, course(30.5, 0, heading=EAST, speed=5), ("ahead", *STRAIGHT)),
     (EGO, drive(20, 0, EAST, 12, accel=lambda t: -5.0 if t > 0.5 else 0.0), ("ahead", "keeps speed", "brakes")),
-    *((EGO, course(40, 0, heading, 0), ("ahead", "keeps speed", "stands")) for heading in (EAST, NORTH, WEST, 2.0)),
-    (course(0, 0, EAST, 10), course(43.0, -24, NORTH, 6), ("crossing from the right", *STRAIGHT)),
-    (course(0, 0, EAST, 10), course(43.0, 24, SOUTH, 6), ("crossing from the left", *STRAIGHT)),
+    *((EGO, course(40, 0, heading=heading, speed=0), ("ahead", "keeps speed", "stands")) for heading in (EAST, NORTH, WEST, 2.0)),
+    (course(0, 0, heading=EAST, speed=10), course(43.0, -24, heading=NORTH, speed=6), ("crossing from the right", *STRAIGHT)),
+    (course(0, 0, heading=EAST, speed=10), course(43.0, 24, heading=SOUTH, speed=6), ("crossing from the left", *STRAIGHT)),
     (  # a left turn across oncoming traffic, of the ego and of its partner
         drive(-10, 0, EAST, 6, turn=lambda t: 0.4 if 2 < t < 5 else 0.0),
-        course(47, 5, WEST, 9),
+        course(47, 5, heading=WEST, speed=9),
         ("oncoming", "turns left", "keeps speed"),
     ),
     (
-        course(0, 0, EAST, 8),
+        course(0, 0, heading=EAST, speed=8),
         drive(26, 3.5, WEST, 6, turn=lambda t: 0.5 if t > 0.5 else 0.0),
         ("oncoming", "keeps speed", "turns left"),
     ),
     (
         drive(0, 0, EAST, 10, accel=lambda t: -4.0 if t > 1 else 0.0),
-        course(-14, 0, EAST, 10),
+        course(-14, 0, heading=EAST, speed=10),
         ("from behind", "brakes", "keeps speed"),
     ),
-    (course(0, 0, EAST, 0), course(-30, 0.5, EAST, 15), ("from behind", "stands", "keeps speed")),
+    (course(0, 0, heading=EAST, speed=0), course(-30, 0.5, heading=EAST, speed=15), ("from behind", "stands", "keeps speed")),
 ]
 
 
@@ -71,7 +71,7 @@ def test_known_cases_have_their_words(ego, partner, expected):
 @pytest.mark.parametrize(("side", "sign", "other"), [("left", 1, "right"), ("right", -1, "left")])
 def test_who_comes_over_cuts_in_from_its_side_or_is_beside(side, sign, other):
     cuts_in = drive(18, 3.5 * sign, EAST, 9, turn=swerve(-sign, 1.5))
-    assert words(course(0, 0, EAST, 13), cuts_in) == (f"cut-in from the {side}", "keeps speed", f"veers {other}")
+    assert words(course(0, 0, heading=EAST, speed=13), cuts_in) == (f"cut-in from the {side}", "keeps speed", f"veers {other}")
     beside = drive(0, 3.5 * sign, EAST, 12, turn=swerve(-sign, 2.0))
     assert words(EGO, beside) == (f"beside on the {side}", "keeps speed", f"veers {other}")
 
@@ -103,14 +103,14 @@ def test_along_a_bend_of_the_lane_nobody_veers():
 
 
 def test_contacts_soon_after_the_start_use_what_is_known():
-    batch = as_doubles(scene(course(0, 0, EAST, 10), course(9, 0, EAST, 0, appears=2)))
+    batch = as_doubles(scene(course(0, 0, heading=EAST, speed=10), course(9, 0, heading=EAST, speed=0, appears=2)))
     batch |= first_contact(batch)
     window, known, size = last_seconds(batch)
     assert window.shape == (1, WINDOW + 1, 2, 4) and size.shape == (1, 2, 2)
     assert known.tolist() == [int(batch["before"]) - 2] and window[0, 0, 0, 0] == pytest.approx(2.0)
-    late = course(5.5, 0, EAST, 5, appears=2)  # a step before the contact
-    assert words(course(0, 0, EAST, 8), late)[1:] == ("keeps speed", "keeps speed")
-    assert words(course(0, 0, EAST, 8), course(5.5, 0, EAST, 5, appears=5))[1:] == ("", "")  # at its birth: none
+    late = course(5.5, 0, heading=EAST, speed=5, appears=2)  # a step before the contact
+    assert words(course(0, 0, heading=EAST, speed=8), late)[1:] == ("keeps speed", "keeps speed")
+    assert words(course(0, 0, heading=EAST, speed=8), course(5.5, 0, heading=EAST, speed=5, appears=5))[1:] == ("", "")  # at its birth: none
 
 
 def test_speeds_just_above_and_below_the_thresholds():
@@ -119,5 +119,5 @@ def test_speeds_just_above_and_below_the_thresholds():
     for gain, word in ((1.2, "accelerates"), (0.8, "keeps speed"), (-0.8, "keeps speed"), (-1.2, "brakes")):
         window = still.clone()
         window[0, :, 0, 3] = 10 + gain * 0.1 * (steps - WINDOW + LATE).clamp(min=0)
-        found = manoeuvre(window, torch.tensor([WINDOW]), window[..., 2])
+        found = manoeuvre(window, torch.tensor([WINDOW]), lanes=window[..., 2])
         assert MANOEUVRES[found.item()] == word

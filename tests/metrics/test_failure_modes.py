@@ -140,7 +140,7 @@ def test_coverage_is_the_expected_number_of_modes_at_so_many_places():
     given = torch.tensor(labels, dtype=torch.float64), torch.tensor(places)
     for count in (1, 2, 4, 6):
         found = resampled_labels(*given, bootstrap_draws(6, 3), count)
-        assert found[0].item() == pytest.approx(expected_labels(labels, places, count), abs=0.05)
+        assert found[0].item() == pytest.approx(expected_labels(labels, places, count=count), abs=0.05)
     assert resampled_labels(*given, bootstrap_draws(6, 3), 7).isnan().all(), "there are only six places"
     rows = [failure(CROSSING, scene=str(index), mode=3) | {"counted": float(index % 3 == 0)} for index in range(36)]
     coverage = [metric for metric in row_metrics() if metric.places]

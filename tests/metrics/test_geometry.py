@@ -41,8 +41,8 @@ def test_shared_and_collinear_edges_need_no_special_case(turn):
     forward = torch.tensor([math.cos(turn), math.sin(turn), 0, 0], dtype=torch.float64)
     for shift, expected in ((0.0, 8.0), (1.0, 6.0), (4.0, 0.0), (5.0, 0.0)):
         other = state + shift * forward
-        assert overlap_area(state, size, other, size).item() == pytest.approx(expected, abs=1e-9)
-    assert overlap_area(state, size, state, size / 2).item() == pytest.approx(2.0, abs=1e-9)
+        assert overlap_area(state, size, second=other, second_size=size).item() == pytest.approx(expected, abs=1e-9)
+    assert overlap_area(state, size, second=state, second_size=size / 2).item() == pytest.approx(2.0, abs=1e-9)
 
 
 def test_edge_parts_are_shapely_s():

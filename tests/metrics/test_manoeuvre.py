@@ -52,7 +52,7 @@ def test_a_bend_is_followed_at_the_shift_asked_for():
     route = arc(25.0).double()
     ramp = (torch.arange(KNOTS).double() / 4).clamp(max=1)
     for wanted in (0.0, 2.0, -3.0):
-        _, states = execute(start, route, 0 * ramp, wanted * ramp, STEPS, LIMITS)
+        _, states = execute(start, route, accel=0 * ramp, shift=wanted * ramp, steps=STEPS, sim=LIMITS)
         offset = project(states[40:, :2], route)[1]
         assert (offset - wanted).abs().max() < 0.4, offset
 
@@ -61,7 +61,7 @@ def test_limits_hold_and_the_actions_give_the_states():
     generator = torch.Generator().manual_seed(1)
     accel, shift = 20 * torch.randn(2, 200, KNOTS, generator=generator)
     start = START.expand(200, 4)
-    actions, states = execute(start, arc(15.0), accel, shift, STEPS, LIMITS)
+    actions, states = execute(start, arc(15.0), accel=accel, shift=shift, steps=STEPS, sim=LIMITS)
     assert actions[..., 0].min() >= -8 and actions[..., 0].max() <= 5 and actions[..., 1].abs().max() <= 1.6
     torch.testing.assert_close(dynamics.rollout(start, actions), states)
     assert peak_acceleration(start, states).max() < dynamics.MAX_LATERAL + 1e-2, "braking and turning share the grip"
@@ -82,7 +82,7 @@ def trajectories(scene, shift=0.0, speed=10.0, steps=40):
 
 def evasion_scene(scene_set, moment=0):
     scene = scene_set.scenes
-    return EvasionScene.after(torch.full((len(scene_set),), moment), scene, scene["logged"], scene["logged_valid"])
+    return EvasionScene.after(torch.full((len(scene_set),), moment), scene, states=scene["logged"], valid=scene["logged_valid"])
 
 
 def test_contact_is_what_the_environment_calls_contact():
@@ -95,7 +95,7 @@ def test_contact_is_what_the_environment_calls_contact():
         after = env.step(td)["next"]
         hit.append(after["metrics", "contact"][:, 0])
         td = after.exclude("reward")
-    missed = violations(trajectories(scene_set.scenes), evasion_scene(scene_set), 0.0, 0.0)[:, 0]
+    missed = violations(trajectories(scene_set.scenes), evasion_scene(scene_set), clearance=0.0, road_margin=0.0)[:, 0]
     assert torch.equal(missed > 0, torch.stack(hit, 1)) and (missed > 0).any()
 
 
@@ -103,30 +103,30 @@ def test_pedestrians_count_and_the_absent_do_not():
     scene_set = make_scenes(1, vehicles=[(0, 0, 10.0)], num_vrus=1, steps=40, **SMALL)
     scene_set.scenes["logged"][:, :, 4, 1] = 0.0
     ego = trajectories(scene_set.scenes)
-    assert (violations(ego, evasion_scene(scene_set), 0.0, 0.0) > 0).any()
+    assert (violations(ego, evasion_scene(scene_set), clearance=0.0, road_margin=0.0) > 0).any()
     scene_set.scenes["logged_valid"][:, :, 4] = False
     task = evasion_scene(scene_set)
-    assert (violations(ego, task, 0.0, 0.0) == 0).all() and (task.others < AWAY).all()
+    assert (violations(ego, task, clearance=0.0, road_margin=0.0) == 0).all() and (task.others < AWAY).all()
 
 
 def test_clearance_widens_and_the_road_ends_beside():
     scene_set = make_scenes(1, vehicles=[(0, 0, 10.0), (5, 1, 10.0)], num_vrus=0, steps=40, **SMALL)
     gap = LANE_WIDTH - 2.0
     task = evasion_scene(scene_set)
-    assert (violations(trajectories(scene_set.scenes), task, gap - 0.05, 0.0) == 0).all()
-    assert (violations(trajectories(scene_set.scenes), task, gap + 0.05, 0.0) > 0).any()
-    assert (violations(trajectories(scene_set.scenes, shift=-4.5), task, 0.0, 0.0) > 1).all()
+    assert (violations(trajectories(scene_set.scenes), task, clearance=gap - 0.05, road_margin=0.0) == 0).all()
+    assert (violations(trajectories(scene_set.scenes), task, clearance=gap + 0.05, road_margin=0.0) > 0).any()
+    assert (violations(trajectories(scene_set.scenes, shift=-4.5), task, clearance=0.0, road_margin=0.0) > 1).all()
     edge = trajectories(scene_set.scenes, shift=-LANE_WIDTH / 2 - 0.7)  # 0.3 m inside the border
-    assert (violations(edge, task, 0.0, 0.1) == 0).all()
-    assert (violations(edge, task, 0.0, 0.5) > 0).all()
+    assert (violations(edge, task, clearance=0.0, road_margin=0.1) == 0).all()
+    assert (violations(edge, task, clearance=0.0, road_margin=0.5) > 0).all()
 
 
 def test_nothing_counts_behind_the_map_s_end_or_after_the_episode():
     cars = [(0, 0, 10.0), (30, 0, 0.0)]
     for end, misses in ((400.0, True), (20.0, False)):
         scene_set = make_scenes(1, vehicles=cars, num_vrus=0, steps=40, road=(-60.0, end), **SMALL)
-        assert (violations(trajectories(scene_set.scenes), evasion_scene(scene_set), 0.0, 0.0) > 0).any() == misses
+        assert (violations(trajectories(scene_set.scenes), evasion_scene(scene_set), clearance=0.0, road_margin=0.0) > 0).any() == misses
     scene_set = make_scenes(1, vehicles=cars, num_vrus=0, steps=40, **SMALL)
     late = evasion_scene(scene_set, moment=30)
     assert late.inside.sum() == 10
-    assert (violations(trajectories(scene_set.scenes), late, 0.0, 0.0)[..., 10:] == 0).all()
+    assert (violations(trajectories(scene_set.scenes), late, clearance=0.0, road_margin=0.0)[..., 10:] == 0).all()

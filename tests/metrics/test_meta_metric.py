@@ -39,7 +39,7 @@ def test_weights_sum_to_one_so_that_a_certain_log_has_one():
 
 
 def test_bins_are_equal_parts_of_the_range_and_the_outer_ones_take_the_rest():
-    feature = Feature(1.0, -2.0, 6.0, 4)
+    feature = Feature(1.0, -2.0, high=6.0, bins=4)
     values = torch.tensor([-100.0, -2.0, -0.01, 0.0, 1.9, 2.0, 5.9, 6.0, 1e6])
     assert bin_index(values, feature).tolist() == [0, 0, 0, 1, 1, 2, 3, 3, 3]
 
@@ -53,21 +53,21 @@ def test_probabilities_of_all_bins_sum_to_one():
 def test_an_indication_has_the_share_of_rollouts_smoothed():
     hits = torch.tensor([0.0, 8.0, 2.0, 2.0])
     happened = torch.tensor([False, True, True, False])
-    p = log_bernoulli(hits, 8, happened).exp()
+    p = log_bernoulli(hits, 8, happened=happened).exp()
     sure = (8 + SMOOTHING) / (8 + 2 * SMOOTHING)
     assert p.tolist() == pytest.approx([sure, sure, 2.1 / 8.2, 6.1 / 8.2])
-    assert torch.allclose(log_bernoulli(hits, 8, ~happened).exp() + p, torch.ones(4))
+    assert torch.allclose(log_bernoulli(hits, 8, happened=~happened).exp() + p, torch.ones(4))
 
 
 def test_a_scene_s_likelihood_is_the_geometric_mean_over_its_known_values():
     p = torch.tensor([[0.5, 0.25], [0.125, 0.9], [0.3, 0.3]], dtype=torch.float64)
     known = torch.tensor([[True, True], [True, False], [True, True]])
     scene = torch.tensor([2, 2, 0])
-    found = likelihood(p.log(), known, scene, 3)
+    found = likelihood(p.log(), known, scene=scene, scenes=3)
     assert found[0].item() == pytest.approx(0.3) and found[1].isnan()
     assert found[2].item() == pytest.approx((0.5 * 0.25 * 0.125) ** (1 / 3))
     order = torch.tensor([1, 2, 0])
-    assert torch.allclose(likelihood(p.log()[order], known[order], scene[order], 3), found, equal_nan=True)
+    assert torch.allclose(likelihood(p.log()[order], known[order], scene=scene[order], scenes=3), found, equal_nan=True)
 
 
 CAR = (4.0, 2.0)
@@ -132,8 +132,8 @@ def test_the_nearest_object_is_the_smallest_signed_distance():
     size = 1 + 5 * draw(25, 2)
     other_size = 0.5 + 11 * draw(25, 5, 2)
     seen = draw(25, 2, 5) < 0.8
-    found = nearest_object(track, size, others, other_size, seen)
-    gaps = signed_distance(track[:, :, None], size[:, None, None], others, other_size[:, None])
+    found = nearest_object(track, size, others=others, other_size=other_size, seen=seen)
+    gaps = signed_distance(track[:, :, None], size[:, None, None], second=others, second_size=other_size[:, None])
     torch.testing.assert_close(found, gaps.masked_fill(~seen, FAR).amin(-1))
     assert 5 < (found < 0).sum() < 45, "the draw must hold boxes apart and overlapping ones"
 
@@ -167,7 +167,7 @@ def test_metres_beyond_the_road_are_those_of_the_worst_corner():
     origin = torch.tensor([[-30.0, -30.0]])
     for heading, reach in ((0.0, 2.0), (math.pi / 2, 1.0), (math.atan2(2, 4), math.hypot(2, 1) * math.cos(0))):
         state = torch.tensor([[[[5.0, 3.0, heading, 0.0]]]])
-        found = beyond_road(state, torch.tensor([[CAR]]), field, origin).item()
+        found = beyond_road(state, torch.tensor([[CAR]]), field=field, origin=origin).item()
         assert found == pytest.approx(30 + 5 + reach, abs=1e-4)
 
 
@@ -179,7 +179,7 @@ def crossing_of(light_state, known=None, light=(0, -1), speed=10.0):
     known = torch.ones(1, steps, dtype=torch.bool) if known is None else known
     route = torch.stack([2.0 * torch.arange(-5, 40), torch.zeros(45)], -1)[None]
     return runs_red_light(
-        track, known, torch.tensor([CAR]), route, torch.tensor([light]), torch.tensor([[18.0, 0.0]]), light_state[None]
+        track, known, size=torch.tensor([CAR]), route=route, light=torch.tensor([light]), light_s=torch.tensor([[18.0, 0.0]]), state=light_state[None]
     ).item()  # 18 m from the route's begin
 
 

@@ -12,7 +12,7 @@ shapely = pytest.importorskip("shapely")
 
 
 def doubles(rollouts, seed):
-    road = random_map(rollouts, 60.0, torch.Generator().manual_seed(seed))
+    road = random_map(rollouts, 60.0, generator=torch.Generator().manual_seed(seed))
     return {key: value.double() if value.is_floating_point() else value for key, value in road.items()}
 
 
@@ -32,12 +32,12 @@ def parts(road, name, rollout, minimum):
 
 
 def test_distance_to_lanes_is_shapely_s():
-    road, (points, rollout) = doubles(4, 1), random_points(6000, 4, 2)
-    near = near_lane(points, rollout, road["lane_points"], road["lane_index"], road["lane_width"]).numpy()
+    road, (points, rollout) = doubles(4, 1), random_points(6000, 4, seed=2)
+    near = near_lane(points, rollout, lane_points=road["lane_points"], lane_index=road["lane_index"], lane_width=road["lane_width"]).numpy()
     for index in range(4):
         chosen = (rollout == index).numpy()
         expected = np.zeros(chosen.sum(), bool)
-        for line, lane in parts(road, "lane", index, 2):
+        for line, lane in parts(road, "lane", rollout=index, minimum=2):
             reach = road["lane_width"][index, line].item() / 2 + 1.0
             where = shapely.points(points[chosen].numpy())
             expected |= shapely.distance(shapely.LineString(lane), where) <= reach
@@ -46,22 +46,22 @@ def test_distance_to_lanes_is_shapely_s():
 
 
 def test_inside_overlapping_polygons_is_shapely_s():
-    road, (points, rollout) = doubles(5, 3), random_points(6000, 5, 4)
-    inside = inside_polygon(points, rollout, road["drivable_points"], road["drivable_index"]).numpy()
+    road, (points, rollout) = doubles(5, 3), random_points(6000, 5, seed=4)
+    inside = inside_polygon(points, rollout, polygon_points=road["drivable_points"], polygon_index=road["drivable_index"]).numpy()
     for index in range(5):
         chosen = (rollout == index).numpy()
         where = shapely.points(points[chosen].numpy())
         expected = np.zeros(chosen.sum(), bool)
-        for _, ring in parts(road, "drivable", index, 3):
+        for _, ring in parts(road, "drivable", rollout=index, minimum=3):
             expected |= shapely.contains(shapely.Polygon(ring), where)
         np.testing.assert_array_equal(inside[chosen], expected)
 
 
 def test_a_vehicle_off_the_road_at_the_start_is_left_out():
-    ego = course(0, 0, 0, 10)
-    stays = course(50, 0, 0, 10)
-    parked = course(0, 40, 0, 0)
-    leaves = course(100, 0, 0.5, 10)
+    ego = course(0, 0, heading=0, speed=10)
+    stays = course(50, 0, heading=0, speed=10)
+    parked = course(0, 40, heading=0, speed=0)
+    leaves = course(100, 0, heading=0.5, speed=10)
     result = row(ego, stays, parked)
     assert (result["aor_step"], result["aor_any"], result["aor_left_out"]) == (0, 0, 1)
     result = row(ego, stays, leaves)
@@ -72,10 +72,10 @@ def test_a_vehicle_off_the_road_at_the_start_is_left_out():
 
 
 def test_the_ego_leaves_the_road_or_not_and_is_unknown_where_it_starts_beside_it():
-    other = course(50, 0, 0, 10)
-    leaves = course(0, 0, 0.5, 10)
-    stays = course(0, 0, 0, 10)
-    beside = course(0, 40, 0, 10)
+    other = course(50, 0, heading=0, speed=10)
+    leaves = course(0, 0, heading=0.5, speed=10)
+    stays = course(0, 0, heading=0, speed=10)
+    beside = course(0, 40, heading=0, speed=10)
     assert (row(leaves, other)["ego_off_road"], row(stays, other)["ego_off_road"]) == (1, 0)
     assert np.isnan(row(beside, other)["ego_off_road"])
 
@@ -86,4 +86,4 @@ def test_a_seam_between_polygons_is_theirs_and_an_outer_border_is_none(gap, on):
     polygons = torch.cat([square, square + torch.tensor([10.0 + gap, 0.0])])[None]
     index = torch.arange(2).repeat_interleave(4)[None]
     points = torch.tensor([[10.0 + gap / 2, 5.0], [-0.1, 5.0], [5.0, 10.1]], dtype=torch.float64)
-    assert in_seam(points, torch.zeros(3, dtype=torch.long), polygons, index).tolist() == [on, False, False]
+    assert in_seam(points, torch.zeros(3, dtype=torch.long), polygon_points=polygons, polygon_index=index).tolist() == [on, False, False]

@@ -31,14 +31,14 @@ def circle(radius, speed, steps=80):
 
 def others(*tracks):
     states = torch.cat(tracks)[None].transpose(1, 2)
-    return Tracks(states, SIZE.expand(1, len(tracks), 2), torch.ones(states.shape[:3], dtype=torch.bool))
+    return Tracks(states, SIZE.expand(1, len(tracks), 2), present=torch.ones(states.shape[:3], dtype=torch.bool))
 
 
 @pytest.mark.parametrize("way", [track(9.0), circle(30.0, 8.0), track(torch.linspace(10, 0, 81))])
 @pytest.mark.parametrize("name", DRIVERS)
 def test_a_vehicle_alone_drives_as_recorded(way, name):
     far = others(track(0.0, start=(500.0, 500.0)))
-    driven = redrive(DRIVERS[name], way, SIZE, along_way(way, SIZE[:, 1], far))
+    driven = redrive(DRIVERS[name], way, size=SIZE, others=along_way(way, SIZE[:, 1], others=far))
     assert torch.allclose(driven[..., :2], way[..., :2], atol=0.02)
     assert torch.allclose(driven[..., 3], way[..., 3], atol=1e-9)
 
@@ -47,7 +47,7 @@ def test_a_vehicle_alone_drives_as_recorded(way, name):
 def test_it_never_leaves_its_way_nor_outruns_its_recording(name):
     way = circle(40.0, 12.0)
     blocker = others(torch.tensor([[[36.0, 22.0, 1.0, 0.0]]], dtype=torch.float64).expand(1, 81, 4))
-    driven = redrive(DRIVERS[name], way, SIZE, along_way(way, SIZE[:, 1], blocker))
+    driven = redrive(DRIVERS[name], way, size=SIZE, others=along_way(way, SIZE[:, 1], others=blocker))
     assert ((driven[..., :2] - torch.tensor([0.0, 40.0])).norm(dim=-1) - 40.0).abs().max() < 0.05
     assert (driven_length(driven) <= driven_length(way) + 0.01).all()
     assert (driven[..., 3] < way[..., 3] - 1).any()  # it did brake
@@ -75,9 +75,9 @@ def driven_again(driver, cut_in):
     # The oracle's vehicles do not turn: their lateral speed is not in their heading.
     other = torch.stack([x, y, zero, zero + cut_in.other_speed], -1).transpose(0, 1)
     size = torch.tensor([[LENGTH, WIDTH]], dtype=torch.float64).expand(len(ego), 2)
-    tracks = Tracks(other[:, :, None], size[:, None], torch.ones_like(other[..., :1], dtype=torch.bool))
-    along = along_way(ego, size[:, 1], tracks)._replace(lateral_speed=side_speed[: steps + 1, :, None])
-    return contacts(redrive(driver, ego, size, along), size, tracks)[..., 0].any(1)
+    tracks = Tracks(other[:, :, None], size[:, None], present=torch.ones_like(other[..., :1], dtype=torch.bool))
+    along = along_way(ego, size[:, 1], others=tracks)._replace(lateral_speed=side_speed[: steps + 1, :, None])
+    return contacts(redrive(driver, ego, size=size, others=along), size, others=tracks)[..., 0].any(1)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -107,7 +107,7 @@ def collision(ego, *others, partner=1):
     assert touch.any()
     stop = touch.int().argmax()[None]
     present = torch.ones(states.shape[:3], dtype=torch.bool)
-    return Collision(states, present, SIZE.expand(1, states.shape[2], 2), torch.tensor([partner]), stop)
+    return Collision(states, present, size=SIZE.expand(1, states.shape[2], 2), partner=torch.tensor([partner]), stop=stop)
 
 
 def human(case):
@@ -116,7 +116,7 @@ def human(case):
 
 def test_a_cut_in_is_preventable_where_there_is_room_to_brake():
     ego = track(14.0)
-    near, far = (human(collision(ego, cut_in(gap, 14.0, 6.0))) for gap in (5.0, 14.0))
+    near, far = (human(collision(ego, cut_in(gap, 14.0, other_speed=6.0))) for gap in (5.0, 14.0))
     assert not near.avoided.any() and far.avoided.all() and not far.followers.any()
     needed = HumanDriver().stopping_gap(torch.tensor(8.0))
     assert 5.0 < needed < 14.0
@@ -140,7 +140,7 @@ def follower(gap, speed=14.0):
 
 @pytest.mark.parametrize("gap, avoided", [(20.0, True), (1.0, False)])
 def test_a_follower_that_is_replayed_into_the_driver_brakes_as_competently_as_it_can(gap, avoided):
-    case = collision(track(14.0), cut_in(14.0, 14.0, 6.0), follower(gap))
+    case = collision(track(14.0), cut_in(14.0, 14.0, other_speed=6.0), follower(gap))
     result = human(case)
     assert result.avoided.item() is avoided
     assert (result.followers > 0).item() is avoided
@@ -148,12 +148,12 @@ def test_a_follower_that_is_replayed_into_the_driver_brakes_as_competently_as_it
 
 @pytest.mark.parametrize("gap, avoided", [(44.0, True), (30.0, False)])
 def test_a_second_follower_must_manage_behind_the_first(gap, avoided):
-    result = human(collision(track(14.0), cut_in(14.0, 14.0, 6.0), follower(20.0), follower(gap)))
+    result = human(collision(track(14.0), cut_in(14.0, 14.0, other_speed=6.0), follower(20.0), follower(gap)))
     assert result.avoided.item() is avoided
 
 
 def test_the_order_of_the_others_does_not_matter():
-    case = collision(track(14.0), cut_in(13.0, 14.0, 6.0), follower(20.0), track(10.0, start=(3.0, -3.5)))
+    case = collision(track(14.0), cut_in(13.0, 14.0, other_speed=6.0), follower(20.0), track(10.0, start=(3.0, -3.5)))
     order = torch.tensor([0, 3, 2, 1])
     other = preventions(case._replace(states=case.states[:, :, order], partner=torch.tensor([3])))
     for name, result in preventions(case).items():

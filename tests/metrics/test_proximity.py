@@ -27,12 +27,12 @@ def test_cost_is_the_mean_over_steps_of_the_worst_adversary():
 
 
 def test_gap_is_the_smallest_box_distance():
-    assert row(course(0, 0, 0, 5), course(0, 5, 0, 5))["min_dtc"] == pytest.approx(3.0, abs=1e-5)
-    assert math.isnan(row(course(0, 0, 0, 5))["min_dtc"]), "nobody else: unknown"
+    assert row(course(0, 0, heading=0, speed=5), course(0, 5, heading=0, speed=5))["min_dtc"] == pytest.approx(3.0, abs=1e-5)
+    assert math.isnan(row(course(0, 0, heading=0, speed=5))["min_dtc"]), "nobody else: unknown"
 
 
 def test_constant_braking_has_its_own_mean_acceleration_and_way():
-    result = row(course(0, 0, 0.3, 20, accel=-2))
+    result = row(course(0, 0, heading=0.3, speed=20, accel=-2))
     assert result["macc"] == pytest.approx(2, abs=1e-3)
     assert result["progress"] == pytest.approx(20 * 8 - 64, abs=1e-3)
 
@@ -45,9 +45,9 @@ def test_short_paths_have_no_acceleration():
 
 
 def test_gaps_of_the_ego_s_track_are_closed_before_measuring():
-    states, valid = course(0, 0, 0, 10)
+    states, valid = course(0, 0, heading=0, speed=10)
     valid[3:6] = False
-    path, count = ego_path(states[None, :, None], valid[None, :, None], torch.tensor([80]))
+    path, count = ego_path(states[None, :, None], valid[None, :, None], stop=torch.tensor([80]))
     assert count.item() == 78 and progress(path, count).item() == pytest.approx(80)
 
 
@@ -62,12 +62,12 @@ def completion(ego, recorded, *others):
 
 def test_the_share_of_the_recorded_way_is_what_lies_behind_the_ego():
     """On it and beside it alike; more than the recording has drives no more than all of it."""
-    recorded = course(0, 0, 0.3, 10)
+    recorded = course(0, 0, heading=0.3, speed=10)
     assert completion(recorded, recorded) == pytest.approx(1)
-    assert completion(course(0, 0, 0.3, 4), recorded) == pytest.approx(0.4, abs=1e-4)
-    assert completion(course(-math.sin(0.3), math.cos(0.3), 0.3, 4), recorded) == pytest.approx(0.4, abs=1e-4)
-    assert completion(course(0, 0, 0.3, 20), recorded) == 1
-    assert completion(course(0, 0, 0.3 + math.pi, 5), recorded) == 0
+    assert completion(course(0, 0, heading=0.3, speed=4), recorded) == pytest.approx(0.4, abs=1e-4)
+    assert completion(course(-math.sin(0.3), math.cos(0.3), heading=0.3, speed=4), recorded) == pytest.approx(0.4, abs=1e-4)
+    assert completion(course(0, 0, heading=0.3, speed=20), recorded) == 1
+    assert completion(course(0, 0, heading=0.3 + math.pi, speed=5), recorded) == 0
 
 
 def test_a_bent_way_counts_by_its_length_and_a_standing_ego_has_none():
@@ -75,21 +75,21 @@ def test_a_bent_way_counts_by_its_length_and_a_standing_ego_has_none():
     bent = torch.stack([20 * angle.sin(), 20 - 20 * angle.cos(), angle, torch.full_like(angle, 8)], -1)
     everywhere = torch.ones(1, 81, 1, dtype=torch.bool)
     for steps in (20, 40, 80):
-        found = route_completion(bent[None], torch.tensor([steps + 1]), bent[None, :, None], everywhere)
+        found = route_completion(bent[None], torch.tensor([steps + 1]), logged=bent[None, :, None], logged_valid=everywhere)
         assert found.item() == pytest.approx(steps / 80, abs=1e-6)
     gone = everywhere & (torch.arange(81) <= 40)[:, None]
-    found = route_completion(bent[None], torch.tensor([21]), bent[None, :, None], gone)
+    found = route_completion(bent[None], torch.tensor([21]), logged=bent[None, :, None], logged_valid=gone)
     assert found.item() == pytest.approx(0.5, abs=1e-6), "of the way that is recorded"
-    assert math.isnan(completion(course(0, 0, 0, 5), course(0, 0, 0, 0.1)))
+    assert math.isnan(completion(course(0, 0, heading=0, speed=5), course(0, 0, heading=0, speed=0.1)))
 
 
 @pytest.mark.parametrize("steps", [5, 24, 26, 60, 81])
 def test_the_share_of_a_way_that_crosses_itself_is_what_was_driven(steps):
     """The crossing is passed at the steps 15 and 82; near it, the nearest piece is of the other passage."""
-    recorded = track(loop(), 20.0, 25.0, steps=90)[None].double()
+    recorded = track(loop(), 20.0, speed=25.0, steps=90)[None].double()
     ego = recorded + torch.tensor([0.3, -0.3, 0, 0])
     everywhere = torch.ones(1, 91, 1, dtype=torch.bool)
-    found = route_completion(ego, torch.tensor([steps + 1]), recorded[:, :, None], everywhere)
+    found = route_completion(ego, torch.tensor([steps + 1]), logged=recorded[:, :, None], logged_valid=everywhere)
     assert found.item() == pytest.approx(steps / 90, abs=0.01)
 
 

@@ -63,5 +63,5 @@ def test_a_little_more_room_is_survived_and_a_little_less_is_not(name):
     other = rows["cut_in_kmh"] / 3.6
     for sign in (1, -1):
         gap = rows[f"{name}_m"] + sign * TIME[name] * (speed - other)
-        crash = simulate_cut_ins(DRIVERS[name], CutIn(speed, other, gap, rows["lateral_mps"]))
+        crash = simulate_cut_ins(DRIVERS[name], CutIn(speed, other, gap=gap, lateral_speed=rows["lateral_mps"]))
         assert (crash == (sign < 0)).all(), (sign, (crash == (sign > 0)).nonzero()[:, 0].tolist())

@@ -23,7 +23,7 @@ def test_a_draw_equals_the_distance_of_the_repeated_samples():
     pair = torch.randn(2, 9000, generator=generator, dtype=torch.float64)  # more than one block of columns
     cluster = torch.randint(5, (9000,), generator=generator)
     draws = torch.tensor([[1.0, 0, 2, 1, 3], [0, 0, 5, 0, 0], [0, 0, 0, 0, 0]], dtype=torch.float64)
-    result = wasserstein(pair, cluster, draws)
+    result = wasserstein(pair, cluster, draws=draws)
     for draw, distance in zip(draws[:2], result[:2], strict=True):
         repeated = pair.repeat_interleave(draw[cluster].long(), dim=1)
         assert distance.item() == pytest.approx(wasserstein_distance(*repeated.numpy()))
@@ -33,7 +33,7 @@ def test_a_draw_equals_the_distance_of_the_repeated_samples():
 def test_pooled_figures_follow_the_definition():
     features = features_of(random_rollouts(8, seed=4))
     draws, cluster = once(8)
-    table = realism(features, cluster, draws)
+    table = realism(features, cluster, draws=draws)
     distances = []
     scaled = []
     for name in KINEMATICS:
@@ -57,7 +57,7 @@ def test_the_ego_the_parked_and_what_happens_after_the_stop_do_not_count():
     states[:, :, 1, 3] = 5.0
     agents = torch.tensor([[False, True, True]])
     for stop, blocks in ((80, 16), (34, 6), (9, 1)):
-        sample = kinematic_samples(states, valid, states, valid, agents, torch.tensor([stop]))[0]
+        sample = kinematic_samples(states, valid, logged=states, logged_valid=valid, agents=agents, stop=torch.tensor([stop]))[0]
         assert [sample[name].shape[1] for name in KINEMATICS] == [blocks - 1, blocks - 1, max(blocks - 2, 0)], stop
 
 
@@ -65,11 +65,11 @@ def test_real_adv_is_real_of_a_traffic_of_adversaries_alone():
     rollouts = random_rollouts(6, seed=3)
     alone = rollouts.replace(simulated=rollouts.simulated & rollouts.adversaries)
     draws, cluster = once(6)
-    ours, theirs = (realism(features_of(given), cluster, draws) for given in (rollouts, alone))
+    ours, theirs = (realism(features_of(given), cluster, draws=draws) for given in (rollouts, alone))
     assert ours["real_adv"] == theirs["real"] == theirs["real_adv"] and ours["real_adv"] != ours["real"]
     nobody = rollouts.replace(adversaries=torch.zeros_like(rollouts.adversaries))
     rows, features = score_rollouts(nobody)
-    table = realism(features, cluster, draws)
+    table = realism(features, cluster, draws=draws)
     assert table["real_adv"].isnan() and table["real"] == ours["real"] and rows[0]["real_adv"] != rows[0]["real_adv"]
 
 
@@ -78,7 +78,7 @@ def test_a_constant_turn_has_its_lateral_acceleration():
     states = torch.stack([time, time, 3.0 + 0.2 * time, 4.0 + 0.5 * time], -1)[None, :, None].expand(1, 81, 2, 4)
     valid = torch.ones(1, 81, 2, dtype=torch.bool)
     agents = torch.tensor([[False, True]])
-    sample = kinematic_samples(states, valid, states, valid, agents, torch.tensor([80]))[0]
+    sample = kinematic_samples(states, valid, logged=states, logged_valid=valid, agents=agents, stop=torch.tensor([80]))[0]
     middle = 4.0 + 0.5 * (0.55 + 0.5 * torch.arange(15))
     torch.testing.assert_close(sample["a_lat"][0], (0.2 * middle).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(sample["a_lon"][0], torch.full((15,), 0.5, dtype=torch.float64))
@@ -95,6 +95,6 @@ def test_split_halves_are_scipy_s_whichever_half_is_first_and_keep_clusters_toge
     samples = [torch.randn(20 + 9 * k, generator=generator, dtype=torch.float64) * (1 + 0.1 * k) for k in range(6)]
     cluster = torch.tensor([0, 0, 1, 1, 2, 2])
     halves = torch.tensor([[True, False, False], [False, True, True]])
-    one, other = split_half(logs(*samples), cluster, halves).tolist()
+    one, other = split_half(logs(*samples), cluster, halves=halves).tolist()
     distance = wasserstein_distance(torch.cat(samples[:2]).numpy(), torch.cat(samples[2:]).numpy())
     assert one == pytest.approx(1 - distance) and other == pytest.approx(one)

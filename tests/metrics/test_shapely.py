@@ -23,7 +23,7 @@ class Blind(Ego):
 
 
 def bundled(traffic):
-    return e2rl.roll_out(e2rl.load_scenes("bundled", num_scenes=6), Blind(), traffic)
+    return e2rl.roll_out(e2rl.load_scenes("bundled", num_scenes=6), Blind(), traffic=traffic)
 
 
 SETS = {

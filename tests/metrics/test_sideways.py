@@ -56,7 +56,7 @@ def moving_over(x, y, speed, across, begin=2.0, lasts=10.0, heading=EAST, steps=
 @pytest.mark.parametrize("ahead", [-3.0, 0.0, 3.0])
 @pytest.mark.parametrize("across", [0.3, 1.0, 2.0])
 def test_an_ego_that_changes_lanes_into_a_car_that_keeps_its_lane_is_at_fault(side, ahead, across):
-    found = verdict(moving_over(0, 0, 12, side * across), course(ahead, side * 3.5, EAST, 12))
+    found = verdict(moving_over(0, 0, speed=12, across=side * across), course(ahead, side * 3.5, heading=EAST, speed=12))
     assert (found["cfr"], found["at_fault"], found["counted"], found["duty"]) == (1, 1, 1, "none")
     assert found["approach"] == ("beside on the left" if side > 0 else "beside on the right")
 
@@ -65,15 +65,15 @@ def test_an_ego_that_changes_lanes_into_a_car_that_keeps_its_lane_is_at_fault(si
 @pytest.mark.parametrize("ahead", [-3.0, 0.0, 3.0])
 @pytest.mark.parametrize("across", [0.3, 1.0, 2.0])
 def test_a_car_that_changes_lanes_into_the_ego_is(side, ahead, across):
-    found = verdict(course(0, 0, EAST, 12), moving_over(ahead, side * 3.5, 12, -side * across))
+    found = verdict(course(0, 0, heading=EAST, speed=12), moving_over(ahead, side * 3.5, speed=12, across=-side * across))
     assert (found["cfr"], found["at_fault"], found["duty"]) == (1, 0, "entry")
 
 
 @pytest.mark.parametrize(("own", "others", "fault"), [(1.0, 1.0, 1), (1.0, 0.4, 1), (0.4, 1.0, 0), (0.6, 1.0, 1)])
 def test_where_both_move_into_a_lane_both_are_but_for_a_drift_beside_a_lane_change(own, others, fault):
     """From the outer lanes into the middle one; a drift is less than half as fast."""
-    ego = moving_over(0, -3.5, 12, own, lasts=5.0)
-    partner = moving_over(0, 3.5, 12, -others, lasts=5.0)
+    ego = moving_over(0, -3.5, speed=12, across=own, lasts=5.0)
+    partner = moving_over(0, 3.5, speed=12, across=-others, lasts=5.0)
     found = verdict(ego, partner)
     assert (found["cfr"], found["at_fault"]) == (1, fault)
     assert (found["duty"] == "entry") == (others > 0.5)
@@ -81,10 +81,10 @@ def test_where_both_move_into_a_lane_both_are_but_for_a_drift_beside_a_lane_chan
 
 def test_who_drifts_within_its_lane_into_a_car_at_the_lane_s_edge_is_at_fault():
     """Lane width 3.5 m, cars 2.0 m: the partner keeps 0.7 m off its lane's middle, the ego drifts 0.9 m at 0.25 m/s."""
-    drifts = moving_over(0, 0, 12, 0.25, lasts=3.6)
-    assert verdict(drifts, course(0, 2.8, EAST, 12))["at_fault"] == 1
-    keeps = course(0, 0.7, EAST, 12)
-    found = verdict(keeps, moving_over(0, 3.5, 12, -0.25, lasts=3.6))
+    drifts = moving_over(0, 0, speed=12, across=0.25, lasts=3.6)
+    assert verdict(drifts, course(0, 2.8, heading=EAST, speed=12))["at_fault"] == 1
+    keeps = course(0, 0.7, heading=EAST, speed=12)
+    found = verdict(keeps, moving_over(0, 3.5, speed=12, across=-0.25, lasts=3.6))
     assert (found["cfr"], found["at_fault"]) == (1, 0)
 
 
@@ -111,16 +111,16 @@ def test_in_a_bend_who_leaves_its_lane_is_at_fault_although_both_turn(own, other
     """The ego is carried outwards; or its neighbour, as fast in angle, comes inwards."""
     ego = bend(40.0, speed=10.0, drift=own)
     partner = bend(43.5, speed=10.9, drift=others)
-    found = verdict(ego, partner, rings(40.0, 43.5))
+    found = verdict(ego, partner, lines=rings(40.0, 43.5))
     assert (found["cfr"], found["at_fault"]) == (1, fault)
 
 
 @pytest.mark.parametrize("reverses", [False, True])
 def test_who_comes_out_of_a_driveway_cuts_in_whichever_way_its_nose_looks(reverses):
-    partner = course(30, -1.6 - 2.0 * 3.6, NORTH, 2.0)
+    partner = course(30, -1.6 - 2.0 * 3.6, heading=NORTH, speed=2.0)
     if reverses:
         partner[0][:, 2], partner[0][:, 3] = SOUTH, -2.0
-    found = verdict(course(0, 0, EAST, 8), partner, straight_lanes(0.0, 3.5))
+    found = verdict(course(0, 0, heading=EAST, speed=8), partner, lines=straight_lanes(0.0, 3.5))
     expected = {"cfr": 1, "at_fault": 0, "counted": 0, "partner_speed": 2.0, "relvel": math.hypot(8, 2)}
     assert {name: found[name] for name in expected} == pytest.approx(expected)
     assert (found["partner_manoeuvre"], found["duty"]) == ("keeps speed", "none")
@@ -129,8 +129,8 @@ def test_who_comes_out_of_a_driveway_cuts_in_whichever_way_its_nose_looks(revers
 
 def test_a_car_that_reverses_towards_the_ego_in_its_lane_is_judged_as_one_that_comes_towards_it():
     """At 2 m/s, from 60 m on: the competent driver brakes, and is struck where it stands."""
-    backs = course(60, 0, WEST, 2.0)
-    comes = course(60, 0, WEST, 2.0)
+    backs = course(60, 0, heading=WEST, speed=2.0)
+    comes = course(60, 0, heading=WEST, speed=2.0)
     backs[0][:, 2], backs[0][:, 3] = EAST, -2.0
     names = (
         "cfr",
@@ -143,54 +143,54 @@ def test_a_car_that_reverses_towards_the_ego_in_its_lane_is_judged_as_one_that_c
         "partner_speed",
         "margin",
     )
-    rows = [verdict(course(0, 0, EAST, 10), partner) for partner in (backs, comes)]
+    rows = [verdict(course(0, 0, heading=EAST, speed=10), partner) for partner in (backs, comes)]
     assert {name: rows[0][name] for name in names} == pytest.approx({name: rows[1][name] for name in names})
     assert (rows[0]["at_fault"], rows[0]["duty"], rows[0]["approach"]) == (0, "wrong way", "oncoming")
 
 
 def test_an_ego_that_runs_into_a_car_that_reverses_away_from_it_is_judged_by_its_motion():
     """The car backs away from the ego, at 3 m/s, slower than the ego comes: a leader as any other."""
-    away = course(30, 0, EAST, 3.0)
-    leads = course(30, 0, EAST, 3.0)
+    away = course(30, 0, heading=EAST, speed=3.0)
+    leads = course(30, 0, heading=EAST, speed=3.0)
     away[0][:, 2], away[0][:, 3] = WEST, -3.0
-    rows = [verdict(course(0, 0, EAST, 10), partner) for partner in (away, leads)]
+    rows = [verdict(course(0, 0, heading=EAST, speed=10), partner) for partner in (away, leads)]
     for row in rows:
         assert (row["at_fault"], row["preventable"], row["duty"], row["approach"]) == (1, 1, "none", "ahead")
 
 
 def test_an_ego_that_reverses_leads_with_its_rear():
     """Into a car behind it that is slower; one that comes from the other side hits its trailing front."""
-    backs = course(0, 0, WEST, 2.0)
+    backs = course(0, 0, heading=WEST, speed=2.0)
     backs[0][:, 2], backs[0][:, 3] = EAST, -2.0
     westwards = [line.flip(0) for line in straight_lanes(0.0)]
-    found = verdict(backs, course(-12, 0, WEST, 0.5), westwards)
+    found = verdict(backs, course(-12, 0, heading=WEST, speed=0.5), lines=westwards)
     assert (found["contact_type"], found["at_fault"], found["duty"]) == ("rear", 1, "none")
     assert found["ego_speed"] == pytest.approx(2.0)
-    found = verdict(backs, course(15, 0, WEST, 6.0), westwards)
+    found = verdict(backs, course(15, 0, heading=WEST, speed=6.0), lines=westwards)
     assert (found["contact_type"], found["at_fault"], found["duty"]) == ("front", 0, "rear-end")
 
 
 def test_an_ego_that_turns_round_into_the_next_lane_is_at_fault_and_a_car_that_does_before_it_is_not():
     """Half a second after it has crossed the line; an ego that could see it turn for longer has to stop."""
     turns = drive(20, 0, EAST, 5, turn=lambda t: 0.8 if t > 2.2 else 0.0)
-    found = verdict(turns, course(0, 3.5, EAST, 9), straight_lanes(0.0, 3.5))
+    found = verdict(turns, course(0, 3.5, heading=EAST, speed=9), lines=straight_lanes(0.0, 3.5))
     assert (found["cfr"], found["at_fault"], found["duty"]) == (1, 1, "none")
-    found = verdict(course(0, 3.5, EAST, 9), turns, straight_lanes(0.0, 3.5))
+    found = verdict(course(0, 3.5, heading=EAST, speed=9), turns, lines=straight_lanes(0.0, 3.5))
     assert (found["cfr"], found["at_fault"]) == (1, 0)
 
 
 @pytest.mark.parametrize(("turns", "counted"), [(True, 0), (False, 1)])
 def test_a_standing_car_that_turns_on_the_spot_makes_no_failure_that_counts(turns, counted):
     """2.3 m beside the ego's way; or aslant from the start, where it has to be passed with more room."""
-    states, valid = course(40, 2.3, EAST, 0)
+    states, valid = course(40, 2.3, heading=EAST, speed=0)
     slant = torch.linspace(0, 0.8, 81, dtype=torch.float64)
     states[:, 2] = slant if turns else 0.5
-    found = verdict(course(0, 0, EAST, 9), (states, valid))
+    found = verdict(course(0, 0, heading=EAST, speed=9), (states, valid))
     assert (found["cfr"], found["at_fault"], found["counted"]) == (1, counted, counted)
 
 
 def test_a_cyclist_s_or_nobody_s_contact_is_no_movement_into_anybody():
-    found = verdict(course(0, 0, EAST, 9), course(0, 30, EAST, 9))
+    found = verdict(course(0, 0, heading=EAST, speed=9), course(0, 30, heading=EAST, speed=9))
     assert found["cfr"] == 0 and math.isnan(found["at_fault"]) and found["duty"] == ""
 
 
@@ -198,9 +198,9 @@ def test_a_cyclist_s_or_nobody_s_contact_is_no_movement_into_anybody():
 @pytest.mark.parametrize("speed", [0.6, 1.0, 2.0])
 def test_a_standing_car_whose_heading_jitters_is_run_into_all_the_same(speed, placing):
     """The front of the ego meets its rear straight on; its recorded heading changed by two degrees."""
-    states, valid = course(4.5 + speed * (2.0 + 0.02 * placing), 0, 0, 0)
+    states, valid = course(4.5 + speed * (2.0 + 0.02 * placing), 0, heading=0, speed=0)
     states[5:, 2] = math.radians(2)
-    row = verdict(course(0, 0, 0, speed), (states, valid))
+    row = verdict(course(0, 0, heading=0, speed=speed), (states, valid))
     assert row["cfr"] == 1
     assert row["counted"] == 1
 
@@ -219,8 +219,8 @@ def test_a_u_turn_into_the_lane_of_who_comes_is_at_fault_until_its_nose_has_been
     ego = torch.stack([x, radius * (1 - angle.cos()), angle, torch.full_like(time, speed)], -1)
     contact = int((begins + radius * math.radians(165) / speed) / 0.1)
     meets = ego[contact, 0].item() + 2.4
-    partner = course(meets + 14 * 0.1 * contact, 7.0, math.pi, 14.0)
-    row = verdict((ego, torch.ones(81, dtype=torch.bool)), partner, straight_lanes(0.0))
+    partner = course(meets + 14 * 0.1 * contact, 7.0, heading=math.pi, speed=14.0)
+    row = verdict((ego, torch.ones(81, dtype=torch.bool)), partner, lines=straight_lanes(0.0))
     assert row["cfr"] == 1
     assert row["at_fault"] == 1
     assert row["duty"] == "none"

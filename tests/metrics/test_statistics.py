@@ -46,13 +46,13 @@ def test_intervals_cover_the_truth_in_about_95_of_100_cases_when_rollouts_come_i
     values = (torch.rand(trials, clusters, members, generator=generator) < chance).double()
     cluster = torch.arange(clusters).repeat_interleave(members)
     draws = bootstrap_draws(clusters, 400)
-    means = resampled_means(values.flatten(1).T, torch.ones(clusters * members, trials).double(), cluster, draws)
+    means = resampled_means(values.flatten(1).T, torch.ones(clusters * members, trials).double(), cluster=cluster, draws=draws)
     low, high = means[1:].quantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
     covered = ((low <= 1 / 3) & (high >= 1 / 3)).double().mean().item()
     assert 0.91 <= covered <= 0.98, covered
     alone = torch.arange(clusters * members)
     means = resampled_means(
-        values.flatten(1).T, torch.ones(len(alone), trials).double(), alone, bootstrap_draws(len(alone), 400)
+        values.flatten(1).T, torch.ones(len(alone), trials).double(), cluster=alone, draws=bootstrap_draws(len(alone), 400)
     )
     low, high = means[1:].quantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
     assert ((low <= 1 / 3) & (high >= 1 / 3)).double().mean().item() < covered - 0.08
@@ -79,11 +79,11 @@ def test_a_median_draw_is_the_median_of_the_repeated_values():
     cluster = torch.randint(6, (41,), generator=generator)
     values[::7] = torch.nan
     draws = torch.cat([bootstrap_draws(6, 20), torch.zeros(1, 6, dtype=torch.float64)])
-    medians = resampled_medians(values, cluster, draws)
+    medians = resampled_medians(values, cluster, draws=draws)
     for draw, median in zip(draws[:-1], medians[:-1], strict=True):
         repeated = values.repeat_interleave(draw[cluster].long())
         assert median.item() == pytest.approx(repeated.nanquantile(0.5, interpolation="midpoint").item())
-    assert medians[-1].isnan() and resampled_medians(values * torch.nan, cluster, draws).isnan().all()
+    assert medians[-1].isnan() and resampled_medians(values * torch.nan, cluster, draws=draws).isnan().all()
     table = brief(*rows_of([1.0, math.nan, 9.0, 2.0], name="contact_time"))["contact_time"]
     assert (table["mean"], table["n"]) == (2.0, 3)
 
@@ -101,7 +101,7 @@ def test_fewer_than_ten_places_give_no_interval():
 @pytest.mark.parametrize(("events", "places"), [(0, 12), (1, 12), (3, 12), (12, 12), (2, 100), (97, 100)])
 def test_few_events_have_the_interval_of_clopper_and_pearson(events, places, level):
     expected = binomtest(events, places).proportion_ci(level, "exact")
-    assert exact_interval(events / places, places, level) == pytest.approx(tuple(expected), abs=1e-9)
+    assert exact_interval(events / places, places, level=level) == pytest.approx(tuple(expected), abs=1e-9)
     if level == 0.95:
         found = brief(*rows_of([1.0] * events + [0.0] * (places - events)))["cfr"]
         assert (found["low"], found["high"]) == pytest.approx(tuple(expected), abs=1e-9)
@@ -132,7 +132,7 @@ def test_a_difference_of_rare_events_lies_between_the_differences_of_their_bound
     ours = rows_of([1.0] * 8 + [0.0] * 42)
     theirs = rows_of([0.0] * 49 + [1.0])
     found = paired_differences(*ours, *theirs, draws=50, realism_draws=2)["cfr"]
-    (low, high), (other_low, other_high) = (exact_interval(k / 50, 50, 0.975) for k in (8, 1))
+    (low, high), (other_low, other_high) = (exact_interval(k / 50, 50, level=0.975) for k in (8, 1))
     assert found["difference"] == pytest.approx(0.14)
     assert (found["low"], found["high"]) == pytest.approx((low - other_high, high - other_low))
     six = paired_differences(*rows_of([0.0] * 6), *rows_of([1.0] * 2 + [0.0] * 4), draws=50, realism_draws=2)["cfr"]
@@ -213,7 +213,7 @@ def test_a_paired_difference_uses_shared_scenes_and_is_narrower_than_unpaired_on
     base = torch.rand(60, generator=generator) * 10
     ours, features = rows_of((base + 1 + 0.1 * torch.rand(60, generator=generator)).tolist(), name="progress")
     theirs, other = rows_of(base.tolist(), name="progress")
-    result = paired_differences(ours[:50], features[:50], theirs[10:], other[10:], draws=300, realism_draws=2)
+    result = paired_differences(ours[:50], features[:50], other_rows=theirs[10:], other_samples=other[10:], draws=300, realism_draws=2)
     assert result["progress"]["n"] == 40
     assert 1.0 < result["progress"]["low"] < result["progress"]["difference"] < result["progress"]["high"] < 1.1
     own = brief(ours, features)["progress"]

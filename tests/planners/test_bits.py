@@ -63,12 +63,12 @@ def test_a_moved_scene_gets_the_moved_candidates():
 def test_a_file_gives_the_network_back_and_another_is_refused(tmp_path):
     network = wild_ego().network
     seen = torch.randn(4, OBSERVATION_SIZE)
-    save_bits(network, tmp_path / "bits.safetensors", {"data": "made"})
+    save_bits(network, tmp_path / "bits.safetensors", origin={"data": "made"})
     again = load_bits(str(tmp_path))
     for one, other in zip(network.goals(network.encode(seen)), again.goals(again.encode(seen)), strict=True):
         assert torch.equal(one, other) and not other.requires_grad
     network.architecture["cells"] = 9
-    save_bits(network, tmp_path / "bits.safetensors", {})
+    save_bits(network, tmp_path / "bits.safetensors", origin={})
     for where, why in ((tmp_path, "another architecture"), (tmp_path / "no", "no bits.safetensors there")):
         with pytest.raises(InputError, match=why):
             BitsEgo(checkpoint=str(where))
@@ -79,8 +79,8 @@ def test_cells_and_places_are_inverses():
     speed = 20 * torch.rand(1000, generator=generator)
     way = 1.1 * reach(speed) * torch.rand(1000, generator=generator)
     side = 10 * torch.rand(1000, generator=generator) - 5
-    cell, residual = cell_of(speed, way, side)
-    again = place(speed, cell[:, None], residual[:, None])
+    cell, residual = cell_of(speed, way, side=side)
+    again = place(speed, cell[:, None], residual=residual[:, None])
     torch.testing.assert_close(again[0][:, 0], way, atol=1e-3, rtol=0)
     torch.testing.assert_close(again[1][:, 0], side, atol=1e-4, rtol=0)
     on_grid = (way < reach(speed)) & (side.abs() < SIDES / 2)

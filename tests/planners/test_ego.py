@@ -39,7 +39,7 @@ def test_a_drivable_plan_is_followed_without_error():
     plan = torch.cat([start[None], dynamics.rollout(start, actions)])
     state = start
     for k in range(50):
-        state = dynamics.step(state, track(state, plan[k], plan[k + 1]))
+        state = dynamics.step(state, track(state, plan[k], following=plan[k + 1]))
         assert torch.allclose(state[:2], plan[k + 1, :2], atol=1e-6)
 
 
@@ -48,7 +48,7 @@ def test_deviations_are_made_good():
     plan = torch.stack([distance, 0 * distance, 0 * distance, 10 + 0 * distance], -1)
     state = torch.tensor([-0.8, 1.0, 0.1, 9.0])
     for k in range(50):
-        state = dynamics.step(state, track(state, plan[k], plan[k + 1]))
+        state = dynamics.step(state, track(state, plan[k], following=plan[k + 1]))
     assert (state - plan[50])[:2].abs().max() < 0.05 and state[2].abs() < 0.02
 
 
@@ -182,7 +182,7 @@ def test_replayed_log_is_tracked():
 
 @pytest.mark.parametrize("name", ["idm", "lane_graph", "lane_graph_tuned", "replay", "sampling", "bits"])
 def test_a_file_of_the_configuration_builds_its_ego(name):
-    ego = built(load_choice("ego", name), "ego", Ego)
+    ego = built(load_choice("ego", name), "ego", kind=Ego)
     plan = ego.plan(world_of(num_scenes=2)[1])
     assert plan.shape == (2, PLAN_STEPS, 4) and torch.isfinite(plan).all()
     with pytest.raises(InputError, match=r"ego\.replan_every=0"):
@@ -244,7 +244,7 @@ def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic
     second.scenes["size"][:, 2] = second.scenes["agent_type"][:, 2] = 3
     for scenes in (first, second):
         ego = Meddler()
-        roll_out(scenes, torch.arange(2), torch.arange(2), torch.zeros(2), ego, traffic, SimSettings())
+        roll_out(scenes, torch.arange(2), seed=torch.arange(2), eta=torch.zeros(2), ego=ego, traffic=traffic, sim=SimSettings())
         told.append(ego.told[:3])  # at steps 0, 5 and 10
         ego.told = []
         world = worlds(scenes)[1]

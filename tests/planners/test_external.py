@@ -47,15 +47,15 @@ def scene_set(count=4, **about):
 
 
 def run(ego, folder=None, processes=1, batch=4):
-    setup = Setup(scene_set(), ego, "external", SimSettings(), batch)
-    return run_protocol(setup, [Method("replay", LogReplay())], [0], folder, processes=processes)
+    setup = Setup(scene_set(), ego, ego_name="external", sim=SimSettings(), batch=batch)
+    return run_protocol(setup, [Method("replay", LogReplay())], seeds=[0], folder=folder, processes=processes)
 
 
 @pytest.mark.parametrize(("replan_every", "red_light_x"), [(1, None), (5, 45.0)])
 def test_it_drives_as_the_same_law_inside(replan_every, red_light_x):
     scenes = scene_set(red_light_x=red_light_x)
     inside, outside = (
-        roll_out(scenes, ego, LogReplay()).states
+        roll_out(scenes, ego, traffic=LogReplay()).states
         for ego in (SameLaw(replan_every), ExternalEgo(command_of(), replan_every=replan_every))
     )
     assert torch.allclose(inside, outside, atol=1e-3)

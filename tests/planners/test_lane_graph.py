@@ -29,11 +29,11 @@ def test_hazard_equals_its_definition():
     scene = torch.tensor([0, 1, 1, 0, 1])
     size = torch.tensor([4.0, 2.0]).double().repeat(5, 1)
     ego_size = torch.tensor([4.5, 1.8]).double().repeat(2, 1)
-    found = collision_hazard(ego, ego_size, Prediction(poses, size, scene), 0.3, 0.02)
+    found = collision_hazard(ego, ego_size, others=Prediction(poses, size, scene=scene), slope=0.3, growth=0.02)
     safe = torch.ones(2, 3).double()
     for j in range(5):
         for t in range(4):
-            gap = circle_gap(ego[scene[j], :, t], ego_size[0], poses[j, t], size[j])
+            gap = circle_gap(ego[scene[j], :, t], ego_size[0], second=poses[j, t], second_size=size[j])
             safe[scene[j]] *= torch.tanh(gap.clamp(min=0) * (0.3 + 0.02 * t)).clamp(min=1e-6)
     assert torch.allclose(found, -safe.log(), rtol=1e-3)
 

@@ -50,7 +50,7 @@ def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(nuplan,
     heading = torch.tensor([0.0, 0.4])
     scenes.scenes["start"][:, 0, 2] = scenes.scenes["logged"][:, 0, 0, 2] = heading
     start = scenes.scenes["start"][:, 0].clone()
-    states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Straight", replan_every), LogReplay()).states
+    states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Straight", replan_every), traffic=LogReplay()).states
     expected = dynamics.constant_velocity(start, torch.tensor([4.0]))[:, 0]
     assert torch.allclose(states[:, 40, 0], expected, atol=2e-3)
 
@@ -64,7 +64,7 @@ def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_softly_to_its_path(
     seconds = DT * torch.arange(51)
     scenes.scenes["start"][:, 0, 1] = scenes.scenes["logged"][:, 0, 0, 1] = beside
     ego = nuplan(f"--planner nuplan_planners:Centred acceleration={acceleration}", replan_every)
-    states = e2rl.roll_out(scenes, ego, LogReplay()).states[:, :51, 0]
+    states = e2rl.roll_out(scenes, ego, traffic=LogReplay()).states[:, :51, 0]
     speed = 10.0 + acceleration * seconds
     assert torch.allclose(states[..., 3], speed.expand(2, -1), atol=0.05)
     left = states[..., 1] / beside[:, None]
@@ -78,7 +78,7 @@ def test_it_sees_the_ego_and_everybody_else_where_they_are(nuplan, tmp_path, rep
     scenes = make_scenes(1, num_vrus=1)
     scenes.scenes["start"][:, 1, 2] = 1.0  # one looks along no axis
     scenes.scenes["logged"][:, :, 1, 2] = 1.0
-    rollouts = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), LogReplay())
+    rollouts = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), traffic=LogReplay())
     seen = written(tmp_path)
     states = rollouts.states[0]
     assert [one["index"] for one in seen] == list(range(0, 80, replan_every))
@@ -103,7 +103,7 @@ def test_it_sees_the_ego_and_everybody_else_where_they_are(nuplan, tmp_path, rep
 def test_its_history_is_what_was_driven_and_before_that_steady(nuplan, tmp_path, replan_every):
     scenes = make_scenes(1)
     scenes.scenes["start_yaw_rate"][0, 0], scenes.scenes["start_accel"][0, 0] = 0.2, -1.0
-    states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), LogReplay()).states[
+    states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), traffic=LogReplay()).states[
         0, :, 0
     ]
     first, *_, last = written(tmp_path)
@@ -196,8 +196,8 @@ WRONG = {
 @pytest.mark.parametrize("how", WRONG)
 def test_what_goes_wrong_in_a_scene_costs_that_scene_and_is_told(nuplan, tmp_path, how):
     ego = nuplan(f"--planner nuplan_planners:Wrong how={how} bad=3.5", replan_every=5)
-    setup = Setup(scene_set(), ego, "nuplan", SimSettings(), 4)
-    (row,) = run_protocol(setup, [Method("replay", LogReplay())], [0], tmp_path)
+    setup = Setup(scene_set(), ego, ego_name="nuplan", sim=SimSettings(), batch=4)
+    (row,) = run_protocol(setup, [Method("replay", LogReplay())], seeds=[0], folder=tmp_path)
     (entry,) = json.loads((tmp_path / ERRORED_FILE).read_text())
     reason, detail = WRONG[how]
     assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 4

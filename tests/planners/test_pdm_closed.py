@@ -118,9 +118,9 @@ def test_whom_it_touched_without_fault_it_may_touch_again():
     both = beside._replace(states=torch.cat([beside.states, ahead.states], 2))
     touch = torch.ones(1, 1, 1, 2, dtype=torch.bool)
     loose = torch.zeros(1, 1, 2, dtype=torch.bool)
-    assert not at_fault(states, torch.tensor([[4.8, 2.0]]), both, touch, loose).any()
+    assert not at_fault(states, torch.tensor([[4.8, 2.0]]), others=both, touch=touch, loose=loose).any()
     swapped = both._replace(states=both.states.flip(2))
-    assert at_fault(states, torch.tensor([[4.8, 2.0]]), swapped, touch, loose).any()
+    assert at_fault(states, torch.tensor([[4.8, 2.0]]), others=swapped, touch=touch, loose=loose).any()
 
 
 def others_at(place):
@@ -135,8 +135,8 @@ def test_an_object_that_it_hits_halves_the_score():
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
     ahead = EGO._others(world, range(SCORED_STEPS + 1))
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
-    vehicle, time = score(world, go, ahead)
-    thing, same = score(world, go, ahead._replace(objects=ahead.seen))
+    vehicle, time = score(world, go, others=ahead)
+    thing, same = score(world, go, others=ahead._replace(objects=ahead.seen))
     assert vehicle.item() == 0 and time.item() == same.item() < 2.0
     assert thing.item() == pytest.approx(0.5 * (PROGRESS + COMFORT) / (PROGRESS + TIME_TO_COLLISION + COMFORT))
 
@@ -155,7 +155,7 @@ def test_the_time_to_collision_looks_30_degrees_to_each_side_in_one_lane(degrees
     touch = torch.zeros(1, 1, 1, 1, 4, dtype=torch.bool)
     touch[..., 0] = True
     for loose, clear in ((False, expected), (True, 0)):
-        assert runs_into(states, size, other, touch, torch.full((1, 1, 1), loose)).item() == (not clear)
+        assert runs_into(states, size, others=other, touch=touch, loose=torch.full((1, 1, 1), loose)).item() == (not clear)
 
 
 def test_comfort_has_the_published_windows_and_bounds():
@@ -194,7 +194,7 @@ def test_the_score_is_the_weighted_mean_of_its_terms():
     actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(3, 50, 2)
     states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
     distance = states[0, :, SCORED_STEPS - 1, 0] - start[0, 0, 0]
-    found = score(world, states, none)[0][0]
+    found = score(world, states, others=none)[0][0]
     whole = PROGRESS + TIME_TO_COLLISION + COMFORT
     expected = PROGRESS * distance / distance[0] + TIME_TO_COLLISION + COMFORT * torch.tensor([1.0, 1.0, 0.0])
     torch.testing.assert_close(found, expected / whole, atol=1e-4, rtol=0)
@@ -206,13 +206,13 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
     ahead = EGO._others(world, range(SCORED_STEPS + 1))
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
-    found, collides = score(world, go, ahead)
+    found, collides = score(world, go, others=ahead)
     size = world.scene["size"][0, 0]
-    first = int((separation(go[0, 0], size, world.states[0, 1], world.scene["size"][0, 1]) < 0).nonzero()[0, 0]) + 1
+    first = int((separation(go[0, 0], size, second=world.states[0, 1], second_size=world.scene["size"][0, 1]) < 0).nonzero()[0, 0]) + 1
     assert found.item() == 0 and collides.item() == pytest.approx(DT * first)
     turn = dynamics.rollout(world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2))[:, None]
     free = ahead._replace(seen=ahead.seen & False)
-    assert score(world, turn, free)[0].item() == 0
+    assert score(world, turn, others=free)[0].item() == 0
 
 
 def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_collision():
@@ -221,7 +221,7 @@ def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_col
     ahead = EGO._others(world, range(SCORED_STEPS + 1))
     actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
     states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
-    found, collides = score(world, states, ahead)
+    found, collides = score(world, states, others=ahead)
     late, early = states[0, :, SCORED_STEPS - 1, 0]
     expected = torch.stack([late / late * PROGRESS + COMFORT, early / late * PROGRESS + TIME_TO_COLLISION])
     assert collides.isinf().all()
@@ -234,7 +234,7 @@ def test_where_every_proposal_is_excluded_it_drives_the_slowest():
     scenes.scenes["field"][:, 86:] = 10.0  # from x = 6 m on
     _, world = worlds(scenes)
     states = EGO.proposals(world)
-    assert (score(world, states, EGO._others(world, range(SCORED_STEPS + 1)))[0] == 0).all()
+    assert (score(world, states, others=EGO._others(world, range(SCORED_STEPS + 1)))[0] == 0).all()
     torch.testing.assert_close(EGO.plan(world)[0], states[0, 0])
 
 
@@ -243,5 +243,5 @@ def test_a_scene_is_planned_alike_alone_and_in_a_batch():
     _, world = worlds(scenes)
     whole = EGO.plan(world)
     for k in range(3):
-        alone = EGO.plan(take(world, torch.tensor([k]), KEYS))[0]
+        alone = EGO.plan(take(world, torch.tensor([k]), keys=KEYS))[0]
         torch.testing.assert_close(alone, whole[k], atol=1e-3, rtol=0)

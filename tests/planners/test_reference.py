@@ -53,7 +53,7 @@ def test_leading_dims_do_not_matter():
 
 def test_the_order_of_the_agents_changes_nothing_and_each_of_them_counts():
     torch.manual_seed(0)
-    trunk = Trunk((32, 16), 8, 2, last_gain=1.0)
+    trunk = Trunk((32, 16), 8, out=2, last_gain=1.0)
     seen = torch.randn(5, OBSERVATION_SIZE)
     agents = seen[:, AGENTS].unflatten(1, (NEAREST, PER_AGENT))
     shuffled = seen.clone()
@@ -69,9 +69,9 @@ def test_the_order_of_the_agents_changes_nothing_and_each_of_them_counts():
 def test_the_rest_of_the_scene_counts_and_a_last_layer_of_zeros_says_nothing():
     torch.manual_seed(0)
     seen = torch.randn(OBSERVATION_SIZE, requires_grad=True)
-    (gradient,) = torch.autograd.grad(Trunk((32,), 8, 1, last_gain=1.0)(seen).sum(), seen)
+    (gradient,) = torch.autograd.grad(Trunk((32,), 8, out=1, last_gain=1.0)(seen).sum(), seen)
     assert (gradient[: AGENTS.start] != 0).all() and (gradient[AGENTS.stop :] != 0).all()
-    assert torch.equal(Trunk((32, 16), 8, 2, last_gain=0.0)(seen), torch.zeros(2))
+    assert torch.equal(Trunk((32, 16), 8, out=2, last_gain=0.0)(seen), torch.zeros(2))
 
 
 def test_the_gradient_of_the_largest_is_shared_among_equals():

@@ -27,7 +27,7 @@ def test_boxed_in_it_is_never_worse_than_hard_braking():
     braking = dynamics.rollout(world.states[0, 0], torch.tensor([-8.0, 0.0]).expand(PLAN_STEPS, 2))
 
     def impact(states):
-        hit = (separation(states, size, wall, size) < 0).nonzero()
+        hit = (separation(states, size, second=wall, second_size=size) < 0).nonzero()
         return states[hit[0, 0], 3].item() if len(hit) else 0.0
 
     assert impact(braking) > 1 and impact(plan) <= impact(braking) + 0.5
@@ -74,7 +74,7 @@ def test_a_mirrored_scene_gets_the_mirrored_plan(beside):
 
 def test_speed_profiles_keep_the_caps():
     caps = (torch.tensor([[8.0]]).expand(1, 100)) ** 2
-    speed = speed_profiles(torch.tensor([10.0]), torch.tensor([[0.0, 0.0], [5.0, 5.0], [-8.0, -8.0]]), caps, 4.0)
+    speed = speed_profiles(torch.tensor([10.0]), torch.tensor([[0.0, 0.0], [5.0, 5.0], [-8.0, -8.0]]), caps=caps, braking=4.0)
     assert speed.shape == (1, 3, PLAN_STEPS + 1) and (speed[..., 0] == 10).all()
     assert torch.allclose(speed[0, :2, 10:], torch.tensor(8.0)) and (speed[0, 2, 15:] == 0).all()
     assert (speed.diff(dim=-1) / DT > -8.001).all() and (speed[0, :2].diff(dim=-1) / DT > -4.001).all()
@@ -82,7 +82,7 @@ def test_speed_profiles_keep_the_caps():
 
 def test_steering_catches_up_with_what_a_bound_withheld():
     aimed = torch.tensor([0.3, 0.3, 0.3, 0.3])
-    turns = steer(torch.tensor(0.0), aimed, torch.tensor(0.1).expand(4))
+    turns = steer(torch.tensor(0.0), aimed, bound=torch.tensor(0.1).expand(4))
     torch.testing.assert_close(turns, torch.tensor([0.1, 0.1, 0.1, 0.0]))
 
 
@@ -105,7 +105,7 @@ def test_forecasts_of_constant_acceleration_and_turn():
     _, world = worlds(scenes)
     agents, seen = nearest(world, 5)
     assert seen.tolist() == [[True, True, False, False, False]] and agents[0, :2].tolist() == [1, 2]
-    found = forecast(world, agents, seen, TIMES, 1.0, 2.0)
+    found = forecast(world, agents, seen=seen, times=TIMES, hold=1.0, turn=2.0)
     expected = 20 + 10 * TIMES - 4 * TIMES.clamp(max=1) ** 2 - 8 * (TIMES - 1).clamp(min=0)
     torch.testing.assert_close(found.poses[0, 0, :, 0], expected, atol=1e-3, rtol=0)
     torch.testing.assert_close(found.speed[0, 0], 10 - 8 * TIMES.clamp(max=1))
@@ -125,7 +125,7 @@ def test_pair_costs_order_situations():
     def cost(x, y, speed, ego_speed=10.0):
         ego = torch.tensor([[0.0, 0.0, 0.0, ego_speed]])
         other = torch.tensor([[x, y, 0.0, speed]])
-        return pair_cost(ego, size, other, size, torch.tensor([1.0]), weights)[0].item()
+        return pair_cost(ego, size, other=other, other_size=size, margin=torch.tensor([1.0]), weights=weights)[0].item()
 
     assert cost(4.0, 0.0, 0.0) > cost(4.0, 0.0, 8.0) > cost(5.0, 0.0, 8.0) > 0
     assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0

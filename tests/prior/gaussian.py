@@ -42,5 +42,5 @@ def moments(estimate, sampler, churn, steps, spacing="level"):
     """Exact mean and standard deviation of K-step samples where the estimate is affine in x: samples are affine in the
     noises then, and one run with no noise and one with each noise alone give all their coefficients."""
     noise = torch.cat([torch.zeros(steps, 1), torch.eye(steps)], 1).double()
-    x = run(estimate, sampler, churn, SCHEDULE.levels(steps, spacing=spacing).double(), noise)
+    x = run(estimate, sampler, churn=churn, levels=SCHEDULE.levels(steps, spacing=spacing).double(), noise=noise)
     return x[0].item(), (x[1:] - x[0]).norm().item()

@@ -106,5 +106,5 @@ def random_state(points: torch.Tensor, generator: torch.Generator, speed=(2.0, 1
     xy = xy + d[:, None] * torch.stack([-heading.sin(), heading.cos()], -1)
     v = draw(*speed)
     states = torch.cat([xy, (heading + turn)[:, None], v[:, None]], -1)
-    state = locate(states[None], draw(-1, 1)[None], v[None] * draw(-0.02, 0.02)[None], points[None])
+    state = locate(states[None], draw(-1, 1)[None], yaw_rate=v[None] * draw(-0.02, 0.02)[None], points=points[None])
     return state.map(lambda value: value[0])

@@ -33,9 +33,9 @@ def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
     exempt, yields: vehicles of such a duty; patience [m/s^2]: see Duty.
     """
     agents = torch.tensor([cars], dtype=torch.float32)
-    routes = torch.stack([arc(x, y, heading, turn) for x, y, heading, _ in cars])[None]
+    routes = torch.stack([arc(x, y, heading=heading, curvature=turn) for x, y, heading, _ in cars])[None]
     zero = torch.zeros(1, len(cars))
-    state = locate(agents, zero, zero + turn * agents[..., 3], routes, zero + 20.0)
+    state = locate(agents, zero, yaw_rate=zero + turn * agents[..., 3], points=routes, hint=zero + 20.0)
     size = torch.tensor(CAR).expand(1, len(cars), 2)
     duty = Duty(*(torch.zeros(1, len(cars), dtype=torch.bool) for _ in range(2)), zero + patience)
     duty.exempt[0, list(exempt)] = True
@@ -44,15 +44,15 @@ def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
     def decode(rows=None, cap=None):
         x = torch.zeros(1, len(cars), SIZE)
         if rows is None:
-            return lane_relative.decode(x, state, routes)
+            return lane_relative.decode(x, state, points=routes)
         x[(*rows, torch.zeros_like(rows[0]))] = cap.clamp(max=0.0)
-        return lane_relative.decode(x, state, routes).map(lambda value: value[rows])
+        return lane_relative.decode(x, state, points=routes).map(lambda value: value[rows])
 
-    return decode, state, Obstacles(agents, size, torch.ones(1, len(cars), dtype=torch.bool), duty)
+    return decode, state, Obstacles(agents, size, present=torch.ones(1, len(cars), dtype=torch.bool), duty=duty)
 
 
 def caps(decode, state, obstacles, **settings):
-    return acceleration_caps(BoundSettings(**settings), decode(), state, obstacles)[0]
+    return acceleration_caps(BoundSettings(**settings), decode(), state=state, obstacles=obstacles)[0]
 
 
 def contact_time(seconds):
@@ -62,15 +62,15 @@ def contact_time(seconds):
 
 def test_plans_that_meet_nobody_are_free():
     decode, state, obstacles = traffic((0, 0, 0, 10), (30, 0, 0, 10), (0, 3.5, 0, 12), (40, -3.5, math.pi, 9))
-    assert (caps(decode, state, obstacles) == NO_CAP).all()
-    motion = bounded(BoundSettings(), decode, state, obstacles)
+    assert (caps(decode, state, obstacles=obstacles) == NO_CAP).all()
+    motion = bounded(BoundSettings(), decode, state=state, obstacles=obstacles)
     assert torch.equal(motion.states(), decode().states())
 
 
 @pytest.mark.parametrize("speed", [0.0, 4.0])
 def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
     decode, state, obstacles = traffic((0, 0, 0, 10), (15, 0, 0, speed))
-    cap = caps(decode, state, obstacles)
+    cap = caps(decode, state, obstacles=obstacles)
     time = contact_time((15 - CAR[0]) / (10 - speed))
     room = 10 * time - GAP - speed * time
     assert cap.tolist() == pytest.approx([-((10 - speed) ** 2) / (2 * room), NO_CAP], rel=2e-2)
@@ -85,7 +85,7 @@ def test_braking_is_never_harder_than_the_floor_nor_softer_than_gentle():
 
 def test_of_two_that_cross_the_later_one_brakes():
     decode, state, obstacles = traffic((-20, 0, 0, 10), (0, -23, math.pi / 2, 10))
-    cap = caps(decode, state, obstacles)
+    cap = caps(decode, state, obstacles=obstacles)
     assert cap[0] == NO_CAP and cap[1] < -1
 
 
@@ -129,7 +129,7 @@ def test_patience_is_for_the_ego_alone():
 def test_absent_vehicles_are_in_nobody_s_way():
     decode, state, obstacles = traffic((0, 0, 0, 10), (15, 0, 0, 0))
     obstacles.present[0, 1] = False
-    assert (caps(decode, state, obstacles) == NO_CAP).all()
+    assert (caps(decode, state, obstacles=obstacles) == NO_CAP).all()
 
 
 def test_a_pedestrian_without_a_plan_keeps_its_velocity():
@@ -138,25 +138,25 @@ def test_a_pedestrian_without_a_plan_keeps_its_velocity():
     obstacles = Obstacles(
         torch.cat([obstacles.agents, walker], 1),
         torch.cat([obstacles.size, torch.ones(1, 1, 2)], 1),
-        torch.ones(1, 2, dtype=torch.bool),
+        present=torch.ones(1, 2, dtype=torch.bool),
     )
-    assert caps(decode, state, obstacles)[0] < -1
+    assert caps(decode, state, obstacles=obstacles)[0] < -1
     obstacles.agents[0, 1, 3] = 0.0
-    assert caps(decode, state, obstacles)[0] == NO_CAP
+    assert caps(decode, state, obstacles=obstacles)[0] == NO_CAP
 
 
 def test_a_curve_is_met_at_the_lateral_acceleration_allowed():
     decode, state, obstacles = traffic((0, 0, 0, 12), turn=1 / 20.0)
-    cap = caps(decode, state, obstacles, lateral=4.0)[0]
+    cap = caps(decode, state, obstacles=obstacles, lateral=4.0)[0]
     assert cap == pytest.approx(-(12**2 - 4.0 * 20) / (2 * 12 * STRIDE * DT), rel=0.1) or cap == -7.0
-    assert caps(decode, state, obstacles, lateral=8.0)[0] == NO_CAP
-    assert caps(decode, state, obstacles, lateral=4.0, curve=False)[0] == NO_CAP
+    assert caps(decode, state, obstacles=obstacles, lateral=8.0)[0] == NO_CAP
+    assert caps(decode, state, obstacles=obstacles, lateral=4.0, curve=False)[0] == NO_CAP
 
 
 def test_whoever_follows_a_braking_vehicle_brakes_too():
     decode, state, obstacles = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12))
-    assert caps(decode, state, obstacles, look=1.6)[2] == NO_CAP, "its plan meets nobody's as they stand"
-    motion = bounded(BoundSettings(look=1.6), decode, state, obstacles)
+    assert caps(decode, state, obstacles=obstacles, look=1.6)[2] == NO_CAP, "its plan meets nobody's as they stand"
+    motion = bounded(BoundSettings(look=1.6), decode, state=state, obstacles=obstacles)
     assert (motion.v <= decode().v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2
 
 
@@ -164,6 +164,6 @@ def test_a_cap_lowers_the_next_knot_and_at_most_by_its_onset_the_present_acceler
     _, state, _ = traffic((0, 0, 0, 10), (0, 8, 0, 10), (0, 16, 0, 10))
     state.a = torch.tensor([[1.0, -1.5, -6.0]])
     x0 = torch.tensor([[[0.5] * SIZE, [-3.0] * SIZE, [0.0] * SIZE]])
-    capped, after = apply_cap(torch.tensor([[-4.0, -2.0, -5.0]]), x0, state)
+    capped, after = apply_cap(torch.tensor([[-4.0, -2.0, -5.0]]), x0, state=state)
     assert after.a.tolist() == [[1.0 - ONSET, -2.0, -6.0]] and capped[0, :, 0].tolist() == [-4.0, -3.0, -5.0]
-    assert torch.equal(capped[..., 1:], x0[..., 1:]) and apply_cap(None, x0, state) == (x0, state)
+    assert torch.equal(capped[..., 1:], x0[..., 1:]) and apply_cap(None, x0, state=state) == (x0, state)

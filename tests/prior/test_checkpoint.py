@@ -18,7 +18,7 @@ from tests.prior.small import small_prior
 
 def test_a_saved_prior_comes_back(tmp_path):
     prior = small_prior()
-    path = save_prior(prior, tmp_path / "new", {"command": "x", "step": 3})
+    path = save_prior(prior, tmp_path / "new", origin={"command": "x", "step": 3})
     back, origin = load_prior(str(path), SamplerSettings(steps=3))
     assert origin == {"command": "x", "step": 3} and back.sampler.steps == 3
     assert back.denoiser.settings == prior.denoiser.settings
@@ -60,7 +60,7 @@ def rewritten(path, change, drop=None):
     ids=["width", "endless-width", "without-lanes"],
 )
 def test_another_architecture_is_refused(tmp_path, change):
-    path = rewritten(save_prior(small_prior(), tmp_path, {}), change)
+    path = rewritten(save_prior(small_prior(), tmp_path, origin={}), change)
     with pytest.raises(InputError, match="prior-"):
         load_prior(path)
 
@@ -76,6 +76,6 @@ def test_missing_damaged_foreign_and_incomplete_files_are_refused(tmp_path):
     save_file({"x": torch.zeros(1)}, foreign)
     with pytest.raises(InputError, match="format"):
         load_prior(str(foreign))
-    path = rewritten(save_prior(small_prior(), tmp_path, {}), lambda a: None, drop="denoiser.head.1.bias")
+    path = rewritten(save_prior(small_prior(), tmp_path, origin={}), lambda a: None, drop="denoiser.head.1.bias")
     with pytest.raises(InputError, match="head"):
         load_prior(path)

@@ -17,12 +17,12 @@ def features(scene, step=None):
     state = locate(
         scene["start"][:, :vehicles],
         scene["start_accel"][:, :vehicles],
-        scene["start_yaw_rate"][:, :vehicles],
-        routed.points,
+        yaw_rate=scene["start_yaw_rate"][:, :vehicles],
+        points=routed.points,
     )
     step = torch.zeros(len(scene), dtype=torch.long) if step is None else step
     nodes = node_features(
-        routed, state, leaders_ahead(routed, state.s, scene["start"], scene["valid"]), step, step == 0
+        routed, state, leaders_ahead(routed, state.s, agents=scene["start"], present=scene["valid"]), step, step == 0
     )
     here = scene["valid"][0, :vehicles]
     return nodes[:, here], edge_features(routed, state)[:, here][:, :, here]
@@ -42,7 +42,7 @@ def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
 
 def test_features_do_not_know_where_the_scene_lies():
     scene = curved_scenes()
-    for here, there in zip(features(scene), features(moved(scene, 120.0, -40.0, 0.7)), strict=True):
+    for here, there in zip(features(scene), features(moved(scene, 120.0, y=-40.0, angle=0.7)), strict=True):
         torch.testing.assert_close(there, here, rtol=0, atol=5e-3)
 
 
@@ -68,6 +68,6 @@ def test_a_queue_a_light_and_a_limit_are_seen():
 
 
 def test_the_curve_speed_of_a_circle_is_that_of_its_radius():
-    points = arc(0, 0, 0, 0.02)[None, None]
-    state = locate(torch.tensor([[[0.0, 0.0, 0.0, 8.0]]]), torch.zeros(1, 1), torch.zeros(1, 1), points)
-    assert curve_speed(state, points, 2.5, 1.2).item() == pytest.approx(math.sqrt(2.5 / 0.02), rel=1e-2)
+    points = arc(0, 0, heading=0, curvature=0.02)[None, None]
+    state = locate(torch.tensor([[[0.0, 0.0, 0.0, 8.0]]]), torch.zeros(1, 1), yaw_rate=torch.zeros(1, 1), points=points)
+    assert curve_speed(state, points, lateral=2.5, brake=1.2).item() == pytest.approx(math.sqrt(2.5 / 0.02), rel=1e-2)

@@ -10,13 +10,13 @@ COUNT = 32
 
 def start(v, kappa, heading):
     zero = torch.zeros_like(v)
-    return LaneState(zero + 20, zero, zero, zero, v, zero, zero + 3, zero - 2, heading, kappa)
+    return LaneState(zero + 20, zero, d1=zero, d2=zero, v=v, a=zero, x=zero + 3, y=zero - 2, heading=heading, kappa=kappa)
 
 
 def random_start(seed=0):
     generator = torch.Generator().manual_seed(seed)
     draw = lambda low, high: low + (high - low) * torch.rand(COUNT, generator=generator)  # noqa: E731
-    return start(draw(4, 12), draw(-0.03, 0.03), draw(-3, 3)), generator
+    return start(draw(4, 12), draw(-0.03, 0.03), heading=draw(-3, 3)), generator
 
 
 def test_constant_curvature_is_a_circle():
@@ -39,7 +39,7 @@ def test_fitting_a_decoded_plan_gives_it_back():
     x = torch.cat([0.3 * torch.randn(COUNT, KNOTS, generator=generator), torch.randn(COUNT, 2, generator=generator)], 1)
     plan = decode(x, state)
     wrapped = torch.remainder(plan.heading + torch.pi, 2 * torch.pi) - torch.pi
-    found = fit(wrapped, torch.ones_like(plan.heading), state, x[:, :KNOTS])
+    found = fit(wrapped, torch.ones_like(plan.heading), state=state, knots=x[:, :KNOTS])
     again = decode(torch.cat([x[:, :KNOTS], found], 1), state)
     gap = torch.hypot(again.x - plan.x, again.y - plan.y)
     assert gap.max() < 0.1
@@ -58,7 +58,7 @@ def test_heading_is_the_direction_of_motion():
 
 def test_a_standing_vehicle_stays_and_gradients_are_finite():
     zero = torch.zeros(4)
-    state = start(zero, zero, zero + 0.5)
+    state = start(zero, zero, heading=zero + 0.5)
     x = torch.cat([-torch.ones(4, KNOTS), torch.ones(4, 2)], 1).requires_grad_(True)
     plan = decode(x, state)
     torch.testing.assert_close(plan.x, state.x[:, None].expand(4, HORIZON))

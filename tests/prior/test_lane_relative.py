@@ -29,14 +29,14 @@ def generator():
 
 def routes(count=COUNT):
     curvature = torch.linspace(-0.02, 0.02, count).tolist()
-    return torch.stack([arc(0.0, 0.0, 0.3, c) for c in curvature])
+    return torch.stack([arc(0.0, 0.0, heading=0.3, curvature=c) for c in curvature])
 
 
 def straight(v, a=0.0, d=0.0, heading=0.0, count=1):
     """Vehicles at 20 m of a route along +x."""
     full = lambda value: torch.full((count,), float(value))  # noqa: E731
     return LaneState(
-        full(20), full(d), full(heading).tan(), full(0), full(v), full(a), full(0), full(d), full(heading), full(0)
+        full(20), full(d), d1=full(heading).tan(), d2=full(0), v=full(v), a=full(a), x=full(0), y=full(d), heading=full(heading), kappa=full(0)
     )
 
 
@@ -44,7 +44,7 @@ def test_plans_begin_where_and_as_the_vehicle_is(generator):
     points = routes()
     state = random_state(points, generator)
     x = torch.randn(COUNT, SIZE, generator=generator)
-    plan = decode(x, state, points)
+    plan = decode(x, state, points=points)
     step = 0.1 * (state.v + plan.v[:, 0]) / 2
     expected = torch.stack([state.x + step * state.heading.cos(), state.y + step * state.heading.sin()], -1)
     gap = torch.stack([plan.x[:, 0], plan.y[:, 0]], -1) - expected
@@ -59,7 +59,7 @@ def test_the_offset_passes_its_half_way_mark_and_ends_flat_at_its_target(generat
     state = straight(8.0, d=1.5, heading=0.05)
     x = torch.zeros(1, SIZE)
     x[:, KNOTS:] = torch.tensor([0.8, -2.0])
-    plan = decode(x, state, arc(0, 0, 0, 0)[None])
+    plan = decode(x, state, points=arc(0, 0, heading=0, curvature=0)[None])
     reach = lateral_horizon(state.v).item()
     end = -2.0 * OFFSET_SCALE
     way = plan.s - state.s
@@ -76,7 +76,7 @@ def test_the_offset_passes_its_half_way_mark_and_ends_flat_at_its_target(generat
 def test_constant_acceleration_is_the_closed_form(accel):
     state = straight(12.0, a=accel)
     x = torch.cat([torch.full((1, KNOTS), accel), torch.zeros(1, 2)], 1)
-    plan = decode(x, state, arc(0, 0, 0, 0)[None])
+    plan = decode(x, state, points=arc(0, 0, heading=0, curvature=0)[None])
     torch.testing.assert_close(plan.v[0], 12 + accel * TIME)
     torch.testing.assert_close(plan.x[0], 12 * TIME + accel * TIME**2 / 2, rtol=1e-4, atol=1e-3)
 
@@ -84,7 +84,7 @@ def test_constant_acceleration_is_the_closed_form(accel):
 def test_nobody_reverses(generator):
     points = routes()
     state = random_state(points, generator, speed=(0.0, 5.0))
-    plan = decode(-4 * torch.rand(COUNT, SIZE, generator=generator), state, points)
+    plan = decode(-4 * torch.rand(COUNT, SIZE, generator=generator), state, points=points)
     assert (plan.v >= 0).all() and (plan.s.diff(dim=-1) >= -1e-5).all()
     assert (plan.v[:, -1] == 0).all()
 
@@ -93,7 +93,7 @@ def test_gradients_are_finite_everywhere(generator):
     points = routes()
     state = random_state(points, generator, speed=(0.0, 8.0))
     x = (3 * torch.randn(COUNT, SIZE, generator=generator)).requires_grad_(True)
-    plan = decode(x, state, points)
+    plan = decode(x, state, points=points)
     (gradient,) = torch.autograd.grad(plan.states().square().sum(), x)
     assert gradient.isfinite().all() and (gradient[:, :KNOTS] != 0).any(1).all(), "a held speed still passes some"
 
@@ -101,7 +101,7 @@ def test_gradients_are_finite_everywhere(generator):
 def test_a_standing_vehicle_does_not_move_sideways():
     state = straight(0.0, d=1.0, heading=0.2)
     x = torch.cat([-torch.ones(1, KNOTS), torch.tensor([[3.0, -4.0]])], 1)
-    plan = decode(x, state, arc(0, 0, 0, 0)[None])
+    plan = decode(x, state, points=arc(0, 0, heading=0, curvature=0)[None])
     for name in ("x", "y", "heading"):
         torch.testing.assert_close(
             getattr(plan, name), getattr(state, name)[:, None].expand(1, HORIZON), rtol=0, atol=1e-4
@@ -114,22 +114,22 @@ def test_fitting_a_decoded_plan_gives_it_back(generator):
     state = random_state(points, generator, speed=(10.0, 15.0))
     knots = state.a[:, None] + (0.05 * torch.randn(COUNT, KNOTS, generator=generator)).cumsum(1)
     x = torch.cat([knots.clamp(-1.5, 3), torch.randn(COUNT, 2, generator=generator)], 1)
-    plan = decode(x, state, points)
-    found, error = fit(plan, torch.ones_like(plan.s), state)
+    plan = decode(x, state, points=points)
+    found, error = fit(plan, torch.ones_like(plan.s), state=state)
     assert error.max() < 0.1
     torch.testing.assert_close(found[:, :KNOTS], x[:, :KNOTS], rtol=0, atol=0.15)
     # The ridge pulls lateral knots towards 0; the offsets they stand for are met within centimetres.
-    torch.testing.assert_close(decode(found, state, points).d, plan.d, rtol=0, atol=0.08)
+    torch.testing.assert_close(decode(found, state, points=points).d, plan.d, rtol=0, atol=0.08)
 
 
 def test_unknown_steps_do_not_influence_a_fit(generator):
     points = routes()
     state = random_state(points, generator)
-    plan = decode(torch.randn(COUNT, SIZE, generator=generator), state, points)
+    plan = decode(torch.randn(COUNT, SIZE, generator=generator), state, points=points)
     known = torch.ones_like(plan.s)
     known[:, 20:] = 0
     other = plan.map(lambda value: torch.where(known > 0, value, -77.0))
-    for one, two in zip(fit(plan, known, state), fit(other, known, state), strict=True):
+    for one, two in zip(fit(plan, known, state=state), fit(other, known, state=state), strict=True):
         torch.testing.assert_close(one, two)
 
 

@@ -157,7 +157,7 @@ def test_the_ego_s_plan_becomes_the_x_that_decodes_to_it(on_lane):
 def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     scene = curved_scenes()
     scene["start"][:, 5] = torch.tensor([-7.0, 0.0, 0.0, 14.0])  # runs into the ego from behind
-    scene["route_points"][:, 5] = arc(-7.0, 0.0, 0.0, 0.0)
+    scene["route_points"][:, 5] = arc(-7.0, 0.0, heading=0.0, curvature=0.0)
     x0 = torch.zeros(*scene["route_log"].shape, SIZE)
     tight, loose = (small_prior(bounds=bounds) for bounds in (BoundSettings(curve=False), FREE))
     free = loose.plan(x0, context_of(loose, scene)).motion.v
@@ -166,7 +166,7 @@ def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     nobody = torch.zeros(scene["route_log"].shape, dtype=torch.bool)
     exempt = nobody.clone()
     exempt[:, 5] = True
-    context.obstacles.duty = Duty(exempt, nobody, torch.zeros_like(free[..., 0]))
+    context.obstacles.duty = Duty(exempt, nobody, patience=torch.zeros_like(free[..., 0]))
     bold = tight.plan(x0, context).motion.v
     assert (shy[0, 5, 2:] < free[0, 5, 2:]).all()
     others = torch.arange(shy.shape[1]) != 5
@@ -242,10 +242,10 @@ def test_routes_are_drawn_in_proportion_and_never_where_there_is_none():
     logits = torch.tensor([1.0, -torch.inf, 0.0, -torch.inf]).expand(20_000, 4)
     uniform = torch.rand(len(logits), generator=torch.Generator().manual_seed(0))
     uniform[0], uniform[1] = 0.0, 1.0
-    chosen = sample_route(logits, 0.5, uniform)
+    chosen = sample_route(logits, 0.5, uniform=uniform)
     share = torch.bincount(chosen, minlength=4) / len(chosen)
     torch.testing.assert_close(share, torch.softmax(logits[0] / 0.5, -1), rtol=0, atol=0.01)
-    assert (sample_route(logits, 0.0, uniform) == 0).all()
+    assert (sample_route(logits, 0.0, uniform=uniform) == 0).all()
 
 
 def test_the_ego_follows_its_mission_whatever_is_drawn():
@@ -278,5 +278,5 @@ def test_without_a_plan_the_ego_is_sampled_like_everybody_else():
     known = context_of(prior, scene)
     step = torch.zeros(len(scene), dtype=torch.long)
     unknown = prior.encode(known.routed, known.state, scene["start"], scene["valid"], step, None)
-    one, two = (prior.sample(unknown, noise_for(prior, scene, seed)).x0[:, 0] for seed in (0, 1))
+    one, two = (prior.sample(unknown, noise_for(prior, scene, seed=seed)).x0[:, 0] for seed in (0, 1))
     assert (one - two).abs().amin() > 0

@@ -139,7 +139,7 @@ def guided(gradient, scaling):
         x0 = plain(x, t)
         through = x0 if gradient == "clean" else x
         (away,) = torch.autograd.grad((WEIGHT * x0**2 / 2).sum(), through)
-        return (x0 - gradient_weight(SCHEDULE, t, scaling) * away).detach()
+        return (x0 - gradient_weight(SCHEDULE, t, scaling=scaling) * away).detach()
 
     return estimate
 
@@ -171,7 +171,7 @@ def errors(sampler, counts):
     for count in counts:
         levels = torch.linspace(0.9, 0.1, count + 1, dtype=torch.float64)
         end = run(denoiser(MEAN, STD), *sampler, levels, torch.cat([x[None], torch.zeros(count - 1, 5)]))
-        out.append((end - flow(x, MEAN, STD, levels[0], levels[-1])).abs().max().item())
+        out.append((end - flow(x, MEAN, std=STD, high=levels[0], low=levels[-1])).abs().max().item())
     return torch.tensor(out)
 
 

@@ -29,7 +29,7 @@ def test_any_one_sample_is_standard_normal_and_vehicles_are_independent():
     settings = SamplerSettings(steps=3)
     direction = main_direction(SCHEDULE, settings)
     noise = stratified_noise(
-        draws(COUNT, 3, SCENES, 2, SIZE, normal=True), direction, draws(COUNT, SCENES, 2), draws(SCENES, 2)
+        draws(COUNT, 3, SCENES, 2, SIZE, normal=True), direction, order=draws(COUNT, SCENES, 2), position=draws(SCENES, 2)
     )
     for sample in noise[:2]:
         rows = sample.permute(1, 2, 0, 3).flatten(1)  # [SCENES, vehicles x steps x SIZE]
@@ -42,7 +42,7 @@ def test_any_one_sample_is_standard_normal_and_vehicles_are_independent():
 def test_samples_differ_along_the_direction_and_keep_the_rest():
     direction = main_direction(SCHEDULE, SamplerSettings(steps=3))
     before = draws(COUNT, 3, 50, 2, SIZE, normal=True)
-    after = stratified_noise(before, direction, draws(COUNT, 50, 2), draws(50, 2))
+    after = stratified_noise(before, direction, order=draws(COUNT, 50, 2), position=draws(50, 2))
     along = torch.einsum("skbvx,kx->sbv", after, direction).sort(0).values
     edges = torch.special.ndtri(torch.arange(1, COUNT) / COUNT)[:, None, None]
     assert (along[:-1] <= edges + 1e-4).all() and (along[1:] >= edges - 1e-4).all()

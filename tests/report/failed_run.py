@@ -39,7 +39,7 @@ def write_run(folder: Path, rollouts: dict[str, Rollouts]) -> Path:
         driven.to_npz(folder / ROLLOUTS)
         rows += scores
         features += samples
-    record(rows, features, [], folder, lambda *found: metric_rows(*found, draws=20, realism_draws=2))
+    record(rows, features, errored=[], folder=folder, summarise=lambda *found: metric_rows(*found, draws=20, realism_draws=2))
     return folder
 
 

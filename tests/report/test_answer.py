@@ -40,12 +40,12 @@ def modes_of(*modes):
     return {"failures": sum(failures), "groups": groups, "modes": list(modes)}
 
 
-MODES = modes_of(mode(1, "rear", 4, 0), mode(2, "oncoming", 2, 2), mode(0, "other", 2, 2))
+MODES = modes_of(mode(1, "rear", count=4, counted=0), mode(2, "oncoming", count=2, counted=2), mode(0, "other", count=2, counted=2))
 
 
 def test_an_attack_is_told_with_its_numbers_and_the_weaknesses_that_count():
     attack = row("e2", 2.0, cfr=0.25)
-    attack["metrics"]["cfr"] = value(0.25, 12, 0.055, 0.572)
+    attack["metrics"]["cfr"] = value(0.25, 12, low=0.055, high=0.572)
     attack["paired"] = {"nominal": {"cfr": {"difference": 0.17, "low": 0.02, "high": 0.31, "n": 12}}}
     text = " ".join(" ".join(answer_lines([row(cfr=1 / 12), attack], MODES)).split())
     for part in (
@@ -63,7 +63,7 @@ def test_methods_stand_by_what_they_find_and_egos_by_how_little():
     lines = answer_lines([row(), row("a", 1.0, cfr=1 / 4), row("b", 1.0, cfr=1 / 2)])
     assert [line.split()[0] for line in lines if " of 12)" in line] == ["b", "a", "nominal"]
     assert lines[0].startswith("lane_graph fails most in the traffic of b η=1: hit in 6 of 12 rollouts")
-    lines = answer_lines([row("e2", 2.0, ego, cfr=cfr) for ego, cfr in (("idm", 0.5), ("actor", 0.25))])
+    lines = answer_lines([row("e2", 2.0, ego=ego, cfr=cfr) for ego, cfr in (("idm", 0.5), ("actor", 0.25))])
     assert [line.split()[0] for line in lines if " of 12)" in line] == ["actor", "idm"]
     lines = answer_lines([row(), row("a", 1.0), row("b", 1.0)])
     assert lines[0].startswith("lane_graph does not fail, not even in the traffic of a η=1: hit in 0 of 12")
@@ -90,7 +90,7 @@ def atlas(failed, **scenes):
 def test_the_ways_before_and_after_training_stand_side_by_side(tmp_path):
     old = row("e2", 2.0, cfr=0.5)
     new = row("e2", 2.0, cfr=0.25)
-    lines = compared_answer([old], [new], (atlas(4, rear=1, oncoming=3), atlas(2, crossing=1, oncoming=1)), tmp_path)
+    lines = compared_answer([old], [new], atlases=(atlas(4, rear=1, oncoming=3), atlas(2, crossing=1, oncoming=1)), folder=tmp_path)
     said = " ".join(" ".join(lines).split())
     assert "in 4 of 12 scenes before training, in 2 ways, and in 2 of 12 scenes after it, in 2 ways" in said
     assert "1 are gone, 1 are new" in said
@@ -100,22 +100,22 @@ def test_the_ways_before_and_after_training_stand_side_by_side(tmp_path):
     nominal = row("nominal", 0.0)
     rows = [old, milder, nominal]
     for atlases, shown in ((None, 3), ((atlas(0), atlas(0)), 2)):
-        hits = [line for line in compared_answer(rows, rows, atlases, tmp_path) if line.startswith("hit, ")]
+        hits = [line for line in compared_answer(rows, rows, atlases=atlases, folder=tmp_path) if line.startswith("hit, ")]
         assert len(hits) == shown, "beside an atlas nominal traffic and the strongest attack"
-    none = compared_answer([old], [new], (atlas(0), atlas(0)), tmp_path)
+    none = compared_answer([old], [new], atlases=(atlas(0), atlas(0)), folder=tmp_path)
     assert "in 0 of 12 scenes before training" in " ".join(" ".join(none).split())
 
 
 @pytest.mark.parametrize("width", [80, 100])
 def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
     monkeypatch.setenv("COLUMNS", str(width))
-    long = modes_of(*(mode(k, "crossing from the right, " * 6, 300, 300) for k in (1, 2, 3)))
-    egos = [row(method, eta, ego, 0.5, 9999) for ego in "uvwxyz" for method, eta in (("n", 0.0), ("ctg_adv", 2.5))]
+    long = modes_of(*(mode(k, "crossing from the right, " * 6, count=300, counted=300) for k in (1, 2, 3)))
+    egos = [row(method, eta, ego=ego, cfr=0.5, n=9999) for ego in "uvwxyz" for method, eta in (("n", 0.0), ("ctg_adv", 2.5))]
     notes = ["12 scenes left out: the ego overlaps another vehicle at the start of the recording."] * 4
     pairs = [row(f"a_long_name_of_a_method_{k}", 1.0, cfr=0.5) for k in range(9)]
     ways = atlas(9, **{"crossing from the right, " * 9 + str(k): k for k in range(20)})
-    answers = [answer_lines(rows, long, tmp_path, None, notes) for rows in (pairs[:1], egos, egos[:1])]
-    for lines in (*answers, *(compared_answer(pairs, pairs, each, tmp_path) for each in (None, (ways, ways)))):
+    answers = [answer_lines(rows, long, folder=tmp_path, report=None, notes=notes) for rows in (pairs[:1], egos, egos[:1])]
+    for lines in (*answers, *(compared_answer(pairs, pairs, atlases=each, folder=tmp_path) for each in (None, (ways, ways)))):
         assert len(lines) <= LINES and all(len(line) <= width for line in lines if str(tmp_path) not in line)
         assert lines[-1].endswith("tables.md"), "where everything lies is never cut"
 
@@ -148,7 +148,7 @@ def test_a_search_is_told_by_its_scenes_and_none_of_its_tries_rates():
 
 
 def test_nominal_failures_are_not_among_those_of_an_attack():
-    found = modes_of(mode(1, "rear", 4, 1, nominal=3), mode(2, "oncoming", 0, 0, nominal=5))
+    found = modes_of(mode(1, "rear", count=4, counted=1, nominal=3), mode(2, "oncoming", count=0, counted=0, nominal=5))
     text = " ".join(answer_lines([row(cfr=8 / 12), row("e2", 2.0, cfr=4 / 12)], found))
     assert "rear (4 of 4 failures, 1 count)" in text and "oncoming" not in text
 
@@ -158,7 +158,7 @@ def test_nominal_failures_are_not_among_those_of_an_attack():
     [(3, "No weakness stands out: 3 failures that count"), (0, "although none of the failures counts")],
 )
 def test_what_counts_is_not_denied(other, said):
-    found = modes_of(mode(1, "rear", 4, 0), mode(0, "other", 5, other))
+    found = modes_of(mode(1, "rear", count=4, counted=0), mode(0, "other", count=5, counted=other))
     assert said in " ".join(answer_lines([row("e2", 2.0, cfr=9 / 12)], found))
 
 

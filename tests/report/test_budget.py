@@ -26,12 +26,12 @@ def line(scene, seed, number, cell="", method="search", clean=0.0):
 def searched(method, found, rounds=4, seeds=(0, 1)):
     """A try of every scene in each round; found(scene, seed, round): the cell of its failure."""
     triples = ((scene, seed, number) for seed in seeds for number in range(rounds) for scene in range(40))
-    return [line(scene, seed, number, found(scene, seed, number), method) for scene, seed, number in triples]
+    return [line(scene, seed, number=number, cell=found(scene, seed, number), method=method) for scene, seed, number in triples]
 
 
 def rows_of(told, *budgets, unit="nfe", known=None, plans=None):
     return budget_rows(
-        told, SCENES, budgets, unit, known or {}, plans or list(dict.fromkeys(r["method"] for r in told))
+        told, SCENES, budgets=budgets, unit=unit, samples=known or {}, plans=plans or list(dict.fromkeys(r["method"] for r in told))
     )
 
 
@@ -44,7 +44,7 @@ def test_what_is_found_grows_with_the_budget_and_is_the_mean_of_the_seeds():
     told = searched("search", lambda scene, seed, number: f"{scene % 5}" if not seed and scene % 4 == number else "")
     for rounds in (1, 2, 3, 4):
         for unit, budget in (("tries", rounds), ("nfe", 100 * rounds), ("seconds", 0.1 * rounds)):
-            row = one_row(told, budget, unit)
+            row = one_row(told, budget, unit=unit)
             assert row["scenes"]["mean"] == pytest.approx(100 * rounds / 4 / 2)
             assert row["failures"]["mean"] == pytest.approx(rounds / 4 / 2)
             assert row["cells"]["mean"] == pytest.approx(5 / 2)
@@ -86,7 +86,7 @@ def test_realism_is_of_the_adversaries_of_the_tries_within_the_budget():
 def test_tables_files_and_the_picture(tmp_path):
     told = searched("search", lambda scene, *_: f"{scene % 7}") + searched("e2", lambda scene, *_: "0")
     rows = rows_of(told, 200, 400)
-    (table,) = budget_tables(rows, 40, "Told the ego's plan: nobody.")
+    (table,) = budget_tables(rows, 40, knowledge="Told the ego's plan: nobody.")
     assert [cells[:2] for cells in table.rows] == [["search", "200"], ["e2", "200"], ["search", "400"], ["e2", "400"]]
     assert "ratio" in table.markdown() and "idm" in table.title
     write_budget(tmp_path / "budget.csv", rows)
@@ -96,7 +96,7 @@ def test_tables_files_and_the_picture(tmp_path):
     figure = budget_figure(told, 40)
     lines = figure.axes[0].get_lines()
     assert [each.get_label() for each in lines] == ["search", "e2"] and len(figure.axes) == 6
-    x, y = curve([row for row in told if row["method"] == "search"], "nfe", "cells", 40)
+    x, y = curve([row for row in told if row["method"] == "search"], "nfe", name="cells", scenes=40)
     assert max(y) == 7 and x == sorted(x) and y == sorted(y)
 
 
@@ -169,7 +169,7 @@ def test_what_was_not_tried_is_no_zero():
         row["nfe"] = 100.0 * (1 + number % 160) / 40
     none, some = rows_of(told, 1, 25, plans=["search"])
     assert math.isnan(none["scenes"]["mean"]) and some["scenes"]["mean"] == 25 and some["tried"] == 10
-    (table,) = budget_tables([none, some], 40, "")
+    (table,) = budget_tables([none, some], 40, knowledge="")
     assert table.rows[0][5:] == ["–"] * 8 and "in 10 scenes" in table.rows[1][2]
 
 

@@ -9,7 +9,7 @@ from e2rl.search.tries import TRIES
 
 TRAINED = ["a_0", "a_1"]
 OTHERS = ["b_0", "b_1"]
-EGOS = EgoSet({}, ["a", "b"], [("a", "b")], {"a": TRAINED, "b": OTHERS})
+EGOS = EgoSet({}, ["a", "b"], pairs=[("a", "b")], trainings={"a": TRAINED, "b": OTHERS})
 
 
 def tries(ego, failed, scenes=60, each=3, seed=0):
@@ -49,6 +49,6 @@ def test_trainings_are_pooled_and_compared_by_scene():
 @pytest.mark.parametrize("pairs", [[], [("a_0", "b_0"), ("a_0", "b_1")]])
 def test_egos_may_be_compared_with_none_or_with_the_first(pairs):
     rows = tries("a_0", {1}) + tries("b_0", {1}) + tries("b_1", set())
-    table = searched_table(rows, EgoSet({}, ["a_0", "b_0", "b_1"], pairs))
+    table = searched_table(rows, EgoSet({}, ["a_0", "b_0", "b_1"], pairs=pairs))
     assert [line[0] for line in table.rows] == ["a_0, search", "b_0, search", "b_1, search"]
     assert (table.rows[0][4] == "–") == (not pairs)

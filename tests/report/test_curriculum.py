@@ -16,7 +16,7 @@ def row(number, eta, template, draws, episodes=0, failures=0):
     return dict(zip(COLUMNS, (number, eta, template, draws, 0, episodes, failures, rate, NAN), strict=True))
 
 
-ROWS = [row(0, 1.0, "pair", 3, 4, 1), row(0, 0.5, "full", 1), row(1, 2.0, "single", 2, 5, 5), row(1, 1.0, "pair", 0)]
+ROWS = [row(0, 1.0, template="pair", draws=3, episodes=4, failures=1), row(0, 0.5, template="full", draws=1), row(1, 2.0, template="single", draws=2, episodes=5, failures=5), row(1, 1.0, template="pair", draws=0)]
 
 
 def test_cells_are_fractions_of_a_round_s_draws_and_of_failed_episodes():

@@ -21,7 +21,7 @@ def trial(gain, step, cfr, realism=0.8):
 
 def tuning(best=None):
     """Trials at gains 0.5 (as it is), 2.0 and 0.1, and one with another step size, in 12 rollouts' nominal traffic."""
-    trials = [trial(0.5, 0.3, 0.3), trial(2.0, 0.3, 0.5), trial(0.1, 0.3, 0.1, realism=math.nan), trial(1.0, 0.7, 0.4)]
+    trials = [trial(0.5, 0.3, cfr=0.3), trial(2.0, 0.3, cfr=0.5), trial(0.1, 0.3, cfr=0.1, realism=math.nan), trial(1.0, 0.7, cfr=0.4)]
     for each in trials:
         each["metrics"] |= MEASURED | {"cfr nominal": 0.05, "real nominal": 0.93, "real_adv nominal": math.nan}
     return {"best": best and trials[best]["parameters"], "trials": trials}
@@ -39,7 +39,7 @@ def interval(value):
     return {"mean": value, "low": value - 0.01, "high": value + 0.01, "n": 12}
 
 
-ROWS = [row("nominal", 0.0, 0.05), row("cat", 4.0, 0.2), row("cat", 1.0, 0.1), row("e2", 2.0, 0.4)]
+ROWS = [row("nominal", 0.0, cfr=0.05), row("cat", 4.0, cfr=0.2), row("cat", 1.0, cfr=0.1), row("e2", 2.0, cfr=0.4)]
 
 
 @pytest.mark.parametrize(("best", "expected"), [(None, []), (1, [(2.0, True)]), (3, [(1.0, False)])])

@@ -61,7 +61,7 @@ def test_everybody_is_where_the_rollout_has_them():
 @pytest.mark.parametrize(("gap", "preventable"), [(30.5, 1), (6.0, 0)])
 def test_the_competent_driver_does_what_the_verdict_says(gap, preventable):
     """It brakes for a slower vehicle 30 m ahead; 1 m of gap is too late for it."""
-    ((_, row, replay),) = replays_of(scene(course(0, 0, 0, 12), course(gap, 0, 0, 5), adversaries=[1]))
+    ((_, row, replay),) = replays_of(scene(course(0, 0, heading=0, speed=12), course(gap, 0, heading=0, speed=5), adversaries=[1]))
     motion = motion_of(replay)
     driver = track_of(replay, "driver")
     ego = track_of(replay, "ego")

@@ -17,20 +17,20 @@ from e2rl.traffic.e2.skeleton import Selection
 from e2rl.traffic.e2.topology import TopologySettings, pair_weights
 from tests.metrics.test_contact import course, scene
 
-EGO = course(0, 0, 0, 10)
-AHEAD = course(25, 0, 0, 6)
-FAR = course(50, 0, 0, 4)
-ASIDE = course(0, 25, 1.0, 0)
+EGO = course(0, 0, heading=0, speed=10)
+AHEAD = course(25, 0, heading=0, speed=6)
+FAR = course(50, 0, heading=0, speed=4)
+ASIDE = course(0, 25, heading=1.0, speed=0)
 
 
 def replay_of(*courses, eta=2.0):
     rollouts = scene(*courses, adversaries=[1])
     rollouts.eta = torch.tensor([eta])
-    return Replay(rollouts.rollout(0), score_rollouts(rollouts)[0][0], 60.0, SIDE)
+    return Replay(rollouts.rollout(0), score_rollouts(rollouts)[0][0], metres=60.0, pixels=SIDE)
 
 
 def test_panels_stand_by_eta_at_their_contacts_and_without_one_at_the_first_of_the_stronger():
-    replays = [replay_of(EGO, course(x, 0, 0, 5), eta=eta) for eta, x in ((0.0, 70), (1.0, 35), (3.0, 20))]
+    replays = [replay_of(EGO, course(x, 0, heading=0, speed=5), eta=eta) for eta, x in ((0.0, 70), (1.0, 35), (3.0, 20))]
     figure = drawing.image_of(intensity_figure([Failure(each.rollout, each.row) for each in replays]))
     assert replays[0].contact is None and replays[1].contact > replays[2].contact
     times = [replays[1].contact, replays[1].contact, replays[2].contact]
@@ -49,7 +49,7 @@ def shown():
     settings = TopologySettings()
     reference = torch.as_tensor(rollout.states[:50:5])[None]
     size = torch.as_tensor(rollout.size)[None, None].expand(*reference.shape[:3], 2)
-    weights = pair_weights(reference, torch.ones(reference.shape[:3], dtype=torch.bool), size, settings)
+    weights = pair_weights(reference, torch.ones(reference.shape[:3], dtype=torch.bool), size=size, settings=settings)
     coalition, candidates = (torch.tensor([[False, True, True, third]]) for third in (False, True))
     zero = torch.tensor([0])
     moments = 0.5 * torch.arange(10.0)[None]
@@ -81,7 +81,7 @@ def test_vehicles_have_the_colour_of_their_part(shown):
 
 def test_the_same_figure_is_written_as_the_same_pixels_and_vectors_and_no_name_is_a_formula(tmp_path):
     for name in "ab":
-        made, axes = new_panels(2, 200, 10, 40, 30)
+        made, axes = new_panels(2, 200, gap=10, head=40, foot=30)
         axes[0].plot([0, 1, 2], [0, 1, 0], linewidth=2)
         axes[0].set_title("$\\frac{")
         save_figure(tmp_path / f"{name}.png", made)

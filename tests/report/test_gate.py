@@ -25,14 +25,14 @@ def gate(capsys, *arguments):
 def run_with(folder, places, hits, **settings):
     """A run of one rollout at each place, `hits` of them contacts, and a nominal one without."""
     rows = [row_of(k, hit=k < hits, progress=30.0 + k % 7) for k in range(places)]
-    return run_of(folder, rows + [row_of(k, method="nominal", eta=0.0) for k in range(places)], settings)
+    return run_of(folder, rows + [row_of(k, method="nominal", eta=0.0) for k in range(places)], settings=settings)
 
 
 @pytest.mark.parametrize(("limit", "places"), [(0.05, 20), (0.1, 12), (0.01, 30)])
 def test_without_an_event_the_number_is_that_of_the_binomial(limit, places):
     """(1 - limit)^m = 0.025."""
     high = exact_interval(0.0, places)[1]
-    needed = places * growth((0.0, 0.0, high), limit, places, True)
+    needed = places * growth((0.0, 0.0, high), limit, places=places, fraction=True)
     assert needed == pytest.approx(math.log(0.025) / math.log(1 - limit), rel=1e-6)
     assert binom.pmf(0, math.ceil(needed), limit) <= 0.025 < binom.pmf(0, math.floor(needed), limit)
 
@@ -41,7 +41,7 @@ def test_without_an_event_the_number_is_that_of_the_binomial(limit, places):
 def test_of_many_places_the_number_is_that_of_the_normal_law(value, limit):
     """m = z^2 p (1 - p) / (limit - p)^2."""
     ends = exact_interval(value, 100)
-    needed = 100 * growth((value, *ends), limit, 100, True)
+    needed = 100 * growth((value, *ends), limit, places=100, fraction=True)
     assert needed == pytest.approx(Z**2 * value * (1 - value) / (limit - value) ** 2, rel=0.05)
     assert exact_interval(value, needed)[value < limit] == pytest.approx(limit, abs=1e-6)
 
@@ -49,14 +49,14 @@ def test_of_many_places_the_number_is_that_of_the_normal_law(value, limit):
 def test_intervals_of_means_shrink_with_the_root():
     half = 4.0
     gap = 1.0
-    assert growth((30.0, 30 - half, 30 + half), 30 - gap, 50, False) == pytest.approx((half / gap) ** 2)
-    assert growth((30.0, 26.0, 34.0), 30.0, 50, False) is None
-    assert growth((0.2, 0.1, 0.3), 0.2 + 1e-12, 50, True) is None
-    assert growth((0.1, math.nan, math.nan), 0.2, 4, True) == LEAST / 4
+    assert growth((30.0, 30 - half, 30 + half), 30 - gap, places=50, fraction=False) == pytest.approx((half / gap) ** 2)
+    assert growth((30.0, 26.0, 34.0), 30.0, places=50, fraction=False) is None
+    assert growth((0.2, 0.1, 0.3), 0.2 + 1e-12, places=50, fraction=True) is None
+    assert growth((0.1, math.nan, math.nan), 0.2, places=4, fraction=True) == LEAST / 4
 
 
 def test_the_rollouts_that_it_asks_for_decide(tmp_path, capsys):
-    run = run_with(tmp_path / "few", 30, 0)
+    run = run_with(tmp_path / "few", 30, hits=0)
     file = tmp_path / "gate.json"
     status, said = gate(capsys, run, "preventable<=0.05", "--json", file)
     (result,) = json.loads(file.read_text())
@@ -64,9 +64,9 @@ def test_the_rollouts_that_it_asks_for_decide(tmp_path, capsys):
         status == 3
         and f"not enough rollouts: about {result['more']} more, at further places; preventable<=0.05: found 0.0" in said
     )
-    enough = run_with(tmp_path / "enough", 30 + result["more"], 0)
+    enough = run_with(tmp_path / "enough", 30 + result["more"], hits=0)
     assert gate(capsys, enough, "preventable<=0.05")[0] == 0
-    assert gate(capsys, run_with(tmp_path / "short", 29 + result["more"], 0), "preventable<=0.05")[0] == 3
+    assert gate(capsys, run_with(tmp_path / "short", 29 + result["more"], hits=0), "preventable<=0.05")[0] == 3
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_the_rollouts_that_it_asks_for_decide(tmp_path, capsys):
 )
 def test_the_interval_decides_and_a_failure_outweighs_doubt(tmp_path, capsys, rules, status):
     """40 of 100 places: the interval is about 0.31 to 0.50."""
-    found, said = gate(capsys, run_with(tmp_path, 100, 40), *rules)
+    found, said = gate(capsys, run_with(tmp_path, 100, hits=40), *rules)
     assert found == status and len(said.splitlines()) == len(rules) and all(rule in said for rule in rules)
 
 
@@ -101,7 +101,7 @@ def test_the_interval_decides_and_a_failure_outweighs_doubt(tmp_path, capsys, ru
     ],
 )
 def test_bad_rules_have_the_status_of_bad_input(tmp_path, capsys, rules, said):
-    status, text = gate(capsys, run_with(tmp_path, 12, 1), *rules)
+    status, text = gate(capsys, run_with(tmp_path, 12, hits=1), *rules)
     assert status == 2 and said in text and len(text.splitlines()) == 1
 
 
@@ -113,15 +113,15 @@ def test_an_attack_must_be_named_where_there_are_several(tmp_path, capsys):
 
 
 def test_changes_are_measured_against_a_former_run(tmp_path, capsys):
-    before = run_with(tmp_path / "before", 200, 60)
-    after = run_with(tmp_path / "after", 200, 20)
+    before = run_with(tmp_path / "before", 200, hits=60)
+    after = run_with(tmp_path / "after", 200, hits=20)
     against = ("--against", before)
     assert gate(capsys, after, "contacts<=+0.02", *against)[0] == 0
     assert gate(capsys, after, "contacts<=-0.1", *against)[0] == 0
     assert gate(capsys, before, "contacts<=+0.02", "--against", after)[0] == 1
     assert gate(capsys, after, "contacts<=-0.2", *against)[0] == 3
     assert "no rule is on a change" in gate(capsys, after, "contacts<=0.2", *against)[1]
-    other = run_with(tmp_path / "other", 200, 20, seeds=[7])
+    other = run_with(tmp_path / "other", 200, hits=20, seeds=[7])
     status, said = gate(capsys, other, "contacts<=+0.02", *against)
     assert status == 2 and "which has other seeds" in said
 
@@ -142,7 +142,7 @@ def test_changes_are_measured_against_a_former_run(tmp_path, capsys):
 )
 def test_a_planner_that_has_not_changed_is_within_what_its_places_exclude(tmp_path, capsys, rule, status):
     """No place of 80 differs: at most 4.5% do."""
-    run = run_with(tmp_path, 80, 24)
+    run = run_with(tmp_path, 80, hits=24)
     found, said = gate(capsys, run, rule, "--against", run)
     assert found == status and ("[-4.5, +4.5] points" in said) == ("progress" not in rule)
 
@@ -151,7 +151,7 @@ def test_a_planner_that_has_not_changed_is_within_what_its_places_exclude(tmp_pa
 def test_the_number_for_an_unchanged_planner_is_that_without_an_event(places, limit, more):
     """ln 0.025 / ln 0.95 = 72, and 90.4 for 4%."""
     bound = exact_interval(0.0, places)[1]
-    assert math.ceil(places * (growth((0.0, -bound, bound), limit, places, False) - 1)) == more
+    assert math.ceil(places * (growth((0.0, -bound, bound), limit, places=places, fraction=False) - 1)) == more
 
 
 def test_the_same_progress_everywhere_is_decided(tmp_path, capsys):
@@ -186,7 +186,7 @@ def check(node):
 def test_the_files_for_continuous_integration_hold_what_was_decided(tmp_path, capsys):
     rules = ["preventable<=0.6", "preventable<=0.2", "preventable<=0.45"]
     files = [tmp_path / "out" / "gate.xml", tmp_path / "out" / "gate.json"]
-    run = run_with(tmp_path / "run", 100, 40)
+    run = run_with(tmp_path / "run", 100, hits=40)
     gate(capsys, run, *rules, "--junit", files[0], "--json", files[1])
     root = ET.fromstring(files[0].read_text())
     check(root)
@@ -298,14 +298,14 @@ def test_the_errored_rollouts_of_an_earlier_version_s_run_count_as_the_planner_s
 @pytest.mark.parametrize("limit", ["5", "1.01", "41.7", "100", "00002"])
 @pytest.mark.parametrize("rate", ["contacts", "preventable", "counted", "clean"])
 def test_a_limit_that_no_fraction_reaches_is_refused(tmp_path, capsys, rate, limit):
-    status, said = gate(capsys, run_with(tmp_path, 100, 40), f"{rate}<={limit}")
+    status, said = gate(capsys, run_with(tmp_path, 100, hits=40), f"{rate}<={limit}")
     assert status == 2 and "write a number from 0 to 1, such as 0.05 for 5%" in said
 
 
 @pytest.mark.parametrize("rule", ["contacts<=+1.5", "contacts>=-2", "contacts<=nan", "contacts<=inf", "contacts<=1e-2"])
 def test_what_is_no_limit_is_refused(tmp_path, capsys, rule):
-    before = run_with(tmp_path / "before", 40, 4)
-    assert gate(capsys, run_with(tmp_path / "after", 40, 4), rule, "--against", before)[0] == 2
+    before = run_with(tmp_path / "before", 40, hits=4)
+    assert gate(capsys, run_with(tmp_path / "after", 40, hits=4), rule, "--against", before)[0] == 2
 
 
 @pytest.mark.parametrize(

@@ -39,11 +39,11 @@ def test_scenes_count_once_however_often_they_fail_and_errors_stand_apart():
     rows += [errored(2, 1), errored(3), errored(4, raised_by="traffic"), row_of(5, hit={"approach": "rear"})]
     found = headline(rows, searched=False)
     assert (found.scenes, found.preventable, found.raised, found.failed) == (5, 2, 2, 4)
-    assert headline_text(found, "a", "e2") == (
+    assert headline_text(found, "a", traffic="e2") == (
         "a under e2: preventable failures, or it raised, in 4 of 5 scenes; preventable failures in 2 of 5, in 2 ways; "
         "it raised in 2 of 5."
     )
-    whole = headline_text(headline(rows[:5], searched=False), "a", "e2")
+    whole = headline_text(headline(rows[:5], searched=False), "a", traffic="e2")
     assert whole == "a under e2: preventable failures in 1 of 3 scenes, in 1 way."
 
 
@@ -127,7 +127,7 @@ def test_screen_page_rows_json_gate_and_comparison_say_the_same(answered, tmp_pa
     preventable = {row["scene_id"] for row in rows if row["cfr_preventable"] == 1}
     raised = {row["scene_id"] for row in rows if row["errored"] == 1}
     assert len(scenes) == 4 and raised == {"arterial_015_0280"} and len(rows) <= 3 * 4
-    sentence = headline_text(headline(rows, searched=True), "fragile", "search at η=2")
+    sentence = headline_text(headline(rows, searched=True), "fragile", traffic="search at η=2")
     assert f"preventable failures, or it raised, in {len(preventable | raised)} of 4 scenes" in sentence
     assert f"; preventable failures in {len(preventable)} of 4" in sentence
     assert sentence.endswith(f"; it raised in {len(raised)} of 4.")

@@ -134,7 +134,7 @@ def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
 def test_filters_keep_what_they_say_and_names_from_files_are_text(run, page):
     heads = heads_of(page)
     side = [row for row in failures_of(run) if row["contact_type"] == "side"]
-    choose(page, "Contact", "side")
+    choose(page, "Contact", starts="side")
     shown = rows_of(page)
     assert 0 < len(shown) == len(side) and {row[heads.index("Contact")] for row in shown} == {"side"}
     page.find_element("css selector", "#filters button").click()  # reset
@@ -150,7 +150,7 @@ def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(chromium, 
     chromium.get(write_report(run).as_uri())
     wait_for(chromium, "return page.player.replay !== null")
     for method in ("e2", "planned"):
-        choose(chromium, "Traffic", method)
+        choose(chromium, "Traffic", starts=method)
         atlas = atlas_of([row for row in failures_of(run) if row["method"] == method])
         buttons = chromium.find_elements("css selector", "#atlas button")
         assert len(buttons) == len(atlas) == 3
@@ -194,7 +194,7 @@ def test_a_link_opens_at_its_failure_from_a_folder_and_from_a_server(run, page):
 def test_the_first_lines_are_of_one_traffic_and_others_can_be_chosen(run, page):
     for method in (None, "planned", "e2"):
         if method:
-            choose(page, "Traffic", method)
+            choose(page, "Traffic", starts=method)
         rows = [row for row in read_rows(run / TABLE) if row["method"] == (method or "e2")]
         known = [row["cfr"] for row in rows if row["cfr"] == row["cfr"]]
         assert f"hit in {sum(known):.0f} of {len(known)} rollouts" in page.find_element("id", "summary").text

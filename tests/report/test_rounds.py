@@ -30,5 +30,5 @@ def test_videos_are_of_hits_of_different_scenes(attacked):
 
 def test_videos_are_written(attacked, tmp_path):
     scenes, run, _ = attacked
-    (video,) = save_videos(run.memory.rounds[-1].traffic, scenes, 1, "brake_check", tmp_path, 1)
+    (video,) = save_videos(run.memory.rounds[-1].traffic, scenes, number=1, method="brake_check", folder=tmp_path, count=1)
     assert video == tmp_path / "videos" / "round-001-1.gif" and Image.open(video).n_frames > 10

@@ -21,7 +21,7 @@ def selection(*targets, seed=0, risk=0.5):
 
 
 def test_links_then_members_then_risk_decide_and_the_first_of_equals_stays():
-    chain = LongestChain(Method("e2", synthesizer(), 2.0))
+    chain = LongestChain(Method("e2", synthesizer(), eta=2.0))
     chain(selection([-1, -1, -1, -1]))
     assert chain.longest is None
     for given, seed in (

@@ -50,7 +50,7 @@ def test_numbers_keep_three_digits():
     share, metres, real = (METRICS[name] for name in ("cfr", "progress", "real"))
     assert [number(share, value) for value in (0.1234, 0.0012, 0.0, 1.0)] == ["12.3", "0.12", "0.0", "100.0"]
     assert [number(metres, value) for value in (1234.4, 64.35, 3.14159, 0.01)] == ["1234", "64.3", "3.14", "0.010"]
-    assert number(real, 0.8764, "+") == "+0.876"
+    assert number(real, 0.8764, sign="+") == "+0.876"
     declared = SimpleNamespace(fraction=False, decimals=3)
     assert [number(declared, value) for value in (1.0, 12.34)] == ["1.000", "12.340"]
 
@@ -60,7 +60,7 @@ def test_numbers_keep_three_digits():
 
 @pytest.fixture(scope="module")
 def methods():
-    return method_tables(rows_of(*((name, "idm", 2.0) for name in TERMS)), TERMS, ["e2", "replay"], "The prior.")
+    return method_tables(rows_of(*((name, "idm", 2.0) for name in TERMS)), TERMS, references=["e2", "replay"], settings="The prior.")
 
 
 def test_differences_are_paired_to_each_reference(methods):
@@ -87,7 +87,7 @@ def test_they_are_written_in_three_formats(methods, tmp_path):
     assert len(body) == 2 + 3 + 4
     assert {line.count(" & ") for line in body} == {len(table.head) - 1 for table in methods}
     assert r"cfr [\%]" in latex and r"seconds\_per\_rollout" in latex and r"$\eta$" in latex
-    assert "a&#124;b" in Table("C.", ["", "x"], [["a|b", "1"]]).markdown()
+    assert "a&#124;b" in Table("C.", ["", "x"], rows=[["a|b", "1"]]).markdown()
     assert escaped("a_b & 5% {x} \\ 3 m/s²") == r"a\_b \& 5\% \{x\} \textbackslash{} 3 m/s$^2$"
 
 
@@ -95,7 +95,7 @@ def test_every_ego_has_a_row_and_a_difference_to_the_reference():
     names = ["idm", "lane_graph", "actor"]
     pairs = [("idm", "lane_graph"), ("actor", "lane_graph")]
     rows = rows_of(*(("e2", name, 2.0) for name in names), egos=pairs)
-    means, differences = planner_tables(rows, names, ["lane_graph"])
+    means, differences = planner_tables(rows, names, references=["lane_graph"])
     assert [row[:2] for row in means.rows] == [[ego, "e2 η=2"] for ego in names]
     assert [row[0] for row in differences.rows] == ["idm", "actor"]
     difference = rows[0]["paired"]["ego lane_graph"]["cfr"]["difference"]

@@ -18,7 +18,7 @@ from tests.metrics.test_contact import course, scene
 from tests.report.failed_run import write_run
 from tests.report.pixels import pixel_at, rgb
 
-CRASH = course(0, 0, 0, 12), course(30.5, 0, 0, 5)
+CRASH = course(0, 0, heading=0, speed=12), course(30.5, 0, heading=0, speed=5)
 
 
 def replay_of(*courses, **options):
@@ -55,14 +55,14 @@ def test_the_contact_is_marked_where_the_boxes_touch():
     shown = replay_of(*CRASH, adversaries=[1])
     assert shown.contact == 37
     middle = 0.5 * (37 * 1.2 + 2.4 + 30.5 + 37 * 0.5 - 2.4)
-    np.testing.assert_allclose(picture.contact_point(shown.rollout, 37, 1), [middle, 0], atol=0.3)
+    np.testing.assert_allclose(picture.contact_point(shown.rollout, 37, partner=1), [middle, 0], atol=0.3)
 
 
 def test_the_ego_is_blue_and_the_adversary_red_where_they_are():
-    shown = replay_of(course(0, 0, 0, 0), course(12, 0, 0, 0), course(-12, 0, 0, 0), adversaries=[1])
+    shown = replay_of(course(0, 0, heading=0, speed=0), course(12, 0, heading=0, speed=0), course(-12, 0, heading=0, speed=0), adversaries=[1])
     image = shown.picture(10)
     for x, colour in ((0, drawing.EGO), (12, drawing.ADVERSARY), (-12, drawing.BACKGROUND)):
-        assert pixel_at(image, shown.panel.map.axes, np.array([x - 0.8, 0.0])) == rgb(colour)
+        assert pixel_at(image, shown.panel.map.axes, point=np.array([x - 0.8, 0.0])) == rgb(colour)
 
 
 def test_an_mp4_shows_each_picture_when_it_is_due(tmp_path):

@@ -40,7 +40,7 @@ def test_help_has_every_line_of_the_files_that_are_chosen(tmp_path):
     ],
 )
 def test_wrong_options_are_refused_with_the_nearest_name(tmp_path, monkeypatch, capsys, script, option, told):
-    status, said = call(script, [option, f"hydra.run.dir={tmp_path / 'run'}"], monkeypatch, capsys)
+    status, said = call(script, [option, f"hydra.run.dir={tmp_path / 'run'}"], monkeypatch=monkeypatch, capsys=capsys)
     assert status == 2 and told in error_line(said) and not list(tmp_path.rglob("*.json"))
 
 
@@ -74,7 +74,7 @@ class Unlicensed(Cruise):
 
 def ego_of(target):
     config = load_config("evaluate", ["~ego", f"+ego._target_={target}", "+ego.replan_every=2", "+ego.speed=3"])
-    return built(config.ego, "ego", Ego)
+    return built(config.ego, "ego", kind=Ego)
 
 
 @pytest.mark.parametrize(

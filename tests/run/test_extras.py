@@ -30,7 +30,7 @@ def test_elsewhere_the_libraries_are_named(monkeypatch, tmp_path):
 def test_a_library_that_is_missing_is_told_with_its_extra(monkeypatch):
     monkeypatch.chdir(ROOT)
     with pytest.raises(InputError, match=r"--to x: no_such cannot be imported .* pip install -e '\.\[mcap\]'"):
-        library("no_such", "--to x", "mcap")
+        library("no_such", "--to x", extra="mcap")
 
 
 def test_every_extra_that_the_code_names_is_one():

@@ -115,7 +115,7 @@ def test_a_device_is_written_through_and_nothing_beside_it(tmp_path, content):
     (tmp_path / "link.png").symlink_to(device)
     for path in (device, tmp_path / "link.png"):
         write_atomically(path, content)
-        write_beside(path, ".pdf", content)
+        write_beside(path, ".pdf", content=content)
     assert device.is_char_device()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link.png", "null.png"]
 
@@ -188,7 +188,7 @@ def test_what_comes_beside_a_file_follows_no_link_out_of_its_folder(tmp_path):
     (tmp_path / "user").write_text("a user's")
     (tmp_path / "run" / "page.csv").symlink_to(tmp_path / "user")
     with pytest.raises(PermissionError, match="a link out of its folder"):
-        write_beside(tmp_path / "run" / "page.html", ".csv", "new")
+        write_beside(tmp_path / "run" / "page.html", ".csv", content="new")
     assert (tmp_path / "user").read_text() == "a user's"
 
 

@@ -47,7 +47,7 @@ def test_a_part_is_computed_once_and_read_as_it_was(tmp_path, file, monkeypatch)
     ("stage", "about", "identity"), [("other", "", [1]), ("", "another round", [1]), ("", "", [2])]
 )
 def test_a_part_of_something_else_is_none(tmp_path, file, stage, about, identity):
-    assert computes(Parts(tmp_path, stage, about), identity=identity)
+    assert computes(Parts(tmp_path, stage, about=about), identity=identity)
 
 
 def test_every_damage_is_noticed_and_the_part_done_again(tmp_path, file):

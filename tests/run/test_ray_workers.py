@@ -61,12 +61,12 @@ def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path
     scene_set = scenes(3, steps=20)
     folders = (tmp_path / "forked", tmp_path / "ray")
     for processes, folder in zip((2, workers), folders, strict=True):
-        setup = Mortal(scene_set, IDMEgo(), "idm", SimSettings(), 1)
+        setup = Mortal(scene_set, IDMEgo(), ego_name="idm", sim=SimSettings(), batch=1)
         setup.mark = str(tmp_path / "killed")
         if processes == 2:
             setup.mark = os.devnull  # it is there: nobody is killed
-        methods = [Method("nominal", synthesizer(), 0.0), Method("e2", synthesizer(), 3.0)]
-        run_protocol(setup, methods, SEEDS, folder, processes=processes, parts=Parts(folder))
+        methods = [Method("nominal", synthesizer(), eta=0.0), Method("e2", synthesizer(), eta=3.0)]
+        run_protocol(setup, methods, seeds=SEEDS, folder=folder, processes=processes, parts=Parts(folder))
     assert int((tmp_path / "killed").read_text()) != os.getpid()
     same_runs(*folders)
     parts = [sorted(path.name for path in (folder / "parts").iterdir()) for folder in folders]
@@ -89,7 +89,7 @@ def test_workers_make_the_traffic_of_a_round_while_it_learns(workers):
     """The same D' as of the same order here, made against the policy before learning."""
     scene_set = small_scenes()
     run = small_run(scenes=scene_set, nominal="prior", spread=0.5, prefetch=True)
-    run.synthesize = synthesize_traffic(scene_set, Ambush(), SimSettings())
+    run.synthesize = synthesize_traffic(scene_set, Ambush(), sim=SimSettings())
     run.batch = 2
     run.workers = workers
     train_round(run)
@@ -114,7 +114,7 @@ def test_errors_of_workers_arrive_and_one_that_always_dies_is_named(workers, mon
     monkeypatch.setattr(ray_workers, "RETRIES", 1)
     for fault, message in ((refuse, "^job 0: refused$"), (vanish, "launcher=ray: a job lost its worker 2 times")):
         with pytest.raises(InputError, match=message):
-            list(in_processes(fault, range(1), workers, cost=float))
+            list(in_processes(fault, range(1), processes=workers, cost=float))
 
 
 def test_without_ray_the_extra_is_named(monkeypatch):

@@ -24,14 +24,14 @@ SCENES = {"scenes": ("scene_id\na\n", "abc")}
 
 def begin(folder, resume=False, scenes=SCENES, free=("processes",), **changes):
     given = {"resume": str(folder) if resume else None}
-    run = Run(OmegaConf.merge(load_config("evaluate"), given, changes), folder, {"ego": "lane_graph"}, free)
+    run = Run(OmegaConf.merge(load_config("evaluate"), given, changes), folder, choices={"ego": "lane_graph"}, free=free)
     run.begin(scenes)
     return run
 
 
 @pytest.fixture
 def weights(tmp_path):
-    path = save_prior(small_prior(0), tmp_path / "priors", {})
+    path = save_prior(small_prior(0), tmp_path / "priors", origin={})
     return path.rename(path.with_name("prior.safetensors"))
 
 
@@ -66,7 +66,7 @@ def test_changed_weights_and_files_of_methods_are_refused(tmp_path, weights, mon
     with pytest.raises(InputError, match="synthesizer=nominal changed"):
         begin(tmp_path, resume=True, prior=prior)
     monkeypatch.undo()
-    save_prior(small_prior(1), tmp_path / "priors", {}).rename(weights)
+    save_prior(small_prior(1), tmp_path / "priors", origin={}).rename(weights)
     with pytest.raises(InputError, match=r"prior\.checkpoint=.*prior\.safetensors changed since the run began"):
         begin(tmp_path, resume=True, prior=prior)
 
@@ -111,14 +111,14 @@ def test_a_new_run_begins_in_an_empty_folder(tmp_path, name):
     for own in ("job.log", "job.err", str(CONFIG), "scenes.csv"):
         (tmp_path / own).parent.mkdir(exist_ok=True)
         (tmp_path / own).write_text("")
-        Run(config, tmp_path, {}).enter()
+        Run(config, tmp_path, choices={}).enter()
     (tmp_path / CONFIG).unlink()
     (tmp_path / CONFIG).parent.rmdir()
     (tmp_path / "scenes.csv").unlink()
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("mine")
     with pytest.raises(InputError, match="name another folder by hydra.run.dir=FOLDER"):
-        Run(config, tmp_path, {}).enter()
+        Run(config, tmp_path, choices={}).enter()
 
 
 def test_a_run_that_is_refused_leaves_everything_as_it_was(tmp_path, monkeypatch, capsys):
@@ -126,9 +126,9 @@ def test_a_run_that_is_refused_leaves_everything_as_it_was(tmp_path, monkeypatch
     before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
     monkeypatch.chdir(tmp_path)
     for script in ("evaluate.py", "train.py"):
-        status, said = call(script, [f"hydra.run.dir={tmp_path / 'run'}"], monkeypatch, capsys)
+        status, said = call(script, [f"hydra.run.dir={tmp_path / 'run'}"], monkeypatch=monkeypatch, capsys=capsys)
         assert status == 2 and f"has a run already; go on with it by resume={tmp_path / 'run'}" in error_line(said)
-        assert call(script, ["batch=0"], monkeypatch, capsys)[0] == 2
+        assert call(script, ["batch=0"], monkeypatch=monkeypatch, capsys=capsys)[0] == 2
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 

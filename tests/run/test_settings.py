@@ -40,8 +40,8 @@ class Reach:
 
 def test_values_that_are_not_given_are_those_of_the_file():
     assert Reach() == Reach(look=2.5, gap=4, curve=True, kind="wide", times=(1, 2), most=None)
-    assert Reach(1.5).look == settings_of(Reach, {"look": 1.5}, "reach").look == 1.5
-    assert settings_of(Reach, {"times": [3, 4]}, "reach") == Reach(times=(3.0, 4.0))
+    assert Reach(1.5).look == settings_of(Reach, {"look": 1.5}, where="reach").look == 1.5
+    assert settings_of(Reach, {"times": [3, 4]}, where="reach") == Reach(times=(3.0, 4.0))
 
 
 def test_constructors_are_filled_by_name_and_never_overruled():
@@ -64,7 +64,7 @@ def test_constructors_are_filled_by_name_and_never_overruled():
 def test_bad_values_name_the_group_and_the_key(values):
     (key,) = values
     with pytest.raises(InputError, match=rf"^(driver\.)?reach\.{key}"):
-        settings_of(Reach, values, "reach")
+        settings_of(Reach, values, where="reach")
 
 
 def test_bounds_are_allowed_themselves_and_a_class_built_by_hand_is_checked_as_well():

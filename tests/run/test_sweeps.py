@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 )
 def test_several_values_are_told_as_a_list(key, value, mend):
     said = f"Ambiguous value for argument '{key}={value}'\n1. To use it as a list, use key=[value1,value2]"
-    assert mend in told("evaluate", [f"{key}={value}"], said)
+    assert mend in told("evaluate", [f"{key}={value}"], said=said)
     with pytest.raises(InputError, match="several values are a list") as refused:
         check_list(key, value)
     assert mend in str(refused.value)

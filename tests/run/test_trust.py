@@ -32,12 +32,12 @@ def written(folder, content):
 
 
 def reading(folder, content, config=EVALUATE):
-    return saved_configuration(config, written(folder, content), "resume=x")
+    return saved_configuration(config, written(folder, content), where="resume=x")
 
 
 @pytest.mark.parametrize("config", [TRAIN, EVALUATE, TUNE])
 def test_a_run_of_ones_own_goes_on(tmp_path, config):
-    saved = reading(tmp_path, config, config)
+    saved = reading(tmp_path, config, config=config)
     assert saved == config
     check_written(saved, tmp_path, "resume=x", config)
 
@@ -45,20 +45,20 @@ def test_a_run_of_ones_own_goes_on(tmp_path, config):
 def test_a_run_of_a_version_without_an_option_that_is_off_goes_on(tmp_path):
     earlier = changed(EVALUATE, {})
     del earlier["failure"]
-    assert reading(tmp_path, earlier, EVALUATE) == EVALUATE
+    assert reading(tmp_path, earlier, config=EVALUATE) == EVALUATE
     with pytest.raises(InputError, match="failure: missing"):
-        reading(tmp_path, earlier, changed(EVALUATE, {"failure": "one"}))
+        reading(tmp_path, earlier, config=changed(EVALUATE, {"failure": "one"}))
 
 
 @pytest.mark.parametrize("group", ["learner", "ego", "curriculum", "synthesizer"])
 def test_every_file_of_ones_own_goes_on(tmp_path, group):
     for name in set(choices(group)) - {"class", "external", "nuplan", "policy_file"}:
         own = changed(TRAIN, with_choice(group, name))
-        assert reading(tmp_path, own, TRAIN) == own, name
+        assert reading(tmp_path, own, config=TRAIN) == own, name
 
 
 def test_a_policy_that_holds_arithmetic_goes_on():
-    check_code(changed(EVALUATE, {"ego": {"_target_": POLICY_FILE, "file": "x.onnx"}}), [], "x")
+    check_code(changed(EVALUATE, {"ego": {"_target_": POLICY_FILE, "file": "x.onnx"}}), [], where="x")
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_policy_that_holds_arithmetic_goes_on():
 )
 def test_code_from_elsewhere_needs_the_users_consent(changes):
     with pytest.raises(InputError, match="runs code that is no extension of e2rl: .*plugins="):
-        check_code(changed(EVALUATE, changes), ["my_stack"], "resume=x")
+        check_code(changed(EVALUATE, changes), ["my_stack"], where="resume=x")
 
 
 @pytest.mark.parametrize("key", ["_args_", "_partial_", "_other_"])
@@ -102,19 +102,19 @@ def test_code_from_elsewhere_needs_the_users_consent(changes):
 )
 def test_of_hydras_keys_a_saved_configuration_has_targets_only(key, place):
     with pytest.raises(InputError, match=f"its configuration has {key}, which no run"):
-        check_code(changed(EVALUATE, place(key)), ["my_stack"], "resume=x")
+        check_code(changed(EVALUATE, place(key)), ["my_stack"], where="resume=x")
 
 
 def test_modules_that_the_command_line_names_take_part():
     mine = {"ego": {"_target_": "my_stack.cruise.Cruise"}, "plugins": ["my_stack.hard_braking"]}
     config = changed(TRAIN, mine)
-    check_code(config, ["my_stack"], "resume=x")
-    check_code(config, ["my_stack.cruise", "my_stack.hard_braking"], "resume=x")
+    check_code(config, ["my_stack"], where="resume=x")
+    check_code(config, ["my_stack.cruise", "my_stack.hard_braking"], where="resume=x")
     with pytest.raises(InputError, match="my_stack.hard_braking"):
-        check_code(config, ["my_stack.cruise", "my_stack_of_others"], "resume=x")
+        check_code(config, ["my_stack.cruise", "my_stack_of_others"], where="resume=x")
     external = changed(EVALUATE, with_choice("ego", "external", command="true"))
     assert outside_modules(external) == {"e2rl.planners.external"}
-    check_code(external, ["e2rl.planners.external"], "resume=x")
+    check_code(external, ["e2rl.planners.external"], where="resume=x")
 
 
 @pytest.mark.parametrize("name", ["../../stranger/evil", "/tmp/evil", "a/../b", ".hidden", "nominal,e2", "${x}", ""])
@@ -166,13 +166,13 @@ def test_links_out_of_the_folder_pipes_and_devices_are_refused(tmp_path, name, k
     (folder / "wandb").mkdir()
     (folder / "wandb" / "debug.log").symlink_to(outside)  # as wandb does
     (folder / "latest").symlink_to(folder / "wandb")
-    saved_configuration(EVALUATE, folder, "resume=x")
+    saved_configuration(EVALUATE, folder, where="resume=x")
     place = folder / name
     place.parent.mkdir(parents=True, exist_ok=True)
     place.unlink(missing_ok=True)
     os.mkfifo(place) if kind == "pipe" else place.symlink_to(outside if kind == "link" else "/dev/zero")
     with pytest.raises(InputError, match="a link out of|no regular file|no run found"):
-        saved_configuration(EVALUATE, folder, "resume=x")
+        saved_configuration(EVALUATE, folder, where="resume=x")
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_an_endpoint_gets_no_key_unasked(tmp_path, changes):
     with pytest.raises(InputError, match="sends your API key to http://else"):
         reading(tmp_path, content)
     agreed = changed(EVALUATE, {"synthesizer": {"reasoner": {"base_url": "http://else"}}})
-    assert reading(tmp_path, content, agreed)
+    assert reading(tmp_path, content, config=agreed)
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def track(position, heading, speed, kind: str = "VEHICLE", valid=None, size=(4.5
 
 def straight(x: float, y: float, speed: float, **options) -> dict:
     """A track along +x at constant speed, at (x, y) at frame 0."""
-    return track(np.stack([x + 0.1 * speed * ALL, np.full(FRAMES, y)], 1), 0.0, speed, **options)
+    return track(np.stack([x + 0.1 * speed * ALL, np.full(FRAMES, y)], 1), 0.0, speed=speed, **options)
 
 
 def lane(points, exits=(), speed_kmh: float = 50.0, width: float = 3.6, **more) -> dict:
@@ -69,9 +69,9 @@ def fork(connected: bool = True) -> dict:
 def description(tracks: dict | None = None, lanes: dict | None = None, **metadata) -> dict:
     """A scenario of tracks (default: the ego at 8 m/s on `in`, a car ahead on `near`, a pedestrian) on the fork."""
     tracks = tracks or {
-        "ego": straight(20, 0, 8),
-        "7": straight(50, 3.5, 6),
-        "p": straight(40, -6, 1, kind="PEDESTRIAN", size=(0.6, 0.6)),
+        "ego": straight(20, 0, speed=8),
+        "7": straight(50, 3.5, speed=6),
+        "p": straight(40, -6, speed=1, kind="PEDESTRIAN", size=(0.6, 0.6)),
     }
     return {
         "id": "fork",

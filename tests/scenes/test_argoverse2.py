@@ -50,11 +50,11 @@ def segment(
 
 def write_map(folder: Path, name: str) -> None:
     segments = [
-        segment(1, (0, 100), 0, [2], left=3),
-        segment(2, (100, 400), 0),
-        segment(3, (0, 100), 3.6, left=4, right=1),
-        segment(4, (100, 0), 7.2, left=3),  # oncoming
-        segment(5, (0, 100), -3.6, kind="BIKE"),
+        segment(1, (0, 100), y=0, successors=[2], left=3),
+        segment(2, (100, 400), y=0),
+        segment(3, (0, 100), y=3.6, left=4, right=1),
+        segment(4, (100, 0), y=7.2, left=3),  # oncoming
+        segment(5, (0, 100), y=-3.6, kind="BIKE"),
     ]
     area = {"id": 9, "area_boundary": points((0, -6), (400, -6), (400, 9), (0, 9))}
     parts = {"drivable_areas": {"9": area}, "pedestrian_crossings": {}}
@@ -73,10 +73,10 @@ def track(name: str, kind: str, x: float, y: float, speed: float, frames: range 
 def write_scenario(root: Path, tracks: list[schema.Track] | None = None) -> Path:
     """A scenario `made` in its folder: the ego at 8 m/s on segment 1, a bus beside it, and a pedestrian for 2 s."""
     tracks = tracks or [
-        track("7", "bus", 40, 3.6, 6),
-        track("AV", "vehicle", 20, 0, 8),
-        track("p", "pedestrian", 30, -5, 1, range(20)),
-        track("c", "construction", 60, -5, 0),
+        track("7", "bus", x=40, y=3.6, speed=6),
+        track("AV", "vehicle", x=20, y=0, speed=8),
+        track("p", "pedestrian", x=30, y=-5, speed=1, frames=range(20)),
+        track("c", "construction", x=60, y=-5, speed=0),
     ]
     stamps = np.linspace(315e15, 315e15 + 1e9 * TIMES[-1], FRAMES)
     scenario = schema.ArgoverseScenario("made", stamps, tracks, "7", "austin", None, None)
@@ -186,7 +186,7 @@ def pipe(folder: Path) -> None:
         ),
         (in_map(lambda parts: parts["lane_segments"]["1"]["left_lane_boundary"][0].update(x="a")), "is none of"),
         (
-            in_map(lambda parts: parts["lane_segments"].update({str(k): segment(k, (0, 5), 0) for k in range(9, 999)})),
+            in_map(lambda parts: parts["lane_segments"].update({str(k): segment(k, (0, 5), y=0) for k in range(9, 999)})),
             "lanes begin at one place",
         ),
     ],
@@ -211,5 +211,5 @@ def test_recorded_logs_make_scenes_in_which_the_ego_keeps_to_the_road():
     for row in rows:
         scene = {name: torch.from_numpy(value) for name, value in row.scene.items()}
         driven = scene["logged"][scene["logged_valid"][:, 0], 0, :2]
-        beyond = off_road(driven[None], scene["field"][None], scene["field_origin"][None])
+        beyond = off_road(driven[None], scene["field"][None], origin=scene["field_origin"][None])
         assert (beyond < 0).all(), row.scene_id

@@ -46,7 +46,7 @@ def test_penetration_is_the_shortest_way_apart(boxes):
     for turn in (0.0, torch.pi / 2, torch.pi, -torch.pi / 2):
         for pose in (first[0], second[0]):
             way = torch.stack([(pose[:, 2] + turn).cos(), (pose[:, 2] + turn).sin(), torch.zeros(len(pose))], -1)
-            moved.append(separation(first[0], first[1], second[0] - way * depth[:, None], second[1]))
+            moved.append(separation(first[0], first[1], second=second[0] - way * depth[:, None], second_size=second[1]))
     assert torch.allclose(torch.stack(moved).amax(0)[inside].clamp(max=0), torch.zeros(()).double(), atol=1e-6)
 
 
@@ -60,5 +60,5 @@ def test_rigid_motion_and_order_do_not_matter(boxes):
         turned = pose[:, :2] @ rotation.T + torch.tensor([3.0, -7.0])
         return torch.cat([turned, pose[:, 2:] + torch.atan2(sin, cos)], 1)
 
-    assert torch.allclose(signed_distance(move(first[0]), first[1], move(second[0]), second[1]), before)
+    assert torch.allclose(signed_distance(move(first[0]), first[1], second=move(second[0]), second_size=second[1]), before)
     assert torch.allclose(signed_distance(*second, *first), before)

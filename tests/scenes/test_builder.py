@@ -36,18 +36,18 @@ def left_turn() -> dict:
     angle = np.clip((s - 100) / 20, 0, np.pi / 2)
     x = np.minimum(s, 100) + 20 * np.sin(angle)
     y = 20 * (1 - np.cos(angle)) + np.maximum(s - 100 - 10 * np.pi, 0)
-    return track(np.stack([x, y], 1), angle, 8.0)
+    return track(np.stack([x, y], 1), angle, speed=8.0)
 
 
 def lane_change(y_end: float = 3.5) -> dict:
     """An ego at 8 m/s from y = 0 to y_end between x = 30 and x = 70."""
     x = 15 + 0.8 * ALL
     y = y_end * (1 - np.cos(np.pi * np.clip((x - 30) / 40, 0, 1))) / 2
-    return track(np.stack([x, y], 1), np.arctan2(np.gradient(y), np.gradient(x)), 8.0)
+    return track(np.stack([x, y], 1), np.arctan2(np.gradient(y), np.gradient(x)), speed=8.0)
 
 
 def test_scenes_of_one_log_are_those_built_one_by_one():
-    windows = list(recorded({"ego": left_turn(), "7": straight(50, 3.5, 0)}).windows([10, 12, 30, 48], 80))
+    windows = list(recorded({"ego": left_turn(), "7": straight(50, 3.5, speed=0)}).windows([10, 12, 30, 48], 80))
     builder = SceneBuilder(windows[0], SETTINGS)
     for window in windows:
         scene = builder.scene(window)
@@ -85,9 +85,9 @@ def test_the_start_sees_nothing_of_the_future():
 
 def test_the_start_of_what_stands_sees_nothing_of_the_future():
     wobble = np.random.default_rng(0).normal(0, 0.1, FRAMES)
-    parked = track([[60, 3.5]], wobble, 0.0)
-    other = track([[60, 3.5]], np.where(ALL > 10, 0.5 + wobble, wobble), 0.0)
-    ego = straight(20, 0, 8)
+    parked = track([[60, 3.5]], wobble, speed=0.0)
+    other = track([[60, 3.5]], np.where(ALL > 10, 0.5 + wobble, wobble), speed=0.0)
+    ego = straight(20, 0, speed=8)
     scene = build({"ego": ego, "7": parked})
     changed = build({"ego": ego, "7": other})
     assert torch.equal(scene["start"], changed["start"]) and torch.equal(scene["past"], changed["past"])
@@ -95,14 +95,14 @@ def test_the_start_of_what_stands_sees_nothing_of_the_future():
 
 
 def test_headings_are_mended_counted_and_drop_nobody():
-    flipped = straight(20, 0, 8)
+    flipped = straight(20, 0, speed=8)
     flipped["state"]["heading"][8:12] = np.pi
     tracks = {
         "ego": flipped,
-        "back": track(np.stack([30 + 0.9 * ALL, np.full(FRAMES, 3.5)], 1), np.pi, -9.0),
-        "spins": track([[60, -5]], 0.08 * ALL, 0.0),
-        "reverses": track(np.stack([90 - 0.2 * ALL, np.full(FRAMES, -5.0)], 1), 0.0, -2.0),
-        "spiked": straight(50, 0, 8),
+        "back": track(np.stack([30 + 0.9 * ALL, np.full(FRAMES, 3.5)], 1), np.pi, speed=-9.0),
+        "spins": track([[60, -5]], 0.08 * ALL, speed=0.0),
+        "reverses": track(np.stack([90 - 0.2 * ALL, np.full(FRAMES, -5.0)], 1), 0.0, speed=-2.0),
+        "spiked": straight(50, 0, speed=8),
     }
     tracks["spiked"]["state"]["heading"][[30, 60]] = 1.3
     builder = SceneBuilder(recorded(tracks), SETTINGS)
@@ -125,11 +125,11 @@ def test_the_log_ends_where_the_recording_does():
 
 
 def test_the_nearest_take_part_the_ego_first():
-    cars = {f"c{k}": straight(40 + 8.0 * k, 0 if k % 2 else 3.5, 8) for k in range(6)}
-    late = straight(48, 3.5, 8, valid=ALL > 30)
-    people = {f"p{k}": straight(30, -5 - k, 8, kind="PEDESTRIAN", valid=5 * k < ALL) for k in range(4)}
+    cars = {f"c{k}": straight(40 + 8.0 * k, 0 if k % 2 else 3.5, speed=8) for k in range(6)}
+    late = straight(48, 3.5, speed=8, valid=ALL > 30)
+    people = {f"p{k}": straight(30, -5 - k, speed=8, kind="PEDESTRIAN", valid=5 * k < ALL) for k in range(4)}
     scene = build(
-        cars | {"late": late, "ego": straight(20, 0, 8)} | people,
+        cars | {"late": late, "ego": straight(20, 0, speed=8)} | people,
         settings=BuildSettings(field_cells=64, vehicles=4, others=3),
     )
     assert scene["start"][:4, 0].tolist() == pytest.approx([0, 20, 28, 36], abs=0.01)
@@ -140,34 +140,34 @@ def test_the_nearest_take_part_the_ego_first():
 def crossing(start_y: float, **options) -> dict:
     """A car that crosses the ego's path at x = 60 at 6 m/s."""
     y = start_y + 0.6 * ALL
-    return track(np.stack([np.full(FRAMES, 60.0), y], 1), np.pi / 2, 6.0, **options)
+    return track(np.stack([np.full(FRAMES, 60.0), y], 1), np.pi / 2, speed=6.0, **options)
 
 
 def test_cars_that_stand_leave_their_rows_to_those_that_move():
     """Those farthest from the ego's path first; where the rows suffice, nobody is left out."""
-    stands = {f"p{k}": straight(24 + 6.0 * k, -8 - k, 0) for k in range(6)}
+    stands = {f"p{k}": straight(24 + 6.0 * k, -8 - k, speed=0) for k in range(6)}
     settings = BuildSettings(field_cells=64, vehicles=6, others=0)
-    scene = build({"ego": straight(20, 0, 8), "x": crossing(-40)} | stands, settings=settings)
+    scene = build({"ego": straight(20, 0, speed=8), "x": crossing(-40)} | stands, settings=settings)
     moving = scene["valid"] & (scene["start"][:, 3] > 1)
     assert moving.sum() == 2 and scene["valid"].all()
     assert sorted(scene["start"][~moving, 1].tolist()) == pytest.approx([-11, -10, -9, -8])
     assert scene["left_out"] == 0  # the others stand more than 10 m from the ego's path
-    assert build({"ego": straight(20, 0, 8), "x": crossing(-40)} | stands)["valid"].sum() == 8
+    assert build({"ego": straight(20, 0, speed=8), "x": crossing(-40)} | stands)["valid"].sum() == 8
 
 
 def test_who_appears_later_and_comes_near_is_replayed_and_counted():
-    late = {"x": crossing(-30, valid=ALL > 30), "far": straight(0, 60, 8, valid=ALL > 30)}
-    scene = build({"ego": straight(20, 0, 8), "7": straight(50, 3.5, 6)} | late)
+    late = {"x": crossing(-30, valid=ALL > 30), "far": straight(0, 60, speed=8, valid=ALL > 30)}
+    scene = build({"ego": straight(20, 0, speed=8), "7": straight(50, 3.5, speed=6)} | late)
     assert scene["valid"].sum() == 2 and scene["left_out"] == 1
     assert scene["logged_valid"].any(0).nonzero()[:, 0].tolist() == [0, 1, 2]
     assert scene["logged_valid"][:, 2].nonzero()[0] == 21 and scene["route_log"][2] == -1
     assert not scene["start"][2].any() and not scene["parked"][2]
-    crowded = build({"ego": straight(20, 0, 8)} | late, settings=BuildSettings(field_cells=64, vehicles=2))
+    crowded = build({"ego": straight(20, 0, speed=8)} | late, settings=BuildSettings(field_cells=64, vehicles=2))
     assert crowded["left_out"] == 1 and crowded["logged_valid"][:, 1].any()
 
 
 def test_the_way_driven_is_found_and_is_the_mission():
-    scene = build({"ego": left_turn(), "7": straight(50, 3.5, 6), "p": straight(70, 0, 8)})
+    scene = build({"ego": left_turn(), "7": straight(50, 3.5, speed=6), "p": straight(70, 0, speed=8)})
     assert scene["route_valid"][0].sum() == 3  # on, left, and the lane beside
     mission = mission_of(scene[None])
     _, offset, _ = project(scene["logged"][:, 0, :2], mission.points[0])
@@ -192,7 +192,7 @@ def test_a_mission_without_lane_is_the_recorded_way_and_ends_with_what_is_known(
 
 
 def test_limits_and_lights_lie_on_the_route():
-    full = description({"ego": straight(40, 0, 8)})
+    full = description({"ego": straight(40, 0, speed=8)})
     states = ["LANE_STATE_STOP"] * 50 + ["LANE_STATE_GO"] * 41
     full["dynamic_map_states"] = {"left": {"state": {"object_state": states}}}
     scene = build_scene(recording_of(full), SETTINGS)
@@ -209,10 +209,10 @@ def test_limits_and_lights_lie_on_the_route():
 def test_only_vehicles_that_stand_beside_the_lanes_are_parked():
     scene = build(
         {
-            "ego": straight(20, 0, 8),
-            "queue": straight(60, 0, 0),
-            "kerb": straight(60, -6, 0),
-            "slow": straight(60, 9, 1.0),
+            "ego": straight(20, 0, speed=8),
+            "queue": straight(60, 0, speed=0),
+            "kerb": straight(60, -6, speed=0),
+            "slow": straight(60, 9, speed=1.0),
         }
     )
     parked = {
@@ -224,15 +224,15 @@ def test_only_vehicles_that_stand_beside_the_lanes_are_parked():
 
 
 def test_overlap_with_the_ego_is_seen_and_only_that():
-    far = {"ego": straight(20, 0, 8), "a": straight(24.6, 0, 8), "b": straight(50, 0, 8), "c": straight(51, 0.5, 8)}
+    far = {"ego": straight(20, 0, speed=8), "a": straight(24.6, 0, speed=8), "b": straight(50, 0, speed=8), "c": straight(51, 0.5, speed=8)}
     assert not ego_overlaps(build(far))
-    assert ego_overlaps(build(far | {"a": straight(24.4, 0, 8)}))
+    assert ego_overlaps(build(far | {"a": straight(24.4, 0, speed=8)}))
     aside = np.stack([20 + 0.8 * ALL + 3.5, np.full(FRAMES, 2.1)], 1)
-    assert not ego_overlaps(build({"ego": straight(20, 0, 8), "a": track(aside, -0.4, 8.0)}))
-    assert ego_overlaps(build({"ego": straight(20, 0, 8), "a": track(aside, 0.4, 8.0)}))
+    assert not ego_overlaps(build({"ego": straight(20, 0, speed=8), "a": track(aside, -0.4, speed=8.0)}))
+    assert ego_overlaps(build({"ego": straight(20, 0, speed=8), "a": track(aside, 0.4, speed=8.0)}))
     for kind, word in (("PEDESTRIAN", "a pedestrian"), ("CYCLIST", "a cyclist"), ("TRAFFIC_CONE", "an object")):
-        other = {"p": straight(21, 0, 8, kind=kind, size=(0.5, 0.5)), "far": straight(60, 0, 8, kind=kind)}
-        assert ego_overlaps(build({"ego": straight(20, 0, 8)} | other)) == word
+        other = {"p": straight(21, 0, speed=8, kind=kind, size=(0.5, 0.5)), "far": straight(60, 0, speed=8, kind=kind)}
+        assert ego_overlaps(build({"ego": straight(20, 0, speed=8)} | other)) == word
 
 
 @pytest.mark.parametrize(

@@ -74,9 +74,9 @@ def test_lane_ends_meet():
 def small_set() -> tuple[Place, Recording]:
     rng = np.random.default_rng(1)
     lanes = {
-        "a": Lane(np.array([[0.0, 0.0], [50.0, 1.5]]), 3.4, 13.9, ["b"], ["c"]),
-        "b": Lane(np.eye(2), 3.5, 8.0),
-        "c": Lane(np.array([[0.0, 3.4], [50.0, 5.0]]), 3.4, 13.9, right=["a"]),
+        "a": Lane(np.array([[0.0, 0.0], [50.0, 1.5]]), 3.4, speed_limit=13.9, exits=["b"], left=["c"]),
+        "b": Lane(np.eye(2), 3.5, speed_limit=8.0),
+        "c": Lane(np.array([[0.0, 3.4], [50.0, 5.0]]), 3.4, speed_limit=13.9, right=["a"]),
     }
     lights = {"b": rng.integers(0, 4, 200).astype(np.int8)}
     scene_map = Place("here", lanes, [np.eye(3)[:, :2]], lights, rng.normal(size=(2, 3)), np.full((2, 2), 2.0))

@@ -56,9 +56,9 @@ EVERY = np.ones((FRAMES, 1), bool)
 @pytest.mark.parametrize("name", MOTIONS)
 def test_true_headings_are_left_as_they_are(name):
     states = MOTIONS[name]
-    mended, counts = mend_headings(states, EVERY, TYPES)
+    mended, counts = mend_headings(states, EVERY, agent_type=TYPES)
     assert not counts and np.array_equal(mended, states)
-    held, count = hold_headings(mended, EVERY, TYPES)
+    held, count = hold_headings(mended, EVERY, agent_type=TYPES)
     assert count == 0 and np.abs(wrap(held[..., 2] - states[..., 2])).max() < 0.03
 
 
@@ -71,27 +71,27 @@ def test_single_frames_turned_round_are_turned_back(name, seed):
     flipped = rng.choice(FRAMES, size=rng.integers(1, 15), replace=False)
     valid = EVERY.copy()
     valid[rng.integers(FRAMES, size=9)] = False
-    mended, counts = mend_headings(turned_by(states, np.pi, flipped), valid, TYPES)
-    assert_same(mended, states, valid)
+    mended, counts = mend_headings(turned_by(states, np.pi, frames=flipped), valid, agent_type=TYPES)
+    assert_same(mended, states, valid=valid)
     assert counts == ({TURNED: 1} if valid[flipped].any() else {})
 
 
 @pytest.mark.parametrize("name", ["fast", "stops", "starts"])
 @pytest.mark.parametrize("part", [slice(None), slice(30, None), slice(None, 60), slice(10, 11), slice(20, 50)])
 def test_whoever_drives_at_road_speed_with_the_back_first_is_turned(name, part):
-    mended, counts = mend_headings(turned_by(MOTIONS[name], np.pi, part), EVERY, TYPES)
+    mended, counts = mend_headings(turned_by(MOTIONS[name], np.pi, frames=part), EVERY, agent_type=TYPES)
     assert counts == {TURNED: 1}
     assert_same(mended, MOTIONS[name])
 
 
 def test_a_slow_vehicle_whose_heading_flips_for_good_drives_forwards():
-    mended, _ = mend_headings(turned_by(MOTIONS["slow"], np.pi, slice(20, None)), EVERY, TYPES)
+    mended, _ = mend_headings(turned_by(MOTIONS["slow"], np.pi, frames=slice(20, None)), EVERY, agent_type=TYPES)
     assert_same(mended, MOTIONS["slow"])
 
 
 def test_a_tracker_that_turns_whoever_reverses_is_not_believed():
     states = MOTIONS["reverses at the end"]
-    mended, counts = mend_headings(turned_by(states, np.pi, states[:, 0, 3] < 0), EVERY, TYPES)
+    mended, counts = mend_headings(turned_by(states, np.pi, frames=states[:, 0, 3] < 0), EVERY, agent_type=TYPES)
     assert counts == {TURNED: 1} and mended[-1, 0, 3] == -2.5
     assert_same(mended, states)
 
@@ -100,7 +100,7 @@ def test_a_tracker_that_turns_whoever_reverses_is_not_believed():
 @pytest.mark.parametrize("angle", [0.5, 1.2, 1.57, -1.0])
 def test_spikes_are_interpolated(frames, angle):
     states = MOTIONS["fast"]
-    mended, counts = mend_headings(turned_by(states, angle, np.array(frames)), EVERY, TYPES)
+    mended, counts = mend_headings(turned_by(states, angle, frames=np.array(frames)), EVERY, agent_type=TYPES)
     assert counts[SPIKES] == 1
     known = np.setdiff1d(np.arange(FRAMES), [90])
     assert np.abs(wrap(mended[known, 0, 2] - states[known, 0, 2])).max() < 0.03
@@ -112,23 +112,23 @@ def test_who_turns_while_hidden_has_no_spike():
     states = np.concatenate([np.cumsum(step, axis=0), heading[:, None], np.full((FRAMES, 1), 4.0)], -1)[:, None]
     valid = EVERY.copy()
     valid[30:70] = valid[72:] = False
-    mended, counts = mend_headings(turned_by(states, 0.5, slice(10, 11)), valid, TYPES)
+    mended, counts = mend_headings(turned_by(states, 0.5, frames=slice(10, 11)), valid, agent_type=TYPES)
     assert counts == {SPIKES: 1}, "that before the gap"
-    assert_same(mended, states, valid)
+    assert_same(mended, states, valid=valid)
 
 
 def test_a_spike_beside_frames_that_are_lost_is_one():
     valid = EVERY.copy()
     valid[[41, 44, 46]] = False
-    mended, counts = mend_headings(turned_by(MOTIONS["fast"], 1.2, np.array([42, 45])), valid, TYPES)
+    mended, counts = mend_headings(turned_by(MOTIONS["fast"], 1.2, frames=np.array([42, 45])), valid, agent_type=TYPES)
     assert counts == {SPIKES: 1}
-    assert_same(mended, MOTIONS["fast"], valid)
+    assert_same(mended, MOTIONS["fast"], valid=valid)
 
 
 def test_a_log_whose_headings_are_all_turned_round_is_not_mended():
     """That is its convention, which is refused."""
     states = np.concatenate([turned_by(MOTIONS["fast"], np.pi)] * 4, axis=1)
-    mended, counts = mend_headings(states, np.ones((FRAMES, 4), bool), np.repeat(TYPES, 4))
+    mended, counts = mend_headings(states, np.ones((FRAMES, 4), bool), agent_type=np.repeat(TYPES, 4))
     assert np.array_equal(mended, states) and not counts
 
 
@@ -147,8 +147,8 @@ def test_what_stands_keeps_its_heading(name, jitter):
     rng = np.random.default_rng(1)
     states = turned_by(MOTIONS["stands"], SPINS[name](rng))
     states[..., :2] += rng.normal(0, jitter, (FRAMES, 1, 2))
-    mended, _ = mend_headings(states, EVERY, TYPES)
-    held, count = hold_headings(mended, EVERY, TYPES)
+    mended, _ = mend_headings(states, EVERY, agent_type=TYPES)
+    held, count = hold_headings(mended, EVERY, agent_type=TYPES)
     axis = wrap(2 * (held[:, 0, 2] - 2.9)) / 2
     assert count == (name != "flips") and np.ptp(held[:, 0, 2]) < 1e-9 and np.abs(axis).max() < 0.16
 
@@ -157,17 +157,17 @@ def test_what_stands_keeps_its_heading(name, jitter):
 def test_whoever_stops_keeps_the_heading_with_which_it_came(name):
     states = driven(np.clip(5 - 4 * TIME, 0, None))
     states = turned_by(states, np.where(TIME > 1.25, SPINS[name](None), 0.0))
-    held, count = hold_headings(mend_headings(states, EVERY, TYPES)[0], EVERY, TYPES)
+    held, count = hold_headings(mend_headings(states, EVERY, agent_type=TYPES)[0], EVERY, agent_type=TYPES)
     assert count == 1 and np.abs(wrap(held[..., 2] - 2.9)).max() < 0.1
 
 
 def test_whoever_creeps_round_a_corner_does_not_stand():
     states = driven(0.5, 0.2)
     assert not standing_frames(states[..., :2], EVERY).any()
-    assert np.array_equal(hold_headings(states, EVERY, TYPES)[0], states)
+    assert np.array_equal(hold_headings(states, EVERY, agent_type=TYPES)[0], states)
 
 
 def test_a_pedestrian_turns_on_the_spot():
     states = turned_by(MOTIONS["stands"], SPINS["spin"](None))
-    assert np.array_equal(hold_headings(states, EVERY, np.array([PEDESTRIAN]))[0], states)
-    assert np.array_equal(mend_headings(states, EVERY, np.array([PEDESTRIAN]))[0], states)
+    assert np.array_equal(hold_headings(states, EVERY, agent_type=np.array([PEDESTRIAN]))[0], states)
+    assert np.array_equal(mend_headings(states, EVERY, agent_type=np.array([PEDESTRIAN]))[0], states)

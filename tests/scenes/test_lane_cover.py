@@ -41,7 +41,7 @@ def test_it_is_what_a_search_finds_in_all_scenes_of_a_log(seed):
         ([0.0, 0.0], [720, -400]),
     ):
         found = cover.beyond(np.array(origin), np.array(corner), 83)
-        assert np.abs(found - searched(lines, widths, np.add(origin, corner), 83)).max() < 1e-9
+        assert np.abs(found - searched(lines, widths, corner=np.add(origin, corner), cells=83)).max() < 1e-9
         assert np.array_equal(found, LaneCover(lines, widths).beyond(np.array(origin), np.array(corner), 83))
         assert (found < -INSIDE).any() and (found == FAR).any() or not any(origin)
 

@@ -19,9 +19,9 @@ LEFT = np.concatenate([np.stack([100 + 20 * np.cos(ARC), 20 + 20 * np.sin(ARC)],
 def lanes(**more) -> dict[str, Lane]:
     """`in` along x = 0..100; `on` straight to 400 and `left`, an arc of 20 m radius up to y = 320, both after it."""
     return {
-        "in": Lane(np.array([[0.0, 0], [50, 0], [100, 0]]), 3.5, 14.0, exits=["on", "left"]),
-        "on": Lane(np.array([[100.0, 0], [400, 0]]), 3.5, 20.0),
-        "left": Lane(LEFT, 3.5, 10.0),
+        "in": Lane(np.array([[0.0, 0], [50, 0], [100, 0]]), 3.5, speed_limit=14.0, exits=["on", "left"]),
+        "on": Lane(np.array([[100.0, 0], [400, 0]]), 3.5, speed_limit=20.0),
+        "left": Lane(LEFT, 3.5, speed_limit=10.0),
         **more,
     }
 
@@ -102,7 +102,7 @@ def lane_change() -> np.ndarray:
 
 def test_a_recorded_way_goes_on_along_the_lane_at_its_end():
     graph = LaneGraph(lanes(beside=Lane(np.array([[0.0, 3.5], [100, 3.5], [200, 3.5]]), speed_limit=9.0)))
-    route = route_from_log(graph, lane_change(), 150)
+    route = route_from_log(graph, lane_change(), vertices=150)
     line = LineString(route.points)
     assert route.vehicle_s == 20.0 and max(line.distance(Point(*point)) for point in lane_change()[:, :2]) < 0.1
     assert route.open and abs(route.length - 200.0) < 3.0 and np.allclose(route.points[60:, 1], 3.5, atol=1e-3)
@@ -111,11 +111,11 @@ def test_a_recorded_way_goes_on_along_the_lane_at_its_end():
 
 def test_a_recorded_way_off_the_map_ends_soon_after_the_recording():
     track = lane_change() + [0, 100, 0, 0]
-    route = route_from_log(LaneGraph(lanes()), track, 150)
+    route = route_from_log(LaneGraph(lanes()), track, vertices=150)
     way = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1).sum()
     assert route.open and abs(route.length - (20 + way + MARGIN)) < 0.5 and route.lanes == []
     standing = np.tile([5.0, 100.0, 0.3, 0.0], (81, 1))
-    route = route_from_log(LaneGraph(lanes()), standing, 150)
+    route = route_from_log(LaneGraph(lanes()), standing, vertices=150)
     assert route.open and abs(route.length - 30.0) < 1e-6 and np.isfinite(route.points).all()
     assert np.allclose(route.points[10], [5, 100], atol=0.01)
 
@@ -127,7 +127,7 @@ AHEAD = torch.tensor([[[0.0, math.pi, math.pi / 2]]])
 
 
 def against(y):
-    return against_lanes(ROAD, LANE, torch.tensor([[[20.0, y]]]), AHEAD)[0, 0].tolist()
+    return against_lanes(ROAD, LANE, xy=torch.tensor([[[20.0, y]]]), heading=AHEAD)[0, 0].tolist()
 
 
 def test_a_vehicle_is_against_the_lanes_where_none_runs_with_it():
@@ -141,13 +141,13 @@ def test_a_lane_that_crosses_is_no_lane_to_drive_along():
     slope = torch.tensor([[[20.0, 3.5]]]) + torch.linspace(-10, 10, 21)[None, :, None] * torch.tensor([1.0, 1.0])
     points = torch.cat([ROAD, slope], 1)
     lane = torch.cat([LANE, torch.full((1, 21), 2)], 1)
-    assert against_lanes(points, lane, torch.tensor([[[20.0, 3.4]]]), AHEAD)[0, 0].tolist() == [True, False, False]
+    assert against_lanes(points, lane, xy=torch.tensor([[[20.0, 3.4]]]), heading=AHEAD)[0, 0].tolist() == [True, False, False]
 
 
 def test_the_gap_between_two_lanes_in_the_list_is_no_lane():
     far = ROAD.clone()
     far[:, len(X) :, 1] = 100.0  # the list jumps from (38, 0) to (38, 100)
-    middle = against_lanes(far, LANE, torch.tensor([[[38.0, 50.0]]]), torch.tensor([[[-math.pi / 2]]]))
+    middle = against_lanes(far, LANE, xy=torch.tensor([[[38.0, 50.0]]]), heading=torch.tensor([[[-math.pi / 2]]]))
     assert not middle.any()
 
 

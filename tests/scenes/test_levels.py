@@ -15,7 +15,7 @@ MAST = 50.0  # m, x of the road that crosses
 
 def crossing(y: float, speed: float, height: float, **options) -> dict:
     """A vehicle towards +y at x = MAST, at `y` m at frame 0, at a height."""
-    car = track(np.stack([np.full(len(ALL), MAST), y + 0.1 * speed * ALL], 1), np.pi / 2, speed, **options)
+    car = track(np.stack([np.full(len(ALL), MAST), y + 0.1 * speed * ALL], 1), np.pi / 2, speed=speed, **options)
     car["state"]["position"][:, 2] = height
     return car
 
@@ -33,7 +33,7 @@ def lanes(height: float, known: bool = True) -> dict:
 
 def built(height: float, *, y: float = -40.0, known: bool = True, lift: float = 0.0) -> tuple[int, int]:
     """How many agents are present at the start beside the ego, and how many are left out as on another level."""
-    tracks = {"ego": straight(0, 0, 8), "beside": straight(-20, 3.5, 8), "crossing": crossing(y, 10.0, height)}
+    tracks = {"ego": straight(0, 0, speed=8), "beside": straight(-20, 3.5, speed=8), "crossing": crossing(y, 10.0, height=height)}
     for each in tracks.values():
         each["state"]["position"][:, 2] += lift
     roads = lanes(height, known)
@@ -60,7 +60,7 @@ def test_a_lane_tells_who_would_cross_although_nobody_has_yet():
 def test_heights_of_tracks_suffice_and_without_any_nobody_is_left_out():
     assert built(7.0, known=False) == (1, 1)
     recording = recording_of(
-        description({"ego": straight(0, 0, 8), "crossing": crossing(-40.0, 10.0, 0.0)}, lanes(7.0))
+        description({"ego": straight(0, 0, speed=8), "crossing": crossing(-40.0, 10.0, height=0.0)}, lanes(7.0))
     )
     assert recording.heights is None and not SceneBuilder(recording, SETTINGS).repairs
 
@@ -69,7 +69,7 @@ def test_a_hill_is_no_bridge():
     """The car ahead is 10 m higher than the ego now, and on the same road."""
     roads = {"up": lane([[-100, 0], [0, 0], [100, 0], [300, 0]])}
     roads["up"]["polyline"][:, 2] = [-10, 0, 10, 30]
-    tracks = {"ego": straight(0, 0, 8), "ahead": straight(100, 0, 8)}
+    tracks = {"ego": straight(0, 0, speed=8), "ahead": straight(100, 0, speed=8)}
     for each in tracks.values():
         each["state"]["position"][:, 2] = 0.1 * each["state"]["position"][:, 0]
     recording = recording_of(description(tracks, roads))
@@ -81,7 +81,7 @@ def test_a_hill_is_no_bridge():
 def test_a_vehicle_is_on_the_lane_of_its_level_where_two_lie_one_above_the_other(height, limit):
     roads = {"deck": lane([[-100, 0], [300, 0]], speed_kmh=90.0), "below": lane([[-100, 0], [300, 0]])}
     roads["deck"]["polyline"][:, 2] = 7.0
-    tracks = {"ego": straight(0, 0, 8), "above": straight(30, 0, 8), "under": straight(-30, 0, 8)}
+    tracks = {"ego": straight(0, 0, speed=8), "above": straight(30, 0, speed=8), "under": straight(-30, 0, speed=8)}
     for name, own in (("ego", height), ("above", 7.0), ("under", 0.0)):
         tracks[name]["state"]["position"][:, 2] = own
     scene = build_scene(recording_of(description(tracks, roads)), SETTINGS)
@@ -95,13 +95,13 @@ def test_headings_in_the_place_of_heights_are_none():
     roads = {"west": lane([[300, 0], [0, 0], [-100, 0]]), "north": lane([[50, -200], [50, 0], [50, 200]])}
     roads["west"]["polyline"][:, 2] = 3.1
     roads["north"]["polyline"][:, 2] = 1.6
-    recording = recording_of(description({"ego": straight(0, 0, 8)}, roads))
+    recording = recording_of(description({"ego": straight(0, 0, speed=8)}, roads))
     assert [each.heights for each in recording.lanes.values()] == [None, None]
 
 
 def test_an_ego_whose_height_is_always_0_tells_nothing_of_those_ahead_uphill():
     """Heights of the others are relative to it (nuScenes): the car ahead stays 5 m above it on the same road."""
-    tracks = {"ego": straight(0, 0, 8), "ahead": straight(60, 0, 8), "behind": straight(-60, 0, 8)}
+    tracks = {"ego": straight(0, 0, speed=8), "ahead": straight(60, 0, speed=8), "behind": straight(-60, 0, speed=8)}
     wobble = 0.05 * np.sin(np.arange(len(tracks["ego"]["state"]["position"])))
     for name, height in (("ahead", 5.0), ("behind", -5.0)):
         tracks[name]["state"]["position"][:, 2] = height + wobble
@@ -112,8 +112,8 @@ def test_an_ego_whose_height_is_always_0_tells_nothing_of_those_ahead_uphill():
 
 def test_a_flat_map_below_tracks_with_heights_takes_no_lane_from_who_is_on_a_hill():
     roads = {"road": lane([[-100, 0], [0, 0], [300, 0]])}
-    tracks = {"ego": straight(0, 0, 8), "hill": straight(100, 0, 8)}
-    tracks |= {f"flat{k}": straight(-20.0 * k, 0, 8) for k in range(1, 5)}
+    tracks = {"ego": straight(0, 0, speed=8), "hill": straight(100, 0, speed=8)}
+    tracks |= {f"flat{k}": straight(-20.0 * k, 0, speed=8) for k in range(1, 5)}
     for each in tracks.values():
         x = each["state"]["position"][:, 0]
         each["state"]["position"][:, 2] = 0.1 * np.maximum(x - 50.0, 0.0)
@@ -128,7 +128,7 @@ def test_where_a_lane_leads_does_not_depend_on_where_its_vehicle_is_on_it():
     ramp = lane([[-100, 50], [-50, 25], [0, 0]], exits=["road"])
     road = lane([[0, 0], [300, 0]])
     deck["polyline"][:, 2], ramp["polyline"][:, 2] = 7.0, [7.0, 3.5, 0.0]
-    tracks = {"ego": straight(20, 0, 8), "comes": straight(-160, 50, 8)}
+    tracks = {"ego": straight(20, 0, speed=8), "comes": straight(-160, 50, speed=8)}
     tracks["comes"]["state"]["position"][:, 2] = 7.0
     recording = recording_of(description(tracks, {"deck": deck, "ramp": ramp, "road": road}))
     builder = SceneBuilder(recording, SETTINGS)
@@ -137,7 +137,7 @@ def test_where_a_lane_leads_does_not_depend_on_where_its_vehicle_is_on_it():
 
 def test_a_track_without_heights_takes_those_of_the_others_from_nobody():
     """No warning, no change: the bridge is told by the tracks that have heights."""
-    tracks = {"ego": straight(0, 0, 8), "beside": straight(-20, 3.5, 8), "crossing": crossing(-40.0, 10.0, 7.0)}
+    tracks = {"ego": straight(0, 0, speed=8), "beside": straight(-20, 3.5, speed=8), "crossing": crossing(-40.0, 10.0, height=7.0)}
     recording = recording_of(description(tracks, lanes(7.0)))
     recording.heights[:, 1] = np.nan
     with warnings.catch_warnings(action="error"):

@@ -26,16 +26,16 @@ def pieces(exits: dict[str, list[str]], count: int = 5) -> dict[str, Lane]:
 def test_connectivity_is_inferred_from_geometry_and_heights():
     found = infer_exits(
         {
-            "a": flat([0, 0], [50, 0], 5.0),
-            "b": flat([50.5, 0.3], [90, 0], 5.5),
-            "back": flat([50, 0], [0, 0], 5.0),
-            "bridge": flat([50, 0], [100, 10], 12.0),
-            "far": flat([54, 0], [90, 0], 5.0),
-            "side": flat([50, 0], [50, 50], 5.0),
+            "a": flat([0, 0], [50, 0], height=5.0),
+            "b": flat([50.5, 0.3], [90, 0], height=5.5),
+            "back": flat([50, 0], [0, 0], height=5.0),
+            "bridge": flat([50, 0], [100, 10], height=12.0),
+            "far": flat([54, 0], [90, 0], height=5.0),
+            "side": flat([50, 0], [50, 50], height=5.0),
         }
     )
     assert found["a"] == ["b"] and found["bridge"] == [] and found["back"] == []
-    no_heights = infer_exits({"a": Lane(np.array([[0.0, 0], [50, 0]])), "b": flat([50, 0], [90, 0], 40.0)})
+    no_heights = infer_exits({"a": Lane(np.array([[0.0, 0], [50, 0]])), "b": flat([50, 0], [90, 0], height=40.0)})
     assert no_heights["a"] == ["b"]
     doubled = {"a": Lane(np.array([[0.0, 5], [0, 50], [0, 50]])), "b": Lane(np.array([[0.0, 50], [0, 50], [0, 90]]))}
     assert infer_exits(doubled) == {"a": ["b"], "b": []}
@@ -90,7 +90,7 @@ def test_a_lane_with_a_recorded_link_gets_no_other():
     ],
 )
 def test_a_link_is_kept_where_a_vehicle_can_drive_it(begin, end, height, drivable):
-    lanes = {"a": flat([0, 0], [40, 0], 0.0, exits=["b"]), "b": flat(begin, end, float(height))}
+    lanes = {"a": flat([0, 0], [40, 0], height=0.0, exits=["b"]), "b": flat(begin, end, height=float(height))}
     graph = LaneGraph(lanes)
     assert list(graph.graph.edges) == [("a", "b")] * drivable
     assert graph.repairs == ({} if drivable else {links.UNDRIVABLE: 1})

@@ -124,14 +124,14 @@ ATTACKS = {
     "bytes of a length": b"\x80\x04cbuiltins\nbytes\n" + HUGE + b"\x85R.",
     "memo": b"\x80\x04Nr\xff\xff\xff\x7f}.",
     "ndarray of a shape": b"\x80\x04cnumpy\nndarray\n" + HUGE + b"\x85\x85R.",
-    "array of a shape": array(HUGE + b"\x85", b"f8", b"C\x08" + bytes(8)) + b".",
-    "array of no bytes": array(HUGE + b"K\x00\x86", b"f8", b"C\x00") + b".",
-    "array longer than its bytes": array(b"K\x09\x85", b"f8", b"C\x08" + bytes(8)) + b".",
-    "array of pointers": array(b"K\x01\x85", b"O", b"C\x08" + b"A" * 8) + b".",
-    "dtype with fields": array(b"K\x01\x85", b"f8", b"C\x08" + bytes(8), b"(K\x03U\x01<N)}K\x08K\x08K\x00t") + b".",
-    "dtype of structures": array(b"K\x01\x85", b"O,O", b"C\x10" + b"A" * 16) + b".",
-    "dtype of void": array(b"K\x01\x85", b"V8", b"C\x08" + bytes(8)) + b".",
-    "text beyond Unicode": array(b"K\x01\x85", b"U1", b"C\x04" + b"\xff" * 4) + b".",
+    "array of a shape": array(HUGE + b"\x85", b"f8", data=b"C\x08" + bytes(8)) + b".",
+    "array of no bytes": array(HUGE + b"K\x00\x86", b"f8", data=b"C\x00") + b".",
+    "array longer than its bytes": array(b"K\x09\x85", b"f8", data=b"C\x08" + bytes(8)) + b".",
+    "array of pointers": array(b"K\x01\x85", b"O", data=b"C\x08" + b"A" * 8) + b".",
+    "dtype with fields": array(b"K\x01\x85", b"f8", data=b"C\x08" + bytes(8), state=b"(K\x03U\x01<N)}K\x08K\x08K\x00t") + b".",
+    "dtype of structures": array(b"K\x01\x85", b"O,O", data=b"C\x10" + b"A" * 16) + b".",
+    "dtype of void": array(b"K\x01\x85", b"V8", data=b"C\x08" + bytes(8)) + b".",
+    "text beyond Unicode": array(b"K\x01\x85", b"U1", data=b"C\x04" + b"\xff" * 4) + b".",
     "unbuilt": b"\x80\x03" + ARRAY + b"}" + b"\x94.",
     "number of a megabyte": b"\x80\x04\x8b" + struct.pack("<I", 10**6) + b"\x7f" * 10**6 + b".",
     "marks": b"(" * 10_000 + b".",
@@ -206,5 +206,5 @@ def test_limits_stop_long_programs(monkeypatch):
 
 
 def test_bytes_that_are_no_truth_values_count_as_true():
-    found = load_plain(array(b"K\x03\x85", b"b1", b"C\x03\x00\x01\x07") + b".")
+    found = load_plain(array(b"K\x03\x85", b"b1", data=b"C\x03\x00\x01\x07") + b".")
     assert found.tolist() == [False, True, True] and found.view(np.uint8).tolist() == [0, 1, 1]

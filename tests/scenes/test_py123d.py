@@ -33,7 +33,7 @@ def turned(x, y, heading, height=0.0):
 
 
 def box(name, label, x, y, heading, size, height=0.0):
-    shape = BoundingBoxSE3(turned(x, y, heading, height), *size, 1.5)
+    shape = BoundingBoxSE3(turned(x, y, heading=heading, height=height), *size, 1.5)
     return d.BoxDetectionSE3(d.BoxDetectionAttributes(label, name), shape, None)
 
 
@@ -49,12 +49,12 @@ def write_map(root, location="town"):
     writer = ArrowMapWriter(False, root / "maps", root / "logs")
     assert writer.reset(about)
     for part in (
-        lane(1, (0, 100), 0, successor_ids=[2, 99], left_lane_id=3),
-        lane(2, (100, 700), 0, predecessor_ids=[1]),
-        lane(3, (0, 100), 3.6, left_lane_id=4, right_lane_id=1),
-        lane(4, (100, 0), 7.2, left_lane_id=3),  # oncoming
-        lane(5, (0, 100), -3.6, kind=d.LaneType.BIKE_LANE),
-        lane(6, (9000, 9100), 0),  # elsewhere in town
+        lane(1, (0, 100), y=0, successor_ids=[2, 99], left_lane_id=3),
+        lane(2, (100, 700), y=0, predecessor_ids=[1]),
+        lane(3, (0, 100), y=3.6, left_lane_id=4, right_lane_id=1),
+        lane(4, (100, 0), y=7.2, left_lane_id=3),  # oncoming
+        lane(5, (0, 100), y=-3.6, kind=d.LaneType.BIKE_LANE),
+        lane(6, (9000, 9100), y=0),  # elsewhere in town
         d.GenericDrivable(
             9, outline=Polyline3D.from_array(np.array([[0, -6, 0], [700, -6, 0], [700, 9, 0], [0, 9, 0.0]]))
         ),
@@ -76,15 +76,15 @@ def write_log(root, name="log", seconds=12.0, rate=10.0, location="town", about=
         if any(begin < time < end for begin, end in pauses):
             continue
         stamp = d.Timestamp.from_us(1_000_000_000 + round(1e6 * time))
-        ego = d.EgoStateSE3.from_imu(turned(20 + 8 * time - 1.5, 0, 0), EGO, stamp)
+        ego = d.EgoStateSE3.from_imu(turned(20 + 8 * time - 1.5, 0, heading=0), EGO, stamp)
         found = [
-            box("truck", Label.VEHICLE, 60 + 6 * time, 3.6, 0.02 * time, (9.0, 2.5), 0.05 * time),
-            box("rider", Label.BICYCLE, 30 + 4 * time, -4, 0, (1.8, 0.7)),
-            box("cone", Label.TRAFFIC_CONE, 70, -5, 0, (0.4, 0.4)),
-            box("sign", Label.CZONE_SIGN, 80, -5, 0, (0.4, 0.4)),
+            box("truck", Label.VEHICLE, x=60 + 6 * time, y=3.6, heading=0.02 * time, size=(9.0, 2.5), height=0.05 * time),
+            box("rider", Label.BICYCLE, x=30 + 4 * time, y=-4, heading=0, size=(1.8, 0.7)),
+            box("cone", Label.TRAFFIC_CONE, x=70, y=-5, heading=0, size=(0.4, 0.4)),
+            box("sign", Label.CZONE_SIGN, x=80, y=-5, heading=0, size=(0.4, 0.4)),
         ]
         if time < 2:
-            found.append(box("walker", Label.PEDESTRIAN, 40, -7 + time, 1.5, (0.6, 0.5)))
+            found.append(box("walker", Label.PEDESTRIAN, x=40, y=-7 + time, heading=1.5, size=(0.6, 0.5)))
         green = d.TrafficLightStatus.GREEN if time >= 4 else d.TrafficLightStatus.RED
         lights = [d.TrafficLightDetection(2, green), d.TrafficLightDetection(3, d.TrafficLightStatus.OFF)]
         parts = [ego, d.BoxDetectionsSE3(found, stamp, BOXES), d.TrafficLightDetections(lights, stamp)]

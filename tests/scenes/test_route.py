@@ -74,8 +74,8 @@ def test_leading_dims_broadcast_and_a_hint_chooses_the_pass():
     angle = torch.arange(120) * SPACING / 20.0  # nearly two rounds of a circle
     loop = 20.0 * torch.stack([angle.cos(), angle.sin()], -1)
     here = loop[10:11]
-    assert abs(project(here, loop, torch.tensor([20.0]))[0].item() - 20.0) < 0.1
-    assert abs(project(here, loop, torch.tensor([145.0]))[0].item() - 20.0 - 40 * torch.pi) < 0.1
+    assert abs(project(here, loop, hint=torch.tensor([20.0]))[0].item() - 20.0) < 0.1
+    assert abs(project(here, loop, hint=torch.tensor([145.0]))[0].item() - 20.0 - 40 * torch.pi) < 0.1
 
 
 def test_interpolation_differentiates():
@@ -91,7 +91,7 @@ def test_interpolation_differentiates():
 @pytest.mark.parametrize("begin", [20.0, CROSSING[0] - 3])
 def test_a_track_is_followed_across_the_crossing_of_a_loop(begin):
     """The nearest place alone jumps by the length of the loop, in both directions."""
-    states = track(loop(), begin, 25.0)
+    states = track(loop(), begin, speed=25.0)
     for points in (states[:, :2], states[:, :2] + torch.tensor([0.3, -0.4])):
         s, d, heading = (value[0] for value in project_track(points[None], loop()[None], start=begin))
         assert (s - begin - 2.5 * torch.arange(81)).abs().max() < 0.6
@@ -99,11 +99,11 @@ def test_a_track_is_followed_across_the_crossing_of_a_loop(begin):
 
 
 def test_a_gap_in_a_track_is_no_jump_and_what_does_not_jump_is_projected():
-    states = track(loop(), 20.0, 25.0)
+    states = track(loop(), 20.0, speed=25.0)
     known = torch.ones(1, 81, dtype=torch.bool)
     known[0, 30:40] = False
     points = torch.where(known[0, :, None], states[:, :2], 0.0)[None]
-    s = project_track(points, loop()[None], known, start=20.0)[0][0]
+    s = project_track(points, loop()[None], known=known, start=20.0)[0][0]
     assert (s - 20 - 2.5 * torch.arange(81))[known[0]].abs().max() < 0.6
     short = states[None, :8, :2]
     assert torch.equal(project_track(short, loop()[None])[0], project(short, loop()[None])[0])

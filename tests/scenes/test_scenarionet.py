@@ -34,7 +34,7 @@ def test_folders_and_zips_hold_the_same_scenes_and_an_index_beside_them_their_pl
     expected = contents(folder)
     assert len(expected) == 2
     for method in (zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
-        path = write_zip(tmp_path / f"{method}.zip", scenes, method)
+        path = write_zip(tmp_path / f"{method}.zip", scenes, method=method)
         assert contents(path) == expected
     assert ScenarioNetSource(str(path)).locations == {}
     (tmp_path / "index.csv").write_text("file,location_group\npart/sd_00.pkl,17\n")
@@ -95,10 +95,10 @@ def test_a_damaged_zip_is_named(tmp_path):
 
 def test_tracks_types_sizes_and_the_map_arrive():
     tracks = {
-        "ego": straight(20, 0, 8),
-        5: straight(40, 0, 6, size=(1.7, 4.1)),
-        "cone": straight(60, 0, 0, kind="TRAFFIC_CONE"),
-        "p": straight(0, 9, 1, kind="PEDESTRIAN", size=(0.5, 0.6)),
+        "ego": straight(20, 0, speed=8),
+        5: straight(40, 0, speed=6, size=(1.7, 4.1)),
+        "cone": straight(60, 0, speed=0, kind="TRAFFIC_CONE"),
+        "p": straight(0, 9, speed=1, kind="PEDESTRIAN", size=(0.5, 0.6)),
     }
     tracks["p"]["state"]["valid"] = np.where(ALL < 30, 1.0, 0.0)[:, None]  # as nuScenes files have it
     tracks["p"]["state"]["length"] = tracks["p"]["state"]["length"][:, None]
@@ -256,13 +256,13 @@ def test_sizes_are_read_wherever_converters_write_them(form):
 @pytest.mark.parametrize("value", [None, 0.0, np.nan])
 def test_a_size_that_is_missing_or_not_positive_is_the_usual_one_of_the_type(value):
     kinds = {"VEHICLE": (4.6, 1.9), "TRAFFIC_CONE": (0.4, 0.4), "TRAFFIC_BARRIER": (2.0, 0.5), "PEDESTRIAN": (0.7, 0.7)}
-    others = {kind: straight(50 + 10 * number, -6, 0, kind=kind) for number, kind in enumerate(kinds)}
+    others = {kind: straight(50 + 10 * number, -6, speed=0, kind=kind) for number, kind in enumerate(kinds)}
     for agent in others.values():
         for name in ("length", "width"):
             agent["state"].pop(name)
             if value is not None:
                 agent["state"][name] = np.full(FRAMES, value)
-    (recording,) = read(description({"ego": straight(20, 0, 8)} | others))
+    (recording,) = read(description({"ego": straight(20, 0, speed=8)} | others))
     assert recording.validate_log().size[1:].tolist() == [list(size) for size in kinds.values()]
     assert sum(recording.repairs.values()) == len(kinds)
 

@@ -20,7 +20,7 @@ def build(**options) -> TensorDict:
 def test_the_set_is_sliced():
     several = torch.stack([build(), build()])
     several["scene_index"] = torch.arange(2)
-    whole = SceneSet(several, ["a", "b"], ["p", "q"], "made", "test", {"invalid": 1})
+    whole = SceneSet(several, ["a", "b"], location=["p", "q"], dataset="made", split="test", dropped={"invalid": 1})
     assert len(whole) == 2 and whole.batch([1, 0, 1])["scene_index"].tolist() == [1, 0, 1] and whole.steps == 80
     assert [part["scene_index"].tolist() for part in whole.parts(1)] == [[0], [1]]
     assert [whole.index(which) for which in (0, 1, "a", "b")] == [0, 1, 0, 1]

@@ -76,11 +76,11 @@ def test_scenes_come_back_bit_for_bit_and_padded(scenes):
 
 def test_a_set_is_built_once_and_read_from_its_file(tmp_path):
     path = file_of(tmp_path / "cache")
-    first = cached(path, build, 1)
+    first = cached(path, build, gigabytes=1)
     same(uncached(build), first)
-    changed = cached(path, never, 1)
+    changed = cached(path, never, gigabytes=1)
     changed.scenes["logged"].fill_(7.0)  # in memory, not in the file
-    same(cached(path, never, 1), first)
+    same(cached(path, never, gigabytes=1), first)
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -97,30 +97,30 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_rebuilt_and_a_set_in_use_survives_it(tmp_path, capsys, damage):
     path = file_of(tmp_path)
-    first = cached(path, build, 1)
+    first = cached(path, build, gigabytes=1)
     content = path.read_bytes()
     path.unlink()
     path.write_bytes(DAMAGES[damage](content))
-    same(cached(path, build, 1), first)
+    same(cached(path, build, gigabytes=1), first)
     assert "rebuilding the damaged cache file" in capsys.readouterr().err
     assert path.read_bytes() == content and list(tmp_path.iterdir()) == [path]
 
 
 def test_a_scene_s_hash_is_of_what_is_used_not_of_what_its_file_says(tmp_path):
     """A cache entry with another scene in it, whose own hash was made anew."""
-    first = cached(path := file_of(tmp_path), build, 1).hashes()
+    first = cached(path := file_of(tmp_path), build, gigabytes=1).hashes()
     content = bytearray(path.read_bytes()[: -cache.END.size])
     length = cache.END.unpack(path.read_bytes()[-cache.END.size :])[0]
     content[20] ^= 1
     path.write_bytes(content + cache.END.pack(length, cache.FORMAT, hashlib.sha256(content).digest()))
-    forged = cached(path, never, 1).hashes()
+    forged = cached(path, never, gigabytes=1).hashes()
     assert forged[0] != first[0] and forged[1:] == first[1:]
 
 
 @pytest.mark.parametrize("change", [("|O", [5, 3, 4]), ("|V8", [5, 3]), ("<U2", [5, 3]), ("?", [5]), ("<f4", [9**9])])
 def test_a_file_of_other_arrays_than_numbers_is_refused(tmp_path, change):
     """Its hash is right: somebody wrote it so."""
-    cached(path := file_of(tmp_path), build, 1)
+    cached(path := file_of(tmp_path), build, gigabytes=1)
     content = path.read_bytes()
     begin = len(content) - cache.END.size - cache.END.unpack(content[-cache.END.size :])[0]
     about = json.loads(content[begin : -cache.END.size])
@@ -164,15 +164,15 @@ def test_sets_not_used_for_longest_make_room_and_nothing_else_does(tmp_path, cap
         path.write_bytes(bytes(10**6))
     names = [file_of(tmp_path, letter) for letter in "abc"]
     for number, path in enumerate(names):
-        cached(path, partial(build, seed=number), 1)
+        cached(path, partial(build, seed=number), gigabytes=1)
         os.utime(path, (0, 100 * number))
-    cached(names[0], never, 1)  # used now
+    cached(names[0], never, gigabytes=1)  # used now
     size = names[0].stat().st_size
     new = file_of(tmp_path, "d")
-    cached(new, partial(build, seed=9), 3.5 * size / 1e9)
+    cached(new, partial(build, seed=9), gigabytes=3.5 * size / 1e9)
     assert [path for path in [*names, new] if path.exists()] == [names[0], names[2], new]
     assert f"removed {names[1]}" in capsys.readouterr().err
-    cached(file_of(tmp_path, "e"), build, 0)  # what is used stays, however small the limit
+    cached(file_of(tmp_path, "e"), build, gigabytes=0)  # what is used stays, however small the limit
     assert sorted(tmp_path.iterdir()) == sorted([*others, file_of(tmp_path, "e")])
 
 
@@ -181,7 +181,7 @@ def _counted(folder, _: int) -> list[str]:
         (folder / f"built-{os.getpid()}").touch()
         return build(index)
 
-    return cached(file_of(folder), build_and_tell, 1).hashes()
+    return cached(file_of(folder), build_and_tell, gigabytes=1).hashes()
 
 
 def test_of_several_processes_one_builds(tmp_path):

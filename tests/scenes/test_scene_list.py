@@ -41,7 +41,7 @@ def test_a_hash_is_of_the_scene_alone_and_of_all_of_it():
     scenes = scenes_of()
     hashes = scene_hashes(scenes)
     assert len(set(hashes)) == 4
-    alone = SceneSet(make_scenes(1, speed=8, **SMALL).scenes, ["s0"], ["place"], "made", "other", {"too short": 1})
+    alone = SceneSet(make_scenes(1, speed=8, **SMALL).scenes, ["s0"], location=["place"], dataset="made", split="other", dropped={"too short": 1})
     assert scenes.scenes["lane_points"].shape[1] == alone.scenes["lane_points"].shape[1] + 9, "the first is padded"
     assert scene_hashes(alone) == hashes[:1] and scene_hashes(scenes.chosen([2, 1])) == [hashes[2], hashes[1]]
     for key, value in scenes.scenes.items():
@@ -66,7 +66,7 @@ def test_what_a_run_lists_is_what_another_takes(tmp_path):
         assert found.scene_id == ["s3", "s1"] and found.number == [3, 1]
         assert torch.equal(found.scenes["logged"], some.scenes["logged"])
         assert found.scenes["scene_index"].tolist() == [0, 1]
-    assert listed_scenes(tmp_path, scenes.first, 1).scene_id == ["s3"]
+    assert listed_scenes(tmp_path, scenes.first, most=1).scene_id == ["s3"]
 
 
 def test_a_list_by_hand_names_scenes_only(tmp_path):

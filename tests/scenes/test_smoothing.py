@@ -29,7 +29,7 @@ def accelerating(heading: float = 0.7, speed: float = 4.0, accel: float = 1.5) -
 def test_constant_acceleration_is_estimated_exactly():
     states = accelerating()
     valid = np.ones((40, 1), bool)
-    start, accel, yaw_rate = causal_state(states, valid, 20)
+    start, accel, yaw_rate = causal_state(states, valid, frame=20)
     assert np.allclose(start[0, :3], states[20, 0, :3], atol=1e-6)
     assert np.isclose(start[0, 3], 4.0 + 1.5 * 2.0, atol=1e-5) and np.isclose(accel[0], 1.5, atol=1e-4)
     assert abs(yaw_rate[0]) < 1e-9
@@ -39,18 +39,18 @@ def test_a_steady_turn_is_estimated():
     heading = 0.3 * TIME
     states = np.stack([np.sin(heading) * 20, (1 - np.cos(heading)) * 20, heading, np.full(40, 6.0)], -1)[:, None]
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
-    start, _, yaw_rate = causal_state(states, np.ones((40, 1), bool), 20)
+    start, _, yaw_rate = causal_state(states, np.ones((40, 1), bool), frame=20)
     assert np.isclose(yaw_rate[0], 0.3, atol=1e-4) and np.isclose(start[0, 3], 6.0, atol=0.1)  # the fit is a chord's
 
 
 def test_the_start_state_is_blind_to_the_future_and_to_gaps_before():
     states = accelerating()
     valid = np.ones((40, 1), bool)
-    before = causal_state(states, valid, 20)
+    before = causal_state(states, valid, frame=20)
     states[21:], valid[21:] = np.nan, False
     states[:15], valid[:15] = 1e6, True
     valid[14] = False
-    after = causal_state(states, valid, 20)
+    after = causal_state(states, valid, frame=20)
     assert all(np.allclose(a, b, atol=1e-4) for a, b in zip(before, after, strict=True))
 
 
@@ -59,22 +59,22 @@ def test_the_past_is_seen_from_the_present_and_blind_to_the_future_and_to_gaps_b
     valid = np.ones((40, 1), bool)
     speed = np.array([7.0])
     back = np.arange(1, 11) * 0.1
-    past = causal_past(states, valid, 20, speed)
+    past = causal_past(states, valid, frame=20, speed=speed)
     assert past.shape == (1, 10, 3)
     assert np.allclose(past[0, :, 0], -7.0 * back + 1.5 * back**2 / 2) and np.allclose(past[0, :, 1:], 0)
     states[21:], valid[21:], states[:15] = np.nan, False, 1e6
     valid[14] = False
-    short = causal_past(states, valid, 20, speed)
+    short = causal_past(states, valid, frame=20, speed=speed)
     assert np.allclose(short[0, :5], past[0, :5])
     assert np.allclose(np.diff(short[0, 4:, 0]), -0.7) and np.allclose(short[0, :, 1:], 0)
-    assert np.allclose(causal_past(states, valid, 0, speed)[0, :, 0], -7.0 * back), "straight on where nothing is known"
+    assert np.allclose(causal_past(states, valid, frame=0, speed=speed)[0, :, 0], -7.0 * back), "straight on where nothing is known"
 
 
 def test_a_turn_shows_in_the_past():
     angle = np.linspace(3.0, 3.5, 20)  # across the cut
     states = np.stack([10 * np.sin(angle), -10 * np.cos(angle), angle, np.zeros(20)], -1)[:, None]
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
-    past = causal_past(states, np.ones((20, 1), bool), 19, np.array([1.0]))[0]
+    past = causal_past(states, np.ones((20, 1), bool), frame=19, speed=np.array([1.0]))[0]
     turned = -np.arange(1, 11) * 0.5 / 19
     assert np.allclose(past[:, 2], turned)
     assert np.allclose(past[:, 0], 10 * np.sin(turned)) and np.allclose(past[:, 1], 10 * (1 - np.cos(turned)))
@@ -123,7 +123,7 @@ def test_speeds_are_signed_along_the_heading():
     back = accelerating(speed=-3.0, accel=-0.5)
     valid = np.ones((40, 1), bool)
     assert np.allclose(smooth(back, valid)[:, 0, 3], -3.0 - 0.5 * TIME, atol=1e-9)
-    start, accel, _ = causal_state(back, valid, 20)
+    start, accel, _ = causal_state(back, valid, frame=20)
     assert np.isclose(start[0, 3], -4.0, atol=1e-5) and np.isclose(accel[0], -0.5, atol=1e-4)
 
 
@@ -135,14 +135,14 @@ def test_who_brakes_to_a_halt_or_stands_does_not_reverse(accel):
     states[..., :2] += np.random.default_rng(0).normal(0, 0.02, (40, 1, 2))
     valid = np.ones((40, 1), bool)
     assert (smooth(states, valid)[..., 3] >= 0).all()
-    assert all(causal_state(states, valid, frame)[0][0, 3] >= 0 for frame in range(40))
+    assert all(causal_state(states, valid, frame=frame)[0][0, 3] >= 0 for frame in range(40))
 
 
 def test_gapped_time_stamps_are_resampled_linearly():
     stamps = np.delete(TIME, [7, 8, 20])
     full = accelerating(accel=0.0)
     states = np.delete(full, [7, 8, 20], axis=0)
-    out, known = resample_uniform(states, np.ones((37, 1), bool), stamps + 1.6e9)
+    out, known = resample_uniform(states, np.ones((37, 1), bool), ts=stamps + 1.6e9)
     assert known.all() and np.allclose(out[..., :3], full[..., :3], atol=1e-5)
 
 
@@ -152,7 +152,7 @@ def test_resampling_turns_the_short_way_and_respects_validity():
     states[:5, 0, 2], states[5:, 0, 2] = 3.1, -3.1
     valid = np.ones((39, 1), bool)
     valid[20] = False
-    out, known = resample_uniform(states, valid, stamps)
+    out, known = resample_uniform(states, valid, ts=stamps)
     assert abs(abs(out[5, 0, 2]) - np.pi) < 1e-6
     assert np.flatnonzero(~known[:, 0]).tolist() == [21]
 
@@ -161,9 +161,9 @@ def test_long_gaps_are_not_invented_and_other_rates_are_brought_to_ten_hertz():
     stamps = np.concatenate([TIME[:20], TIME[20:] + 1.0])
     states = accelerating(accel=0.0)
     valid = np.ones((40, 1), bool)
-    _, known = resample_uniform(states, valid, stamps)
+    _, known = resample_uniform(states, valid, ts=stamps)
     assert len(known) == 50 and not known[20:30].any() and known[:20].all() and known[30:].all()
-    out, known = resample_uniform(states, valid, TIME / 2)
+    out, known = resample_uniform(states, valid, ts=TIME / 2)
     assert len(out) == 20 and np.allclose(out, states[::2], atol=1e-6) and known.all()
 
 
@@ -188,7 +188,7 @@ def test_at_every_rate_a_track_is_what_was_recorded_and_no_more(rate, jitter, se
     seconds -= seconds[0]
     valid = np.repeat(rng.random(count) < 0.7, 1 + rng.integers(6))[: len(seconds), None]
     assume(valid.any())
-    out, known = resample_uniform(np.where(valid[..., None], circle(seconds), np.nan), valid, seconds)
+    out, known = resample_uniform(np.where(valid[..., None], circle(seconds), np.nan), valid, ts=seconds)
     time = 0.1 * np.flatnonzero(known[:, 0])
     recorded = seconds[valid[:, 0]]
     error = out[known] - circle(time)[:, 0]
@@ -215,7 +215,7 @@ def test_who_is_not_recorded_is_nowhere(rate):
     seconds = np.arange(int(6 * rate)) / rate
     valid = ((seconds < 2.03) | (seconds > 4.07))[:, None]
     states = np.where(valid[..., None], circle(seconds), 0.0)
-    out, known = resample_uniform(states, valid, seconds)
+    out, known = resample_uniform(states, valid, ts=seconds)
     grid = 0.1 * np.arange(len(out))
     assert known[:, 0].tolist() == ((grid < 2.04) | (grid > 4.06)).tolist() or rate in (12.5, 24.0, 25.0)
     assert not known[(grid > 2.04) & (grid < 4.06)].any()
@@ -228,7 +228,7 @@ def test_a_track_annotated_at_a_lower_rate_is_interpolated_and_one_lost_from_sig
     valid[40:48, 1] = False
     valid[[60, 81], 2] = False
     states = np.where(valid[..., None], np.repeat(circle(seconds), 3, axis=1), 0.0)
-    out, known = resample_uniform(states, valid, seconds)
+    out, known = resample_uniform(states, valid, ts=seconds)
     assert np.flatnonzero(~known[:, 0]).tolist() == [56, 57, 58, 59], "after its last annotation"
     assert np.flatnonzero(~known[:, 1]).tolist() == [20, 21, 22, 23]
     assert known[:, 2].all(), "a flicker between frames that lie 0.1 s apart"
@@ -241,8 +241,8 @@ def test_frames_of_one_time_stamp_are_one():
     valid = np.ones((len(seconds), 1), bool)
     first = np.flatnonzero(np.diff(seconds) == 0)
     valid[first[::2]], valid[first[1::2] + 1] = False, False
-    out, known = resample_uniform(states, valid, seconds)
-    expected, _ = resample_uniform(circle(np.unique(seconds)), np.ones((40, 1), bool), np.unique(seconds))
+    out, known = resample_uniform(states, valid, ts=seconds)
+    expected, _ = resample_uniform(circle(np.unique(seconds)), np.ones((40, 1), bool), ts=np.unique(seconds))
     assert known.all() and np.allclose(out, expected)
 
 
@@ -254,7 +254,7 @@ def test_a_frame_beside_the_grid_that_is_alone_is_moved_along_its_speed(speed):
     states = circle(seconds)
     valid = np.zeros((50, 1), bool)
     valid[frames], states[..., 3] = True, speed
-    out, known = resample_uniform(np.where(valid[..., None], states, 0.0), valid, seconds)
+    out, known = resample_uniform(np.where(valid[..., None], states, 0.0), valid, ts=seconds)
     assert np.flatnonzero(known[:, 0]).tolist() == grid
     x, y, heading, _ = states[frames, 0].T
     way = speed * (0.1 * np.array(grid) - seconds[frames])
@@ -267,18 +267,18 @@ def test_a_height_that_is_unknown_is_the_nearest_of_its_track_and_others_stay():
     heights[:, 0] = TIME
     heights[[0, 1, 9, 10], 0] = np.nan
     heights[:, 2] = np.nan
-    out = resample_heights(heights, valid, TIME)
+    out = resample_heights(heights, valid, ts=TIME)
     expected = TIME.copy()
     expected[[0, 1, 9, 10]] = TIME[[2, 2, 8, 11]]
     assert np.allclose(out[:, 0], expected) and (out[:, 1] == 8).all() and np.isnan(out[:, 2]).all()
-    assert resample_heights(np.full((40, 3), np.nan), valid, TIME) is None
-    assert resample_heights(np.where(valid, 1.0, heights), valid, TIME) is None
+    assert resample_heights(np.full((40, 3), np.nan), valid, ts=TIME) is None
+    assert resample_heights(np.where(valid, 1.0, heights), valid, ts=TIME) is None
 
 
 def test_a_heading_that_flips_between_frames_is_never_halfway():
     seconds = np.arange(50) / 25
     states = np.stack([8 * seconds, 0 * seconds, np.where(seconds > 1.0, np.pi, 0.0), 0 * seconds], -1)[:, None]
-    out, _ = resample_uniform(states, np.ones((50, 1), bool), seconds)
+    out, _ = resample_uniform(states, np.ones((50, 1), bool), ts=seconds)
     assert np.allclose(np.sin(out[..., 2]), 0)
 
 
@@ -293,7 +293,7 @@ def test_a_light_holds_from_its_frame_on(rate):
 @pytest.mark.parametrize("stamps", [TIME[::-1], TIME * 1e6, TIME * 0, np.where(TIME > 2, np.nan, TIME)])
 def test_impossible_time_stamps_are_refused(stamps):
     with pytest.raises(InputError, match="time stamps"):
-        resample_uniform(accelerating(), np.ones((40, 1), bool), stamps)
+        resample_uniform(accelerating(), np.ones((40, 1), bool), ts=stamps)
 
 
 @pytest.mark.parametrize("braking", [4.0, 9.0])

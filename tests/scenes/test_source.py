@@ -31,7 +31,7 @@ from tests.scenes.descriptions import (
 
 
 def scenes_of(count: int) -> list[dict]:
-    return numbered([description({"ego": straight(20 + k, 0, 8), "7": straight(50, 3.5, 6)}) for k in range(count)])
+    return numbered([description({"ego": straight(20 + k, 0, speed=8), "7": straight(50, 3.5, speed=6)}) for k in range(count)])
 
 
 def bad_scenes() -> dict[str, dict | bytes]:
@@ -83,7 +83,7 @@ def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
     folder = write_folder(tmp_path / "x", scenes_of(1))
     cache = tmp_path / "cache"
     load_scenes(data_config(folder, cache))
-    write_folder(folder, numbered([description({"ego": straight(33, 0, 5)})]))
+    write_folder(folder, numbered([description({"ego": straight(33, 0, speed=5)})]))
     assert load_scenes(data_config(folder, cache)).scenes["start"][0, 0, 3].item() == pytest.approx(5.0, abs=1e-4)
     assert load_scenes(data_config(folder, cache, build={"field_cells": 32})).scenes["field"].shape == (1, 32, 32)
     assert load_scenes(data_config(folder, cache, split="mine")).split == "mine"
@@ -93,7 +93,7 @@ def test_the_cache_is_keyed_by_content_and_settings(tmp_path):
 
 def test_mirror_images_are_scenes_of_the_same_place(tmp_path):
     """Drawn in the mirror, a scene is the other one: states, lanes and what is drivable."""
-    turned = description({"ego": straight(20, 0, 8), "7": straight(50, 3.5, 6)}) | {"id": "turned"}
+    turned = description({"ego": straight(20, 0, speed=8), "7": straight(50, 3.5, speed=6)}) | {"id": "turned"}
     found = load_scenes(
         data_config(write_folder(tmp_path / "x", [turned]), tmp_path / "cache", versions=("recorded", "mirrored"))
     )
@@ -131,7 +131,7 @@ def test_invalid_scenes_are_skipped_and_counted_on_request(tmp_path):
 
 
 def test_overlaps_with_the_ego_and_logs_too_short_are_dropped_and_counted(tmp_path):
-    close = description({"ego": straight(20, 0, 8), "7": straight(23, 0.5, 8)})
+    close = description({"ego": straight(20, 0, speed=8), "7": straight(23, 0.5, speed=8)})
     folder = write_folder(tmp_path / "x", [close, *scenes_of(1)])
     found = load_scenes(data_config(folder, tmp_path / "cache"))
     assert len(found) == 1 and found.dropped == {source.OVERLAP: 1}
@@ -140,9 +140,9 @@ def test_overlaps_with_the_ego_and_logs_too_short_are_dropped_and_counted(tmp_pa
 
 
 def test_what_overlaps_the_ego_is_counted_by_its_kind(tmp_path):
-    ego = straight(20, 0, 8)
+    ego = straight(20, 0, speed=8)
     kinds = {"PEDESTRIAN": "a pedestrian", "CYCLIST": "a cyclist", "TRAFFIC_CONE": "an object"}
-    close = [description({"ego": ego, "7": straight(29, 0.5, 0, kind=kind, size=(0.6, 0.6))}) for kind in kinds]
+    close = [description({"ego": ego, "7": straight(29, 0.5, speed=0, kind=kind, size=(0.6, 0.6))}) for kind in kinds]
     folder = write_folder(tmp_path / "x", [*close, *scenes_of(1)])
     found = load_scenes(data_config(folder, tmp_path / "cache"))
     assert found.dropped == {f"ego overlaps {word} at the start": 1 for word in kinds.values()}
@@ -183,7 +183,7 @@ class SpeedSource(Source):
         road = {"road": Lane(np.array([[0.0, 0], [900, 0]]), self.lane_width)}
         valid = np.ones((200, 1), bool)
         size = np.array([[4.5, 1.9]])
-        yield Recording(log, "road", "speeds", states, valid, size, np.zeros(1, int), 0, road, current=None)
+        yield Recording(log, "road", dataset="speeds", states=states, valid=valid, size=size, agent_type=np.zeros(1, int), ego=0, lanes=road, current=None)
 
     def fingerprint(self) -> bytes:
         return hash_files(sorted(self.root().glob("*.txt")))

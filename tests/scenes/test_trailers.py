@@ -13,11 +13,11 @@ TIME = 0.1 * np.arange(FRAMES)
 
 def recording(*tracks: np.ndarray, sizes: list[tuple[float, float]]) -> Recording:
     """An ego at 12 m/s beside tracks [F, 4] of vehicles, on a straight road of two lanes."""
-    states = np.stack([driving(-60.0, 0.0, 12.0), *tracks], 1)
+    states = np.stack([driving(-60.0, 0.0, speed=12.0), *tracks], 1)
     lanes = {name: Lane(np.array([[-300.0, y], [600.0, y]]), 3.5) for name, y in (("0", 0.0), ("1", 3.5))}
     valid = np.ones(states.shape[:2], bool)
     kinds = np.zeros(states.shape[1], int)
-    return Recording("towed", "road", "made", states, valid, np.array([(4.5, 1.9), *sizes]), kinds, 0, lanes)
+    return Recording("towed", "road", dataset="made", states=states, valid=valid, size=np.array([(4.5, 1.9), *sizes]), agent_type=kinds, ego=0, lanes=lanes)
 
 
 def driving(x: float, y: float, speed) -> np.ndarray:
@@ -36,7 +36,7 @@ def on_a_circle(behind: float, radius: float, speed: float = 8.0) -> np.ndarray:
 @pytest.mark.parametrize("gap", [-0.3, 0.1, 0.4, 1.5])
 @pytest.mark.parametrize("speed", [15.0, np.clip(15 - 2 * TIME, 0, None), 8 + 3 * np.sin(TIME)])
 def test_a_trailer_is_one_vehicle_with_its_tractor(gap, speed):
-    log = recording(driving(10, 3.5, speed), driving(1 - gap, 3.5, speed), sizes=[(6, 2.4), (12, 2.6)])
+    log = recording(driving(10, 3.5, speed=speed), driving(1 - gap, 3.5, speed=speed), sizes=[(6, 2.4), (12, 2.6)])
     found = couple(log)
     assert found.repairs == {JOINED: 1} and found.valid.any(0).tolist() == [True, True, False]
     assert found.size[1].tolist() == pytest.approx([18 + gap, 2.6])
@@ -48,7 +48,7 @@ def test_a_trailer_is_one_vehicle_with_its_tractor(gap, speed):
 
 
 def test_a_road_train_is_one_vehicle_and_stays_where_it_is_while_one_part_is_hidden():
-    tracks = [driving(10 - behind, 3.5, 15.0) for behind in (0.0, 8.5, 17.0)]
+    tracks = [driving(10 - behind, 3.5, speed=15.0) for behind in (0.0, 8.5, 17.0)]
     log = recording(*tracks, sizes=[(6, 2.4), (10, 2.5), (6, 2.5)])
     log.valid[40:50, 3] = log.valid[60:70, 1] = False
     found = couple(log)
@@ -90,23 +90,23 @@ def test_a_trailer_that_turns_is_shown_by_a_replay_alone_and_counted():
     ids=["follows", "creeps in a queue", "stands", "queue begins to drive"],
 )
 def test_vehicles_that_follow_each_other_are_two(speed, distance):
-    log = recording(driving(10, 3.5, speed), driving(10 - 4.5 - distance, 3.5, speed), sizes=[(4.5, 1.9)] * 2)
+    log = recording(driving(10, 3.5, speed=speed), driving(10 - 4.5 - distance, 3.5, speed=speed), sizes=[(4.5, 1.9)] * 2)
     assert not couple(log).repairs and couple(log).valid.all()
 
 
 def test_who_comes_nearer_is_no_trailer():
-    log = recording(driving(10, 3.5, 10.0), driving(4.8, 3.5, 9.9), sizes=[(4.5, 1.9)] * 2)
+    log = recording(driving(10, 3.5, speed=10.0), driving(4.8, 3.5, speed=9.9), sizes=[(4.5, 1.9)] * 2)
     assert not couple(log).repairs
 
 
 @pytest.mark.parametrize(("aside", "back"), [(1.2, 0.0), (1.6, 1.0)])
 def test_who_rides_beside_another_is_no_trailer(aside, back):
-    log = recording(driving(10, 3.5, 12.0), driving(10 - back, 3.5 + aside, 12.0), sizes=[(2.2, 0.8)] * 2)
+    log = recording(driving(10, 3.5, speed=12.0), driving(10 - back, 3.5 + aside, speed=12.0), sizes=[(2.2, 0.8)] * 2)
     assert not couple(log).repairs
 
 
 def test_the_ego_of_another_window_is_no_trailer():
-    log = recording(driving(10, 3.5, 15.0), driving(0.7, 3.5, 15.0), sizes=[(6, 2.4), (12, 2.6)])
+    log = recording(driving(10, 3.5, speed=15.0), driving(0.7, 3.5, speed=15.0), sizes=[(6, 2.4), (12, 2.6)])
     assert couple(log).repairs == {JOINED: 1}
     assert not couple(Recording(**{**vars(log), "egos": {40: 2}})).repairs
 

@@ -9,7 +9,7 @@ SURE = 1000.0  # a chance that draws hardly differ from
 
 
 def portfolio(scenes: int = 2, chance: float = SURE, nfe: tuple[float, ...] = (100.0,)) -> Portfolio:
-    return Portfolio([Family(str(k), "e2", {}, chance=chance, nfe=cost) for k, cost in enumerate(nfe)], scenes)
+    return Portfolio([Family(str(k), "e2", ranges={}, chance=chance, nfe=cost) for k, cost in enumerate(nfe)], scenes)
 
 
 def mean_worth(found: Portfolio, draws: int = 400) -> torch.Tensor:
@@ -99,7 +99,7 @@ def test_the_nearer_a_scene_came_the_likelier_is_a_find_there():
 
 
 def test_without_learning_nothing_that_was_told_changes_the_choice():
-    found = Portfolio([Family("a", "e2", {}), Family("b", "e2", {})], 2, learns=False)
+    found = Portfolio([Family("a", "e2", ranges={}), Family("b", "e2", ranges={})], 2, learns=False)
     for _ in range(50):
         found.tell(0, 0, 1.0, 2.0, 100.0)
     torch.testing.assert_close(mean_worth(found, 4000), torch.full((2, 2), 0.5).double(), atol=0.03, rtol=0)

@@ -8,13 +8,13 @@ from e2rl.metrics.margin import PREVENTED
 from e2rl.search.search import RAISES, ROUND, Outcome, Search, SearchSettings
 from e2rl.search.tries import Family
 
-FAMILIES = [Family(name, "e2", {"moment": (1.0, 5.0)}) for name in ("good", "poor", "idle")]
+FAMILIES = [Family(name, "e2", ranges={"moment": (1.0, 5.0)}) for name in ("good", "poor", "idle")]
 CHANCE = {"good": 0.5, "poor": 0.05, "idle": 0.0}
 PLAIN = SearchSettings()
 
 
 def search_of(scenes=40, seed=0, settings=PLAIN, families=FAMILIES):
-    return Search(families, range(100, 100 + scenes), seed, settings)
+    return Search(families, range(100, 100 + scenes), seed=seed, settings=settings)
 
 
 def told(search, rounds, hopeless=()):
@@ -26,7 +26,7 @@ def told(search, rounds, hopeless=()):
             luck = torch.rand((), generator=torch.Generator().manual_seed(hash((one.scene, one.seed)) % 2**31)).item()
             fails = luck < CHANCE[one.family] and one.scene not in hopeless
             margin = PREVENTED if fails else -25.0 if one.scene in hopeless else -2.0
-            outcomes.append(Outcome(margin, f"cell {one.scene} {one.number}" if fails else "", 100.0))
+            outcomes.append(Outcome(margin, f"cell {one.scene} {one.number}" if fails else "", nfe=100.0))
         search.tell(tries, outcomes)
     return search
 
@@ -46,36 +46,36 @@ def test_every_scene_is_tried_before_any_is_tried_more():
 
 
 def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_them_all():
-    many = [Family(f"family {k}", "e2", {}) for k in range(12)]
+    many = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
     CHANCE.update({family.name: 0.0 for family in many})
     search = search_of(scenes=5, settings=replace(PLAIN, cover=7), families=many)
     first = search.ask()
     assert len({(one.scene, one.family) for one in first}) == len(first) == ROUND + 1  # five of each of five scenes
-    search.tell(first, [Outcome(-2.0, "", 100.0)] * len(first))
+    search.tell(first, [Outcome(-2.0, "", nfe=100.0)] * len(first))
     assert {len(tries) for tries in told(search, 1).tries} == {7}
     assert len(search.ask()) == ROUND
 
 
 def test_rounds_grow_with_the_tries_so_far():
-    many = [Family(f"family {k}", "e2", {}) for k in range(12)]
+    many = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
     CHANCE.update({family.name: 0.0 for family in many})
     search = told(search_of(settings=replace(PLAIN, growth=0.5), families=many), PLAIN.cover + 1)
     for _ in range(4):
         asked = search.ask()
         assert len(asked) == min(max(40, len(tries_of(search)) // 2), 40 * 12 // 4)
         assert len({(one.scene, one.family) for one in asked}) == len(asked)
-        search.tell(asked, [Outcome(-2.0, "", 100.0)] * len(asked))
+        search.tell(asked, [Outcome(-2.0, "", nfe=100.0)] * len(asked))
     assert len(search.ask()) == 120
 
 
 def test_a_family_that_nearly_finds_is_tried_more_unless_the_margin_does_not_count():
-    families = [Family(name, "e2", {}) for name in ("near", "far", "away")]
+    families = [Family(name, "e2", ranges={}) for name in ("near", "far", "away")]
 
     def share(climb):
         search = search_of(settings=replace(PLAIN, climb=climb, again=1.0), families=families)
         for _ in range(15):
             tries = search.ask()
-            search.tell(tries, [Outcome(0.9 if one.family == "near" else -2.0, "", 100.0) for one in tries])
+            search.tell(tries, [Outcome(0.9 if one.family == "near" else -2.0, "", nfe=100.0) for one in tries])
         return sum(one.family == "near" for one in tries_of(search)) / len(tries_of(search))
 
     assert share(climb=True) > 1.4 * share(climb=False)
@@ -90,7 +90,7 @@ def test_tries_go_to_the_family_that_finds_and_not_to_hopeless_scenes():
 
 
 def test_it_finds_more_scenes_than_chance_at_equal_cost():
-    idle = [Family(f"idle {k}", "e2", {}) for k in range(6)]
+    idle = [Family(f"idle {k}", "e2", ranges={}) for k in range(6)]
     CHANCE.update({family.name: 0.0 for family in idle})
 
     def found(bandit, seed):
@@ -107,7 +107,7 @@ def crashing(scenes, rounds=30):
     search = search_of(scenes=12)
     for _ in range(rounds):
         tries = search.ask()
-        search.tell(tries, [Outcome(-2.0, "", 100.0, one.scene in scenes) for one in tries])
+        search.tell(tries, [Outcome(-2.0, "", nfe=100.0, raised=one.scene in scenes) for one in tries])
     return search
 
 
@@ -122,5 +122,5 @@ def test_no_more_tries_are_spent_where_the_planner_always_raises():
 def test_a_planner_that_raises_has_failed_in_a_way_of_its_own():
     search = search_of(scenes=2, settings=replace(PLAIN, cover=1))
     tries = search.ask()
-    search.tell(tries, [Outcome(-30.0, "", 100.0, True) for _ in tries])
+    search.tell(tries, [Outcome(-30.0, "", nfe=100.0, raised=True) for _ in tries])
     assert search.cells == {"raised"} and all(search._found(scene) for scene in (0, 1))

@@ -8,7 +8,7 @@ from e2rl.run.errors import InputError
 from e2rl.search.tries import Family, family_of
 from e2rl.traffic.e2.decisions import RULE, WHOM, Decisions
 
-TIMED = Family("timed", "e2", {"moment": (1.0, 5.0), "strength": (0.5, 1.5)})
+TIMED = Family("timed", "e2", ranges={"moment": (1.0, 5.0), "strength": (0.5, 1.5)})
 
 
 def drawn(count, stratified, family=TIMED, seed=7):
@@ -30,7 +30,7 @@ def test_decisions_lie_in_their_range_and_others_follow_the_rule():
 
 
 def test_a_family_without_ranges_is_the_rule():
-    assert [one.decisions for one in drawn(3, True, Family("rule", "e2", {}))] == [RULE] * 3
+    assert [one.decisions for one in drawn(3, True, family=Family("rule", "e2", ranges={}))] == [RULE] * 3
 
 
 def test_stratified_tries_look_elsewhere_than_those_before_of_whatever_family():
@@ -39,7 +39,7 @@ def test_stratified_tries_look_elsewhere_than_those_before_of_whatever_family():
     other = replace(TIMED, name="other")
 
     def gap(stratified, seed):
-        each = [drawn(10, stratified, family, seed)[at::2] for at, family in enumerate((TIMED, other))]
+        each = [drawn(10, stratified, family=family, seed=seed)[at::2] for at, family in enumerate((TIMED, other))]
         moments = sorted(Decisions(*one.decisions).moment for tries in each for one in tries)
         return max(b - a for a, b in zip([1.0, *moments], [*moments, 5.0], strict=True))
 
@@ -49,7 +49,7 @@ def test_stratified_tries_look_elsewhere_than_those_before_of_whatever_family():
 
 def test_a_family_is_read_from_its_configuration():
     given = {"whom": "crossing", "patience": [1, 3], "chance": 0.3, "method": "e2_pursuit", "changes": {"reselect": 1}}
-    family = family_of("crossing", given, "search.families")
+    family = family_of("crossing", given, where="search.families")
     assert (family.method, family.chance, family.changes) == ("e2_pursuit", 0.3, {"reselect": 1})
     assert family.ranges == {"whom": float(WHOM.index("crossing")), "patience": (1.0, 3.0)}
 
@@ -64,4 +64,4 @@ def test_a_family_is_read_from_its_configuration():
 )  # fmt: skip
 def test_what_is_no_decision_is_told_where_it_stands(given):
     with pytest.raises(InputError, match=r"search\.families\.odd"):
-        family_of("odd", given, "search.families")
+        family_of("odd", given, where="search.families")

@@ -134,7 +134,7 @@ def test_an_arc_is_the_unicycle_s_motion_at_constant_acceleration_and_curvature(
     states = torch.tensor([1.0, -2.0, 0.4, 9.0])
     given = Arc(torch.tensor(-3.0), torch.tensor(0.04))
     times = DT * torch.arange(1, 51)
-    arc, driven = along_arc(states, given, times)
+    arc, driven = along_arc(states, given, times=times)
     speed = torch.nn.functional.pad(arc[:, 3], (1, 0), value=9.0)
     actions = torch.stack([torch.full((50,), -3.0), 0.04 * (speed[1:] + speed[:-1]) / 2], -1)
     torch.testing.assert_close(arc, dynamics.rollout(states, actions), rtol=0, atol=0.02)
@@ -148,10 +148,10 @@ def test_an_arc_in_reverse_is_the_arc_forwards_of_who_looks_the_other_way(accel)
     ways = [dict(hold=1.0, turn=2.0), {}]
     for way in ways:
         back, metres = along_arc(
-            torch.tensor([1.0, 2.0, 0.3, -4.0]), Arc(torch.tensor(-accel), torch.tensor(0.05)), times, **way
+            torch.tensor([1.0, 2.0, 0.3, -4.0]), Arc(torch.tensor(-accel), torch.tensor(0.05)), times=times, **way
         )
         facing = torch.tensor([1.0, 2.0, 0.3 + math.pi, 4.0])
-        ahead, driven = along_arc(facing, Arc(torch.tensor(accel), torch.tensor(-0.05)), times, **way)
+        ahead, driven = along_arc(facing, Arc(torch.tensor(accel), torch.tensor(-0.05)), times=times, **way)
         torch.testing.assert_close(back[:, :2], ahead[:, :2], rtol=0, atol=1e-4)
         torch.testing.assert_close(metres, -driven)
         torch.testing.assert_close(back[:, 3], -ahead[:, 3])
@@ -162,7 +162,7 @@ def test_an_arc_in_reverse_is_the_arc_forwards_of_who_looks_the_other_way(accel)
 def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():
     given = Arc(torch.tensor(2.0), torch.tensor(0.05))
     times = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    arc, driven = along_arc(torch.tensor([0.0, 0.0, 0.0, 10.0]), given, times, hold=1.0, turn=2.0)
+    arc, driven = along_arc(torch.tensor([0.0, 0.0, 0.0, 10.0]), given, times=times, hold=1.0, turn=2.0)
     torch.testing.assert_close(arc[:, 3], torch.full((4,), 12.0))
     torch.testing.assert_close(driven, torch.tensor([11.0, 23.0, 35.0, 47.0]))
     torch.testing.assert_close(arc[1:, 2], torch.full((3,), 1.0))

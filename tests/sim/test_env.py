@@ -26,7 +26,7 @@ def act(env, acceleration=0.0, yaw_rate=0.0):
 def drive(env, steps, acceleration=0.0, yaw_rate=0.0):
     """The td after `steps` equal actions, or at the first step where all are done."""
     for _ in range(steps):
-        td = act(env, acceleration, yaw_rate)
+        td = act(env, acceleration, yaw_rate=yaw_rate)
         if td["done"].all():
             break
     return td
@@ -283,4 +283,4 @@ def test_what_a_reset_of_some_writes_is_what_a_reset_of_all_writes():
     begun = torch.tensor([[True], [False], [True], [False]])
     seen_anew = some.reset(TensorDict({"scene_index": index, "_reset": begun}, [4]))["observation"]
     torch.testing.assert_close(seen_anew[begun[:, 0]], seen[begun[:, 0]])
-    assert torch.equal(act(whole, 1.0, 0.1)["observation"], act(some, 1.0, 0.1)["observation"])
+    assert torch.equal(act(whole, 1.0, yaw_rate=0.1)["observation"], act(some, 1.0, yaw_rate=0.1)["observation"])

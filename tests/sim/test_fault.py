@@ -17,13 +17,13 @@ def judged(ego, others, since=0, vehicle=True, steps=40):
     count, agents = others.shape[:2]
     half = SIZE.T[None].expand(count, 2, agents) / 2
     still = torch.zeros(count, agents)
-    near = neighbours_of(ego, rotation_into(ego), SIZE.expand(count, 2), half, Agents(others, still == 0, still, still))
+    near = neighbours_of(ego, rotation_into(ego), size=SIZE.expand(count, 2), half_size=half, agents=Agents(others, still == 0, accel=still, turn_rate=still))
     states = torch.cat([ego[:, None], others], 1)[:, None].repeat(1, steps + 1, 1, 1)
     states[:, :since, 1:2, 3] = 6.0
     tracks = states, torch.ones_like(states[..., 0], dtype=torch.bool)
     static = SimpleNamespace(size=SIZE.expand(count, 2), half_size=half, vehicle=torch.full((count, agents), vehicle))
     static.row = torch.arange(count)[:, None]
-    return own_fault(ego[:, 3], near, near.gap < 0, static, tracks, torch.full((count,), steps)).tolist()
+    return own_fault(ego[:, 3], near, hit=near.gap < 0, static=static, tracks=tracks, before=torch.full((count,), steps)).tolist()
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
 def test_what_the_front_hits_must_have_stood(since, vehicle, expected):
     ego = torch.tensor([[0.0, 0.0, 0.0, 5.0]])
     others = torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
-    assert judged(ego, others, since, vehicle) == [expected]
+    assert judged(ego, others, since=since, vehicle=vehicle) == [expected]
 
 
 def test_who_stands_since_the_start_has_stood():

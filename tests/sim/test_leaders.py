@@ -18,7 +18,7 @@ def lead(agents):
     agents = torch.tensor(agents, dtype=torch.float32)[None]
     size = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2)
     present = torch.ones(agents.shape[:2]).bool()
-    found = leaders(agents[:, :1, 0] + 20.0, arc(0.0, 0.0, 0.0, 0.0)[None, None], agents[:, :, None], size, present)
+    found = leaders(agents[:, :1, 0] + 20.0, arc(0.0, 0.0, heading=0.0, curvature=0.0)[None, None], agents=agents[:, :, None], size=size, present=present)
     return tuple(value[0, :, 0] for value in found)
 
 
@@ -37,10 +37,10 @@ def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
 def test_who_stands_at_the_crossing_of_a_loop_leads_at_the_first_passage_to_come(s, gap):
     """Even where it is nearer to the other passage, or to one that lies behind."""
     for x, y in ((35.3, 0.0), (35.0, 0.3), (35.2, -0.2)):
-        ego = torch.cat([track(loop(), s, 8.0, 0)[0], torch.tensor([x, y, 0.0, 0.0])]).view(1, 2, 4)
+        ego = torch.cat([track(loop(), s, speed=8.0, steps=0)[0], torch.tensor([x, y, 0.0, 0.0])]).view(1, 2, 4)
         size = torch.tensor([LENGTH, WIDTH]).expand(1, 2, 2)
         present = torch.ones(1, 2, dtype=torch.bool)
-        found = leaders(torch.tensor([[s]]), loop()[None, None], ego[:, :, None], size, present)
+        found = leaders(torch.tensor([[s]]), loop()[None, None], agents=ego[:, :, None], size=size, present=present)
         assert found.index.item() == 1 and abs(found.gap.item() - gap + LENGTH / 2 + 1.5) < 1.0
 
 
@@ -89,7 +89,7 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
 
 def gap(speed, leader_speed):
     driver = IDMParameters(headway=1.5, standstill_gap=2.0, acceleration=1.0, braking=4.0)
-    return desired_gap(torch.tensor(speed), torch.tensor(leader_speed), driver).item()
+    return desired_gap(torch.tensor(speed), torch.tensor(leader_speed), driver=driver).item()
 
 
 def accel(speed, desired, gap, leading, improved):
@@ -108,15 +108,15 @@ def test_standing_following_closing_and_falling_behind():
 def test_equilibrium_gap(improved):
     """At constant speed behind a leader of the same speed: gap = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
     gap = (5 + 6 * 1.0) / (1 - (6 / 10) ** 4) ** 0.5
-    assert abs(accel(6, 10, gap, 6, improved)) < 1e-5
-    assert accel(6, 10, gap + 1, 6, improved) > 0 > accel(6, 10, gap - 1, 6, improved)
+    assert abs(accel(6, 10, gap=gap, leading=6, improved=improved)) < 1e-5
+    assert accel(6, 10, gap=gap + 1, leading=6, improved=improved) > 0 > accel(6, 10, gap=gap - 1, leading=6, improved=improved)
 
 
 @pytest.mark.parametrize("improved", [False, True])
 def test_a_free_road(improved):
-    assert abs(accel(10, 10, torch.inf, 0, improved)) < 1e-6 and accel(0, 10, torch.inf, 0, improved) == 1.0
+    assert abs(accel(10, 10, gap=torch.inf, leading=0, improved=improved)) < 1e-6 and accel(0, 10, gap=torch.inf, leading=0, improved=improved) == 1.0
 
 
 def test_above_the_desired_speed_only_the_improved_term_brakes_comfortably():
-    assert -3.0 <= accel(20, 10, torch.inf, 0, True) < 0
-    assert accel(20, 10, torch.inf, 0, False) == pytest.approx(1 - 2**4)
+    assert -3.0 <= accel(20, 10, gap=torch.inf, leading=0, improved=True) < 0
+    assert accel(20, 10, gap=torch.inf, leading=0, improved=False) == pytest.approx(1 - 2**4)

@@ -85,7 +85,7 @@ def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
     last = scene["light_state"].shape[1] - 1
     here = torch.full((2,), 20.0)
     at_the_end, beyond = (
-        light_features(observation_config(torch.device("cpu")), static, torch.full((2,), step), here)
+        light_features(observation_config(torch.device("cpu")), static, step=torch.full((2,), step), s=here)
         for step in (last, last + 40)
     )
     assert torch.equal(beyond, at_the_end) and beyond[0, 0] == 1 and beyond[1, 2] == 1

@@ -19,12 +19,12 @@ def others(*cars):
     half = (torch.tensor(CAR) / 2)[None, :, None].expand(1, 2, len(cars))
     direction = torch.stack([heading.cos(), heading.sin()], 1)
     there = torch.ones(1, len(cars), dtype=torch.bool)
-    return Others(torch.stack([x, y], 1), direction, half, speed, Arc(accel, curvature), there)
+    return Others(torch.stack([x, y], 1), direction, half_size=half, speed=speed, arc=Arc(accel, curvature), present=there)
 
 
 def straight_on(speed, accel=0.0):
     """One manoeuvre of an ego that drives straight on: x, y, cosine, sine [4, 1, T, 1]."""
-    way = travelled(torch.tensor(speed), torch.tensor(accel), torch.tensor(TIMES))
+    way = travelled(torch.tensor(speed), torch.tensor(accel), time=torch.tensor(TIMES))
     none = torch.zeros_like(way)
     return torch.stack([way, none, none + 1, none])[:, None, :, None]
 
@@ -32,7 +32,7 @@ def straight_on(speed, accel=0.0):
 def test_the_way_is_driven_to_the_halt_and_never_backwards():
     speed = torch.tensor([10.0, 10.0, 3.0])
     accel = torch.tensor([2.0, -5.0, -6.0])
-    way = travelled(speed, accel, torch.tensor(4.0))
+    way = travelled(speed, accel, time=torch.tensor(4.0))
     assert way.tolist() == pytest.approx([40 + 16, 10**2 / 10, 3**2 / 12])
 
 
@@ -48,8 +48,8 @@ def test_gaps_are_those_of_the_boxes_but_for_rounded_corners(seed):
     ego = straight_on(9.0)
     rounded = 2 * (2**0.5 - 1) * CAR[1] / 2
     for pose in poses.tolist():
-        found = gaps(ego, torch.tensor([CAR]), others((*pose, 0.0, 0.0)))[0, :, 0]
-        boxes = [polygon(x, 0.0, 0.0) for x in ego[0, 0, :, 0].tolist()]
+        found = gaps(ego, torch.tensor([CAR]), others=others((*pose, 0.0, 0.0)))[0, :, 0]
+        boxes = [polygon(x, 0.0, heading=0.0) for x in ego[0, 0, :, 0].tolist()]
         exact = torch.tensor([box.distance(polygon(*pose)) for box in boxes], dtype=torch.float32)
         apart = exact > 0
         assert (found[apart] >= exact[apart] - 1e-3).all() and (found[apart] <= exact[apart] + rounded + 0.1).all()
@@ -58,7 +58,7 @@ def test_gaps_are_those_of_the_boxes_but_for_rounded_corners(seed):
 def test_others_keep_their_acceleration_for_a_second_then_their_speed():
     ego = straight_on(0.0)
     size = torch.tensor([CAR])
-    found = gaps(ego, size, others((20.0, 0.0, torch.pi, 5.0, -2.0)))[0, :, 0]
+    found = gaps(ego, size, others=others((20.0, 0.0, torch.pi, 5.0, -2.0)))[0, :, 0]
     way = [5 * t - t**2 if t <= 1 else 4 + 3 * (t - 1) for t in TIMES]
     assert found.tolist() == pytest.approx([20 - driven - CAR[0] for driven in way], abs=0.05)
 
@@ -70,10 +70,10 @@ def test_who_turns_goes_on_turning():
     pose = (12.0, -14.0, 1.4)
     speed = 6.0
     curvature = 0.06
-    found = gaps(ego, size, others((*pose, speed, 0.0, curvature)))[0, :, 0]
+    found = gaps(ego, size, others=others((*pose, speed, 0.0, curvature)))[0, :, 0]
     arc = Arc(torch.tensor(0.0), torch.tensor(curvature))
-    path, _ = along_arc(torch.tensor([*pose, speed]), arc, torch.tensor(TIMES[:4]))
-    standing = [gaps(ego, size, others((*state[:3], 0.0, 0.0)))[0, 0, 0] for state in path.tolist()]
+    path, _ = along_arc(torch.tensor([*pose, speed]), arc, times=torch.tensor(TIMES[:4]))
+    standing = [gaps(ego, size, others=others((*state[:3], 0.0, 0.0)))[0, 0, 0] for state in path.tolist()]
     torch.testing.assert_close(found[:4], torch.stack(standing))
 
 

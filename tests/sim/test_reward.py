@@ -58,7 +58,7 @@ def test_progress_pays_up_to_what_is_allowed():
     progress = torch.tensor([0.5, 2.0, 2.0, 2.0, 2.0, -1.0])
     limit = torch.tensor([10.0, 10.0, 0.0, 0.0, 30.0, 10.0])
     recorded = torch.tensor([3.0, 15.0, 15.0, 3.0, 3.0, 3.0])
-    paid = rewarded_progress(progress, limit, recorded)
+    paid = rewarded_progress(progress, limit, top_speed=recorded)
     torch.testing.assert_close(paid, torch.tensor([0.5, 1.0, 1.5, 0.5, 0.5, -1.0]))
 
 

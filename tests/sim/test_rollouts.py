@@ -102,10 +102,10 @@ def test_scenes_tell_who_is_simulated_and_what_was_recorded():
     scenes = make_scenes(2, vehicles=[(0, 0, 5.0), (20, 0, 5.0)], num_vrus=1, steps=10)
     scene = scenes.scenes
     more = {"adversaries": scene["valid"] & False, "seed": torch.arange(2), "eta": torch.zeros(2).double()}
-    made = Rollouts.in_scenes(scenes, torch.arange(2), scene["logged"], scene["logged_valid"], **more)
+    made = Rollouts.in_scenes(scenes, torch.arange(2), states=scene["logged"], valid=scene["logged_valid"], **more)
     assert torch.equal(made.simulated, scene["valid"] & (scene["agent_type"] == VEHICLE))
     assert not made.logged_valid[:, :, ~scene["valid"][0]].any() and list(made.scene_id) == scenes.scene_id
-    replayed = Rollouts.in_scenes(scenes, torch.arange(2), made.states, made.valid, replays_ego=True, **more)
+    replayed = Rollouts.in_scenes(scenes, torch.arange(2), states=made.states, valid=made.valid, replays_ego=True, **more)
     assert not replayed.simulated[:, 0].any() and torch.equal(replayed.simulated[:, 1:], made.simulated[:, 1:])
 
 

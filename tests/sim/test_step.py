@@ -29,7 +29,7 @@ def test_a_compiled_step_is_the_eager_one(batch, vehicles, hold, monkeypatch):
         monkeypatch.setitem(
             each.__dict__, "_run", lambda flat, run=each._run, name=each.name: called.add(name) or run(flat)
         )
-    eager, other = (outcomes(batch, vehicles, hold, compiled) for compiled in (False, True))
+    eager, other = (outcomes(batch, vehicles, hold=hold, compiled=compiled) for compiled in (False, True))
     assert called == {features.name, drive.name}, "they never ran compiled"
     for key in eager.keys(True, True):
         assert torch.allclose(eager[key].float(), other[key].float(), rtol=1e-6, atol=1e-5), key

@@ -49,7 +49,7 @@ def raises(error):
     ],
 )
 def test_outcomes_are_what_happened(watch, tmp_path, read, expected):
-    assert outcome(read, b"", watch, tmp_path / "mark")[0] == expected
+    assert outcome(read, b"", watch=watch, mark=tmp_path / "mark")[0] == expected
 
 
 def test_a_command_is_refused_by_one_line_and_no_other_way():
@@ -63,7 +63,7 @@ def test_a_command_is_refused_by_one_line_and_no_other_way():
 
 def test_what_an_input_leaves_behind_counts_as_executed(watch, tmp_path):
     (tmp_path / "mark").touch()
-    assert outcome(lambda content: None, b"", watch, tmp_path / "mark")[0] == "executed"
+    assert outcome(lambda content: None, b"", watch=watch, mark=tmp_path / "mark")[0] == "executed"
     assert not (tmp_path / "mark").exists()
 
 
@@ -77,7 +77,7 @@ def test_whole_inputs_are_read_and_hostile_ones_run_nothing(tmp_path, watch):
     @settings(max_examples=40, database=None, deadline=None)
     @given(hostile(str(readers.mark)))
     def each(content):
-        found[outcome(readers.pickles()[1], content, watch, readers.mark)[0]] += 1
+        found[outcome(readers.pickles()[1], content, watch=watch, mark=readers.mark)[0]] += 1
 
     each()
     assert found["refused"] > 20 and not set(found) - set(fuzz.GOOD)

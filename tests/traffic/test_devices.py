@@ -44,7 +44,7 @@ def test_a_rollout_keeps_to_its_device_and_is_that_of_the_cpu(method, ego):
         }
         traffic = on[method]()
         traffic.prior.to(device)
-        return roll_out(scene_set, index, index, torch.full((2,), 2.0), ego(), traffic, SimSettings(), device)
+        return roll_out(scene_set, index, seed=index, eta=torch.full((2,), 2.0), ego=ego(), traffic=traffic, sim=SimSettings(), device=device)
 
     with pretended_device():
         there = driven("cuda")

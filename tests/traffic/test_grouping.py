@@ -29,7 +29,7 @@ def sized(counts, others=0):
     empty = torch.zeros(len(counts), AGENTS)
     route = torch.zeros(len(counts), WIDTH, dtype=torch.long)
     scene = TensorDict({"valid": valid, "route_log": route}, batch_size=[len(counts)])
-    return World(scene, empty[:, 0].long(), empty[..., None].expand(-1, -1, 4), valid, empty, empty)
+    return World(scene, empty[:, 0].long(), states=empty[..., None].expand(-1, -1, 4), valid=valid, accel=empty, turn_rate=empty)
 
 
 def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_than_half():
@@ -46,12 +46,12 @@ def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_tha
 def test_what_changes_in_a_crop_arrives_where_it_belongs_and_nothing_else_changes():
     on = synthesizer()
     scene = scenes(3).scenes
-    state, (group,) = begin(on, scene, 1.0), group_scenes(World.at_start(scene))
-    part = crop_state(state, group, state.routed.route.shape[1])
+    state, (group,) = begin(on, scene, eta=1.0), group_scenes(World.at_start(scene))
+    part = crop_state(state, group, width=state.routed.route.shape[1])
     whole = clone(state)
     part.routed.conflict_s[0, 1, 2] += 7.0
     part.path_kl[1, 3] += 1.0
-    write_state(whole, part, group)
+    write_state(whole, part, group=group)
     rows = group.rows.tolist()
     changed = whole.routed.conflict_s != state.routed.conflict_s
     assert changed.nonzero().tolist() == [[rows[0], 1, 2]] and whole.path_kl.nonzero().tolist() == [[rows[1], 3]]
@@ -61,11 +61,11 @@ def test_what_changes_in_a_crop_arrives_where_it_belongs_and_nothing_else_change
 def test_noise_is_standard_and_depends_on_seed_and_draw_only():
     seed = torch.tensor([3, 4, 3])
     draw = torch.tensor([1, 1, 2])
-    noise = noise_of(seed, draw, (5000,))
+    noise = noise_of(seed, draw, shape=(5000,))
     assert noise.mean(1).abs().max() < 0.06 and (noise.std(1) - 1).abs().max() < 0.04
-    assert torch.equal(noise[2:], noise_of(seed[2:], draw[2:], (5000,)))
+    assert torch.equal(noise[2:], noise_of(seed[2:], draw[2:], shape=(5000,)))
     assert not torch.equal(noise[0], noise[1]) and not torch.equal(noise[0], noise[2])
-    uniform = noise_of(seed, draw, (5000,), uniform=True)
+    uniform = noise_of(seed, draw, shape=(5000,), uniform=True)
     assert uniform.min() >= 0 and uniform.max() < 1
 
 
@@ -74,5 +74,5 @@ def test_rows_are_taken_and_put_in_nested_states_without_touching_the_original()
     rows = torch.tensor([2, 0])
     part = take_rows(state, rows)
     assert part.v.tolist() == [18.0, 16.0]
-    back = put_rows(state, rows, part.map(lambda value: value + 100))
+    back = put_rows(state, rows, new=part.map(lambda value: value + 100))
     assert back.v.tolist() == [116.0, 17.0, 118.0, 19.0] and state.v.tolist() == [16.0, 17.0, 18.0, 19.0]

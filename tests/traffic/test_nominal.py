@@ -39,7 +39,7 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
     routed, lane = on.prior.start(scene, state.routed.route)
     lane = on.lane_now(replace(state, routed=routed, lane=lane), world, plan)
     context = on.prior.encode(routed, lane, world.states, world.valid, world.step, plan)
-    noise = noise_of(state.seed, torch.ones(2, dtype=torch.long), (4, ROWS, SIZE)).transpose(0, 1)
+    noise = noise_of(state.seed, torch.ones(2, dtype=torch.long), shape=(4, ROWS, SIZE)).transpose(0, 1)
     expected = on.prior.plan(on.prior.sample(context, noise).x0, context)
     here = scene["valid"][:, :ROWS]
     torch.testing.assert_close(found.states[here], expected.states()[here], rtol=1e-4, atol=1e-4)
@@ -52,7 +52,7 @@ def test_plans_continue_where_the_last_one_was_left():
     scene = scenes(2).scenes
     world = World.at_start(scene)
     state, plan = on.replan(begin(on, scene), world, EGO.plan(world))
-    world = executed(world, plan, EGO.plan(world))
+    world = executed(world, plan, ego_plan=EGO.plan(world))
     _, following = on.replan(state, world, EGO.plan(world))
     end = plan.states[:, 1:5, 4]
     step = following.states[:, 1:5, 0] - end
@@ -103,7 +103,7 @@ class Liar(Ego):
 
     def act(self, world, observation, plan):
         honest = EGO.plan(world)
-        return track(world.states[:, 0], world.states[:, 0], honest[:, 0])
+        return track(world.states[:, 0], world.states[:, 0], following=honest[:, 0])
 
 
 class Honest(Liar):
@@ -139,7 +139,7 @@ def fork(copies=3):
     """Scenes of an ego that may go on or turn, with others beside, behind and across its ways."""
     others = [(40.0, -40.0, 1.5708, 10.0), (30.0, 3.5, 0.0, 8.0), (-20.0, 0.0, 0.0, 10.0)]
     world = make_world([(0.0, 0.0, 0.0, 10.0), *others], copies)
-    add_route(world, 0, 1, 0.6)
+    add_route(world, 0, candidate=1, heading=0.6)
     return world.scene
 
 
@@ -148,14 +148,14 @@ METHODS = ["nominal", "e2", "e2_pursuit", "ccdiff", "ctg_adv", "strive", "safe_s
 
 def plans_beside(method, scene, times=2):
     """Plans of all but the ego, which keeps its velocity."""
-    state = begin(method, scene, 2.0 * method.adversarial)
+    state = begin(method, scene, eta=2.0 * method.adversarial)
     world = World.at_start(scene)
     found = []
     for _ in range(times):
         known = keep_velocity(world.states[:, 0])
         state, plan = method.replan(state, world, known)
         found.append(plan.states[:, 1:])
-        world = executed(world, plan, known)
+        world = executed(world, plan, ego_plan=known)
     return torch.stack(found)
 
 

@@ -22,7 +22,7 @@ def recorded():
 
 
 def live(eta=1.0):
-    return TrafficPool.live(INDEX, torch.full((3,), eta), torch.tensor([7, 8, 9]))
+    return TrafficPool.live(INDEX, torch.full((3,), eta), seed=torch.tensor([7, 8, 9]))
 
 
 def test_joined_rows_keep_their_traffic():

@@ -13,19 +13,19 @@ TIMES = DT * torch.arange(1, HORIZON + 1)
 
 
 def onward(world):
-    return constant_speed_states(world.scene, world, TIMES)
+    return constant_speed_states(world.scene, world, times=TIMES)
 
 
 def test_one_period_as_long_as_the_horizon_is_the_ego_s_plan():
     world = World.at_start(scenes(3).scenes)
     for rows in (torch.tensor([2, 0]), torch.arange(3)):
-        found = Lookahead(EGO, world, HORIZON)(rows, onward(world)[rows])
+        found = Lookahead(EGO, world, period=HORIZON)(rows, onward(world)[rows])
         torch.testing.assert_close(found, EGO.plan(world)[rows])
 
 
 def test_the_ego_reacts_to_what_the_others_plan():
     world = World.at_start(scenes(2).scenes)
-    look = Lookahead(EGO, world, 5)
+    look = Lookahead(EGO, world, period=5)
     rows = torch.arange(2)
     halted = onward(world)
     halted[:, 1] = world.states[:, 1, None]  # the vehicle ahead stands still from now on

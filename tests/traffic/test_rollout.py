@@ -89,7 +89,7 @@ class Turns(Traffic):
         acting[:, 1], acting[:, 2] = state == 0, state > 0
         cost[:, 1], cost[:, 2], cost[:, 3] = 1.0, (state > 0).float(), 0.25
         present = world.valid[:, :ROWS, None].expand(states.shape[:-1])
-        return state + 1, TrafficPlan(states, present, acting, cost)
+        return state + 1, TrafficPlan(states, present, adversary=acting, path_kl=cost)
 
 
 def test_adversaries_are_whoever_was_one_at_any_time_and_the_transport_is_shared_out():
@@ -102,7 +102,7 @@ def test_adversaries_are_whoever_was_one_at_any_time_and_the_transport_is_shared
 def test_the_traffic_of_a_round_is_the_rollouts_and_its_seeds_are_the_scenes_own():
     scene_set = scenes(4)
     rows = torch.tensor([3, 1, 0])
-    synthesize = synthesize_traffic(scene_set, synthesizer(), SimSettings(), batch=2)
+    synthesize = synthesize_traffic(scene_set, synthesizer(), sim=SimSettings(), batch=2)
     found = synthesize(EGO, rows, 2.0, 5)
     assert torch.equal(found["scene_index"], rows) and found["states"].shape[:2] == (3, 21)
     assert found["adversaries"].any(1).all() and found["contact"].shape == (3,) and found["owes"].all()

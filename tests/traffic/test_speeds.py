@@ -40,7 +40,7 @@ def deviations(rollouts):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_vehicle_moves_as_fast_as_it_says(recorded, method):
     scenes, prior = recorded
-    rollouts = e2rl.roll_out(scenes, e2rl.make_ego("lane_graph"), e2rl.make_traffic(method, prior), eta=2.0)
+    rollouts = e2rl.roll_out(scenes, e2rl.make_ego("lane_graph"), traffic=e2rl.make_traffic(method, prior), eta=2.0)
     found = deviations(rollouts)
     assert len(found) > 100
     assert found.max() < SLACK

@@ -41,7 +41,7 @@ class March(Traffic):
         acting = torch.zeros(states.shape[:2], dtype=torch.bool)
         acting[:, 1] = True
         here = world.valid[:, : acting.shape[1], None].expand(states.shape[:-1])
-        return state + torch.tensor([0.0, 1.0]), TrafficPlan(states, here, acting)
+        return state + torch.tensor([0.0, 1.0]), TrafficPlan(states, here, adversary=acting)
 
 
 def in_turn(pool):
@@ -57,13 +57,13 @@ def in_turn(pool):
 
 def environment(pool, traffic=None, steps=20, batch=3, scene_set=None, ego=None):
     base = DrivingEnv(scene_set or scenes(3, steps), ON, batch, agents=True)
-    return TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), traffic, ego))
+    return TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), traffic=traffic, ego=ego))
 
 
 def live(eta=0.0, count=9):
     """Rows of scenes 0, 1, 2, 0, ... whose seed is the row."""
     row = torch.arange(count)
-    return TrafficPool.live(row % 3, torch.full((count,), eta), row)
+    return TrafficPool.live(row % 3, torch.full((count,), eta), seed=row)
 
 
 def replayed(scene_set, eta=4.0):
@@ -104,7 +104,7 @@ def random_environment(own=0, traffic=None):
     draw = RowDraw(torch.ones(len(pool)).double(), own)
     reaction = Reaiming(ReactSettings(fraction=1.0, scatter=1.0), own)
     base = DrivingEnv(scene_set, ON, 4, agents=True)
-    return TransformedEnv(base, Compose(AdversarialSynthesizer(pool, draw, traffic, None, reaction), RewardSum()))
+    return TransformedEnv(base, Compose(AdversarialSynthesizer(pool, draw, traffic=traffic, ego=None, reaction=reaction), RewardSum()))
 
 
 def same(first, second):
@@ -143,14 +143,14 @@ def collected(kind, own, seed):
 
 @pytest.mark.parametrize("kind", [None, SerialEnv])
 def test_a_seed_decides_what_a_collector_collects(kind):
-    once = collected(kind, 0, 3)
-    assert same(once, collected(kind, 1, 3))
-    assert not torch.equal(once["traffic", "row"], collected(kind, 0, 4)["traffic", "row"])
+    once = collected(kind, 0, seed=3)
+    assert same(once, collected(kind, 1, seed=3))
+    assert not torch.equal(once["traffic", "row"], collected(kind, 0, seed=4)["traffic", "row"])
 
 
 @pytest.mark.slow
 def test_a_seed_decides_the_episodes_of_processes():
-    assert same(collected(ParallelEnv, 0, 3), collected(SerialEnv, 1, 3))
+    assert same(collected(ParallelEnv, 0, seed=3), collected(SerialEnv, 1, seed=3))
 
 
 # --- live rows
@@ -160,11 +160,11 @@ def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
     on = March()
     env = environment(live(), on)
     policy = EgoPolicy(IDMEgo(), env)
-    tensordict = advance(env, policy, env.reset(), 7)
+    tensordict = advance(env, policy, tensordict=env.reset(), steps=7)
     tensordict = env.reset(tensordict.set("_reset", SECOND))
     assert tensordict["scene_index"][:, 0].tolist() == [0, 0, 2] and tensordict["timestep"][:, 0].tolist() == [7, 0, 7]
     assert tensordict["traffic", "row"][:, 0].tolist() == [0, 3, 2]
-    tensordict = advance(env, policy, tensordict, 4)
+    tensordict = advance(env, policy, tensordict=tensordict, steps=4)
     assert [steps for steps, _ in on.calls] == [[0, 0, 0], [5, 5, 5], [0], [10, 10]]
     speed = tensordict["agents", "states"][:, 1, 3]
     torch.testing.assert_close(speed, torch.tensor([0.2, 3.0, 2.2]))  # by seed, and replans of its own
@@ -182,7 +182,7 @@ def test_a_method_that_asks_the_ego_can_where_there_is_one():
 
     for ego in (EGO, None):
         env = environment(live(), Asking(), ego=ego)
-        advance(env, still, env.reset(), 1)
+        advance(env, still, tensordict=env.reset(), steps=1)
     assert asked == [(1, 50, 4), None]
 
 
@@ -224,7 +224,7 @@ def test_who_raises_where_the_traffic_asks_is_named_by_its_own_scene(due, broken
         scene_set.scenes[name][3, ..., 0, 0] += 60.0 if broken else 110.0
 
     def driven(tasks):
-        pool = TrafficPool.live(torch.tensor(tasks), torch.zeros(len(tasks)), torch.tensor(tasks))
+        pool = TrafficPool.live(torch.tensor(tasks), torch.zeros(len(tasks)), seed=torch.tensor(tasks))
         env = environment(pool, Reordering(broken), batch=len(tasks), scene_set=scene_set, ego=Picky())
         tensordict = env.reset()
         env.transform._planned_at = torch.tensor([-5 if task in due else 0 for task in tasks])
@@ -246,9 +246,9 @@ def test_traffic_that_is_told_the_plan_refuses_a_policy_that_writes_none():
 
     env = environment(live(), Told())
     with pytest.raises(InputError, match="the policy writes no"):
-        advance(env, still, env.reset(), 1)
+        advance(env, still, tensordict=env.reset(), steps=1)
     policy = EgoPolicy(IDMEgo(), env)
-    advance(env, policy, env.reset(), 1)
+    advance(env, policy, tensordict=env.reset(), steps=1)
 
 
 # --- all kinds of rows at once
@@ -279,7 +279,7 @@ def test_vehicles_of_replayed_rows_are_expected_to_keep_their_velocity():
     scene_set = scenes(3)
     scene_set.scenes["logged"][:, 3:, 1, 3] = 1.0
     env = environment(mixed(scene_set), March(), batch=9, scene_set=scene_set)
-    tensordict = advance(env, still, env.reset(), 7)
+    tensordict = advance(env, still, tensordict=env.reset(), steps=7)
     straight = keep_velocity(tensordict["agents", "states"][:, :ROWS])
     torch.testing.assert_close(tensordict["traffic", "plan"][3:, 1:], straight[3:, 1:])
 
@@ -304,7 +304,7 @@ def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
 def test_egos_that_drive_differently_meet_plans_of_their_own():
     """The same attempt twice, but one of the egos brakes: the plan of one is not that of the other."""
     on = synthesizer()
-    pool = TrafficPool.live(torch.zeros(2, dtype=torch.int64), torch.full((2,), 2.0), torch.tensor([5, 5]))
+    pool = TrafficPool.live(torch.zeros(2, dtype=torch.int64), torch.full((2,), 2.0), seed=torch.tensor([5, 5]))
     env = environment(pool, on, steps=20, batch=2, scene_set=scenes(1, 20))
     plans = []
     env.transform.on_plan = lambda plan: plans.append(plan.states)

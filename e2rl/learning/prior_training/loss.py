@@ -114,11 +114,11 @@ class DenoisingLoss(nn.Module):
 def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
     """Huber error [W, R] in m of travelled distance and (twice, on lanes) of offset at the knots' times."""
     zero = torch.zeros_like(batch["v"])
-    state = LaneState(zero, batch["d"], batch["d1"], batch["d2"], batch["v"], batch["a"], zero, zero, zero, zero)
+    state = LaneState(zero, batch["d"], d1=batch["d1"], d2=batch["d2"], v=batch["v"], a=batch["a"], x=zero, y=zero, heading=zero, kappa=zero)
     knots, half, end = split(x0, state)
     travelled = speeds(state, knots)[1][..., KNOT_STEPS - 1 : HORIZON : KNOT_STEPS]
     u = (travelled / lateral_horizon(state.v)[..., None]).clamp(max=1.0)
-    d = polynomial(offset_coefficients(state, half, end), u)[0]
+    d = polynomial(offset_coefficients(state, half, end=end), u)[0]
     ahead = F.huber_loss(travelled, batch["ahead"], reduction="none")
     aside = F.huber_loss(2 * d, 2 * batch["aside"], reduction="none") * batch["on_lane"][..., None]
     return ((ahead + aside) * batch["known"].float()).sum(-1) / KNOTS

@@ -33,24 +33,24 @@ def run_prior_stage(run: Run, logger: RunLogger | None) -> tuple[Path, list[dict
         folder = processes.from_leader(lambda: run.folder)
         own = config.prior
         prior = Prior(  # whose first weights follow the run's seed
-            settings_of(DenoiserSettings, own.network, "prior.network"),
-            settings_of(SamplerSettings, own.sampler, "prior.sampler"),
-            settings_of(BoundSettings, own.bounds, "prior.bounds"),
+            settings_of(DenoiserSettings, own.network, where="prior.network"),
+            settings_of(SamplerSettings, own.sampler, where="prior.sampler"),
+            bounds=settings_of(BoundSettings, own.bounds, where="prior.bounds"),
         ).to(device)
         scenes = processes.leader_first(
-            lambda: load_scenes(config.data, config.num_scenes, "train", list(settings.starts), config.scenes)
+            lambda: load_scenes(config.data, config.num_scenes, split="train", starts=list(settings.starts), scenes=config.scenes)
         )
         processes.from_leader(lambda: run.begin({"scenes": listed(scenes)}))
         data = hashlib.sha256("\n".join(scene_hashes(scenes)).encode()).hexdigest()[:16]
         about = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), "fingerprint": data}
         origin = about | origin_of(folder) | {"settings": vars(settings)}
-        parts = Parts(folder, "training", data)
-        path = train_prior(prior, scenes, settings, folder, origin, processes, logger, parts)
+        parts = Parts(folder, "training", about=data)
+        path = train_prior(prior, scenes, settings=settings, folder=folder, origin=origin, processes=processes, logger=logger, parts=parts)
         if path is None:
             return None
-        fields: dict[str, Any] = {"stage": "prior", "parts": Parts(folder, "prior", path.name), **origin_of(folder)}
-        setup = Setup(_first_starts(scenes), ReplayEgo(), "replay", SimSettings(), device=device)
-        return path, run_protocol(setup, [Method("nominal", NominalTraffic(prior))], [0], folder, **fields)
+        fields: dict[str, Any] = {"stage": "prior", "parts": Parts(folder, "prior", about=path.name), **origin_of(folder)}
+        setup = Setup(_first_starts(scenes), ReplayEgo(), ego_name="replay", sim=SimSettings(), device=device)
+        return path, run_protocol(setup, [Method("nominal", NominalTraffic(prior))], seeds=[0], folder=folder, **fields)
 
 
 def _first_starts(scenes: SceneSet) -> SceneSet:
@@ -61,4 +61,4 @@ def _first_starts(scenes: SceneSet) -> SceneSet:
         first[log] = min(first.get(log, (int(start), index)), (int(start), index))
     keep = [index for _, index in first.values()]
     names, places = ([values[i] for i in keep] for values in (scenes.scene_id, scenes.location))
-    return SceneSet(scenes.batch(keep), names, places, scenes.dataset, f"{scenes.split}-held-out", {})
+    return SceneSet(scenes.batch(keep), names, location=places, dataset=scenes.dataset, split=f"{scenes.split}-held-out", dropped={})

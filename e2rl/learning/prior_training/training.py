@@ -128,12 +128,12 @@ class PriorTraining(Supervised):
     def turn(self) -> dict[str, float]:
         """Steps up to the next validation, and that; followers return no losses."""
         if self.routes is not None and not self.done:
-            self.accuracy = train_route_choice(self.prior, self.routes, self.settings)
+            self.accuracy = train_route_choice(self.prior, self.routes, settings=self.settings)
         row = self.train(min(self.done + self.settings.validate_every, self.settings.steps))
         if not self.processes.leader:
             return row | {"held_out_loss": math.nan}
         with self.averaged() as prior:
-            loss = held_out_loss(prior, self.test, self.settings.batch)
+            loss = held_out_loss(prior, self.test, batch=self.settings.batch)
         return row | {"step": float(self.done), "held_out_loss": loss}
 
     def train(self, until: int) -> dict[str, float]:
@@ -304,7 +304,7 @@ def train_prior(
     """
     begin = time.perf_counter()
     windows, test = window_sets(scenes)
-    run = PriorTraining(prior, windows, test, settings, processes)
+    run = PriorTraining(prior, windows, test=test, settings=settings, processes=processes)
     run.routes = scenes.batch((~held_out(scenes)).nonzero()[:, 0])
     validations = -(-settings.steps // settings.validate_every)
     best = run.fit("prior", validations, parts, vars(settings), logger)
@@ -322,4 +322,4 @@ def train_prior(
         "versions": {"python": platform.python_version(), "torch": torch.__version__},
         "seconds": {"training": round(time.perf_counter() - begin, 1)},
     }
-    return save_prior(prior.eval(), folder, origin | results)
+    return save_prior(prior.eval(), folder, origin=origin | results)

@@ -42,7 +42,7 @@ def make_windows(scenes: TensorDictBase, chunk: int = 32) -> TensorDict:
         heading = torch.where(valid, logged[..., 2], 0.0)
         unwrapped = torch.cumsum(torch.cat([heading[:, :1], wrap(heading.diff(dim=1))], 1), 1)
         yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
-        exact = [_window(scene, routed, offset, accel[:, offset], yaw_rate[:, offset], False) for offset in OFFSETS]
+        exact = [_window(scene, routed, offset=offset, accel=accel[:, offset], yaw_rate=yaw_rate[:, offset], causal=False) for offset in OFFSETS]
         observed = (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles])
         parts += [*exact, _window(scene, routed, 0, *observed, True)]
     windows = TensorDict.cat(parts)
@@ -63,11 +63,11 @@ def _window(
     logged = scene["logged"][:, offset]
     valid = scene["logged_valid"][:, offset] & scene["valid"]
     agents = scene["start"] if causal else logged
-    state = locate(agents[:, :vehicles], accel, yaw_rate, routed.points)
+    state = locate(agents[:, :vehicles], accel, yaw_rate=yaw_rate, points=routed.points)
     step = torch.full((len(logged),), offset, dtype=torch.long, device=logged.device)
     estimated = torch.full_like(step, causal, dtype=torch.bool)
-    tracks, known = _future(scene, offset, vehicles)
-    x0, error, ahead, d = _targets(routed, state, tracks, known)
+    tracks, known = _future(scene, offset, vehicles=vehicles)
+    x0, error, ahead, d = _targets(routed, state, tracks=tracks, known=known)
     ends = slice(KNOT_STEPS - 1, HORIZON, KNOT_STEPS)
     at_knots = known[..., ends]
     moving = torch.where(known, tracks[..., 3], 0.0).amax(-1).clamp(min=state.v) > 0.5
@@ -75,7 +75,7 @@ def _window(
     fits = (scene["route_log"] >= 0) | ~routed.has_lane
     use = here & routed.modelled & fits & (error < MAX_ERROR) & (known.sum(-1) >= KNOT_STEPS)
     columns = {name: getattr(state, name) for name in ("v", "a", "d", "d1", "d2")} | {
-        "nodes": node_features(routed, state, leaders_ahead(routed, state.s, agents, valid), step, estimated),
+        "nodes": node_features(routed, state, leaders_ahead(routed, state.s, agents=agents, present=valid), step, estimated),
         "present": here,
         "x0": x0,
         "weight": use * torch.where(moving, 1.0, STANDING_WEIGHT),
@@ -107,14 +107,14 @@ def _future(scene: TensorDictBase, offset: int, vehicles: int) -> tuple[Tensor, 
 def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tensor) -> tuple[Tensor, ...]:
     """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], recorded distance and offset [B, V, HORIZON]."""
     hint = state.s[..., None] + (torch.where(known, tracks[..., 3], 0.0) * DT).cumsum(-1)
-    s, d, _ = project(tracks[..., :2], routed.points, hint)
-    x0, error = lane_relative.fit(LaneState.from_states(tracks, s, d), known.float(), state)
+    s, d, _ = project(tracks[..., :2], routed.points, hint=hint)
+    x0, error = lane_relative.fit(LaneState.from_states(tracks, s, d=d), known.float(), state=state)
     ahead = s - state.s[..., None]
     lane = routed.has_lane
     if bool(lane.all()):
         return x0, error, ahead, d
     knots = lane_relative.ACCEL_SCALE * x0[..., :KNOTS]
-    lateral = free_space.fit(tracks[..., 2], known.float(), state, knots)
+    lateral = free_space.fit(tracks[..., 2], known.float(), state=state, knots=knots)
     free = torch.cat([x0[..., :KNOTS], lateral], -1)
     motion = free_space.decode(free, state)
     gap = torch.hypot(motion.x - tracks[..., 0], motion.y - tracks[..., 1])

@@ -56,7 +56,7 @@ MOST_CHARACTERS = 40  # of a map's name
 def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
     """Write ZAM_<place>-<n>_1_T-1.xml of each episode; open_ego: the ego is a planning problem only, no obstacle."""
     for number, episode in enumerate(episodes, 1):
-        made, problems = scenario(episode, number, open_ego)
+        made, problems = scenario(episode, number, open_ego=open_ego)
         known = {"author": "", "affiliation": "", "source": "e2rl", "tags": {Tag.CRITICAL, Tag.SIMULATED}}
         writer = XMLFileWriter(made, problems, **known, decimal_precision=6)
         text = re.sub("-(?=-)", "- ", f" {episode.text()} ")  # a comment must not hold two dashes in a row
@@ -74,10 +74,10 @@ def scenario(episode: Episode, number: int, open_ego: bool) -> tuple[Any, Any]:
     ids = count(len(episode.rollout.size) + 1)
     made.add_objects(lanelets(episode, ids))
     plan = road_plan(episode.lanes)
-    made.add_objects(speed_limits(episode, made, ids))
-    made.add_objects(traffic_lights(episode, plan, made, ids))
-    made.add_objects(intersections(episode, plan, made, ids))
-    made.add_objects(obstacles(episode, ids, open_ego))
+    made.add_objects(speed_limits(episode, made, ids=ids))
+    made.add_objects(traffic_lights(episode, plan, made=made, ids=ids))
+    made.add_objects(intersections(episode, plan, made=made, ids=ids))
+    made.add_objects(obstacles(episode, ids, open_ego=open_ego))
     if episode.origin is not None:
         shift = episode.origin.tolist()
         made.lanelet_network.location = Location(geo_transformation=GeoTransformation("", *shift, 0.0, 1.0))
@@ -93,8 +93,8 @@ def lanelets(episode: Episode, ids: Iterator[int]) -> list:
     entries = episode.entries()
     made = []
     for name, lane in episode.lanes.items():
-        left = beside(episode.lanes, name, "left", "right")
-        right = beside(episode.lanes, name, "right", "left")
+        left = beside(episode.lanes, name, side="left", other_side="right")
+        right = beside(episode.lanes, name, side="right", other_side="left")
         made.append(
             Lanelet(
                 left_vertices=shift_left(lane.points, lane.width / 2),
@@ -144,7 +144,7 @@ def traffic_lights(episode: Episode, plan: RoadPlan, made: Any, ids: Iterator[in
             if other in episode.lights:
                 groups.setdefault(tuple(episode.lights[other].tolist()), []).append(other)
         for states, others in groups.items():
-            turns = {"ALL"} if len(others) == len(lane.exits) else {turn(episode, plan, other) for other in others}
+            turns = {"ALL"} if len(others) == len(lane.exits) else {turn(episode, plan, name=other) for other in others}
             for direction in map(TrafficLightDirection.__getitem__, sorted(turns)):
                 light = TrafficLight(next(ids), lane.points[-1], cycle(states), direction=direction)
                 number[name].add_traffic_light_to_lanelet(light.traffic_light_id)
@@ -187,7 +187,7 @@ def intersections(episode: Episode, plan: RoadPlan, made: Any, ids: Iterator[int
         for group in groups:
             ways: dict[str, set[int]] = {"LEFT": set(), "STRAIGHT": set(), "RIGHT": set()}
             for other in (other for name in group for other in exits[name]):
-                ways[turn(episode, plan, other)].add(number[other])
+                ways[turn(episode, plan, name=other)].add(number[other])
             incoming = IncomingGroup(
                 next(ids),
                 incoming_lanelets={number[name] for name in group},
@@ -204,7 +204,7 @@ def side_by_side(lanes: dict[str, Lane], names: list[str]) -> list[list[str]]:
     """Returns the lanes `names` in groups of neighbours."""
     groups: list[list[str]] = []
     for name in names:
-        near = {beside(lanes, name, "left", "right"), beside(lanes, name, "right", "left")}
+        near = {beside(lanes, name, side="left", other_side="right"), beside(lanes, name, side="right", other_side="left")}
         touching = [group for group in groups if near & set(group)]
         groups = [group for group in groups if group not in touching]
         groups.append([other for group in touching for other in group] + [name])
@@ -223,7 +223,7 @@ def obstacles(episode: Episode, ids: Iterator[int], open_ego: bool) -> list:
         shape = RectObstacleShape(width=width, length=length)
         spans = [span for span in episode.appearances(row) if span[1] - span[0] >= 2]
         for index, (first, end) in enumerate(spans):
-            begin, *states = [state(episode, step, row) for step in range(first, end)]
+            begin, *states = [state(episode, step, row=row) for step in range(first, end)]
             prediction = TrajectoryPrediction(Trajectory(first + 1, states), shape)
             number = row + 1 if index == 0 else next(ids)
             made.append(DynamicObstacle(number, ObstacleType[name], shape, begin, prediction))
@@ -245,5 +245,5 @@ def planning_problem(episode: Episode, number: int) -> Any:
     there = RectOccupancy(shapely.Point(x, y), GOAL_WIDTH, GOAL_LENGTH, float(wrap(heading)))
     goal = CustomState(time_step=Interval(1, max(episode.steps, 1)), position=there)
     turning = 0.0 if episode.scene is None else float(episode.scene["start_yaw_rate"][0])
-    begin = state(episode, 0, 0, yaw_rate=turning, slip_angle=0.0)
+    begin = state(episode, 0, row=0, yaw_rate=turning, slip_angle=0.0)
     return PlanningProblem(number, begin, GoalRegion([goal]))

@@ -99,7 +99,7 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
     lights = {name: states for name, states in recording.lights.items() if name in graph.lanes}
     return replace(
         bare,
-        lanes={name: _linked(graph, name, lane) for name, lane in zip(graph.ids, bare.lanes.values(), strict=True)},
+        lanes={name: _linked(graph, name, lane=lane) for name, lane in zip(graph.ids, bare.lanes.values(), strict=True)},
         lights={name: states[frames] for name, states in lights.items()},
         light_past={name: states[:start] for name, states in lights.items()},
         scene=scene,
@@ -113,7 +113,7 @@ def rollout_episode(run: Path, row: Mapping) -> Episode:
     pairs = zip(rollout.lanes(), rollout.lane_width.tolist(), strict=True)
     lanes = {str(index): Lane(points.astype(float), width) for index, (points, width) in enumerate(pairs)}
     adversaries = np.flatnonzero(rollout.adversaries).tolist()
-    return Episode(run / ROLLOUTS / rollout.name, rollout, known_facts(row) | {"adversaries": adversaries}, lanes)
+    return Episode(run / ROLLOUTS / rollout.name, rollout, facts=known_facts(row) | {"adversaries": adversaries}, lanes=lanes)
 
 
 def known_facts(row: Mapping) -> dict[str, Any]:

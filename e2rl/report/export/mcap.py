@@ -79,7 +79,7 @@ def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
     """(step, topic, fields of the message) in the order of time."""
     rollout = episode.rollout
     borders = [np.concatenate([ring, ring[:1]]) for ring in rollout.polygons()]
-    road = [lines("lanes", rollout.lanes(), drawing.BACKGROUND), lines("borders", borders, "black")]
+    road = [lines("lanes", rollout.lanes(), colour=drawing.BACKGROUND), lines("borders", borders, colour="black")]
     yield 0, "/map", {"entities": road}
     for step in range(episode.steps + 1):
         yield step, "/traffic", {"entities": list(traffic(episode, step))}
@@ -87,19 +87,19 @@ def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
         if rollout.plans is not None and rest == 0 and number < len(rollout.plans):
             yield step, "/plans", {"entities": list(plans(episode, number))}
         x, y, heading = rollout.states[step, 0, :3].tolist()
-        pose = placed(x, y, heading, "translation", "rotation")
+        pose = placed(x, y, heading=heading, where="translation", turned="rotation")
         yield step, "/tf", {"parent_frame_id": MAP, "child_frame_id": EGO} | pose
 
 
 def traffic(episode: Episode, step: int) -> Iterator[Entity]:
     """Everybody who is there at a step, the lights at the beginning of their lanes, and the contact."""
     for row in np.flatnonzero(episode.rollout.valid[step]).tolist():
-        yield agent(episode, step, row)
+        yield agent(episode, step, row=row)
     if episode.lights:
         lit = [(episode.lanes[name].points[0], int(states[step])) for name, states in episode.lights.items()]
         yield spheres("lights", [(place, LIGHTS[state], 1.0) for place, state in lit if state in LIGHTS])
     if episode.facts.get("contact_step") == step and "partner" in episode.facts:
-        place = contact_point(episode.rollout, step, episode.facts["partner"])
+        place = contact_point(episode.rollout, step, partner=episode.facts["partner"])
         yield spheres("contact", [(place, drawing.CONTACT, 1.5)])
 
 
@@ -111,7 +111,7 @@ def plans(episode: Episode, number: int) -> Iterator[Entity]:
     for row, path in zip(rollout.planners.tolist(), rollout.plans[number], strict=True):
         if rollout.valid[step, row] and np.isfinite(path).all():
             whole = np.concatenate([rollout.states[step, row, :2][None], path])
-            yield lines(f"plan of {row}", [whole], drawing.EGO if row == 0 else drawing.ADVERSARY)
+            yield lines(f"plan of {row}", [whole], colour=drawing.EGO if row == 0 else drawing.ADVERSARY)
 
 
 def agent(episode: Episode, step: int, row: int) -> Entity:
@@ -122,7 +122,7 @@ def agent(episode: Episode, step: int, row: int) -> Entity:
     role = role_of(rollout, row)
     part = role if role in ("ego", "adversary") else kind
     height = HEIGHT[kind]
-    pose = placed(x, y, heading, "position", "orientation", height / 2)
+    pose = placed(x, y, heading=heading, where="position", turned="orientation", z=height / 2)
     cube = {"pose": pose, "size": {"x": length, "y": width, "z": height}, "color": rgba(COLOURS[role])}
     pairs = [{"key": "part", "value": part}, {"key": "speed", "value": f"{speed:.2f} m/s"}]
     return {"id": f"agent {row}", "frame_id": MAP, "cubes": [cube], "metadata": pairs}

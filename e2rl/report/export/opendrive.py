@@ -44,7 +44,7 @@ def road_network(episode: Episode) -> Any:
     plan = road_plan(episode.lanes)
     number = {name: index for index, name in enumerate(plan.roads, 1)}
     for name in plan.roads:
-        network.add_road(road(episode.lanes, plan, name, number))
+        network.add_road(road(episode.lanes, plan, name=name, number=number))
     for index, names in enumerate(plan.junctions, 1):
         junction = xodr.Junction(f"junction {index}", index)
         for name in names:
@@ -89,7 +89,7 @@ def road(lanes: dict[str, Lane], plan: RoadPlan, name: str, number: dict[str, in
             element.add_type(xodr.RoadType.town, s=start, speed=limit, speed_unit="m/s")
         elif start > 0:
             element.add_type(xodr.RoadType.town, s=start)
-    add_links(element, driving, plan, name, number)
+    add_links(element, driving, plan=plan, name=name, number=number)
     return element
 
 

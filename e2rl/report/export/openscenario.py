@@ -31,7 +31,7 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
         road = path.with_suffix(".xodr") if episode.lanes else None
         if road is not None:
             write_roads(episode, road)
-        scenario(episode, road.name if road else None, open_ego).write_xml(str(path))
+        scenario(episode, road.name if road else None, open_ego=open_ego).write_xml(str(path))
         yield episode, path
 
 
@@ -44,7 +44,7 @@ def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
         name = name_of(row)
         entities.add_scenario_object(name, entity(episode, row))
         if episode.rollout.valid[0, row]:
-            init.add_init_action(name, xosc.TeleportAction(places(episode, row, 0, 1)[0]))
+            init.add_init_action(name, xosc.TeleportAction(places(episode, row, first=0, end=1)[0]))
             speed = float(episode.rollout.states[0, row, 3])
             change = xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0)
             init.add_init_action(name, xosc.AbsoluteSpeedAction(speed, change))
@@ -54,7 +54,7 @@ def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
             for event in events:
                 manoeuvre.add_event(event)
             act.add_maneuver_group(xosc.ManeuverGroup(name).add_actor(name).add_maneuver(manoeuvre))
-    end = at(episode.steps * episode.rollout.dt, "replay ends", "stop")
+    end = at(episode.steps * episode.rollout.dt, "replay ends", point="stop")
     board = xosc.StoryBoard(init, end)
     board.add_story(xosc.Story("rollout").add_act(act))
     facts = xosc.Properties()
@@ -111,7 +111,7 @@ def events_of(episode: Episode, row: int) -> list:
     events = []
     for first, end in episode.appearances(row):
         begin, gone = (round(step * episode.rollout.dt, 6) for step in (first, end))
-        path = places(episode, row, first, end)
+        path = places(episode, row, first=first, end=end)
         drives = xosc.Event(f"{name} from {begin:g} s", xosc.Priority.parallel)
         if first > 0:
             drives.add_action(f"{name} appears at {begin:g} s", xosc.AddEntityAction(name, path[0]))

@@ -56,15 +56,15 @@ def road_plan(lanes: dict[str, Lane]) -> RoadPlan:
     graph = lane_digraph(lanes)
     chains = chains_of(graph)
     chain_of = {name: chain for chain in chains for name in chain}
-    links = [(chain_of[a], chain_of[b]) for a, b in graph.edges if is_junction(graph, a, b)]
+    links = [(chain_of[a], chain_of[b]) for a, b in graph.edges if is_junction(graph, a, b=b)]
     length = {name: float(arc_length(lane.points)[-1]) for name, lane in lanes.items()}
     short = [chain for chain in chains if sum(length[name] for name in chain) <= LONGEST]
-    through = through_chains(graph, chain_of, links, short)
-    heads, tails = cut_ends(graph, links, through, length)
+    through = through_chains(graph, chain_of, links=links, short=short)
+    heads, tails = cut_ends(graph, links, through=through, length=length)
     plan = RoadPlan()
     first, last = {}, {}  # roads of a chain
     for chain in chains:
-        spans = [Span(name, 0.0, length[name]) for name in chain]
+        spans = [Span(name, 0.0, end=length[name]) for name in chain]
         if chain in through:
             (before,) = graph.predecessors(chain[0])
             (after,) = graph.successors(chain[-1])
@@ -79,7 +79,7 @@ def road_plan(lanes: dict[str, Lane]) -> RoadPlan:
         plan.roads |= {span.lane: [span] for span in spans if span.begin < span.end}
         plan.plain += zip(roads, roads[1:], strict=False)
         first[chain], last[chain] = roads[0], roads[-1]
-        if graph.has_edge(chain[-1], chain[0]) and not is_junction(graph, chain[-1], chain[0]):  # a ring
+        if graph.has_edge(chain[-1], chain[0]) and not is_junction(graph, chain[-1], b=chain[0]):  # a ring
             plan.plain.append((chain[-1], chain[0]))
     for name, (before, after) in plan.connecting.items():
         plan.connecting[name] = (last[chain_of[before]], first[chain_of[after]])
@@ -110,7 +110,7 @@ def chains_of(graph: nx.DiGraph) -> list[Chain]:
     """Returns the lanes in chains, each as long as it can be; a ring without fork or merge is one, too."""
     alone = nx.DiGraph()
     alone.add_nodes_from(graph)
-    alone.add_edges_from((a, b) for a, b in graph.edges if not is_junction(graph, a, b))
+    alone.add_edges_from((a, b) for a, b in graph.edges if not is_junction(graph, a, b=b))
     chains = []
     for part in nx.weakly_connected_components(alone):
         first = next((name for name in alone if name in part and not alone.in_degree(name)), None)
@@ -141,8 +141,8 @@ def through_chains(
         chain
         for chain in short
         if graph.in_degree(chain[0]) == 1 == graph.out_degree(chain[-1])
-        and is_junction(graph, next(graph.predecessors(chain[0])), chain[0])
-        and is_junction(graph, chain[-1], next(graph.successors(chain[-1])))
+        and is_junction(graph, next(graph.predecessors(chain[0])), b=chain[0])
+        and is_junction(graph, chain[-1], b=next(graph.successors(chain[-1])))
     }
     while True:
         whole_tails = {chain_of[next(graph.predecessors(chain[0]))] for chain in through}
@@ -176,13 +176,13 @@ def cut_ends(
     for _, after in (pair for pair in pairs if not cut_tails[pair]):
         lane = after[0]
         whole = len(after) > 1 and graph.in_degree(lane) == 1 and length[lane] <= LONGEST
-        heads[after] = Span(lane, 0.0, length[lane] if whole else min(CUT, MOST_CUT * length[lane]))
+        heads[after] = Span(lane, 0.0, end=length[lane] if whole else min(CUT, MOST_CUT * length[lane]))
     for before, _ in (pair for pair in pairs if cut_tails[pair]):
         lane = before[-1]
         rest = len(before) - (before in heads and heads[before].end == length[before[0]])
         whole = rest > 1 and graph.out_degree(lane) == 1 and length[lane] <= LONGEST
         piece = length[lane] if whole else min(CUT, MOST_CUT * length[lane])
-        tails[before] = Span(lane, length[lane] - piece, length[lane])
+        tails[before] = Span(lane, length[lane] - piece, end=length[lane])
     return heads, tails
 
 

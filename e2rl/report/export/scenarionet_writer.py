@@ -50,9 +50,9 @@ def description(episode: Episode) -> dict[str, Any]:
     frames = history + episode.steps + 1
     known = {row: states for row, states in past_of(episode)}
     scene_id = episode.path.stem
-    tracks = {str(row): track(episode, row, history, known.get(row)) for row in episode.agents}
+    tracks = {str(row): track(episode, row, history=history, past=known.get(row)) for row in episode.agents}
     objects = {name: object_summary(name, entry) for name, entry in tracks.items()}
-    lights = {name: light(episode, name, history) for name in episode.lights}
+    lights = {name: light(episode, name, history=history) for name in episode.lights}
     metadata: dict[str, Any] = {
         "id": scene_id,
         "scenario_id": scene_id,
@@ -66,7 +66,7 @@ def description(episode: Episode) -> dict[str, Any]:
         "sdc_id": "0",
         "sdc_track_index": 0,
         "object_summary": objects,
-        "number_summary": number_summary(objects, lights, len(episode.lanes)),
+        "number_summary": number_summary(objects, lights, lanes=len(episode.lanes)),
         "map_height_diff": 0.0,  # beside the numbers: the filter of overpasses looks here
         "e2rl": episode.facts,
     }

@@ -27,10 +27,10 @@ def episodes_of(run: Path, rows: Sequence[Mapping], plugins: Sequence[str], scen
     waiting: dict[str, list[Mapping]] = defaultdict(list)
     for row in rows:
         waiting[row["scene_id"]].append(row)
-    source = source_of_run(run, rows[0]["split"], plugins)
+    source = source_of_run(run, rows[0]["split"], plugins=plugins)
     for recording in recordings(source, list(waiting)):
         for row in waiting.pop(recording.scene_id, ()):
-            yield recorded_episode(run, row, recording, source.build)
+            yield recorded_episode(run, row, recording=recording, build=source.build)
         if not waiting:
             return
     raise InputError(f"{run}: the data of the run hold no scene {next(iter(waiting))!r} now; restore them, {WITHOUT}")
@@ -45,7 +45,7 @@ def source_of_run(run: Path, split: str, plugins: Sequence[str]) -> Source:
     config = read_yaml(folder / CONFIG)
     try:
         data = OmegaConf.create({"data": OmegaConf.select(config, "data")})
-        check_code(data, plugins, f"{run} (pass --plugin MODULE for plugins=)")
+        check_code(data, plugins, where=f"{run} (pass --plugin MODULE for plugins=)")
         plain = resolved(data)["data"]
     except OmegaConfBaseException as error:
         raise InputError(f"{folder / CONFIG}: damaged ({str(error).splitlines()[0]}); restore it, {WITHOUT}") from error

@@ -70,7 +70,7 @@ class Baseline(NominalTraffic):
         if self.samples == 1:
             return first
         shape = (self.samples - 1, self.prior.sampler.steps, first.shape[2], SIZE)
-        further = noise_of(state.seed, FURTHER + state.replans, shape)
+        further = noise_of(state.seed, FURTHER + state.replans, shape=shape)
         return torch.cat([first, further.permute(2, 0, 3, 1, 4)], 3)
 
     def strength(self, state: State) -> Tensor:
@@ -79,12 +79,12 @@ class Baseline(NominalTraffic):
 
     def replan_group(self, now: Replan) -> tuple[BaselineState, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
-        context = self.encode(now.state, now.world, now.ego_plan, now.before)
+        context = self.encode(now.state, now.world, ego_plan=now.ego_plan, known=now.before)
         if not bool((self.strength(now.state) > 0).any()):
             return now.state, self.prior.sample(context, now.noise[..., 0, :]).x0, context
         state, x0 = self.attack(now, context)
         if self.adversarial:
-            context.obstacles.duty = duty_of(self.responsibility, self.yielding, now.world, state.adversary, state.eta)
+            context.obstacles.duty = duty_of(self.responsibility, self.yielding, world=now.world, coalition=state.adversary, eta=state.eta)
         return state, x0, context
 
     @abstractmethod
@@ -103,5 +103,5 @@ def replay_others(state: Own, plan: TrafficPlan, world: World, driven: Tensor) -
     before = logged.states[:, :, REPLAN_STEPS - 2]
     accel = (now[..., 3] - before[..., 3]) / DT
     yaw_rate = wrap(now[..., 2] - before[..., 2]) / DT
-    lane = select(driven, state.lane, locate(now, accel, yaw_rate, state.routed.points))
+    lane = select(driven, state.lane, other=locate(now, accel, yaw_rate=yaw_rate, points=state.routed.points))
     return replace(state, lane=lane), replace(plan, states=states, present=present)

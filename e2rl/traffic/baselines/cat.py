@@ -32,7 +32,7 @@ class CAT(OpenLoop):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("synthesizer.tracks", self.tracks, 1, self.samples)
+        check_range("synthesizer.tracks", self.tracks, low=1, high=self.samples)
         self.queries_ego = self.knowledge == "plan"
 
     def replan(
@@ -42,7 +42,7 @@ class CAT(OpenLoop):
         adversaries: who has left its recording does not return to it."""
         state, plan = super().replan(state, world, ego_plan, react)
         driven = state.held | state.released | (self.strength(state) <= 0)[:, None]
-        return replay_others(state, plan, world, driven)
+        return replay_others(state, plan, world=world, driven=driven)
 
     def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The nominal sample with the future of greatest overlap in its vehicle's row, which alone is held."""
@@ -53,8 +53,8 @@ class CAT(OpenLoop):
         many = tiled(context, count)
         wide = torch.cat([noise[..., :1, :], self.spread * noise[..., 1:, :]], 3)  # the first is the nominal one
         x0 = self.prior.sample(many, folded(wide)).x0
-        futures = motion_of(self.prior, x0, many, count, slice(None)).states()
-        value = overlap_value(futures, self.recent_tracks(now, futures), now.world.scene["size"][:, :vehicles])
+        futures = motion_of(self.prior, x0, context=many, count=count, steps=slice(None)).states()
+        value = overlap_value(futures, self.recent_tracks(now, futures), size=now.world.scene["size"][:, :vehicles])
         value = value * context.active
         tried = torch.arange(count, device=value.device)[:, None] < self.strength(state).round().clamp(min=1)
         best, at = (value * tried[..., None]).transpose(0, 1).flatten(1).max(-1)
@@ -62,7 +62,7 @@ class CAT(OpenLoop):
         adversary = adversary & (best > 0)[:, None]
         chosen = pick(x0.unflatten(0, (count, -1)), at // vehicles)
         x = torch.where(adversary[..., None], chosen, nominal)
-        return Scenario(x, adversary, adversary, torch.zeros_like(state.path_kl))
+        return Scenario(x, adversary, adversary=adversary, path_kl=torch.zeros_like(state.path_kl))
 
     def recent_tracks(self, now: Replan, futures: Tensor) -> Tensor:
         """Motions [tracks, B, HORIZON, 4] of the ego: its policy driven against nominal futures [S, B, V, HORIZON, 4],
@@ -76,7 +76,7 @@ class CAT(OpenLoop):
         free = self.prior.encode(state.routed, state.lane, world.states, world.valid, world.step, None)
         many = tiled(free, self.tracks)
         x0 = self.prior.sample(many, folded(now.noise[..., : self.tracks, :])).x0
-        return motion_of(self.prior, x0, many, self.tracks, slice(None)).states()[:, :, 0]
+        return motion_of(self.prior, x0, context=many, count=self.tracks, steps=slice(None)).states()[:, :, 0]
 
 
 def overlap_value(futures: Tensor, tracks: Tensor, size: Tensor) -> Tensor:

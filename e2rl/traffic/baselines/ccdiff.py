@@ -68,7 +68,7 @@ def ranked(scene: TensorDictBase, count: int, draw: Tensor) -> Tensor:
     vehicles = states.shape[1]
     there = scene["valid"][:, :vehicles] & ~scene["parked"][:, :vehicles]
     distance = (states[:, :, -1, :2] - states[:, :1, -1, :2]).norm(dim=-1)
-    nodes = smallest(there, distance, NODES)
+    nodes = smallest(there, distance, count=NODES)
     states = states.transpose(1, 2)
     weight = risk(states, scene["size"][:, None, :vehicles].expand(*states.shape[:-1], 2))
     edges = (weight > EDGE) & nodes[:, None, :, None] & nodes[:, None, None]
@@ -80,7 +80,7 @@ def ranked(scene: TensorDictBase, count: int, draw: Tensor) -> Tensor:
         for clique in (clique for step in steps for clique in step):
             row[list(clique)] += 1
     there = there & (torch.arange(vehicles, device=there.device) > 0)
-    return smallest(there, draw - score.to(draw.device), count)
+    return smallest(there, draw - score.to(draw.device), count=count)
 
 
 def _top_cliques(adjacency: np.ndarray, weight: np.ndarray) -> list[tuple[int, ...]]:
@@ -114,8 +114,8 @@ class CCDiff(MeanGuided):
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> CCDiffState:
         """Returns states of scenes [B] with their top vehicles, whose routes are the prior's; others' are recorded."""
         state = super().reset(scenes, seed, eta)
-        draw = noise_of(state.seed, torch.full_like(state.seed, TIES), tuple(state.adversary.shape[1:]), uniform=True)
-        top = ranked(scenes, self.controlled, draw) | (self.strength(state) <= 0)[:, None]
+        draw = noise_of(state.seed, torch.full_like(state.seed, TIES), shape=tuple(state.adversary.shape[1:]), uniform=True)
+        top = ranked(scenes, self.controlled, draw=draw) | (self.strength(state) <= 0)[:, None]
         logged = scenes["route_log"].clone()
         logged[:, 0] = -1  # nobody's but the ego's own business
         routed, lane = self.prior.start(scenes, torch.where(top | (logged < 0), state.routed.route, logged))
@@ -126,7 +126,7 @@ class CCDiff(MeanGuided):
     ) -> tuple[CCDiffState, TrafficPlan]:
         """Returns states and plans of the coming HORIZON steps; who is not among the top replays."""
         state, plan = super().replan(state, world, ego_plan, react)
-        return replay_others(state, plan, world, state.top)
+        return replay_others(state, plan, world=world, driven=state.top)
 
     def attackers(self, state: CCDiffState, view: View) -> Tensor:
         """The top vehicles."""
@@ -138,5 +138,5 @@ class CCDiff(MeanGuided):
         others = torch.ones_like(view.routed.conflict)
         others[:, :, 0] = False
         weights = torch.full_like(discounts(states), 1 / states.shape[-2])
-        near = pair_term(states, view, disk_overlap(self.margin), self.margin, weights, others)
-        return self.off_road * off_road_term(states, view, discounts(states)) - self.collision * near
+        near = pair_term(states, view, cost=disk_overlap(self.margin), reach=self.margin, weights=weights, left_out=others)
+        return self.off_road * off_road_term(states, view, weights=discounts(states)) - self.collision * near

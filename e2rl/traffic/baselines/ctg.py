@@ -48,8 +48,8 @@ class CTG(MeanGuided):
         """Weighted collision, off-road and speeding terms."""
         states = view.with_ego(motion)
         weights = discounts(states)
-        total = self.collision * pair_term(states, view, disk_overlap(self.margin), self.margin, weights)
-        total = total + self.off_road * off_road_term(states, view, weights)
+        total = self.collision * pair_term(states, view, cost=disk_overlap(self.margin), reach=self.margin, weights=weights)
+        total = total + self.off_road * off_road_term(states, view, weights=weights)
         return total + self.speed * speeding_term(motion, view)
 
 
@@ -68,8 +68,8 @@ class CTGAdv(MeanGuided):
         """Soft-min distance to the ego, and metres off the road."""
         states = view.with_ego(motion)
         near = approach_term(states, self.temperature)
-        return self.approach * near + self.off_road * off_road_term(states, view, discounts(states))
+        return self.approach * near + self.off_road * off_road_term(states, view, weights=discounts(states))
 
     def chosen(self, motion: LaneState, state: BaselineState, view: View, guided: Tensor) -> Tensor:
         """Sample [B] in which some vehicle comes nearest to the ego."""
-        return self.loss(motion, state, view).masked_fill(~guided, float("inf")).amin(-1).argmin(0)
+        return self.loss(motion, state, view=view).masked_fill(~guided, float("inf")).amin(-1).argmin(0)

@@ -38,25 +38,25 @@ class DiffScene(OpenLoop):
 
     def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The guided joint sample of least loss; the adversary alone is held."""
-        view = View.of(now.world, context, now.ego_plan)
+        view = View.of(now.world, context, ego_plan=now.ego_plan)
         count = now.noise.shape[3]
-        adversary = smallest(view.active, view.distance_to_ego(), 1) & (self.strength(now.state) > 0)[:, None]
+        adversary = smallest(view.active, view.distance_to_ego(), count=1) & (self.strength(now.state) > 0)[:, None]
         loss = partial(self.loss, state=now.state, view=view, adversary=adversary)
-        control = CleanGuidance(self.prior, loss, adversary.repeat(count, 1), count, self.step_size, self.clip)
+        control = CleanGuidance(self.prior, loss, guided=adversary.repeat(count, 1), samples=count, step_size=self.step_size, clip=self.clip)
         many = tiled(context, count)
         sample = self.prior.sample(many, folded(now.noise), control)
-        index = loss(motion_of(self.prior, sample.x0, many, count)).sum(-1).argmin(0)
+        index = loss(motion_of(self.prior, sample.x0, context=many, count=count)).sum(-1).argmin(0)
         x0, kl = (pick(value.unflatten(0, (count, -1)), index) for value in (sample.x0, sample.kl))
-        return Scenario(x0, adversary, adversary, kl)
+        return Scenario(x0, adversary, adversary=adversary, path_kl=kl)
 
     def loss(self, motion: LaneState, state: OpenLoopState, view: View, adversary: Tensor) -> Tensor:
         """The three objectives of the adversary [B, V]; 0 for others."""
         states = view.with_ego(motion)
         attack = self.safety * approach_term(states, self.temperature)
-        attack = attack + self.functionality * corridor_term(states, view, adversary)
+        attack = attack + self.functionality * corridor_term(states, view, adversary=adversary)
         even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
-        lawful = off_route_term(motion, view) + comfort_term(motion, LOW, HIGH, JERK)
-        lawful = lawful + off_road_term(states, view, even) + speeding_term(motion, view)
+        lawful = off_route_term(motion, view) + comfort_term(motion, LOW, high=HIGH, jerk=JERK)
+        lawful = lawful + off_road_term(states, view, weights=even) + speeding_term(motion, view)
         return (self.strength(state)[:, None] * attack + self.constraint * lawful) * adversary
 
 

@@ -61,7 +61,7 @@ class MeanGuidance:
         mean, variance = step(x=x, x0=x0, past=past)
         none = None if past is None else (zero, past[1])
         per_x0, _ = step(x=zero, x0=zero + 1, past=none)  # a step is affine in x0
-        shift = self._shift(mean, self.limit[:, None, None] * variance.sqrt(), context)
+        shift = self._shift(mean, self.limit[:, None, None] * variance.sqrt(), context=context)
         moved = x0 + shift / per_x0
         self.past = moved, level
         return x, x0, moved
@@ -71,7 +71,7 @@ class MeanGuidance:
             z = mean.detach().clone().requires_grad_(True)
             adam = torch.optim.Adam([z], lr=self.step_size, eps=ROUNDING)
             for _ in range(self.iterations):
-                value = self.loss(motion_of(self.prior, z, context, self.samples)).sum()
+                value = self.loss(motion_of(self.prior, z, context=context, count=self.samples)).sum()
                 (z.grad,) = torch.autograd.grad(value, z)
                 adam.step()
                 z.data = mean + (z.data - mean).clamp(-limit, limit)
@@ -99,7 +99,7 @@ class CleanGuidance:
         with torch.enable_grad():
             variable = x.detach().requires_grad_(True)
             x0 = denoise(variable)
-            value = self.loss(motion_of(self.prior, x0, context, self.samples)).sum()
+            value = self.loss(motion_of(self.prior, x0, context=context, count=self.samples)).sum()
             (gradient,) = torch.autograd.grad(value, variable)
         shift = (self.step_size * gradient).clamp(-self.clip, self.clip)
         x0 = x0.detach()
@@ -118,24 +118,24 @@ class Guided(Baseline):
         """Returns state and chosen joint sample x0 [G, V, SIZE]; scenes without strength keep the nominal one."""
         state = now.state
         count = now.noise.shape[3]
-        view = View.of(now.world, context, now.ego_plan)
+        view = View.of(now.world, context, ego_plan=now.ego_plan)
         acts = self.strength(state) > 0
         adversary = self.attackers(state, view) & acts[:, None]
         state = replace(state, adversary=adversary)
         guided = (context.active if self.guides_everybody else adversary) & acts[:, None]
         loss = partial(self.loss, state=state, view=view)
         many = tiled(context, count)
-        control = self.guidance(loss, guided.repeat(count, 1), self.strength(state).repeat(count))
+        control = self.guidance(loss, guided.repeat(count, 1), strength=self.strength(state).repeat(count))
         sample = self.prior.sample(many, folded(now.noise), control)
-        motion = motion_of(self.prior, sample.x0, many, count)
-        index = self.chosen(motion, state, view, guided)
+        motion = motion_of(self.prior, sample.x0, context=many, count=count)
+        index = self.chosen(motion, state, view=view, guided=guided)
         index = index * acts if index.ndim == 1 else index * acts[:, None]
         x0, kl = (pick(value.unflatten(0, (count, -1)), index) for value in (sample.x0, sample.kl))
         return replace(state, path_kl=state.path_kl + kl), x0
 
     def chosen(self, motion: LaneState, state: State, view: View, guided: Tensor) -> Tensor:
         """Sample [B] of each scene that is driven: that of least loss over the guided vehicles."""
-        return torch.where(guided, self.loss(motion, state, view), 0.0).sum(-1).argmin(0)
+        return torch.where(guided, self.loss(motion, state, view=view), 0.0).sum(-1).argmin(0)
 
     def attackers(self, state: State, view: View) -> Tensor:
         """Bool [B, V]: vehicles under adversarial control, all that the prior moves by default."""
@@ -169,4 +169,4 @@ class MeanGuided(Guided):
 
     def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> MeanGuidance:
         """The control of `Prior.sample`."""
-        return MeanGuidance(self.prior, loss, guided, strength, self.samples, self.step_size, self.iterations)
+        return MeanGuidance(self.prior, loss, guided=guided, limit=strength, samples=self.samples, step_size=self.step_size, iterations=self.iterations)

@@ -90,7 +90,7 @@ def off_road_term(states: Tensor, view: View, weights: Tensor) -> Tensor:
     """Metres beyond the drivable border, mean over a box's corners, over its diagonal."""
     points = corners(states, view.size[:, :, None])  # [S, B, V, T, 4, 2]
     by_scene = points.transpose(0, 1).contiguous()
-    beyond = off_road(by_scene, view.scene["field"], view.scene["field_origin"]).transpose(0, 1)
+    beyond = off_road(by_scene, view.scene["field"], origin=view.scene["field_origin"]).transpose(0, 1)
     cost = beyond.clamp(0, MAX_OFF_ROAD).mean(-1) / view.size.norm(dim=-1)[..., None]
     return (cost * weights).sum(-1)
 

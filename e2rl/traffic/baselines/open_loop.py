@@ -67,11 +67,11 @@ class OpenLoop(Baseline):
         age = state.replans % EVERY
         due = (age == 0) & (self.strength(state) > 0)
         nominal = self.prior.sample(context, now.noise[..., 0, :]).x0
-        rest = later(state.x, state.begun, state.lane, age, context.routed.has_lane)
+        rest = later(state.x, state.begun, lane=state.lane, age=age, has_lane=context.routed.has_lane)
         x0 = torch.where(state.held[..., None], rest, nominal)
         if not bool(due.any()):
             return state, x0
-        made = self.scenario(now, context, nominal)
+        made = self.scenario(now, context, nominal=nominal)
         rows = due[:, None]
         held = torch.where(rows, made.held, state.held)
         state = replace(
@@ -81,7 +81,7 @@ class OpenLoop(Baseline):
             adversary=torch.where(rows, made.adversary, state.adversary),
             path_kl=state.path_kl + torch.where(rows, made.path_kl, 0.0),
             x=torch.where(rows[..., None], made.x, state.x),
-            begun=select(rows.expand_as(state.held), state.lane, state.begun),
+            begun=select(rows.expand_as(state.held), state.lane, other=state.begun),
         )
         return state, torch.where(rows[..., None], made.x, x0)
 
@@ -101,7 +101,7 @@ def later(x: Tensor, begun: LaneState, lane: LaneState, age: Tensor, has_lane: T
     reach = lateral_horizon(lane.v)[..., None]
     first_reach = lateral_horizon(begun.v)[..., None]
     ahead = (lane.s - begun.s)[..., None] + reach * torch.tensor([0.5, 1.0], device=x.device)
-    path = polynomial(offset_coefficients(begun, half, end), (ahead / first_reach).clamp(0, 1))[0]
+    path = polynomial(offset_coefficients(begun, half, end=end), (ahead / first_reach).clamp(0, 1))[0]
     bend = (path[..., 0] - 0.5 * (lane.d + path[..., 1])) / BEND_SCALE
     lateral = torch.stack([bend, path[..., 1] / OFFSET_SCALE], -1)
     lateral = torch.where(has_lane[..., None], lateral, x[..., KNOTS + 1 :])

@@ -42,13 +42,13 @@ class SafeSimOpt(Guided):
     def attackers(self, state: BaselineState, view: View) -> Tensor:
         """Those nearest to the ego, within `reach`."""
         distance = view.distance_to_ego()
-        return smallest(distance <= self.reach, distance, self.adversaries)
+        return smallest(distance <= self.reach, distance, count=self.adversaries)
 
     def loss(self, motion: LaneState, state: BaselineState, view: View) -> Tensor:
         """Route and Gaussian terms of all; collision and TTC terms of adversaries, by the strength."""
         states = view.with_ego(motion)
         strength = self.strength(state)[:, None] * state.adversary
-        calm = self.route * off_route_term(motion, view) + self.gaussian * self._overlap(states, view, state)
+        calm = self.route * off_route_term(motion, view) + self.gaussian * self._overlap(states, view, state=state)
         attack = self.collision * collision_term(states) * in_conflict(view) + self.ttc * ttc_term(states)
         return calm + strength * attack
 
@@ -57,18 +57,18 @@ class SafeSimOpt(Guided):
         early = states[..., : round(GAUSSIAN_TIME / (STRIDE * DT)), :]
         pursued = state.adversary[:, :, None] & (torch.arange(states.shape[2], device=states.device) == 0)
         weights = early.new_full(early.shape[-2:-1], 1 / early.shape[-2])
-        return pair_term(early, view, gaussian_overlap, GAUSSIAN_REACH, weights, pursued)
+        return pair_term(early, view, cost=gaussian_overlap, reach=GAUSSIAN_REACH, weights=weights, left_out=pursued)
 
     def chosen(self, motion: LaneState, state: BaselineState, view: View, guided: Tensor) -> Tensor:
         """Sample [B, V] of each vehicle: the least Gaussian term, for adversaries the least collision term."""
         states = view.with_ego(motion)
-        calm = self._overlap(states, view, state)
+        calm = self._overlap(states, view, state=state)
         near = collision_term(states)
         return torch.where(state.adversary, near, calm).argmin(0)
 
     def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> CleanGuidance:
         """The strength is in the loss."""
-        return CleanGuidance(self.prior, loss, guided, self.samples, self.step_size, self.clip)
+        return CleanGuidance(self.prior, loss, guided=guided, samples=self.samples, step_size=self.step_size, clip=self.clip)
 
 
 def collision_term(states: Tensor) -> Tensor:

@@ -64,33 +64,33 @@ class Strive(OpenLoop):
         """The optimised scenario, in which all vehicles are held; the nominal sample where it has no solution."""
         first = now.noise[0, :, :, 0].contiguous()
         acts = self.strength(now.state) > 0
-        x0, view = self.attacked(first, now, context)
-        motion = motion_of(self.prior, x0, context, 1)
+        x0, view = self.attacked(first, now, context=context)
+        motion = motion_of(self.prior, x0, context=context, count=1)
         weight = softmin(view.with_ego(motion), view).sum(-1)  # of each vehicle
         attacker = torch.nn.functional.one_hot(weight.argmax(-1), weight.shape[1]).bool()
         holds = acts & (weight.sum(-1) > 0)
         if self.solution:
-            holds = holds & self.solvable(first, motion, view, context)
+            holds = holds & self.solvable(first, motion, view=view, context=context)
         held, adversary = (rows & holds[:, None] & context.active for rows in (torch.ones_like(attacker), attacker))
         x = torch.where(holds[:, None, None], x0, nominal)
-        return Scenario(x, held, adversary, torch.zeros_like(now.state.path_kl))
+        return Scenario(x, held, adversary=adversary, path_kl=torch.zeros_like(now.state.path_kl))
 
     def attacked(self, first: Tensor, now: Replan, context: Context) -> tuple[Tensor, View]:
         """x0 [B, V, SIZE] of optimised latents that begin at `first`, and the View with the ego as it last drove."""
-        view, told = View.of(now.world, context, now.ego_plan), context  # with the ego as it has driven last
+        view, told = View.of(now.world, context, ego_plan=now.ego_plan), context  # with the ego as it has driven last
 
         def decoded(latent: Tensor) -> Tensor:
             nonlocal view, told
-            x0 = decode_latent(self.prior, latent, told, self.steps)
+            x0 = decode_latent(self.prior, latent, context=told, steps=self.steps)
             if now.react is not None:
                 ego = now.react(self.prior.decode(x0.detach(), context).states())
                 view = replace(view, ego=ego[:, SAMPLED_STEPS])
-                told = replace(context, ego_x=plan_to_x(ego, context.state, context.routed))
+                told = replace(context, ego_x=plan_to_x(ego, context.state, routed=context.routed))
             return x0
 
         def loss(latent: Tensor) -> Tensor:
-            motion = motion_of(self.prior, decoded(latent), told, 1)
-            return self.loss(motion, latent, first, now.state, view)
+            motion = motion_of(self.prior, decoded(latent), context=told, count=1)
+            return self.loss(motion, latent, first=first, state=now.state, view=view)
 
         latent = self.optimised(first, loss)
         with torch.no_grad():
@@ -117,8 +117,8 @@ class Strive(OpenLoop):
         even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
         with_ego = torch.zeros_like(view.routed.conflict)
         with_ego[:, :, 0] = True
-        bumps = [pair_term(states, view, disk_overlap(0.0), 0.0, even, rows)[0] for rows in (with_ego, ~with_ego)]
-        calm = COLLISION * (bumps[0] + (1 - fraction) * bumps[1] + off_road_term(states, view, even)[0])
+        bumps = [pair_term(states, view, cost=disk_overlap(0.0), reach=0.0, weights=even, left_out=rows)[0] for rows in (with_ego, ~with_ego)]
+        calm = COLLISION * (bumps[0] + (1 - fraction) * bumps[1] + off_road_term(states, view, weights=even)[0])
         energy = blend(PRIOR, fraction) * 0.5 * latent.square().sum(-1)
         energy = energy + blend(START, fraction) * (latent - first).square().sum(-1)
         return self.strength(state) * attack + ((calm + energy) * view.active).sum(-1)
@@ -143,12 +143,12 @@ class Strive(OpenLoop):
 
         def driven(ego: Tensor) -> Tensor:
             latent = torch.cat([ego[:, None], first[:, 1:]], 1)
-            return motion_of(self.prior, decode_latent(self.prior, latent, unknown, self.steps), unknown, 1).states()
+            return motion_of(self.prior, decode_latent(self.prior, latent, context=unknown, steps=self.steps), context=unknown, count=1).states()
 
         def loss(ego: Tensor) -> Tensor:
             states = torch.cat([driven(ego)[:, :, :1], others[None, :, 1:]], 2)
             even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
-            bump = pair_term(states, view, disk_overlap(CLEARANCE), CLEARANCE, even) + off_road_term(states, view, even)
+            bump = pair_term(states, view, cost=disk_overlap(CLEARANCE), reach=CLEARANCE, weights=even) + off_road_term(states, view, weights=even)
             return SOLUTION[0] * bump[0, :, 0] + SOLUTION[1] * 0.5 * ego.square().sum(-1)
 
         with torch.no_grad():
@@ -157,7 +157,7 @@ class Strive(OpenLoop):
 
 def touched(ego: Tensor, others: Tensor, view: View) -> Tensor:
     """Bool [B]: the ego's states [B, 1, T, 4] overlap some of the others' [B, V, T, 4], whose row 0 does not count."""
-    touches = overlap(ego, view.size[:, :1, None], others[:, 1:], view.size[:, 1:, None]).any(-1)
+    touches = overlap(ego, view.size[:, :1, None], second=others[:, 1:], second_size=view.size[:, 1:, None]).any(-1)
     return (touches & view.valid[:, 1:]).any(-1)
 
 

@@ -56,7 +56,7 @@ class AnchorSettings:
     max_accel: float = setting()
 
     def __post_init__(self) -> None:
-        check_range("synthesizer.anchor.max_accel", self.max_accel, self.min_accel + 0.1)
+        check_range("synthesizer.anchor.max_accel", self.max_accel, low=self.min_accel + 0.1)
 
 
 @dataclass(frozen=True)
@@ -135,10 +135,10 @@ def _candidates(scene: TensorDictBase, world: World, index: Tensor, keep_route: 
     if keep_route:
         usable = usable & (route >= 0)
     if halt_at_red:
-        end = torch.minimum(end, s + distance_to_stop_line(world, index, number))
+        end = torch.minimum(end, s + distance_to_stop_line(world, index, number=number))
     accel = take(world.accel[:, :vehicles], index)
     size = take(scene["size"], index)
-    return _Candidates(number, points, usable, end, s, d, _bend_bound(points, s), states[..., 3], accel, size)
+    return _Candidates(number, points, usable=usable, end=end, s=s, d=d, bend_bound=_bend_bound(points, s), speed=states[..., 3], accel=accel, size=size)
 
 
 def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
@@ -148,7 +148,7 @@ def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
     touch = (candidates.size + size) / 2
     slack = 0.8 * touch[..., 0, None, None] * cosine.clamp(min=0) ** 2
     crossing_time = (1 - cosine**2) / path[:, :, None, :, 3].clamp(min=1.0)
-    return _Target(s, d, slack, crossing_time, touch[..., 1])
+    return _Target(s, d, slack=slack, crossing_time=crossing_time, corridor=touch[..., 1])
 
 
 def _knots(candidates: _Candidates, accel: Tensor, limits: Tensor) -> Tensor:
@@ -176,7 +176,7 @@ def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
     """Speed and travelled distance [B, M, R, A, H] of knots [B, M, R, A, 10], by the prior's decoder."""
     zero = knots.new_zeros(knots.shape[:-1])
     v, a = (x[..., None, None].expand(zero.shape) for x in (candidates.speed, candidates.accel))
-    return speeds(LaneState(zero, zero, zero, zero, v, a, zero, zero, zero, zero), knots)
+    return speeds(LaneState(zero, zero, d1=zero, d2=zero, v=v, a=a, x=zero, y=zero, heading=zero, kappa=zero), knots)
 
 
 @fused(
@@ -191,7 +191,7 @@ def scored(candidates: _Candidates, accel: Tensor, target: _Target, limits: Tens
 
     Time gap: distance to the target over speed, least over the steps at which the target is on the candidate.
     """
-    knots = _knots(candidates, accel, limits)
+    knots = _knots(candidates, accel, limits=limits)
     v, travelled = _decode(candidates, knots)
     offset = candidates.d[..., None, None] * remaining_offset(travelled, candidates.speed[..., None, None, None])
     lateral = (target.d[..., None, :] - offset).abs()
@@ -208,7 +208,7 @@ def _on_lane(
     candidates: _Candidates, path: Tensor, size: Tensor, settings: AnchorSettings
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The proposal of least cost on the candidates: candidate [B, M], knots [B, M, 10], cost [B, M] (inf for none)."""
-    target = _along(candidates, path, size)
+    target = _along(candidates, path, size=size)
     low = settings.min_accel
     high = settings.max_accel
     limits = path.new_tensor((low, high))
@@ -240,32 +240,32 @@ def propose(
     that binds it now.
     """
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
-    expected = constant_speed_states(scene, world, times)
+    expected = constant_speed_states(scene, world, times=times)
     expected[:, 0] = ego_plan[:, :HORIZON].detach()
     assert world.route is not None
     nobody = torch.zeros_like(skeleton.coalition)
     cost = expected.new_full(world.route.shape, torch.inf)
     knots = expected.new_zeros(*world.route.shape, KNOTS)
     path = torch.zeros_like(scene["route_points"][:, :, 0])
-    anchor = Anchor(world.route.clone(), knots, nobody, cost, nobody, path)
+    anchor = Anchor(world.route.clone(), knots, feasible=nobody, cost=cost, off_lane=nobody, off_lane_path=path)
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         target = skeleton.target.gather(1, index).clamp(min=0)
-        candidates = _candidates(scene, world, index, keep_route, halt_at_red)
-        pick, knots, cost = _on_lane(candidates, take(expected, target), take(scene["size"], target), settings)
+        candidates = _candidates(scene, world, index=index, keep_route=keep_route, halt_at_red=halt_at_red)
+        pick, knots, cost = _on_lane(candidates, take(expected, target), size=take(scene["size"], target), settings=settings)
         cost = cost.masked_fill(~present, torch.inf)
         off_lane = torch.zeros_like(present)
         found = None
         if depth == 1 and interception.reach > 0:
-            found = intercept(world, index, target, expected, wish, interception, halt_at_red)
+            found = intercept(world, index, target=target, expected=expected, wish=wish, settings=interception, halt_at_red=halt_at_red)
             off_lane = present & (found.cost < cost)
         on_lane = cost.isfinite() & ~off_lane
-        expected = put(expected, index, on_lane, _states(candidates, pick, knots))
+        expected = put(expected, index, mask=on_lane, rows=_states(candidates, pick, knots=knots))
         route = take_route(candidates.number, pick)
-        anchor = _updated(anchor, index, on_lane, feasible=on_lane, cost=cost, knots=knots, route=route)
+        anchor = _updated(anchor, index, mask=on_lane, feasible=on_lane, cost=cost, knots=knots, route=route)
         if found is not None:
             rows = {"feasible": off_lane, "off_lane": off_lane, "cost": found.cost, "knots": found.knots}
-            anchor = _updated(anchor, index, off_lane, off_lane_path=found.path, **rows)
+            anchor = _updated(anchor, index, mask=off_lane, off_lane_path=found.path, **rows)
     return anchor
 
 
@@ -274,9 +274,9 @@ def _states(candidates: _Candidates, pick: Tensor, knots: Tensor) -> Tensor:
     v, travelled = (x[:, :, 0, 0] for x in _decode(candidates, knots[:, :, None, None]))
     route, s, d = (take_route(x, pick) for x in (candidates.points, candidates.s, candidates.d))
     offset = d[..., None] * remaining_offset(travelled, candidates.speed[..., None])
-    return states_on_route(route, s[..., None] + travelled, offset, v)
+    return states_on_route(route, s[..., None] + travelled, d=offset, speed=v)
 
 
 def _updated(anchor: Anchor, index: Tensor, mask: Tensor, **rows: Tensor) -> Anchor:
     """The Anchor with rows [B, M, ...] of its fields written at vehicles index [B, M] where mask [B, M]."""
-    return replace(anchor, **{name: put(getattr(anchor, name), index, mask, new) for name, new in rows.items()})
+    return replace(anchor, **{name: put(getattr(anchor, name), index, mask=mask, rows=new) for name, new in rows.items()})

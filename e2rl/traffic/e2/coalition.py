@@ -99,7 +99,7 @@ class Coalitions(NominalTraffic):
         for part in fields(self):
             given = getattr(self, part.name)
             if isinstance(given, Mapping):
-                setattr(self, part.name, settings_of(cast(type, part.type), given, f"synthesizer.{part.name}"))
+                setattr(self, part.name, settings_of(cast(type, part.type), given, where=f"synthesizer.{part.name}"))
         rules = self.reasoner.kind == "rules"
         self.feasible_vehicles = feasible_vehicles if rules else LanguageReasoner(self.reasoner)
 
@@ -140,23 +140,23 @@ class Coalitions(NominalTraffic):
         due = state.replans == 0
         if self.reselect > 0:
             due = due | (state.replans % self.reselect == 0)
-        anchor = self._anchor(state, world, ego_plan)
+        anchor = self._anchor(state, world, ego_plan=ego_plan)
         rows = (due & (state.eta > 0) & ~anchor.feasible.any(1)).nonzero().squeeze(-1)
         if not len(rows):
             return state, anchor
         there = take_rows(world, rows)
-        chosen = self._select(take_rows(state, rows), there, ego_plan[rows])
-        found = self._anchor(chosen, replace(there, route=chosen.routed.route), ego_plan[rows])
-        return put_rows(state, rows, chosen), put_rows(anchor, rows, found)
+        chosen = self._select(take_rows(state, rows), there, ego_plan=ego_plan[rows])
+        found = self._anchor(chosen, replace(there, route=chosen.routed.route), ego_plan=ego_plan[rows])
+        return put_rows(state, rows, new=chosen), put_rows(anchor, rows, new=found)
 
     def _anchor(self, state: E2State, world: World, ego_plan: Tensor) -> Anchor:
         """Proposals for the present coalition on its present routes; whom the ego follows keeps its last one."""
         depth = chain_depth(state.target)
         if self.responsibility == "full":
             depth = depth.masked_fill(leading(world, depth.shape[1]) & (state.now.whom != LEADER)[:, None], 0)
-        skeleton = Skeleton(state.coalition, state.target, depth, depth == 1, depth > 1)
-        anchor = self._propose(skeleton, state, world, ego_plan, keep_route=True)
-        return self._held(anchor, state, world) if self.responsibility == "full" else anchor
+        skeleton = Skeleton(state.coalition, state.target, depth=depth, near=depth == 1, far=depth > 1)
+        anchor = self._propose(skeleton, state, world=world, ego_plan=ego_plan, keep_route=True)
+        return self._held(anchor, state, world=world) if self.responsibility == "full" else anchor
 
     def _held(self, anchor: Anchor, state: E2State, world: World) -> Anchor:
         """The anchor in which members that can no longer meet the ego go on with their last proposal while they are
@@ -179,31 +179,31 @@ class Coalitions(NominalTraffic):
         settings = (self.anchor, self.interception)
         lawful = self.responsibility == "full"
         now = state.now
-        wish = Wish(state.eta, now.moment, now.wrong_way)
+        wish = Wish(state.eta, now.moment, wrong_way=now.wrong_way)
         return propose(world.scene, world, skeleton, ego_plan, *settings, wish, keep_route, lawful)
 
     def _select(self, state: E2State, world: World, ego_plan: Tensor) -> E2State:
         """Topology on a reference rollout, feasibility, skeleton; the coalition takes the routes that meet targets."""
         scene = world.scene
         vehicles = state.routed.route.shape[1]
-        context = self.encode(state, world, ego_plan)
+        context = self.encode(state, world, ego_plan=ego_plan)
         nominal = self.prior.plan(self.prior.estimate(context), context)
         reference = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1).transpose(1, 2)
         valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
-        found = topological_candidates(reference, valid, scene["size"][:, :vehicles], self.topology)
+        found = topological_candidates(reference, valid, size=scene["size"][:, :vehicles], settings=self.topology)
         feasible = self.feasible_vehicles(scene, world, self.feasibility).mask
         steps = round(STEP / DT)
         expected = reference[:, steps - 1 :: steps].transpose(1, 2)
-        support, fallback = self._support(state, world, found.candidates, feasible)
-        may = eligible(world, state.now.whom, self.responsibility == "full")
+        support, fallback = self._support(state, world, candidates=found.candidates, feasible=feasible)
+        may = eligible(world, state.now.whom, lawful=self.responsibility == "full")
         support = support & may
         fallback = fallback & may
-        anchor = self._propose(direct(support | fallback), state, world, ego_plan)  # its cost chooses the near agents
-        cost = anchor.cost + state.now.scatter[:, None] * noise_of(state.seed, SCATTER + state.replans, (vehicles,))
+        anchor = self._propose(direct(support | fallback), state, world=world, ego_plan=ego_plan)  # its cost chooses the near agents
+        cost = anchor.cost + state.now.scatter[:, None] * noise_of(state.seed, SCATTER + state.replans, shape=(vehicles,))
         limits = state.near, state.far
-        skeleton = build_skeleton(scene, world, support, fallback, self.skeleton, expected, cost, limits)
+        skeleton = build_skeleton(scene, world, support=support, feasible=fallback, settings=self.skeleton, expected=expected, cost=cost, limits=limits)
         if bool(skeleton.far.any()):  # otherwise everybody meets the ego, as just proposed
-            anchor = self._propose(skeleton, state, world, ego_plan)
+            anchor = self._propose(skeleton, state, world=world, ego_plan=ego_plan)
         # Infeasible configurations are pruned (Sec. IV-A3): members without a proposal, and whoever acts through them.
         members = skeleton.coalition & (state.eta > 0)[:, None]
         acts = members & anchor.feasible
@@ -225,7 +225,7 @@ class Coalitions(NominalTraffic):
             at = reference[:, found.steps]
             self.on_decision(Selection(state.seed, world.step, at, moments, found.weights, *chosen, self.topology))
         route = torch.where(acts, anchor.route, state.routed.route)
-        return self._onto(state, world, route, acts & False, anchor.off_lane_path)
+        return self._onto(state, world, route=route, off_lane=acts & False, paths=anchor.off_lane_path)
 
     def _route_nats(self, scene: TensorDictBase, route: Tensor) -> Tensor:
         """-log p of candidates route [B, V] under the prior's own choice of routes."""
@@ -239,7 +239,7 @@ class Coalitions(NominalTraffic):
         if self.support == "random":
             there = world.valid[:, : feasible.shape[1]] & ~state.routed.parked
             there = there & (torch.arange(feasible.shape[1], device=there.device) > 0)
-            draw = noise_of(state.seed, SUPPORT + state.replans, tuple(feasible.shape[1:]), uniform=True)
+            draw = noise_of(state.seed, SUPPORT + state.replans, shape=tuple(feasible.shape[1:]), uniform=True)
             rank = draw.masked_fill(~there, torch.inf).argsort(-1).argsort(-1)
             chosen = there & (rank < state.near[:, None])
             return chosen, chosen
@@ -251,4 +251,4 @@ class Coalitions(NominalTraffic):
         changed = (route != state.routed.route) | off_lane | state.off_lane
         if not bool(changed.any()):
             return state
-        return replace(onto(state, world, route, changed, off_lane, paths), off_lane=off_lane)
+        return replace(onto(state, world, route=route, moved=changed, off_lane=off_lane, paths=paths), off_lane=off_lane)

@@ -81,7 +81,7 @@ class Pull:
 def pull_to(x0: Tensor, goal: Tensor, vehicles: Tensor, strength: Tensor, level: Tensor) -> Tensor:
     """`Pull` of x0 at a noise level."""
     goal = torch.where(goal.isnan(), x0, goal)
-    moved = pulled(x0, goal, strength[:, None, None], level, NoiseSchedule())
+    moved = pulled(x0, goal, strength=strength[:, None, None], level=level, schedule=NoiseSchedule())
     return torch.where(vehicles[..., None], moved, x0)
 
 
@@ -117,7 +117,7 @@ class SparseControl:
         if self.settings.anchoring == "clean" and self.strength > 0:
             lateral = torch.full_like(self.anchor.knots[..., : SIZE - KNOTS], torch.nan)
             goal = torch.cat([self.anchor.knots / ACCEL_SCALE, lateral], -1)
-            self.pulls.append(Pull(goal, self.anchor.feasible & self.coalition, self.strength * self.eta))
+            self.pulls.append(Pull(goal, self.anchor.feasible & self.coalition, strength=self.strength * self.eta))
 
     def __call__(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Callable[[Tensor], Tensor]
@@ -125,11 +125,11 @@ class SparseControl:
         """x [B, V, SIZE] of step k and its noise level -> (x after anchoring, clean estimate x0, controlled x0)."""
         settings = self.settings
         if k == self.anchor_step and settings.anchoring == "literal" and self.strength > 0:
-            x = self._blended(x, level, context, denoise)
-        x0, adversarial, feasibility = self._gradients(x, level, k, context, denoise)
+            x = self._blended(x, level, context=context, denoise=denoise)
+        x0, adversarial, feasibility = self._gradients(x, level, k=k, context=context, denoise=denoise)
         if k == 1:
             return x, x0, self._driven(x0)
-        weight = gradient_weight(self.prior.schedule, level, settings.scaling)
+        weight = gradient_weight(self.prior.schedule, level, scaling=settings.scaling)
         moved = x0
         if self.has_coalition:
             adversarial = clip_rows(weight * adversarial, settings.adversarial_clip)

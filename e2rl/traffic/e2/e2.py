@@ -77,22 +77,22 @@ class E2(Coalitions):
         if not bool((state.eta > 0).any()) or self.control.transport_budget == 0:
             return super().replan_group(now)
         world = replace(now.world, route=state.routed.route)
-        state, anchor = self._reselected(state, world, ego_plan)
-        state, anchor = self._afforded(state, world, anchor)
-        context = self.encode(state, world, ego_plan, now.before)
+        state, anchor = self._reselected(state, world, ego_plan=ego_plan)
+        state, anchor = self._afforded(state, world, anchor=anchor)
+        context = self.encode(state, world, ego_plan=ego_plan, known=now.before)
         anchored = anchor.feasible & state.coalition
         acts = anchored if self.control.anchoring != "off" else anchored & state.off_lane
         state = replace(state, committed=acts, knots=anchor.knots)
         if self.kernels.samples == 1 or not bool(self._affords(state).any()):
-            control = self._control(state, world, ego_plan, anchor)
+            control = self._control(state, world, ego_plan=ego_plan, anchor=anchor)
             sample = self.prior.sample(context, now.noise, control, self._budget(state))
             x0 = sample.x0
             kl = sample.kl
             jump = control.jump
             state = replace(state, drawn=state.drawn & False)
         else:
-            attack, kernels = self._kernels(state, world, ego_plan, context, acts)
-            state, x0, kl, jump = self._best(state, attack, kernels, anchor, context, now.noise)
+            attack, kernels = self._kernels(state, world, ego_plan=ego_plan, context=context, acts=acts)
+            state, x0, kl, jump = self._best(state, attack, kernels=kernels, anchor=anchor, context=context, noise=now.noise)
         members = state.coalition | state.drawn
         decided = state.now
         given = (self.responsibility, self.yielding, world, members)
@@ -102,7 +102,7 @@ class E2(Coalitions):
     def _afforded(self, state: E2State, world: World, anchor: Anchor) -> tuple[E2State, Anchor]:
         """States with the interceptions under way and their nats booked; those beyond the budget are off."""
         off_lane = anchor.off_lane & state.coalition & (state.eta > 0)[:, None]
-        cost = sideways(anchor, world, state.lane, state.routed.route, off_lane)
+        cost = sideways(anchor, world, lane=state.lane, route=state.routed.route, off_lane=off_lane)
         budget = self._budget(state)
         if budget is not None:
             held = (cost.sum(-1) <= budget)[:, None]
@@ -110,7 +110,7 @@ class E2(Coalitions):
             off_lane = off_lane & held
             cost = cost * held
         state = replace(state, path_kl=state.path_kl + cost)
-        return self._onto(state, world, state.routed.route, off_lane, anchor.off_lane_path), anchor
+        return self._onto(state, world, route=state.routed.route, off_lane=off_lane, paths=anchor.off_lane_path), anchor
 
     def _kernels(
         self, state: E2State, world: World, ego_plan: Tensor, context: Context, acts: Tensor
@@ -120,11 +120,11 @@ class E2(Coalitions):
         plan = self.prior.decode(mean, context).states()
         more = state.coalition.sum(1) < state.near  # of the scene's template
         free = context.active & ~acts & (state.coalition | more[:, None]) & (state.eta > 0)[:, None]
-        free &= eligible(world, state.now.whom, False) | (state.now.whom == ANY)[:, None]
-        attack = KernelAttack.of(world, free, ego_plan, plan, state.since, state.settled)
+        free &= eligible(world, state.now.whom, lawful=False) | (state.now.whom == ANY)[:, None]
+        attack = KernelAttack.of(world, free, ego_plan=ego_plan, plan=plan, since=state.since, settled=state.settled)
         gain = self.kernels.gain * state.eta
         count = self.kernels.samples - 1
-        return attack, propose_kernels(attack, state.lane, state.routed.points, mean, gain, count)
+        return attack, propose_kernels(attack, state.lane, points=state.routed.points, mean=mean, gain=gain, count=count)
 
     def _best(
         self, state: E2State, attack: KernelAttack, kernels: Kernels, anchor: Anchor, context: Context, noise: Tensor
@@ -140,21 +140,21 @@ class E2(Coalitions):
         many, goal, drawn = tries(kernels, rows)
         copies = take_rows(state, many)
         context = of_scenes(context, many)
-        pull = Pull(goal, drawn, self.kernels.pull * copies.eta)
+        pull = Pull(goal, drawn, strength=self.kernels.pull * copies.eta)
         given = take_rows(attack.world, many), attack.ego_plan[many], take_rows(anchor, many)
         control = self._control(copies, *given, pull)
-        choice = choice_nats(rows, len(state.eta), count)
+        choice = choice_nats(rows, len(state.eta), count=count)
         budget = self._budget(copies)
         sample = self.prior.sample(context, noise[:, many], control, None if budget is None else budget - choice)
         kl = torch.where(drawn, torch.maximum(sample.kl, sample.log_ratio), sample.kl)
         kl = torch.cat([choice[:, None], kl[:, 1:]], 1)
-        worth, prevented = self._worth(attack, context, sample.x0, many)
+        worth, prevented = self._worth(attack, context, x0=sample.x0, many=many)
         value = self.kernels.gain * copies.eta * worth.amax(-1) - kl.sum(-1)
         if budget is not None:
             value = value.masked_fill(drawn.any(1) & (kl.sum(-1) > budget), -torch.inf)
-        pick = best_try(value, rows, len(state.eta))
+        pick = best_try(value, rows, batch=len(state.eta))
         settled = state.settled | (drawn & (worth > 0) & prevented)[pick]
-        since = time_before(attack.world, attack.ego_plan, state.since)
+        since = time_before(attack.world, attack.ego_plan, since=state.since)
         state = replace(state, drawn=drawn[pick], settled=settled, since=since)
         return state, sample.x0[pick], kl[pick], control.jump[pick]
 
@@ -179,6 +179,6 @@ class E2(Coalitions):
         routed = state.routed
         now = world.states[:, :vehicles], state.lane.a, world.valid[:, :vehicles]
         seen = PotentialContext(world.scene, *now, routed.points, routed.has_lane, ego_plan[:, :HORIZON], state.target)
-        literal = noise_of(state.seed, LITERAL + state.replans, (*state.target.shape[1:], SIZE))
+        literal = noise_of(state.seed, LITERAL + state.replans, shape=(*state.target.shape[1:], SIZE))
         given = self.prior, self.control, self.potentials, seen, state.coalition, state.eta
         return SparseControl(*given, anchor, self.anchor.strength, literal, kernel)

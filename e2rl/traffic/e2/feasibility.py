@@ -84,9 +84,9 @@ def _sample(route: Tensor, s: Tensor, end: Tensor, speed: Tensor, length: Tensor
     speed = speed[:, None]
     half = length[:, None] / 2
     xy, heading, _ = interpolate(route, arc)
-    earliest, _ = arrival_window(distance - half, speed, acceleration)
-    _, latest = arrival_window(distance + half, speed, acceleration)
-    return _Samples(arc, xy, heading, earliest, latest, distance / speed.clamp(min=1.0), arc <= end[:, None])
+    earliest, _ = arrival_window(distance - half, speed, acceleration=acceleration)
+    _, latest = arrival_window(distance + half, speed, acceleration=acceleration)
+    return _Samples(arc, xy, heading=heading, earliest=earliest, latest=latest, nominal=distance / speed.clamp(min=1.0), on_route=arc <= end[:, None])
 
 
 def _conflict_samples(own: _Samples, ego: _Samples, settings: FeasibilitySettings) -> tuple[Tensor, ...]:
@@ -130,16 +130,16 @@ def find_conflicts(scene: TensorDictBase, world: World, own_s: Tensor, settings:
     asked[:, 0] = False
     at = b, v, r = asked.nonzero(as_tuple=True)  # padding would be most of the work
     ego_s = project(states[:, :1, :2], mission.points)[0][:, 0]
-    ego = _sample(mission.points, ego_s, mission.end, states[:, 0, 3], length[:, 0], EGO_ACCELERATION)
+    ego = _sample(mission.points, ego_s, end=mission.end, speed=states[:, 0, 3], length=length[:, 0], acceleration=EGO_ACCELERATION)
     ego = _Samples(*(value[b] for value in ego))
     route = scene["route_points"][at]
     end = scene["route_length"][at]
-    own = _sample(route, own_s[at], end, states[b, v, 3], length[b, v], MAX_ACCELERATION)
-    i, j, earliest, latest, time_gap = _conflict_samples(own, ego, settings)
+    own = _sample(route, own_s[at], end=end, speed=states[b, v, 3], length=length[b, v], acceleration=MAX_ACCELERATION)
+    i, j, earliest, latest, time_gap = _conflict_samples(own, ego, settings=settings)
     row = torch.arange(len(b), device=b.device)
     mine = (row, i)
     its = (row, j)
-    conflict_s = own.s[mine] + _to_intersection(own.xy[mine], own.heading[mine], ego.xy[its], ego.heading[its])
+    conflict_s = own.s[mine] + _to_intersection(own.xy[mine], own.heading[mine], ego=ego.xy[its], ego_heading=ego.heading[its])
     found = time_gap.isfinite()
 
     def table(value: Tensor) -> Tensor:
@@ -170,11 +170,11 @@ def feasible_vehicles(scene: TensorDictBase, world: World, settings: Feasibility
     states = world.states[:, :vehicles].detach()
     s, d, error = frenet_pose(states, scene["route_points"])
     on_lane = (d.abs() <= LATERAL_BOUND) & (error.abs() <= HEADING_BOUND) & scene["route_valid"]
-    associated = on_lane.any(-1) & (off_road(states[..., :2], scene["field"], scene["field_origin"]) <= 0)
-    conflicts = find_conflicts(scene, world, s, settings)
+    associated = on_lane.any(-1) & (off_road(states[..., :2], scene["field"], origin=scene["field_origin"]) <= 0)
+    conflicts = find_conflicts(scene, world, own_s=s, settings=settings)
     conflicting = conflicts.exists.any(-1)
     moving = states[..., 3] > MOVING_SPEED
     relevant = (moving | blocks_ego(scene, world)) & ~scene["parked"][:, :vehicles]
     mask = world.valid[:, :vehicles] & associated & conflicting & relevant
     mask[:, 0] = False
-    return Feasibility(mask, associated, conflicting, relevant, conflicts)
+    return Feasibility(mask, associated, conflicting=conflicting, relevant=relevant, conflicts=conflicts)

@@ -47,13 +47,13 @@ def foresee(path: Tensor, size: Tensor, tracks: Tensor, sizes: Tensor, since: Te
     """
     plans = tracks.transpose(1, 2)
     box = sizes[:, None].expand(*tracks.shape[:2], 2)
-    along = along_way(path, size[:, 1], Tracks(plans, box, torch.ones_like(plans[..., 0], dtype=torch.bool)))
-    hit, time = _contacts(path, size[:, 0], along, since)
+    along = along_way(path, size[:, 1], others=Tracks(plans, box, present=torch.ones_like(plans[..., 0], dtype=torch.bool)))
+    hit, time = _contacts(path, size[:, 0], along=along, since=since)
     prevented = ~hit[0]
     horizon = DT * tracks.shape[2]
     worth = (hit[1:] * path.new_tensor(WEIGHTS)[:, None, None]).sum(0)
     worth = worth * (prevented | settled[:, None]) * (1 - SOON * time.clamp(max=horizon) / horizon)
-    return Foresight(worth, prevented, time)
+    return Foresight(worth, prevented, time=time)
 
 
 def _contacts(path: Tensor, length: Tensor, along: Along, since: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,11 +110,11 @@ def meet(
     hit = hit > 0
     front = front > 0
     reacts = reacts > 0
-    memory = DriverState(since, brakes, hit)
+    memory = DriverState(since, brakes, decided=hit)
     for t in range(own.shape[0]):
         gap = rear[t] - way - length / 2
         met, lateral, long = (value[t].expand_as(gap) for value in (other, aside, extent))
-        seen = Observation(speed, way, gap, met, lateral, way, lateral <= 0, length, long)
+        seen = Observation(speed, way, gap=gap, other_speed=met, lateral_gap=lateral, lateral_speed=way, overlaps=lateral <= 0, length=length, other_length=long)
         memory, asked = drivers.step(memory, seen)
         reacts = reacts | (asked < -1.0)
         planned = own[t].expand_as(speed)
@@ -135,7 +135,7 @@ def time_before(world: World, ego_plan: Tensor, since: Tensor) -> Tensor:
     size = world.scene["size"]
     path = torch.cat([world.states[:, :1], ego_plan[:, :HORIZON]], 1)
     present = world.valid[:, None, :vehicles]
-    seen = along_way(path, size[:, 0, 1], Tracks(world.states[:, None, :vehicles], size[:, :vehicles], present))
+    seen = along_way(path, size[:, 0, 1], others=Tracks(world.states[:, None, :vehicles], size[:, :vehicles], present=present))
     gap = seen.rear[0] - size[:, :1, 0] / 2
     closing = world.states[:, :1, 3].abs() - seen.speed[0]
     driver = HumanDriver()

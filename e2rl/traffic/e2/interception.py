@@ -108,9 +108,9 @@ def _paths(states: Tensor, meeting: Tensor) -> _Paths:
     heading, bearing, xy = (x.repeat_interleave(ENDS, 2) for x in (heading, bearing, meeting[..., :2]))
     start = states[:, :, None, :2].expand_as(xy)
     u = torch.linspace(0, 1, SAMPLES, device=states.device)
-    points, tangents = cubic(start, heading, xy, end_heading, u)
+    points, tangents = cubic(start, heading, end=xy, end_heading=end_heading, u=u)
     length = torch.nn.functional.pad(points.diff(dim=3).norm(dim=-1).cumsum(-1), (1, 0))
-    return _Paths(points, tangents, length, bearing, wrap(end_heading - heading), end_heading)
+    return _Paths(points, tangents, length=length, bearing=bearing, turn=wrap(end_heading - heading), end_heading=end_heading)
 
 
 def _lateral(paths: _Paths, speed: Tensor, accel: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,7 +125,7 @@ def _within(
     settings: InterceptionSettings, paths: _Paths, speed: Tensor, accel: Tensor, time: Tensor, eta: Tensor
 ) -> Tensor:
     """Bool [B, M, O]: paths entered at speed [B, M, 1], driven at accel for time [B, M, O], keep the limits of eta."""
-    lateral, curvature = _lateral(paths, speed, accel)
+    lateral, curvature = _lateral(paths, speed, accel=accel)
     ok = (accel <= settings.push * eta) & (accel >= -settings.brake * eta) & (speed + accel * time >= 0)
     ok &= (lateral <= settings.lateral * eta) & (curvature < SHARPEST)
     return ok & (paths.bearing.abs() < MAX_BEARING) & (paths.turn.abs() < MAX_TURN)
@@ -135,8 +135,8 @@ def _on_road(paths: _Paths, states: Tensor, scene: TensorDictBase) -> Tensor:
     """Bool [B, M, O]: paths from states [B, M, 4] leave the drivable area by no more than the shoulder, or than now."""
     field = scene["field"]
     origin = scene["field_origin"]
-    allowed = off_road(states[..., :2], field, origin).clamp(min=SHOULDER)[..., None]
-    return off_road(paths.points, field, origin).amax(-1) <= allowed
+    allowed = off_road(states[..., :2], field, origin=origin).clamp(min=SHOULDER)[..., None]
+    return off_road(paths.points, field, origin=origin).amax(-1) <= allowed
 
 
 def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
@@ -193,30 +193,30 @@ def intercept(
     alike = wrap(paths.end_heading - meeting[..., 2].repeat_interleave(ENDS, -1)).cos().clamp(min=0) ** 2
     length = paths.length[..., -1] - 0.4 * (size[..., 0] + target_size[..., 0])[..., None] * alike
     accel = 2 * (length.clamp(min=0) - v * time) / time**2
-    ok = _within(settings, paths, v, accel, time, wish.eta[:, None, None])
-    ok &= _on_road(paths, states, scene)
+    ok = _within(settings, paths, speed=v, accel=accel, time=time, eta=wish.eta[:, None, None])
+    ok &= _on_road(paths, states, scene=scene)
     if halt_at_red:
         assert world.route is not None
         followed = take(world.route, index)[..., None].clamp(min=0)
-        ok &= paths.length[..., -1] <= distance_to_stop_line(world, index, followed)
+        ok &= paths.length[..., -1] <= distance_to_stop_line(world, index, number=followed)
     travelled = (v[..., None] * times + 0.5 * accel[..., None] * times**2).clamp(min=0)
     travelled = travelled.masked_fill(times >= time[..., None], -1.0)
     row = torch.arange(vehicles, device=index.device)
     counts = world.valid[:, None, :vehicles] & (row != index[..., None]) & (row != target[..., None])
-    ok &= _clear(paths, travelled, size, (expected[:, :, steps - 1], scene["size"][:, :vehicles], counts))
-    cost = ACCEL_COST * accel.abs() + LATERAL_COST * _lateral(paths, v, accel)[0]
+    ok &= _clear(paths, travelled, size=size, others=(expected[:, :, steps - 1], scene["size"][:, :vehicles], counts))
+    cost = ACCEL_COST * accel.abs() + LATERAL_COST * _lateral(paths, v, accel=accel)[0]
     cost = cost + TIME_COST * time
     cost = cost + MOMENT_COST * ((time - wish.moment[:, None, None]).abs() * (wish.moment >= 0)[:, None, None])
     wrong_way = settings.wrong_way + wish.wrong_way
     if bool((wrong_way > 0).any()):
-        against = _against_lanes(scene, meeting, paths.end_heading)
+        against = _against_lanes(scene, meeting, end_heading=paths.end_heading)
         cost = torch.where(against, cost + wrong_way[:, None, None], cost)
-    cost = cost - WORTH * _foresight(world, expected[:, 0], states, size, paths, accel, ok)
+    cost = cost - WORTH * _foresight(world, expected[:, 0], states=states, size=size, paths=paths, accel=accel, ok=ok)
     cost, pick = (cost - settings.preference).masked_fill(~ok, torch.inf).min(-1)
     knot_times = DT * KNOT_STEPS * torch.arange(1, HORIZON // KNOT_STEPS + 1, device=cost.device)
     knots = take_route(accel, pick)[..., None] * (knot_times <= take_route(time, pick)[..., None])
     points, length, heading = (take_route(x, pick) for x in (paths.points, paths.length, paths.end_heading))
-    return Interception(_resampled(points, length, heading, scene["route_points"].shape[3]), knots, cost)
+    return Interception(_resampled(points, length, heading=heading, count=scene["route_points"].shape[3]), knots, cost=cost)
 
 
 def _tracks(paths: _Paths, speed: Tensor, accel: Tensor) -> Tensor:
@@ -225,10 +225,10 @@ def _tracks(paths: _Paths, speed: Tensor, accel: Tensor) -> Tensor:
     time = DT * torch.arange(HORIZON + 1, device=speed.device)
     v = (speed[..., None] + accel[..., None] * time).clamp(min=0)
     driven = ((v[..., 1:] + v[..., :-1]) / 2 * DT).cumsum(-1)
-    tangent = _at(paths.tangents, paths.length, driven)
+    tangent = _at(paths.tangents, paths.length, s=driven)
     heading = torch.atan2(tangent[..., 1], tangent[..., 0])
     beyond = (driven - paths.length[..., -1:]).clamp(min=0)
-    xy = _at(paths.points, paths.length, driven) + beyond[..., None] * direction(heading)
+    xy = _at(paths.points, paths.length, s=driven) + beyond[..., None] * direction(heading)
     return torch.cat([xy, heading[..., None], v[..., 1:, None]], -1)
 
 
@@ -241,11 +241,11 @@ def _foresight(
     worth = torch.zeros_like(accel)
     if not len(row):
         return worth
-    tracks = _tracks(_Paths(*(value[at] for value in paths)), states[at][:, None, 3], accel[at])
+    tracks = _tracks(_Paths(*(value[at] for value in paths)), states[at][:, None, 3], accel=accel[at])
     plans = torch.cat([states[at][:, None, None].expand(*tracks.shape[:2], 1, 4), tracks], 2)
     path = torch.cat([world.states[:, :1], ego_plan], 1)[row]
     never = torch.full_like(path[:, 0, 3], -1.0)
-    seen = foresee(path, world.scene["size"][row, 0], plans, size[at], never, never > 0)
+    seen = foresee(path, world.scene["size"][row, 0], tracks=plans, sizes=size[at], since=never, settled=never > 0)
     return worth.index_put(at, seen.worth)
 
 
@@ -254,14 +254,14 @@ def _against_lanes(scene: TensorDictBase, meeting: Tensor, end_heading: Tensor) 
     batch, count, moments = meeting.shape[:3]
     heading = end_heading.reshape(batch, count * moments, ENDS)
     xy = meeting[..., :2].flatten(1, 2)
-    return against_lanes(scene["lane_points"], scene["lane_index"], xy, heading).view_as(end_heading)
+    return against_lanes(scene["lane_points"], scene["lane_index"], xy=xy, heading=heading).view_as(end_heading)
 
 
 def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> Tensor:
     """Vertices [B, M, count, 2] every SPACING m along points [B, M, U, 2] at length [B, M, U], then along `heading`."""
     s = SPACING * torch.arange(count, device=points.device, dtype=points.dtype).expand(*length.shape[:2], count)
     beyond = (s - length[..., -1:]).clamp(min=0)
-    return _at(points, length, s) + beyond[..., None] * direction(heading)[:, :, None]
+    return _at(points, length, s=s) + beyond[..., None] * direction(heading)[:, :, None]
 
 
 def _at(values: Tensor, length: Tensor, s: Tensor) -> Tensor:

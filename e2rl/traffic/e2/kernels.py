@@ -126,13 +126,13 @@ def sideways(anchor: Anchor, world: World, lane: LaneState, route: Tensor, off_l
 @fused("Q 4", "Q", "Q P 2!", "Q P 2!", f"Q {KNOTS}")
 def lateral_nats(states: Tensor, lane: LaneState, points: Tensor, path: Tensor, knots: Tensor) -> Tensor:
     """`sideways` [Q] of vehicles that leave lanes points [Q, P, 2] for a path [Q, P, 2]."""
-    now = lane_relative.locate(states, lane.a, lane.kappa * lane.v, points)
+    now = lane_relative.locate(states, lane.a, yaw_rate=lane.kappa * lane.v, points=points)
     speed, travelled = lane_relative.speeds(now, knots)
     start = project(states[:, None, :2], path)[0]
     xy, heading, _ = interpolate(path, start + travelled)
-    s, d, _ = project(xy, points, now.s[..., None] + travelled)
-    track = LaneState.from_states(torch.cat([xy, heading[..., None], speed[..., None]], -1), s, d)
-    x = lane_relative.fit(track, None, now)[0]
+    s, d, _ = project(xy, points, hint=now.s[..., None] + travelled)
+    track = LaneState.from_states(torch.cat([xy, heading[..., None], speed[..., None]], -1), s, d=d)
+    x = lane_relative.fit(track, None, state=now)[0]
     variance = torch.tensor(SPREAD[KNOTS:], device=x.device).square()
     return (x[..., KNOTS:].square() / (2 * variance)).sum(-1)
 
@@ -160,7 +160,7 @@ class KernelAttack:
         points = plan[..., 4::5, :2]
         aside = torch.cdist(points, way.expand(*points.shape[:2], -1, -1)).flatten(2).amin(-1)
         near = active & (gap < REACH) & (aside < ASIDE) & (plan[..., 3].amax(-1) > STIRS)
-        row, vehicle = smallest(near, gap, NEAREST).nonzero(as_tuple=True)
+        row, vehicle = smallest(near, gap, count=NEAREST).nonzero(as_tuple=True)
         return cls(row, vehicle, world, ego_plan, plan, since[row, vehicle], settled[row, vehicle])
 
     def foresight(self, tracks: Tensor, rows: Tensor | None = None) -> Foresight:
@@ -172,7 +172,7 @@ class KernelAttack:
         states = self.world.states
         now = states[row, vehicle, None, None].expand(*tracks.shape[:2], 1, 4)
         path = torch.cat([states[:, :1], self.ego_plan[:, :HORIZON]], 1)[row]
-        return foresee(path, size[row, 0], torch.cat([now, tracks], 2), size[row, vehicle], since, settled)
+        return foresee(path, size[row, 0], tracks=torch.cat([now, tracks], 2), sizes=size[row, vehicle], since=since, settled=settled)
 
     def impossible(self, tracks: Tensor, lateral: Tensor, time: Tensor) -> Tensor:
         """Bool [G, O]: plans [G, O, H, 4] that leave the road, turn too sharply (lateral [G, O] m/s^2) or touch others
@@ -204,7 +204,7 @@ class KernelAttack:
         every = pose[place].flatten(1, 2)
         points = self.world.scene["lane_points"][scene]
         line = self.world.scene["lane_index"][scene]
-        found = against_lanes(points, line, every[..., :2], every[..., 2, None]).view(*place.shape, -1)
+        found = against_lanes(points, line, xy=every[..., :2], heading=every[..., 2, None]).view(*place.shape, -1)
         wrong = torch.zeros(pose.shape[:2], dtype=torch.bool, device=pose.device)
         wrong[place[there]] = found[there]
         return wrong.view(at.shape).any(-1)
@@ -221,7 +221,7 @@ def propose_kernels(
     at = (attack.row, attack.vehicle)
     if not len(attack.row):
         nobody = gain.new_full((len(mean), count), -1, dtype=torch.int64)
-        return Kernels(mean.new_zeros(len(mean), count, SIZE), nobody, mean.shape[1])
+        return Kernels(mean.new_zeros(len(mean), count, SIZE), nobody, vehicles=mean.shape[1])
     x = mean[at][:, None] + table
     start = lane.map(lambda value: value[at][:, None].expand(x.shape[:2]))
     motion = lane_relative.decode_options(x, start, points[at])
@@ -246,7 +246,7 @@ def propose_kernels(
         alike = nats(table - table[option][:, None]) < APART  # [B, O]
         mine = torch.nn.functional.one_hot(vehicle, mean.shape[1]).bool()
         of_scene = of_scene.masked_fill(mine[..., None] & alike[:, None], -torch.inf)
-    return Kernels(torch.stack(goals, 1), torch.stack(vehicles, 1), mean.shape[1])
+    return Kernels(torch.stack(goals, 1), torch.stack(vehicles, 1), vehicles=mean.shape[1])
 
 
 def tries(kernels: Kernels, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:

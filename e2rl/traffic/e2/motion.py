@@ -83,7 +83,7 @@ def constant_speed_states(scene: TensorDictBase, world: World, times: Tensor) ->
     s, d, _ = project(states[:, :, None, :2], route)
     speed = states[..., 3:]
     travelled = speed * times
-    along = states_on_route(route, s + travelled, d * remaining_offset(travelled, speed), speed)
+    along = states_on_route(route, s + travelled, d=d * remaining_offset(travelled, speed), speed=speed)
     xy = states[:, :, None, :2] + travelled[..., None] * direction(states[..., 2])[:, :, None]
     straight = torch.cat([xy, states[:, :, None, 2:].expand(*travelled.shape, 2)], -1)
     return torch.where(has_route[..., None, None], along, straight)
@@ -122,9 +122,9 @@ def distance_to_stop_line(world: World, index: Tensor, number: Tensor) -> Tensor
     scene = world.scene
     states = take(world.states, index)
     at = (torch.arange(len(index), device=index.device)[:, None, None], index[..., None], number)
-    light = light_state_at(scene["light_state"], scene["route_light"][at], world.step)
+    light = light_state_at(scene["light_state"], scene["route_light"][at], step=world.step)
     front = project(states[:, :, None, None, :2], scene["route_points"][at])[0][..., 0]
     front = front + take(scene["size"], index)[..., None, 0] / 2
     ahead = scene["route_light_s"][at] - front[..., None]
     speed = states[:, :, None, 3].expand_as(front)
-    return stop_line_distance(light, ahead, speed, MAX_BRAKING, YELLOW_BRAKING)
+    return stop_line_distance(light, ahead, speed=speed, red_braking=MAX_BRAKING, yellow_braking=YELLOW_BRAKING)

@@ -60,11 +60,11 @@ class PotentialSettings:
 
     def adversarial(self, states: Tensor, context: "PotentialContext", temperature: Tensor | float) -> Tensor:
         """Returns V_adv [B, V], which adversaries lower: see `adversarial_potential`."""
-        return adversarial_potential(states, context, self, temperature)
+        return adversarial_potential(states, context, settings=self, temperature=temperature)
 
     def feasibility(self, states: Tensor, context: "PotentialContext") -> Tensor:
         """Returns V_feas [B, V], which all vehicles lower: see `feasibility_potential`."""
-        return feasibility_potential(states, context, self)
+        return feasibility_potential(states, context, settings=self)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class PotentialContext:
     @cached_property
     def start_off_road(self) -> Tensor:
         """Metres [B, V] off the drivable area at present."""
-        return off_road(self.start[..., :2], self.scene["field"], self.scene["field_origin"])
+        return off_road(self.start[..., :2], self.scene["field"], origin=self.scene["field_origin"])
 
 
 def annealed_temperature(noise_level: Tensor | float, settings: PotentialSettings) -> Tensor:
@@ -143,12 +143,12 @@ def _neighbours(states: Tensor, context: PotentialContext, size: Tensor) -> tupl
 def _overlap_term(states: Tensor, context: PotentialContext) -> Tensor:
     """Squared shortfall of the gap to neighbours [m^2], at most the present gap; mean over steps, their sum [B, V]."""
     size = context.scene["size"][:, : states.shape[1]]
-    index, near = _neighbours(states, context, size)
+    index, near = _neighbours(states, context, size=size)
     scene, own, rank = near.nonzero(as_tuple=True)  # most of the nearest are too far to cost anything
     mine = (scene, own)
     them = (scene, index[scene, own, rank])
-    gap = box_gap(states[mine], size[mine][:, None], states.detach()[them], size[them][:, None])
-    present = box_gap(context.start[mine], size[mine], context.start[them], size[them])
+    gap = box_gap(states[mine], size[mine][:, None], other=states.detach()[them], other_size=size[them][:, None])
+    present = box_gap(context.start[mine], size[mine], other=context.start[them], other_size=size[them])
     missing = (present.clamp(max=PAIR_MARGIN)[:, None] - gap).clamp(min=0).square().mean(-1)
     return torch.zeros_like(states[..., 0, 0]).index_put(mine, missing, accumulate=True)
 
@@ -156,14 +156,14 @@ def _overlap_term(states: Tensor, context: PotentialContext) -> Tensor:
 def _road_terms(states: Tensor, context: PotentialContext, settings: PotentialSettings) -> Tensor:
     """Weighted off-road, lateral and wrong-way terms [B, V]; what is no worse than at present costs nothing."""
     scene = context.scene
-    beyond = off_road(states[..., :2], scene["field"], scene["field_origin"])
+    beyond = off_road(states[..., :2], scene["field"], origin=scene["field_origin"])
     allowed = context.start_off_road.clamp(min=-OFF_ROAD_MARGIN)[..., None]
     off_road_term = (beyond - allowed).clamp(0, MAX_EXCESS).square().mean(-1)
     s, d = context.start_frenet
     with torch.no_grad():
         track = torch.cat([context.start[:, :, None, :2], states[..., :2]], 2)
         hint = s[..., None] + track.diff(dim=2).norm(dim=-1).cumsum(-1)
-        xy, heading, _ = interpolate(context.route, project(track[:, :, 1:], context.route, hint, 10.0)[0])
+        xy, heading, _ = interpolate(context.route, project(track[:, :, 1:], context.route, hint=hint, window=10.0)[0])
     cos = heading.cos()
     sin = heading.sin()
     delta = states[..., :2] - xy
@@ -202,8 +202,8 @@ def feasibility_potential(states: Tensor, context: PotentialContext, settings: P
     jerk, wrong way.
     """
     states = with_ego(states, context)
-    road = _road_terms(states, context, settings)
-    motion = _motion_terms(states, context, settings)
+    road = _road_terms(states, context, settings=settings)
+    motion = _motion_terms(states, context, settings=settings)
     value = road + motion + settings.pair * _overlap_term(states, context)
     counted = context.valid.clone()
     counted[:, 0] = False

@@ -54,7 +54,7 @@ def surroundings(world: World, rows: Tensor, agents: Tensor) -> World:
     at = rows[:, None], torch.cat([torch.zeros_like(agents)[:, None], agents[:, None], near.indices], 1)
     valid = torch.cat([world.valid[rows, :1], torch.ones_like(agents)[:, None].bool(), near.values < torch.inf], 1)
     scene = TensorDict({"size": world.scene["size"][at]}, batch_size=rows.shape)
-    return World(scene, world.step[rows], world.states[at], valid, world.accel[at], turn_rate=world.turn_rate[at])
+    return World(scene, world.step[rows], states=world.states[at], valid=valid, accel=world.accel[at], turn_rate=world.turn_rate[at])
 
 
 class Ground(NamedTuple):
@@ -92,7 +92,7 @@ def best_aim(
     aim = Arc(accel, curvature)
     portions = torch.arange(1, CHECKED + 1, device=times.device) / CHECKED
     looked_at = torch.cat([times[:, None], times[:, None].clamp(min=RUN_ON) * portions], 1)
-    path, _ = along_arc(states[:, None], aim, looked_at)
+    path, _ = along_arc(states[:, None], aim, times=looked_at)
     miss = ((path[:, :, 0, :2] - target[..., :2]).norm(dim=-1) - touch).clamp(min=0)
     cost = MISS_COST * miss + ACCEL_COST * accel.abs() + TIME_COST * times
     cost = cost + LATERAL_COST * fastest.square() * curvature.abs()
@@ -113,14 +113,14 @@ def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSe
     """Braking [K] (negative: none is needed) that vehicles owe the ego (duty, [K, 1]) and those near them, if they
     drive their aim [K] and the others go on as they do: motion [K, N] of `surroundings`."""
     steps = torch.arange(STRIDE, round(bounds.look / DT) + 1, STRIDE, device=aim.accel.device)
-    own, driven = along_arc(world.states[:, 1], aim, DT * steps)
+    own, driven = along_arc(world.states[:, 1], aim, times=DT * steps)
     index = [0, *range(2, world.states.shape[1])]
     states = world.states[:, index]
     going_on = Arc(*(value[:, index] for value in motion))
-    tracks, _ = along_arc(states, going_on, DT * steps, HOLD, TURN)  # [K, J, T, 4]
+    tracks, _ = along_arc(states, going_on, times=DT * steps, hold=HOLD, turn=TURN)  # [K, J, T, 4]
     size = world.scene["size"]
     wide = size[:, 1] + size.new_tensor([0.0, 2 * LATERAL_MARGIN])
-    meets = separation(own[:, None], wide[:, None, None], tracks, size[:, index][:, :, None]) < 0
+    meets = separation(own[:, None], wide[:, None, None], second=tracks, second_size=size[:, index][:, :, None]) < 0
     meets = meets & world.valid[:, index][..., None]
     first = meets.int().argmax(-1)
     at = first[..., None, None].expand(*first.shape, 1, 4)
@@ -129,9 +129,9 @@ def braking_for(world: World, aim: Arc, motion: Arc, duty: Duty, bounds: BoundSe
     across = (other[:, :, :1, 2] - own[:, :, :1, 2]).cos() < ALONG
     other[:, :, :1, 3] *= ~across  # whoever turns into the ego's side must stop short of it, not drive as fast as it
     speed = world.states[:, 1, 3] + aim.accel.clamp(min=0) * WAIT  # if it does not brake before it decides again
-    meeting = Meeting(own, other, driven.gather(1, first)[:, None], steps[first][:, None], meets.any(-1)[:, None])
+    meeting = Meeting(own, other, driven=driven.gather(1, first)[:, None], steps=steps[first][:, None], happens=meets.any(-1)[:, None])
     length = (size[:, :1, 0] + size[:, 1:2, 0]) / 2
-    return meeting_braking(meeting, speed[:, None], length, duty)[:, 0]
+    return meeting_braking(meeting, speed[:, None], length=length, duty=duty)[:, 0]
 
 
 NEAR, MOVING = 50.0, 1.0  # m from the ego and m/s: other vehicles that may react
@@ -239,7 +239,7 @@ class Reaiming:
         eta [b]: of replayed attacks, 0 of other traffic; template [b], owes [b] bool, adversaries [b, V] bool: of these
         attacks.
         """
-        part = drawn(self.settings, eta, template, owes, adversaries, horizon, self.generator)
+        part = drawn(self.settings, eta, template=template, owes=owes, adversaries=adversaries, horizon=horizon, generator=self.generator)
         if self._part is None or len(part) == len(self._part):
             self._part = part  # the first reset is of all environments
         else:
@@ -252,7 +252,7 @@ class Reaiming:
         assert part is not None
         due = ~part["chosen"] & (part["start"] <= world.step)
         if bool(due.any()):
-            vehicle, acts = chosen(part, world, self.settings.responsibility)
+            vehicle, acts = chosen(part, world, responsibility=self.settings.responsibility)
             part["vehicle"] = torch.where(due[:, None], vehicle, part["vehicle"])
             part["acts"] = part["acts"] | (acts & due[:, None])
             part["chosen"] = part["chosen"] | due
@@ -261,11 +261,11 @@ class Reaiming:
             return None
         agents = part["vehicle"][row, slot]
         shift = self.settings.scatter * torch.randn(len(row), 2, generator=self.generator).to(row.device)
-        ground = Ground(world.scene["field"], world.scene["field_origin"], row)
-        seen = surroundings(world, row, agents)
-        aim = self.aims(seen, part["eta"][row], shift, ground, part["reckless"][row])
+        ground = Ground(world.scene["field"], world.scene["field_origin"], row=row)
+        seen = surroundings(world, row, agents=agents)
+        aim = self.aims(seen, part["eta"][row], shift=shift, ground=ground, reckless=part["reckless"][row])
         times = DT * torch.arange(1, 2 * REPLAN_STEPS + 1, device=row.device)
-        states, _ = along_arc(seen.states[:, 1], aim, times)
+        states, _ = along_arc(seen.states[:, 1], aim, times=times)
         return row, agents, states
 
     def aims(self, world: World, eta: Tensor, shift: Tensor, ground: Ground, reckless: Tensor) -> Arc:
@@ -278,13 +278,13 @@ class Reaiming:
         length = world.scene["size"][..., 0]
         motion = Arc(world.accel, curvature_of(world.turn_rate, world.states[..., 3]))
         its_motion = Arc(*(value[:, 0] for value in motion))
-        expected, _ = along_arc(world.states[:, 0], its_motion, moments(states), HOLD, TURN)
+        expected, _ = along_arc(world.states[:, 0], its_motion, times=moments(states), hold=HOLD, turn=TURN)
         expected = expected + torch.nn.functional.pad(shift, (0, 2))[:, None]
-        aim = best_aim(states, expected, length[:, 0] + length[:, 1], eta, ground, self.limits)
+        aim = best_aim(states, expected, lengths=length[:, 0] + length[:, 1], eta=eta, ground=ground, limits=self.limits)
         none = aim.accel.isnan()
         aim = Arc(aim.accel.masked_fill(none, -UNAIMED), torch.where(none, motion.curvature[:, 1] / 2, aim.curvature))
         itself = torch.tensor([[False, True]], device=eta.device).expand(len(eta), -1)
-        duty = duty_of(self.settings.responsibility, self.yielding, world, itself, eta)
-        duty = Duty(duty.exempt[:, 1:] | reckless[:, None], duty.yields[:, 1:], duty.patience[:, 1:])
-        braking = braking_for(world, aim, motion, duty, self.bounds)
+        duty = duty_of(self.settings.responsibility, self.yielding, world=world, coalition=itself, eta=eta)
+        duty = Duty(duty.exempt[:, 1:] | reckless[:, None], duty.yields[:, 1:], patience=duty.patience[:, 1:])
+        braking = braking_for(world, aim, motion=motion, duty=duty, bounds=self.bounds)
         return aim._replace(accel=torch.minimum(aim.accel, (-braking).clamp(min=self.bounds.floor)))

@@ -107,7 +107,7 @@ def _next_light(scene: TensorDictBase, step: Tensor, vehicle: int, candidate: in
     """The next light on a candidate route of scene [1] at step [1], where it is ahead of arc length s and known."""
     ahead = float(scene["route_light_s"][0, vehicle, candidate, 0]) - s
     light = scene["route_light"][:, vehicle, candidate, :1]
-    colour = LIGHTS.get(int(light_state_at(scene["light_state"], light, step)))
+    colour = LIGHTS.get(int(light_state_at(scene["light_state"], light, step=step)))
     return f", {colour} light in {ahead:.0f} m" if colour and ahead >= 0 else ""
 
 
@@ -115,7 +115,7 @@ def describe(scene: TensorDictBase, world: World, conflicts: Conflicts, row: int
     """The ego of scene `row` and its mission in words, and every present vehicle that is not parked, by its index."""
     vehicles = scene["route_points"].shape[1]
     present = (world.valid[row, :vehicles] & ~scene["parked"][row, :vehicles]).nonzero()[:, 0].tolist()
-    texts = {vehicle: describe_vehicle(scene, world, conflicts, row, vehicle) for vehicle in present if vehicle > 0}
+    texts = {vehicle: describe_vehicle(scene, world, conflicts=conflicts, row=row, vehicle=vehicle) for vehicle in present if vehicle > 0}
     mission = mission_of(scene[row : row + 1])
     limit = float(mission.limit[0, 10])
     s = project(world.states[row : row + 1, :1, :2], mission.points)[0][0, 0]
@@ -140,7 +140,7 @@ def describe_vehicle(scene: TensorDictBase, world: World, conflicts: Conflicts, 
     for candidate in scene["route_valid"][row, vehicle].nonzero()[:, 0].tolist():
         at = (row, vehicle, candidate)
         course = _course(scene["route_points"][at], s[candidate])
-        light = _next_light(scene[rows], world.step[rows], vehicle, candidate, float(s[candidate]))
+        light = _next_light(scene[rows], world.step[rows], vehicle=vehicle, candidate=candidate, s=float(s[candidate]))
         meeting = "; does not meet the ego's route in time"
         if conflicts.exists[at]:
             meeting = (
@@ -182,7 +182,7 @@ class LanguageReasoner:
 
     def __init__(self, settings: ReasonerSettings) -> None:
         where = "synthesizer.reasoner.kind=lm"
-        openai = library("openai", where, "lm")
+        openai = library("openai", where, extra="lm")
         given: dict[str, Any] = {"base_url": settings.base_url, "timeout": settings.timeout}
         try:
             self._client = openai.OpenAI(**given, max_retries=settings.retries)
@@ -197,9 +197,9 @@ class LanguageReasoner:
     def __call__(self, scene: TensorDictBase, world: World, settings: FeasibilitySettings) -> Feasibility:
         """Feasible vehicles of scenes [B]: `mask` by the model's verdicts on the three criteria, or the rules' where it
         fails; never the ego nor parked ones. All else is the rules'."""
-        rules = feasible_vehicles(scene, world, settings)
+        rules = feasible_vehicles(scene, world, settings=settings)
         criteria = torch.stack([rules.associated, rules.conflicting, rules.relevant], -1).cpu()
-        described = [describe(scene, world, rules.conflicts, row) for row in range(len(world.step))]
+        described = [describe(scene, world, conflicts=rules.conflicts, row=row) for row in range(len(world.step))]
         with ThreadPoolExecutor(self.settings.workers) as pool:
             for row, verdicts in enumerate(pool.map(self._verdicts, *zip(*described, strict=True))):
                 if verdicts:

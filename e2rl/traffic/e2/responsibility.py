@@ -75,14 +75,14 @@ def duty_of(
     nobody = torch.zeros_like(coalition)
     zero = torch.zeros_like(eta[:, None] * coalition)
     if responsibility == "none":
-        return Duty(coalition, nobody, zero)
+        return Duty(coalition, nobody, patience=zero)
     ahead = coalition & (place_of(world, vehicles)[0][..., 0] > 0)
     if responsibility == "rear":
-        return Duty(ahead, nobody, zero)
+        return Duty(ahead, nobody, patience=zero)
     free = coalition & followed(world, vehicles)
     waits = ahead & ~yields_at_once(world, vehicles)
     lateness = torch.ones_like(eta) if lateness is None else lateness
     patience = torch.minimum(settings.patience * eta * lateness, settings.max_patience * lateness.clamp(min=1))
     if owes is not None:
         free = torch.where(owes[:, None], free, coalition)
-    return Duty(free, coalition & ~free, patience[:, None] * waits)
+    return Duty(free, coalition & ~free, patience=patience[:, None] * waits)

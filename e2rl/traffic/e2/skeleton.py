@@ -60,7 +60,7 @@ def limits_of(template: Tensor, settings: SkeletonSettings) -> tuple[Tensor, Ten
 
 def direct(support: Tensor) -> Skeleton:
     """The skeleton in which all of support [B, V] act on the ego directly."""
-    return Skeleton(support, torch.where(support, 0, -1), support.long(), support, torch.zeros_like(support))
+    return Skeleton(support, torch.where(support, 0, -1), depth=support.long(), near=support, far=torch.zeros_like(support))
 
 
 def chain_depth(target: Tensor) -> Tensor:
@@ -179,7 +179,7 @@ def _link_chains(after: Tensor, near: Tensor, far: Tensor, max_links: int) -> tu
         start = initiators[:, k]
         taken = target.gather(1, start[:, None])[:, 0] >= 0
         blocked = (target >= 0) & ~near
-        found, current, parents = _shortest_chain(after, start, near, blocked, max_links)
+        found, current, parents = _shortest_chain(after, start, near=near, blocked=blocked, links=max_links)
         found = torch.where(there[:, k] & ~taken, found, 0)
         linked = (there[:, k] & (taken | (found > 0)))[:, None]
         viable = viable.scatter(1, start[:, None], linked | viable.gather(1, start[:, None]))
@@ -216,23 +216,23 @@ def build_skeleton(
     ego = torch.arange(vehicles, device=states.device) == 0
     support, feasible = (mask & world.valid[:, :vehicles] & ~ego for mask in (support, feasible))
     first, second = (mask & cost.isfinite() for mask in (support, feasible))
-    near = smallest(torch.where(first.any(1, keepdim=True), first, second), cost, most_near)
+    near = smallest(torch.where(first.any(1, keepdim=True), first, second), cost, count=most_near)
     if settings.pursuit:
-        nearest = smallest(torch.where(support.any(1, keepdim=True), support, feasible), distance, most_near)
+        nearest = smallest(torch.where(support.any(1, keepdim=True), support, feasible), distance, count=most_near)
         near = torch.where(near.any(1, keepdim=True), near, nearest)
     index, present = compact(support | near)
     distant = support & ~near & (distance > settings.tau_dist) & (distance <= MAX_DIST)
     distant = present & take(distant, index)
-    distant &= ~_on_ego_lanes(torch.cat([states[:, :1], take(states, index)], 1), distant, scene)
-    far = smallest(distant, -take(distance, index), most_far)
+    distant &= ~_on_ego_lanes(torch.cat([states[:, :1], take(states, index)], 1), distant, scene=scene)
+    far = smallest(distant, -take(distance, index), count=most_far)
     linked = present & far.any(1, keepdim=True)  # no far agent, no chain to look for
-    after = first_after(influence(scene, world, (index, linked), expected, settings))
-    slot_target, viable = _link_chains(after, present & take(near, index), far, settings.max_chain - 1)
+    after = first_after(influence(scene, world, slots=(index, linked), expected=expected, settings=settings))
+    slot_target, viable = _link_chains(after, present & take(near, index), far=far, max_links=settings.max_chain - 1)
     vehicle = torch.cat([index, torch.zeros_like(index[:, :1])], 1)  # of each slot; the last is the ego
     target = torch.full_like(support, -1, dtype=torch.int64)
-    target = put(target, index, slot_target >= 0, vehicle.gather(1, slot_target.clamp(min=0)))
-    far = put(torch.zeros_like(support), index, present, viable)
-    return Skeleton(target >= 0, target, chain_depth(target), near, far)
+    target = put(target, index, mask=slot_target >= 0, rows=vehicle.gather(1, slot_target.clamp(min=0)))
+    far = put(torch.zeros_like(support), index, mask=present, rows=viable)
+    return Skeleton(target >= 0, target, depth=chain_depth(target), near=near, far=far)
 
 
 @dataclass(frozen=True)

@@ -80,8 +80,8 @@ def time_to_collision(states: Tensor, size: Tensor, horizon: float = RISK_SECOND
     turn_sin = (ci * sj - si * cj).abs()
     half = size / 2
     (li, wi), (lj, wj) = half[..., :, None, :].unbind(-1), half[..., None, :, :].unbind(-1)
-    along = _overlap_interval(ci * dx + si * dy, ci * dvx + si * dvy, li + turn_cos * lj + turn_sin * wj)
-    across = _overlap_interval(ci * dy - si * dx, ci * dvy - si * dvx, wi + turn_sin * lj + turn_cos * wj)
+    along = _overlap_interval(ci * dx + si * dy, ci * dvx + si * dvy, extent=li + turn_cos * lj + turn_sin * wj)
+    across = _overlap_interval(ci * dy - si * dx, ci * dvy - si * dvx, extent=wi + turn_sin * lj + turn_cos * wj)
     begin, end = torch.maximum(along[0], across[0]), torch.minimum(along[1], across[1])  # on the normals of box i
     begin = torch.maximum(begin, begin.transpose(-1, -2))
     end = torch.minimum(end, end.transpose(-1, -2))
@@ -145,7 +145,7 @@ def _top_cliques(graph: tuple[np.ndarray, ...], settings: TopologySettings) -> l
         mean = weight_of(clique, weight) / (size * (size - 1) / 2)
         return -round(mean, 6), fsum(distance[i] for i in clique) / size, clique
 
-    trimmed = {_trim(clique, weight, distance, settings.max_clique) for clique in cliques_in(adjacency)}
+    trimmed = {_trim(clique, weight, distance=distance, limit=settings.max_clique) for clique in cliques_in(adjacency)}
     return sorted((clique for clique in trimmed if relevant[list(clique)].any()), key=rank)[: settings.top_cliques]
 
 
@@ -158,10 +158,10 @@ def topological_candidates(states: Tensor, valid: Tensor, size: Tensor, settings
     steps = torch.arange(0, states.shape[1], STRIDE, device=states.device)
     states = states[:, steps].detach()
     valid = valid[:, steps]
-    weights = pair_weights(states, valid, size[:, None].expand(*states.shape[:-1], 2), settings)
+    weights = pair_weights(states, valid, size=size[:, None].expand(*states.shape[:-1], 2), settings=settings)
     distance = (states[..., :2] - states[..., :1, :2]).norm(dim=-1)
     distance = distance.masked_fill(~valid | ~valid[..., :1], torch.inf)
-    nodes = smallest(valid, distance, NODES)
+    nodes = smallest(valid, distance, count=NODES)
     adjacency = (weights >= settings.edge_threshold) & nodes[..., :, None] & nodes[..., None, :]
     # Only cliques with a member within HOPS of the ego count; all their members lie within one hop more.
     relevant = _within_hops(adjacency, HOPS)
@@ -180,5 +180,5 @@ def topological_candidates(states: Tensor, valid: Tensor, size: Tensor, settings
     scored = valid[:, 0] & (score > 0)
     scored[:, 0] = False
     tie = distance.amin(1).argsort(dim=-1, stable=True).argsort(-1)
-    candidates = smallest(scored, tie - score * score.shape[1], settings.candidates)
-    return TopologyResult(score, candidates, weights, steps, cliques)
+    candidates = smallest(scored, tie - score * score.shape[1], count=settings.candidates)
+    return TopologyResult(score, candidates, weights=weights, steps=steps, cliques=cliques)

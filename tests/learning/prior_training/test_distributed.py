@@ -26,7 +26,7 @@ SETTINGS = TrainingSettings(steps=6, batch=4, bf16=False)
 
 
 def training(windows, processes, seed=0):
-    return PriorTraining(small_prior(seed).requires_grad_(True), windows, windows, SETTINGS, processes)
+    return PriorTraining(small_prior(seed).requires_grad_(True), windows, test=windows, settings=SETTINGS, processes=processes)
 
 
 def prearranged(windows, part=slice(None)):
@@ -66,7 +66,7 @@ def _work(rank, folder, port):
         again = training(windows, processes)
         again.load_state_dict(torch.load(folder / f"half{rank}.pt", weights_only=True))
         again.train(6)
-        shared = updates(training(windows, processes), windows, slice(2 * rank, 2 * rank + 2))
+        shared = updates(training(windows, processes), windows, part=slice(2 * rank, 2 * rank + 2))
         assert processes.mean(torch.tensor([float(rank)])) == 0.5
     torch.save(
         {
@@ -130,7 +130,7 @@ def test_halves_of_a_batch_make_the_update_of_the_whole(ranks, windows):
 
 def test_a_batch_that_cannot_be_shared_and_another_number_of_processes_are_refused(windows):
     with pytest.raises(InputError, match="batch=4: 3 processes"):
-        PriorTraining(small_prior(), windows, windows, SETTINGS, Processes(0, 3))
+        PriorTraining(small_prior(), windows, test=windows, settings=SETTINGS, processes=Processes(0, 3))
     run = training(windows, ALONE)
     state = run.state_dict()
     with pytest.raises(InputError, match="begun by 2 processes"):

@@ -73,7 +73,7 @@ def test_noise_levels_are_stratified_and_a_clean_ego_weighs_nothing(windows):
 def test_a_perfect_estimate_costs_nothing_but_the_fit_s_own_error(windows):
     prior = small_prior()
     prior.denoiser.forward = lambda x, level, encoding: torch.cat([windows["x0"]] * loss.LEVELS)
-    total, action, trajectory = terms(prior, windows, seeded())
+    total, action, trajectory = terms(prior, windows, generator=seeded())
     assert action == 0 and trajectory < 0.05 and total == loss.TRAJECTORY * trajectory
 
 
@@ -84,7 +84,7 @@ def test_the_action_term_is_the_weighted_mean_square_over_known_knots(windows):
     weight = loss_weight(windows, drawn)
     known = torch.cat([windows["knot_weight"]] * loss.LEVELS).mean(-1)
     expected = (0.25 * known * weight).sum() / weight.sum()
-    torch.testing.assert_close(terms(prior, windows, seeded())[1], expected)
+    torch.testing.assert_close(terms(prior, windows, generator=seeded())[1], expected)
 
 
 def test_offsets_count_on_lanes_only(windows):
@@ -94,5 +94,5 @@ def test_offsets_count_on_lanes_only(windows):
     free["on_lane"] = torch.zeros_like(free["on_lane"])
     wrong[..., -1] += 2.0  # 1 m to the left in the end
     prior.denoiser.forward = lambda x, level, encoding: torch.cat([wrong] * loss.LEVELS)
-    seen, unseen = (terms(prior, batch, seeded())[2] for batch in (windows, free))
+    seen, unseen = (terms(prior, batch, generator=seeded())[2] for batch in (windows, free))
     assert seen > 0.2 and unseen < 0.05

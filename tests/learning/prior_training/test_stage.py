@@ -21,7 +21,7 @@ from tests.synthetic import make_scenes
 def test_impossible_settings_are_named_before_anything_is_read(tmp_path, override, what):
     config = load_config("train", ["stage=prior", "data=scenarionet", "data.path=nowhere", override])
     with pytest.raises(InputError, match=what):
-        run_prior_stage(Run(config, tmp_path, {}), RunLogger("none", tmp_path))
+        run_prior_stage(Run(config, tmp_path, choices={}), RunLogger("none", tmp_path))
     assert not list(tmp_path.iterdir())
 
 

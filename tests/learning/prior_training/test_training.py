@@ -39,14 +39,14 @@ def untrained(seed=0):
 
 
 def of(windows, seed=0, settings=SETTINGS):
-    return PriorTraining(untrained(seed), windows, windows, settings)
+    return PriorTraining(untrained(seed), windows, test=windows, settings=settings)
 
 
 def test_training_lowers_the_loss(windows):
     run = of(windows, settings=replace(SETTINGS, steps=60, batch=8, learning_rate=5e-3))
-    before = held_out_loss(run.prior, windows, 8)
+    before = held_out_loss(run.prior, windows, batch=8)
     run.train(60)
-    assert held_out_loss(run.prior, windows, 8) < 0.8 * before
+    assert held_out_loss(run.prior, windows, batch=8) < 0.8 * before
 
 
 def test_the_average_is_exponential_with_a_decay_that_grows_to_ema(windows, monkeypatch):
@@ -80,7 +80,7 @@ def test_route_choice_learns_the_candidate_that_is_driven():
     scene = curved_scenes(2)
     scene["route_valid"][:, :6, 1] = True
     scene["route_points"][:, :, 1] = scene["route_points"][:, :, 0] + torch.tensor([0.0, 3.5])
-    assert train_route_choice(untrained(), scene, TrainingSettings(route_steps=60)) == 1.0
+    assert train_route_choice(untrained(), scene, settings=TrainingSettings(route_steps=60)) == 1.0
 
 
 def test_places_are_held_out_whole():
@@ -112,7 +112,7 @@ def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_w
     def trained(name, seed=0):
         folder = tmp_path / name
         how = {"logger": RunLogger("csv", folder), "parts": Parts(folder)}
-        return train_prior(untrained(seed), four_places(), SETTINGS, folder, {"command": "test"}, **how)
+        return train_prior(untrained(seed), four_places(), settings=SETTINGS, folder=folder, origin={"command": "test"}, **how)
 
     one, origin = load_prior(str(trained("whole")))
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -134,4 +134,4 @@ def test_logs_without_a_moving_vehicle_are_named(tmp_path):
     scenes = make_scenes(2, speed=0.0)
     scenes.location[:] = ["a", "b"]
     with pytest.raises(InputError, match="no vehicle moves"):
-        train_prior(untrained(), scenes, SETTINGS, tmp_path, {})
+        train_prior(untrained(), scenes, settings=SETTINGS, folder=tmp_path, origin={})

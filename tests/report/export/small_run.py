@@ -31,18 +31,18 @@ def turning() -> dict:
     """A truck of 9 m on a circle, so that its heading passes pi."""
     angle = 2.0 + 0.02 * np.arange(FRAMES)
     place = np.stack([60 + 40 * np.sin(angle), 40 - 40 * np.cos(angle)], 1)
-    return track(place, (angle + np.pi) % (2 * np.pi) - np.pi, 8.0, size=(9.0, 2.5))
+    return track(place, (angle + np.pi) % (2 * np.pi) - np.pi, speed=8.0, size=(9.0, 2.5))
 
 
 def scenes() -> list[dict]:
     tracks = {
-        "ego": straight(20, 0, 8),
-        "cut in": straight(32, 3.5, 8),
+        "ego": straight(20, 0, speed=8),
+        "cut in": straight(32, 3.5, speed=8),
         "truck": turning(),
-        "late": straight(5, 3.5, 6),
-        "walker": straight(40, -6, 1, kind="PEDESTRIAN", size=(0.6, 0.5)),
-        "rider": straight(30, -4, 4, kind="CYCLIST", size=(1.8, 0.7)),
-        "box": straight(70, -7, 0, kind="TRAFFIC_CONE", size=(0.4, 0.4)),
+        "late": straight(5, 3.5, speed=6),
+        "walker": straight(40, -6, speed=1, kind="PEDESTRIAN", size=(0.6, 0.5)),
+        "rider": straight(30, -4, speed=4, kind="CYCLIST", size=(1.8, 0.7)),
+        "box": straight(70, -7, speed=0, kind="TRAFFIC_CONE", size=(0.4, 0.4)),
     }
     lights = {"on": light("on", PHASES), "left": light("left", ["LANE_STATE_GO"] * FRAMES)}
     return numbered([description(tracks, map="a place") | {"dynamic_map_states": lights} for _ in range(2)])
@@ -68,15 +68,15 @@ def write_run(folder: Path) -> Path:
     rollouts = Rollouts.in_scenes(
         found,
         torch.arange(2),
-        states,
-        valid,
+        states=states,
+        valid=valid,
         adversaries=torch.arange(valid.shape[-1])[None].expand(2, -1) == CUT_IN,
         seed=torch.zeros(2, dtype=torch.int64),
         eta=torch.full((2,), 2.0, dtype=torch.float64),
     )
     simulated = torch.arange(valid.shape[-1])[None].expand(2, -1) < 3
-    rollouts = sourced(rollouts.replace(simulated=simulated, location=["a place"] * 2), "made", "data", "e2", "idm")
-    return save_run(folder, data, rollouts)
+    rollouts = sourced(rollouts.replace(simulated=simulated, location=["a place"] * 2), "made", split="data", method="e2", ego="idm")
+    return save_run(folder, data, rollouts=rollouts)
 
 
 def save_run(folder: Path, data: dict, rollouts: Rollouts) -> Path:

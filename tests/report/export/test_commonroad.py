@@ -96,9 +96,9 @@ def test_lights_before_a_fork_belong_to_an_intersection_that_says_where_each_way
 def test_neighbours_are_mutual():
     points = np.array([[0.0, 0.0], [50.0, 0.0]])
     lanes = {"a": Lane(points, left=["b"]), "b": Lane(points + [0, 3], right=["c"]), "c": Lane(points - [0, 3])}
-    assert beside(lanes, "a", "left", "right") is None
+    assert beside(lanes, "a", side="left", other_side="right") is None
     lanes["b"].right.insert(0, "a")
-    assert beside(lanes, "a", "left", "right") == "b" and beside(lanes, "b", "right", "left") == "a"
+    assert beside(lanes, "a", side="left", other_side="right") == "b" and beside(lanes, "b", side="right", other_side="left") == "a"
     assert side_by_side(lanes, ["a", "c", "b"]) == [["c"], ["a", "b"]]
 
 
@@ -121,5 +121,5 @@ def test_who_reverses_has_a_negative_velocity(run):
     states = episode.rollout.states.copy()
     states[:, 0, 3] = -2.0
     backing = replace(episode, rollout=replace(episode.rollout, states=states))
-    ego = obstacles(backing, itertools.count(1000), False)[0]
+    ego = obstacles(backing, itertools.count(1000), open_ego=False)[0]
     assert [state.velocity for state in states_of(ego)] == [-2.0] * len(states)

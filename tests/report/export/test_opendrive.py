@@ -71,15 +71,15 @@ def test_a_turn_in_two_pieces_changes_width_and_limit_where_the_second_begins():
     turn = np.stack([50 + 15 * np.sin(arc), 15 - 15 * np.cos(arc)], 1)
     second = turn[9:] + [0.05, 0.0]  # begins a little beside the end of the first
     lanes = {
-        "in": Lane(np.array([[0.0, 0.0], [50.0, 0.0]]), 3.5, 10.0, ["t", "on"]),
-        "t": Lane(turn[:10], 3.0, 5.0, ["u"]),
-        "u": Lane(second, 3.2, 0.0, ["up"]),
-        "on": Lane(np.array([[50.0, 0.0], [90.0, 0.0]]), 3.5, 10.0),
-        "side": Lane(np.array([[65.0, -20.0], [65.0, 15.0]]), 3.5, 10.0, ["up"]),
-        "up": Lane(np.array([[65.0, 15.0], [65.0, 90.0]]), 3.5, 10.0),
+        "in": Lane(np.array([[0.0, 0.0], [50.0, 0.0]]), 3.5, speed_limit=10.0, exits=["t", "on"]),
+        "t": Lane(turn[:10], 3.0, speed_limit=5.0, exits=["u"]),
+        "u": Lane(second, 3.2, speed_limit=0.0, exits=["up"]),
+        "on": Lane(np.array([[50.0, 0.0], [90.0, 0.0]]), 3.5, speed_limit=10.0),
+        "side": Lane(np.array([[65.0, -20.0], [65.0, 15.0]]), 3.5, speed_limit=10.0, exits=["up"]),
+        "up": Lane(np.array([[65.0, 15.0], [65.0, 90.0]]), 3.5, speed_limit=10.0),
     }
     plan = road_plan(lanes)
-    element = opendrive.road(lanes, plan, "t", {name: index for index, name in enumerate(plan.roads, 1)}).get_element()
+    element = opendrive.road(lanes, plan, name="t", number={name: index for index, name in enumerate(plan.roads, 1)}).get_element()
     add_lane_speeds(element)
     line = drawn(element)
     beside = np.linalg.norm(np.concatenate([turn[:10], second])[:, None] - line[None], axis=-1).min(1)

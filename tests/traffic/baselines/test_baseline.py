@@ -15,7 +15,7 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, executed, replanned, sce
 def test_without_gain_it_is_the_prior_bit_for_bit(name, knowledge):
     on = baseline(name, gain=0.0, knowledge=knowledge)
     scene = scenes(2).scenes
-    _, plan = replanned(on, scene, 2.0, times=3)
+    _, plan = replanned(on, scene, eta=2.0, times=3)
     _, nominal = replanned(NominalTraffic(on.prior, knowledge), scene, times=3)
     assert torch.equal(plan.states, nominal.states) and torch.equal(plan.present, nominal.present)
     assert not plan.adversary.any() and (plan.path_kl == 0).all()
@@ -31,7 +31,7 @@ def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_o
     _, nominal = replanned(NominalTraffic(on.prior, on.knowledge), scene)
     torch.testing.assert_close(plan.states[0], nominal.states[0], rtol=0, atol=5e-3)
     assert not plan.adversary[0].any()
-    _, calm = replanned(on, scene, 0.0)
+    _, calm = replanned(on, scene, eta=0.0)
     assert torch.equal(calm.states, nominal.states)
 
 
@@ -39,8 +39,8 @@ def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_o
 def test_a_scene_is_planned_alike_alone_and_in_a_batch(name):
     on = baseline(name)
     scene = scenes(3).scenes
-    _, whole = replanned(on, scene, 2.0, [5, 6, 7], times=2)
-    _, alone = replanned(on, scene[1:2], 2.0, [6], times=2)
+    _, whole = replanned(on, scene, eta=2.0, seeds=[5, 6, 7], times=2)
+    _, alone = replanned(on, scene[1:2], eta=2.0, seeds=[6], times=2)
     torch.testing.assert_close(alone.states, whole.states[1:2], rtol=0, atol=2e-2)
     assert torch.equal(alone.adversary, whole.adversary[1:2])
 
@@ -49,8 +49,8 @@ def test_a_scene_is_planned_alike_alone_and_in_a_batch(name):
 def test_it_attacks_on_the_authors_terms_and_on_ours(name):
     scene = scenes(3).scenes
     for terms in ({}, {"knowledge": "predicted", "responsibility": "full"}):
-        _, plan = replanned(baseline(name, **terms), scene, 2.0)
-        _, nominal = replanned(baseline(name, **terms), scene, 0.0)
+        _, plan = replanned(baseline(name, **terms), scene, eta=2.0)
+        _, nominal = replanned(baseline(name, **terms), scene, eta=0.0)
         assert plan.adversary.any() and not plan.adversary[:, 0].any()
         assert not torch.equal(plan.states[plan.adversary], nominal.states[plan.adversary])
         assert plan.states.isfinite().all()
@@ -61,7 +61,7 @@ def test_who_predicts_the_ego_does_not_look_at_its_plan(name):
     on = baseline(name, knowledge="predicted")
     scene = scenes(2).scenes
     world = World.at_start(scene)
-    plans = [on.replan(begin(on, scene, 2.0), world, EGO.plan(world) + shift)[1].states for shift in (0.0, 50.0)]
+    plans = [on.replan(begin(on, scene, eta=2.0), world, EGO.plan(world) + shift)[1].states for shift in (0.0, 50.0)]
     assert torch.equal(*plans)
 
 
@@ -82,7 +82,7 @@ def test_the_yielding_rule_binds_the_adversaries():
 def test_who_is_left_alone_replays_and_the_prior_sees_where_they_are(name):
     on = baseline(name)
     scene = scenes(3).scenes
-    state = begin(on, scene, 2.0)
+    state = begin(on, scene, eta=2.0)
     world = World.at_start(scene)
     for _ in range(2):
         plan = EGO.plan(world)
@@ -91,7 +91,7 @@ def test_who_is_left_alone_replays_and_the_prior_sees_where_they_are(name):
         driven = state.top if name == "ccdiff" else state.held
         assert torch.equal(traffic.states[~driven], logged.states[~driven])
         assert torch.equal(traffic.present[~driven], logged.present[~driven])
-        world = executed(world, traffic, plan)
+        world = executed(world, traffic, ego_plan=plan)
         here = scene["valid"][:, :8] & ~driven
         torch.testing.assert_close(state.lane.states()[here][:, :3], logged.states[here][:, 4, :3])
     assert traffic.adversary.any() and not (traffic.adversary & ~driven).any()

@@ -26,7 +26,7 @@ def driving(x, speed):
 def test_overlap_is_worth_more_the_sooner_and_the_more_often_it_comes():
     ways = torch.stack([driving(0.0, 10.0), driving(0.0, 5.0)])[:, None]  # two ways of the ego
     futures = torch.stack([standing(x) for x in (500.0, 40.0, 20.0)])[:, None, None].repeat(1, 1, 2, 1, 1)
-    value = overlap_value(futures, ways, SIZE)[:, 0, 1]
+    value = overlap_value(futures, ways, size=SIZE)[:, 0, 1]
     assert value[0] == 0
     assert value[1].item() == pytest.approx(DECAY**38 / 2)  # the faster way alone gets there: beyond 36 m after 3.6 s
     assert value[2].item() == pytest.approx((DECAY**18 + DECAY**34) / 2)

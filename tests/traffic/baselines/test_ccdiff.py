@@ -45,7 +45,7 @@ def test_those_in_cliques_come_first_and_chance_fills_up():
     vehicles = [(0, 0, 0.0, 10.0), (30, 0, 0.0, 2.0), (60, 0, 3.14159, 8.0), (0, 300, 0.0, 10.0), (0, -300, 3.1, 10.0)]
     scene = scene_of(vehicles)
     draw = torch.tensor([[0.0, 0.9, 0.8, 0.7, 0.1, 0.5, 0.5, 0.5]])
-    assert ranked(scene, 2, draw)[0].nonzero()[:, 0].tolist() == [1, 2]
-    assert ranked(scene, 3, draw)[0].nonzero()[:, 0].tolist() == [1, 2, 4]  # the least draw
+    assert ranked(scene, 2, draw=draw)[0].nonzero()[:, 0].tolist() == [1, 2]
+    assert ranked(scene, 3, draw=draw)[0].nonzero()[:, 0].tolist() == [1, 2, 4]  # the least draw
     scene["parked"][:, 1] = True
-    assert not ranked(scene, 8, draw)[0, [0, 1, 5, 6, 7]].any()
+    assert not ranked(scene, 8, draw=draw)[0, [0, 1, 5, 6, 7]].any()

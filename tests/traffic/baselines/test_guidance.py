@@ -25,7 +25,7 @@ def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
     guided = context.active.clone()
     limit = torch.tensor([0.05, 10.0])
     guided[1, 1] = False
-    control = MeanGuidance(on.prior, partial(on.loss, state=state, view=view), guided, limit, 1, 0.3, 1)
+    control = MeanGuidance(on.prior, partial(on.loss, state=state, view=view), guided=guided, limit=limit, samples=1, step_size=0.3, iterations=1)
     _, nominal, x0 = control(x, level, 3, context, lambda value: on.prior.denoise(value, level, context))
 
     def mean(clean):
@@ -41,7 +41,7 @@ def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
 
 def test_the_last_step_of_mean_guidance_is_free():
     on, state, view, context, x, level, _ = control_inputs()
-    control = MeanGuidance(on.prior, partial(on.loss, state=state, view=view), context.active, torch.ones(2), 1, 0.3, 1)
+    control = MeanGuidance(on.prior, partial(on.loss, state=state, view=view), guided=context.active, limit=torch.ones(2), samples=1, step_size=0.3, iterations=1)
     _, nominal, x0 = control(x, level, 1, context, lambda value: on.prior.denoise(value, level, context))
     assert torch.equal(nominal, x0)
 
@@ -50,7 +50,7 @@ def test_clean_guidance_is_clipped_and_leaves_masked_rows_alone():
     on, state, view, context, x, level, _ = control_inputs()
     guided = context.active.clone()
     guided[:, 1] = False
-    control = CleanGuidance(on.prior, partial(on.loss, state=state, view=view), guided, 1, 1e6, 0.25)
+    control = CleanGuidance(on.prior, partial(on.loss, state=state, view=view), guided=guided, samples=1, step_size=1e6, clip=0.25)
     _, nominal, x0 = control(x, level, 3, context, lambda value: on.prior.denoise(value, level, context))
     shift = (x0 - nominal).abs()
     assert (shift[~guided] == 0).all() and shift.max().item() == pytest.approx(0.25, rel=1e-4)
@@ -84,7 +84,7 @@ def test_guidance_lowers_the_loss_of_bundled_scenes(name, bundled):
     nominal = prior.sample(context, now.noise[..., 0, :].contiguous()).x0
     given = {"adversary": state.adversary} if name == "diffscene" else {}
     loss = partial(on.loss, state=state, view=view, **given)
-    values = [loss(motion_of(prior, value, context, 1)) for value in (x0, nominal)]
+    values = [loss(motion_of(prior, value, context=context, count=1)) for value in (x0, nominal)]
     guided = state.adversary if on.adversarial else context.active
     after, before = (torch.where(guided, value[0], 0.0).sum() for value in values)
     assert after < before

@@ -28,7 +28,7 @@ def pose(x, y=0.0, heading=0.0, speed=5.0):
 
 
 def test_disks_reach_from_bumper_to_bumper():
-    distance, radii = disk_gap(pose(0.0), SIZE, pose(10.0), SIZE)
+    distance, radii = disk_gap(pose(0.0), SIZE, other=pose(10.0), other_size=SIZE)
     assert distance.item() == pytest.approx(8.0, abs=1e-3) and radii.item() == 2.0  # centres 1 m inside both bumpers
     cost = disk_overlap(0.5)(pose(0.0), SIZE, pose(4.0), SIZE)
     assert cost.item() == pytest.approx(1 - 2.0 / 2.5, abs=1e-3)
@@ -36,7 +36,7 @@ def test_disks_reach_from_bumper_to_bumper():
 
 
 def test_the_gaussian_is_flat_inside_the_box_and_falls_outside():
-    values = [gaussian_overlap(pose(0.0), SIZE, pose(x), SIZE).item() for x in (0.0, 1.9, 3.0, 4.0)]
+    values = [gaussian_overlap(pose(0.0), SIZE, other=pose(x), other_size=SIZE).item() for x in (0.0, 1.9, 3.0, 4.0)]
     assert values[0] == values[1] > values[2] > values[3]
     assert values[2] == pytest.approx(10 * math.exp(-0.5 * (1 - 2.25)), rel=1e-4)
 
@@ -54,7 +54,7 @@ def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
     states = view.states[None, :, :, None].repeat(2, 1, 1, 3, 1)
     states[..., :2] = 0.3 * states[..., :2] + torch.rand(states[..., :2].shape, generator=generator)
     weights = torch.tensor([0.5, 0.3, 0.2])
-    found = pair_term(states, view, disk_overlap(0.2), 0.2, weights)
+    found = pair_term(states, view, cost=disk_overlap(0.2), reach=0.2, weights=weights)
     expected = torch.zeros_like(found)
     for s, b in product(range(2), range(2)):
         for i, j in permutations(view.valid[b].nonzero()[:, 0].tolist(), 2):
@@ -63,17 +63,17 @@ def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
     assert expected.max() > 0.1
     torch.testing.assert_close(found, expected)
     none = torch.ones_like(view.routed.conflict)
-    assert (pair_term(states, view, disk_overlap(0.2), 0.2, weights, none) == 0).all()
+    assert (pair_term(states, view, cost=disk_overlap(0.2), reach=0.2, weights=weights, left_out=none) == 0).all()
 
 
 def test_leaving_the_road_costs_and_the_gradient_leads_back():
     _, view = first_replan(baseline("ctg"), scenes(1).scenes)
     states = view.states[None, :, :, None].clone()
     weights = torch.ones(1)
-    assert (off_road_term(states, view, weights)[0, 0, :6] == 0).all()
+    assert (off_road_term(states, view, weights=weights)[0, 0, :6] == 0).all()
     states[..., 1] = 9.0  # the road ends at 5.25 m
     states.requires_grad_(True)
-    cost = off_road_term(states, view, weights)
+    cost = off_road_term(states, view, weights=weights)
     assert (cost[0, 0, :6] > 0).all()
     (gradient,) = torch.autograd.grad(cost.sum(), states)
     assert (gradient[0, 0, 1:6, 0, 1] > 0).all()
@@ -84,5 +84,5 @@ def test_discounts_sum_to_one_and_comfort_is_free_within_its_bounds():
     accel = torch.tensor([[[[0.0, 1.0, 2.0], [-6.0, -6.0, -6.0]]]])
     motion = LaneState(*([torch.zeros_like(accel)] * 10))
     motion.a = accel
-    value = comfort_term(motion, -3.5, 2.0, 2.0)[0, 0]
+    value = comfort_term(motion, -3.5, high=2.0, jerk=2.0)[0, 0]
     assert value[0] == 0 and value[1].item() == pytest.approx(2.5**2)

@@ -19,7 +19,7 @@ def test_latents_are_decoded_as_by_ddim_without_noise():
     (now, context), _ = first_replan(on, scenes(2).scenes)
     prior = small_prior(0, sampler=SamplerSettings(sampler="ddim", spacing="level", steps=4, churn=0.0))
     expected = prior.sample(context, now.noise[..., 0, :]).x0
-    torch.testing.assert_close(decode_latent(on.prior, now.noise[0, ..., 0, :], context, 4), expected)
+    torch.testing.assert_close(decode_latent(on.prior, now.noise[0, ..., 0, :], context=context, steps=4), expected)
 
 
 def test_the_objective_falls_over_the_iterations():
@@ -29,7 +29,7 @@ def test_the_objective_falls_over_the_iterations():
     values = []
 
     def loss(latent):
-        motion = motion_of(on.prior, decode_latent(on.prior, latent, context, on.steps), context, 1)
+        motion = motion_of(on.prior, decode_latent(on.prior, latent, context=context, steps=on.steps), context=context, count=1)
         values.append(on.loss(motion, latent, first, now.state, view).detach())
         return on.loss(motion, latent, first, now.state, view)
 
@@ -45,7 +45,7 @@ def test_the_planner_is_driven_anew_at_every_iteration_and_not_without_its_plan(
     react = lambda rows, planned: asked.append(planned) or look(rows, planned)  # noqa: E731
     on = baseline("strive", iterations=3)
     assert on.queries_ego and not baseline("strive", knowledge="predicted").queries_ego
-    on.replan(begin(on, scene, 2.0), world, EGO.plan(world), react)
+    on.replan(begin(on, scene, eta=2.0), world, EGO.plan(world), react)
     assert len(asked) == 4 and not torch.equal(asked[0], asked[3])
 
 
@@ -71,7 +71,7 @@ def test_an_ego_that_is_boxed_in_has_no_solution():
     walled[:, :, 1, :, :2] = torch.tensor([8.0, 0.0])  # stands a box's length ahead, at 10 m/s
     found = []
     for states in (far, walled):
-        motion = motion_of(on.prior, torch.zeros_like(first), context, 1)
+        motion = motion_of(on.prior, torch.zeros_like(first), context=context, count=1)
         motion.x, motion.y, motion.heading, motion.v = states.unbind(-1)
         found.append(on.solvable(first, motion, view, context).tolist())
     assert found == [[True], [False]]

@@ -69,10 +69,10 @@ def skeleton_of(
     chosen = SkeletonSettings(**settings)
     times = STEP * torch.arange(1, 11)
     distance = (world.states[:, : support.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
-    expected = constant_speed_states(world.scene, world, times)
+    expected = constant_speed_states(world.scene, world, times=times)
     feasible = support if feasible is None else feasible
     return build_skeleton(
-        world.scene, world, support, feasible, chosen, expected, distance if cost is None else cost, limits
+        world.scene, world, support=support, feasible=feasible, settings=chosen, expected=expected, cost=distance if cost is None else cost, limits=limits
     )
 
 

@@ -19,14 +19,14 @@ LANES = InterceptionSettings(reach=0.0)
 def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options):
     settings = settings or AnchorSettings()
     wish = wish_of(len(plan), eta)
-    return propose(world.scene, world, skeleton, plan, settings, interception, wish, **options)
+    return propose(world.scene, world, skeleton=skeleton, ego_plan=plan, settings=settings, interception=interception, wish=wish, **options)
 
 
 def anchored(world, *vehicles, near=2, **settings):
     support = mask(world, *vehicles)
     skeleton = skeleton_of(world, support, near=near)
-    plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
-    return proposed(world, skeleton, plan, AnchorSettings(**settings)), skeleton
+    plan = constant_speed_states(world.scene, world, times=TIMES)[:, 0]
+    return proposed(world, skeleton, plan=plan, settings=AnchorSettings(**settings)), skeleton
 
 
 @pytest.mark.parametrize(
@@ -63,13 +63,13 @@ def test_the_candidate_that_meets_the_target_is_chosen():
     world = make_world([EGO, (40.0, -30.0, UP, 8.0)])
     world.scene["route_points"][:, 1, 2] = world.scene["route_points"][:, 1, 0]
     world.scene["route_valid"][:, 1, 2] = True
-    add_route(world, 1, 0, 0.0)  # the one it follows leads away from the ego's
+    add_route(world, 1, candidate=0, heading=0.0)  # the one it follows leads away from the ego's
     assert anchored(world, 1)[0].route[0, 1] == 2
 
 
 def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken(monkeypatch):
     world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
-    add_route(world, 1, 2, UP)
+    add_route(world, 1, candidate=2, heading=UP)
     assert not anchored(world, 1)[0].feasible.any()
     monkeypatch.setattr(anchoring, "MAX_SWING", 100.0)
     assert anchored(world, 1)[0].route[0, 1] == 2
@@ -83,13 +83,13 @@ def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken(
 
 def test_a_kept_route_is_the_only_one_looked_at():
     world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
-    add_route(world, 1, 2, UP)
+    add_route(world, 1, candidate=2, heading=UP)
     support = mask(world, 1)
     skeleton = skeleton_of(world, support)
-    plan = constant_speed_states(world.scene, world, TIMES)[:, 0]
-    assert not proposed(world, skeleton, plan, keep_route=True).feasible.any()
+    plan = constant_speed_states(world.scene, world, times=TIMES)[:, 0]
+    assert not proposed(world, skeleton, plan=plan, keep_route=True).feasible.any()
     world.route[:, 1] = 2
-    kept = proposed(world, skeleton, plan, keep_route=True)
+    kept = proposed(world, skeleton, plan=plan, keep_route=True)
     assert kept.feasible[0, 1] and torch.equal(kept.route, world.route)
 
 
@@ -137,11 +137,11 @@ def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_sti
     ample = torch.full((1, 1, 1, anchoring.BEND_VERTICES), 1e4)
     size = torch.tensor([[[4.0, 2.0]]])
     candidates = anchoring._Candidates(
-        one.long(), one, one.bool(), 200 * one, 0 * one, 0 * one, ample, speed, 0 * speed, size
+        one.long(), one, usable=one.bool(), end=200 * one, s=0 * one, d=0 * one, bend_bound=ample, speed=speed, accel=0 * speed, size=size
     )
     steps = torch.ones(1, 1, 1, 50)
     limits = torch.tensor((-3.0, 2.0))
-    target = anchoring._Target(30.5 * steps, beside * steps, slack * steps, crossing * steps, torch.full((1, 1), 2.0))
+    target = anchoring._Target(30.5 * steps, beside * steps, slack=slack * steps, crossing_time=crossing * steps, corridor=torch.full((1, 1), 2.0))
     cost, gap, _ = anchoring.scored(candidates, torch.zeros(1, 1, 1, 1), target, limits)
     expected = max(0.5 - slack, 0.0) / 10 + abs(beside) * crossing
     assert gap.item() == pytest.approx(expected, abs=1e-4) and cost.item() == pytest.approx(expected, abs=1e-4)

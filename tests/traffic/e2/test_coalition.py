@@ -17,7 +17,7 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synth
 def test_a_coalition_acts_on_the_ego_directly_or_through_members():
     on = synthesizer()
     scene = scenes(4).scenes
-    state, plan = replanned(on, scene, 2.0)
+    state, plan = replanned(on, scene, eta=2.0)
     assert state.coalition.any(1).all() and not state.coalition[:, 0].any()
     assert torch.equal(state.coalition, state.target >= 0)
     assert torch.equal(plan.adversary, state.coalition | state.drawn)
@@ -46,7 +46,7 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
 
     monkeypatch.setattr(coalition, "build_skeleton", chained)
     monkeypatch.setattr(coalition, "propose", without_one)
-    state, _ = replanned(on, scene, 1.0)
+    state, _ = replanned(on, scene, eta=1.0)
     assert state.coalition.nonzero()[:, 1].tolist() == [3] and state.target[0].max() == 0
 
 
@@ -62,7 +62,7 @@ def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
     monkeypatch.setattr(coalition, "propose", nothing)
     for pursuit in (False, True):
         on = synthesizer(skeleton={"pursuit": pursuit}, control={"adversarial_clip": 2.0})
-        state, plan = replanned(on, scene, 2.0)
+        state, plan = replanned(on, scene, eta=2.0)
         assert state.coalition.any(1).tolist() == [pursuit] * 3
         assert (plan.path_kl[state.coalition] > 0).all() and not state.anchor_jump.any()
 
@@ -71,7 +71,7 @@ def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
     on = synthesizer(reselect=0)
     scene = scenes(3).scenes
     world = World.at_start(scene)
-    lanes = begin(on, scene, 2.0)
+    lanes = begin(on, scene, eta=2.0)
     state, _ = on.replan(lanes, world, EGO.plan(world))
     assert state.off_lane.any() and not (state.off_lane & ~state.coalition).any()
     moved = (state.routed.points != lanes.routed.points).flatten(2).any(-1)
@@ -85,8 +85,8 @@ def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
 def test_the_other_supports_choose_a_coalition_too(support):
     """The ablations: whoever topology finds, or anybody who is there and not parked, drawn by the scene's seed."""
     scene = scenes(3).scenes
-    _, plan = replanned(synthesizer(support=support, responsibility="none"), scene, 2.0, [5, 6, 7])
-    _, again = replanned(synthesizer(support=support, responsibility="none"), scene, 2.0, [5, 6, 7])
+    _, plan = replanned(synthesizer(support=support, responsibility="none"), scene, eta=2.0, seeds=[5, 6, 7])
+    _, again = replanned(synthesizer(support=support, responsibility="none"), scene, eta=2.0, seeds=[5, 6, 7])
     assert plan.adversary.any() and torch.equal(plan.adversary, again.adversary)
     vehicles = plan.adversary.shape[1]
     assert not (plan.adversary & (scene["parked"] | ~scene["valid"])[:, :vehicles]).any()
@@ -99,7 +99,7 @@ def test_templates_reach_the_rows_of_synthesized_traffic():
     """Equal scenes of equal noise: a vehicle more acts where the template allows it."""
     scene_set = scenes(4)
     on = synthesizer(reselect=0, responsibility="none")
-    synthesize = synthesize_traffic(scene_set, on, SimSettings(), batch=3)
+    synthesize = synthesize_traffic(scene_set, on, sim=SimSettings(), batch=3)
     index = torch.arange(4)
     eta = torch.full((4,), 3.0)
 

@@ -41,7 +41,7 @@ class Case:
         feasible = self.coalition.clone()
         none = self.coalition & False
         knots = torch.full((count, ROWS, KNOTS), -2.0)
-        self.anchor = Anchor(route, knots, feasible, torch.zeros(count, ROWS), none, routed.points)
+        self.anchor = Anchor(route, knots, feasible=feasible, cost=torch.zeros(count, ROWS), off_lane=none, off_lane_path=routed.points)
         self.generator = torch.Generator().manual_seed(0)
         self.noise = torch.randn(self.prior.sampler.steps, count, ROWS, SIZE, generator=self.generator)
 
@@ -96,8 +96,8 @@ def test_the_shift_is_that_of_the_gradients_scaled_clipped_and_masked(gradient, 
     narrow = PotentialSettings().narrow
     wide = PotentialSettings().wide
     temperature = narrow * (wide / narrow) ** 0.4
-    adversarial = adversarial_potential(states, case.where, PotentialSettings(), temperature).sum()
-    feasible = feasibility_potential(states, case.where, PotentialSettings()).sum()
+    adversarial = adversarial_potential(states, case.where, settings=PotentialSettings(), temperature=temperature).sum()
+    feasible = feasibility_potential(states, case.where, settings=PotentialSettings()).sum()
     (by_clean,) = torch.autograd.grad(feasible, x0, retain_graph=True)
     (by_adversary,) = torch.autograd.grad(adversarial, x if gradient == "denoiser" else x0)
     alpha = case.prior.schedule.alpha(level)

@@ -15,7 +15,7 @@ SETTINGS = FeasibilitySettings()
 
 def judge(*vehicles, settings=SETTINGS):
     world = make_world([EGO, *vehicles])
-    return feasible_vehicles(world.scene, world, settings), world
+    return feasible_vehicles(world.scene, world, settings=settings), world
 
 
 def test_routes_that_cross_meet_where_the_lines_do():
@@ -55,8 +55,8 @@ def test_who_can_meet_the_ego(vehicle, conflicting):
 
 def test_only_the_candidate_that_crosses_is_listed():
     world = make_world([EGO, (40.0, 20.0, 0.0, 8.0)])
-    add_route(world, 1, 3, -UP)
-    table = feasible_vehicles(world.scene, world, SETTINGS).conflicts
+    add_route(world, 1, candidate=3, heading=-UP)
+    table = feasible_vehicles(world.scene, world, settings=SETTINGS).conflicts
     assert table.exists[0, 1].nonzero().tolist() == [[3]]
 
 
@@ -77,7 +77,7 @@ def test_whoever_is_on_the_road_near_a_centreline_and_along_it_is_associated(asi
     world.states[:, 1, 0] += aside
     world.states[:, 1, 2] += turn
     world.scene["field"].fill_(depth)
-    result = feasible_vehicles(world.scene, world, SETTINGS)
+    result = feasible_vehicles(world.scene, world, settings=SETTINGS)
     assert result.associated[0, 1] == associated and (associated or not result.mask.any())
 
 
@@ -99,16 +99,16 @@ def test_whoever_moves_or_stands_closely_ahead_is_relevant(gap, aside, speed, re
     length, width = (world.scene["size"][0, :2].sum(0) / 2).tolist()
     world.states[:, 1, 0] = gap + math.copysign(length, gap)
     world.states[:, 1, 1] = width + aside if aside else 0.0
-    assert feasible_vehicles(world.scene, world, SETTINGS).relevant[0, 1] == relevant
+    assert feasible_vehicles(world.scene, world, settings=SETTINGS).relevant[0, 1] == relevant
     world.scene["parked"][:, 1] = True
-    assert not feasible_vehicles(world.scene, world, SETTINGS).relevant[0, 1]
+    assert not feasible_vehicles(world.scene, world, settings=SETTINGS).relevant[0, 1]
 
 
 def test_absent_vehicles_and_the_ego_are_never_feasible_and_scenes_do_not_mix():
     alone = judge((50.0, -40.0, UP, 10.0))[0]
     world = make_world([EGO, (50.0, -40.0, UP, 10.0)], copies=3)
     world.valid[1, 1] = False
-    result = feasible_vehicles(world.scene, world, SETTINGS)
+    result = feasible_vehicles(world.scene, world, settings=SETTINGS)
     assert result.mask[:, 1].tolist() == [True, False, True] and not result.mask[:, 0].any()
     torch.testing.assert_close(result.conflicts.s[2], alone.conflicts.s[0])
 

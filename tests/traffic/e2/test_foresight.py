@@ -20,7 +20,7 @@ def standing(gap, aside=0.0):
     tracks = torch.zeros(1, 1, STEPS, 4)
     tracks[..., 0], tracks[..., 1] = gap + 4.0, aside
     return lambda since=-1.0, settled=False: foresee(
-        path, SIZE, tracks, SIZE, torch.tensor([since]), torch.tensor([settled])
+        path, SIZE, tracks=tracks, sizes=SIZE, since=torch.tensor([since]), settled=torch.tensor([settled])
     )
 
 
@@ -61,7 +61,7 @@ def test_who_reverses_is_foreseen_as_the_same_motion_forwards():
     tracks = torch.zeros(1, 1, STEPS, 4)
     tracks[..., 0] = 24.0
     ways = [
-        foresee(each, SIZE, tracks, SIZE, torch.tensor([-1.0]), torch.tensor([False]))
+        foresee(each, SIZE, tracks=tracks, sizes=SIZE, since=torch.tensor([-1.0]), settled=torch.tensor([False]))
         for each in (path, mirrored(path))
     ]
     assert float(ways[0].worth) > 0.2 and float(ways[0].time) < 3
@@ -75,7 +75,7 @@ def test_the_clock_starts_where_the_ego_reverses_into_the_risk():
     plan = world.states[:, :1] + torch.zeros(1, 50, 4)
     plan[..., 0] += torch.arange(1, 51)
     world.states[:, :1] = mirrored(world.states[:, :1])
-    since = time_before(world, mirrored(plan), torch.full((1, scene["route_log"].shape[1]), -1.0))
+    since = time_before(world, mirrored(plan), since=torch.full((1, scene["route_log"].shape[1]), -1.0))
     assert since[0, 1:3].tolist() == [0.0, -1.0]
 
 
@@ -85,7 +85,7 @@ def test_the_clock_starts_at_the_competent_driver_s_risk_and_runs_while_it_lasts
     world = World.at_start(scene)
     plan = world.states[:, :1] + torch.zeros(1, 50, 4)
     plan[..., 0] += torch.arange(1, 51)
-    since = time_before(world, plan, torch.full((1, scene["route_log"].shape[1]), before))
+    since = time_before(world, plan, since=torch.full((1, scene["route_log"].shape[1]), before))
     begins = 0.0 if ahead < 30 else -1.0
     assert float(since[0, 1]) == (before + 0.5 if before >= 0 else begins)
     assert float(since[0, 2]) == -1.0, "it is in the next lane"

@@ -23,17 +23,17 @@ def met(vehicles, eta=2.0, settings=FREE, world=None, halt_at_red=False, moment=
     """Vehicle 1's interception of the ego among the others, all of which keep their speed."""
     world = world or make_world(vehicles)
     scene = world.scene
-    expected = constant_speed_states(world.scene, world, TIMES)
+    expected = constant_speed_states(world.scene, world, times=TIMES)
     index, target = (torch.full((len(scene), 1), vehicle) for vehicle in (1, 0))
     found = intercept(
-        world, index, target, expected, wish_of(len(scene), eta, moment, wrong_way), settings, halt_at_red
+        world, index, target=target, expected=expected, wish=wish_of(len(scene), eta, moment=moment, wrong_way=wrong_way), settings=settings, halt_at_red=halt_at_red
     )
     return found, expected, scene["size"][:, :8]
 
 
 def driven(found, speed):
     """States [50, 4] of the vehicle on its way, by the prior's decoder of speeds."""
-    v, way = decoded(found.knots[0, 0], speed, found.knots[0, 0, 0])
+    v, way = decoded(found.knots[0, 0], speed, accel=found.knots[0, 0, 0])
     xy, heading, _ = interpolate(found.path[0, 0], way)
     return torch.cat([xy, heading[:, None], v[:, None]], -1)
 
@@ -45,7 +45,7 @@ def test_the_boxes_touch_if_everybody_drives_as_expected(vehicle):
     found, expected, size = met([EGO, vehicle])
     assert found.cost.isfinite().all()
     track = driven(found, vehicle[3])
-    assert overlap(track, size[0, 1].expand(50, 2), expected[0, 0], size[0, 0].expand(50, 2)).any()
+    assert overlap(track, size[0, 1].expand(50, 2), second=expected[0, 0], second_size=size[0, 0].expand(50, 2)).any()
 
 
 def test_a_way_begins_at_the_vehicle_in_its_direction_with_a_vertex_every_two_metres():
@@ -61,7 +61,7 @@ def test_a_way_begins_at_the_vehicle_in_its_direction_with_a_vertex_every_two_me
 def test_the_cubic_between_two_poses_of_a_circle_is_its_arc(angle):
     radius = 12.0
     end = torch.tensor([radius * math.sin(angle), radius * (1 - math.cos(angle))])
-    points, _ = cubic(torch.zeros(2), torch.tensor(0.0), end, torch.tensor(angle), torch.linspace(0, 1, 21))
+    points, _ = cubic(torch.zeros(2), torch.tensor(0.0), end=end, end_heading=torch.tensor(angle), u=torch.linspace(0, 1, 21))
     gap = (points - torch.tensor([0.0, radius])).norm(dim=-1) - radius
     assert gap.abs().max() < 3e-3 * radius
 
@@ -91,7 +91,7 @@ def test_what_is_proposed_keeps_the_limits(eta):
     generator = torch.Generator().manual_seed(0)
     world.states[:, 1, 0] += 30 * torch.rand(30, generator=generator) - 10
     world.states[:, 1, 3] += 6 * torch.rand(30, generator=generator) - 3
-    found, _, _ = met([EGO, BESIDE], eta, settings, world)
+    found, _, _ = met([EGO, BESIDE], eta, settings=settings, world=world)
     some = found.cost[:, 0].isfinite()
     assert some.any()
     knots = found.knots[some, 0]

@@ -62,7 +62,7 @@ def test_the_pull_is_the_posterior_mean_of_a_gaussian_prior(level, strength):
     tilted = torch.linalg.solve(
         (1 + strength) * precision + noise, precision @ (m + strength * goal) + alpha / sigma**2 * x
     )
-    found = pulled(clean.float(), goal.float(), torch.tensor(strength), t.float(), schedule)
+    found = pulled(clean.float(), goal.float(), strength=torch.tensor(strength), level=t.float(), schedule=schedule)
     torch.testing.assert_close(found.double(), tilted, rtol=1e-3, atol=1e-3)
 
 
@@ -78,7 +78,7 @@ def test_what_a_pull_costs_goes_to_the_divergence_of_the_tilted_gaussian(monkeyp
 
     def control(x, level, k, context, denoise):
         x0 = denoise(x)
-        return x, x0, pulled(x0, torch.full((SIZE,), MEAN + d), torch.tensor(w / (1 - w)), level, prior.schedule)
+        return x, x0, pulled(x0, torch.full((SIZE,), MEAN + d), strength=torch.tensor(w / (1 - w)), level=level, schedule=prior.schedule)
 
     try:
         for cached in caches:
@@ -102,15 +102,15 @@ def test_importance_weights_of_pulled_paths_average_1(recorded):
     options = {"data": "scenarionet", "path": str(TUNE)} if recorded else {"data": "bundled"}
     scene = e2rl.load_scenes(**options, num_scenes=24).scenes
     on = e2rl.make_traffic("e2", e2rl.load_prior())
-    state = begin(on, scene, 1.0)
+    state = begin(on, scene, eta=1.0)
     world = World.at_start(scene)
     context = on.encode(state, world, EGO.plan(world))
     mean = on.prior.estimate(context)
     gap = (world.states[:, : mean.shape[1], :2] - world.states[:, :1, :2]).norm(dim=-1)
     moves = context.active & (state.lane.v > 1.0)
-    near = smallest(moves, gap, 1)
+    near = smallest(moves, gap, count=1)
     shift = torch.nn.functional.pad(torch.full((KNOTS,), -1.0 / ACCEL_SCALE), (0, SIZE - KNOTS))
-    pull = Pull(mean + shift, near, torch.full((24,), 0.2))
+    pull = Pull(mean + shift, near, strength=torch.full((24,), 0.2))
     generator = torch.Generator().manual_seed(0)
     nobody = on._anchor(state, world, EGO.plan(world))
     control = on._control(state, world, EGO.plan(world), replace(nobody, feasible=nobody.feasible & False), pull)
@@ -128,14 +128,14 @@ def test_importance_weights_of_pulled_paths_average_1(recorded):
 def proposed(gain, count=5):
     on = synthesizer()
     scene = scenes(3).scenes
-    state = begin(on, scene, 2.0)
+    state = begin(on, scene, eta=2.0)
     world = World.at_start(scene)
     context = on.encode(state, world, EGO.plan(world))
     mean = on.prior.estimate(context)
     plan = on.prior.decode(mean, context).states()
-    attack = KernelAttack.of(world, context.active, EGO.plan(world), plan, state.since, state.settled)
+    attack = KernelAttack.of(world, context.active, ego_plan=EGO.plan(world), plan=plan, since=state.since, settled=state.settled)
     gains = torch.full((3,), gain)
-    return mean, world, propose_kernels(attack, state.lane, state.routed.points, mean, gains, count)
+    return mean, world, propose_kernels(attack, state.lane, points=state.routed.points, mean=mean, gain=gains, count=count)
 
 
 def test_kernels_are_shifts_of_moving_vehicles_that_gain_more_than_they_cost():
@@ -154,18 +154,18 @@ def test_kernels_are_shifts_of_moving_vehicles_that_gain_more_than_they_cost():
 def test_a_drawn_vehicle_is_an_adversary_that_pays_for_its_shift_and_the_choice():
     on = synthesizer(kernels={"samples": 4}, interception={"reach": 0})
     scene = scenes(4).scenes
-    state, plan = replanned(on, scene, 3.0)
+    state, plan = replanned(on, scene, eta=3.0)
     assert state.drawn.any()
     assert (plan.adversary == (state.coalition | state.drawn)).all() and (plan.target[state.drawn] == 0).all()
     assert (plan.path_kl[state.drawn] > 0).all()
     assert (plan.path_kl[state.drawn.any(1), 0] >= math.log(3 / DRAWN)).all()
-    _, one = replanned(synthesizer(kernels={"samples": 1}, interception={"reach": 0}), scene, 3.0)
+    _, one = replanned(synthesizer(kernels={"samples": 1}, interception={"reach": 0}), scene, eta=3.0)
     assert not torch.equal(one.states, plan.states)
 
 
 def test_the_prices_of_a_choice_are_those_of_a_law_over_the_samples():
     """A code is one: the weights exp(-price) of a scene's samples sum to 1, and no choice has no price."""
-    price = choice_nats(torch.tensor([1]), 2, 5)
+    price = choice_nats(torch.tensor([1]), 2, count=5)
     assert price.shape == (7,) and price[0] == 0
     assert float((-price[1:]).exp().sum()) == pytest.approx(1.0)
 
@@ -174,20 +174,20 @@ def test_a_budget_below_the_price_of_a_choice_draws_nobody_and_none_is_the_prior
     scene = scenes(3).scenes
     for budget, drawn in ((1.0, False), (None, True)):
         on = synthesizer(control={"transport_budget": budget}, interception={"reach": 0})
-        assert bool(replanned(on, scene, 3.0)[0].drawn.any()) == drawn
-    _, prior = replanned(synthesizer(), scene, 0.0)
-    _, none = replanned(synthesizer(control={"transport_budget": 0.0}), scene, 3.0)
+        assert bool(replanned(on, scene, eta=3.0)[0].drawn.any()) == drawn
+    _, prior = replanned(synthesizer(), scene, eta=0.0)
+    _, none = replanned(synthesizer(control={"transport_budget": 0.0}), scene, eta=3.0)
     assert torch.equal(none.states, prior.states) and not none.adversary.any()
 
 
 def test_the_best_of_a_scene_s_tries_is_taken_and_the_plain_one_where_there_are_no_others():
     vehicle = torch.tensor([[-1, -1], [2, 1], [-1, -1], [3, -1]])
-    found = Kernels(torch.arange(8.0).view(4, 2, 1).expand(4, 2, SIZE), vehicle, 5)
+    found = Kernels(torch.arange(8.0).view(4, 2, 1).expand(4, 2, SIZE), vehicle, vehicles=5)
     rows = torch.tensor([1, 3])
     scenes, goal, drawn = tries(found, rows)
     assert scenes.tolist() == [0, 1, 2, 3, 1, 1, 3, 3]
     assert drawn.nonzero().tolist() == [[4, 2], [5, 1], [6, 3]]
     assert goal[4:, 0, 0].tolist() == [2.0, 3.0, 6.0, 7.0]
     value = torch.tensor([9.0, 1.0, 0.0, 5.0, 2.0, 3.0, 4.0, 5.0])
-    assert best_try(value, rows, 4).tolist() == [0, 5, 2, 3]
-    assert best_try(value[:4], rows[:0], 4).tolist() == [0, 1, 2, 3]
+    assert best_try(value, rows, batch=4).tolist() == [0, 5, 2, 3]
+    assert best_try(value[:4], rows[:0], batch=4).tolist() == [0, 1, 2, 3]

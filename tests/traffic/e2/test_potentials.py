@@ -17,7 +17,7 @@ SETTINGS = PotentialSettings()
 
 
 def feasibility_potential(states, context, settings):
-    return potentials.feasibility_potential(states[:, :, SAMPLED_STEPS], context, settings)
+    return potentials.feasibility_potential(states[:, :, SAMPLED_STEPS], context, settings=settings)
 
 
 def adversarial_potential(states, context, settings, *temperature):
@@ -30,7 +30,7 @@ POTENTIALS = [feasibility_potential, adversarial_potential]
 def situation(*vehicles, targets=()):
     """Cruising states [B, 8, 50, 4] in float64, and their context; targets: (vehicle, target) pairs."""
     world = make_world([EGO, *vehicles])
-    states = constant_speed_states(world.scene, world, 0.1 * torch.arange(1, 51)).double()
+    states = constant_speed_states(world.scene, world, times=0.1 * torch.arange(1, 51)).double()
     scene = world.scene.apply(lambda x: x.double() if x.dtype == torch.float32 else x)
     target = torch.full((1, 8), -1)
     for vehicle, aim in targets:
@@ -81,26 +81,26 @@ def test_gradients_are_finite_for_coincident_and_standing_vehicles():
 
 def test_only_the_coalition_has_v_adv_and_it_acts_on_its_own_target():
     states, context = busy()
-    value = adversarial_potential(states, context, SETTINGS)
+    value = adversarial_potential(states, context, settings=SETTINGS)
     assert (value[0, 3:] == 0).all() and (value[0, 1:3] != 0).all()
     far = replace(context, ego_plan=context.ego_plan + 500)
-    changed = adversarial_potential(states, far, SETTINGS)
+    changed = adversarial_potential(states, far, settings=SETTINGS)
     assert changed[0, 2] == value[0, 2] and changed[0, 1] > value[0, 1] + 100
 
 
 def test_adversary_and_target_do_not_repel_each_other():
     start = (8.0, 0.0, 0.0, 2.0)
     free, context = situation(start, (8.0, 6.0, 0.0, 2.0))
-    assert feasibility_potential(free, context, SETTINGS)[0, 1] > 0.1
+    assert feasibility_potential(free, context, settings=SETTINGS)[0, 1] > 0.1
     _, hunting = situation(start, (8.0, 6.0, 0.0, 2.0), targets=[(1, 0)])
-    assert feasibility_potential(free, hunting, SETTINGS)[0, 1] == 0
+    assert feasibility_potential(free, hunting, settings=SETTINGS)[0, 1] == 0
     _, between = situation(start, (8.0, 6.0, 0.0, 2.0), targets=[(2, 1), (1, 0)])
     states = free.clone()
     states[:, 2, 20:] = states[:, 1, 20:]
     for vehicle in (1, 2):
         calm = replace(SETTINGS, accel=0.0, jerk=0.0, lateral=0.0)
-        assert feasibility_potential(states, between, calm)[0, vehicle] == 0
-        assert feasibility_potential(states, context, calm)[0, vehicle] > 0.1
+        assert feasibility_potential(states, between, settings=calm)[0, vehicle] == 0
+        assert feasibility_potential(states, context, settings=calm)[0, vehicle] > 0.1
 
 
 def only(**weights):
@@ -112,12 +112,12 @@ def only(**weights):
 def test_each_term_of_v_feas_has_its_closed_form_and_cruising_alone_is_free():
     """Ten states, one every 0.5 s; the vehicle drives at 10 m/s, 60 m ahead of the ego in the next lane."""
     states, context = situation((60.0, 3.5, 0.0, 10.0))
-    assert feasibility_potential(states, context, SETTINGS)[0, 1] == 0
+    assert feasibility_potential(states, context, settings=SETTINGS)[0, 1] == 0
 
     def cost(change, **weights):
         plan = states.clone()
         change(plan[0, 1])
-        return feasibility_potential(plan, context, only(**weights))[0, 1].item()
+        return feasibility_potential(plan, context, settings=only(**weights))[0, 1].item()
 
     def aside(plan):
         plan[25:, 1] -= 3.0  # five of the ten, 2 m beyond the bound of 1 m
@@ -155,7 +155,7 @@ def test_the_pair_term_is_the_squared_shortfall_of_the_gap_that_is_wanted():
         states, context = situation((30.0, 0.0, 0.0, 10.0), (30.0, began, 0.0, 10.0))
         context.scene["size"][:, 1:3] = torch.tensor([4.5, size])
         states[0, 2, :, 1] = size + 0.1
-        found = feasibility_potential(states, context, only(pair=3.0))[0]
+        found = feasibility_potential(states, context, settings=only(pair=3.0))[0]
         assert found[1].item() == pytest.approx(3.0 * (wanted - 0.1) ** 2, rel=2e-2) and found[1] == found[2]
 
 
@@ -164,7 +164,7 @@ def test_v_adv_has_its_closed_form_at_a_constant_distance():
     states, context = situation((1.5, 2.0, 0.0, 10.0), targets=[(1, 0)])
     value = adversarial_potential(states, context, only(distance=1.5), 0.7)[0, 1]
     assert value.item() == pytest.approx(1.5 * 2.5 / 2, abs=2e-3)
-    value = adversarial_potential(states, context, only(ttc=0.5))[0, 1]
+    value = adversarial_potential(states, context, settings=only(ttc=0.5))[0, 1]
     assert value.item() == pytest.approx(0.5 * (1 - math.exp(-(2.5**2) / 2)), rel=1e-3)
 
 
@@ -173,7 +173,7 @@ def test_the_closing_speed_at_the_nearest_moment_is_rewarded_up_to_a_bound(speed
     """Head-on and held at a distance of 20 m: closing at both speeds, counted in 10 m/s and up to 20 m/s."""
     states, context = situation((20.0, 0.0, math.pi, 1.0), targets=[(1, 0)])
     states[0, 1, :, 0], states[0, 1, :, 3] = context.ego_plan[0, :, 0] + 20.0, speed
-    value = adversarial_potential(states, context, only(impact_speed=0.3))[0, 1].item()
+    value = adversarial_potential(states, context, settings=only(impact_speed=0.3))[0, 1].item()
     assert value == pytest.approx(-0.3 * min(closing * 20 / 20.1, 20) / 10, rel=1e-3)
 
 
@@ -182,14 +182,14 @@ def test_who_starts_off_the_road_or_beside_its_route_is_only_kept_from_worse():
     context.scene["field"].fill_(3.0)
     context.start[:, 1, 1] += 2.5
     states[:, 1, :, 1] += 2.5
-    assert feasibility_potential(states, context, SETTINGS)[0, 1] == 0
+    assert feasibility_potential(states, context, settings=SETTINGS)[0, 1] == 0
 
 
 def test_the_gap_of_disks_is_near_that_of_the_boxes():
     generator = torch.Generator().manual_seed(0)
     pose = torch.rand(400, 2, 4, generator=generator, dtype=torch.float64) * torch.tensor([16.0, 16, 6.28, 1])
     size = torch.tensor([[4.8, 2.0], [9.0, 2.5]], dtype=torch.float64).expand(400, 2, 2)
-    gap = box_gap(pose[:, 0], size[:, 0], pose[:, 1], size[:, 1], 9)
+    gap = box_gap(pose[:, 0], size[:, 0], other=pose[:, 1], other_size=size[:, 1], disks=9)
     exact = torch.from_numpy(shapely.distance(*shapely.polygons(corners(pose, size).numpy()).T))
     apart = exact > 0
     assert (gap - exact)[apart].min() > -2e-3  # disks lie inside the box

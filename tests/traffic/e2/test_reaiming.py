@@ -57,17 +57,17 @@ def scene_set():
 
 def test_traffic_in_which_nobody_reacts_is_today_s_bit_for_bit(scene_set):
     pool = stored(scene_set) + stored(scene_set, 0.0) + TrafficPool.recorded(torch.arange(4))
-    today = driven(pool, scene_set, None)
-    nobody = driven(pool, scene_set, ReactSettings(fraction=0.0))
+    today = driven(pool, scene_set, settings=None)
+    nobody = driven(pool, scene_set, settings=ReactSettings(fraction=0.0))
     for key in today.keys(True, True):
         assert torch.equal(today[key], nobody[key]), key
-    reacting = driven(pool, scene_set, EVERYBODY)
+    reacting = driven(pool, scene_set, settings=EVERYBODY)
     assert torch.equal(tracks(today)[4:], tracks(reacting)[4:]), "nor in rows without an intensity"
 
 
 def test_the_row_s_adversaries_leave_the_replay_and_everybody_else_stays(scene_set):
     pool = stored(scene_set)
-    frames = driven(pool, scene_set, EVERYBODY)
+    frames = driven(pool, scene_set, settings=EVERYBODY)
     moved = (tracks(frames) != pool.parts[0].states[:, 1:]).any(-1)
     others = [1, *range(4, moved.shape[2])]
     assert moved[:, :, 2:4].any(2).any(1).all() and not moved[:, :, others].any()
@@ -77,10 +77,10 @@ def test_the_row_s_adversaries_leave_the_replay_and_everybody_else_stays(scene_s
 
 def test_other_vehicles_that_move_near_the_ego_react(scene_set):
     pool = stored(scene_set)
-    frames = driven(pool, scene_set, ReactSettings(fraction=1.0, others=1.0, responsibility="none"))
+    frames = driven(pool, scene_set, settings=ReactSettings(fraction=1.0, others=1.0, responsibility="none"))
     moved = (tracks(frames) != pool.parts[0].states[:, 1:]).any(-1)
     assert moved[:, :, [1, 4]].any(2).any(1).all() and not moved[:, :, [2, 3, 5]].any(), "5 is parked"
-    full = driven(pool, scene_set, ReactSettings(fraction=1.0, others=1.0))
+    full = driven(pool, scene_set, settings=ReactSettings(fraction=1.0, others=1.0))
     leads = (tracks(full) != pool.parts[0].states[:, 1:]).any(-1)[..., 4]
     assert not leads.any(), "under full responsibility none that leads the ego's way"
 
@@ -109,13 +109,13 @@ def law(responsibility):
 
 
 def ground_of(world):
-    return Ground(torch.full_like(world.scene["field"], -5.0), world.scene["field_origin"], torch.tensor([0]))
+    return Ground(torch.full_like(world.scene["field"], -5.0), world.scene["field_origin"], row=torch.tensor([0]))
 
 
 def seen_by(vehicles):
     """What vehicle 1 sees, and the ground, all of it drivable."""
     world = make_world(vehicles)
-    return surroundings(world, torch.tensor([0]), torch.tensor([1])), ground_of(world)
+    return surroundings(world, torch.tensor([0]), agents=torch.tensor([1])), ground_of(world)
 
 
 def aimed(vehicles, eta=2.0, responsibility="none", shift=STILL):
@@ -129,8 +129,8 @@ def test_straight_ahead_of_a_standing_ego_it_touches_it_at_the_chosen_moment(dis
     seen, aim = aimed([(0, 0, 0, 0.0), (distance, 0, math.pi, speed)])
     assert aim.curvature.abs().item() < 1e-3 and -2.4 <= aim.accel.item() <= 3.0
     times = torch.arange(1, 501) / 100
-    path, driven = along_arc(seen.states[:, 1], aim, times)
-    met = overlap(path, seen.scene["size"][:, 1, None], seen.states[:, :1], seen.scene["size"][:, :1])[0]
+    path, driven = along_arc(seen.states[:, 1], aim, times=times)
+    met = overlap(path, seen.scene["size"][:, 1, None], second=seen.states[:, :1], second_size=seen.scene["size"][:, :1])[0]
     arrival = times[driven[0] >= distance - 0.4 * 2 * 4.5 - 1e-3]
     assert met.any() and len(arrival), "it comes there"
     assert (arrival[0] / 0.5 - (arrival[0] / 0.5).round()).abs() < 0.021, "at one of the ten moments"
@@ -141,11 +141,11 @@ def test_aims_keep_the_limits_at_every_intensity():
     count = 400
     states = torch.stack([*(60 * torch.rand(3, count) - 30), 20 * torch.rand(count)], -1)
     ego = torch.stack([*(60 * torch.rand(3, count) - 30), 15 * torch.rand(count)], -1)
-    target = along_arc(ego, Arc(torch.zeros(count), torch.zeros(count)), moments(ego))[0]
+    target = along_arc(ego, Arc(torch.zeros(count), torch.zeros(count)), times=moments(ego))[0]
     eta = 1 + 2 * torch.rand(count)
     length = torch.full((count,), 4.5)
-    ground = Ground(torch.full((1, 200, 200), -5.0), torch.tensor([[-100.0, -100.0]]), torch.zeros(count).long())
-    aim = best_aim(states, target, 2 * length, eta, ground, InterceptionSettings())
+    ground = Ground(torch.full((1, 200, 200), -5.0), torch.tensor([[-100.0, -100.0]]), row=torch.zeros(count).long())
+    aim = best_aim(states, target, lengths=2 * length, eta=eta, ground=ground, limits=InterceptionSettings())
     some = ~aim.accel.isnan()
     assert 0.2 < some.float().mean() < 0.8, "not where the ego is behind"
     accel = aim.accel[some]
@@ -185,7 +185,7 @@ def test_only_paths_on_the_drivable_area_are_taken():
     ground.field[:] = (torch.arange(ground.field.shape[-1]) + ground.origin[0, 1] - 3.0).clamp(-5, 5)
     kerb = law("none")(seen, torch.tensor([2.0]), STILL, ground, LAWFUL)
     assert free.curvature > 0.01
-    end = along_arc(seen.states[:, 1], kerb, torch.tensor([2.0]))[0]
+    end = along_arc(seen.states[:, 1], kerb, times=torch.tensor([2.0]))[0]
     assert end[0, 0, 1] < 3.6
 
 
@@ -196,14 +196,14 @@ def followed_for(seconds, responsibility, vehicles):
     generator = torch.Generator().manual_seed(0)
     touched = False
     for _ in range(round(seconds / 0.5)):
-        seen = surroundings(world, torch.tensor([0]), torch.tensor([1]))
+        seen = surroundings(world, torch.tensor([0]), agents=torch.tensor([1]))
         aim = aims(seen, torch.tensor([3.0]), 0.7 * torch.randn(1, 2, generator=generator), ground_of(world), LAWFUL)
         states = world.states.clone()
-        path, _ = along_arc(states[:, 1], aim, DT * torch.arange(1, 6))
+        path, _ = along_arc(states[:, 1], aim, times=DT * torch.arange(1, 6))
         still = Arc(torch.zeros(1), torch.zeros(1))
-        ego, _ = along_arc(states[:, 0], still, DT * torch.arange(1, 6))
+        ego, _ = along_arc(states[:, 0], still, times=DT * torch.arange(1, 6))
         size = world.scene["size"]
-        touched |= overlap(path, size[:, 1, None], ego, size[:, :1]).any().item()
+        touched |= overlap(path, size[:, 1, None], second=ego, second_size=size[:, :1]).any().item()
         world.turn_rate[:, 1] = dynamics.wrap(path[:, -1, 2] - states[:, 1, 2]) / 0.5
         world.accel[:, 1] = aim.accel
         states[:, 0], states[:, 1] = ego[:, -1], path[:, -1]
@@ -214,8 +214,8 @@ def followed_for(seconds, responsibility, vehicles):
 @pytest.mark.parametrize("speed", [10.0, 16.0])
 def test_from_behind_it_hits_a_steady_ego_without_responsibility_and_never_with_it(speed):
     vehicles = [(0, 0, 0, 9.0), (-25, 0, 0, speed)]
-    assert followed_for(8, "none", vehicles)
-    assert not followed_for(8, "full", vehicles) and not followed_for(8, "rear", vehicles)
+    assert followed_for(8, "none", vehicles=vehicles)
+    assert not followed_for(8, "full", vehicles=vehicles) and not followed_for(8, "rear", vehicles=vehicles)
 
 
 def test_a_reckless_vehicle_owes_the_ego_nothing_whatever_the_law():
@@ -227,7 +227,7 @@ def test_a_reckless_vehicle_owes_the_ego_nothing_whatever_the_law():
 
 def test_ahead_it_gives_way_late_but_in_time_under_full_responsibility():
     crossing = [(0, 0, 0, 9.0), (30, -25, math.pi / 2, 8.0)]
-    assert followed_for(6, "none", crossing) and not followed_for(6, "full", crossing)
+    assert followed_for(6, "none", vehicles=crossing) and not followed_for(6, "full", vehicles=crossing)
     near, far = (aimed([(0, 0, 0, 9.0), (x, 0, math.pi, 8.0)], responsibility="full")[1].accel for x in (20.0, 60.0))
     free = aimed([(0, 0, 0, 9.0), (60.0, 0, math.pi, 8.0)])[1].accel
     assert near < -2.4 and far == free, "it waits while little braking still suffices"

@@ -88,7 +88,7 @@ def ask(url, tmp_path, made, **settings):
 
 def test_the_model_decides_and_is_asked_by_schema_at_temperature_zero(tmp_path):
     with chat_server(verdicts) as (url, requests):
-        result, counts = ask(url, tmp_path, world())
+        result, counts = ask(url, tmp_path, made=world())
     assert result.mask[0].tolist() == [False, True, True] + [False] * 5, "the rules would take the first only"
     request = requests[0]
     assert request["path"] == "/v1/chat/completions" and request["temperature"] == 0 and request["model"] == "small"
@@ -103,10 +103,10 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
     made = world()
     made.scene["parked"][:, 2] = True
     with chat_server(verdicts) as (url, requests):
-        result, _ = ask(url, tmp_path, made)
+        result, _ = ask(url, tmp_path, made=made)
     assert result.mask[0].tolist() == [False, True] + [False] * 6
     assert "Vehicle 2" not in requests[0]["messages"][-1]["content"]
-    torch.testing.assert_close(result.conflicts.s, feasible_vehicles(made.scene, made, RULES).conflicts.s)
+    torch.testing.assert_close(result.conflicts.s, feasible_vehicles(made.scene, made, settings=RULES).conflicts.s)
 
 
 @pytest.mark.parametrize(
@@ -127,26 +127,26 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
 def test_the_rules_decide_where_the_model_fails(tmp_path, answer):
     made = world(2)
     with chat_server(lambda request: answer) as (url, _), pytest.warns(UserWarning, match="rules decided for 1 of"):
-        result, counts = ask(url, tmp_path, made)
-    assert torch.equal(result.mask, feasible_vehicles(made.scene, made, RULES).mask)
+        result, counts = ask(url, tmp_path, made=made)
+    assert torch.equal(result.mask, feasible_vehicles(made.scene, made, settings=RULES).mask)
     assert counts["lm_fallbacks"] == counts["lm_requests"] == 2
     assert not list(tmp_path.iterdir()), "failures are not kept"
 
 
 def test_answers_are_kept_by_content(tmp_path):
     with chat_server(verdicts) as (url, requests):
-        first, _ = ask(url, tmp_path, world())
-        again, counts = ask(url, tmp_path, world())
+        first, _ = ask(url, tmp_path, made=world())
+        again, counts = ask(url, tmp_path, made=world())
         assert len(requests) == 1 and counts["lm_cached"] == 1 and torch.equal(first.mask, again.mask)
-        ask(url, tmp_path, world(), model="other")
+        ask(url, tmp_path, made=world(), model="other")
         assert len(requests) == 2, "another model is asked anew"
         moved = world()
         moved.states[:, 1, 0] += 5
-        ask(url, tmp_path, moved)
+        ask(url, tmp_path, made=moved)
         assert len(requests) == 3, "and so is about another scene"
         for path in tmp_path.iterdir():
             path.write_text("{")
-        ask(url, tmp_path, world())
+        ask(url, tmp_path, made=world())
         assert len(requests) == 4, "damaged answers are not believed"
 
 

@@ -84,7 +84,7 @@ def test_the_ego_s_own_neighbour_and_following_lanes_hold_no_initiator():
             world.scene[lane][:, 0] = 1
         states = world.states[:, [0, 2]]
         asked = torch.tensor([[True]])
-        assert skeleton._on_ego_lanes(states, asked, world.scene).item() != counts, lane
+        assert skeleton._on_ego_lanes(states, asked, scene=world.scene).item() != counts, lane
 
 
 def test_pursuit_takes_the_nearest_of_the_support_where_nobody_can_meet_the_ego():
@@ -96,7 +96,7 @@ def test_pursuit_takes_the_nearest_of_the_support_where_nobody_can_meet_the_ego(
     cost = torch.full(support.shape, torch.inf)
     cost[2, 1] = 1.0
     chosen = [
-        members(skeleton_of(world, support, feasible, cost=cost, near=1, far=0, pursuit=pursuit))
+        members(skeleton_of(world, support, feasible=feasible, cost=cost, near=1, far=0, pursuit=pursuit))
         for pursuit in (False, True)
     ]
     assert chosen == [[[2, 1]], [[0, 2], [1, 2], [2, 1]]]
@@ -129,16 +129,16 @@ def test_influence_is_that_of_the_equations_of_motion(seed):
     world = random_world(seed)
     settings = SkeletonSettings(tau_long=12.0)
     times = STEP * torch.arange(1, 11)
-    expected = constant_speed_states(world.scene, world, times)
+    expected = constant_speed_states(world.scene, world, times=times)
     slots = torch.arange(1, 8)[None], torch.ones(1, 7, dtype=torch.bool)
-    found = influence(world.scene, world, slots, expected, settings)[0]
+    found = influence(world.scene, world, slots=slots, expected=expected, settings=settings)[0]
     states = world.states[0]
     wanted = torch.zeros_like(found)
     for i in range(7):
         for j in range(8):
             if i != j:
                 other = states[0] if j == 7 else states[j + 1]
-                wanted[i, j] = torch.tensor([acts(states[i + 1], other, t, 12.0) for t in times.tolist()])
+                wanted[i, j] = torch.tensor([acts(states[i + 1], other, time=t, tau_long=12.0) for t in times.tolist()])
     assert wanted.any() and torch.equal(found, wanted)
 
 
@@ -159,9 +159,9 @@ def test_a_chain_is_a_shortest_one_whose_effects_never_precede_their_causes(seed
     world = random_world(seed)
     settings = {"near": 2, "far": 1, "tau_long": 25.0, "max_chain": 4}
     result = skeleton_of(world, mask(world, *range(1, 8)), **settings)
-    expected = constant_speed_states(world.scene, world, STEP * torch.arange(1, 11))
+    expected = constant_speed_states(world.scene, world, times=STEP * torch.arange(1, 11))
     slots = torch.arange(1, 8)[None], torch.ones(1, 7, dtype=torch.bool)
-    link = influence(world.scene, world, slots, expected, SkeletonSettings(**settings))[0]
+    link = influence(world.scene, world, slots=slots, expected=expected, settings=SkeletonSettings(**settings))[0]
     near = (result.near[0, 1:].nonzero()[:, 0]).tolist()
     distance = (world.states[0, 1:8, :2] - world.states[0, :1, :2]).norm(dim=-1)
     others = [i for i in range(7) if i not in near]
@@ -185,7 +185,7 @@ def test_a_chain_is_a_shortest_one_whose_effects_never_precede_their_causes(seed
 def test_any_candidate_route_may_lead_to_the_target():
     world = make_world([EGO, COLUMN[0], (10.0, -40.0, UP, 20.0)])
     assert not skeleton_of(world, mask(world, 1, 2), near=1).far.any()
-    add_route(world, 2, 3, math.atan2(32.0, 20.0))  # towards where the first will be
+    add_route(world, 2, candidate=3, heading=math.atan2(32.0, 20.0))  # towards where the first will be
     assert skeleton_of(world, mask(world, 1, 2), near=1, tau_long=60.0).far.any()
 
 

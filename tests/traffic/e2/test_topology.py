@@ -39,7 +39,7 @@ def rollout(states, steps=81):
 
 
 def test_first_contact_is_that_of_stepped_polygons():
-    states, size = random_boxes(120, 2, 15.0, 0)
+    states, size = random_boxes(120, 2, spread=15.0, seed=0)
     closed = time_to_collision(states, size)
     assert torch.equal(closed, closed.transpose(-1, -2))
     time = torch.arange(0, 8.0, 0.01, dtype=torch.float64)
@@ -74,7 +74,7 @@ def test_weights_are_the_sigmoid_of_the_ttc_and_nothing_for_the_absent():
     """Boxes grown by the clearance: a gap of 34 - 4 - 1 m closes at 10 m/s."""
     settings = TopologySettings(clearance=1.0, tau_max=2.5, beta=0.5)
     states = torch.tensor([[0.0, 0, 0, 10], [34, 0, 0, 0], [30, 0, 0, 0]])
-    weight = pair_weights(states, torch.tensor([True, True, False]), torch.tensor([4.0, 2.0]).expand(3, 2), settings)
+    weight = pair_weights(states, torch.tensor([True, True, False]), size=torch.tensor([4.0, 2.0]).expand(3, 2), settings=settings)
     assert weight[0, 1].item() == pytest.approx(1 / (1 + math.exp((2.9 - 2.5) / 0.5)))
     assert weight[1, 0] == weight[0, 1] and weight[2].sum() == 0 and weight.diagonal().sum() == 0
 
@@ -112,13 +112,13 @@ def cliques_by_definition(weight, distance, valid, settings):
 def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypatch):
     """Eqs. (ttc_weight_t) and (temporal_scoring): a point for each top clique of each analysed step."""
     monkeypatch.setattr(topology, "NODES", nodes)
-    states, size = random_boxes(1, 11, 20.0, seed)
+    states, size = random_boxes(1, 11, spread=20.0, seed=seed)
     states[:, 0, :2] *= 0.3
     track = rollout(states)
     valid = torch.rand(1, 81, 11, generator=torch.Generator().manual_seed(seed)) < 0.9
     valid[:, :, 0] = valid[:, 0] = True
     settings = TopologySettings(candidates=3, max_clique=3, top_cliques=2)
-    result = topological_candidates(track, valid, size, settings)
+    result = topological_candidates(track, valid, size=size, settings=settings)
     assert result.steps.tolist() == list(range(0, 81, STRIDE)) and STRIDE == 5
     score = [0] * 11
     nearest = [math.inf] * 11
@@ -127,7 +127,7 @@ def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypa
         distance = distance.masked_fill(~valid[0, step], math.inf).tolist()
         nearest = [min(pair) for pair in zip(nearest, distance, strict=True)]
         weight = result.weights[0, number].numpy()
-        expected = cliques_by_definition(weight, distance, valid[0, step].tolist(), settings)
+        expected = cliques_by_definition(weight, distance, valid=valid[0, step].tolist(), settings=settings)
         assert result.cliques[0][number] == expected
         for i in (i for clique in expected for i in clique):
             score[i] += 1

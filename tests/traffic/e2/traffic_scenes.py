@@ -38,7 +38,7 @@ def drive(scene_set: SceneSet, on: Traffic, eta: float, seeds=None, ego: Ego | N
     index = torch.arange(len(scene_set))
     seeds = index if seeds is None else torch.tensor(seeds)
     etas = torch.full((len(index),), eta)
-    return roll_out(scene_set, index, seeds, etas, ego or EGO, on, SimSettings(**sim))
+    return roll_out(scene_set, index, seed=seeds, eta=etas, ego=ego or EGO, traffic=on, sim=SimSettings(**sim))
 
 
 def begin(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None) -> State:
@@ -50,12 +50,12 @@ def begin(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None) -> S
 
 def replanned(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None, times: int = 1):
     """State and plan after `times` replans, half a second of perfect execution between two of them."""
-    state = begin(on, scene, eta, seeds)
+    state = begin(on, scene, eta=eta, seeds=seeds)
     world = World.at_start(scene)
     for _ in range(times):
         ego_plan = EGO.plan(world)
         state, plan = on.replan(state, world, ego_plan)
-        world = executed(world, plan, ego_plan)
+        world = executed(world, plan, ego_plan=ego_plan)
     return state, plan
 
 

@@ -111,7 +111,7 @@ class EgoState:
     ):
         back = vehicle_parameters.rear_axle_to_center
         rear = StateVector2D(center_velocity_2d.x, center_velocity_2d.y - back * angular_vel)
-        dynamic = DynamicCarState(rear, center_velocity_2d, center_acceleration_2d, angular_vel)
+        dynamic = DynamicCarState(rear, center_velocity_2d, center_acceleration_2d=center_acceleration_2d, angular_velocity=angular_vel)
         return cls(center, moved(center, -back), dynamic, time_point, CarFootprint(vehicle_parameters))
 
     @classmethod
@@ -129,12 +129,12 @@ class EgoState:
         ahead = vehicle_parameters.rear_axle_to_center
         rear = rear_axle_velocity_2d
         velocity = StateVector2D(rear.x, rear.y + ahead * angular_vel)
-        dynamic = DynamicCarState(rear, velocity, rear_axle_acceleration_2d, angular_vel)
+        dynamic = DynamicCarState(rear, velocity, center_acceleration_2d=rear_axle_acceleration_2d, angular_velocity=angular_vel)
         return cls(moved(rear_axle_pose, ahead), rear_axle_pose, dynamic, time_point, CarFootprint(vehicle_parameters))
 
 
 def moved(pose, ahead):
-    return StateSE2(pose.x + ahead * math.cos(pose.heading), pose.y + ahead * math.sin(pose.heading), pose.heading)
+    return StateSE2(pose.x + ahead * math.cos(pose.heading), pose.y + ahead * math.sin(pose.heading), heading=pose.heading)
 
 
 TrackedObjectType = Enum(

@@ -34,13 +34,13 @@ def places(tmp_path_factory):
     rollouts = Rollouts.in_scenes(
         scenes,
         torch.arange(count),
-        states,
-        batch["logged_valid"],
+        states=states,
+        valid=batch["logged_valid"],
         adversaries=torch.zeros(count, agents, dtype=torch.bool),
         seed=torch.zeros(count, dtype=torch.int64),
         eta=torch.zeros(count, dtype=torch.float64),
     )
-    return save_run(folder, data, sourced(rollouts, "bundled", "test", "replay", "log"))
+    return save_run(folder, data, rollouts=sourced(rollouts, "bundled", split="test", method="replay", ego="log"))
 
 
 @pytest.fixture(scope="session")

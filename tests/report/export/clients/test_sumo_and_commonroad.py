@@ -47,7 +47,7 @@ def lane_pairs(lanes, outside):
 
 def test_every_link_is_a_connection_at_its_lane_s_limit(places, sumo, tmp_path):
     count = 0
-    for episode in episodes_of(places, read_rows(places / TABLE), [], True):
+    for episode in episodes_of(places, read_rows(places / TABLE), plugins=[], scene=True):
         roads = tmp_path / f"{count}.xodr"
         net = tmp_path / f"{count}.net.xml"
         write_roads(episode, roads)
@@ -68,7 +68,7 @@ def test_every_link_is_a_connection_at_its_lane_s_limit(places, sumo, tmp_path):
 
 
 def test_the_designer_links_lanelets_as_the_lanes_are(places, tools, tmp_path):
-    episodes = list(episodes_of(places, read_rows(places / TABLE), [], True))
+    episodes = list(episodes_of(places, read_rows(places / TABLE), plugins=[], scene=True))
     paths = [tmp_path / f"{index}.xodr" for index in range(len(episodes))]
     for episode, path in zip(episodes, paths, strict=True):
         write_roads(episode, path)
@@ -82,7 +82,7 @@ def test_the_designer_links_lanelets_as_the_lanes_are(places, tools, tmp_path):
 
 
 def test_commonroad_sumo_takes_every_place_with_its_lights(places, tools, sumo, commonroad_files):
-    episodes = list(episodes_of(places, read_rows(places / TABLE), [], True))
+    episodes = list(episodes_of(places, read_rows(places / TABLE), plugins=[], scene=True))
     read = answer(tools, "lights_to_sumo", *commonroad_files(places, "places"), path=sumo)
     assert len(read) == len(episodes) == 16
     for episode, found in zip(episodes, read, strict=True):
