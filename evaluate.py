@@ -1,4 +1,5 @@
-"""Closed-loop evaluation: `python evaluate.py [data=...] [ego=...] [eta=...]` says how often, and how, an ego fails."""
+"""Closed-loop evaluation: `python evaluate.py [data=...] [ego=...] [eta=...]` says how
+often, and how, an ego fails."""
 
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
@@ -26,21 +27,37 @@ def evaluate(run: Run) -> None:
     plan = begin(run)
     asked = plan.asked
     egos = plan.egos
-    work = Work(plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard)
+    work = Work(
+        plan.rollouts(folder), processes_of(config), plan.only, run.parts(), asked.shard
+    )
     setups = egos.setups(plan.setup)
     most = max(asked.budget, default=0.0)
-    then = failure_row(Path(config.reproduce), config.failure) if config.failure else None
+    then = (
+        failure_row(Path(config.reproduce), config.failure) if config.failure else None
+    )
     if then is not None:
-        (scored,) = score_all([("failure", plan.part_of(then, Path(config.reproduce)))], work, lambda job: 1)
+        (scored,) = score_all(
+            [("failure", plan.part_of(then, Path(config.reproduce)))],
+            work,
+            lambda job: 1,
+        )
     elif asked.budget:
-        scored, tries = search_all(setups, plan.searches, most, asked.budget_unit, asked.seeds, work)
+        scored, tries = search_all(
+            setups, plan.searches, most, asked.budget_unit, asked.seeds, work
+        )
     else:
-        scored = drive_all(setups, plan.methods, asked.seeds, work)  # every ego, method, eta, scene and seed
+        scored = drive_all(
+            setups, plan.methods, asked.seeds, work
+        )  # every ego, method, eta, scene and seed
     if asked.shard != WHOLE:
-        print(f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them")
+        print(
+            f"\nshard {asked.shard[0]} of {asked.shard[1]} written to {folder}; e2rl merge joins all of them"
+        )
         return
     searched = bool(asked.budget) and then is None
-    about = {"references": references(plan), "searched": searched} | origin_of(run.folder)
+    about = {"references": references(plan), "searched": searched} | origin_of(
+        run.folder
+    )
     rows = record(*scored, folder, partial(egos.metric_rows, **about))
     if searched:
         save_budget(folder, plan, tries, *scored[:2])

@@ -1,6 +1,8 @@
-"""Training: `python train.py [data=...] [synthesizer=...] [learner=...]` hardens an ego in rounds of Algorithm 1.
+"""Training: `python train.py [data=...] [synthesizer=...] [learner=...]` hardens an ego
+in rounds of Algorithm 1.
 
-`stage=prior` trains a prior, `stage=imitation` the start of an actor, `stage=bits` the driver bits.
+`stage=prior` trains a prior, `stage=imitation` the start of an actor, `stage=bits` the
+driver bits.
 """
 
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
@@ -11,10 +13,20 @@ import sys
 from e2rl.evaluation.methods import build_ego, build_prior, build_traffic, caption
 from e2rl.evaluation.rollout_files import ERRORED_FILE, add_errored
 from e2rl.learning.bits_training import run_bits_stage
-from e2rl.learning.build import build_evolution, build_logger, build_measure, build_progress, check_training
+from e2rl.learning.build import (
+    build_evolution,
+    build_logger,
+    build_measure,
+    build_progress,
+    check_training,
+)
 from e2rl.learning.evolution import Evolution
 from e2rl.learning.imitation import run_imitation_stage
-from e2rl.learning.prior_training.distributed import follower_overrides, follows, started_by_torchrun
+from e2rl.learning.prior_training.distributed import (
+    follower_overrides,
+    follows,
+    started_by_torchrun,
+)
 from e2rl.learning.prior_training.stage import run_prior_stage
 from e2rl.learning.run_checkpoint import load_checkpoint, rounds_done, save_checkpoint
 from e2rl.report.answer import compared_answer
@@ -34,11 +46,19 @@ MAY_CHANGE = ("rounds", "device", "threads", "launcher")  # when a run is resume
 
 def train_round(run: Evolution) -> dict[str, float]:
     """One round of Algorithm 1; returns its metrics."""
-    order = run.draw()  # scenes, and for each an intensity and a causal template, by the curriculum
-    attack = run.roll_out(order)  # the attack on the current policy; what no driver avoids does not enter D'
+    order = (
+        run.draw()
+    )  # scenes, and for each an intensity and a causal template, by the curriculum
+    attack = run.roll_out(
+        order
+    )  # the attack on the current policy; what no driver avoids does not enter D'
     run.prefetch()  # the next round's attack, in another process meanwhile
-    learned = run.learn(attack)  # episodes in D', by TorchRL's collector, and updates of the policy, in turn
-    return run.move_on(order, attack, learned)  # the curriculum, by what the policy failed in
+    learned = run.learn(
+        attack
+    )  # episodes in D', by TorchRL's collector, and updates of the policy, in turn
+    return run.move_on(
+        order, attack, learned
+    )  # the curriculum, by what the policy failed in
 
 
 def evolve(task: Run) -> None:
@@ -47,18 +67,28 @@ def evolve(task: Run) -> None:
     folder = task.folder
     done = rounds_done(task.config.resume)
     progress = build_progress(config, done)
-    prior, origin = build_prior(config, config.device)  # before the scenes, which take longer than a wrong path
+    prior, origin = build_prior(
+        config, config.device
+    )  # before the scenes, which take longer than a wrong path
     traffic = build_traffic(config.synthesizer, prior)
     ego = build_ego(config)
-    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
+    scenes = load_scenes(
+        config.data, config.num_scenes, split="train", scenes=config.scenes
+    )
     run = build_evolution(config, scenes, ego, traffic, folder=folder)
     logger = build_logger(config, folder)
     measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
-    task.begin({"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)})
+    task.begin(
+        {"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)}
+    )
     logger.forget(load_checkpoint(config.resume, run) if done else 0)
-    progress.say(f"{len(scenes)} scenes to train on, {len(measure.setup.scenes)} to measure on, in {folder}")
+    progress.say(
+        f"{len(scenes)} scenes to train on, {len(measure.setup.scenes)} to measure on, in {folder}"
+    )
     if (task.choices["data"], task.choices["experiment"]) == ("bundled", "harden"):
-        progress.say("these are the bundled scenes: experiment=harden is for logs of your own (data=, data.path=)")
+        progress.say(
+            "these are the bundled scenes: experiment=harden is for logs of your own (data=, data.path=)"
+        )
     if not done:
         with progress.phase("measurement"):
             measure("before", run.ego, 0)
@@ -73,33 +103,50 @@ def evolve(task: Run) -> None:
             if picture := draw_choices(folder):
                 logger.show("curriculum/choices", picture, number)
             if config.logger.videos and run.memory.rounds:
-                attacks = run.memory.rounds[-1].traffic, scenes, number + 1, config.synthesizer.name
-                for k, video in enumerate(save_videos(*attacks, folder, config.logger.videos)):
+                attacks = (
+                    run.memory.rounds[-1].traffic,
+                    scenes,
+                    number + 1,
+                    config.synthesizer.name,
+                )
+                for k, video in enumerate(
+                    save_videos(*attacks, folder, config.logger.videos)
+                ):
                     logger.show(f"synthesizer/video_{k + 1}", video, number)
         progress.say(round_line(metrics, number + 1, config.rounds))
     logger.close()
     with progress.phase("measurement"):
         rows = measure("after", run.ego, run.round)
     save_tables(folder / "tables.md", metric_tables(rows, caption(config, origin)))
-    before, after = ([row for row in rows if row["stage"] == stage] for stage in ("before", "after"))
+    before, after = (
+        [row for row in rows if row["stage"] == stage] for stage in ("before", "after")
+    )
     answer = compared_answer(before, after, measure.atlases(), folder)
     print("", *answer, run.improve.outcome(folder), sep="\n")
 
 
 def train_prior(task: Run) -> None:
     """Train a prior and print its nominal closed loop on held-out logs."""
-    logger = None if follows() else build_logger(task.config, task.folder)  # the leader alone writes
+    logger = (
+        None if follows() else build_logger(task.config, task.folder)
+    )  # the leader alone writes
     outcome = run_prior_stage(task, logger)
     if outcome is None:
         return  # another process of torchrun is the leader and reports
     path, rows = outcome
-    print_tables(metric_tables(rows, f"nominal closed loop of {path.name} on held-out logs, ego replayed"))
+    print_tables(
+        metric_tables(
+            rows, f"nominal closed loop of {path.name} on held-out logs, ego replayed"
+        )
+    )
     print(f"\ncheckpoint: {path}\nuse it with prior.checkpoint={path}")
 
 
 def imitate(task: Run) -> None:
     """Warm-start the actor from the recorded egos."""
-    print(losses_line(run_imitation_stage(task, build_logger(task.config, task.folder))))
+    print(
+        losses_line(run_imitation_stage(task, build_logger(task.config, task.folder)))
+    )
     print(f"start evolution rounds from it with ego.checkpoint={task.folder}")
 
 
@@ -111,7 +158,9 @@ def train_bits(task: Run) -> None:
 
 def losses_line(row: dict[str, float]) -> str:
     """The losses of a training's chosen turn."""
-    return ", ".join(f"{name} {value:.4f}" for name, value in row.items() if value == value)  # NaN: none held out
+    return ", ".join(
+        f"{name} {value:.4f}" for name, value in row.items() if value == value
+    )  # NaN: none held out
 
 
 def purpose(task: Run) -> str:
@@ -126,14 +175,21 @@ def purpose(task: Run) -> str:
     )
 
 
-STAGES = {"evolution": evolve, "prior": train_prior, "imitation": imitate, "bits": train_bits}
+STAGES = {
+    "evolution": evolve,
+    "prior": train_prior,
+    "imitation": imitate,
+    "bits": train_bits,
+}
 
 
 def train(task: Run) -> None:
     """One stage of training, as configured."""
     config = task.config
     if started_by_torchrun() and config.stage.name != "prior":
-        raise InputError(f"torchrun: stage={config.stage.name} runs in one process, started with python")
+        raise InputError(
+            f"torchrun: stage={config.stage.name} runs in one process, started with python"
+        )
     set_up(config)
     check_training(config)
     if not follows():

@@ -1,4 +1,5 @@
-"""The simulator through TorchRL's Collector with the learned actor, as in an evolution round."""
+"""The simulator through TorchRL's Collector with the learned actor, as in an evolution
+round."""
 
 import time
 from collections.abc import Iterator

@@ -12,10 +12,11 @@ from e2rl.learning.build import build_evolution
 
 
 def evolution_round(bench: Bench) -> Iterator[Row]:
-    """Seconds of a round, not repeated: it takes minutes; synthesis is of D' and of its nominal scenes.
+    """Seconds of a round, not repeated: it takes minutes; synthesis is of D' and of its
+    nominal scenes.
 
-    With synthesis beside learning it is the second of three rounds, which waits for what was begun during the first and
-    learns while the third's D' is made.
+    With synthesis beside learning it is the second of three rounds, which waits for
+    what was begun during the first and learns while the third's D' is made.
     """
     for prefetch in (False, True):
         config = bench.configured("train")
@@ -31,4 +32,6 @@ def evolution_round(bench: Bench) -> Iterator[Row]:
         where = ", prefetch" if prefetch else ""
         yield bench.row("evolution_round", f"whole{where}", index, total, "s")
         for part in ("synthesize", "improve", *(["waiting"] if prefetch else [])):
-            yield bench.row("evolution_round", f"{part}{where}", index, metrics[f"time/{part}"], "s")
+            yield bench.row(
+                "evolution_round", f"{part}{where}", index, metrics[f"time/{part}"], "s"
+            )

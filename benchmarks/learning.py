@@ -1,4 +1,5 @@
-"""Policy learning from collection to weights, in the default configuration, on recorded traffic."""
+"""Policy learning from collection to weights, in the default configuration, on recorded
+traffic."""
 
 import time
 from collections.abc import Iterator
@@ -14,15 +15,24 @@ WARM_UP = 2  # iterations that are not counted: the first updates fit the critic
 
 
 def learning(bench: Bench) -> Iterator[Row]:
-    """Simulator steps of 0.1 s per second of CPU: of collecting a batch, and of collecting and updating; the best of
-    the repeats, without cloning, eager and compiled."""
+    """Simulator steps of 0.1 s per second of CPU: of collecting a batch, and of
+    collecting and updating; the best of the repeats, without cloning, eager and
+    compiled."""
     for fast in (False, True) if bench.compile else (False,):
         fused.switch(fast)
         collected, whole = rates(bench)
         index = bench.pick(bench.configured("train").learner.collect.batch)
         how = ", compiled" if fast else ""
-        yield bench.row("learning", f"collect{how}", index, collected, "simulator steps/CPU s")
-        yield bench.row("learning", f"collect and update{how}", index, whole, "simulator steps/CPU s")
+        yield bench.row(
+            "learning", f"collect{how}", index, collected, "simulator steps/CPU s"
+        )
+        yield bench.row(
+            "learning",
+            f"collect and update{how}",
+            index,
+            whole,
+            "simulator steps/CPU s",
+        )
     fused.switch(False)
 
 
@@ -33,7 +43,13 @@ def rates(bench: Bench) -> tuple[float, float]:
     collect = dict(config.learner.collect)
     ppo = {**config.learner.ppo, "cloning": 0.0}
     improve = PolicyImprovement(
-        build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo, react=None, rounds=config.rounds
+        build_ego(config),
+        bench.scenes,
+        build_sim(config),
+        collect=collect,
+        ppo=ppo,
+        react=None,
+        rounds=config.rounds,
     )
     collected = []
     whole = []

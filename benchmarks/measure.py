@@ -1,4 +1,5 @@
-"""What every benchmark shares: the scenes and parts under test, timing, and the row that is written."""
+"""What every benchmark shares: the scenes and parts under test, timing, and the row
+that is written."""
 
 import os
 import platform
@@ -25,13 +26,16 @@ from e2rl.traffic.traffic import Traffic
 
 def versions() -> dict[str, str]:
     """Of what the figures depend on."""
-    return {"python": platform.python_version()} | {name: version(name) for name in ("torch", "torchrl", "tensordict")}
+    return {"python": platform.python_version()} | {
+        name: version(name) for name in ("torch", "torchrl", "tensordict")
+    }
 
 
 @dataclass
 class Row:
-    """A figure. variant: what of the benchmark; batch: scenes at once; agents, map_points: rows a scene has; value in
-    unit, None where it could not be measured; load: of the machine in the minute before; processes, threads of each."""
+    """A figure. variant: what of the benchmark; batch: scenes at once; agents,
+    map_points: rows a scene has; value in unit, None where it could not be measured;
+    load: of the machine in the minute before; processes, threads of each."""
 
     benchmark: str
     variant: str
@@ -52,10 +56,12 @@ class Row:
 
 @dataclass
 class Bench:
-    """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes), prior checkpoint, repeats.
+    """What is measured: data (a ScenarioNet folder or zip, None: the bundled scenes),
+    prior checkpoint, repeats.
 
-    largest: scenes at once at most, None: as many as the benchmark wants; train: overrides of conf/train.yaml; compile:
-    measure compiled steps too; peers: the interpreter that has the peers.
+    largest: scenes at once at most, None: as many as the benchmark wants; train:
+    overrides of conf/train.yaml; compile: measure compiled steps too; peers: the
+    interpreter that has the peers.
     """
 
     data: str | None
@@ -74,8 +80,14 @@ class Bench:
     def configured(self, name: str) -> DictConfig:
         """Configuration `name` on the data and prior under test."""
         overrides = self.train if name == "train" else ()
-        data = ["data=scenarionet", f"data.path={self.data}"] if self.data else ["data=bundled"]
-        return load_config(name, [*data, f"prior.checkpoint={self.checkpoint}", *overrides])
+        data = (
+            ["data=scenarionet", f"data.path={self.data}"]
+            if self.data
+            else ["data=bundled"]
+        )
+        return load_config(
+            name, [*data, f"prior.checkpoint={self.checkpoint}", *overrides]
+        )
 
     @cached_property
     def scenes(self) -> SceneSet:
@@ -102,9 +114,14 @@ class Bench:
         return sorted({min(size, self.largest or size) for size in sizes})
 
     def pick(self, batch: int, agents: int | None = None) -> Tensor:
-        """Scene indices [batch], repeated where there are too few; agents: those with nearest to so many first."""
+        """Scene indices [batch], repeated where there are too few; agents: those with
+        nearest to so many first."""
         count = self.scenes.scenes["valid"].sum(1)
-        order = torch.arange(len(count)) if agents is None else (count - agents).abs().argsort(stable=True)
+        order = (
+            torch.arange(len(count))
+            if agents is None
+            else (count - agents).abs().argsort(stable=True)
+        )
         return order[torch.arange(batch) % len(order)]
 
     def environment(self, index: Tensor) -> DrivingEnv:
@@ -113,19 +130,38 @@ class Bench:
         env.reset(TensorDict({"scene_index": index[:, None]}, batch_size=[len(index)]))
         return env
 
-    def row(self, benchmark: str, variant: str, index: Tensor, value: float, unit: str, **fields) -> Row:
-        """A Row whose sizes are those of scenes index [B]: agents present and lane points, a scene's mean."""
+    def row(
+        self,
+        benchmark: str,
+        variant: str,
+        index: Tensor,
+        value: float,
+        unit: str,
+        **fields,
+    ) -> Row:
+        """A Row whose sizes are those of scenes index [B]: agents present and lane
+        points, a scene's mean."""
         scene = self.scenes.scenes
         agents = scene["valid"][index].sum(-1).float().mean().round()
         points = (scene["lane_index"][index] >= 0).sum(-1).float().mean().round()
-        return Row(benchmark, variant, len(index), int(agents), int(points), value, unit, **fields)
+        return Row(
+            benchmark,
+            variant,
+            len(index),
+            int(agents),
+            int(points),
+            value,
+            unit,
+            **fields,
+        )
 
     def best(self, function: Callable[[], object]) -> float:
         """Least wall time [s] of the repeats, after one call that is not counted."""
         return self.both(function)[0]
 
     def both(self, function: Callable[[], object]) -> tuple[float, float]:
-        """`best`, and the least time [s] that the process was on a core, which others on the machine hardly change."""
+        """`best`, and the least time [s] that the process was on a core, which others
+        on the machine hardly change."""
         function()
         wall = []
         cpu = []
@@ -133,7 +169,10 @@ class Bench:
             begin = time.perf_counter()
             begun = time.process_time()
             function()
-            wall.append(time.perf_counter() - begin), cpu.append(time.process_time() - begun)
+            (
+                wall.append(time.perf_counter() - begin),
+                cpu.append(time.process_time() - begun),
+            )
         return min(wall), min(cpu)
 
 

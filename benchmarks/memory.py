@@ -14,12 +14,18 @@ from e2rl.learning.policy import PolicyImprovement
 from e2rl.run.config import load_choice
 from e2rl.traffic.rollout import roll_out
 
-WORK = (("simulator", 512), ("nominal rollout", 48), ("e2 rollout", 8), ("e2 rollout", 48), ("learning", 64))
+WORK = (
+    ("simulator", 512),
+    ("nominal rollout", 48),
+    ("e2 rollout", 8),
+    ("e2 rollout", 48),
+    ("learning", 64),
+)
 
 
 def memory(bench: Bench) -> Iterator[Row]:
-    """MiB at most resident: the scenes alone, 512 of them simulated, rollouts in nominal traffic and against e2, and
-    environments that a policy learns in."""
+    """MiB at most resident: the scenes alone, 512 of them simulated, rollouts in
+    nominal traffic and against e2, and environments that a policy learns in."""
     context = multiprocessing.get_context("spawn")
     alone = 0.0
     done = set()
@@ -30,7 +36,9 @@ def memory(bench: Bench) -> Iterator[Row]:
             continue
         done.add((name, batch))
         with context.Pool(1) as pool:
-            alone, value = pool.apply(_peak, (replace(bench), name, batch))  # without what is loaded
+            alone, value = pool.apply(
+                _peak, (replace(bench), name, batch)
+            )  # without what is loaded
         yield bench.row("memory", name, bench.pick(batch), value, "MiB")
     yield bench.row("memory", "scenes alone", bench.pick(1), alone, "MiB")
 
@@ -49,7 +57,11 @@ def _peak(bench: Bench, name: str, batch: int) -> tuple[float, float]:
     else:
         nominal = name == "nominal rollout"
         choice = load_choice("synthesizer", "nominal")
-        traffic = build_traffic(choice, build_prior(bench.config)[0]) if nominal else bench.traffic
+        traffic = (
+            build_traffic(choice, build_prior(bench.config)[0])
+            if nominal
+            else bench.traffic
+        )
         eta = torch.full((batch,), 0.0 if nominal else 2.0)
         roll_out(bench.scenes, index, index, eta, bench.ego, traffic, bench.sim)
     return alone, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -61,7 +73,12 @@ def _learn(bench: Bench, batch: int) -> None:
     ppo = {**config.learner.ppo, "cloning": 0.0}
     collect = {**config.learner.collect, "batch": batch}
     improve = PolicyImprovement(
-        build_ego(config), bench.scenes, build_sim(config), collect=collect, ppo=ppo, react=None
+        build_ego(config),
+        bench.scenes,
+        build_sim(config),
+        collect=collect,
+        ppo=ppo,
+        react=None,
     )
     for _ in range(2):
         improve.learner.update(improve.collected())

@@ -1,7 +1,9 @@
-"""`PYTHON benchmarks/peers.py NAME REPEATS`: agent-steps per CPU second of another simulator, as JSON, one thread.
+"""`PYTHON benchmarks/peers.py NAME REPEATS`: agent-steps per CPU second of another
+simulator, as JSON, one thread.
 
-Run by `peer.py` in an interpreter that has the peer (extra `peers`), so nothing of e2rl is imported. Every peer moves
-about 32 vehicles a scene at 0.1 s a step and does what its own step does; `work` says what that is.
+Run by `peer.py` in an interpreter that has the peer (extra `peers`), so nothing of e2rl
+is imported. Every peer moves about 32 vehicles a scene at 0.1 s a step and does what
+its own step does; `work` says what that is.
 """
 
 import json
@@ -12,12 +14,14 @@ from importlib.metadata import PackageNotFoundError, version
 
 AGENTS = 32
 STEPS = 20
-Measured = tuple[int, int, str, float]  # scenes at once, agents a scene, work, agent-steps per CPU second
+Measured = tuple[
+    int, int, str, float
+]  # scenes at once, agents a scene, work, agent-steps per CPU second
 
 
 def best(function: Callable[[], int], repeats: int) -> float:
-    """Most agent-steps per second on a core (whoever else is on the machine) of the repeats, after one call that is not
-    counted; function returns agent-steps."""
+    """Most agent-steps per second on a core (whoever else is on the machine) of the
+    repeats, after one call that is not counted; function returns agent-steps."""
     function()
     rates = []
     for _ in range(repeats):
@@ -50,7 +54,12 @@ def highway_env(repeats: int) -> Iterator[Measured]:
                 env.reset(seed=0)
         return STEPS * AGENTS
 
-    yield 1, AGENTS, "IDM and MOBIL traffic, collisions, observation of the ego", best(steps, repeats)
+    yield (
+        1,
+        AGENTS,
+        "IDM and MOBIL traffic, collisions, observation of the ego",
+        best(steps, repeats),
+    )
 
 
 def vmas(repeats: int) -> Iterator[Measured]:
@@ -60,7 +69,9 @@ def vmas(repeats: int) -> Iterator[Measured]:
 
     torch.set_num_threads(1)
     for batch in (1, 32, 256):
-        env = library.make_env("road_traffic", num_envs=batch, device="cpu", n_agents=20, seed=0)
+        env = library.make_env(
+            "road_traffic", num_envs=batch, device="cpu", n_agents=20, seed=0
+        )
         env.reset()
         action = [torch.zeros(batch, agent.action_size) for agent in env.agents]
 
@@ -69,7 +80,12 @@ def vmas(repeats: int) -> Iterator[Measured]:
                 env.step(action)
             return STEPS // 4 * batch * len(action)
 
-        yield batch, 20, "bicycle of all, collisions, observation of all", best(steps, repeats)
+        yield (
+            batch,
+            20,
+            "bicycle of all, collisions, observation of all",
+            best(steps, repeats),
+        )
 
 
 def torchdrivesim(repeats: int) -> Iterator[Measured]:
@@ -85,13 +101,22 @@ def torchdrivesim(repeats: int) -> Iterator[Measured]:
     cells = 14
     axis = torch.linspace(-side / 2, side / 2, cells + 1)
     vertices = torch.cartesian_prod(axis, axis)
-    corner = (torch.arange(cells)[:, None] * (cells + 1) + torch.arange(cells)).flatten()
+    corner = (
+        torch.arange(cells)[:, None] * (cells + 1) + torch.arange(cells)
+    ).flatten()
     faces = torch.cat(
-        [corner[:, None] + torch.tensor([0, 1, cells + 1]), corner[:, None] + torch.tensor([1, cells + 2, cells + 1])]
+        [
+            corner[:, None] + torch.tensor([0, 1, cells + 1]),
+            corner[:, None] + torch.tensor([1, cells + 2, cells + 1]),
+        ]
     )
     for batch in (1, 16):
-        mesh = BirdviewMesh.set_properties(BaseMesh(verts=vertices[None], faces=faces[None]), "road").expand(batch)
-        spot = 12.0 * torch.cartesian_prod(torch.arange(8.0), torch.arange(4.0)).expand(batch, -1, -1)
+        mesh = BirdviewMesh.set_properties(
+            BaseMesh(verts=vertices[None], faces=faces[None]), "road"
+        ).expand(batch)
+        spot = 12.0 * torch.cartesian_prod(torch.arange(8.0), torch.arange(4.0)).expand(
+            batch, -1, -1
+        )
         kinematic = KinematicBicycle()
         kinematic.set_params(lr=1.5 * torch.ones(batch, AGENTS))
         kinematic.set_state(torch.cat([spot, torch.zeros(batch, AGENTS, 2)], -1))
@@ -113,7 +138,12 @@ def torchdrivesim(repeats: int) -> Iterator[Measured]:
                     simulator.compute_collision(), simulator.compute_offroad()
             return STEPS // 4 * batch * AGENTS
 
-        yield batch, AGENTS, "bicycle of all, collisions, off-road of all, no observation", best(steps, repeats)
+        yield (
+            batch,
+            AGENTS,
+            "bicycle of all, collisions, off-road of all, no observation",
+            best(steps, repeats),
+        )
 
 
 PEERS = {

@@ -26,7 +26,12 @@ def ppo_update(bench: Bench) -> Iterator[Row]:
     )
     data = next(iter(source))
     source.shutdown()
-    learner = Learner(network, instantiate(config.learner.ppo, critic_warmup=0, cloning=0.0, target_kl=1e9))
+    learner = Learner(
+        network,
+        instantiate(config.learner.ppo, critic_warmup=0, cloning=0.0, target_kl=1e9),
+    )
     seconds = bench.best(lambda: learner.update(data))
     yield bench.row("ppo_update", "update", bench.pick(batch), seconds, "s")
-    yield bench.row("ppo_update", "update", bench.pick(batch), batch * steps / seconds, "frames/s")
+    yield bench.row(
+        "ppo_update", "update", bench.pick(batch), batch * steps / seconds, "frames/s"
+    )

@@ -1,4 +1,5 @@
-"""What a scene costs as there are more of them, in time and memory, and what a second process brings."""
+"""What a scene costs as there are more of them, in time and memory, and what a second
+process brings."""
 
 import multiprocessing
 import resource
@@ -21,14 +22,16 @@ AT_ONCE = 16
 
 
 def scaling(bench: Bench) -> Iterator[Row]:
-    """Microseconds a scene and step, and MiB at most resident, at 64 to 10,000 scenes (the data's, repeated); rollouts
-    under e2 by one process and by two."""
+    """Microseconds a scene and step, and MiB at most resident, at 64 to 10,000 scenes
+    (the data's, repeated); rollouts under e2 by one process and by two."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         for count in bench.batches(*SCENES):
             spent, peak = pool.apply(_chunks, (replace(bench), count))
             index = bench.pick(count)
             name = f"simulator in chunks of {CHUNK}, resets included"
-            yield bench.row("scaling", name, index, 1e6 * spent / count / STEPS, "us/scene and step")
+            yield bench.row(
+                "scaling", name, index, 1e6 * spent / count / STEPS, "us/scene and step"
+            )
             yield bench.row("scaling", name, index, peak, "MiB")
     (count,) = bench.batches(ROLLOUTS)
     parts = bench.pick(count).split(min(AT_ONCE, -(-count // 2)))
@@ -42,16 +45,26 @@ def scaling(bench: Bench) -> Iterator[Row]:
     for processes in (1, 2, 1, 2):  # in turn: the machine's load changes
         begin = time.perf_counter()
         list(in_processes(work, parts, processes, cost=len))
-        seconds[processes] = min(time.perf_counter() - begin, seconds.get(processes, torch.inf))
+        seconds[processes] = min(
+            time.perf_counter() - begin, seconds.get(processes, torch.inf)
+        )
     for processes, spent in seconds.items():
-        yield bench.row("scaling", "e2, eta 2", torch.cat(parts), spent / count, "s/rollout", processes=processes)
+        yield bench.row(
+            "scaling",
+            "e2, eta 2",
+            torch.cat(parts),
+            spent / count,
+            "s/rollout",
+            processes=processes,
+        )
 
 
 _environments: dict[int, tuple] = {}  # of a child: what the sizes share
 
 
 def _chunks(bench: Bench, count: int) -> tuple[float, float]:
-    """Seconds of STEPS steps of so many scenes, the least of the repeats, and the process's peak memory [MiB]."""
+    """Seconds of STEPS steps of so many scenes, the least of the repeats, and the
+    process's peak memory [MiB]."""
     torch.set_num_threads(1)
     chunk = min(CHUNK, count)
     if chunk not in _environments:

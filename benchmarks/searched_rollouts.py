@@ -1,4 +1,5 @@
-"""What a search costs beside its rollouts: its rounds, which are small batches, and its questions and answers."""
+"""What a search costs beside its rollouts: its rounds, which are small batches, and its
+questions and answers."""
 
 import time
 from collections.abc import Iterator
@@ -17,7 +18,8 @@ TRIES = 4
 
 
 def searched_rollouts(bench: Bench) -> Iterator[Row]:
-    """CPU seconds a rollout of a search, of the same rollouts in full batches, and of questions and answers."""
+    """CPU seconds a rollout of a search, of the same rollouts in full batches, and of
+    questions and answers."""
     (scenes,) = bench.batches(SCENES)
     index = arange(scenes)
     only = range(scenes)
@@ -30,9 +32,17 @@ def searched_rollouts(bench: Bench) -> Iterator[Row]:
         for _, method, tasks in batches(setup, plan, 0, only, tries):
             setup.score(method, tasks, None)
 
-    spent = bench.both(lambda: searched(setup, plan, only))[1], bench.both(plain)[1], talk
-    for name, value in zip(("searched", "in full batches", "ask and tell"), spent, strict=True):
-        yield bench.row("searched_rollouts", name, index, value / count, "CPU s/rollout")
+    spent = (
+        bench.both(lambda: searched(setup, plan, only))[1],
+        bench.both(plain)[1],
+        talk,
+    )
+    for name, value in zip(
+        ("searched", "in full batches", "ask and tell"), spent, strict=True
+    ):
+        yield bench.row(
+            "searched_rollouts", name, index, value / count, "CPU s/rollout"
+        )
 
 
 def searched(setup: Setup, plan: Plan, only: range) -> tuple[list[Try], float]:

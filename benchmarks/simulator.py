@@ -1,8 +1,10 @@
 """The raw simulator on real maps, one core.
 
-step and observation: what DrivingEnv does: the ego's dynamics, its contact with everybody, off-road, reward and
-observation; the others are looked up. everybody driven: the work that simulators of many egos report: dynamics of all
-agents, contact of all pairs, off-road of all, no observation. vehicles re-aim: an episode with them by one without.
+step and observation: what DrivingEnv does: the ego's dynamics, its contact with
+everybody, off-road, reward and observation; the others are looked up. everybody driven:
+the work that simulators of many egos report: dynamics of all agents, contact of all
+pairs, off-road of all, no observation. vehicles re-aim: an episode with them by one
+without.
 """
 
 import time
@@ -30,7 +32,8 @@ BATCHES = 1, 4, 32, 128, 512
 
 
 def simulator(bench: Bench) -> Iterator[Row]:
-    """Agent-steps per second, by the agents that are present, at 1 to 512 scenes a batch, eager and compiled."""
+    """Agent-steps per second, by the agents that are present, at 1 to 512 scenes a
+    batch, eager and compiled."""
     kinds = (False, True) if bench.compile else (False,)
     for fast in kinds:
         name = ", compiled" if fast else ""
@@ -40,14 +43,28 @@ def simulator(bench: Bench) -> Iterator[Row]:
             agents = bench.scenes.scenes["valid"][index].sum().item()
             env = DrivingEnv(bench.scenes, bench.sim, batch)
             wall, cpu = bench.both(lambda e=env, i=index: run(e, i))
-            yield bench.row("simulator", f"step and observation{name}", index, STEPS * agents / wall, "agent-steps/s")
             yield bench.row(
-                "simulator", f"step and observation{name}", index, STEPS * agents / cpu, "agent-steps/CPU s"
+                "simulator",
+                f"step and observation{name}",
+                index,
+                STEPS * agents / wall,
+                "agent-steps/s",
+            )
+            yield bench.row(
+                "simulator",
+                f"step and observation{name}",
+                index,
+                STEPS * agents / cpu,
+                "agent-steps/CPU s",
             )
     fused.switch(False)
     for batch in bench.batches(1, 16, 64):
         index = bench.pick(batch, AGENTS)
-        for value, unit in zip(all_driven(bench, index), ("agent-steps/s", "agent-steps/CPU s"), strict=True):
+        for value, unit in zip(
+            all_driven(bench, index),
+            ("agent-steps/s", "agent-steps/CPU s"),
+            strict=True,
+        ):
             yield bench.row("simulator", "everybody driven", index, value, unit)
     yield from reacting(bench)
 
@@ -61,15 +78,22 @@ def run(env: DrivingEnv, index: Tensor) -> None:
 
 
 def reacting(bench: Bench) -> Iterator[Row]:
-    """Time of an episode in which vehicles re-aim in 70% of the environments, by that of its replay."""
+    """Time of an episode in which vehicles re-aim in 70% of the environments, by that
+    of its replay."""
     (batch,) = bench.batches(256)
     index = bench.pick(batch)
     scene = bench.scenes.batch(index)
     rows = torch.arange(batch)
     adversaries = scene["valid"] & (torch.arange(scene["valid"].shape[1]) < 4)
-    traffic = {"scene_index": index, "states": scene["logged"], "valid": scene["logged_valid"]}
+    traffic = {
+        "scene_index": index,
+        "states": scene["logged"],
+        "valid": scene["logged_valid"],
+    }
     pool = TrafficPool.stored(traffic | {"adversaries": adversaries}, 2.0)
-    sim = replace(bench.sim, end_on_contact=False, end_off_road=False, end_when_gone=False)
+    sim = replace(
+        bench.sim, end_on_contact=False, end_off_road=False, end_when_gone=False
+    )
     action = TensorDict({"action": torch.zeros(batch, 2)}, batch_size=[batch])
 
     def episode(reaction: Reaiming | None) -> None:
@@ -85,13 +109,21 @@ def reacting(bench: Bench) -> Iterator[Row]:
     for seed in range(bench.repeats):  # in turn, since the machine's load changes
         episode(None), episode(Reaiming(ReactSettings(fraction=0.7), seed))
     ratio = min(times[True]) / min(times[False])
-    yield bench.row("simulator", "vehicles re-aim, CPU time", index, ratio, "of the replay's")
+    yield bench.row(
+        "simulator", "vehicles re-aim, CPU time", index, ratio, "of the replay's"
+    )
 
 
 def everybody(
-    states: Tensor, action: Tensor, size: Tensor, pairs: Tensor, field: Tensor, origin: Tensor
+    states: Tensor,
+    action: Tensor,
+    size: Tensor,
+    pairs: Tensor,
+    field: Tensor,
+    origin: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """All agents' next states [B, N, 4], the pairs [2, Q] that touch [B, Q], metres beyond the border [B, N]."""
+    """All agents' next states [B, N, 4], the pairs [2, Q] that touch [B, Q], metres
+    beyond the border [B, N]."""
     states = dynamics.step(states, action)
     one, two = pairs
     touch = separation(states[:, one], size[:, one], states[:, two], size[:, two]) < 0
@@ -99,8 +131,8 @@ def everybody(
 
 
 def all_driven(bench: Bench, index: Tensor) -> tuple[float, float]:
-    """Agent-steps per second and per CPU second of `everybody`, AGENTS rows a scene, all counted: absent ones
-    cost the same."""
+    """Agent-steps per second and per CPU second of `everybody`, AGENTS rows a scene,
+    all counted: absent ones cost the same."""
     scene = bench.scenes.batch(index)
     start = scene["start"][:, :AGENTS]
     size = scene["size"][:, :AGENTS]
@@ -112,7 +144,9 @@ def all_driven(bench: Bench, index: Tensor) -> tuple[float, float]:
     def steps() -> None:
         states = start
         for _ in range(STEPS):
-            states, *_ = everybody(states, action, size, pairs, scene["field"], scene["field_origin"])
+            states, *_ = everybody(
+                states, action, size, pairs, scene["field"], scene["field_origin"]
+            )
 
     wall, cpu = bench.both(steps)
     return STEPS * len(index) * agents / wall, STEPS * len(index) * agents / cpu

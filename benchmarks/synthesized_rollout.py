@@ -1,4 +1,5 @@
-"""A whole rollout: 8 s, 16 replans of the traffic, ego lane_graph; what its parts and kinds of work take of it."""
+"""A whole rollout: 8 s, 16 replans of the traffic, ego lane_graph; what its parts and
+kinds of work take of it."""
 
 import time
 from collections import Counter
@@ -31,9 +32,15 @@ PARTS = {  # each without the others that it calls
     "foresight": [(importance, "foresee"), (interception, "foresee")],
     "kernels proposed": [(e2, "propose_kernels")],
     "proposals and interceptions": [(coalition, "propose")],
-    "topology and feasibility": [(coalition, "topological_candidates"), (coalition, "feasible_vehicles")],
+    "topology and feasibility": [
+        (coalition, "topological_candidates"),
+        (coalition, "feasible_vehicles"),
+    ],
     "skeleton": [(coalition, "build_skeleton")],
-    "groups of scenes": [(nominal, name) for name in ("crop_world", "crop_state", "write_state", "group_scenes")],
+    "groups of scenes": [
+        (nominal, name)
+        for name in ("crop_world", "crop_state", "write_state", "group_scenes")
+    ],
     "planner": [(LaneGraphEgo, "plan")],
     "simulator": [(DrivingEnv, "_step")],
 }
@@ -42,32 +49,59 @@ PRODUCTS = (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, aten.linear)
 
 
 def synthesized_rollout(bench: Bench) -> Iterator[Row]:
-    """Seconds a rollout of the nominal prior and of e2, eager and compiled; of e2's time, shares by part and kind."""
+    """Seconds a rollout of the nominal prior and of e2, eager and compiled; of e2's
+    time, shares by part and kind."""
     for batch in bench.batches(1, 32, 128):
         index = bench.pick(batch)
 
         def run(eta: float, index: torch.Tensor = index) -> Any:
             etas = torch.full((len(index),), eta)
-            return roll_out(bench.scenes, index, index, etas, bench.ego, bench.traffic, bench.sim)
+            return roll_out(
+                bench.scenes, index, index, etas, bench.ego, bench.traffic, bench.sim
+            )
 
         for compiled in (False, True) if bench.compile else (False,):
             fused.switch(compiled)
             how = ", compiled" if compiled else ""
             for name, eta in (("nominal", 0.0), ("e2, eta 2", 2.0)):
                 wall, cpu = bench.both(lambda e=eta: run(e))
-                yield bench.row("synthesized_rollout", name + how, index, wall / batch, "s/rollout")
-                yield bench.row("synthesized_rollout", name + how, index, cpu / batch, "CPU s/rollout")
+                yield bench.row(
+                    "synthesized_rollout", name + how, index, wall / batch, "s/rollout"
+                )
+                yield bench.row(
+                    "synthesized_rollout",
+                    name + how,
+                    index,
+                    cpu / batch,
+                    "CPU s/rollout",
+                )
             rollouts = run(2.0)
             scoring = bench.both(lambda made=rollouts: score_rollouts(made))[1]
             yield bench.row(
-                "synthesized_rollout", f"metrics and verdicts{how}", index, scoring / batch, "CPU s/rollout"
+                "synthesized_rollout",
+                f"metrics and verdicts{how}",
+                index,
+                scoring / batch,
+                "CPU s/rollout",
             )
             shares, operations = kinds(lambda: run(2.0))
-            yield bench.row("synthesized_rollout", f"e2{how}", index, operations / batch, "operations/rollout")
+            yield bench.row(
+                "synthesized_rollout",
+                f"e2{how}",
+                index,
+                operations / batch,
+                "operations/rollout",
+            )
             for kind, each in (("part", parts(lambda: run(2.0))), ("kind", shares)):
                 for name, share in each.items():
                     variant = f"e2{how}, {kind}: {name}"
-                    yield bench.row("synthesized_rollout", variant, index, 100 * share, "% of the rollout")
+                    yield bench.row(
+                        "synthesized_rollout",
+                        variant,
+                        index,
+                        100 * share,
+                        "% of the rollout",
+                    )
         fused.switch(False)
 
 
@@ -101,7 +135,9 @@ def parts(run: Callable[[], object]) -> dict[str, float]:
     with ExitStack() as stack:
         for part, places in PARTS.items():
             for owner, name in places:
-                stack.enter_context(patch.object(owner, name, timed(getattr(owner, name), part)))
+                stack.enter_context(
+                    patch.object(owner, name, timed(getattr(owner, name), part))
+                )
         since[0] = time.perf_counter()
         run()
     enter("end")
@@ -109,8 +145,9 @@ def parts(run: Callable[[], object]) -> dict[str, float]:
 
 
 def kinds(run: Callable[[], object]) -> tuple[dict[str, float], int]:
-    """Shares of a run's time in fused functions and in PyTorch's products of matrices outside of them; and PyTorch's
-    operations, which are too short for a clock beside them."""
+    """Shares of a run's time in fused functions and in PyTorch's products of matrices
+    outside of them; and PyTorch's operations, which are too short for a clock beside
+    them."""
     begin = time.perf_counter()
     run()
     total = time.perf_counter() - begin
@@ -125,7 +162,9 @@ def kinds(run: Callable[[], object]) -> tuple[dict[str, float], int]:
             spent["fused functions"] += time.perf_counter() - begin
 
     class Counted(TorchDispatchMode):
-        def __torch_dispatch__(self, function: Any, types: Any, given: Any = (), named: Any = None) -> Any:
+        def __torch_dispatch__(
+            self, function: Any, types: Any, given: Any = (), named: Any = None
+        ) -> Any:
             begin = time.perf_counter()
             result = function(*given, **(named or {}))
             if function.overloadpacket in PRODUCTS:
@@ -138,4 +177,6 @@ def kinds(run: Callable[[], object]) -> tuple[dict[str, float], int]:
         run()
     with Counted():
         run()
-    return {name: seconds / total for name, seconds in spent.items()}, counts["operations"]
+    return {name: seconds / total for name, seconds in spent.items()}, counts[
+        "operations"
+    ]

@@ -1,9 +1,10 @@
-"""A planner in a process of its own, for `ego=external`: it follows its route behind whoever drives ahead of it.
+"""A planner in a process of its own, for `ego=external`: it follows its route behind
+whoever drives ahead of it.
 
     python evaluate.py ego=external 'ego.command=python examples/external_planner.py'
 
-It needs nothing but Python, and speaks the protocol of docs/how-to/planner.md. Given HOST:PORT instead of unix:PATH, it
-serves any number of connections until it is stopped.
+It needs nothing but Python, and speaks the protocol of docs/how-to/planner.md. Given
+HOST:PORT instead of unix:PATH, it serves any number of connections until it is stopped.
 """
 
 import math
@@ -18,15 +19,25 @@ PLAN = 3
 ACTION = 5
 FAILED = 6
 RED, SPACING = 1, 2.0  # state of a light; metres between two points of a route
-DESIRED, GAP, HEADWAY, ACCELERATION, BRAKING = 10.0, 4.0, 1.2, 1.5, 3.0  # m/s, m, s, m/s^2, m/s^2
+DESIRED, GAP, HEADWAY, ACCELERATION, BRAKING = (
+    10.0,
+    4.0,
+    1.2,
+    1.5,
+    3.0,
+)  # m/s, m, s, m/s^2, m/s^2
 
 
 def read_scene(payload):
     """(scene, what is known of it): the route, its speed limits and its stop lines."""
     scene, _index, points = struct.unpack_from("<3I", payload)
     length, width, _ = struct.unpack_from("<3f", payload, 24)
-    route = list(struct.iter_unpack("<3f", payload[36 : 36 + 12 * points]))  # x, y, speed limit
-    lines = list(struct.iter_unpack("<if", payload[36 + 12 * points : 52 + 12 * points]))  # light, metres of route
+    route = list(
+        struct.iter_unpack("<3f", payload[36 : 36 + 12 * points])
+    )  # x, y, speed limit
+    lines = list(
+        struct.iter_unpack("<if", payload[36 + 12 * points : 52 + 12 * points])
+    )  # light, metres of route
     return scene, (length, width, route, lines)
 
 
@@ -42,16 +53,34 @@ def read_plan(payload):
 
 
 def act(known, lights, agents):
-    """Acceleration by the intelligent driver model, yaw rate by pure pursuit of the route."""
+    """Acceleration by the intelligent driver model, yaw rate by pure pursuit of the
+    route."""
     length, width, route, lines = known
     _, _, x, y, heading, speed, *_ = agents[0]
-    near = min(range(len(route)), key=lambda k: (route[k][0] - x) ** 2 + (route[k][1] - y) ** 2)
+    near = min(
+        range(len(route)), key=lambda k: (route[k][0] - x) ** 2 + (route[k][1] - y) ** 2
+    )
     desired = route[near][2] or DESIRED
     gap = math.inf
     leader = 0.0
-    for _, _, other_x, other_y, other_heading, other_speed, other_length, other_width, _, _ in agents[1:]:
+    for (
+        _,
+        _,
+        other_x,
+        other_y,
+        other_heading,
+        other_speed,
+        other_length,
+        other_width,
+        _,
+        _,
+    ) in agents[1:]:
         along, aside = ahead(other_x - x, other_y - y, heading)
-        if along > 0 and abs(aside) < (width + other_width) / 2 and along - (length + other_length) / 2 < gap:
+        if (
+            along > 0
+            and abs(aside) < (width + other_width) / 2
+            and along - (length + other_length) / 2 < gap
+        ):
             gap = along - (length + other_length) / 2
             leader = other_speed * math.cos(other_heading - heading)
     for light, line in lines:
@@ -59,11 +88,17 @@ def act(known, lights, agents):
         if light >= 0 and lights[light] == RED and 0 < to_line < gap:
             gap = to_line
             leader = 0.0
-    wanted = GAP + max(0.0, speed * HEADWAY + speed * (speed - leader) / (2 * math.sqrt(ACCELERATION * BRAKING)))
+    wanted = GAP + max(
+        0.0,
+        speed * HEADWAY
+        + speed * (speed - leader) / (2 * math.sqrt(ACCELERATION * BRAKING)),
+    )
     push = 1 - (speed / desired) ** 4 - (wanted / max(gap, 0.1)) ** 2
     goal = route[min(near + 2 + int(speed / SPACING), len(route) - 1)]
     along, aside = ahead(goal[0] - x, goal[1] - y, heading)
-    return max(ACCELERATION * push, -8.0), 2 * speed * aside / max(along**2 + aside**2, 1.0)
+    return max(ACCELERATION * push, -8.0), 2 * speed * aside / max(
+        along**2 + aside**2, 1.0
+    )
 
 
 def ahead(x, y, heading):
@@ -89,9 +124,21 @@ class Connection(socketserver.StreamRequestHandler):
             elif kind == PLAN:
                 for scene, lights, agents in read_plan(payload):
                     try:
-                        self.reply(ACTION, struct.pack("<I2f", scene, *act(scenes[scene], lights, agents)))
-                    except (ArithmeticError, LookupError, ValueError) as error:  # ends this scene's rollout only
-                        self.reply(FAILED, struct.pack("<I", scene) + repr(error).encode()[:1000])
+                        self.reply(
+                            ACTION,
+                            struct.pack(
+                                "<I2f", scene, *act(scenes[scene], lights, agents)
+                            ),
+                        )
+                    except (
+                        ArithmeticError,
+                        LookupError,
+                        ValueError,
+                    ) as error:  # ends this scene's rollout only
+                        self.reply(
+                            FAILED,
+                            struct.pack("<I", scene) + repr(error).encode()[:1000],
+                        )
 
     def reply(self, kind, payload):
         self.wfile.write(struct.pack("<II", kind, len(payload)) + payload)

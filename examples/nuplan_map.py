@@ -1,7 +1,9 @@
-"""The map of a scene as a planner written for nuPlan asks for it; goes with nuplan_planner.py (docs/how-to/nuplan.md).
+"""The map of a scene as a planner written for nuPlan asks for it; goes with
+nuplan_planner.py (docs/how-to/nuplan.md).
 
-Lanes are e2rl's centrelines with their widths. Lanes side by side make a roadblock. A roadblock with a light, behind a
-split or before a merge is a connector, as are its lanes.
+Lanes are e2rl's centrelines with their widths. Lanes side by side make a roadblock. A
+roadblock with a light, behind a split or before a merge is a connector, as are its
+lanes.
 """
 
 import math
@@ -21,14 +23,23 @@ from nuplan.common.maps.maps_datatypes import LaneConnectorType, SemanticMapLaye
 from shapely.geometry import LineString, Point, box
 from shapely.ops import unary_union
 
-STRAY, DISTANT = math.radians(60), 4.0  # rad, m: a point of the route is on a lane that is within both
-ASIDE, JUMP = 3.0, 1000.0  # cost, in m of distance, of a lane change and of going where no lane leads
+STRAY, DISTANT = (
+    math.radians(60),
+    4.0,
+)  # rad, m: a point of the route is on a lane that is within both
+ASIDE, JUMP = (
+    3.0,
+    1000.0,
+)  # cost, in m of distance, of a lane change and of going where no lane leads
 SHOULDER = 1.0  # m beside a lane that e2rl counts as road
 LIT = 0.5  # m from where a lane begins to the point of its light
 LANES = (SemanticMapLayer.LANE, SemanticMapLayer.LANE_CONNECTOR)
 BLOCKS = (SemanticMapLayer.ROADBLOCK, SemanticMapLayer.ROADBLOCK_CONNECTOR)
 BESIDE = SemanticMapLayer.CARPARK_AREA  # nuPlan's layer of what is drivable and no lane
-AREAS = {SemanticMapLayer.DRIVABLE_AREA: (*LANES, BESIDE), SemanticMapLayer.INTERSECTION: LANES[1:]}  # made of what
+AREAS = {
+    SemanticMapLayer.DRIVABLE_AREA: (*LANES, BESIDE),
+    SemanticMapLayer.INTERSECTION: LANES[1:],
+}  # made of what
 EMPTY = (
     SemanticMapLayer.STOP_LINE,
     SemanticMapLayer.CROSSWALK,
@@ -61,7 +72,9 @@ class Polyline(PolylineMapObject):
     @cached_property
     def poses(self):
         """[P, 3]"""
-        return np.column_stack([self.points, np.append(self._heading, self._heading[-1])])
+        return np.column_stack(
+            [self.points, np.append(self._heading, self._heading[-1])]
+        )
 
     @cached_property
     def discrete_path(self):
@@ -79,14 +92,21 @@ class Polyline(PolylineMapObject):
         """Change of heading over the metre on either side."""
         start = max(arc_length - 1.0, 0.0)
         end = min(arc_length + 1.0, self.length)
-        return wrap(self._heading_at(end) - self._heading_at(start)) / max(end - start, 1e-6)
+        return wrap(self._heading_at(end) - self._heading_at(start)) / max(
+            end - start, 1e-6
+        )
 
     def _heading_at(self, s):
-        return float(self._heading[min(int(np.searchsorted(self._s[1:], s)), len(self._heading) - 1)])
+        return float(
+            self._heading[
+                min(int(np.searchsorted(self._s[1:], s)), len(self._heading) - 1)
+            ]
+        )
 
 
 class LaneOfScene:
-    """What lanes and lane connectors have in common. light: index of its light, None where it has none."""
+    """What lanes and lane connectors have in common. light: index of its light, None
+    where it has none."""
 
     def __init__(self, name, points, width):
         super().__init__(name)
@@ -99,9 +119,12 @@ class LaneOfScene:
         self.incoming = []
         self.outgoing = []
         normal = np.gradient(points, axis=0)[:, ::-1] * [-1.0, 1.0]
-        normal *= width / 2 / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        normal *= (
+            width / 2 / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        )
         self._lines = [
-            Polyline(name + end, points + side * normal) for end, side in (("", 0), ("left", 1), ("right", -1))
+            Polyline(name + end, points + side * normal)
+            for end, side in (("", 0), ("left", 1), ("right", -1))
         ]
 
     baseline_path = property(lambda self: self._lines[0])
@@ -134,7 +157,9 @@ class LaneOfScene:
 
     def oriented_distance(self, point):
         pose = self.baseline_path.get_nearest_pose_from_position(point)
-        aside = math.cos(pose.heading) * (point.y - pose.y) - math.sin(pose.heading) * (point.x - pose.x)
+        aside = math.cos(pose.heading) * (point.y - pose.y) - math.sin(pose.heading) * (
+            point.x - pose.x
+        )
         return math.copysign(math.hypot(point.x - pose.x, point.y - pose.y), aside)
 
     def get_width_left_right(self, point, include_outside=False):
@@ -183,7 +208,13 @@ class SceneRoadblock(RoadBlockGraphEdgeMapObject):
         return joined if joined.geom_type == "Polygon" else joined.convex_hull
 
     def _blocks(self, edges):
-        return list({edge.block.id: edge.block for lane in self.lanes for edge in getattr(lane, edges)}.values())
+        return list(
+            {
+                edge.block.id: edge.block
+                for lane in self.lanes
+                for edge in getattr(lane, edges)
+            }.values()
+        )
 
 
 class Shoulder(PolygonMapObject):
@@ -197,28 +228,39 @@ class Shoulder(PolygonMapObject):
 
 
 class SceneMap(AbstractMap):
-    """The lanes and roadblocks of a scene. Inside of the drivable area is who is inside of a lane or beside one, inside
-    of an intersection who is inside of a connector; the layers of EMPTY hold no objects."""
+    """The lanes and roadblocks of a scene. Inside of the drivable area is who is inside
+    of a lane or beside one, inside of an intersection who is inside of a connector; the
+    layers of EMPTY hold no objects."""
 
     def __init__(self, name, lines, about, lights):
-        """lines: centrelines [P, 2], P >= 2, by lane; about [L, 9]: width, left, right and 6 exits of each, -1 none;
-        lights [S, 2]: where lanes with lights begin."""
+        """lines: centrelines [P, 2], P >= 2, by lane; about [L, 9]: width, left, right
+        and 6 exits of each, -1 none; lights [S, 2]: where lanes with lights begin."""
         self._name = name
         self._boxes = {}
         self._objects = {layer: {} for layer in (*LANES, *BLOCKS, BESIDE, *EMPTY)}
-        left, right = ([int(row[k]) if row[k] in lines else -1 for row in about] for k in (1, 2))
+        left, right = (
+            [int(row[k]) if row[k] in lines else -1 for row in about] for k in (1, 2)
+        )
         exits = [{int(lane) for lane in row[3:] if lane in lines} for row in about]
         entries = [sum(lane in after for after in exits) for lane in range(len(about))]
         connecting = {lane for after in exits if len(after) > 1 for lane in after}
-        connecting |= {lane for lane, after in enumerate(exits) if any(entries[other] > 1 for other in after)}
         connecting |= {
-            lane for lane, line in lines.items() if len(lights) and np.hypot(*(lights - line[0]).T).min() < LIT
+            lane
+            for lane, after in enumerate(exits)
+            if any(entries[other] > 1 for other in after)
+        }
+        connecting |= {
+            lane
+            for lane, line in lines.items()
+            if len(lights) and np.hypot(*(lights - line[0]).T).min() < LIT
         }
         self.lanes = {}
         for number, row in enumerate(rows_of(lines, left, right, exits), len(about)):
             connector = not connecting.isdisjoint(row)
             kind = SceneLaneConnector if connector else SceneLane
-            lanes = [kind(str(lane), lines[lane], float(about[lane][0])) for lane in row]
+            lanes = [
+                kind(str(lane), lines[lane], float(about[lane][0])) for lane in row
+            ]
             block = SceneRoadblock(str(number), lanes)
             self._objects[BLOCKS[connector]][block.id] = block
             for lane, made in zip(row, lanes):
@@ -233,7 +275,9 @@ class SceneMap(AbstractMap):
         area = unary_union([lane.polygon for lane in self.lanes.values()])
         beside = area.buffer(SHOULDER, quad_segs=2).difference(area)
         for number, part in enumerate(getattr(beside, "geoms", [beside])):
-            self._objects[BESIDE][f"beside-{number}"] = Shoulder(f"beside-{number}", part)
+            self._objects[BESIDE][f"beside-{number}"] = Shoulder(
+                f"beside-{number}", part
+            )
 
     map_name = property(lambda self: self._name)
 
@@ -259,31 +303,52 @@ class SceneMap(AbstractMap):
         return self._of(layer).get(str(object_id))
 
     def get_all_map_objects(self, point, layer):
-        return [one for one in self._near(point, 0.0, layer) if one.contains_point(point)]
+        return [
+            one for one in self._near(point, 0.0, layer) if one.contains_point(point)
+        ]
 
     def get_one_map_object(self, point, layer):
         found = self.get_all_map_objects(point, layer)
-        assert len(found) <= 1, f"{len(found)} map objects found; use get_all_map_objects()"
+        assert len(found) <= 1, (
+            f"{len(found)} map objects found; use get_all_map_objects()"
+        )
         return found[0] if found else None
 
     def is_in_layer(self, point, layer):
-        return any(self.get_all_map_objects(point, one) for one in AREAS.get(layer, (layer,)))
+        return any(
+            self.get_all_map_objects(point, one) for one in AREAS.get(layer, (layer,))
+        )
 
     def get_proximal_map_objects(self, point, radius, layers):
-        """Objects that touch the square of half the side `radius` around a point, as in nuPlan."""
-        square = box(point.x - radius, point.y - radius, point.x + radius, point.y + radius)
+        """Objects that touch the square of half the side `radius` around a point, as in
+        nuPlan."""
+        square = box(
+            point.x - radius, point.y - radius, point.x + radius, point.y + radius
+        )
         return {
-            layer: [one for one in self._near(point, radius, layer) if one.polygon.intersects(square)]
+            layer: [
+                one
+                for one in self._near(point, radius, layer)
+                if one.polygon.intersects(square)
+            ]
             for layer in layers
         }
 
     def get_distance_to_nearest_map_object(self, point, layer):
         at = Point(point.x, point.y)
-        found = [(one.polygon.distance(at), name) for name, one in self._of(layer).items()]
+        found = [
+            (one.polygon.distance(at), name) for name, one in self._of(layer).items()
+        ]
         return min(found)[::-1] if found else (None, None)
 
     def get_distances_matrix_to_nearest_map_object(self, points, layer):
-        return np.array([self.get_distance_to_nearest_map_object(point, layer)[1] for point in points], float)
+        return np.array(
+            [
+                self.get_distance_to_nearest_map_object(point, layer)[1]
+                for point in points
+            ],
+            float,
+        )
 
     def _get_roadblock(self, name):  # PDM-Closed asks by this and the next one
         return self.get_map_object(name, SemanticMapLayer.ROADBLOCK)
@@ -293,7 +358,9 @@ class SceneMap(AbstractMap):
 
     def _of(self, layer):
         if layer not in self._objects:
-            raise NotImplementedError(f"e2rl's scenes have no layer {getattr(layer, 'name', layer)}")
+            raise NotImplementedError(
+                f"e2rl's scenes have no layer {getattr(layer, 'name', layer)}"
+            )
         return self._objects[layer]
 
     def _near(self, point, radius, layer):
@@ -305,12 +372,17 @@ class SceneMap(AbstractMap):
             self._boxes[layer] = np.array([one.polygon.bounds for one in objects])
         low, high = np.split(self._boxes[layer], 2, axis=1)
         at = np.array([point.x, point.y])
-        return [objects[i] for i in np.flatnonzero(((low <= at + radius) & (high >= at - radius)).all(1))]
+        return [
+            objects[i]
+            for i in np.flatnonzero(
+                ((low <= at + radius) & (high >= at - radius)).all(1)
+            )
+        ]
 
 
 def rows_of(lanes, left, right, exits):
-    """Rows of lanes side by side, each from left to right: neighbours of each other, none of which follows another.
-    left, right, exits: of each lane; -1 none."""
+    """Rows of lanes side by side, each from left to right: neighbours of each other,
+    none of which follows another. left, right, exits: of each lane; -1 none."""
     row = {lane: [lane] for lane in lanes}
     for lane in lanes:
         other = left[lane]
@@ -322,8 +394,9 @@ def rows_of(lanes, left, right, exits):
 
 
 def lanes_along(route, lanes):
-    """The lane [P] of each point of a route [P, 2], None where none is near: of all sequences of lanes the one of least
-    distance, lane changes and jumps. lanes: by number."""
+    """The lane [P] of each point of a route [P, 2], None where none is near: of all
+    sequences of lanes the one of least distance, lane changes and jumps. lanes: by
+    number."""
     steps = np.gradient(route, axis=0)
     heading = np.arctan2(steps[:, 1], steps[:, 0])
     names = []
@@ -353,7 +426,10 @@ def lanes_along(route, lanes):
     found = [int(best.argmin())]
     for before in reversed(came):
         found.append(int(before[found[-1]]))
-    return [names[i] if cost[k, i] < DISTANT else None for k, i in enumerate(reversed(found))]
+    return [
+        names[i] if cost[k, i] < DISTANT else None
+        for k, i in enumerate(reversed(found))
+    ]
 
 
 def _change(lane, other):

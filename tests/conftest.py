@@ -2,7 +2,9 @@
 
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each of xdist's processes has one core
+os.environ.setdefault(
+    "OMP_NUM_THREADS", "1"
+)  # before torch is imported: each of xdist's processes has one core
 
 import atexit
 import pickle
@@ -22,12 +24,22 @@ from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
 from e2rl.run.files import HASH
 from e2rl.run.fused import switched_off
-from tests.scenes.descriptions import Malicious, description, numbered, straight, write_folder
+from tests.scenes.descriptions import (
+    Malicious,
+    description,
+    numbered,
+    straight,
+    write_folder,
+)
 
-if "E2RL_TESTS" not in os.environ:  # the folder of caches of these tests and all processes that they start
+if (
+    "E2RL_TESTS" not in os.environ
+):  # the folder of caches of these tests and all processes that they start
     os.environ["E2RL_TESTS"] = tempfile.mkdtemp(prefix="e2rl-tests-")
     atexit.register(shutil.rmtree, os.environ["E2RL_TESTS"], ignore_errors=True)
-os.environ.setdefault("MPLCONFIGDIR", matplotlib.get_cachedir())  # its list of fonts takes long to make
+os.environ.setdefault(
+    "MPLCONFIGDIR", matplotlib.get_cachedir()
+)  # its list of fonts takes long to make
 os.environ["XDG_CACHE_HOME"] = os.environ["E2RL_TESTS"]
 
 
@@ -42,7 +54,14 @@ def nothing_compiled():
 def world(tmp_path_factory):
     """Folders of good and bad scenes, checkpoints of several kinds."""
     root = tmp_path_factory.mktemp("input")
-    good = numbered([description({"ego": straight(20 + k, 0, speed=8), "7": straight(50, 3.5, speed=6)}) for k in range(2)])
+    good = numbered(
+        [
+            description(
+                {"ego": straight(20 + k, 0, speed=8), "7": straight(50, 3.5, speed=6)}
+            )
+            for k in range(2)
+        ]
+    )
     nan = description()
     nan["tracks"]["7"]["state"]["position"][40] = np.nan
     bad = {
@@ -55,7 +74,11 @@ def world(tmp_path_factory):
         write_folder(root / name, [good[0], scene])
     (root / "empty").mkdir()
     torch.manual_seed(0)
-    path = save_prior(Prior(DenoiserSettings(width=16, heads=2, blocks=1, pair=8)), root, origin={"data": "made"})
+    path = save_prior(
+        Prior(DenoiserSettings(width=16, heads=2, blocks=1, pair=8)),
+        root,
+        origin={"data": "made"},
+    )
     path.rename(root / "prior.safetensors")
     _variants(root)
     return root
@@ -64,9 +87,12 @@ def world(tmp_path_factory):
 def _variants(root: Path) -> None:
     """Checkpoints that are none: of another architecture, another format, cut off."""
     with safe_open(root / "prior.safetensors", "pt") as file:
-        metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        metadata = file.metadata()
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     del metadata[HASH]  # as a stranger would
     save_file(dict(list(tensors.items())[1:]), root / "other.safetensors", metadata)
-    save_file(tensors, root / "format.safetensors", metadata | {"format": "e2rl-prior/9"})
+    save_file(
+        tensors, root / "format.safetensors", metadata | {"format": "e2rl-prior/9"}
+    )
     content = (root / "prior.safetensors").read_bytes()
     (root / "cut.safetensors").write_bytes(content[: len(content) // 2])

@@ -1,7 +1,9 @@
-"""A device that is not there: tensors of it lie in the CPU's memory and carry a mark, and must not meet unmarked ones.
+"""A device that is not there: tensors of it lie in the CPU's memory and carry a mark,
+and must not meet unmarked ones.
 
-What torch refuses on a GPU is refused here: operations on tensors of two devices, an index on another device, numpy's
-view. Tensors without dimensions pass, as those of the CPU do there.
+What torch refuses on a GPU is refused here: operations on tensors of two devices, an
+index on another device, numpy's view. Tensors without dimensions pass, as those of the
+CPU do there.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,7 +19,11 @@ from torch.utils._pytree import tree_leaves
 CPU = torch.device("cpu")
 PRETENDED = torch.device("cuda", 0)
 MARK = "pretended"
-TAKEN = {"tensor", "as_tensor", "asarray"}  # whose result lies where what they are given lies
+TAKEN = {
+    "tensor",
+    "as_tensor",
+    "asarray",
+}  # whose result lies where what they are given lies
 CREATED = TAKEN | {
     "zeros",
     "ones",
@@ -33,7 +39,12 @@ CREATED = TAKEN | {
     "randperm",
 }
 LIKE = ("_like", "new_")
-MOVED = {"copy_", "__set__", "_has_compatible_shallow_copy_type", "equal"}  # between devices, as they are meant
+MOVED = {
+    "copy_",
+    "__set__",
+    "_has_compatible_shallow_copy_type",
+    "equal",
+}  # between devices, as they are meant
 
 
 def device_of(tensor: Tensor) -> torch.device:
@@ -52,10 +63,14 @@ def on(found: Any, device: torch.device, given: list[Tensor]) -> Any:
 class Pretended(TorchFunctionMode):
     """Between enter and exit there is a device `cuda`."""
 
-    def __torch_function__(self, function: Callable, types, args=(), kwargs=None) -> Any:
+    def __torch_function__(
+        self, function: Callable, types, args=(), kwargs=None
+    ) -> Any:
         kwargs = dict(kwargs or {})
         name = getattr(function, "__name__", "")
-        given = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
+        given = [
+            each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)
+        ]
         if function == Tensor.device.__get__:
             return device_of(args[0])
         if function == Tensor.is_cuda.__get__:
@@ -69,7 +84,11 @@ class Pretended(TorchFunctionMode):
             function(*args)
             return on(args[0], device_of(args[1]), given=[])
         if name in CREATED or any(part in name for part in LIKE):
-            own = device_of(given[0]) if given and (name in TAKEN or name not in CREATED) else CPU
+            own = (
+                device_of(given[0])
+                if given and (name in TAKEN or name not in CREATED)
+                else CPU
+            )
             return on(function(*args, **kwargs), asked or own, given=[])
         if name in ("numpy", "__array__"):
             assert device_of(args[0]) == CPU, f"{name} of a tensor on {PRETENDED}"
@@ -79,12 +98,21 @@ class Pretended(TorchFunctionMode):
     @staticmethod
     def moved(function: Callable, name: str, args: tuple, kwargs: dict) -> Any:
         """The result of Tensor.to and its like."""
-        places = [x for x in (*args[1:], *kwargs.values()) if isinstance(x, str | torch.device | Tensor)]
+        places = [
+            x
+            for x in (*args[1:], *kwargs.values())
+            if isinstance(x, str | torch.device | Tensor)
+        ]
         target = {"cpu": CPU, "cuda": PRETENDED}.get(name, device_of(args[0]))
         for place in places:
-            target = device_of(place) if isinstance(place, Tensor) else torch.device(place)
+            target = (
+                device_of(place) if isinstance(place, Tensor) else torch.device(place)
+            )
         own = [CPU if isinstance(x, str | torch.device) else x for x in args]
-        own_kwargs = {key: CPU if isinstance(x, str | torch.device) else x for key, x in kwargs.items()}
+        own_kwargs = {
+            key: CPU if isinstance(x, str | torch.device) else x
+            for key, x in kwargs.items()
+        }
         found = own[0] if name != "to" else function(*own, **own_kwargs)
         if found is args[0] and target != device_of(args[0]):
             found = found.clone()
@@ -96,19 +124,33 @@ class Pretended(TorchFunctionMode):
         if name in ("__getitem__", "__setitem__"):
             own = device_of(args[0])
             index = [x for x in tree_leaves(args[1]) if isinstance(x, Tensor)]
-            assert own == PRETENDED or all(device_of(x) == CPU for x in index), f"{name}: index on {PRETENDED}"
+            assert own == PRETENDED or all(device_of(x) == CPU for x in index), (
+                f"{name}: index on {PRETENDED}"
+            )
             value = [x for x in args[2:] if isinstance(x, Tensor) and x.ndim]
-            assert all(device_of(x) == own for x in value), f"{name}: a value on another device"
+            assert all(device_of(x) == own for x in value), (
+                f"{name}: a value on another device"
+            )
             return own
-        places = {device_of(x) for x in given if x.ndim} or {device_of(x) for x in given}
-        mixed = len(places) > 1 or (places == {CPU} and any(device_of(x) == PRETENDED for x in given))
-        assert not mixed or name in MOVED, f"{name}: tensors of shapes {[list(x.shape) for x in given]} on two devices"
+        places = {device_of(x) for x in given if x.ndim} or {
+            device_of(x) for x in given
+        }
+        mixed = len(places) > 1 or (
+            places == {CPU} and any(device_of(x) == PRETENDED for x in given)
+        )
+        assert not mixed or name in MOVED, (
+            f"{name}: tensors of shapes {[list(x.shape) for x in given]} on two devices"
+        )
         return PRETENDED if PRETENDED in places else CPU
 
 
 @contextmanager
 def pretended_device() -> Iterator[None]:
     """A device `cuda`, of which torch's own modules are told."""
-    here = {"is_available": lambda: True, "current_device": lambda: 0, "synchronize": lambda *given: None}
+    here = {
+        "is_available": lambda: True,
+        "current_device": lambda: 0,
+        "synchronize": lambda *given: None,
+    }
     with mock.patch.multiple(torch.cuda, **here), Pretended():
         yield

@@ -1,7 +1,8 @@
-"""Golden rollouts: what each method and each ego does, one round of training and one search, as digests.
+"""Golden rollouts: what each method and each ego does, one round of training and one
+search, as digests.
 
-`python -m tests.golden [CASE...]` writes golden.json anew: after a change that is meant to move results, or on another
-processor.
+`python -m tests.golden [CASE...]` writes golden.json anew: after a change that is meant
+to move results, or on another processor.
 """
 
 import csv
@@ -97,13 +98,16 @@ def rollouts_of(method: str, ego: str) -> Record:
 
 
 def rollouts_record(rollouts: Rollouts) -> Record:
-    """Returns digests of states and of scored rows, and numbers [B] that tell how far apart two machines are."""
+    """Returns digests of states and of scored rows, and numbers [B] that tell how far
+    apart two machines are."""
     states = rollouts.states * rollouts.valid[..., None]
     rows = [held(row) for row in e2rl.score(rollouts)]
     return {
         "states": digest(states.numpy().tobytes(), rollouts.valid.numpy().tobytes()),
         "rows": digest(json.dumps(rows, default=str).encode()),
-        "places": [round(value, 2) for value in states[:, -1, :, :2].sum((1, 2)).tolist()],
+        "places": [
+            round(value, 2) for value in states[:, -1, :, :2].sum((1, 2)).tolist()
+        ],
         "hits": [int(row["cfr"] == 1) for row in rows],
         "nats": [round(float(row["transport"]), 1) for row in rows],
     }
@@ -120,14 +124,19 @@ def searched() -> Record:
         command("evaluate.py", *SEARCH, f"hydra.run.dir={folder}/run")
         with open(f"{folder}/run/rollouts.csv", newline="") as file:
             rows = [held(row) for row in csv.DictReader(file)]
-    return {"rows": digest(json.dumps(rows).encode()), "hits": [int(float(row["cfr"] or 0) == 1) for row in rows]}
+    return {
+        "rows": digest(json.dumps(rows).encode()),
+        "hits": [int(float(row["cfr"] or 0) == 1) for row in rows],
+    }
 
 
 def trained() -> Record:
     """Returns the record of one round of training: the actor's weights after it."""
     with tempfile.TemporaryDirectory() as folder:
         command("train.py", *TRAINING, f"hydra.run.dir={folder}/run")
-        weights = load_file(Path(folder, "run", "checkpoints", "round-000001", "actor.safetensors"))
+        weights = load_file(
+            Path(folder, "run", "checkpoints", "round-000001", "actor.safetensors")
+        )
     content = [weights[name].numpy().tobytes() for name in sorted(weights)]
     total = sum(weights[name].double().abs().sum() for name in sorted(weights))
     return {"weights": digest(*content), "size": round(float(total), 2)}
@@ -135,13 +144,21 @@ def trained() -> Record:
 
 def command(script: str, *overrides: str) -> None:
     """Runs a script of the project to its end."""
-    run = subprocess.run([sys.executable, ROOT / script, *overrides], capture_output=True, text=True, cwd=ROOT)
+    run = subprocess.run(
+        [sys.executable, ROOT / script, *overrides],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
     if run.returncode:
         raise RuntimeError(f"{script}: {run.stderr}")
 
 
 CASES: dict[str, Callable[[], Record]] = {
-    **{f"{method}, lane_graph": partial(rollouts_of, method, "lane_graph") for method in METHODS},
+    **{
+        f"{method}, lane_graph": partial(rollouts_of, method, "lane_graph")
+        for method in METHODS
+    },
     **{f"e2, {ego}": partial(rollouts_of, "e2", ego) for ego in EGOS},
     "search": searched,
     "training": trained,

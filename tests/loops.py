@@ -1,4 +1,5 @@
-"""A route that crosses itself: along +x, round a loop of 270 degrees to the left, and across its own beginning."""
+"""A route that crosses itself: along +x, round a loop of 270 degrees to the left, and
+across its own beginning."""
 
 import math
 
@@ -10,7 +11,10 @@ from e2rl.scenes.scene import SceneSet
 from tests.synthetic import BACK, make_scenes
 
 RADIUS, STRAIGHT = 25.0, 80.0  # m
-CROSSING = STRAIGHT - RADIUS, STRAIGHT + 1.5 * math.pi * RADIUS + RADIUS  # m: arc lengths of the crossing
+CROSSING = (
+    STRAIGHT - RADIUS,
+    STRAIGHT + 1.5 * math.pi * RADIUS + RADIUS,
+)  # m: arc lengths of the crossing
 
 
 def loop(vertices: int = 150) -> Tensor:
@@ -23,14 +27,16 @@ def loop(vertices: int = 150) -> Tensor:
 
 
 def track(route: Tensor, begin: float, speed: float, steps: int = 80) -> Tensor:
-    """States [steps + 1, 4] of a vehicle that drives along a route [P, 2] from arc length `begin` at constant speed."""
+    """States [steps + 1, 4] of a vehicle that drives along a route [P, 2] from arc
+    length `begin` at constant speed."""
     s = begin + 0.1 * speed * torch.arange(steps + 1)
     xy, heading, _ = interpolate(route, s)
     return torch.cat([xy, heading[:, None], torch.full_like(xy[:, :1], speed)], -1)
 
 
 def loop_scenes(speed: float) -> SceneSet:
-    """One scene in which the ego drives alone along the loop, as recorded, at constant speed."""
+    """One scene in which the ego drives alone along the loop, as recorded, at constant
+    speed."""
     scenes = make_scenes(1, num_vehicles=1, num_vrus=0, speed=speed)
     scenes.scenes["route_points"][0, 0] = loop()
     scenes.scenes["route_open"][:] = False

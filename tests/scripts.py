@@ -1,4 +1,5 @@
-"""The scripts run in this process, which spares seconds of imports each: their overrides, status and messages."""
+"""The scripts run in this process, which spares seconds of imports each: their
+overrides, status and messages."""
 
 import runpy
 import sys
@@ -8,7 +9,12 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 
 ROOT = Path(__file__).parents[1]
-SMALL = ["data.build.field_cells=64", "data.build.vehicles=4", "data.build.others=2", "data.workers=1"]
+SMALL = [
+    "data.build.field_cells=64",
+    "data.build.vehicles=4",
+    "data.build.others=2",
+    "data.workers=1",
+]
 SHORT = [
     "data.split=tune",
     "num_scenes=2",
@@ -44,7 +50,8 @@ def left_behind(folder: Path) -> list[str]:
 
 
 def call(script: str, overrides: list[str], monkeypatch, capsys) -> tuple[int, str]:
-    """Exit status and what stderr says of a script run in this process, progress bars apart."""
+    """Exit status and what stderr says of a script run in this process, progress bars
+    apart."""
     monkeypatch.setattr(sys, "argv", [str(ROOT / script), *overrides])
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     threads = torch.get_num_threads()

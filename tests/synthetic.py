@@ -1,4 +1,5 @@
-"""Scenes with known answers: a straight two-lane road along +x, every key of the scene contract present."""
+"""Scenes with known answers: a straight two-lane road along +x, every key of the scene
+contract present."""
 
 import math
 
@@ -9,7 +10,9 @@ from e2rl.scenes.recording import DT, LIGHT_UNKNOWN, PEDESTRIAN, VEHICLE
 from e2rl.scenes.route import SPACING
 from e2rl.scenes.scene import SceneSet
 
-LANE_WIDTH = 3.5  # m; lane 0 at y = 0, lane 1 (its left neighbour) at y = 3.5, both towards +x
+LANE_WIDTH = (
+    3.5  # m; lane 0 at y = 0, lane 1 (its left neighbour) at y = 3.5, both towards +x
+)
 MARGIN = 1.0  # m beyond a lane's half width that still counts as on the road (docs/method.md, section 1)
 BACK = 20.0  # m of route behind each vehicle
 
@@ -30,17 +33,24 @@ def make_scenes(
     num_routes: int = 6,
     num_points: int = 150,
 ) -> SceneSet:
-    """Scenes at constant logged velocity; scene k starts k metres further on, so scenes can be told apart.
+    """Scenes at constant logged velocity; scene k starts k metres further on, so scenes
+    can be told apart.
 
-    Vehicle i starts at x = gap * i in lane i % 2 at `speed` unless `vehicles` lists (x [m], lane, speed [m/s]) of each,
-    ego first; a speed of 0 makes it parked (the ego excepted). VRU j walks along the road at y = -6 m, off it.
-    red_light_x: stop line on both lanes, red throughout. road: x at which the map begins and ends.
+    Vehicle i starts at x = gap * i in lane i % 2 at `speed` unless `vehicles` lists (x
+    [m], lane, speed [m/s]) of each, ego first; a speed of 0 makes it parked (the ego
+    excepted). VRU j walks along the road at y = -6 m, off it. red_light_x: stop line on
+    both lanes, red throughout. road: x at which the map begins and ends.
     """
     if vehicles is None:
         vehicles = [(gap * i, i % 2, speed) for i in range(num_vehicles)]
-    x, lane, v = (torch.tensor(column, dtype=torch.float32) for column in zip(*vehicles, strict=True))
+    x, lane, v = (
+        torch.tensor(column, dtype=torch.float32)
+        for column in zip(*vehicles, strict=True)
+    )
     if len(vehicles) > max_vehicles or num_vrus > max_agents - max_vehicles:
-        raise ValueError(f"{len(vehicles)} vehicles, {num_vrus} VRUs exceed {max_vehicles}, {max_agents} rows")
+        raise ValueError(
+            f"{len(vehicles)} vehicles, {num_vrus} VRUs exceed {max_vehicles}, {max_agents} rows"
+        )
     shift = torch.arange(num_scenes, dtype=torch.float32)[:, None]
     start = torch.zeros(num_scenes, max_agents, 4)
     n = len(vehicles)
@@ -74,7 +84,10 @@ def make_scenes(
     }
     cars = start[:, :max_vehicles], valid[:, :max_vehicles]
     scenes |= _routes(*cars, num_routes, num_points, limit, red_light_x, road)
-    scenes |= {key: value.expand(num_scenes, *value.shape).clone() for key, value in _map(road).items()}
+    scenes |= {
+        key: value.expand(num_scenes, *value.shape).clone()
+        for key, value in _map(road).items()
+    }
     scenes |= _lights(num_scenes, steps, red_light_x=red_light_x)
     return SceneSet(
         scenes=TensorDict(scenes, [num_scenes]),
@@ -107,7 +120,9 @@ def _routes(start, valid, num_routes, num_points, limit, red_light_x, road):
     light_s = torch.zeros(*shape, 2)
     if red_light_x is not None:
         light_s[..., 0] = (red_light_x - begin)[..., None]
-        light[..., 0] = torch.where(first & (light_s[..., 0] > 0) & (light_s[..., 0] < length[..., None]), 0, -1)
+        light[..., 0] = torch.where(
+            first & (light_s[..., 0] > 0) & (light_s[..., 0] < length[..., None]), 0, -1
+        )
     return {
         "route_points": points[:, :, None].repeat(1, 1, num_routes, 1, 1),
         "route_length": length[..., None].repeat(1, 1, num_routes),
@@ -130,21 +145,28 @@ def _lights(num_scenes, steps, red_light_x):
 
 
 def _map(road):
-    """Two lanes, the rectangle they cover, and its exact distance field of docs/method.md, section 1."""
+    """Two lanes, the rectangle they cover, and its exact distance field of
+    docs/method.md, section 1."""
     x = torch.arange(road[0], road[1] + 1e-6, SPACING)
     y = torch.tensor([0.0, LANE_WIDTH])
     lane = torch.stack([x.repeat(2), y.repeat_interleave(len(x))], -1)
     low = -LANE_WIDTH / 2
     high = 1.5 * LANE_WIDTH
-    polygon = torch.tensor([[road[0], low], [road[1], low], [road[1], high], [road[0], high]])
+    polygon = torch.tensor(
+        [[road[0], low], [road[1], low], [road[1], high], [road[0], high]]
+    )
     cells = math.ceil(road[1] - road[0]) + 41
     origin = torch.tensor([road[0] - 20.0, -cells // 2])
     centre = torch.arange(cells, dtype=torch.float32)
     gx, gy = torch.meshgrid(centre + origin[0], centre + origin[1], indexing="ij")
     along = torch.maximum(road[0] - gx, gx - road[1])
     across = torch.maximum(low - gy, gy - high)
-    polygon_gap = torch.hypot(along.clamp(min=0), across.clamp(min=0)) + torch.maximum(along, across).clamp(max=0)
-    lane_gap = torch.hypot(along.clamp(min=0)[..., None], gy[..., None] - y).amin(-1) - (LANE_WIDTH / 2 + MARGIN)
+    polygon_gap = torch.hypot(along.clamp(min=0), across.clamp(min=0)) + torch.maximum(
+        along, across
+    ).clamp(max=0)
+    lane_gap = torch.hypot(along.clamp(min=0)[..., None], gy[..., None] - y).amin(
+        -1
+    ) - (LANE_WIDTH / 2 + MARGIN)
     field = torch.minimum(polygon_gap, lane_gap)
     return {
         "lane_points": lane,

@@ -1,4 +1,5 @@
-"""A default stands once, in conf/: neither a class nor a settings dataclass repeats a key of its YAML file."""
+"""A default stands once, in conf/: neither a class nor a settings dataclass repeats a
+key of its YAML file."""
 
 import inspect
 from dataclasses import MISSING, fields, is_dataclass
@@ -12,8 +13,19 @@ import e2rl
 from e2rl.run.settings import conf_folder, file_values
 
 FILES = sorted(conf_folder().glob("*/*.yaml"))
-OPTIONAL = {"commonroad_writer", "openscenario", "opendrive", "mcap", "gym_env", "sb3"}  # they need libraries of extras
-BASES = {"path", "split", "replan_every"}  # what a source or ego from outside, without a YAML file, inherits
+OPTIONAL = {
+    "commonroad_writer",
+    "openscenario",
+    "opendrive",
+    "mcap",
+    "gym_env",
+    "sb3",
+}  # they need libraries of extras
+BASES = {
+    "path",
+    "split",
+    "replan_every",
+}  # what a source or ego from outside, without a YAML file, inherits
 
 
 def defaults_of(kind: type) -> set[str]:
@@ -22,7 +34,9 @@ def defaults_of(kind: type) -> set[str]:
     return {each.name for each in parameters if each.default is not each.empty}
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}={file.stem}")
+@pytest.mark.parametrize(
+    "file", FILES, ids=lambda file: f"{file.parent.name}={file.stem}"
+)
 def test_what_a_file_builds_has_no_default_for_its_keys(file):
     target = OmegaConf.load(file).get("_target_")
     if target is None:
@@ -39,14 +53,28 @@ def test_settings_dataclasses_have_no_defaults():
         if path.parent.name in ("scripts", "commands") or path.stem.startswith("__"):
             continue
         try:
-            module = import_module(".".join(("e2rl", *path.relative_to(root).with_suffix("").parts)))
+            module = import_module(
+                ".".join(("e2rl", *path.relative_to(root).with_suffix("").parts))
+            )
         except ModuleNotFoundError:
             assert path.stem in OPTIONAL, f"{path}: it needs the library of an extra"
             continue
-        own = [kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == module.__name__]
-        for kind in (kind for kind in own if "__configured__" in vars(kind) and is_dataclass(kind)):
+        own = [
+            kind
+            for kind in vars(module).values()
+            if isinstance(kind, type) and kind.__module__ == module.__name__
+        ]
+        for kind in (
+            kind
+            for kind in own
+            if "__configured__" in vars(kind) and is_dataclass(kind)
+        ):
             known = file_values(*kind.__configured__).keys() - BASES
-            twice = {each.name for each in fields(kind) if each.name in known and each.default is not MISSING}
+            twice = {
+                each.name
+                for each in fields(kind)
+                if each.name in known and each.default is not MISSING
+            }
             assert not twice, f"{kind.__name__}: {', '.join(sorted(twice))}"
             found += 1
     assert found > 20

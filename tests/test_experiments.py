@@ -14,14 +14,22 @@ pytestmark = pytest.mark.slow  # whole runs
 
 @pytest.fixture
 def evaluated(world, tmp_path, monkeypatch, capsys):
-    """Runs evaluate.py with options on two short bundled scenes in tmp_path / "run", its folder. Metrics of plugins are
-    unknown to the tests after this one, whose workers would not have them."""
+    """Runs evaluate.py with options on two short bundled scenes in tmp_path / "run",
+    its folder. Metrics of plugins are unknown to the tests after this one, whose
+    workers would not have them."""
 
     def run(*options):
-        given = [*SHORT, f"data.cache={world / 'bundled'}", "seeds=[0]", f"hydra.run.dir={tmp_path / 'run'}"]
+        given = [
+            *SHORT,
+            f"data.cache={world / 'bundled'}",
+            "seeds=[0]",
+            f"hydra.run.dir={tmp_path / 'run'}",
+        ]
         named = {option.partition("=")[0] for option in options}
         kept = [option for option in given if option.partition("=")[0] not in named]
-        status, said = call("evaluate.py", [*kept, *options], monkeypatch=monkeypatch, capsys=capsys)
+        status, said = call(
+            "evaluate.py", [*kept, *options], monkeypatch=monkeypatch, capsys=capsys
+        )
         assert status == 0, said
         return tmp_path / "run"
 
@@ -37,19 +45,40 @@ def test_the_dial_has_a_row_and_a_picture_for_every_eta(evaluated):
     """Two of the bundled scenes with the bundled prior."""
     run = evaluated("experiment=intensity")
     rows = read_metrics(run / "metrics.json")
-    assert [(row["method"], row["eta"]) for row in rows] == [("e2", eta) for eta in range(4)]
-    assert all((row["n_scenes"], row["n_rollouts"], len(row["paired"])) == (2, 2, 3) for row in rows)
-    assert [row["metrics"]["real_adv"]["n"] > 0 for row in rows] == [False, True, True, True]
+    assert [(row["method"], row["eta"]) for row in rows] == [
+        ("e2", eta) for eta in range(4)
+    ]
+    assert all(
+        (row["n_scenes"], row["n_rollouts"], len(row["paired"])) == (2, 2, 3)
+        for row in rows
+    )
+    assert [row["metrics"]["real_adv"]["n"] > 0 for row in rows] == [
+        False,
+        True,
+        True,
+        True,
+    ]
     assert len(list((run / "rollouts").glob("*.npz"))) == 8
-    assert {path.name for path in run.glob("intensity.*")} == {"intensity.png", "intensity.pdf"}
+    assert {path.name for path in run.glob("intensity.*")} == {
+        "intensity.png",
+        "intensity.pdf",
+    }
 
 
 def test_the_curves_have_a_line_for_every_method_and_eta(evaluated):
     """Differences are to nominal traffic alone; the tables have a row for each."""
     run = evaluated("experiment=curves", "methods=[nominal,ctg_adv,cat]", "eta=[1,2]")
     lines = (run / "curves.csv").read_text().splitlines()[1:]
-    points = [("nominal", "0"), ("ctg_adv", "1"), ("ctg_adv", "2"), ("cat", "1"), ("cat", "2")]
-    assert [(line.split(",")[0], f"{float(line.split(',')[2]):g}") for line in lines] == points
+    points = [
+        ("nominal", "0"),
+        ("ctg_adv", "1"),
+        ("ctg_adv", "2"),
+        ("cat", "1"),
+        ("cat", "2"),
+    ]
+    assert [
+        (line.split(",")[0], f"{float(line.split(',')[2]):g}") for line in lines
+    ] == points
     rows = read_metrics(run / "metrics.json")
     assert [list(row["paired"]) for row in rows] == [[], *[["nominal"]] * 4]
     assert (run / "curves.png").exists() and not (run / "rollouts").exists()
@@ -57,7 +86,8 @@ def test_the_curves_have_a_line_for_every_method_and_eta(evaluated):
 
 
 def test_nuplan_s_scores_are_a_table_of_their_own(evaluated):
-    """The recorded ego in its own recording drives all of its way, hits nobody, and is within 1 m of the road."""
+    """The recorded ego in its own recording drives all of its way, hits nobody, and is
+    within 1 m of the road."""
     run = evaluated("experiment=nuplan", "methods=[replay,idm]", "ego=replay")
     rows = {row["method"]: row["metrics"] for row in read_metrics(run / "metrics.json")}
     for method in ("replay", "idm"):
@@ -67,78 +97,158 @@ def test_nuplan_s_scores_are_a_table_of_their_own(evaluated):
     assert "| nuplan_score [%]" in (run / "tables.md").read_text()
 
 
-def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(evaluated):
-    overrides = ["experiment=public_protocol", "methods=[replay,cat]", "egos.policy.checkpoint=bundled"]
+def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(
+    evaluated,
+):
+    overrides = [
+        "experiment=public_protocol",
+        "methods=[replay,cat]",
+        "egos.policy.checkpoint=bundled",
+    ]
     run = evaluated(*overrides)
     head, *rows = (run / "egos.csv").read_text().splitlines()
     names = ["replay", "idm", "lane_graph", "untrained", "policy"]
-    assert [row.split(",")[:2] for row in rows] == [[ego, name] for ego in names for name in ("replay", "cat η=2")]
+    assert [row.split(",")[:2] for row in rows] == [
+        [ego, name] for ego in names for name in ("replay", "cat η=2")
+    ]
     assert head.startswith("ego,traffic,cfr [%]")
     log = rows[0].split(",")[head.split(",").index("route_completion [%]")]
-    assert float(log.split()[0]) > 99, "the recorded ego in recorded traffic drives all of its way"
+    assert float(log.split()[0]) > 99, (
+        "the recorded ego in recorded traffic drives all of its way"
+    )
 
 
-def test_the_budget_has_a_row_for_the_search_and_for_every_rival_as_its_authors_have_it_and_with_one_sample(evaluated):
+def test_the_budget_has_a_row_for_the_search_and_for_every_rival_as_its_authors_have_it_and_with_one_sample(
+    evaluated,
+):
     run = evaluated("experiment=budget", "methods=[search,nominal]", "budget=[40]")
     head, *rows = (run / "budget.csv").read_text().splitlines()
     names = [
         "search",
         "nominal",
-        *(f"{name}, one sample" for name in ("ccdiff", "ctg_adv", "safe_sim_opt", "diffscene")),
+        *(
+            f"{name}, one sample"
+            for name in ("ccdiff", "ctg_adv", "safe_sim_opt", "diffscene")
+        ),
     ]
-    assert [next(csv.reader([row]))[1] for row in rows] == names and head.startswith("ego,method,budget,unit")
+    assert [next(csv.reader([row]))[1] for row in rows] == names and head.startswith(
+        "ego,method,budget,unit"
+    )
     assert "Told the ego's plan: ccdiff, one sample" in (run / "budget.md").read_text()
-    assert {path.name for path in run.glob("budget.*")} == {"budget.csv", "budget.md", "budget.png", "budget.pdf"}
+    assert {path.name for path in run.glob("budget.*")} == {
+        "budget.csv",
+        "budget.md",
+        "budget.png",
+        "budget.pdf",
+    }
 
 
 def test_egos_before_and_after_are_rated_in_one_run(evaluated):
     """An untrained actor and a planner in its place."""
     roles = "{before: before, after: after, planner: before}"
-    egos = "+egos.before={ego: actor}", "+egos.after={ego: lane_graph}", f"policy_learning={roles}"
+    egos = (
+        "+egos.before={ego: actor}",
+        "+egos.after={ego: lane_graph}",
+        f"policy_learning={roles}",
+    )
     run = evaluated("methods=[nominal,e2]", *egos)
     rows = read_metrics(run / "metrics.json")
     assert [(row["ego"], row["method"]) for row in rows] == [
         (ego, method) for ego in ("before", "after") for method in ("nominal", "e2")
     ]
-    assert {key for row in rows[2:] for key in row["paired"]} == {"e2", "nominal", "ego before"}
+    assert {key for row in rows[2:] for key in row["paired"]} == {
+        "e2",
+        "nominal",
+        "ego before",
+    }
     text = (run / "tables.md").read_text()
     assert "Difference of each ego to before" in text and "Guards of after" in text
-    assert {path.name for path in run.glob("policy_learning.*")} == {"policy_learning.png", "policy_learning.pdf"}
+    assert {path.name for path in run.glob("policy_learning.*")} == {
+        "policy_learning.png",
+        "policy_learning.pdf",
+    }
 
 
 def test_table_4_has_a_row_for_every_ego_in_three_formats(evaluated):
     run = evaluated("experiment=table4")
     head, *rows = (run / "egos.csv").read_text().splitlines()
-    names = ["replay", "idm", "lane_graph", "sampling", "pdm_closed", "lane_graph_tuned", "bits"]
+    names = [
+        "replay",
+        "idm",
+        "lane_graph",
+        "sampling",
+        "pdm_closed",
+        "lane_graph_tuned",
+        "bits",
+    ]
     names += ["actor_untrained", "actor"]
     assert [row.split(",")[:2] for row in rows] == [[name, "e2 η=2"] for name in names]
-    columns = ("cfr", "cfr_counted", "cfr_preventable", "front", "side", "rear", "front_any", "side_any", "rear_any")
-    assert head.startswith("ego,traffic,") and all(f"{name} [%]" in head.split(",") for name in columns)
+    columns = (
+        "cfr",
+        "cfr_counted",
+        "cfr_preventable",
+        "front",
+        "side",
+        "rear",
+        "front_any",
+        "side_any",
+        "rear_any",
+    )
+    assert head.startswith("ego,traffic,") and all(
+        f"{name} [%]" in head.split(",") for name in columns
+    )
     for suffix in ("md", "tex"):
         assert "Difference of each ego to lane" in (run / f"egos.{suffix}").read_text()
     differences = (run / "egos_differences.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in differences[1:]] == [name for name in names if name != "lane_graph"]
+    assert [row.split(",")[0] for row in differences[1:]] == [
+        name for name in names if name != "lane_graph"
+    ]
     assert "## Egos" in (run / "tables.md").read_text()
 
 
-def test_a_folder_of_somebody_else_adds_methods_to_the_table(world, tmp_path, monkeypatch, capsys):
+def test_a_folder_of_somebody_else_adds_methods_to_the_table(
+    world, tmp_path, monkeypatch, capsys
+):
     (tmp_path / "conf" / "synthesizer").mkdir(parents=True)
     text = "_target_: e2rl.traffic.rule_based.ConstantVelocity\nname: straight\n"
     (tmp_path / "conf" / "synthesizer" / "straight.yaml").write_text(text)
     overrides = [
         f"--config-dir={tmp_path / 'conf'}",
-        *arguments(world, tmp_path, "good", "data.build.steps=20", "methods=[replay,straight]", "seeds=[0]"),
+        *arguments(
+            world,
+            tmp_path,
+            "good",
+            "data.build.steps=20",
+            "methods=[replay,straight]",
+            "seeds=[0]",
+        ),
     ]
-    status, said = call("evaluate.py", overrides, monkeypatch=monkeypatch, capsys=capsys)
+    status, said = call(
+        "evaluate.py", overrides, monkeypatch=monkeypatch, capsys=capsys
+    )
     assert status == 0, said
     rows = read_metrics(tmp_path / "run" / "metrics.json")
-    assert [(row["method"], row["eta"]) for row in rows] == [("replay", 0), ("straight", 0)]
+    assert [(row["method"], row["eta"]) for row in rows] == [
+        ("replay", 0),
+        ("straight", 0),
+    ]
 
 
 def test_one_scene_is_driven_as_among_all(evaluated, tmp_path):
     found = []
     for which in ("scene=null", "scene=1"):
         folder = tmp_path / which
-        evaluated("seeds=[1]", "methods=[e2]", which, "batch=1", f"hydra.run.dir='{folder}'")
-        found.append({path.name: path.read_bytes() for path in (folder / "rollouts").glob("*.npz")})
-    assert len(found[0]) == 2 and len(found[1]) == 1 and found[1].items() <= found[0].items()
+        evaluated(
+            "seeds=[1]", "methods=[e2]", which, "batch=1", f"hydra.run.dir='{folder}'"
+        )
+        found.append(
+            {
+                path.name: path.read_bytes()
+                for path in (folder / "rollouts").glob("*.npz")
+            }
+        )
+    assert (
+        len(found[0]) == 2
+        and len(found[1]) == 1
+        and found[1].items() <= found[0].items()
+    )

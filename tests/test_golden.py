@@ -1,6 +1,8 @@
-"""Golden rollouts (tests/golden.py): what methods, egos, training and search do is what they did, bit for bit.
+"""Golden rollouts (tests/golden.py): what methods, egos, training and search do is what
+they did, bit for bit.
 
-On another processor than golden.json was written on, bits differ and rollouts part: there most end where they did.
+On another processor than golden.json was written on, bits differ and rollouts part:
+there most end where they did.
 """
 
 import json
@@ -28,7 +30,10 @@ def test_nothing_has_changed(name):
     elif name == "training":
         assert record["size"] == pytest.approx(stored["size"], rel=0.02)
     elif name == "search":
-        hits = [torch.tensor(each["hits"]).double().mean().item() for each in (record, stored)]
+        hits = [
+            torch.tensor(each["hits"]).double().mean().item()
+            for each in (record, stored)
+        ]
         assert hits[0] == pytest.approx(hits[1], abs=0.25)
     else:
         places = torch.tensor(record["places"]) - torch.tensor(stored["places"])

@@ -13,13 +13,24 @@ from tests.synthetic import make_scenes
 
 PACKAGE = Path(e2rl.__file__).parent
 ORDER = (  # of the rooms
-    *("run", "scenes", "sim", "prior", "planners", "metrics", "traffic", "search", "evaluation"),
+    *(
+        "run",
+        "scenes",
+        "sim",
+        "prior",
+        "planners",
+        "metrics",
+        "traffic",
+        "search",
+        "evaluation",
+    ),
     *("learning", "report", "api", "commands"),
 )
 
 
 def imports() -> list[tuple[str, str, str]]:
-    """(room, imported room, file:line) of every import between rooms, those inside functions included."""
+    """(room, imported room, file:line) of every import between rooms, those inside
+    functions included."""
     found = []
     for path in sorted(PACKAGE.rglob("*.py")):
         room = path.relative_to(PACKAGE).with_suffix("").parts[0]
@@ -27,7 +38,10 @@ def imports() -> list[tuple[str, str, str]]:
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom):
-                names = [f"{'.' * node.level}{node.module or ''}.{alias.name}" for alias in node.names]
+                names = [
+                    f"{'.' * node.level}{node.module or ''}.{alias.name}"
+                    for alias in node.names
+                ]
             else:
                 continue
             for first, *rest in (name.split(".") for name in names):
@@ -39,8 +53,14 @@ def imports() -> list[tuple[str, str, str]]:
 
 
 def test_every_room_has_its_place_in_the_order():
-    rooms = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or any(path.glob("*.py"))}
-    assert rooms - {"__init__", "scripts"} == set(ORDER)  # scripts: installed copies of train.py and evaluate.py
+    rooms = {
+        path.stem
+        for path in PACKAGE.iterdir()
+        if path.suffix == ".py" or any(path.glob("*.py"))
+    }
+    assert rooms - {"__init__", "scripts"} == set(
+        ORDER
+    )  # scripts: installed copies of train.py and evaluate.py
 
 
 def test_rooms_import_only_from_rooms_before_them():
@@ -56,10 +76,13 @@ def test_rooms_have_no_cycle():
     graph: dict[str, set[str]] = {}
     for room, other, _ in imports():
         graph.setdefault(room, set()).add(other)
-    assert set(TopologicalSorter(graph).static_order()) <= set(ORDER)  # raises CycleError where there is one
+    assert set(TopologicalSorter(graph).static_order()) <= set(
+        ORDER
+    )  # raises CycleError where there is one
 
 
 def test_learning_can_be_imported_after_an_ego_was_built():
-    """TorchRL changes a module class when it is first built: other classes must not copy its attributes."""
+    """TorchRL changes a module class when it is first built: other classes must not
+    copy its attributes."""
     EgoPolicy(IDMEgo(), DrivingEnv(make_scenes(1), SimSettings(), 1, agents=True))
     assert "PoolDriver" in runpy.run_path(str(PACKAGE / "learning" / "driving.py"))

@@ -1,4 +1,5 @@
-"""The package holds everything that its commands need, and its few names are what they say."""
+"""The package holds everything that its commands need, and its few names are what they
+say."""
 
 import tomllib
 from pathlib import Path
@@ -16,7 +17,10 @@ ROOT = Path(__file__).parents[1]
 
 def test_every_package_and_the_configuration_are_in_the_wheel():
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    found = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / "e2rl").rglob("__init__.py")}
+    found = {
+        ".".join(file.parent.relative_to(ROOT).parts)
+        for file in (ROOT / "e2rl").rglob("__init__.py")
+    }
     assert set(setup["packages"]) == found | {"e2rl.scripts", "e2rl.scripts.conf"}
     assert (ROOT / setup["package-dir"]["e2rl.scripts.conf"] / "evaluate.yaml").exists()
     assert (ROOT / setup["package-dir"]["e2rl.scripts"] / "train.py").exists()
@@ -34,21 +38,34 @@ def test_a_notebook_rolls_out_what_the_command_does():
     theirs = setup.roll_out(Method("e2", traffic, eta=2.0), [Task(0, 0), Task(1, 0)])
     assert (ours.states == theirs.states).all() and ours.adversaries.any()
     rows = e2rl.score(ours)
-    assert [row["scene_id"] for row in rows] == scenes.scene_id and {row["eta"] for row in rows} == {2.0}
+    assert [row["scene_id"] for row in rows] == scenes.scene_id and {
+        row["eta"] for row in rows
+    } == {2.0}
 
 
 def test_a_failure_is_found_in_a_few_rollouts(tmp_path):
     """Places first: with the bundled scenes the first four are of four places."""
     scenes = e2rl.load_scenes("bundled", num_scenes=12)
     found = e2rl.find_failures("lane_graph", "e2", scenes=scenes)
-    assert found and all(failure.row["cfr"] == 1 and failure.contact is not None for failure in found)
+    assert found and all(
+        failure.row["cfr"] == 1 and failure.contact is not None for failure in found
+    )
     assert {failure.rollout.scene_id for failure in found} <= set(scenes.scene_id)
     assert e2rl.save_video(found[0], tmp_path / "failure.gif").stat().st_size > 10_000
 
 
 def test_settings_reach_the_objects_and_wrong_ones_are_named():
-    traffic = e2rl.make_traffic("e2", e2rl.load_prior(sampler={"steps": 4}), support="topology", topology={"beta": 2.0})
-    assert traffic.support == "topology" and traffic.topology.beta == 2.0 and traffic.prior.sampler.steps == 4
+    traffic = e2rl.make_traffic(
+        "e2",
+        e2rl.load_prior(sampler={"steps": 4}),
+        support="topology",
+        topology={"beta": 2.0},
+    )
+    assert (
+        traffic.support == "topology"
+        and traffic.topology.beta == 2.0
+        and traffic.prior.sampler.steps == 4
+    )
     with pytest.raises(InputError, match="synthesizer=e2: .*suport"):
         e2rl.make_traffic("e2", e2rl.load_prior(), suport="topology")
     with pytest.raises(InputError, match="ego=nobody"):

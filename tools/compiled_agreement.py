@@ -1,7 +1,9 @@
-"""How far compiled rollouts are from eager ones: `python tools/compiled_agreement.py [NUM_SCENES]`.
+"""How far compiled rollouts are from eager ones: `python tools/compiled_agreement.py
+[NUM_SCENES]`.
 
-Bundled scenes, ego lane_graph, in nominal traffic and under e2 (eta = 2). A rollout's difference is the largest
-distance, in 8 s, between the two places of a vehicle that is there in both. Compiles what is missing, once.
+Bundled scenes, ego lane_graph, in nominal traffic and under e2 (eta = 2). A rollout's
+difference is the largest distance, in 8 s, between the two places of a vehicle that is
+there in both. Compiles what is missing, once.
 """
 
 import sys
@@ -25,7 +27,9 @@ def main(num_scenes: str = "48") -> None:
     ego = e2rl.make_ego("lane_graph")
     traffic = {name: e2rl.make_traffic(name, e2rl.load_prior()) for name in METHODS}
     prepare_fused(OmegaConf.create({"compile": True, "device": "cpu"}))
-    print("| traffic | rollouts | median | 90% | 95% | largest difference, m | above 3 mm | other contacts |")
+    print(
+        "| traffic | rollouts | median | 90% | 95% | largest difference, m | above 3 mm | other contacts |"
+    )
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for name, eta in METHODS.items():
         compiled = e2rl.roll_out(scenes, ego, traffic[name], eta=eta)
@@ -33,9 +37,15 @@ def main(num_scenes: str = "48") -> None:
         eager = e2rl.roll_out(scenes, ego, traffic[name], eta=eta)
         switch(True)
         distance = differences(compiled, eager)
-        quantiles = " | ".join(f"{value:.2g}" for value in distance.quantile(torch.tensor(QUANTILES)).tolist())
+        quantiles = " | ".join(
+            f"{value:.2g}"
+            for value in distance.quantile(torch.tensor(QUANTILES)).tolist()
+        )
         contacts = int((compiled.contact != eager.contact).sum())
-        print(f"| {name} | {len(distance)} | {quantiles} | {int((distance > CLOSE).sum())} | {contacts} |", flush=True)
+        print(
+            f"| {name} | {len(distance)} | {quantiles} | {int((distance > CLOSE).sum())} | {contacts} |",
+            flush=True,
+        )
 
 
 def differences(first: Rollouts, second: Rollouts) -> Tensor:

@@ -1,6 +1,8 @@
-"""Write the bundled scenes: python tools/generate_scenes.py [--seed 0] [--nets 80] [--out e2rl/assets/scenes].
+"""Write the bundled scenes: python tools/generate_scenes.py [--seed 0] [--nets 80]
+[--out e2rl/assets/scenes].
 
-Needs the build-time extra: pip install -e '.[sumo]'. The same seed and SUMO version give the same files.
+Needs the build-time extra: pip install -e '.[sumo]'. The same seed and SUMO version
+give the same files.
 """
 
 import argparse
@@ -23,7 +25,13 @@ from scenegen.windows import cut_windows  # noqa: E402
 
 from e2rl.scenes.bundled import SPLITS
 
-PATTERN = ("train", "train", "tune", "train", "test")  # of every five nets: 60 / 20 / 20 per cent
+PATTERN = (
+    "train",
+    "train",
+    "tune",
+    "train",
+    "test",
+)  # of every five nets: 60 / 20 / 20 per cent
 
 
 def make_net(index: int, family, seed: int, most: int, folder: Path):
@@ -31,20 +39,33 @@ def make_net(index: int, family, seed: int, most: int, folder: Path):
     rng = np.random.default_rng([seed, index])
     layout = family(rng, f"{family.__name__}_{index:03d}")
     path, net = convert(layout, folder)
-    tracks, lights = run(layout, path, net, folder, int(rng.integers(1, 2**31 - 1)), rng)
+    tracks, lights = run(
+        layout, path, net, folder, int(rng.integers(1, 2**31 - 1)), rng
+    )
     states, valid, size = stack_tracks(tracks, round(RECORDED / DT), rng)
     densify(net.lanes)
     parking = park(net, states, valid, size, rng)
-    scene_map = Place(layout.name, net.lanes, net.drivable + parking.strips, lights, parking.pose, parking.size)
+    scene_map = Place(
+        layout.name,
+        net.lanes,
+        net.drivable + parking.strips,
+        lights,
+        parking.pose,
+        parking.size,
+    )
     scenes, refused = cut_windows(scene_map, states, valid, size, net.border, most, rng)
     return scene_map, scenes, refused
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--nets", type=int, default=80)
-    parser.add_argument("--windows", type=int, default=3, help="at most this many scenes of a net")
+    parser.add_argument(
+        "--windows", type=int, default=3, help="at most this many scenes of a net"
+    )
     parser.add_argument("--out", type=Path, default=Path("e2rl/assets/scenes"))
     options = parser.parse_args()
     began = time.time()
@@ -52,12 +73,19 @@ def main() -> None:
     refusals = Counter()
     with tempfile.TemporaryDirectory() as folder:
         for index, family in enumerate(schedule(options.nets)):
-            scene_map, scenes, refused = make_net(index, family, options.seed, options.windows, Path(folder))
+            scene_map, scenes, refused = make_net(
+                index, family, options.seed, options.windows, Path(folder)
+            )
             refusals += refused
-            print(f"{scene_map.name}: {len(scenes)} scenes, refused {dict(refused)}", flush=True)
+            print(
+                f"{scene_map.name}: {len(scenes)} scenes, refused {dict(refused)}",
+                flush=True,
+            )
             if scenes:
                 nets.append((family.__name__, scene_map, scenes))
-    nets.sort(key=lambda row: row[0])  # stable: families one after another, so that all splits get their share of each
+    nets.sort(
+        key=lambda row: row[0]
+    )  # stable: families one after another, so that all splits get their share of each
     made = {split: ([], []) for split in SPLITS}
     for turn, (_, scene_map, scenes) in enumerate(nets):
         maps, kept = made[PATTERN[turn % len(PATTERN)]]
@@ -68,8 +96,12 @@ def main() -> None:
         path = options.out / f"{split}.npz"
         np.savez_compressed(path, **pack(maps, scenes))
         content = path.read_bytes()
-        print(f"{split}: {len(maps)} nets, {len(scenes)} scenes, {len(content) / 1e6:.2f} MB")
-        print(f'    "{split}": "{hashlib.sha256(content).hexdigest()}",  # SHA256 of e2rl/scenes/bundled.py')
+        print(
+            f"{split}: {len(maps)} nets, {len(scenes)} scenes, {len(content) / 1e6:.2f} MB"
+        )
+        print(
+            f'    "{split}": "{hashlib.sha256(content).hexdigest()}",  # SHA256 of e2rl/scenes/bundled.py'
+        )
     print(f"refused {dict(refusals)}; {time.time() - began:.0f} s")
 
 

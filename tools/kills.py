@@ -1,9 +1,12 @@
-"""python tools/kills.py N [--seed S] [--stages NAME ...]: N runs are killed and resumed, then compared.
+"""python tools/kills.py N [--seed S] [--stages NAME ...]: N runs are killed and
+resumed, then compared.
 
-Each stage of STAGES runs once without interruption, on a few bundled scenes. Then it is started anew, killed by SIGINT,
-SIGTERM or SIGKILL at a random moment, and resumed; every third is killed again in the resumed run. Its folder is
-compared with that of the uninterrupted run: the same files, and the same content but for wall times. Prints a line a
-kill and a table. The exit status is 1 where something differs or a process outlives its parent.
+Each stage of STAGES runs once without interruption, on a few bundled scenes. Then it is
+started anew, killed by SIGINT, SIGTERM or SIGKILL at a random moment, and resumed;
+every third is killed again in the resumed run. Its folder is compared with that of the
+uninterrupted run: the same files, and the same content but for wall times. Prints a
+line a kill and a table. The exit status is 1 where something differs or a process
+outlives its parent.
 """
 
 import argparse
@@ -45,8 +48,14 @@ STAGES = {
     "evaluation": f"{TESTED} num_scenes=4 seeds=[0,1] batch=2 processes=2",
     "table1": f"{TESTED} experiment=table1 methods=[e2,e2_pursuit,nominal,ctg_adv] num_scenes=2 seeds=[0,1] batch=1",
 }
-WORKING = {".hydra", "parts", "time"}  # what a run keeps for itself, and logs of wall times
-TIMED = re.compile(r"seconds|^time$|^cwd$")  # names of wall times, and of the folder that a run began in
+WORKING = {
+    ".hydra",
+    "parts",
+    "time",
+}  # what a run keeps for itself, and logs of wall times
+TIMED = re.compile(
+    r"seconds|^time$|^cwd$"
+)  # names of wall times, and of the folder that a run began in
 DERIVED = {".pdf", ".md", ".tex", ".log", ".html"}  # files that show what others hold
 HASHES = "sha256.json"  # of files that are compared themselves
 
@@ -54,7 +63,9 @@ HASHES = "sha256.json"  # of files that are compared themselves
 def start(command: list[str], folder: Path) -> subprocess.Popen:
     """The command in a session of its own; `folder` is its working directory."""
     folder.mkdir(parents=True, exist_ok=True)
-    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell starts background jobs deaf to it
+    heed = partial(
+        signal.signal, signal.SIGINT, signal.SIG_DFL
+    )  # a shell starts background jobs deaf to it
     with (folder / "output.txt").open("a") as output:
         return subprocess.Popen(
             [sys.executable, str(ROOT / command[0]), *command[1:]],
@@ -75,18 +86,25 @@ def living(session: int) -> list[int]:
             state, _, _, number = entry.read_text().rpartition(") ")[2].split()[:4]
         except OSError:
             continue
-        found += [int(entry.parent.name)] * (int(number) == session and state not in "ZX")
+        found += [int(entry.parent.name)] * (
+            int(number) == session and state not in "ZX"
+        )
     return found
 
 
-def killed(command: list[str], folder: Path, after: float, number: signal.Signals) -> tuple[bool, str]:
-    """(whether the command was still at work, what is wrong) of one that gets a signal after some seconds."""
+def killed(
+    command: list[str], folder: Path, after: float, number: signal.Signals
+) -> tuple[bool, str]:
+    """(whether the command was still at work, what is wrong) of one that gets a signal
+    after some seconds."""
     run = start(command, folder)
     try:
         status = run.wait(after)
         return False, f"status {status}" if status else ""
     except subprocess.TimeoutExpired:
-        os.killpg(run.pid, number) if number is signal.SIGINT else run.send_signal(number)  # as a terminal does
+        os.killpg(run.pid, number) if number is signal.SIGINT else run.send_signal(
+            number
+        )  # as a terminal does
     try:
         run.wait(60)
     except subprocess.TimeoutExpired:
@@ -107,12 +125,23 @@ def complete(command: list[str], folder: Path) -> str:
     return f"status {status}; see {folder / 'output.txt'}" if status else ""
 
 
-def interrupted(command: list[str], folder: Path, took: float, draw: random.Random, times: int) -> tuple[list, str]:
-    """(names of the signals that came in time, what is wrong) of a run that is killed so many times, then ends."""
+def interrupted(
+    command: list[str], folder: Path, took: float, draw: random.Random, times: int
+) -> tuple[list, str]:
+    """(names of the signals that came in time, what is wrong) of a run that is killed
+    so many times, then ends."""
     came = []
     for left in range(times, -1, -1):
         begun = (folder / "run" / PROVENANCE).is_file()
-        now = [command[0], "resume=run", *(each for each in command if "data.cache=" in each)] if begun else command
+        now = (
+            [
+                command[0],
+                "resume=run",
+                *(each for each in command if "data.cache=" in each),
+            ]
+            if begun
+            else command
+        )
         if not left:
             return came, complete(now, folder)
         number = draw.choice(SIGNALS)
@@ -124,17 +153,24 @@ def interrupted(command: list[str], folder: Path, took: float, draw: random.Rand
 
 
 def differences(one: Path, other: Path) -> list[str]:
-    """Names of files that are in one folder only, or whose content differs by more than wall times."""
+    """Names of files that are in one folder only, or whose content differs by more than
+    wall times."""
     names = {folder: set(compared(folder)) for folder in (one, other)}
     alone = names[one] ^ names[other]
     both = names[one] & names[other]
-    return sorted(alone | {name for name in both if content(one / name) != content(other / name)})
+    return sorted(
+        alone | {name for name in both if content(one / name) != content(other / name)}
+    )
 
 
 def compared(folder: Path) -> list[str]:
     """Files of a run that are compared."""
     files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
-    return [str(path) for path in files if not WORKING & set(path.parts) and path.suffix not in DERIVED]
+    return [
+        str(path)
+        for path in files
+        if not WORKING & set(path.parts) and path.suffix not in DERIVED
+    ]
 
 
 def content(path: Path) -> Any:
@@ -144,7 +180,11 @@ def content(path: Path) -> Any:
         return None
     if path.suffix == ".pt":
         hashed = data.startswith(HASHED)
-        return plain(read_state(path) if hashed else torch.load(path, map_location="cpu", weights_only=True))
+        return plain(
+            read_state(path)
+            if hashed
+            else torch.load(path, map_location="cpu", weights_only=True)
+        )
     if path.suffix == ".json":
         return plain(json.loads(data))
     if path.suffix == ".safetensors":  # the header holds wall times
@@ -158,7 +198,11 @@ def content(path: Path) -> Any:
 def plain(value: Any) -> Any:
     """Nested containers with arrays as bytes, and without wall times."""
     if isinstance(value, dict):
-        return {str(key): plain(part) for key, part in value.items() if not TIMED.search(str(key))}
+        return {
+            str(key): plain(part)
+            for key, part in value.items()
+            if not TIMED.search(str(key))
+        }
     if isinstance(value, list | tuple):
         return [plain(part) for part in value]
     if isinstance(value, torch.Tensor | np.ndarray):
@@ -168,7 +212,9 @@ def plain(value: Any) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("count", type=int, metavar="N", help="runs that are killed")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--stages", nargs="+", choices=STAGES, default=list(STAGES))
@@ -182,7 +228,11 @@ def main(arguments: list[str] | None = None) -> int:
         folder = Path(temporary)
         while done < given.count:
             stage = given.stages[done % len(given.stages)]
-            command = [*STAGES[stage].split(), f"data.cache={folder / 'cache'}", "hydra.run.dir=run"]
+            command = [
+                *STAGES[stage].split(),
+                f"data.cache={folder / 'cache'}",
+                "hydra.run.dir=run",
+            ]
             whole = folder / stage
             own = folder / f"{stage}-{tried}"
             tried = tried + 1
@@ -191,20 +241,34 @@ def main(arguments: list[str] | None = None) -> int:
                 if wrong := complete(command, whole):
                     raise SystemExit(f"{stage}: {wrong}")
                 took[stage] = time.monotonic() - begin
-            came, wrong = interrupted(command, own, took[stage], draw, 2 if done % 3 == 2 else 1)
+            came, wrong = interrupted(
+                command, own, took[stage], draw, 2 if done % 3 == 2 else 1
+            )
             if not came and not wrong:  # it ended before the signal
                 continue
             wrong = wrong or ", ".join(differences(whole / "run", own / "run"))
             counts.update(
-                {(stage, "runs"): 1, (stage, "equal"): int(not wrong), **Counter((stage, name) for name in came)}
+                {
+                    (stage, "runs"): 1,
+                    (stage, "equal"): int(not wrong),
+                    **Counter((stage, name) for name in came),
+                }
             )
             done += 1
             print(f"{done}: {stage}: {', '.join(came)}: {wrong or 'equal'}", flush=True)
     columns = ("runs", *(number.name for number in SIGNALS), "equal")
-    print("\n| stage | " + " | ".join(columns) + " |\n| --- |" + " ---: |" * len(columns))
+    print(
+        "\n| stage | " + " | ".join(columns) + " |\n| --- |" + " ---: |" * len(columns)
+    )
     for stage in given.stages:
-        print(f"| {stage} | " + " | ".join(str(counts[stage, name]) for name in columns) + " |")
-    return int(any(counts[stage, "runs"] != counts[stage, "equal"] for stage in given.stages))
+        print(
+            f"| {stage} | "
+            + " | ".join(str(counts[stage, name]) for name in columns)
+            + " |"
+        )
+    return int(
+        any(counts[stage, "runs"] != counts[stage, "equal"] for stage in given.stages)
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""`python tools/showcase.py`: the pictures of the README, from bundled scenes and weights.
+"""`python tools/showcase.py`: the pictures of the README, from bundled scenes and
+weights.
 
-Moving, of one scene and seed: nominal traffic around the untrained actor; the same actor attacked by e2; the trained
-actor, which e2 attacks anew.
+Moving, of one scene and seed: nominal traffic around the untrained actor; the same
+actor attacked by e2; the trained actor, which e2 attacks anew.
 """
 
 import argparse
@@ -29,9 +30,21 @@ PICTURES = {  # file: the ego's checkpoint, traffic, two lines of the picture
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python tools/showcase.py", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/assets"), help="folder (default %(default)s)")
-    parser.add_argument("--scene", default=SCENE, metavar="ID", help="a bundled test scene (default %(default)s)")
+    parser = argparse.ArgumentParser(
+        prog="python tools/showcase.py", description=__doc__
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("docs/assets"),
+        help="folder (default %(default)s)",
+    )
+    parser.add_argument(
+        "--scene",
+        default=SCENE,
+        metavar="ID",
+        help="a bundled test scene (default %(default)s)",
+    )
     options = parser.parse_args(arguments)
     with ending():
         config = load_config("evaluate", ["ego=actor", "data.workers=1"])
@@ -42,14 +55,20 @@ def main(arguments: list[str] | None = None) -> None:
             config.ego.checkpoint = checkpoint
             setup = Setup(scenes, build_ego(config), "actor", sim)
             method = Method(
-                traffic, build_traffic(load_choice("synthesizer", traffic), prior), ETA if traffic == "e2" else 0.0
+                traffic,
+                build_traffic(load_choice("synthesizer", traffic), prior),
+                ETA if traffic == "e2" else 0.0,
             )
             rollouts = setup.roll_out(method, [Task(scenes.index(options.scene), SEED)])
             row = score_rollouts(rollouts)[0][0]
-            frames = Replay(rollouts.rollout(0), row, METRES, PIXELS, caption=caption).frames()
+            frames = Replay(
+                rollouts.rollout(0), row, METRES, PIXELS, caption=caption
+            ).frames()
             save_animation(options.out / f"{name}.gif", frames, COLOURS)
             outcome = "hit" if row["cfr"] else "no collision"
-            print(f"{options.out / name}.gif: {outcome}, {row['progress']:.0f} m driven")
+            print(
+                f"{options.out / name}.gif: {outcome}, {row['progress']:.0f} m driven"
+            )
 
 
 if __name__ == "__main__":

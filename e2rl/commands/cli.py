@@ -9,22 +9,55 @@ from importlib import import_module
 from importlib.metadata import version
 
 COMMANDS = {  # module, and what the command does
-    "try": ("e2rl.commands.try_planner", "how a planner class of your own fails, without a YAML file"),
-    "evaluate": ("e2rl.scripts.evaluate", "how often, and how, an ego fails in attacked traffic"),
-    "train": ("e2rl.scripts.train", "improve a policy on the failures that are found; train a prior"),
+    "try": (
+        "e2rl.commands.try_planner",
+        "how a planner class of your own fails, without a YAML file",
+    ),
+    "evaluate": (
+        "e2rl.scripts.evaluate",
+        "how often, and how, an ego fails in attacked traffic",
+    ),
+    "train": (
+        "e2rl.scripts.train",
+        "improve a policy on the failures that are found; train a prior",
+    ),
     "tune": ("e2rl.commands.tune", "tune the parameters of an adversary or a planner"),
     "report": ("e2rl.report.html", "the page with a replay of every failure of a run"),
     "replay": ("e2rl.commands.replay", "videos and pictures of rollouts of a run"),
-    "export": ("e2rl.commands.export", "failures of a run in the format of another tool"),
-    "export-policy": ("e2rl.commands.export_policy", "a trained actor as ONNX or TorchScript"),
-    "inspect": ("e2rl.commands.inspect", "what a data set holds, and a picture of a scene"),
-    "compare": ("e2rl.report.compare", "which failures of one run, or ego, are new or gone in another"),
-    "gate": ("e2rl.report.gate", "whether a run keeps within limits, for continuous integration"),
+    "export": (
+        "e2rl.commands.export",
+        "failures of a run in the format of another tool",
+    ),
+    "export-policy": (
+        "e2rl.commands.export_policy",
+        "a trained actor as ONNX or TorchScript",
+    ),
+    "inspect": (
+        "e2rl.commands.inspect",
+        "what a data set holds, and a picture of a scene",
+    ),
+    "compare": (
+        "e2rl.report.compare",
+        "which failures of one run, or ego, are new or gone in another",
+    ),
+    "gate": (
+        "e2rl.report.gate",
+        "whether a run keeps within limits, for continuous integration",
+    ),
     "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
     "curves": ("e2rl.report.curves", "failures over realism, of one or several runs"),
-    "policy-figure": ("e2rl.report.policy_figure", "what training was worth, of one or several splits"),
-    "prior-tables": ("e2rl.commands.prior_tables", "the prior as traffic: open loop, closed loop, meta-metric"),
-    "skeleton": ("e2rl.report.skeleton_figure", "the figure of risks, skeleton and chain"),
+    "policy-figure": (
+        "e2rl.report.policy_figure",
+        "what training was worth, of one or several splits",
+    ),
+    "prior-tables": (
+        "e2rl.commands.prior_tables",
+        "the prior as traffic: open loop, closed loop, meta-metric",
+    ),
+    "skeleton": (
+        "e2rl.report.skeleton_figure",
+        "the figure of risks, skeleton and chain",
+    ),
 }
 EXAMPLES = """examples:
   e2rl try LOGS --planner my_planner.py:MyPlanner --scenes 12

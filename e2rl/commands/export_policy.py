@@ -1,7 +1,9 @@
-"""`e2rl export-policy RUN_DIR POLICY.onnx|POLICY.pt`: a trained actor as a policy's file.
+"""`e2rl export-policy RUN_DIR POLICY.onnx|POLICY.pt`: a trained actor as a policy's
+file.
 
-It maps observations [B, 326] to the actor's most central actions [B, 2], with the normalisation and the reference
-inside, and drives e2rl by `ego=policy_file ego.file=POLICY.onnx` (docs/observation.md).
+It maps observations [B, 326] to the actor's most central actions [B, 2], with the
+normalisation and the reference inside, and drives e2rl by `ego=policy_file
+ego.file=POLICY.onnx` (docs/observation.md).
 """
 
 import argparse
@@ -26,16 +28,28 @@ class Deterministic(nn.Module):
 
 
 def export_actor(checkpoint: str, file: Path) -> None:
-    """Write the actor that `find_weights` finds as ONNX or TorchScript, told by the suffix; raises InputError."""
+    """Write the actor that `find_weights` finds as ONNX or TorchScript, told by the
+    suffix; raises InputError."""
     write_policy(Deterministic(read_actor(find_weights(checkpoint)).network), file)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl export-policy", description=__doc__)
-    parser.add_argument("actor", metavar="RUN_DIR", help="run of train.py, a checkpoint, an actor.safetensors; bundled")
-    parser.add_argument("file", type=Path, metavar="FILE", help=f"to write: {ONNX}, or {TORCHSCRIPT} for TorchScript")
+    parser.add_argument(
+        "actor",
+        metavar="RUN_DIR",
+        help="run of train.py, a checkpoint, an actor.safetensors; bundled",
+    )
+    parser.add_argument(
+        "file",
+        type=Path,
+        metavar="FILE",
+        help=f"to write: {ONNX}, or {TORCHSCRIPT} for TorchScript",
+    )
     options = parser.parse_args(arguments)
     with ending():
         export_actor(options.actor, options.file)
-        print(f"{options.file}: drive with it by ego=policy_file ego.file={options.file}")
+        print(
+            f"{options.file}: drive with it by ego=policy_file ego.file={options.file}"
+        )

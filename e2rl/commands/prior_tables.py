@@ -1,7 +1,8 @@
-"""`e2rl prior-tables`: the prior as traffic beside log replay, constant velocity and IDM, in four tables.
+"""`e2rl prior-tables`: the prior as traffic beside log replay, constant velocity and
+IDM, in four tables.
 
-Open-loop accuracy (minADE), the spread of samples, the closed loop, and the realism meta-metric over many rollouts of
-each scene.
+Open-loop accuracy (minADE), the spread of samples, the closed loop, and the realism
+meta-metric over many rollouts of each scene.
 """
 
 from typing import Any
@@ -39,7 +40,9 @@ def prior_tables(run: Run) -> None:
     """Make the rows of the tables; write and print them."""
     config = run.config
     folder = run.folder
-    asked = settings_of(TableSettings, {each.name: config[each.name] for each in fields(TableSettings)})
+    asked = settings_of(
+        TableSettings, {each.name: config[each.name] for each in fields(TableSettings)}
+    )
     plan = begin(run)
     methods = plan.methods
     setup = plan.setup
@@ -47,16 +50,33 @@ def prior_tables(run: Run) -> None:
     before = []
     after = []
     if asked.open_loop_samples:
-        before = open_loop_rows(plan.scenes, methods, samples=asked.open_loop_samples, device=config.device, parts=parts)
+        before = open_loop_rows(
+            plan.scenes,
+            methods,
+            samples=asked.open_loop_samples,
+            device=config.device,
+            parts=parts,
+        )
     if asked.spread_samples:
-        before += spread_rows(plan.scenes, methods, samples=asked.spread_samples, device=config.device, parts=parts)
-    work = Work(plan.rollouts(folder), processes_of(config), only=plan.only, parts=parts)
+        before += spread_rows(
+            plan.scenes,
+            methods,
+            samples=asked.spread_samples,
+            device=config.device,
+            parts=parts,
+        )
+    work = Work(
+        plan.rollouts(folder), processes_of(config), only=plan.only, parts=parts
+    )
     scored = drive_all([setup], methods, seeds=plan.asked.seeds, work=work)
     if asked.meta_rollouts:
         after = meta_rows(setup, methods, rollouts=asked.meta_rollouts, parts=parts)
 
     def summarise(*found: Any) -> list[dict]:
-        return [row | origin_of(run.folder) for row in (*before, *metric_rows(*found), *after)]
+        return [
+            row | origin_of(run.folder)
+            for row in (*before, *metric_rows(*found), *after)
+        ]
 
     rows = record(*scored, folder, summarise)
     answer = write_results(run, plan, rows=rows)

@@ -1,4 +1,5 @@
-"""`e2rl replay RUN_DIR`: videos of failures of a run, first those that count, one of a scene."""
+"""`e2rl replay RUN_DIR`: videos of failures of a run, first those that count, one of a
+scene."""
 
 import argparse
 from collections.abc import Iterator
@@ -16,7 +17,8 @@ from e2rl.sim.rollouts import Rollouts
 
 
 def chosen(run: Path, failures: int, modes: bool) -> Iterator[tuple[str, Failure]]:
-    """(title, rollout) of what is shown: a file alone, a run's first failures, or a typical failure of each mode."""
+    """(title, rollout) of what is shown: a file alone, a run's first failures, or a
+    typical failure of each mode."""
     if run.is_file():
         rollout = Rollout.read(run)
         yield "", Failure(rollout, score_rollouts(Rollouts.of([rollout]))[0][0])
@@ -26,10 +28,19 @@ def chosen(run: Path, failures: int, modes: bool) -> Iterator[tuple[str, Failure
     if modes:
         files = {rollout_name(row): row for row in rows}
         known = read_modes(run / MODES_FILE)["modes"]
-        if lost := [mode["typical"]["file"] for mode in known if mode["typical"]["file"] not in files]:
-            raise InputError(f"{run / MODES_FILE}: {lost[0]} is not in {TABLE}; run evaluate.py again to rewrite both")
+        if lost := [
+            mode["typical"]["file"]
+            for mode in known
+            if mode["typical"]["file"] not in files
+        ]:
+            raise InputError(
+                f"{run / MODES_FILE}: {lost[0]} is not in {TABLE}; run evaluate.py again to rewrite both"
+            )
         found = [
-            (f"{mode['mode']}. {mode['name']} ({mode['count']} failures)", files[mode["typical"]["file"]])
+            (
+                f"{mode['mode']}. {mode['name']} ({mode['count']} failures)",
+                files[mode["typical"]["file"]],
+            )
             for mode in known
             if mode["mode"] != OTHER
         ]
@@ -44,18 +55,55 @@ def chosen(run: Path, failures: int, modes: bool) -> Iterator[tuple[str, Failure
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl replay", description=__doc__)
-    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="a run's folder, or one rollout .npz")
-    parser.add_argument("--failures", type=int, default=3, metavar="N", help="how many failures (default %(default)s)")
-    parser.add_argument("--modes", action="store_true", help="instead, a typical failure of each mode")
-    parser.add_argument("--to", choices=("gif", "mp4"), default="gif", help="kind of file (default %(default)s)")
-    parser.add_argument("--out", type=Path, help="folder to write to (default: RUN_DIR/replays)")
-    parser.add_argument("--metres", type=float, default=70.0, help="side of the picture, m (default %(default)s)")
-    parser.add_argument("--pixels", type=int, default=720, help="side of the picture, pixels (default %(default)s)")
+    parser.add_argument(
+        "run", type=Path, metavar="RUN_DIR", help="a run's folder, or one rollout .npz"
+    )
+    parser.add_argument(
+        "--failures",
+        type=int,
+        default=3,
+        metavar="N",
+        help="how many failures (default %(default)s)",
+    )
+    parser.add_argument(
+        "--modes", action="store_true", help="instead, a typical failure of each mode"
+    )
+    parser.add_argument(
+        "--to",
+        choices=("gif", "mp4"),
+        default="gif",
+        help="kind of file (default %(default)s)",
+    )
+    parser.add_argument(
+        "--out", type=Path, help="folder to write to (default: RUN_DIR/replays)"
+    )
+    parser.add_argument(
+        "--metres",
+        type=float,
+        default=70.0,
+        help="side of the picture, m (default %(default)s)",
+    )
+    parser.add_argument(
+        "--pixels",
+        type=int,
+        default=720,
+        help="side of the picture, pixels (default %(default)s)",
+    )
     options = parser.parse_args(arguments)
     with ending():
-        folder = options.out or own_folder(options.run.parent if options.run.is_file() else options.run, "replays")
+        folder = options.out or own_folder(
+            options.run.parent if options.run.is_file() else options.run, "replays"
+        )
         for title, shown in chosen(options.run, options.failures, modes=options.modes):
             name = f"{shown.rollout.name.removesuffix('.npz')}.{options.to}"
             path = folder / name if options.out else own_folder(folder, name)
-            save_animation(path, Replay(shown.rollout, shown.row, metres=options.metres, pixels=options.pixels).frames())
+            save_animation(
+                path,
+                Replay(
+                    shown.rollout,
+                    shown.row,
+                    metres=options.metres,
+                    pixels=options.pixels,
+                ).frames(),
+            )
             print(*filter(None, [title]), path, sep="\n")

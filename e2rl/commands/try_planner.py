@@ -1,6 +1,8 @@
-"""`e2rl try LOGS --planner MODULE:CLASS`: how a planner of one's own fails in attacked traffic, without a YAML file.
+"""`e2rl try LOGS --planner MODULE:CLASS`: how a planner of one's own fails in attacked
+traffic, without a YAML file.
 
-It writes the command line of `e2rl evaluate` and runs it: the same protocol, files and report.
+It writes the command line of `e2rl evaluate` and runs it: the same protocol, files and
+report.
 """
 
 import argparse
@@ -20,14 +22,20 @@ from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 
 SCENES = 12
-NAMED = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+NAMED = (
+    inspect.Parameter.POSITIONAL_ONLY,
+    inspect.Parameter.POSITIONAL_OR_KEYWORD,
+    inspect.Parameter.KEYWORD_ONLY,
+)
 
 
 def planner_class(named: str) -> type[Ego]:
-    """Returns the class that MODULE:CLASS or FILE.py:CLASS names; its folder is where modules are sought from then on.
+    """Returns the class that MODULE:CLASS or FILE.py:CLASS names; its folder is where
+    modules are sought from then on.
 
     Raises:
-        InputError: where the module cannot be imported, and where it has no such class, or one that is no Ego or does
+        InputError: where the module cannot be imported, and where it has no such class,
+            or one that is no Ego or does
             not drive.
     """
     where = f"--planner {named}"
@@ -35,17 +43,29 @@ def planner_class(named: str) -> type[Ego]:
     if not place or not name:
         raise InputError(f"{where}: name a class, as MODULE:CLASS or FILE.py:CLASS")
     module = _imported(place, where)
-    known = {key: value for key, value in vars(module).items() if _is_planner(value) and _drives(value)}
+    known = {
+        key: value
+        for key, value in vars(module).items()
+        if _is_planner(value) and _drives(value)
+    }
     kind = vars(module).get(name)
     near = get_close_matches(name, known, 1) or list(known)
     if kind is None:
-        advice = f"it has {', '.join(near)}" if near else "nor any other subclass of e2rl.planners.ego.Ego"
+        advice = (
+            f"it has {', '.join(near)}"
+            if near
+            else "nor any other subclass of e2rl.planners.ego.Ego"
+        )
         raise InputError(f"{where}: {place} has no {name}; {advice}")
     if not _is_planner(kind):
-        raise InputError(f"{where}: {name} is no planner; make it a subclass of e2rl.planners.ego.Ego with `plan`")
+        raise InputError(
+            f"{where}: {name} is no planner; make it a subclass of e2rl.planners.ego.Ego with `plan`"
+        )
     if not _drives(kind):
         advice = f"; name {', '.join(near)}" if near else ""
-        raise InputError(f"{where}: {name} overrides neither plan nor act, so that it does not drive{advice}")
+        raise InputError(
+            f"{where}: {name} overrides neither plan nor act, so that it does not drive{advice}"
+        )
     return kind
 
 
@@ -60,20 +80,30 @@ def _imported(place: str, where: str) -> ModuleType:
         folder = str(file.parent)
         module = file.stem
     sys.path.insert(0, folder)
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        filter(None, [folder, os.environ.get("PYTHONPATH")])
+    )
     try:
         loaded = import_module(module)
     except ModuleNotFoundError as error:
         if error.name and module.split(".")[0] == error.name.split(".")[0]:
             mend = "start in the folder that holds it, put that on PYTHONPATH, or name the file as FILE.py:CLASS"
-            raise InputError(f"{where}: no module {module} in {folder}; {mend}") from error
-        raise InputError(f"{where}: {module} needs {error.name}, which is not installed; install it") from error
+            raise InputError(
+                f"{where}: no module {module} in {folder}; {mend}"
+            ) from error
+        raise InputError(
+            f"{where}: {module} needs {error.name}, which is not installed; install it"
+        ) from error
     except (Exception, SystemExit) as error:  # of outside code
-        raise InputError(f"{where}: {module} cannot be imported: {type(error).__name__}: {error}; mend that") from error
+        raise InputError(
+            f"{where}: {module} cannot be imported: {type(error).__name__}: {error}; mend that"
+        ) from error
     file = Path(folder, *module.split(".")).with_suffix(".py")
     other = getattr(loaded, "__file__", None) or "a part of Python"
     if file.is_file() and Path(other).resolve() != file.resolve():
-        raise InputError(f"{where}: rename {file.name}: a module {module} is loaded already, {other}")
+        raise InputError(
+            f"{where}: rename {file.name}: a module {module} is loaded already, {other}"
+        )
     return loaded
 
 
@@ -86,23 +116,36 @@ def _drives(kind: type[Ego]) -> bool:
 
 
 def check_arguments(kind: type[Ego], settings: Sequence[str], where: str) -> None:
-    """Raises InputError where an argument of the class has neither a default nor a setting NAME=VALUE."""
+    """Raises InputError where an argument of the class has neither a default nor a
+    setting NAME=VALUE."""
     given = {setting.partition("=")[0] for setting in settings}
     parameters = list(inspect.signature(kind).parameters.values())
-    needed = [each.name for each in parameters if each.kind in NAMED and each.default is each.empty]
+    needed = [
+        each.name
+        for each in parameters
+        if each.kind in NAMED and each.default is each.empty
+    ]
     if missing := [name for name in needed if name not in given]:
         mend = " ".join(f"--set {name}=VALUE" for name in missing)
-        raise InputError(f"{where}: {kind.__name__} needs {', '.join(missing)}; give defaults, or add {mend}")
+        raise InputError(
+            f"{where}: {kind.__name__} needs {', '.join(missing)}; give defaults, or add {mend}"
+        )
 
 
 def overrides_of(options: argparse.Namespace) -> list[str]:
-    """Returns the overrides of `e2rl evaluate` for the options; InputError for a planner or logs that are none."""
+    """Returns the overrides of `e2rl evaluate` for the options; InputError for a
+    planner or logs that are none."""
     kind = planner_class(options.planner)
     check_arguments(kind, options.settings, where=f"--planner {options.planner}")
     logs = [each for each in options.logs if "=" not in each]
     if len(logs) > 1:
-        raise InputError(f"{logs[1]}: name one folder or zip of logs, or leave it out for the bundled scenes")
-    words = ["ego=class", assigned("ego._target_", f"{kind.__module__}.{kind.__qualname__}")]
+        raise InputError(
+            f"{logs[1]}: name one folder or zip of logs, or leave it out for the bundled scenes"
+        )
+    words = [
+        "ego=class",
+        assigned("ego._target_", f"{kind.__module__}.{kind.__qualname__}"),
+    ]
     words += [f"+ego.{setting}" for setting in options.settings]
     if logs:
         data, _ = open_source(Path(logs[0]), options.data, workers=1)
@@ -114,16 +157,43 @@ def overrides_of(options: argparse.Namespace) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(prog="e2rl try", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="e2rl try", description=__doc__.splitlines()[0]
+    )
     logs = "folder or zip of logs (default: the bundled scenes); further KEY=VALUE of evaluate"
     parser.add_argument("logs", nargs="*", metavar="LOGS", help=logs)
-    parser.add_argument("--planner", required=True, metavar="MODULE:CLASS", help="an Ego, or FILE.py:CLASS")
     parser.add_argument(
-        "--set", action="append", default=[], dest="settings", metavar="NAME=VALUE", help="its argument"
+        "--planner",
+        required=True,
+        metavar="MODULE:CLASS",
+        help="an Ego, or FILE.py:CLASS",
     )
-    parser.add_argument("--scenes", type=int, default=SCENES, metavar="N", help="the first N; 0: all (%(default)s)")
-    parser.add_argument("--data", metavar="NAME", help="file of conf/data that reads the logs (default: one that can)")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="of the run (default: below runs/evaluate)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="settings",
+        metavar="NAME=VALUE",
+        help="its argument",
+    )
+    parser.add_argument(
+        "--scenes",
+        type=int,
+        default=SCENES,
+        metavar="N",
+        help="the first N; 0: all (%(default)s)",
+    )
+    parser.add_argument(
+        "--data",
+        metavar="NAME",
+        help="file of conf/data that reads the logs (default: one that can)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help="of the run (default: below runs/evaluate)",
+    )
     options = parser.parse_intermixed_args(arguments)
     with ending():
         sys.argv = ["e2rl evaluate", *overrides_of(options)]

@@ -1,7 +1,9 @@
-"""`e2rl tune synthesizer=NAME`, or `e2rl tune tuning.group=ego ego=NAME`: parameters of most, or fewest, failures.
+"""`e2rl tune synthesizer=NAME`, or `e2rl tune tuning.group=ego ego=NAME`: parameters of
+most, or fewest, failures.
 
-Writes tuning.json, tuned.yaml (the lines to keep in conf/) and of an adversary the curve over its gain. The ranges are
-those of the class (`tuned`), or tuning.space (docs/adversaries.md, docs/how-to/planner.md).
+Writes tuning.json, tuned.yaml (the lines to keep in conf/) and of an adversary the
+curve over its gain. The ranges are those of the class (`tuned`), or tuning.space
+(docs/adversaries.md, docs/how-to/planner.md).
 """
 
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
@@ -16,11 +18,32 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from e2rl.evaluation.budget import TRIES_FILE, failures_of, methods_at, portfolio_plan
-from e2rl.evaluation.methods import SEARCH, build_ego, build_traffic, method_config, processes_of
+from e2rl.evaluation.methods import (
+    SEARCH,
+    build_ego,
+    build_traffic,
+    method_config,
+    processes_of,
+)
 from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.evaluation.protocol import Method, Part
-from e2rl.evaluation.trials import NOMINAL, AttackObjective, AttackTrials, PlannerObjective, PlannerTrials
-from e2rl.evaluation.tuning import STUDY_FILE, Objective, Parameters, SearchSettings, line_of, save, search, yaml_of
+from e2rl.evaluation.trials import (
+    NOMINAL,
+    AttackObjective,
+    AttackTrials,
+    PlannerObjective,
+    PlannerTrials,
+)
+from e2rl.evaluation.tuning import (
+    STUDY_FILE,
+    Objective,
+    Parameters,
+    SearchSettings,
+    line_of,
+    save,
+    search,
+    yaml_of,
+)
 from e2rl.report.curves import points_of_tuning, save_curves
 from e2rl.run.command import run_command
 from e2rl.run.config import resolved, with_changes
@@ -44,11 +67,15 @@ def tune(run: Run) -> dict:
     objective: Objective
     trials: PlannerTrials | AttackTrials
     if group == "ego":
-        objective = settings_of(PlannerObjective, config.tuning.planner, where="tuning.planner")
+        objective = settings_of(
+            PlannerObjective, config.tuning.planner, where="tuning.planner"
+        )
         trials = planner_trials(config, plan)
         ranges = plan.setup.ego.tuned
     else:
-        objective = settings_of(AttackObjective, config.tuning.attack, where="tuning.attack")
+        objective = settings_of(
+            AttackObjective, config.tuning.attack, where="tuning.attack"
+        )
         trials, ranges = attack_trials(config, plan)
 
     def told(rows: list[dict]) -> None:
@@ -56,53 +83,113 @@ def tune(run: Run) -> dict:
         print(line_of(rows, objective))
 
     about = {name: resolved(config[name]) for name in ("ego", "prior", "sim")} | {
-        "rows": [f"{method.name}@{method.eta:g}" for method in plan.methods] if group == "ego" else [NOMINAL],
+        "rows": [f"{method.name}@{method.eta:g}" for method in plan.methods]
+        if group == "ego"
+        else [NOMINAL],
         "seeds": list(plan.asked.seeds),
-        "failures": [[list(task.one or ()) for task in part[2]] for part in getattr(trials, "failures", ())],
+        "failures": [
+            [list(task.one or ()) for task in part[2]]
+            for part in getattr(trials, "failures", ())
+        ],
         "scenes": plan.scenes.scene_id,
         "eta": list(plan.asked.eta),
     }
     space = resolved(config.tuning.space) or ranges
-    file = folder / STUDY_FILE if config.tuning.study is None else Path(config.tuning.study)
-    rows = search(trials, flat(resolved(config[group])), space=space, settings=settings, objective=objective, file=file, about=about, told=told)
+    file = (
+        folder / STUDY_FILE
+        if config.tuning.study is None
+        else Path(config.tuning.study)
+    )
+    rows = search(
+        trials,
+        flat(resolved(config[group])),
+        space=space,
+        settings=settings,
+        objective=objective,
+        file=file,
+        about=about,
+        told=told,
+    )
     result = save(rows, folder)
     if group == "synthesizer":
         save_curves(folder, points_of_tuning(result, config.synthesizer.name))
     best = "no trial keeps within the limits\n"
     if result["best"]:
-        best = f"best of {len(rows)} trials, for conf/{group}:\n{yaml_of(result['best'])}"
+        best = (
+            f"best of {len(rows)} trials, for conf/{group}:\n{yaml_of(result['best'])}"
+        )
     print(f"\n{best}written to {folder}")
     return result
 
 
 def planner_trials(config: DictConfig, plan: Evaluation) -> PlannerTrials:
-    """Returns trials of the group `ego` against all of `config.methods`, and in the tries of `tuning.failures`."""
+    """Returns trials of the group `ego` against all of `config.methods`, and in the
+    tries of `tuning.failures`."""
 
     def make(parameters: Parameters) -> Any:
-        return build_ego(OmegaConf.create({"ego": with_changes(config.ego, parameters, where="tuning.space", group="ego")}))
+        return build_ego(
+            OmegaConf.create(
+                {
+                    "ego": with_changes(
+                        config.ego, parameters, where="tuning.space", group="ego"
+                    )
+                }
+            )
+        )
 
     failures: list[Part] = []
     if config.tuning.failures is not None:
-        portfolio = portfolio_plan(SEARCH, config, method=partial(methods_at(max(plan.asked.eta)), plan.prior))
+        portfolio = portfolio_plan(
+            SEARCH, config, method=partial(methods_at(max(plan.asked.eta)), plan.prior)
+        )
         file = Path(config.tuning.failures) / TRIES_FILE
-        failures = failures_of(file, plan.setup.ego_name, plan=portfolio, setup=plan.setup)
-    return PlannerTrials(plan.setup, plan.methods, seeds=plan.asked.seeds, make=make, processes=processes_of(config), failures=failures)
+        failures = failures_of(
+            file, plan.setup.ego_name, plan=portfolio, setup=plan.setup
+        )
+    return PlannerTrials(
+        plan.setup,
+        plan.methods,
+        seeds=plan.asked.seeds,
+        make=make,
+        processes=processes_of(config),
+        failures=failures,
+    )
 
 
 def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, Mapping]:
-    """Returns trials of the group `synthesizer` at `config.eta` beside nominal traffic, and the ranges of its class."""
+    """Returns trials of the group `synthesizer` at `config.eta` beside nominal traffic,
+    and the ranges of its class."""
     etas = plan.asked.eta
     if len(etas) != 1 or not etas[0]:
-        raise InputError(f"eta={config.eta}: an adversary is tuned at one intensity above 0")
+        raise InputError(
+            f"eta={config.eta}: an adversary is tuned at one intensity above 0"
+        )
 
     def make(parameters: Parameters) -> Any:
-        return build_traffic(with_changes(config.synthesizer, parameters, where="tuning.space", group="synthesizer"), plan.prior)
+        return build_traffic(
+            with_changes(
+                config.synthesizer,
+                parameters,
+                where="tuning.space",
+                group="synthesizer",
+            ),
+            plan.prior,
+        )
 
     present = make({})
     if not present.adversarial:
-        raise InputError(f"synthesizer={config.synthesizer.name}: no adversary, so there is no attack to tune")
+        raise InputError(
+            f"synthesizer={config.synthesizer.name}: no adversary, so there is no attack to tune"
+        )
     nominal = Method(NOMINAL, build_traffic(method_config(config, NOMINAL), plan.prior))
-    trials = AttackTrials(plan.setup, nominal, eta=etas[0], seeds=plan.asked.seeds, make=make, processes=processes_of(config))
+    trials = AttackTrials(
+        plan.setup,
+        nominal,
+        eta=etas[0],
+        seeds=plan.asked.seeds,
+        make=make,
+        processes=processes_of(config),
+    )
     return trials, present.tuned
 
 
@@ -110,7 +197,11 @@ def flat(group: Mapping[str, Any], before: str = "") -> Parameters:
     """Returns {dotted name: value} of nested settings."""
     found: Parameters = {}
     for name, value in group.items():
-        found |= flat(value, f"{before}{name}.") if isinstance(value, dict) else {f"{before}{name}": value}
+        found |= (
+            flat(value, f"{before}{name}.")
+            if isinstance(value, dict)
+            else {f"{before}{name}": value}
+        )
     return found
 
 

@@ -1,8 +1,10 @@
-"""The egos that a run rates, in the same traffic: the same scenes, noise, methods and intensities for each of them.
+"""The egos that a run rates, in the same traffic: the same scenes, noise, methods and
+intensities for each of them.
 
-The noise of a rollout depends on its scene and seed alone, so egos are compared rollout by rollout. Each is
-attacked by adversaries of its own. Trainings of one policy with different seeds are separate egos in the files, and are
-also pooled under one name, as `metrics.statistics` says.
+The noise of a rollout depends on its scene and seed alone, so egos are compared rollout
+by rollout. Each is attacked by adversaries of its own. Trainings of one policy with
+different seeds are separate egos in the files, and are also pooled under one name, as
+`metrics.statistics` says.
 """
 
 import copy
@@ -47,7 +49,9 @@ class EgoSet:
 
     def setups(self, setup: Setup) -> list[Setup]:
         """Returns the setup with each of the egos."""
-        return [replace(setup, ego=ego, ego_name=name) for name, ego in self.egos.items()]
+        return [
+            replace(setup, ego=ego, ego_name=name) for name, ego in self.egos.items()
+        ]
 
     def metric_rows(
         self,
@@ -56,36 +60,59 @@ class EgoSet:
         references: Collection[str] | None = None,
         **fields: Any,
     ) -> list[dict]:
-        """Returns the rows of metrics.json: for each ego, method and intensity, and for each name of `trainings`.
+        """Returns the rows of metrics.json: for each ego, method and intensity, and for
+        each name of `trainings`.
 
-        Rows of the first name of a pair are compared with the second's under `ego SECOND` of their `paired`.
-        references, fields: see `e2rl.evaluation.summary.metric_rows`.
+        Rows of the first name of a pair are compared with the second's under `ego
+        SECOND` of their `paired`. references, fields: see
+        `e2rl.evaluation.summary.metric_rows`.
         """
         pooled, more = pool_trainings(rows, features, trainings=self.trainings)
-        result = metric_rows(rows + pooled, features + more, egos=self.pairs, references=references, **fields)
+        result = metric_rows(
+            rows + pooled,
+            features + more,
+            egos=self.pairs,
+            references=references,
+            **fields,
+        )
         counts = {name: len(members) for name, members in self.trainings.items()}
-        return [row | {"n_trainings": counts[row["ego"]]} if row["ego"] in counts else row for row in result]
+        return [
+            row | {"n_trainings": counts[row["ego"]]} if row["ego"] in counts else row
+            for row in result
+        ]
 
 
 def pool_trainings(
     rows: Sequence[dict], features: Sequence, trainings: Mapping[str, Sequence[str]]
 ) -> tuple[list[dict], list]:
-    """Returns copies of the rows of several trainings under their common name, with the number of their `training`."""
+    """Returns copies of the rows of several trainings under their common name, with the
+    number of their `training`."""
     pooled: tuple[list[dict], list] = ([], [])
     for name, members in trainings.items():
         for row, feature in zip(rows, features, strict=True):
             if row["ego_policy"] in members:
-                pooled[0].append(row | {"ego_policy": name, "training": list(members).index(row["ego_policy"])})
+                pooled[0].append(
+                    row
+                    | {
+                        "ego_policy": name,
+                        "training": list(members).index(row["ego_policy"]),
+                    }
+                )
                 pooled[1].append(feature)
     return pooled
 
 
 def recorded_acceleration(scenes: SceneSet) -> float:
-    """Returns the mean |acceleration| [m/s^2] of the recorded egos, by the rule of the metric `macc`."""
+    """Returns the mean |acceleration| [m/s^2] of the recorded egos, by the rule of the
+    metric `macc`."""
     found = []
     for part in scenes.parts():
         stop = torch.full((len(part),), scenes.steps)
-        found.append(mean_acceleration(*ego_path(part["logged"].double(), part["logged_valid"], stop=stop)))
+        found.append(
+            mean_acceleration(
+                *ego_path(part["logged"].double(), part["logged_valid"], stop=stop)
+            )
+        )
     return torch.cat(found).nanmean().item()
 
 
@@ -93,14 +120,17 @@ def recorded_acceleration(scenes: SceneSet) -> float:
 
 
 def build_egos(config: DictConfig, name: str) -> EgoSet:
-    """Returns the egos of `config.egos`, or where it names none the one of the group `ego`, a file called `name`.
+    """Returns the egos of `config.egos`, or where it names none the one of the group
+    `ego`, a file called `name`.
 
-    An entry with `checkpoints` is an ego for each of them. Raises InputError for an ego, a field or a checkpoint that
-    is not there, and for names that collide.
+    An entry with `checkpoints` is an ego for each of them. Raises InputError for an
+    ego, a field or a checkpoint that is not there, and for names that collide.
     """
     if not config.egos:
         if config.policy_learning is not None:
-            raise InputError("policy_learning: names no egos; set egos too, as experiment=policy_learning does")
+            raise InputError(
+                "policy_learning: names no egos; set egos too, as experiment=policy_learning does"
+            )
         return EgoSet({name: build_ego(config)}, [name])
     egos: dict[str, Ego] = {}
     trainings: dict[str, list[str]] = {}
@@ -108,43 +138,77 @@ def build_egos(config: DictConfig, name: str) -> EgoSet:
         members = trainings_of(config, entry)
         if len(members) > 1:
             trainings[entry] = list(members)
-        taken = [own for own in members if own in egos or (own != entry and own in config.egos)]
+        taken = [
+            own
+            for own in members
+            if own in egos or (own != entry and own in config.egos)
+        ]
         if taken:
-            raise InputError(f"egos.{entry}: {', '.join(taken)} is the name of another ego, too; choose another name")
-        egos |= {own: one_ego(config, entry, changes=changes) for own, changes in members.items()}
+            raise InputError(
+                f"egos.{entry}: {', '.join(taken)} is the name of another ego, too; choose another name"
+            )
+        egos |= {
+            own: one_ego(config, entry, changes=changes)
+            for own, changes in members.items()
+        }
     counts = {len(members) for members in trainings.values()}
     if len(counts) > 1:
-        raise InputError(f"egos: {' and '.join(trainings)} have different numbers of checkpoints; give as many of each")
-    return EgoSet(egos, list(map(str, config.egos)), pairs=compared(config), trainings=trainings)
+        raise InputError(
+            f"egos: {' and '.join(trainings)} have different numbers of checkpoints; give as many of each"
+        )
+    return EgoSet(
+        egos, list(map(str, config.egos)), pairs=compared(config), trainings=trainings
+    )
 
 
 def trainings_of(config: DictConfig, name: str) -> dict[str, dict[str, Any]]:
-    """Returns {name in files: {ego: FILE, changes of its fields}} of an entry, one for each of its `checkpoints`."""
+    """Returns {name in files: {ego: FILE, changes of its fields}} of an entry, one for
+    each of its `checkpoints`."""
     entry = config.egos[name]
     where = f"egos.{name}"
     if not NAME.fullmatch(name):
-        raise InputError(f"{where}: the name goes into file names; use letters, digits and . _ + -")
+        raise InputError(
+            f"{where}: the name goes into file names; use letters, digits and . _ + -"
+        )
     if not isinstance(entry, DictConfig) or "ego" not in entry:
         raise InputError(
             f"{where}={entry!r}: expected a file of conf/ego and changes, such as {{ego: idm, headway: 2}}"
         )
     several = entry.get("checkpoints") or []
     if not isinstance(several, list | ListConfig):
-        raise InputError(f"{where}.checkpoints={several}: expected a list of training runs, [RUN, RUN]")
-    missing = [key for key in entry if OmegaConf.is_missing(entry, key) and not (key == "checkpoint" and several)]
+        raise InputError(
+            f"{where}.checkpoints={several}: expected a list of training runs, [RUN, RUN]"
+        )
+    missing = [
+        key
+        for key in entry
+        if OmegaConf.is_missing(entry, key) and not (key == "checkpoint" and several)
+    ]
     if missing:
         key = f"{where}.{str(missing[0])}"
-        raise InputError(f"{key}: needed; give the folder that train.py wrote, {key}=RUN")
-    changes = {str(key): entry[key] for key in entry if not OmegaConf.is_missing(entry, key) and key != "checkpoints"}
+        raise InputError(
+            f"{key}: needed; give the folder that train.py wrote, {key}=RUN"
+        )
+    changes = {
+        str(key): entry[key]
+        for key in entry
+        if not OmegaConf.is_missing(entry, key) and key != "checkpoints"
+    }
     if several and changes.get("checkpoint") is not None:
-        raise InputError(f"{where}: has a checkpoint and checkpoints; give one of the two")
+        raise InputError(
+            f"{where}: has a checkpoint and checkpoints; give one of the two"
+        )
     if len(several) < 2:
         return {name: changes | ({"checkpoint": several[0]} if several else {})}
-    return {f"{name}_{number}": changes | {"checkpoint": each} for number, each in enumerate(several)}
+    return {
+        f"{name}_{number}": changes | {"checkpoint": each}
+        for number, each in enumerate(several)
+    }
 
 
 def one_ego(config: DictConfig, name: str, changes: Mapping[str, Any]) -> Ego:
-    """Returns the ego of an entry; its first weights depend on the run's seed alone, not on the other egos."""
+    """Returns the ego of an entry; its first weights depend on the run's seed alone,
+    not on the other egos."""
     where = f"egos.{name}"
     try:
         changed = copy.deepcopy(config)
@@ -157,14 +221,17 @@ def one_ego(config: DictConfig, name: str, changes: Mapping[str, Any]) -> Ego:
         torch.manual_seed(config.get("seed", 0))
         return build_ego(changed)
     except OmegaConfBaseException as error:
-        raise InputError(f"{where}: {str(error).splitlines()[0]}; compare it with conf/ego/{changes['ego']}") from error
+        raise InputError(
+            f"{where}: {str(error).splitlines()[0]}; compare it with conf/ego/{changes['ego']}"
+        ) from error
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 
 
 def compared(config: DictConfig) -> list[tuple[str, str]]:
-    """Returns pairs of names whose difference is of interest: `policy_learning.after` with each other ego, `before`
-    first; or without `policy_learning` each ego with `compare`, or with the first."""
+    """Returns pairs of names whose difference is of interest: `policy_learning.after`
+    with each other ego, `before` first; or without `policy_learning` each ego with
+    `compare`, or with the first."""
     names = [str(name) for name in config.egos]
     roles = config.policy_learning
     if roles is None:
@@ -172,10 +239,16 @@ def compared(config: DictConfig) -> list[tuple[str, str]]:
         return [(name, reference) for name in names if name != reference]
     for role in ROLES:
         if roles.get(role) not in names:
-            raise InputError(f"policy_learning.{role}={roles.get(role)}: none of egos ({', '.join(names)}); name one")
+            raise InputError(
+                f"policy_learning.{role}={roles.get(role)}: none of egos ({', '.join(names)}); name one"
+            )
     if "nominal" not in rows_of(config):
-        raise InputError(f"methods={list(config.methods)}: policy_learning compares nominal driving; name nominal, too")
+        raise InputError(
+            f"methods={list(config.methods)}: policy_learning compares nominal driving; name nominal, too"
+        )
     if roles.after in (roles.before, roles.planner):
-        raise InputError(f"policy_learning: after is {roles.after}, and before or planner, too; name another of egos")
+        raise InputError(
+            f"policy_learning: after is {roles.after}, and before or planner, too; name another of egos"
+        )
     others = [name for name in names if name not in (roles.before, roles.after)]
     return [(roles.after, roles.before), *((roles.after, name) for name in others)]

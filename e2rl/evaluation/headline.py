@@ -1,6 +1,8 @@
-"""The headline of a planner in one traffic: in how many scenes it fails preventably, and in how many it raised.
+"""The headline of a planner in one traffic: in how many scenes it fails preventably,
+and in how many it raised.
 
-It is counted from the rows of rollouts here and nowhere else; all that a reader is shown takes it from here.
+It is counted from the rows of rollouts here and nowhere else; all that a reader is
+shown takes it from here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +23,8 @@ class Headline(NamedTuple):
         failed: scenes with one of the two.
         ways: different ways of failing preventably, cells of the atlas.
         searches: of a scene, by how many seeds; 0: it was not searched.
-        tries, nfe: of a search of a scene in the mean; nfe does not count tries that errored.
+        tries, nfe: of a search of a scene in the mean; nfe does not count tries that
+            errored.
     """
 
     scenes: int
@@ -35,16 +38,23 @@ class Headline(NamedTuple):
 
 
 def headline(rows: Sequence[Mapping[str, Any]], searched: bool) -> Headline:
-    """Returns the headline of rows of rollouts of one ego, method and intensity; `searched`: they are tries."""
+    """Returns the headline of rows of rollouts of one ego, method and intensity;
+    `searched`: they are tries."""
     driven = [row for row in rows if not lost(row)]
     scenes = {row["scene_id"] for row in driven}
-    failures = [row for row in driven if row.get("cfr_preventable") == 1 and not raised(row)]
+    failures = [
+        row for row in driven if row.get("cfr_preventable") == 1 and not raised(row)
+    ]
     preventable = {row["scene_id"] for row in failures}
     crashed = {row["scene_id"] for row in driven if raised(row)}
     cells = {cell_of(row) for row in failures} - {None}
     seeds = {row["seed"] // TRIES for row in driven} if searched else set()
     searches = max(len(scenes) * len(seeds), 1)
-    known = [row["nfe"] for row in driven if row.get("nfe") == row.get("nfe") and "nfe" in row]
+    known = [
+        row["nfe"]
+        for row in driven
+        if row.get("nfe") == row.get("nfe") and "nfe" in row
+    ]
     return Headline(
         scenes=len(scenes),
         preventable=len(preventable),

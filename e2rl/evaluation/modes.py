@@ -1,4 +1,5 @@
-"""Failure modes and atlas of a run: modes.json, the column `mode` of rollouts.csv, atlas.json (docs/modes.md)."""
+"""Failure modes and atlas of a run: modes.json, the column `mode` of rollouts.csv,
+atlas.json (docs/modes.md)."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +27,12 @@ from e2rl.sim.rollout_file import rollout_name
 MODES_FILE = "modes.json"
 ATLAS_FILE = "atlas.json"
 OTHER = 0  # number of the small modes together
-VERDICTS = ("counted", "preventable", "at_fault", "avoidable")  # fractions of a mode's failures
+VERDICTS = (
+    "counted",
+    "preventable",
+    "at_fault",
+    "avoidable",
+)  # fractions of a mode's failures
 MEANS = ("ego_speed", "partner_speed", "relvel")  # m/s
 TYPICAL = ("method", "eta", "scene_id", "seed")
 NUMBER = (int, float)
@@ -35,11 +41,19 @@ SHAPE = {  # what readers of modes.json need
     "rollouts": int,
     "unknown": [str],
     "groups": [
-        {**dict.fromkeys(("dataset", "split", "method", "ego_policy"), str), "eta": NUMBER}
+        {
+            **dict.fromkeys(("dataset", "split", "method", "ego_policy"), str),
+            "eta": NUMBER,
+        }
         | dict.fromkeys(("rollouts", "failures", "modes"), int)
     ],
     "modes": [
-        {"mode": int, "name": str, "count": int, "groups": [{"count": int, "fraction": (*NUMBER, NoneType)}]}
+        {
+            "mode": int,
+            "name": str,
+            "count": int,
+            "groups": [{"count": int, "fraction": (*NUMBER, NoneType)}],
+        }
         | dict.fromkeys((*VERDICTS, *MEANS), (*NUMBER, NoneType))
         | {"typical": {"file": str}}
     ],
@@ -47,11 +61,12 @@ SHAPE = {  # what readers of modes.json need
 
 
 def find_modes(rows: Sequence[dict]) -> dict:
-    """Group the failures among all rows of a run into modes, and return the content of modes.json.
+    """Group the failures among all rows of a run into modes, and return the content of
+    modes.json.
 
-    Adds `mode`, the number of the mode, to the rows of failures, in place. Modes that are too small are gathered as
-    `other`, number 0. Columns that no failure knows, such as `duty`, are named under
-    `unknown` and play no part.
+    Adds `mode`, the number of the mode, to the rows of failures, in place. Modes that
+    are too small are gathered as `other`, number 0. Columns that no failure knows, such
+    as `duty`, are named under `unknown` and play no part.
     """
     failures = [row for row in rows if is_failure(row)]
     numbers = cluster_failures(failures)
@@ -59,36 +74,55 @@ def find_modes(rows: Sequence[dict]) -> dict:
         row["mode"] = number
     large = large_modes(numbers)
     used = known_features(failures)
-    members = {number: [row for row in failures if row["mode"] == number] for number in large}
+    members = {
+        number: [row for row in failures if row["mode"] == number] for number in large
+    }
     if len(large) < len(set(numbers)):
         members[OTHER] = [row for row in failures if row["mode"] not in large]
-    groups = [dict(zip(GROUP, key, strict=True)) for key in dict.fromkeys(group_of(row) for row in rows)]
+    groups = [
+        dict(zip(GROUP, key, strict=True))
+        for key in dict.fromkeys(group_of(row) for row in rows)
+    ]
     counts = [group_counts(group, rows, members=members) for group in groups]
     return {
         "failures": len(failures),
         "rollouts": sum(not lost(row) for row in rows),
         "unknown": [column for column in FEATURES if failures and column not in used],
         "groups": counts,
-        "modes": [describe(number, ours, groups=counts) for number, ours in members.items()],
+        "modes": [
+            describe(number, ours, groups=counts) for number, ours in members.items()
+        ],
     }
 
 
-def group_counts(group: dict, rows: Sequence[Row], members: Mapping[int, Sequence[Row]]) -> dict:
-    """A group (dataset, split, method, ego_policy, eta) with its rollouts, failures, and modes other than the small
-    ones that have one of its failures."""
+def group_counts(
+    group: dict, rows: Sequence[Row], members: Mapping[int, Sequence[Row]]
+) -> dict:
+    """A group (dataset, split, method, ego_policy, eta) with its rollouts, failures,
+    and modes other than the small ones that have one of its failures."""
     key = tuple(group.values())
-    ours = {number: sum(group_of(row) == key for row in failures) for number, failures in members.items()}
+    ours = {
+        number: sum(group_of(row) == key for row in failures)
+        for number, failures in members.items()
+    }
     modes = sum(count > 0 for number, count in ours.items() if number != OTHER)
     rollouts = sum(group_of(row) == key and not lost(row) for row in rows)
-    return group | {"rollouts": rollouts, "failures": sum(ours.values()), "modes": modes}
+    return group | {
+        "rollouts": rollouts,
+        "failures": sum(ours.values()),
+        "modes": modes,
+    }
 
 
 def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
-    """A mode of modes.json: its number, name, failures and their fraction of each group's, verdicts, mean speeds [m/s],
-    and its most typical rollout. Fractions and means are over the members that know the value, None without any."""
+    """A mode of modes.json: its number, name, failures and their fraction of each
+    group's, verdicts, mean speeds [m/s], and its most typical rollout. Fractions and
+    means are over the members that know the value, None without any."""
     keys = [group_of(row) for row in members]
     by_group = [keys.count(tuple(group[name] for name in GROUP)) for group in groups]
-    counting = [key for key, row in zip(keys, members, strict=True) if row.get("counted") == 1]
+    counting = [
+        key for key, row in zip(keys, members, strict=True) if row.get("counted") == 1
+    ]
     counts = [counting.count(tuple(group[name] for name in GROUP)) for group in groups]
     total = sum(group["failures"] for group in groups)
     typical = members[medoid(members)]
@@ -98,28 +132,44 @@ def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
         "count": len(members),
         "fraction": len(members) / total,
         "groups": [
-            {"method": group["method"], "ego_policy": group["ego_policy"], "eta": group["eta"], "count": count}
-            | {"fraction": count / group["failures"] if group["failures"] else None, "counted": counted}
+            {
+                "method": group["method"],
+                "ego_policy": group["ego_policy"],
+                "eta": group["eta"],
+                "count": count,
+            }
+            | {
+                "fraction": count / group["failures"] if group["failures"] else None,
+                "counted": counted,
+            }
             for group, count, counted in zip(groups, by_group, counts, strict=True)
         ],
         **{name: known_mean(members, name) for name in (*VERDICTS, *MEANS)},
-        "typical": {name: typical[name] for name in TYPICAL} | {"file": rollout_name(typical)},
+        "typical": {name: typical[name] for name in TYPICAL}
+        | {"file": rollout_name(typical)},
     }
 
 
 def known_mean(rows: Iterable[Row], column: str) -> float | None:
     """Mean of a column over the rows that know it."""
-    values = [float(row[column]) for row in rows if column in row and row[column] == row[column]]
+    values = [
+        float(row[column])
+        for row in rows
+        if column in row and row[column] == row[column]
+    ]
     return fmean(values) if values else None
 
 
 def _mismatch(found: dict) -> str | None:
-    """Which mode does not say what it is of each group, or names a file elsewhere; None: none."""
+    """Which mode does not say what it is of each group, or names a file elsewhere;
+    None: none."""
     for mode in found["modes"]:
         if len(mode["groups"]) != len(found["groups"]):
             return f"mode {mode['mode']} is not of the {len(found['groups'])} groups"
         if Path(mode["typical"]["file"]).name != mode["typical"]["file"]:
-            return f"mode {mode['mode']} names the file {mode['typical']['file'][:60]!r}"
+            return (
+                f"mode {mode['mode']} names the file {mode['typical']['file'][:60]!r}"
+            )
     return None
 
 
@@ -132,31 +182,54 @@ def read_modes(path: Path) -> dict:
 
 
 def find_atlas(rows: Sequence[dict]) -> dict:
-    """The content of atlas.json from all rows of a run: an atlas for each ego, method and intensity."""
+    """The content of atlas.json from all rows of a run: an atlas for each ego, method
+    and intensity."""
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
         if not lost(row):
             groups.setdefault(group_of(row), []).append(row)
-    return {"groups": [dict(zip(GROUP, key, strict=True)) | group_atlas(ours) for key, ours in groups.items()]}
+    return {
+        "groups": [
+            dict(zip(GROUP, key, strict=True)) | group_atlas(ours)
+            for key, ours in groups.items()
+        ]
+    }
 
 
 def group_atlas(rows: Sequence[dict]) -> dict:
-    """A group's rollouts, scenes, preventable failures, scenes with one, number of cells, and its cells, that of the
-    likeliest failure first."""
+    """A group's rollouts, scenes, preventable failures, scenes with one, number of
+    cells, and its cells, that of the likeliest failure first."""
     failures = [row for row in rows if cell_of(row)]
     cells = [describe_cell(cell, ours) for cell, ours in atlas_of(failures).items()]
-    scenes, failed = (len({row["scene_id"] for row in some}) for some in (rows, failures))
-    counts = {"rollouts": len(rows), "scenes": scenes, "preventable": len(failures), "failed_scenes": failed}
+    scenes, failed = (
+        len({row["scene_id"] for row in some}) for some in (rows, failures)
+    )
+    counts = {
+        "rollouts": len(rows),
+        "scenes": scenes,
+        "preventable": len(failures),
+        "failed_scenes": failed,
+    }
     return counts | {"cells": len(cells), "atlas": cells}
 
 
 def describe_cell(cell: Cell, failures: Sequence[Row]) -> dict:
-    """A cell's words, its numbers of failures and of scenes, and its likeliest failure: nats, realism, rollout."""
+    """A cell's words, its numbers of failures and of scenes, and its likeliest failure:
+    nats, realism, rollout."""
     row = failures[0]
-    counts = {"failures": len(failures), "scenes": len({row["scene_id"] for row in failures})}
+    counts = {
+        "failures": len(failures),
+        "scenes": len({row["scene_id"] for row in failures}),
+    }
     values = {name: row.get(name) for name in ("transport", "real_adv")}
-    likeliest = {"scene_id": row["scene_id"], "seed": row["seed"], "file": rollout_name(row)}
-    return dict(zip(CELL, cell, strict=True)) | counts | values | {"likeliest": likeliest}
+    likeliest = {
+        "scene_id": row["scene_id"],
+        "seed": row["seed"],
+        "file": rollout_name(row),
+    }
+    return (
+        dict(zip(CELL, cell, strict=True)) | counts | values | {"likeliest": likeliest}
+    )
 
 
 def read_atlas(path: Path) -> dict:

@@ -1,4 +1,5 @@
-"""The closed-loop protocol: methods x scenes x seeds with one ego, the files of a run (docs/method.md, section 11)."""
+"""The closed-loop protocol: methods x scenes x seeds with one ego, the files of a run
+(docs/method.md, section 11)."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -34,12 +35,14 @@ from e2rl.traffic.traffic import Traffic
 
 SEEDS_APART = 1_000_003
 WHOLE = (0, 1)  # the only shard of a run
-# Rows and realism samples, one of each per rollout; and the entries of errored.json, whose rows know nothing else.
+# Rows and realism samples, one of each per rollout; and the entries of errored.json,
+# whose rows know nothing else.
 Scored = tuple[list[dict], list[dict[str, Tensor]], list[dict]]
 
 
 class Task(NamedTuple):
-    """A rollout to make: the position of its scene, its seed (of a search: its number), and its try (None: none)."""
+    """A rollout to make: the position of its scene, its seed (of a search: its number),
+    and its try (None: none)."""
 
     scene: int
     seed: int
@@ -71,18 +74,31 @@ class Setup:
     evasions: bool = True  # collisions are searched for evasions
 
     def __post_init__(self) -> None:
-        """InputError where two scenes share an id, and so the files of their rollouts, or a name is not printable."""
+        """InputError where two scenes share an id, and so the files of their rollouts,
+        or a name is not printable."""
         scenes = self.scenes
-        if twice := [name for name, count in Counter(scenes.scene_id).items() if count > 1]:
+        if twice := [
+            name for name, count in Counter(scenes.scene_id).items() if count > 1
+        ]:
             mend = "give each an id of its own in the data, or list the scenes to take with scenes=FILE"
-            raise InputError(f"scene id {twice[0]!r}: stands for several scenes; {mend}")
-        check_names(scenes.dataset, scenes.split, self.ego_name, *scenes.scene_id, *scenes.location)
+            raise InputError(
+                f"scene id {twice[0]!r}: stands for several scenes; {mend}"
+            )
+        check_names(
+            scenes.dataset,
+            scenes.split,
+            self.ego_name,
+            *scenes.scene_id,
+            *scenes.location,
+        )
 
     def roll_out(self, method: Method, tasks: Sequence[Task]) -> Rollouts:
         """The rollouts of (scene, seed) pairs under one method."""
         index = torch.tensor([task.scene for task in tasks])
         tries = [task.one for task in tasks if task.one]
-        noise = torch.tensor([scene_seed(self.scenes.number[task.scene], task.seed) for task in tasks])
+        noise = torch.tensor(
+            [scene_seed(self.scenes.number[task.scene], task.seed) for task in tasks]
+        )
         noise = torch.tensor([one.seed for one in tries]) if tries else noise
         decisions = torch.tensor([one.decisions for one in tries]) if tries else None
         eta = torch.full((len(tasks),), float(method.eta), dtype=torch.float64)
@@ -97,14 +113,21 @@ class Setup:
         """Values of the columns SOURCE of a method's rollouts."""
         return self.scenes.dataset, self.scenes.split, method.name, self.ego_name
 
-    def score(self, method: Method, tasks: Sequence[Task], folder: Path | None = None, begins: bool = False) -> Scored:
+    def score(
+        self,
+        method: Method,
+        tasks: Sequence[Task],
+        folder: Path | None = None,
+        begins: bool = False,
+    ) -> Scored:
         """What (scene, seed) pairs score under one method.
 
         Args:
             method: of the traffic.
             tasks: the pairs.
             folder: for the rollouts' files.
-            begins: the ego begins the run with them; then InputError where its first plan is none.
+            begins: the ego begins the run with them; then InputError where its first
+                plan is none.
         """
         parts, errored = attempt(partial(self.roll_out, method), tasks, begins=begins)
         rows = []
@@ -112,23 +135,38 @@ class Setup:
         for done, rollouts in parts:
             found, features = score_rollouts(rollouts)
             if self.evasions:
-                add_avoidable(found, rollouts, scene=self.scenes.batch([task.scene for task in done]), sim=self.sim)
+                add_avoidable(
+                    found,
+                    rollouts,
+                    scene=self.scenes.batch([task.scene for task in done]),
+                    sim=self.sim,
+                )
             if folder is not None:
                 rollouts.to_npz(folder)
             rows += found
             samples += features
-        about = dict(zip(SOURCE, self.source(method), strict=True)) | {"eta": float(method.eta)}
+        about = dict(zip(SOURCE, self.source(method), strict=True)) | {
+            "eta": float(method.eta)
+        }
         names = self.scenes.scene_id
         places = self.scenes.location
-        scene = [{"scene_id": names[task.scene], "location": places[task.scene]} for task, _ in errored]
-        lost = [about | each | {"seed": task.seed} | why for each, (task, why) in zip(scene, errored, strict=True)]
+        scene = [
+            {"scene_id": names[task.scene], "location": places[task.scene]}
+            for task, _ in errored
+        ]
+        lost = [
+            about | each | {"seed": task.seed} | why
+            for each, (task, why) in zip(scene, errored, strict=True)
+        ]
         return rows, samples, lost
 
 
 def check_names(*names: str) -> None:
     """InputError for a name that a terminal or a table could not show as it is."""
     if odd := next(filter(UNPRINTABLE.search, names), None):
-        raise InputError(f"the name {odd!r}: holds control characters; rename it in the data or the configuration")
+        raise InputError(
+            f"the name {odd!r}: holds control characters; rename it in the data or the configuration"
+        )
 
 
 Part = tuple[Setup, Method, list[Task]]
@@ -136,7 +174,8 @@ Job = tuple[str, Part]  # with its name
 
 
 def scene_seed(number: int, seed: int) -> int:
-    """The noise seed of a rollout in a scene of this number, the same for every method (paired)."""
+    """The noise seed of a rollout in a scene of this number, the same for every method
+    (paired)."""
     return seed * SEEDS_APART + number
 
 
@@ -176,31 +215,61 @@ def run_protocol(
     parts: Parts = NO_PARTS,
     **fields: Any,
 ) -> list[dict]:
-    """The rows of metrics.json of every method on every (scene, seed): `drive_all`, then `record` into a folder (None:
-    nothing is written). fields: added to each row, or further arguments of `metric_rows`."""
-    scored = drive_all([setup], methods, seeds=seeds, work=Work(folder and folder / ROLLOUTS, processes, only=only, parts=parts))
+    """The rows of metrics.json of every method on every (scene, seed): `drive_all`,
+    then `record` into a folder (None: nothing is written). fields: added to each row,
+    or further arguments of `metric_rows`."""
+    scored = drive_all(
+        [setup],
+        methods,
+        seeds=seeds,
+        work=Work(folder and folder / ROLLOUTS, processes, only=only, parts=parts),
+    )
     return record(*scored, folder, partial(metric_rows, **fields))
 
 
-def drive_all(setups: Sequence[Setup], methods: Sequence[Method], seeds: Sequence[int], work: Work = HERE) -> Scored:
-    """What every setup scores under every method on every (scene, seed); the noise is the same for all.
+def drive_all(
+    setups: Sequence[Setup],
+    methods: Sequence[Method],
+    seeds: Sequence[int],
+    work: Work = HERE,
+) -> Scored:
+    """What every setup scores under every method on every (scene, seed); the noise is
+    the same for all.
 
     setups: they differ in their ego.
     """
     first = setups[0]
-    batches = in_batches([Task(scene, seed) for seed in seeds for scene in work.scenes(first)], first.batch)
-    parts = enumerate((setup, method, batch) for setup in setups for method in methods for batch in batches)
-    jobs = [(f"rollouts-{number:06}", part) for number, part in parts][work.shard[0] :: work.shard[1]]
+    batches = in_batches(
+        [Task(scene, seed) for seed in seeds for scene in work.scenes(first)],
+        first.batch,
+    )
+    parts = enumerate(
+        (setup, method, batch)
+        for setup in setups
+        for method in methods
+        for batch in batches
+    )
+    jobs = [(f"rollouts-{number:06}", part) for number, part in parts][
+        work.shard[0] :: work.shard[1]
+    ]
     found: Scored = ([], [], [])
     total = sum(len(batch) for _, (_, _, batch) in jobs)
     with Bar(total=total, desc="rollouts", unit="rollout") as bar:
 
         def done(job: Job) -> None:
             _, (setup, method, batch) = job
-            bar.set_postfix(ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False)
+            bar.set_postfix(
+                ego=setup.ego_name, method=method.name, eta=method.eta, refresh=False
+            )
             bar.update(len(batch))
 
-        for scored in score_all(jobs, work, cost=lambda job: job[1][1].eta, done=done, first=first_names(jobs)):
+        for scored in score_all(
+            jobs,
+            work,
+            cost=lambda job: job[1][1].eta,
+            done=done,
+            first=first_names(jobs),
+        ):
             extend(found, scored)
     return found
 
@@ -211,9 +280,13 @@ def first_names(jobs: Sequence[Job]) -> set[str]:
 
 
 def in_batches(tasks: Sequence[Task], size: int) -> list[list[Task]]:
-    """The tasks in as few batches of at most `size` as can be, of about the same length."""
+    """The tasks in as few batches of at most `size` as can be, of about the same
+    length."""
     count = -(-len(tasks) // size)
-    return [list(tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count]) for k in range(count)]
+    return [
+        list(tasks[k * len(tasks) // count : (k + 1) * len(tasks) // count])
+        for k in range(count)
+    ]
 
 
 def score_all(
@@ -225,8 +298,9 @@ def score_all(
 ) -> Iterator[Scored]:
     """What each of some batches of rollouts scores, in their order.
 
-    A batch is the unit that is checkpointed: rounding makes a rollout's last digits depend on the others of its batch.
-    Raises InputError where files of a worker do not arrive, and where an ego's very first plan is none.
+    A batch is the unit that is checkpointed: rounding makes a rollout's last digits
+    depend on the others of its batch. Raises InputError where files of a worker do not
+    arrive, and where an ego's very first plan is none.
 
     Args:
         jobs: with names for their parts.
@@ -240,17 +314,28 @@ def score_all(
 
     def work(job: Job) -> Scored:
         name, (setup, method, batch) = job
-        told = [(task.scene, task.seed) if task.one is None else list(task.one) for task in batch]
+        told = [
+            (task.scene, task.seed) if task.one is None else list(task.one)
+            for task in batch
+        ]
         identity = [setup.ego_name, method.name, float(method.eta), told]
         score = partial(setup.score, method, batch, into, begins=name in first)
         return parts.result(name, identity, score, partial(has_files, into))
 
-    for scored in in_processes(work, jobs, processes=how.processes, cost=cost, ended=done):
+    for scored in in_processes(
+        work, jobs, processes=how.processes, cost=cost, ended=done
+    ):
         if not has_files(into, scored):
             reason = "rollouts that a worker wrote are not here"
-            raise InputError(f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)")
+            raise InputError(
+                f"{into}: {reason}; put the run's folder where all machines have it (hydra.run.dir)"
+            )
         rows, samples, errored = scored
-        yield rows + list(map(errored_row, errored)), samples + [NO_SAMPLES] * len(errored), errored
+        yield (
+            rows + list(map(errored_row, errored)),
+            samples + [NO_SAMPLES] * len(errored),
+            errored,
+        )
 
 
 def extend(found: Scored, more: Scored) -> None:
@@ -261,7 +346,9 @@ def extend(found: Scored, more: Scored) -> None:
 
 def has_files(into: Path | None, scored: Scored) -> bool:
     """Whether the files of scored rollouts are in the folder `into`."""
-    return into is None or all((into / rollout_name(row)).is_file() for row in scored[0])
+    return into is None or all(
+        (into / rollout_name(row)).is_file() for row in scored[0]
+    )
 
 
 def record(
@@ -271,11 +358,12 @@ def record(
     folder: Path | None,
     summarise: Callable[..., list[dict]],
 ) -> list[dict]:
-    """The rows of metrics.json: summarise(rows, samples), with the counts of what errored where they have none.
+    """The rows of metrics.json: summarise(rows, samples), with the counts of what
+    errored where they have none.
 
-    Writes rollouts.csv, modes.json, atlas.json, metrics.json and, where rollouts errored, errored.json into a folder. A
-    method of which the traffic lost all rollouts has a row too, without metrics. Raises InputError where it lost those
-    of all.
+    Writes rollouts.csv, modes.json, atlas.json, metrics.json and, where rollouts
+    errored, errored.json into a folder. A method of which the traffic lost all rollouts
+    has a row too, without metrics. Raises InputError where it lost those of all.
     """
     modes = find_modes(rows)
     if folder is not None:
@@ -285,7 +373,13 @@ def record(
     known = summarise(rows, samples)
     known += empty_rows(known, errored)
     result = [
-        {"errored": count_reasons(why for why in errored if group_of(why) == group_of(row))} | row for row in known
+        {
+            "errored": count_reasons(
+                why for why in errored if group_of(why) == group_of(row)
+            )
+        }
+        | row
+        for row in known
     ]
     if folder is not None:
         files.write_json(folder / MODES_FILE, modes)

@@ -1,4 +1,5 @@
-"""Tables of a run, written and read whole: rollouts.csv, metrics.json, errored.json (docs/method.md, section 11)."""
+"""Tables of a run, written and read whole: rollouts.csv, metrics.json, errored.json
+(docs/method.md, section 11)."""
 
 import csv
 import io
@@ -13,7 +14,15 @@ from typing import IO, Any
 from e2rl.metrics.catalogue import LATER, SOURCE, WORDS, row_columns
 from e2rl.metrics.errored import errored_row
 from e2rl.run.errors import InputError
-from e2rl.run.files import CsvReader, csv_text, leads_into, misfit, open_regular, read_regular, write_atomically
+from e2rl.run.files import (
+    CsvReader,
+    csv_text,
+    leads_into,
+    misfit,
+    open_regular,
+    read_regular,
+    write_atomically,
+)
 from e2rl.run.parts import PARTS
 from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.traffic.attempt import summary_of
@@ -21,7 +30,10 @@ from e2rl.traffic.attempt import summary_of
 TABLE = "rollouts.csv"
 METRICS_FILE = "metrics.json"
 ERRORED_FILE = "errored.json"
-MAX_JSON, MOST_ROWS = 48 << 20, 300_000  # bytes and lines that take less than 2 GB of memory
+MAX_JSON, MOST_ROWS = (
+    48 << 20,
+    300_000,
+)  # bytes and lines that take less than 2 GB of memory
 DIGITS = 15  # of a whole number: more would not fit a float
 NUMBER = (int, float, NoneType)
 INTERVAL = {"low": NUMBER, "high": NUMBER, "n": NUMBER, ...: NUMBER}
@@ -31,8 +43,19 @@ METRICS_ROW = {  # what readers of metrics.json need
     "metrics": {...: {"mean": NUMBER, **INTERVAL}},
     "paired": {...: {...: {"difference": NUMBER, **INTERVAL}}},
 }
-SOMETIMES = {"errored": {...: int}, "stage": (str, NoneType), "n_trainings": int, "headline": {...: (int, float)}}
-TEXTS = (*SOURCE, "scene_id", "location", *WORDS, *(name for name, value in LATER.items() if value == ""))
+SOMETIMES = {
+    "errored": {...: int},
+    "stage": (str, NoneType),
+    "n_trainings": int,
+    "headline": {...: (int, float)},
+}
+TEXTS = (
+    *SOURCE,
+    "scene_id",
+    "location",
+    *WORDS,
+    *(name for name, value in LATER.items() if value == ""),
+)
 ENTRY = {  # what readers of errored.json need
     **dict.fromkeys((*SOURCE, "scene_id", "reason", "detail"), str),
     **{"eta": (int, float), "seed": int},
@@ -59,20 +82,25 @@ def cell(value: object) -> object:
 
 
 def read_rows(path: Path) -> list[dict]:
-    """The rows of a rollouts.csv: text columns as text, seed and partner as int, all others as float (empty: NaN).
+    """The rows of a rollouts.csv: text columns as text, seed and partner as int, all
+    others as float (empty: NaN).
 
-    LATER columns, which tables of earlier versions lack, are filled. Raises InputError for a file that is no such
-    table.
+    LATER columns, which tables of earlier versions lack, are filled. Raises InputError
+    for a file that is no such table.
     """
     path = Path(path)
     try:
         with opened(path) as file:
             rows = CsvReader(file)
-            missing = [name for name in table_columns() if name not in (rows.fieldnames or ())]
+            missing = [
+                name for name in table_columns() if name not in (rows.fieldnames or ())
+            ]
             if wrong := [name for name in missing if name not in LATER]:
                 raise ValueError(f"no column {wrong[0]}")
             later = {name: LATER[name] for name in missing}
-            found = [_row(rows.line_num, row) | later for row in islice(rows, MOST_ROWS + 1)]
+            found = [
+                _row(rows.line_num, row) | later for row in islice(rows, MOST_ROWS + 1)
+            ]
         if len(found) > MOST_ROWS:
             raise ValueError(f"more than {MOST_ROWS:,} rows")
         return found
@@ -80,22 +108,33 @@ def read_rows(path: Path) -> list[dict]:
         mend = "give the folder of a run of evaluate.py; shards are merged first"
         if (path.parent / PARTS).is_dir():
             mend = (
-                f"the run is not finished; go on with it by e2rl evaluate resume={path.parent}; shards are merged first"
+                f"the run is not finished; go on with it by e2rl evaluate "
+                f"resume={path.parent}; shards are merged first"
             )
         raise InputError(f"{path}: no such table; {mend}") from error
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: damaged ({cause(error)}); run evaluate.py again to rewrite it") from error
+        raise InputError(
+            f"{path}: damaged ({cause(error)}); run evaluate.py again to rewrite it"
+        ) from error
 
 
 def read_run(run: Path) -> list[dict]:
-    """The rows of a run's rollouts.csv, and one for each rollout of its errored.json that the table lacks, as tables of
-    earlier versions do. Raises InputError where either is damaged."""
+    """The rows of a run's rollouts.csv, and one for each rollout of its errored.json
+    that the table lacks, as tables of earlier versions do. Raises InputError where
+    either is damaged."""
     rows = read_rows(run / TABLE)
     file = run / ERRORED_FILE
-    entries = read_json(file, lambda found: misfit(found, [ENTRY]), printable=False) if file.is_file() else []
+    entries = (
+        read_json(file, lambda found: misfit(found, [ENTRY]), printable=False)
+        if file.is_file()
+        else []
+    )
     place = {row["scene_id"]: row["location"] for row in rows}
     known = set(map(_identity, rows))
-    found = [errored_row({"location": place.get(entry["scene_id"], "")} | entry) for entry in entries]
+    found = [
+        errored_row({"location": place.get(entry["scene_id"], "")} | entry)
+        for entry in entries
+    ]
     return rows + [row for row in found if _identity(row) not in known]
 
 
@@ -114,14 +153,19 @@ def cause(error: Exception) -> str:
 
 
 def _row(line: int, row: dict[str, Any]) -> dict:
-    """A line of the table with its values; ValueError where it has other cells than the head."""
+    """A line of the table with its values; ValueError where it has other cells than the
+    head."""
     if None in row or None in row.values():
         raise ValueError(f"line {line} has other cells than the head")
     if odd := [name for name in TEXTS if UNPRINTABLE.search(row.get(name, ""))]:
         raise ValueError(f"line {line}: {odd[0]} holds control characters")
     try:
         return {
-            key: value if key in TEXTS else int(value) if key in ("seed", "partner") else float(value or "nan")
+            key: value
+            if key in TEXTS
+            else int(value)
+            if key in ("seed", "partner")
+            else float(value or "nan")
             for key, value in row.items()
         }
     except ValueError as error:
@@ -144,15 +188,27 @@ def read_metrics(path: Path) -> list[dict]:
     def wrong(rows: Any) -> str | None:
         if found := misfit(rows, [METRICS_ROW]):
             return found
-        others = ({name: shape for name, shape in SOMETIMES.items() if name in row} for row in rows)
+        others = (
+            {name: shape for name, shape in SOMETIMES.items() if name in row}
+            for row in rows
+        )
         return next(filter(None, map(misfit, rows, others)), None)
 
     rows = read_json(path, wrong)
-    return [{key: nans(value) if key in ("metrics", "paired") else value for key, value in row.items()} for row in rows]
+    return [
+        {
+            key: nans(value) if key in ("metrics", "paired") else value
+            for key, value in row.items()
+        }
+        for row in rows
+    ]
 
 
-def read_json(path: Path, wrong: Callable[[Any], str | None], printable: bool = True) -> Any:
-    """The content of a JSON file of a run; raises InputError where it is none, or has something wrong.
+def read_json(
+    path: Path, wrong: Callable[[Any], str | None], printable: bool = True
+) -> Any:
+    """The content of a JSON file of a run; raises InputError where it is none, or has
+    something wrong.
 
     Args:
         path: of the file.
@@ -160,13 +216,17 @@ def read_json(path: Path, wrong: Callable[[Any], str | None], printable: bool = 
         printable: its texts hold no control characters, as those of a traceback do.
     """
     try:
-        found = json.loads(read_regular(path, MAX_JSON, within=path.parent), parse_int=_whole)
+        found = json.loads(
+            read_regular(path, MAX_JSON, within=path.parent), parse_int=_whole
+        )
         if reason := wrong(found):
             raise ValueError(reason)
         if printable and (odd := next(filter(UNPRINTABLE.search, _texts(found)), None)):
             raise ValueError(f"{odd[:40]!r} holds control characters")
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read ({cause(error)}); give the folder of a finished run") from error
+        raise InputError(
+            f"{path}: cannot be read ({cause(error)}); give the folder of a finished run"
+        ) from error
     return found
 
 
@@ -177,7 +237,8 @@ def _whole(digits: str) -> int:
 
 
 def _texts(value: object) -> Iterator[str]:
-    """All text in nested containers, but for the command line, which is never shown as it is."""
+    """All text in nested containers, but for the command line, which is never shown as
+    it is."""
     if isinstance(value, dict):
         for key, part in value.items():
             yield key
@@ -193,7 +254,9 @@ def own_folder(run: Path, *names: str) -> Path:
     """A folder of a run to write to; InputError where a link leads out of the run."""
     folder = run.joinpath(*names)
     if not leads_into(folder, run):
-        raise InputError(f"{folder}: a link out of {run}; remove it, or name another folder with --out")
+        raise InputError(
+            f"{folder}: a link out of {run}; remove it, or name another folder with --out"
+        )
     return folder
 
 
@@ -222,8 +285,9 @@ def write_errored(path: Path, errored: Sequence[dict]) -> None:
 
 
 def add_errored(path: Path, number: int, errored: Sequence[dict]) -> None:
-    """Write the entries of round `number` of a training into its errored.json, after those of earlier rounds; a resumed
-    run repeats some. A damaged file is begun anew."""
+    """Write the entries of round `number` of a training into its errored.json, after
+    those of earlier rounds; a resumed run repeats some. A damaged file is begun anew.
+    """
     try:
         known = json.loads(read_regular(path, MAX_JSON, within=path.parent))
         earlier = [entry for entry in known if entry["round"] < number]
@@ -236,7 +300,17 @@ def require_rows(rows: Sequence, errored: Sequence[dict], folder: Path | None) -
     """InputError where all rollouts errored."""
     if rows or not errored:
         return
-    first = f", as in {errored[0]['scene_id']}, seed {errored[0]['seed']}" if "scene_id" in errored[0] else ""
-    where = f"; {folder / ERRORED_FILE} has the tracebacks, {TABLE} a row of each" if folder is not None else ""
+    first = (
+        f", as in {errored[0]['scene_id']}, seed {errored[0]['seed']}"
+        if "scene_id" in errored[0]
+        else ""
+    )
+    where = (
+        f"; {folder / ERRORED_FILE} has the tracebacks, {TABLE} a row of each"
+        if folder is not None
+        else ""
+    )
     said = f"{summary_of(errored)}{first}{where}"
-    raise InputError(f"no rollout could be scored: {said}; mend the planner or the traffic")
+    raise InputError(
+        f"no rollout could be scored: {said}; mend the planner or the traffic"
+    )

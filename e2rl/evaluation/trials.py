@@ -1,4 +1,5 @@
-"""What a trial of a tuning is: new rollouts with its parameters, and the objective of their metrics.
+"""What a trial of a tuning is: new rollouts with its parameters, and the objective of
+their metrics.
 
 A replay of stored attacks would not do: it does not react to the planner under trial.
 """
@@ -11,7 +12,15 @@ from typing import ClassVar
 
 import torch
 
-from e2rl.evaluation.protocol import Method, Part, Setup, Work, drive_all, extend, score_all
+from e2rl.evaluation.protocol import (
+    Method,
+    Part,
+    Setup,
+    Work,
+    drive_all,
+    extend,
+    score_all,
+)
 from e2rl.evaluation.rollout_files import require_rows
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.errored import lost, raised
@@ -27,16 +36,23 @@ MEASURED = (*SOUGHT, "aor_step", "cfr_bg", "real", "real_adv", "nfe")
 ERRORED = 0.01  # fraction of rollouts that an attack may lose
 NOMINAL = "nominal"  # after a metric's name: its value in the traffic that the budget is held against
 DRIVING = ("collision", "comfort", "progress")
-COLLISIONS = ("cfr", "cfr_vru", "cfr_object", "ego_off_road")  # columns of which one is a collision
+COLLISIONS = (
+    "cfr",
+    "cfr_vru",
+    "cfr_object",
+    "ego_off_road",
+)  # columns of which one is a collision
 
 
 @configured("tune", "tuning.planner")
 @dataclass(frozen=True)
 class PlannerObjective:
-    """Minimised are collisions, and by their weights mean |acceleration| in m/s^2 and the lost fraction of progress.
+    """Minimised are collisions, and by their weights mean |acceleration| in m/s^2 and
+    the lost fraction of progress.
 
-    progress_floor: fraction of the present progress below which a trial is refused, as standing still is the trivial
-    optimum of safety; comfort_ceiling: multiple of the present |acceleration| above which it is.
+    progress_floor: fraction of the present progress below which a trial is refused, as
+    standing still is the trivial optimum of safety; comfort_ceiling: multiple of the
+    present |acceleration| above which it is.
     """
 
     shown: ClassVar[tuple[str, ...]] = (*DRIVING, "errored")
@@ -46,14 +62,21 @@ class PlannerObjective:
     progress_floor: float = setting(low=0)
     comfort_ceiling: float = setting(low=0)
 
-    def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
-        """See `Objective`. A trial in which the planner raised more often than in the reference is refused."""
+    def judge(
+        self, metrics: Mapping[str, float], reference: Mapping[str, float]
+    ) -> tuple[float, float]:
+        """See `Objective`. A trial in which the planner raised more often than in the
+        reference is refused."""
         errored = metrics.get("errored", 0.0) - reference.get("errored", 0.0)
         progress = metrics["progress"] / max(reference["progress"], 1e-6)
         rougher = metrics["comfort"] / max(reference["comfort"], 1e-6)
         lost = self.progress * max(0.0, 1 - progress)
         value = metrics["collision"] + self.comfort * metrics["comfort"] + lost
-        excess = max(0.0, self.progress_floor - progress) + max(0.0, rougher - self.comfort_ceiling) + max(0.0, errored)
+        excess = (
+            max(0.0, self.progress_floor - progress)
+            + max(0.0, rougher - self.comfort_ceiling)
+            + max(0.0, errored)
+        )
         return value, math.inf if math.isnan(value) else excess
 
 
@@ -62,21 +85,35 @@ class PlannerObjective:
 class AttackObjective:
     """Maximised is the fraction of failures `seek`, within limits.
 
-    off_road: the most `aor_step` above nominal traffic; realism: the least `real_adv`. A method that has no adversary
-    in any rollout has no `real_adv`, and keeps every such limit.
+    off_road: the most `aor_step` above nominal traffic; realism: the least `real_adv`.
+    A method that has no adversary in any rollout has no `real_adv`, and keeps every
+    such limit.
     """
 
-    shown: ClassVar[tuple[str, ...]] = (*SOUGHT, "aor_step", f"aor_step {NOMINAL}", "real_adv", "errored")
+    shown: ClassVar[tuple[str, ...]] = (
+        *SOUGHT,
+        "aor_step",
+        f"aor_step {NOMINAL}",
+        "real_adv",
+        "errored",
+    )
 
     seek: str = setting(choices=SOUGHT)
     off_road: float = setting(low=0, high=1)
     realism: float | None = setting(low=0, high=1, optional=True)
 
-    def judge(self, metrics: Mapping[str, float], reference: Mapping[str, float]) -> tuple[float, float]:
-        """See `Objective`; each trial has its nominal metrics. One whose traffic loses more than ERRORED of its
-        rollouts beyond nominal traffic's is refused: it would be compared on other scenes."""
+    def judge(
+        self, metrics: Mapping[str, float], reference: Mapping[str, float]
+    ) -> tuple[float, float]:
+        """See `Objective`; each trial has its nominal metrics. One whose traffic loses
+        more than ERRORED of its rollouts beyond nominal traffic's is refused: it would
+        be compared on other scenes."""
         over = metrics["aor_step"] - metrics[f"aor_step {NOMINAL}"] - self.off_road
-        more = metrics.get("errored", 0.0) - metrics.get(f"errored {NOMINAL}", 0.0) - ERRORED
+        more = (
+            metrics.get("errored", 0.0)
+            - metrics.get(f"errored {NOMINAL}", 0.0)
+            - ERRORED
+        )
         excess = max(0.0, over) + max(0.0, more)
         if self.realism is not None and not math.isnan(metrics["real_adv"]):
             excess += max(0.0, self.realism - metrics["real_adv"])
@@ -86,8 +123,9 @@ class AttackObjective:
 
 @dataclass
 class PlannerTrials:
-    """The metrics of a planner in all scenes, seeds and methods, and in the tries of a search that hit it once; make:
-    the planner of some parameters; failures: these tries, which are driven again."""
+    """The metrics of a planner in all scenes, seeds and methods, and in the tries of a
+    search that hit it once; make: the planner of some parameters; failures: these
+    tries, which are driven again."""
 
     setup: Setup
     methods: Sequence[Method]
@@ -97,16 +135,21 @@ class PlannerTrials:
     failures: Sequence[Part] = ()
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
-        """Returns the means of DRIVING, also of every method alone as `NAME METHOD@ETA`, and `errored`.
+        """Returns the means of DRIVING, also of every method alone as `NAME
+        METHOD@ETA`, and `errored`.
 
-        collision: fraction of rollouts in which the ego touches something or leaves the road; comfort: mean
+        collision: fraction of rollouts in which the ego touches something or leaves the
+        road; comfort: mean
         |acceleration| [m/s^2]; progress [m]; errored: fraction in which the planner raised, of those that the traffic
         did not lose; `errored: REASON`: fraction of all that errored for each reason.
         """
         setup = replace(self.setup, ego=self.make(parameters), evasions=False)
         work = Work(processes=self.processes)
         found = drive_all([setup], self.methods, seeds=self.seeds, work=work)
-        jobs = [(f"{number}", (setup, method, tasks)) for number, (_, method, tasks) in enumerate(self.failures)]
+        jobs = [
+            (f"{number}", (setup, method, tasks))
+            for number, (_, method, tasks) in enumerate(self.failures)
+        ]
         for scored in score_all(jobs, work, cost=lambda job: len(job[1][2])):
             extend(found, scored)
         every, _, errored = found
@@ -115,23 +158,36 @@ class PlannerTrials:
         driven = [*self.methods, *(method for _, method, _ in self.failures)]
         for method, eta in dict.fromkeys((each.name, each.eta) for each in driven):
             own = [row for row in rows if (row["method"], row["eta"]) == (method, eta)]
-            metrics |= {f"{name} {method}@{eta:g}": value for name, value in driving(own).items()}
-        metrics |= {f"errored: {reason}": number / len(every) for reason, number in count_reasons(errored).items()}
+            metrics |= {
+                f"{name} {method}@{eta:g}": value
+                for name, value in driving(own).items()
+            }
+        metrics |= {
+            f"errored: {reason}": number / len(every)
+            for reason, number in count_reasons(errored).items()
+        }
         crashed = sum(map(raised, every))
         return metrics | {"errored": crashed / max(1, len(rows) + crashed)}
 
 
 def driving(rows: Sequence[Mapping]) -> dict[str, float]:
     """Returns the means of DRIVING over the rollouts that know them."""
-    values = [(float(any(row.get(name) == 1 for name in COLLISIONS)), row["macc"], row["progress"]) for row in rows]
+    values = [
+        (
+            float(any(row.get(name) == 1 for name in COLLISIONS)),
+            row["macc"],
+            row["progress"],
+        )
+        for row in rows
+    ]
     means = torch.tensor(values, dtype=torch.float64).view(-1, len(DRIVING)).nanmean(0)
     return dict(zip(DRIVING, means.tolist(), strict=True))
 
 
 @dataclass
 class AttackTrials:
-    """The metrics of an adversary in all scenes and seeds, and nominal traffic's; make: the adversary of some
-    parameters."""
+    """The metrics of an adversary in all scenes and seeds, and nominal traffic's; make:
+    the adversary of some parameters."""
 
     setup: Setup
     nominal: Method
@@ -141,10 +197,14 @@ class AttackTrials:
     processes: Processes = 1
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
-        """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of SOUGHT, and `errored`, the
-        fraction that the traffic lost; and all of them as `NAME nominal` in nominal traffic. A rollout in which the
-        planner raised is a failure of the planner."""
-        return self.measure(Method("trial", self.make(parameters), eta=self.eta)) | self.reference
+        """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of
+        SOUGHT, and `errored`, the fraction that the traffic lost; and all of them as
+        `NAME nominal` in nominal traffic. A rollout in which the planner raised is a
+        failure of the planner."""
+        return (
+            self.measure(Method("trial", self.make(parameters), eta=self.eta))
+            | self.reference
+        )
 
     @cached_property
     def reference(self) -> dict[str, float]:
@@ -154,10 +214,18 @@ class AttackTrials:
     def measure(self, method: Method) -> dict[str, float]:
         """Returns the metrics of a method; InputError where all rollouts errored."""
         setup = replace(self.setup, evasions=False)  # no trial is judged by them
-        rows, samples, errored = drive_all([setup], [method], seeds=self.seeds, work=Work(processes=self.processes))
+        rows, samples, errored = drive_all(
+            [setup], [method], seeds=self.seeds, work=Work(processes=self.processes)
+        )
         require_rows([row for row in rows if row["errored"] != 1], errored, folder=None)
         kept = [k for k, row in enumerate(rows) if not lost(row)]
-        found = summarise([rows[k] for k in kept], [samples[k] for k in kept], realism_draws=0)
+        found = summarise(
+            [rows[k] for k in kept], [samples[k] for k in kept], realism_draws=0
+        )
         metrics = {name: found[name]["mean"] for name in MEASURED}
         metrics["errored"] = 1 - len(kept) / len(rows)
-        return metrics | {f"{name}_{end}": found[name][end] for name in SOUGHT for end in ("low", "high")}
+        return metrics | {
+            f"{name}_{end}": found[name][end]
+            for name in SOUGHT
+            for end in ("low", "high")
+        }

@@ -1,5 +1,6 @@
-"""What an evolution run changes: the same scenes and seeds, nominal and adversarial, for the policies before and after
-it; and the atlas of what a search finds against each."""
+"""What an evolution run changes: the same scenes and seeds, nominal and adversarial,
+for the policies before and after it; and the atlas of what a search finds against each.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +26,8 @@ from e2rl.sim.rollout_file import ROLLOUTS
 class BeforeAfter:
     """Evaluates an ego and keeps the rows of both stages in folder/metrics.json.
 
-    search: what is tried with `budget` NFE a scene, from the first of the seeds; None: there is no search.
+    search: what is tried with `budget` NFE a scene, from the first of the seeds; None:
+    there is no search.
     """
 
     setup: Setup
@@ -37,10 +39,12 @@ class BeforeAfter:
     budget: float = 0.0
 
     def __call__(self, stage: str, ego: Ego, rounds: int) -> list[dict]:
-        """Evaluate an ego as `stage` (before or after) that was trained for some rounds; returns the rows of all stages
-        so far. A measurement that was cut off goes on.
+        """Evaluate an ego as `stage` (before or after) that was trained for some
+        rounds; returns the rows of all stages so far. A measurement that was cut off
+        goes on.
 
-        The rows of stage `after` are paired with the same method before, under the name `before`.
+        The rows of stage `after` are paired with the same method before, under the name
+        `before`.
         """
         setup = replace(self.setup, ego=ego)
         folder = self.folder / stage
@@ -50,34 +54,59 @@ class BeforeAfter:
         scored = drive_all([setup], self.methods, seeds=self.seeds, work=work)
         if self.search is not None:
             self._search(self.search, setup, work=work, folder=folder / SEARCH)
-        rows = record(*scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder)))
+        rows = record(
+            *scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder))
+        )
         if stage == "before":
             measured.save(stage, None, scored[:2])
         elif (before := measured.load("before", None)) is not None:
             for row in rows:
-                row["paired"]["before"] = paired_differences(*_of_row(row, scored[:2]), *_of_row(row, before))
+                row["paired"]["before"] = paired_differences(
+                    *_of_row(row, scored[:2]), *_of_row(row, before)
+                )
         file = self.folder / METRICS_FILE
-        earlier = [row for row in (read_metrics(file) if file.exists() else []) if row.get("stage") != stage]
+        earlier = [
+            row
+            for row in (read_metrics(file) if file.exists() else [])
+            if row.get("stage") != stage
+        ]
         write_json(file, earlier + rows)
         return earlier + rows
 
     def _search(self, plan: Plan, setup: Setup, work: Work, folder: Path) -> None:
         """Write the tries of a stage, their rollouts and their atlas into a folder."""
         work = replace(work, into=folder / ROLLOUTS)
-        found, tries = search_all([setup], [plan], budget=self.budget, unit="nfe", seeds=self.seeds[:1], work=work)
+        found, tries = search_all(
+            [setup],
+            [plan],
+            budget=self.budget,
+            unit="nfe",
+            seeds=self.seeds[:1],
+            work=work,
+        )
         record(*found, folder, partial(metric_rows, searched=True))
         write_tries(folder / TRIES_FILE, tries)
 
     def atlases(self) -> tuple[dict, dict] | None:
-        """The atlas of each stage (`evaluation.modes.group_atlas`); None without a search."""
+        """The atlas of each stage (`evaluation.modes.group_atlas`); None without a
+        search."""
         if self.search is None:
             return None
-        before, after = (read_atlas(self.folder / stage / SEARCH / ATLAS_FILE) for stage in ("before", "after"))
+        before, after = (
+            read_atlas(self.folder / stage / SEARCH / ATLAS_FILE)
+            for stage in ("before", "after")
+        )
         return before, after
 
 
-def _of_row(row: dict, scored: tuple[list[dict], list[Samples]]) -> tuple[list[dict], list[Samples]]:
+def _of_row(
+    row: dict, scored: tuple[list[dict], list[Samples]]
+) -> tuple[list[dict], list[Samples]]:
     """What the rollouts of a row of metrics.json scored."""
     rows, samples = scored
-    own = [k for k, one in enumerate(rows) if (one["method"], one["eta"]) == (row["method"], row["eta"])]
+    own = [
+        k
+        for k, one in enumerate(rows)
+        if (one["method"], one["eta"]) == (row["method"], row["eta"])
+    ]
     return [rows[k] for k in own], [samples[k] for k in own]

@@ -1,4 +1,5 @@
-"""Builds the parts of an evolution from a run's configuration, and says how long the rest takes."""
+"""Builds the parts of an evolution from a run's configuration, and says how long the
+rest takes."""
 
 import time
 from collections import Counter, defaultdict
@@ -11,7 +12,14 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from e2rl.evaluation.budget import methods_at, portfolio_plan
-from e2rl.evaluation.methods import SEARCH, as_list, build_prior, build_sim, build_traffic, processes_of
+from e2rl.evaluation.methods import (
+    SEARCH,
+    as_list,
+    build_prior,
+    build_sim,
+    build_traffic,
+    processes_of,
+)
 from e2rl.evaluation.protocol import Method, Setup
 from e2rl.learning.attack import Synthesize, mixture, solvable
 from e2rl.learning.before_after import BeforeAfter
@@ -43,39 +51,74 @@ def build_evolution(
     synthesize: Synthesize | None = None,
     folder: Path | None = None,
 ) -> Evolution:
-    """An Evolution of `ego` against `traffic` by config.learner and config.curriculum over config.rounds rounds.
+    """An Evolution of `ego` against `traffic` by config.learner and config.curriculum
+    over config.rounds rounds.
 
-    synthesize: makes D'; default: closed-loop rollouts with `traffic`. folder: of the run, where D' is remembered;
-    default: a temporary one.
+    synthesize: makes D'; default: closed-loop rollouts with `traffic`. folder: of the
+    run, where D' is remembered; default: a temporary one.
     """
     sim = build_sim(config)
     seed = config.seed
-    made_by = partial(synthesize_traffic, scenes, sim=sim, batch=config.batch, device=config.device)
+    made_by = partial(
+        synthesize_traffic, scenes, sim=sim, batch=config.batch, device=config.device
+    )
     synthesize = synthesize or made_by(traffic)
     given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
-    curriculum = built(config.curriculum, "curriculum", kind=CurriculumScheduler, **given)
+    curriculum = built(
+        config.curriculum, "curriculum", kind=CurriculumScheduler, **given
+    )
     check_templates(curriculum, config.synthesizer.name, traffic=traffic)
-    settings = settings_of(RoundSettings, _with_prefetch(config, ego), where="learner.round")
+    settings = settings_of(
+        RoundSettings, _with_prefetch(config, ego), where="learner.round"
+    )
     if settings.second:
-        second = build_traffic(load_choice("synthesizer", settings.second), build_prior(config, config.device)[0])
+        second = build_traffic(
+            load_choice("synthesizer", settings.second),
+            build_prior(config, config.device)[0],
+        )
         check_templates(curriculum, settings.second, traffic=second)
-        synthesize = mixture(synthesize, made_by(second), fraction=settings.second_fraction)
-    learner = OmegaConf.create({key: value for key, value in config.learner.items() if key != "round"})
-    parameters = {key: value for key, value in resolved(config.ego).items() if key != "_target_"}
+        synthesize = mixture(
+            synthesize, made_by(second), fraction=settings.second_fraction
+        )
+    learner = OmegaConf.create(
+        {key: value for key, value in config.learner.items() if key != "round"}
+    )
+    parameters = {
+        key: value for key, value in resolved(config.ego).items() if key != "_target_"
+    }
     live = traffic if settings.traffic == "live" else None
-    given = {"ego": ego, "parameters": parameters, "scenes": scenes, "sim": sim, "traffic": live, "seed": seed}
+    given = {
+        "ego": ego,
+        "parameters": parameters,
+        "scenes": scenes,
+        "sim": sim,
+        "traffic": live,
+        "seed": seed,
+    }
     given["device"] = device = learner.pop("device", config.device)
     if live is not None and device != config.device:
-        raise InputError(f"learner.device={device}: live traffic is made where the policy drives; set device={device}")
+        raise InputError(
+            f"learner.device={device}: live traffic is made where the policy drives; set device={device}"
+        )
     improve = built(learner, "learner", kind=Improvement, **given)
-    keep = partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
+    keep = (
+        partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
+    )
     workers = processes_of(config)
-    how = (keep, Memory(folder, settings.memory), config.batch, workers if isinstance(workers, RayWorkers) else None)
+    how = (
+        keep,
+        Memory(folder, settings.memory),
+        config.batch,
+        workers if isinstance(workers, RayWorkers) else None,
+    )
     return Evolution(curriculum, improve, synthesize, settings, seed, *how)
 
 
-def check_templates(curriculum: CurriculumScheduler, name: str, traffic: Traffic) -> None:
-    """InputError for a curriculum that chooses causal templates for a traffic method that has none."""
+def check_templates(
+    curriculum: CurriculumScheduler, name: str, traffic: Traffic
+) -> None:
+    """InputError for a curriculum that chooses causal templates for a traffic method
+    that has none."""
     if curriculum.templates != ("full",) and not traffic.follows_template:
         raise InputError(
             f"curriculum: it chooses causal templates ({', '.join(curriculum.templates)}), but "
@@ -84,13 +127,18 @@ def check_templates(curriculum: CurriculumScheduler, name: str, traffic: Traffic
 
 
 def _with_prefetch(config: DictConfig, ego: Ego) -> dict:
-    """`config.learner.round`, with a `prefetch` that is left open decided by what is possible."""
+    """`config.learner.round`, with a `prefetch` that is left open decided by what is
+    possible."""
     options = {"traffic": "replay", "prefetch": None} | resolved(config.learner.round)
     learns = config.learner.get("device", "cpu")
     device = str(learns if config.device == "cpu" else config.device)
-    reason = why_no_prefetch(device, config.threads, ego=ego, traffic=options["traffic"])
+    reason = why_no_prefetch(
+        device, config.threads, ego=ego, traffic=options["traffic"]
+    )
     if options["prefetch"] and reason:
-        raise InputError(f"learner.round.prefetch=true: {reason}; set it to null or false")
+        raise InputError(
+            f"learner.round.prefetch=true: {reason}; set it to null or false"
+        )
     return options | ({"prefetch": not reason} if options["prefetch"] is None else {})
 
 
@@ -122,8 +170,12 @@ def measure_settings(config: DictConfig) -> MeasureSettings:
 
 
 def check_training(config: DictConfig) -> MeasureSettings:
-    """Returns what is measured; InputError for what train.py cannot run, before anything is built."""
-    settings_of(TrainSettings, {field.name: config[field.name] for field in fields(TrainSettings)})
+    """Returns what is measured; InputError for what train.py cannot run, before
+    anything is built."""
+    settings_of(
+        TrainSettings,
+        {field.name: config[field.name] for field in fields(TrainSettings)},
+    )
     processes_of(config)
     check_device("learner.device", config.learner.get("device", config.device))
     build_sim(config)
@@ -132,16 +184,28 @@ def check_training(config: DictConfig) -> MeasureSettings:
 
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:
     """The logger of config.logger, writing under a run's folder."""
-    return RunLogger(config.logger.kind, folder, project=config.logger.project, name=config.logger.name)
+    return RunLogger(
+        config.logger.kind,
+        folder,
+        project=config.logger.project,
+        name=config.logger.name,
+    )
 
 
 def build_measure(
-    config: DictConfig, ego: Ego, ego_name: str, traffic: Traffic, prior: Prior, folder: Path
+    config: DictConfig,
+    ego: Ego,
+    ego_name: str,
+    traffic: Traffic,
+    prior: Prior,
+    folder: Path,
 ) -> BeforeAfter:
-    """The before/after table: nominal and adversarial traffic, and a search, on the scenes of `config.measure`.
+    """The before/after table: nominal and adversarial traffic, and a search, on the
+    scenes of `config.measure`.
 
-    Sources with splits are measured on their tune split; a path's scenes on `measure.path`, both as recorded; or
-    without it on the first training scenes (see `split` in the rows).
+    Sources with splits are measured on their tune split; a path's scenes on
+    `measure.path`, both as recorded; or without it on the first training scenes (see
+    `split` in the rows).
     """
     options = measure_settings(config)
     data = config.data.copy()
@@ -151,23 +215,41 @@ def build_measure(
             data.path = options.path
             data.split = None
     apart = options.path or source_of(data).has_splits
-    scenes = load_scenes(data, options.scenes, split="tune", scenes=None if apart else config.scenes)
-    nominal = built(load_choice("synthesizer", "nominal"), "synthesizer", kind=Traffic, prior=prior)
-    methods = [Method("nominal", nominal), *(Method(config.synthesizer.name, traffic, eta=eta) for eta in options.eta)]
-    setup = Setup(scenes, ego, ego_name=ego_name, sim=build_sim(config), batch=config.batch, device=config.device)
+    scenes = load_scenes(
+        data, options.scenes, split="tune", scenes=None if apart else config.scenes
+    )
+    nominal = built(
+        load_choice("synthesizer", "nominal"), "synthesizer", kind=Traffic, prior=prior
+    )
+    methods = [
+        Method("nominal", nominal),
+        *(Method(config.synthesizer.name, traffic, eta=eta) for eta in options.eta),
+    ]
+    setup = Setup(
+        scenes,
+        ego,
+        ego_name=ego_name,
+        sim=build_sim(config),
+        batch=config.batch,
+        device=config.device,
+    )
     given = (setup, methods, options.seeds, folder, processes_of(config))
     if not options.budget:
         return BeforeAfter(*given)
 
-    search = portfolio_plan(SEARCH, config, method=partial(methods_at(max(options.eta)), prior))
+    search = portfolio_plan(
+        SEARCH, config, method=partial(methods_at(max(options.eta)), prior)
+    )
     return BeforeAfter(*given, search, options.budget)
 
 
 class Progress:
-    """The phases of a training, by their kinds, in order. Phases of one kind take about equally long."""
+    """The phases of a training, by their kinds, in order. Phases of one kind take about
+    equally long."""
 
     def __init__(self, kinds: Sequence[str]) -> None:
-        """kinds: of the phases of which one of its kind has to be over before its length is known."""
+        """kinds: of the phases of which one of its kind has to be over before its
+        length is known."""
         self._kinds = list(kinds)
         self._spent: dict[str, list[float]] = defaultdict(list)
 
@@ -179,7 +261,8 @@ class Progress:
         self._spent[kind].append(time.monotonic() - begin)
 
     def left(self) -> str:
-        """Returns the time left in words, "about 12 min left", by what phases of this run have taken.
+        """Returns the time left in words, "about 12 min left", by what phases of this
+        run have taken.
 
         "" where nothing is left, and where no phase of a kind that is to come is over.
         """

@@ -1,4 +1,5 @@
-"""Drives an ego through one episode per pool row, for planner tuning and demonstrations; outcomes of episodes."""
+"""Drives an ego through one episode per pool row, for planner tuning and
+demonstrations; outcomes of episodes."""
 
 from collections.abc import Callable, Sequence
 
@@ -26,9 +27,10 @@ OUTCOME_KEYS = (
 
 @tensorclass
 class Episodes:
-    """E finished episodes, each field [E]: pool row and scene (int64), adversarial traffic, contact with any agent,
-    off the road (bool), return, progress [m] and mean |acceleration| [m/s^2] (NaN if not measured); survivable: the
-    fraction of the row's critical moments that a teacher would survive (NaN: unknown)."""
+    """E finished episodes, each field [E]: pool row and scene (int64), adversarial
+    traffic, contact with any agent, off the road (bool), return, progress [m] and mean
+    |acceleration| [m/s^2] (NaN if not measured); survivable: the fraction of the row's
+    critical moments that a teacher would survive (NaN: unknown)."""
 
     row: Tensor
     scene_index: Tensor
@@ -46,11 +48,19 @@ class Episodes:
         return self.contact | self.off_road
 
     def summary(self) -> dict[str, float]:
-        """Means over all episodes and over those in adversarial and in nominal traffic; kinds without any are left
-        out."""
-        values = {"contact": self.contact.float(), "off_road": self.off_road.float(), "return": self.returns}
+        """Means over all episodes and over those in adversarial and in nominal traffic;
+        kinds without any are left out."""
+        values = {
+            "contact": self.contact.float(),
+            "off_road": self.off_road.float(),
+            "return": self.returns,
+        }
         values |= {"progress": self.progress, "acceleration": self.acceleration}
-        kinds = {"": torch.ones_like(self.adversarial), "_adversarial": self.adversarial, "_nominal": ~self.adversarial}
+        kinds = {
+            "": torch.ones_like(self.adversarial),
+            "_adversarial": self.adversarial,
+            "_nominal": ~self.adversarial,
+        }
         result = {"episodes": float(len(self))}
         for suffix, rows in kinds.items():
             for name, value in values.items():
@@ -61,18 +71,25 @@ class Episodes:
 
 
 def decisions(steps, hold: int):
-    """Decisions (int or Tensor) in which an episode reaches so many steps; the last may be cut short."""
+    """Decisions (int or Tensor) in which an episode reaches so many steps; the last may
+    be cut short."""
     return (steps + hold - 1) // hold
 
 
-def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizon: int, hold: int = 1) -> Episodes:
-    """Episodes of a round's batches [B, T_i] in order (OUTCOME_KEYS), all environments reset at the first frame.
+def finished_episodes(
+    batches: list[TensorDictBase], adversarial: Tensor, horizon: int, hold: int = 1
+) -> Episodes:
+    """Episodes of a round's batches [B, T_i] in order (OUTCOME_KEYS), all environments
+    reset at the first frame.
 
-    A frame is a decision, held for `hold` steps; an episode has at most `horizon` steps. Episodes that began too late
-    to last so long before the end of the data are omitted: only the failures among them would be finished. adversarial
-    [R]: of the pool's rows.
+    A frame is a decision, held for `hold` steps; an episode has at most `horizon`
+    steps. Episodes that began too late to last so long before the end of the data are
+    omitted: only the failures among them would be finished. adversarial [R]: of the
+    pool's rows.
     """
-    data = TensorDict.cat([batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1)
+    data = TensorDict.cat(
+        [batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1
+    )
     after = data["next"]
     metrics = data["next", "metrics"]
     begin = torch.arange(data.shape[1]) + 1 - decisions(after["timestep"][..., 0], hold)
@@ -94,21 +111,39 @@ def finished_episodes(batches: list[TensorDictBase], adversarial: Tensor, horizo
     )
 
 
-Disturbance = Callable[[Tensor, Tensor], Tensor]  # (action [B, 2], step [B]) -> the action [B, 2] executed instead
+Disturbance = Callable[
+    [Tensor, Tensor], Tensor
+]  # (action [B, 2], step [B]) -> the action [B, 2] executed instead
 
 
 class PoolDriver:
     """Environments in which egos drive rows of pools with recorded or stored traffic."""
 
-    def __init__(self, scenes: SceneSet, sim: SimSettings, batch: int, device: str = "cpu", hold: int = 1) -> None:
-        """batch: number of environments, i.e. of rows driven at once; hold: steps of a decision."""
+    def __init__(
+        self,
+        scenes: SceneSet,
+        sim: SimSettings,
+        batch: int,
+        device: str = "cpu",
+        hold: int = 1,
+    ) -> None:
+        """batch: number of environments, i.e. of rows driven at once; hold: steps of a
+        decision."""
         self.env = DrivingEnv(scenes, sim, batch, device, agents=True, hold=hold)
 
-    def drive(self, ego: Ego, pool: TrafficPool, rows: Tensor, disturb: Disturbance | None = None) -> TensorDict:
-        """One episode of T decisions in each of pool rows [B]; B is the number of environments.
+    def drive(
+        self,
+        ego: Ego,
+        pool: TrafficPool,
+        rows: Tensor,
+        disturb: Disturbance | None = None,
+    ) -> TensorDict:
+        """One episode of T decisions in each of pool rows [B]; B is the number of
+        environments.
 
-        Returns [B, T]: observation, intended (the ego's action), executed (after disturbance and bounds) [.., 2], alive
-        (the decision belongs to the episode), reward, contact, off_road, progress.
+        Returns [B, T]: observation, intended (the ego's action), executed (after
+        disturbance and bounds) [.., 2], alive (the decision belongs to the episode),
+        reward, contact, off_road, progress.
         """
         transform = AdversarialSynthesizer(pool, lambda count: rows[:count])
         env = TransformedEnv(self.env, transform)
@@ -141,38 +176,64 @@ class PoolDriver:
         return TensorDict(frames, batch_size=steps.batch_size, device=alive.device)
 
     def drive_all(self, ego: Ego, pool: TrafficPool) -> tuple[Episodes, list[dict]]:
-        """Outcomes of one episode in every row of the pool, in their order, but for those in which the ego raises or
-        becomes NaN; and these, each with its row and reason."""
+        """Outcomes of one episode in every row of the pool, in their order, but for
+        those in which the ego raises or becomes NaN; and these, each with its row and
+        reason."""
         none = torch.zeros(0, dtype=torch.int64)
         never = torch.zeros(0, dtype=torch.bool)
-        parts = [Episodes(none, none, never, never, never, *[torch.zeros(0)] * 4, batch_size=[0])]
+        parts = [
+            Episodes(
+                none, none, never, never, never, *[torch.zeros(0)] * 4, batch_size=[0]
+            )
+        ]
         errored: list[dict] = []
         for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):
             begins = len(parts) == 1 and not errored
-            found, failed = attempt(lambda tasks: self._frames(ego, pool, rows=tasks), rows.tolist(), begins=begins)
-            parts += [episodes_of(frames, pool, rows=torch.tensor(done)) for done, frames in found]
+            found, failed = attempt(
+                lambda tasks: self._frames(ego, pool, rows=tasks),
+                rows.tolist(),
+                begins=begins,
+            )
+            parts += [
+                episodes_of(frames, pool, rows=torch.tensor(done))
+                for done, frames in found
+            ]
             errored += [{"row": row, **why} for row, why in failed]
         every = torch.cat(parts)
         return every[every.row.argsort()], errored
 
     def _frames(self, ego: Ego, pool: TrafficPool, rows: Sequence[int]) -> TensorDict:
-        """Frames of `drive` of at most as many rows as there are environments, as `attempt` looks at them."""
-        every = torch.arange(self.env.batch_size[0]) % len(rows)  # the other environments drive them once more
+        """Frames of `drive` of at most as many rows as there are environments, as
+        `attempt` looks at them."""
+        every = torch.arange(self.env.batch_size[0]) % len(
+            rows
+        )  # the other environments drive them once more
         with renumbered(every):
             frames = self.drive(ego, pool, torch.tensor(rows)[every])[: len(rows)]
         return frames.update({"states": frames["executed"], "valid": frames["alive"]})
 
 
 def executed(steps: TensorDictBase) -> Tensor:
-    """Mean accelerations and yaw rates [B, T, 2] (m/s^2, rad/s) of the ego over each decision of a rollout."""
+    """Mean accelerations and yaw rates [B, T, 2] (m/s^2, rad/s) of the ego over each
+    decision of a rollout."""
     now, then = (each["agents", "states"][:, :, 0] for each in (steps, steps["next"]))
     seconds = (steps["next", "timestep"] - steps["timestep"]).clamp(min=1) * DT
-    return torch.cat([then[..., 3:] - now[..., 3:], wrap(then[..., 2:3] - now[..., 2:3])], -1) / seconds
+    return (
+        torch.cat(
+            [then[..., 3:] - now[..., 3:], wrap(then[..., 2:3] - now[..., 2:3])], -1
+        )
+        / seconds
+    )
 
 
 def filled_batches(count: int, batch: int) -> list[Tensor]:
-    """Rows 0..count-1 in batches of exactly `batch`, the last one filled up by repetition."""
-    return list((torch.arange(-(-count // batch) * batch) % count).split(batch)) if count else []
+    """Rows 0..count-1 in batches of exactly `batch`, the last one filled up by
+    repetition."""
+    return (
+        list((torch.arange(-(-count // batch) * batch) % count).split(batch))
+        if count
+        else []
+    )
 
 
 def episodes_of(frames: TensorDictBase, pool: TrafficPool, rows: Tensor) -> Episodes:
@@ -182,5 +243,10 @@ def episodes_of(frames: TensorDictBase, pool: TrafficPool, rows: Tensor) -> Epis
     effort = (frames["executed"][..., 0].abs() * frames["alive"]).sum(1) / count
     ended = frames["contact"].any(1), frames["off_road"].any(1)
     of_rows = pool.scene_index[rows], pool.adversarial[rows]
-    driven = frames["reward"].sum(1), progress, effort, torch.full_like(effort, torch.nan)
+    driven = (
+        frames["reward"].sum(1),
+        progress,
+        effort,
+        torch.full_like(effort, torch.nan),
+    )
     return Episodes(rows, *of_rows, *ended, *driven, batch_size=[len(rows)])

@@ -1,4 +1,5 @@
-"""The steps of a round of Algorithm 1, which `train.py` does in turn, and the state of a run between them."""
+"""The steps of a round of Algorithm 1, which `train.py` does in turn, and the state of
+a run between them."""
 
 import copy
 import time
@@ -7,7 +8,14 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from e2rl.learning.attack import ATTACK, Order, Solvable, Synthesize, counted, make_traffic
+from e2rl.learning.attack import (
+    ATTACK,
+    Order,
+    Solvable,
+    Synthesize,
+    counted,
+    make_traffic,
+)
 from e2rl.learning.driving import Episodes
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.memory import Memory
@@ -40,16 +48,21 @@ class RoundSettings:
 
     def __post_init__(self) -> None:
         if self.second and self.traffic == "live":
-            raise InputError("learner.round.second: live traffic is of one method; set learner.round.traffic=replay")
+            raise InputError(
+                "learner.round.second: live traffic is of one method; set learner.round.traffic=replay"
+            )
         if self.against == "start" and self.traffic == "live":
-            raise InputError("learner.round.against=start: live traffic meets the learning policy; set it to current")
+            raise InputError(
+                "learner.round.against=start: live traffic meets the learning policy; set it to current"
+            )
 
 
 @dataclass
 class RoundTraffic:
-    """The traffic of a round: the pool, which of the ordered attacks its first K rows are (drawn [K] int64; the others
-    were left out), and metrics; contact: the attacked ego's contact rate, None if unknown before the episodes are
-    driven; spent: seconds; errored: rows that could not be made."""
+    """The traffic of a round: the pool, which of the ordered attacks its first K rows
+    are (drawn [K] int64; the others were left out), and metrics; contact: the attacked
+    ego's contact rate, None if unknown before the episodes are driven; spent: seconds;
+    errored: rows that could not be made."""
 
     pool: TrafficPool
     drawn: Tensor
@@ -60,18 +73,22 @@ class RoundTraffic:
 
 
 class Evolution:
-    """The state of a run: curriculum, improvement (which holds the ego) and the memory of D'.
+    """The state of a run: curriculum, improvement (which holds the ego) and the memory
+    of D'.
 
-    choices: what the curriculum chose for the last round and what came of it (e2rl/learning/scheduler.py); errored: the
-    last round's rollouts that errored, each with its reason.
+    choices: what the curriculum chose for the last round and what came of it
+    (e2rl/learning/scheduler.py); errored: the last round's rollouts that errored, each
+    with its reason.
 
     Args:
-        synthesize: (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N],
+        synthesize: (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states
+            [S, T+1, N, 4], valid [S, T+1, N],
             adversaries [S, N] bool, contact [S] bool, owes [S] bool}: closed-loop traffic against that ego; contact: it
             was hit; owes: adversaries give way to it (left out: they do). Rows that cannot be made are left out, and
             `errored` {position in S: why} names them. A curriculum that chooses causal templates gives template [S],
             too.
-        solvable: traffic -> Solved: the rows that enter D', and evasions; None: all, and none.
+        solvable: traffic -> Solved: the rows that enter D', and evasions; None: all,
+            and none.
         memory: None: in a temporary folder.
         batch: scenes that are synthesized at once.
         workers: that do it; None: a process here.
@@ -98,7 +115,9 @@ class Evolution:
         self.memory = memory or Memory(None, settings.memory)
         self.batch = batch
         self.workers = workers
-        self._start = copy.deepcopy(improve.ego) if settings.against == "start" else None
+        self._start = (
+            copy.deepcopy(improve.ego) if settings.against == "start" else None
+        )
         self.episodes: Episodes | None = None
         self.choices: list[Choice] = []
         self.errored: list[dict] = []
@@ -118,18 +137,25 @@ class Evolution:
     # --- the steps of a round, in their order
 
     def draw(self) -> Order:
-        """Returns what is attacked: scenes, intensities and causal templates by the curriculum, and the current ego."""
+        """Returns what is attacked: scenes, intensities and causal templates by the
+        curriculum, and the current ego."""
         order = self._next or self._order(self.round)
         self._next = None
         return order
 
     def roll_out(self, order: Order) -> RoundTraffic:
-        """Returns the attacks on the ordered ego, without those that no driver avoids, with remembered attacks and
-        nominal traffic; of live traffic the rows alone, whose attacks are rolled out while the policy drives."""
-        return self._live(order) if self.settings.traffic == "live" else self._stored(order)
+        """Returns the attacks on the ordered ego, without those that no driver avoids,
+        with remembered attacks and nominal traffic; of live traffic the rows alone,
+        whose attacks are rolled out while the policy drives."""
+        return (
+            self._live(order)
+            if self.settings.traffic == "live"
+            else self._stored(order)
+        )
 
     def prefetch(self) -> None:
-        """With `settings.prefetch`, fix the next round's order, and begin to make it in another process.
+        """With `settings.prefetch`, fix the next round's order, and begin to make it in
+        another process.
 
         What the curriculum learns from the present round then acts two rounds later.
         """
@@ -147,20 +173,36 @@ class Evolution:
         attack.spent |= {name: learned.pop(name) for name in timed if name in learned}
         return learned
 
-    def move_on(self, order: Order, attack: RoundTraffic, learned: dict[str, float]) -> dict[str, float]:
-        """Move the curriculum by what became of the attacks; returns all metrics of the round, named by group (train/,
-        curriculum/, synthesizer/, time/)."""
+    def move_on(
+        self, order: Order, attack: RoundTraffic, learned: dict[str, float]
+    ) -> dict[str, float]:
+        """Move the curriculum by what became of the attacks; returns all metrics of the
+        round, named by group (train/, curriculum/, synthesizer/, time/)."""
         curriculum = self.curriculum
         episodes = self.episodes
         state = self.curriculum.summary()
         assert episodes is not None
         told = episodes.row, episodes.failed, episodes.survivable
         outcomes = outcomes_of(order.eta, order.template, attack.drawn, *told)
-        contact = learned.get("contact_adversarial") if attack.contact is None else attack.contact
-        curriculum.update(episodes.scene_index, episodes.failed, episodes.adversarial, episodes.survivable)
+        contact = (
+            learned.get("contact_adversarial")
+            if attack.contact is None
+            else attack.contact
+        )
+        curriculum.update(
+            episodes.scene_index,
+            episodes.failed,
+            episodes.adversarial,
+            episodes.survivable,
+        )
         curriculum.observe(outcomes)
         curriculum.leave_out(order.scenes[outcomes.left_out])
-        self.choices = tally(order.number, curriculum.level(order.eta), outcomes=outcomes, value=curriculum.values())
+        self.choices = tally(
+            order.number,
+            curriculum.level(order.eta),
+            outcomes=outcomes,
+            value=curriculum.values(),
+        )
         curriculum.advance(contact)
         not_made = sum(entry["during"] == ATTACK for entry in attack.errored)
         attacked = {
@@ -173,9 +215,21 @@ class Evolution:
             **attack.metrics,
         }
         attacked |= {} if contact is None else {"contact": contact}
-        self.errored = [*attack.errored, *({"round": order.number, **entry} for entry in self.improve.errored)]
-        groups = {"curriculum": state, "train": learned, "synthesizer": attacked, "time": attack.spent}
-        return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
+        self.errored = [
+            *attack.errored,
+            *({"round": order.number, **entry} for entry in self.improve.errored),
+        ]
+        groups = {
+            "curriculum": state,
+            "train": learned,
+            "synthesizer": attacked,
+            "time": attack.spent,
+        }
+        return {
+            f"{group}/{name}": value
+            for group, values in groups.items()
+            for name, value in values.items()
+        }
 
     # --- their parts
 
@@ -183,8 +237,16 @@ class Evolution:
         """What is to be synthesized for a round, as the curriculum and the ego are now."""
         scenes = self.curriculum.draw(self.settings.scenes)
         ego = self._start or self.ego
-        ego = copy.deepcopy(ego) if self.settings.prefetch else ego  # learning changes weights in place
-        return Order(number, scenes, *self.curriculum.choices(scenes), self.seed * 1_000_003 + number, ego)
+        ego = (
+            copy.deepcopy(ego) if self.settings.prefetch else ego
+        )  # learning changes weights in place
+        return Order(
+            number,
+            scenes,
+            *self.curriculum.choices(scenes),
+            self.seed * 1_000_003 + number,
+            ego,
+        )
 
     def _begin(self, order: Order) -> Prefetch:
         name = f"round {order.number + 1}: synthesis beside learning failed, checkpoints remain (resume=RUN_DIR)"
@@ -195,7 +257,9 @@ class Evolution:
     def _make(self, order: Order) -> None:
         """Write the traffic of an order into the memory's folder."""
         how = (self.settings.nominal == "prior", self.batch, self.workers or 1)
-        self.memory.write(order.number, *make_traffic(order, self.synthesize, self.solvable, *how))
+        self.memory.write(
+            order.number, *make_traffic(order, self.synthesize, self.solvable, *how)
+        )
 
     def _stored(self, order: Order) -> RoundTraffic:
         """D' of an order joined with the memory, and nominal traffic."""
@@ -203,39 +267,76 @@ class Evolution:
         if self.settings.prefetch:
             at_work = self._prefetch or self._begin(order)
             self._prefetch = None
-            spent = {"synthesize": at_work.wait(), "waiting": time.perf_counter() - begin}
+            spent = {
+                "synthesize": at_work.wait(),
+                "waiting": time.perf_counter() - begin,
+            }
         else:
             self._make(order)
             spent = {"synthesize": time.perf_counter() - begin}
         made = self.memory.take(order.number)
         pool = self.memory.pool(self.settings.fresh)
-        if self.settings.nominal == "log" or not len(pool):  # without nominal traffic the pool may be empty
+        if self.settings.nominal == "log" or not len(
+            pool
+        ):  # without nominal traffic the pool may be empty
             pool = pool + TrafficPool.recorded(order.scenes)
         metrics = {"attacked": made.traffic["attacked"].item()}
         drawn = made.traffic["entered"].nonzero()[:, 0]
-        return RoundTraffic(pool, drawn, metrics=metrics, spent=spent, contact=made.traffic["contact"].item(), errored=made.errored)
+        return RoundTraffic(
+            pool,
+            drawn,
+            metrics=metrics,
+            spent=spent,
+            contact=made.traffic["contact"].item(),
+            errored=made.errored,
+        )
 
     def _live(self, order: Order) -> RoundTraffic:
-        """Rows whose traffic is replanned against the learning ego, attacked and nominal."""
-        index, eta, template = (each.repeat(NOISES) for each in (order.scenes, order.eta, order.template))
-        noise = index + (order.seed * NOISES + torch.arange(NOISES).repeat_interleave(len(order.scenes))) * 1_000_003
+        """Rows whose traffic is replanned against the learning ego, attacked and
+        nominal."""
+        index, eta, template = (
+            each.repeat(NOISES) for each in (order.scenes, order.eta, order.template)
+        )
+        noise = (
+            index
+            + (
+                order.seed * NOISES
+                + torch.arange(NOISES).repeat_interleave(len(order.scenes))
+            )
+            * 1_000_003
+        )
         pool = TrafficPool.live(index, eta, seed=noise, template=template)
         if self.settings.nominal == "prior":
             pool = pool + TrafficPool.live(index, torch.zeros_like(eta), seed=noise)
         elif self.settings.nominal == "log":
             pool = pool + TrafficPool.recorded(order.scenes)
-        return RoundTraffic(pool, torch.arange(len(order.scenes)).repeat(NOISES), metrics={}, spent={"synthesize": 0.0})
+        return RoundTraffic(
+            pool,
+            torch.arange(len(order.scenes)).repeat(NOISES),
+            metrics={},
+            spent={"synthesize": 0.0},
+        )
 
     def state_dict(self) -> dict:
-        """Curriculum, improvement and the order of the coming round; the checkpoint adds weights, the memory's index
-        and generators."""
-        state = {"curriculum": self.curriculum.state_dict(), "improvement": self.improve.state_dict(), "next": None}
+        """Curriculum, improvement and the order of the coming round; the checkpoint
+        adds weights, the memory's index and generators."""
+        state = {
+            "curriculum": self.curriculum.state_dict(),
+            "improvement": self.improve.state_dict(),
+            "next": None,
+        }
         if self._next is not None:
             order = self._next
             ego = self._next.ego
             assert isinstance(ego, ActorEgo)
-            weights = {name: value.detach().cpu() for name, value in ego.network.weights().items()}
-            given = {name: getattr(order, name) for name in ("number", "scenes", "eta", "template", "seed")}
+            weights = {
+                name: value.detach().cpu()
+                for name, value in ego.network.weights().items()
+            }
+            given = {
+                name: getattr(order, name)
+                for name in ("number", "scenes", "eta", "template", "seed")
+            }
             state["next"] = given | {"weights": weights}
         return state
 

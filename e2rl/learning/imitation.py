@@ -1,11 +1,14 @@
-"""Demonstrations (observation, action) of recorded egos, and the actor's warm start from them.
+"""Demonstrations (observation, action) of recorded egos, and the actor's warm start
+from them.
 
-Demonstrations come in two kinds. Replayed: the ego follows its log exactly and the action is the inverse unicycle's.
-Disturbed: the ego tracks its log while its actions are perturbed for a second at a time (Laskey et al. 2017), so they
-show recoveries; the label is the undisturbed action.
+Demonstrations come in two kinds. Replayed: the ego follows its log exactly and the
+action is the inverse unicycle's. Disturbed: the ego tracks its log while its actions
+are perturbed for a second at a time (Laskey et al. 2017), so they show recoveries; the
+label is the undisturbed action.
 
-During cloning, noise is added to the network's input, most to the last executed action: actions are strongly
-autocorrelated, so the actor would copy it instead of learning its causes (de Haan et al. 2019).
+During cloning, noise is added to the network's input, most to the last executed action:
+actions are strongly autocorrelated, so the actor would copy it instead of learning its
+causes (de Haan et al. 2019).
 """
 
 from collections.abc import Mapping
@@ -33,7 +36,10 @@ from e2rl.scenes.source import load_scenes
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.pool import TrafficPool
 
-BURST, PAUSE = 10, 20  # steps: duration of a disturbance, and from the start of one to the next
+BURST, PAUSE = (
+    10,
+    20,
+)  # steps: duration of a disturbance, and from the start of one to the next
 DISTURBED = (1.0, 0.15)  # m/s^2, rad/s: standard deviations of the disturbances
 DRIVES = 3  # drives of a scene that track the log under disturbances, besides its exact replay
 BATCH = 64  # environments that run at once
@@ -52,36 +58,62 @@ class ImitationSettings:
     seed: int = 0
 
 
-def recorded_demonstrations(scenes: SceneSet, sim: SimSettings, seed: int, drives: int = DRIVES) -> TensorDict:
-    """Returns demonstrations [M] with C = 1 (e2rl.learning.cloning) of the recorded egos.
+def recorded_demonstrations(
+    scenes: SceneSet, sim: SimSettings, seed: int, drives: int = DRIVES
+) -> TensorDict:
+    """Returns demonstrations [M] with C = 1 (e2rl.learning.cloning) of the recorded
+    egos.
 
-    Every recording is replayed once, and driven `drives` times under disturbances. A disturbed episode counts until
-    contact or off the road; actions are clipped to 0.99 of the bounds.
+    Every recording is replayed once, and driven `drives` times under disturbances. A
+    disturbed episode counts until contact or off the road; actions are clipped to 0.99
+    of the bounds.
     """
     generator = torch.Generator().manual_seed(seed)
     pool = TrafficPool.recorded(torch.arange(len(scenes)))
     parts = []
     batch = min(BATCH, len(scenes))
-    exact = PoolDriver(scenes, replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False), batch=batch)
+    exact = PoolDriver(
+        scenes,
+        replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False),
+        batch=batch,
+    )
     free = PoolDriver(scenes, replace(sim, replay_ego=False), batch=batch)
-    todo = [(rows, number) for number in range(drives + 1) for rows in filled_batches(len(pool), batch)]
+    todo = [
+        (rows, number)
+        for number in range(drives + 1)
+        for rows in filled_batches(len(pool), batch)
+    ]
     for rows, number in Bar(todo, "demonstrations", unit="batch", leave=False):
         driver, label = (free, "intended") if number else (exact, "executed")
-        frames = driver.drive(ReplayEgo(), pool, rows, _bursts(len(rows), generator) if number else None)
+        frames = driver.drive(
+            ReplayEgo(), pool, rows, _bursts(len(rows), generator) if number else None
+        )
         action = frames[label][:, :, None]
-        parts.append(demonstrations_of(frames, frames["alive"], scene_index=pool.scene_index[rows], env=driver.env, action=action))
+        parts.append(
+            demonstrations_of(
+                frames,
+                frames["alive"],
+                scene_index=pool.scene_index[rows],
+                env=driver.env,
+                action=action,
+            )
+        )
     return torch.cat(parts)
 
 
 def _bursts(batch: int, generator: torch.Generator) -> Disturbance:
-    """Constant offsets of random size for BURST steps out of every PAUSE, at a random phase per scene."""
+    """Constant offsets of random size for BURST steps out of every PAUSE, at a random
+    phase per scene."""
     size = torch.tensor(DISTURBED)
     offsets = torch.randn(batch, 100, 2, generator=generator) * size
     phase = torch.randint(PAUSE, (batch,), generator=generator)
 
     def disturb(action: Tensor, step: Tensor) -> Tensor:
         since = step.cpu() + phase
-        offset = offsets[torch.arange(batch), since // PAUSE] * (since % PAUSE < BURST)[:, None]
+        offset = (
+            offsets[torch.arange(batch), since // PAUSE]
+            * (since % PAUSE < BURST)[:, None]
+        )
         return action + offset.to(action.device)
 
     return disturb
@@ -90,7 +122,9 @@ def _bursts(batch: int, generator: torch.Generator) -> Disturbance:
 class Imitation(Epochs):
     """Behaviour cloning of an ActorCritic's actor from demonstrations."""
 
-    def __init__(self, network: ActorCritic, shown: TensorDictBase, settings: ImitationSettings) -> None:
+    def __init__(
+        self, network: ActorCritic, shown: TensorDictBase, settings: ImitationSettings
+    ) -> None:
         shown = shown.select("observation", "action", "weight", "scene_index")
         super().__init__(network, shown, settings, network.network, WEIGHT_DECAY)
         self.cloning = CloningLoss(network.actor)
@@ -102,8 +136,8 @@ class Imitation(Epochs):
 
     @torch.no_grad()
     def measure(self, data: TensorDictBase) -> dict[str, float]:
-        """The cloning loss, and `miss`: the mean distance of the deterministic action from the labels in halves of the
-        action's range."""
+        """The cloning loss, and `miss`: the mean distance of the deterministic action
+        from the labels in halves of the action's range."""
         reach = (self.network.high - self.network.low) / 2
         central = self.network.network.deterministic(data["observation"])
         miss = ((central[:, None] - data["action"]).abs() / reach).mean(-1)
@@ -123,17 +157,22 @@ class Imitation(Epochs):
 
 
 def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
-    """stage=imitation: ego=actor clones the recorded egos of the training scenes, and its weights are written to the
-    run's folder. Returns the losses of the chosen epoch."""
+    """stage=imitation: ego=actor clones the recorded egos of the training scenes, and
+    its weights are written to the run's folder. Returns the losses of the chosen epoch.
+    """
     config = run.config
     ego = build_ego(run.config)
     if not isinstance(ego, ActorEgo):
         raise InputError("stage=imitation trains ego=actor; set it")
     settings = stage_settings(config, ImitationSettings)
-    scenes = load_scenes(config.data, config.num_scenes, split="train", scenes=config.scenes)
+    scenes = load_scenes(
+        config.data, config.num_scenes, split="train", scenes=config.scenes
+    )
     shown = recorded_demonstrations(scenes, build_sim(config), seed=settings.seed)
     training = Imitation(ego.network, shown, settings=settings)
     run.begin({"scenes": listed(scenes)})
-    row = training.fit("imitation", settings.epochs, run.parts("imitation"), vars(settings), logger)
+    row = training.fit(
+        "imitation", settings.epochs, run.parts("imitation"), vars(settings), logger
+    )
     ego.network.save(run.folder / WEIGHTS)
     return row

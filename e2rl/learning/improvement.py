@@ -12,16 +12,22 @@ from e2rl.traffic.pool import TrafficPool
 
 
 class Improvement(Extension, ABC):
-    """Improves `ego` in the round's pool. A subclass is built as `_target_(ego=, parameters=, scenes=, sim=, traffic=,
-    seed=, device=, **settings)`; parameters: those that the ego was built with; traffic: the method that drives live
-    rows, None without live rows."""
+    """Improves `ego` in the round's pool. A subclass is built as `_target_(ego=,
+    parameters=, scenes=, sim=, traffic=, seed=, device=, **settings)`; parameters:
+    those that the ego was built with; traffic: the method that drives live rows, None
+    without live rows."""
 
     ego: Ego
-    errored: Sequence[dict] = ()  # episodes of the last round that errored, each with its reason
+    errored: Sequence[
+        dict
+    ] = ()  # episodes of the last round that errored, each with its reason
 
     @abstractmethod
-    def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
-        """Learn from the pool; returns the metrics to log and the episodes that the ego drove."""
+    def __call__(
+        self, pool: TrafficPool, curriculum: CurriculumScheduler
+    ) -> tuple[dict[str, float], Episodes]:
+        """Learn from the pool; returns the metrics to log and the episodes that the ego
+        drove."""
 
     @abstractmethod
     def outcome(self, folder: Path) -> str:

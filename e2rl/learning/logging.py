@@ -1,4 +1,5 @@
-"""Logs a run's scalars and pictures to CSV files, TensorBoard or offline wandb, and a curriculum's choices."""
+"""Logs a run's scalars and pictures to CSV files, TensorBoard or offline wandb, and a
+curriculum's choices."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,21 +24,36 @@ CHOICES = "curriculum.csv"
 class RunLogger:
     """Writes {group/name: number} at steps, and pictures; NaN is omitted."""
 
-    def __init__(self, kind: str, folder: Path, project: str = "e2rl", name: str | None = None) -> None:
-        """kind: csv (folder/logs/scalars/<group>/<name>.csv), tensorboard (folder/tensorboard), wandb (offline,
-        folder/wandb), none. Choices are in folder/curriculum.csv in either case but none."""
+    def __init__(
+        self, kind: str, folder: Path, project: str = "e2rl", name: str | None = None
+    ) -> None:
+        """kind: csv (folder/logs/scalars/<group>/<name>.csv), tensorboard
+        (folder/tensorboard), wandb (offline, folder/wandb), none. Choices are in
+        folder/curriculum.csv in either case but none."""
         self._folder = Path(folder)
         self._logger = _logger(kind, self._folder, project=project, name=name)
 
-    def log(self, metrics: Mapping[str, float], step: int, choices: Sequence[Choice] = ()) -> None:
-        """Write the metrics of a step, and the rows of a round's choices beside those of earlier rounds; raises
-        InputError for a name outside GROUPS."""
-        wrong = [name for name in metrics if name.split("/")[0] not in GROUPS or "/" not in name]
+    def log(
+        self, metrics: Mapping[str, float], step: int, choices: Sequence[Choice] = ()
+    ) -> None:
+        """Write the metrics of a step, and the rows of a round's choices beside those
+        of earlier rounds; raises InputError for a name outside GROUPS."""
+        wrong = [
+            name
+            for name in metrics
+            if name.split("/")[0] not in GROUPS or "/" not in name
+        ]
         if wrong:
-            raise InputError(f"metrics {', '.join(wrong)}: begin each with {'/, '.join(GROUPS)}/")
+            raise InputError(
+                f"metrics {', '.join(wrong)}: begin each with {'/, '.join(GROUPS)}/"
+            )
         if self._logger is None:
             return
-        known = {name: float(value) for name, value in metrics.items() if not math.isnan(value)}
+        known = {
+            name: float(value)
+            for name, value in metrics.items()
+            if not math.isnan(value)
+        }
         if isinstance(self._logger, WandbLogger):
             self._write_row(known, step)
         else:
@@ -46,37 +62,56 @@ class RunLogger:
         if choices:
             path = self._folder / CHOICES
             earlier = lines_before(path, step) if path.is_file() else []
-            rows = [["" if row[name] != row[name] else row[name] for name in COLUMNS] for row in choices]  # NaN: empty
-            write_atomically(path, "".join([",".join(COLUMNS) + "\n", *earlier, csv_text(rows)]))
+            rows = [
+                ["" if row[name] != row[name] else row[name] for name in COLUMNS]
+                for row in choices
+            ]  # NaN: empty
+            write_atomically(
+                path, "".join([",".join(COLUMNS) + "\n", *earlier, csv_text(rows)])
+            )
 
     def show(self, name: str, path: Path, step: int) -> None:
-        """Put a picture (PNG) or video (GIF) on the dashboard, if there is one; name: as of a scalar."""
+        """Put a picture (PNG) or video (GIF) on the dashboard, if there is one; name:
+        as of a scalar."""
         if isinstance(self._logger, WandbLogger):
             import wandb
 
             moving = path.suffix == ".gif"
-            media = wandb.Video(str(path), format="gif") if moving else wandb.Image(str(path))
+            media = (
+                wandb.Video(str(path), format="gif")
+                if moving
+                else wandb.Image(str(path))
+            )
             self._write_row({name: media}, step)
         elif isinstance(self._logger, TensorboardLogger):
             from tensorboard.compat.proto.summary_pb2 import Summary
 
-            with Image.open(path) as image:  # its bytes as they are, since a video moves there, too
+            with Image.open(
+                path
+            ) as image:  # its bytes as they are, since a video moves there, too
                 given = {"width": image.width, "height": image.height, "colorspace": 3}
-            value = Summary.Value(tag=name, image=Summary.Image(encoded_image_string=path.read_bytes(), **given))
-            self._logger.experiment.file_writer.add_summary(Summary(value=[value]), step)
+            value = Summary.Value(
+                tag=name,
+                image=Summary.Image(encoded_image_string=path.read_bytes(), **given),
+            )
+            self._logger.experiment.file_writer.add_summary(
+                Summary(value=[value]), step
+            )
 
     def _write_row(self, values: Mapping[str, Any], step: int) -> None:
-        """Add values to wandb's row of a step. It stays open until a later step, or the end, writes it.
+        """Add values to wandb's row of a step. It stays open until a later step, or the
+        end, writes it.
 
-        wandb's own step has to be told. By default TorchRL counts steps of each group beside it, and wandb takes every
-        number for a row of its own, so that a picture of step 1 comes to a row that is written already, and is lost.
+        wandb's own step has to be told. By default TorchRL counts steps of each group
+        beside it, and wandb takes every number for a row of its own, so that a picture
+        of step 1 comes to a row that is written already, and is lost.
         """
         assert isinstance(self._logger, WandbLogger)
         self._logger.log_metrics(dict(values), step=step, override_global_step=True)
 
     def forget(self, step: int) -> None:
-        """Remove the scalars of a step and of later ones from the CSV files, and a line that was cut off: a resumed run
-        logs them again."""
+        """Remove the scalars of a step and of later ones from the CSV files, and a line
+        that was cut off: a resumed run logs them again."""
         for file in sorted((self._folder / "logs").rglob("*.csv")):
             write_atomically(file, "".join(lines_before(file, step)))
 
@@ -89,12 +124,18 @@ class RunLogger:
 
 
 def _logger(kind: str, folder: Path, project: str, name: str | None) -> Logger | None:
-    """TorchRL's logger of a kind; None for none. Raises InputError for one that is unknown or not installed."""
+    """TorchRL's logger of a kind; None for none. Raises InputError for one that is
+    unknown or not installed."""
     check_choice("logger.kind", kind, choices=KINDS)
     if kind == "csv":
         return CSVLogger("logs", log_dir=str(folder))
     if kind == "wandb":
-        given = {"offline": True, "save_dir": str(folder), "project": project, "log_env_packages": False}
+        given = {
+            "offline": True,
+            "save_dir": str(folder),
+            "project": project,
+            "log_env_packages": False,
+        }
         return WandbLogger(name or folder.name, **given)
     if kind == "tensorboard":
         library("tensorboard", "logger=tensorboard", extra="tensorboard")

@@ -1,7 +1,8 @@
-"""The memory of D': the traffic of this round and of earlier ones, in memory-mapped files under a run's folder.
+"""The memory of D': the traffic of this round and of earlier ones, in memory-mapped
+files under a run's folder.
 
-One file memory/round-000003.safetensors a round. Of a mapped file only the rows that are drawn are read, so resident
-memory does not grow with the rounds.
+One file memory/round-000003.safetensors a round. Of a mapped file only the rows that
+are drawn are read, so resident memory does not grow with the rounds.
 """
 
 import json
@@ -25,7 +26,8 @@ FOLDER, ERRORED = "memory", "errored"  # of a run; the key of a file's metadata
 
 @dataclass(frozen=True)
 class Remembered:
-    """The traffic of a round as its file holds it: number, mapped tensors, errored rows, and the file's checksum."""
+    """The traffic of a round as its file holds it: number, mapped tensors, errored
+    rows, and the file's checksum."""
 
     number: int
     traffic: dict[str, Tensor]
@@ -37,10 +39,12 @@ class Remembered:
 
 
 class Memory:
-    """The rounds from the newest one back, at most `bound` rows together; the newest round always stays.
+    """The rounds from the newest one back, at most `bound` rows together; the newest
+    round always stays.
 
-    A round's traffic (`attack.make_traffic`) is written by `write`, by any process, and enters by `take`. Files of
-    rounds that have left go in `prune`: until then a checkpoint may name them.
+    A round's traffic (`attack.make_traffic`) is written by `write`, by any process, and
+    enters by `take`. Files of rounds that have left go in `prune`: until then a
+    checkpoint may name them.
     """
 
     def __init__(self, folder: Path | None, bound: int) -> None:
@@ -61,39 +65,53 @@ class Memory:
         """The file of a round."""
         return self.folder / f"round-{number:06d}.safetensors"
 
-    def write(self, number: int, traffic: Mapping[str, Tensor], errored: Sequence[dict] = ()) -> None:
+    def write(
+        self, number: int, traffic: Mapping[str, Tensor], errored: Sequence[dict] = ()
+    ) -> None:
         """Write the traffic of a round, and its errored rows."""
-        plain = {name: value.detach().cpu().contiguous() for name, value in traffic.items()}
-        write_atomically(self.path(number), save(plain, {ERRORED: json.dumps(list(errored))}))
+        plain = {
+            name: value.detach().cpu().contiguous() for name, value in traffic.items()
+        }
+        write_atomically(
+            self.path(number), save(plain, {ERRORED: json.dumps(list(errored))})
+        )
 
     def take(self, number: int) -> Remembered:
-        """Map a written round as the newest; the oldest rounds beyond the bound leave. Returns it."""
+        """Map a written round as the newest; the oldest rounds beyond the bound leave.
+        Returns it."""
         self.rounds.append(self._mapped(number))
         while self.rows > self.bound and len(self.rounds) > 1:
             del self.rounds[0]
         return self.rounds[-1]
 
     def pool(self, fresh: float) -> TrafficPool:
-        """Rows of all rounds, the newest first, whose rows weigh `fresh` times as much as the others'. The tracks stay
-        in their files."""
+        """Rows of all rounds, the newest first, whose rows weigh `fresh` times as much
+        as the others'. The tracks stay in their files."""
         made = [one.traffic for one in self.rounds]
-        *older, newest = (TrafficPool.stored(each, each["eta"], template=each["template"]) for each in made)
+        *older, newest = (
+            TrafficPool.stored(each, each["eta"], template=each["template"])
+            for each in made
+        )
         joined = replace(newest, weight=newest.weight * fresh)
         for pool in reversed(older):
             joined = joined + replace(pool, fresh=torch.zeros_like(pool.fresh))
         return joined
 
     def index(self) -> list[dict[str, int]]:
-        """The rounds in memory by number and checksum, the oldest first, for a checkpoint."""
+        """The rounds in memory by number and checksum, the oldest first, for a
+        checkpoint."""
         return [{"round": one.number, "crc32": one.crc32} for one in self.rounds]
 
     def restore(self, index: list[dict[str, int]]) -> None:
-        """Map the rounds of an `index`; raises InputError for a missing, damaged or exchanged file."""
+        """Map the rounds of an `index`; raises InputError for a missing, damaged or
+        exchanged file."""
         self.rounds = [self._mapped(entry["round"]) for entry in index]
         for entry, found in zip(index, self.rounds, strict=True):
             if found.crc32 != entry["crc32"]:
                 path = self.path(found.number)
-                raise InputError(f"{path}: damaged, or not of this run; restore it or begin a new run")
+                raise InputError(
+                    f"{path}: damaged, or not of this run; restore it or begin a new run"
+                )
 
     def prune(self, first: int) -> None:
         """Delete the files of rounds before `first`."""
@@ -104,11 +122,19 @@ class Memory:
     def _mapped(self, number: int) -> Remembered:
         path = self.path(number)
         if not path.is_file():
-            raise InputError(f"{path}: this file of the run's memory is missing; restore it or begin a new run")
+            raise InputError(
+                f"{path}: this file of the run's memory is missing; restore it or begin a new run"
+            )
         try:
-            traffic = load_file(path)  # maps the file: its pages are read when they are used
+            traffic = load_file(
+                path
+            )  # maps the file: its pages are read when they are used
             with safe_open(path, "pt") as file:
                 errored = json.loads((file.metadata() or {}).get(ERRORED, "[]"))
         except (SafetensorError, OSError, ValueError) as error:
-            raise InputError(f"{path}: damaged ({error}); restore it or begin a new run") from None
-        return Remembered(number, traffic, errored=errored, crc32=zlib.crc32(path.read_bytes()))
+            raise InputError(
+                f"{path}: damaged ({error}); restore it or begin a new run"
+            ) from None
+        return Remembered(
+            number, traffic, errored=errored, crc32=zlib.crc32(path.read_bytes())
+        )

@@ -1,7 +1,8 @@
-"""The update of a planner: optuna searches its parameters on the round's adversarial and nominal scenes.
+"""The update of a planner: optuna searches its parameters on the round's adversarial
+and nominal scenes.
 
-The paper tunes its lane-graph planner. Progress has a floor, because standing still is the trivial optimum of safety
-and comfort.
+The paper tunes its lane-graph planner. Progress has a floor, because standing still is
+the trivial optimum of safety and comfort.
 """
 
 import json
@@ -29,7 +30,8 @@ from e2rl.traffic.traffic import Traffic
 
 @configured("learner/planner_tuning")
 class PlannerImprovement(Improvement):
-    """Tunes a planner's parameters on the round's pool; `ego` is the planner with the best parameters so far."""
+    """Tunes a planner's parameters on the round's pool; `ego` is the planner with the
+    best parameters so far."""
 
     def __init__(
         self,
@@ -45,42 +47,81 @@ class PlannerImprovement(Improvement):
         seed: int = 0,
         device: str = "cpu",
     ) -> None:
-        """parameters: those that `ego` was built with. Raises InputError for live traffic."""
+        """parameters: those that `ego` was built with. Raises InputError for live
+        traffic."""
         if traffic is not None:
-            raise InputError("learner.round.traffic=live: a planner is tuned on stored traffic; set it to replay")
+            raise InputError(
+                "learner.round.traffic=live: a planner is tuned on stored traffic; set it to replay"
+            )
         self.ego = ego
         self.present = dict(parameters)
         self.space = dict(space) or dict(ego.tuned)
-        self.search = settings_of(SearchSettings, {"seed": seed, "sweep": 0} | dict(search), where="learner.search")
-        self.objective = settings_of(PlannerObjective, objective, where="learner.objective")
+        self.search = settings_of(
+            SearchSettings,
+            {"seed": seed, "sweep": 0} | dict(search),
+            where="learner.search",
+        )
+        self.objective = settings_of(
+            PlannerObjective, objective, where="learner.objective"
+        )
         self.driver = PoolDriver(scenes, sim, batch=batch, device=device)
         self.trials: list[dict] = []
 
-    def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
-        """Drive the pool once with the parameters of every trial; `trials` keeps all results."""
+    def __call__(
+        self, pool: TrafficPool, curriculum: CurriculumScheduler
+    ) -> tuple[dict[str, float], Episodes]:
+        """Drive the pool once with the parameters of every trial; `trials` keeps all
+        results."""
         driven: list[tuple[Parameters, Episodes, list[dict]]] = []
 
         def evaluate(parameters: Parameters) -> dict[str, float]:
-            episodes, errored = self.driver.drive_all(type(self.ego)(**parameters), pool)
+            episodes, errored = self.driver.drive_all(
+                type(self.ego)(**parameters), pool
+            )
             driven.append((parameters, episodes, errored))
-            summary = {"contact": nan, "acceleration": nan, "progress": nan} | episodes.summary()
-            named = {"collision": summary["contact"], "comfort": summary["acceleration"]}
+            summary = {
+                "contact": nan,
+                "acceleration": nan,
+                "progress": nan,
+            } | episodes.summary()
+            named = {
+                "collision": summary["contact"],
+                "comfort": summary["acceleration"],
+            }
             own = sum(entry["raised_by"] == EGO for entry in errored)
             return named | summary | counted(errored) | {"errored": float(own)}
 
-        self.trials = search(evaluate, self.present, space=self.space, settings=self.search, objective=self.objective)
+        self.trials = search(
+            evaluate,
+            self.present,
+            space=self.space,
+            settings=self.search,
+            objective=self.objective,
+        )
         first = self.trials[0]
         best = best_of(self.trials) or self.trials[0]
         self.present, episodes, errored = driven[self.trials.index(best)]
         self.ego = type(self.ego)(**self.present)
-        metrics = {f"parameter_{name}": float(value) for name, value in best["parameters"].items()}
-        metrics |= {"objective_before": first["objective"], "objective": best["objective"]}
+        metrics = {
+            f"parameter_{name}": float(value)
+            for name, value in best["parameters"].items()
+        }
+        metrics |= {
+            "objective_before": first["objective"],
+            "objective": best["objective"],
+        }
         self.errored = [{"during": "tuning", **entry} for entry in errored]
-        return metrics | {"trials": float(len(driven))} | episodes.summary() | counted(errored), episodes
+        return metrics | {"trials": float(len(driven))} | episodes.summary() | counted(
+            errored
+        ), episodes
 
     def outcome(self, folder: Path) -> str:
-        """Write the trials of the last round to tuning.json; returns how to evaluate the tuned planner."""
-        write_atomically(folder / "tuning.json", json.dumps({"best": self.present, "trials": self.trials}, indent=1))
+        """Write the trials of the last round to tuning.json; returns how to evaluate
+        the tuned planner."""
+        write_atomically(
+            folder / "tuning.json",
+            json.dumps({"best": self.present, "trials": self.trials}, indent=1),
+        )
         tuned = " ".join(f"ego.{name}={self.present[name]}" for name in self.space)
         return f"every trial of the last round is in tuning.json; evaluate the tuned planner with: {tuned}"
 

@@ -1,4 +1,5 @@
-"""The update of a learned ego: PPO and behaviour cloning on episodes collected in the round's pool."""
+"""The update of a learned ego: PPO and behaviour cloning on episodes collected in the
+round's pool."""
 
 import copy
 import os
@@ -52,7 +53,8 @@ class RowDraw:
     """Draws pool rows by probability [R], with a generator of its own."""
 
     def __init__(self, probability: Tensor, seed: int | None = 0) -> None:
-        """seed: None, of the system's entropy, anew in every process that a copy draws in until somebody seeds it."""
+        """seed: None, of the system's entropy, anew in every process that a copy draws
+        in until somebody seeds it."""
         self.probability = probability
         self.generator = torch.Generator()
         self._process = os.getpid()
@@ -64,10 +66,15 @@ class RowDraw:
 
     def __call__(self, count: int) -> Tensor:
         """Rows [count]."""
-        if self._process != os.getpid() and self._entropy == self.generator.initial_seed():
+        if (
+            self._process != os.getpid()
+            and self._entropy == self.generator.initial_seed()
+        ):
             self._process = os.getpid()
             self._entropy = self.generator.seed()
-        return torch.multinomial(self.probability, count, replacement=True, generator=self.generator)
+        return torch.multinomial(
+            self.probability, count, replacement=True, generator=self.generator
+        )
 
 
 def on_device(ego: ActorEgo, device: str) -> ActorEgo:
@@ -86,7 +93,8 @@ def steps_of(data: TensorDictBase) -> int:
 
 @configured("learner/ppo_bc")
 class PolicyImprovement(Improvement):
-    """Collects episodes with the actor's stochastic policy in the round's pool and updates it after each batch."""
+    """Collects episodes with the actor's stochastic policy in the round's pool and
+    updates it after each batch."""
 
     ego: ActorEgo
 
@@ -109,18 +117,22 @@ class PolicyImprovement(Improvement):
         react: Mapping[str, Any] | None,
         rounds: int,
     ) -> None:
-        """Settings: conf/learner/ppo_bc.yaml. Raises InputError if the ego is no actor, the teacher no ScoringEgo, or a
-        round shorter than an episode.
+        """Settings: conf/learner/ppo_bc.yaml. Raises InputError if the ego is no actor,
+        the teacher no ScoringEgo, or a round shorter than an episode.
 
         Args:
-            recorded, evasions: with ppo.cloning > 0, clone the recorded egos, and the evasions in the pool's traffic.
-            teacher: with ppo.teaching > 0, a ScoringEgo that labels states of the collected episodes, as `teaching`
+            recorded, evasions: with ppo.cloning > 0, clone the recorded egos, and the
+                evasions in the pool's traffic.
+            teacher: with ppo.teaching > 0, a ScoringEgo that labels states of the
+                collected episodes, as `teaching`
                 says.
             react: vehicles that leave the replayed traffic; None: nobody.
             rounds: of the run, over which the learning rate falls.
         """
         if not isinstance(ego, ActorEgo):
-            raise InputError(f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning")
+            raise InputError(
+                f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning"
+            )
         self.settings = settings_of(CollectSettings, collect, where="learner.collect")
         update = settings_of(UpdateSettings, ppo, where="learner.ppo")
         batch = self.settings.batch
@@ -134,30 +146,52 @@ class PolicyImprovement(Improvement):
             )
         self.ego = ego
         self._learning = on_device(ego, device)
-        self.learner = Learner(self._learning.network, update, total=rounds * iterations)
+        self.learner = Learner(
+            self._learning.network, update, total=rounds * iterations
+        )
         self.frames = 0
         placed = scenes.to(device)
         self.experts: Experts | None = None
         self.teacher: Teacher | None = None
         if update.cloning > 0:
-            known = recorded_demonstrations(scenes, sim, seed=seed) if recorded else None
-            self.experts = Experts(scenes, sim, hold=hold, device=device, recorded=known, evasions=evasions)
+            known = (
+                recorded_demonstrations(scenes, sim, seed=seed) if recorded else None
+            )
+            self.experts = Experts(
+                scenes, sim, hold=hold, device=device, recorded=known, evasions=evasions
+            )
         if update.teaching > 0:
-            planner = teacher if isinstance(teacher, Ego) else built(OmegaConf.create(dict(teacher)), "teacher", kind=Ego)
+            planner = (
+                teacher
+                if isinstance(teacher, Ego)
+                else built(OmegaConf.create(dict(teacher)), "teacher", kind=Ego)
+            )
             bounds = self._learning.network.low, self._learning.network.high
-            self.teacher = Teacher(planner, placed, bounds=bounds, hold=hold, settings=teaching)
+            self.teacher = Teacher(
+                planner, placed, bounds=bounds, hold=hold, settings=teaching
+            )
         every = torch.arange(len(scenes))
-        self.draw = RowDraw(torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed)
+        self.draw = RowDraw(
+            torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed
+        )
         self.reaction = None
         if react is not None:
-            self.reaction = Reaiming(settings_of(ReactSettings, react, where="learner.react"), seed)
+            self.reaction = Reaiming(
+                settings_of(ReactSettings, react, where="learner.react"), seed
+            )
         pool = TrafficPool.recorded(every)
-        self.synthesizer = AdversarialSynthesizer(pool, self.draw, traffic=traffic, ego=self._learning, reaction=self.reaction)
+        self.synthesizer = AdversarialSynthesizer(
+            pool, self.draw, traffic=traffic, ego=self._learning, reaction=self.reaction
+        )
         agents = traffic is not None or self.teacher is not None
         base = DrivingEnv(placed, sim, batch, device, agents=agents, hold=hold)
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
         actor = self._learning.network.actor
-        planning = actor if traffic is None else TensorDictSequential(EgoPlanner(self._learning, base), actor)
+        planning = (
+            actor
+            if traffic is None
+            else TensorDictSequential(EgoPlanner(self._learning, base), actor)
+        )
         self._collect_by(planning, device)
 
     def _collect_by(self, policy: TensorDictModuleBase, device: str) -> None:
@@ -174,22 +208,36 @@ class PolicyImprovement(Improvement):
         )
         self._batches = iter(self._collector)
 
-    def __call__(self, pool: TrafficPool, curriculum: CurriculumScheduler) -> tuple[dict[str, float], Episodes]:
-        """Reset every environment; `iterations` times: collect [B, steps] decisions, update. `frames` are steps of
-        0.1 s."""
+    def __call__(
+        self, pool: TrafficPool, curriculum: CurriculumScheduler
+    ) -> tuple[dict[str, float], Episodes]:
+        """Reset every environment; `iterations` times: collect [B, steps] decisions,
+        update. `frames` are steps of 0.1 s."""
         begin = time.perf_counter()
-        self._learning.network.set_weights(self.ego.network.weights())  # those of a checkpoint, in a resumed run
+        self._learning.network.set_weights(
+            self.ego.network.weights()
+        )  # those of a checkpoint, in a resumed run
         experts = {} if self.experts is None else self.experts.demonstrations(pool)
-        counts = {f"{kind}_demonstrations": float(len(found)) for kind, found in experts.items()}
+        counts = {
+            f"{kind}_demonstrations": float(len(found))
+            for kind, found in experts.items()
+        }
         counts["demonstrations"] = time.perf_counter() - begin
         self.synthesizer.pool = pool
-        self.draw.probability = pool.probabilities(curriculum.priority(), curriculum.fraction)
+        self.draw.probability = pool.probabilities(
+            curriculum.priority(), curriculum.fraction
+        )
         self._collector.reset()
         outcomes = []
         rows = []
         collecting = 0.0
         begun = self.frames
-        bar = Bar(range(self.settings.iterations), "collect and update", unit="batch", leave=False)
+        bar = Bar(
+            range(self.settings.iterations),
+            "collect and update",
+            unit="batch",
+            leave=False,
+        )
         for _ in bar:
             begin = time.perf_counter()
             data = self.collected()
@@ -198,9 +246,14 @@ class PolicyImprovement(Improvement):
             outcomes.append(data.select(*OUTCOME_KEYS).cpu().clone())
             labels, made = self._labels(data, pool.adversarial)
             rows.append(self.learner.update(data, [*experts.values()], labels) | made)
-            bar.set_postfix(reward=f"{data['next', 'reward'].mean().item():.3f}", kl=f"{rows[-1]['kl']:.4f}")
+            bar.set_postfix(
+                reward=f"{data['next', 'reward'].mean().item():.3f}",
+                kl=f"{rows[-1]['kl']:.4f}",
+            )
         self.ego.network.set_weights(self._learning.network.weights())
-        episodes = finished_episodes(outcomes, pool.adversarial, horizon=self.horizon, hold=self.settings.hold)
+        episodes = finished_episodes(
+            outcomes, pool.adversarial, horizon=self.horizon, hold=self.settings.hold
+        )
         if self.teacher is not None:
             episodes.survivable = self.teacher.survivable(len(pool))[episodes.row]
         counts |= {"frames": float(self.frames), "collect": collecting}
@@ -212,14 +265,19 @@ class PolicyImprovement(Improvement):
         self._collector.update_policy_weights_()
         return next(self._batches)
 
-    def _labels(self, data: TensorDictBase, adversarial: Tensor) -> tuple[TensorDictBase | None, dict[str, float]]:
+    def _labels(
+        self, data: TensorDictBase, adversarial: Tensor
+    ) -> tuple[TensorDictBase | None, dict[str, float]]:
         """The teacher's labels so far, those in a batch included, and what these were."""
         if self.teacher is None:
             return None, {}
         begin = time.perf_counter()
         count = -(-self.teacher.settings.states // self.settings.iterations)
         made = self.teacher.watch(data, adversarial, self._learning, count)
-        return self.teacher.labelled, {**made, "label_seconds": time.perf_counter() - begin}
+        return self.teacher.labelled, {
+            **made,
+            "label_seconds": time.perf_counter() - begin,
+        }
 
     def outcome(self, folder: Path) -> str:
         """How to evaluate the improved ego of a run's folder."""
@@ -227,9 +285,17 @@ class PolicyImprovement(Improvement):
 
     def state_dict(self) -> dict:
         """Learner, draws and frames; the weights are the network's."""
-        state = {"learner": self.learner.state_dict(), "frames": self.frames, "draws": self.draw.generator.get_state()}
+        state = {
+            "learner": self.learner.state_dict(),
+            "frames": self.frames,
+            "draws": self.draw.generator.get_state(),
+        }
         state |= {} if self.teacher is None else {"labels": self.teacher.state_dict()}
-        return state | ({} if self.reaction is None else {"reaction": self.reaction.generator.get_state()})
+        return state | (
+            {}
+            if self.reaction is None
+            else {"reaction": self.reaction.generator.get_state()}
+        )
 
     def load_state_dict(self, state: dict) -> None:
         self.learner.load_state_dict(state["learner"])

@@ -1,5 +1,5 @@
-"""Work beside this process, whose result is a file that it writes: in a forked process, or in a thread that waits for
-workers elsewhere."""
+"""Work beside this process, whose result is a file that it writes: in a forked process,
+or in a thread that waits for workers elsewhere."""
 
 import multiprocessing
 import os
@@ -19,23 +19,31 @@ from e2rl.run.processes import die_with_parent
 
 
 class Prefetch:
-    """`work()`, begun at once. A forked process sees what this one holds now; later changes of either are not the
-    other's."""
+    """`work()`, begun at once. A forked process sees what this one holds now; later
+    changes of either are not the other's."""
 
-    def __init__(self, work: Callable[[], None], name: str, forked: bool = True) -> None:
-        """name: of the work, in messages; forked: in a process with one thread, else in a thread of this process."""
+    def __init__(
+        self, work: Callable[[], None], name: str, forked: bool = True
+    ) -> None:
+        """name: of the work, in messages; forked: in a process with one thread, else in
+        a thread of this process."""
         context = multiprocessing.get_context("fork")
         self._name, (self._receiver, sender) = name, context.Pipe(duplex=False)
         for stream in filter(None, (sys.stdout, sys.stderr)):
             stream.flush()  # or the fork would write it once more
         start: Callable = context.Process if forked else Thread
-        self._worker = start(target=_run, args=(work, sender, os.getpid() if forked else None), daemon=True)
+        self._worker = start(
+            target=_run,
+            args=(work, sender, os.getpid() if forked else None),
+            daemon=True,
+        )
         self._worker.start()
         if forked:
             sender.close()
 
     def wait(self) -> float:
-        """Wait for the end; returns the seconds that the work took. Raises InputError if it failed or was killed."""
+        """Wait for the end; returns the seconds that the work took. Raises InputError
+        if it failed or was killed."""
         try:
             seconds, reason = self._receiver.recv()
         except EOFError:  # it died without a word
@@ -73,7 +81,11 @@ def why_no_prefetch(device: str, threads: int, ego: Ego, traffic: str) -> str:
         return "learner.round.traffic=live is not made beforehand"
     if not isinstance(ego, ActorEgo):
         return f"it hands over the weights of ego=actor, which {type(ego).__name__} has not"
-    if device != "cpu" or threads > 1 or "fork" not in multiprocessing.get_all_start_methods():
+    if (
+        device != "cpu"
+        or threads > 1
+        or "fork" not in multiprocessing.get_all_start_methods()
+    ):
         here = f"device={device}, threads={threads}, {sys.platform}"
         return f"it forks a process with one thread on the CPU; here are {here}"
     return ""

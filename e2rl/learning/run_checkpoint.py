@@ -1,8 +1,10 @@
-"""Checkpoints of an evolution run: all state that later rounds depend on, written atomically.
+"""Checkpoints of an evolution run: all state that later rounds depend on, written
+atomically.
 
-A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum, sampler, counters, generators,
-and which rounds are in memory, whose traffic stays in memory/ beside checkpoints/; read with weights_only) and
-actor.safetensors (weights and observation statistics; also what `ego.checkpoint` takes). It is sealed by the hashes of
+A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum,
+sampler, counters, generators, and which rounds are in memory, whose traffic stays in
+memory/ beside checkpoints/; read with weights_only) and actor.safetensors (weights and
+observation statistics; also what `ego.checkpoint` takes). It is sealed by the hashes of
 these files: a torn or altered one is noticed, and the one before it is used.
 """
 
@@ -27,8 +29,8 @@ FORMAT = "e2rl-checkpoint/9"
 
 
 def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:
-    """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last newest are kept, and of the memory
-    the files that these name."""
+    """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last
+    newest are kept, and of the memory the files that these name."""
     parent = Path(folder) / "checkpoints"
     target = parent / f"round-{run.round:06d}"
     with written_whole(target) as part:
@@ -38,9 +40,15 @@ def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:
     kept = [*older, newest][-max(1, keep_last) :]
     for old in set(older) - set(kept):
         shutil.rmtree(old)
-    whole = [load_plain(read_regular(each / STATE, within=each)) for each in kept if altered(each) is None]
+    whole = [
+        load_plain(read_regular(each / STATE, within=each))
+        for each in kept
+        if altered(each) is None
+    ]
     first = [entry["round"] for state in whole for entry in state["memory"]]
-    run.memory.prune(min(first, default=0))  # a file goes when no checkpoint names it any more
+    run.memory.prune(
+        min(first, default=0)
+    )  # a file goes when no checkpoint names it any more
     return target
 
 
@@ -56,9 +64,12 @@ def _write(folder: Path, run: Evolution) -> None:
 
 
 def checkpoints(path: str | Path) -> list[Path]:
-    """The checkpoint folders that `path` names, the oldest first: itself, or those of a run's folder."""
+    """The checkpoint folders that `path` names, the oldest first: itself, or those of a
+    run's folder."""
     path = Path(path)
-    return [path] if (path / STATE).is_file() else sorted(path.glob("checkpoints/round-*"))
+    return (
+        [path] if (path / STATE).is_file() else sorted(path.glob("checkpoints/round-*"))
+    )
 
 
 def rounds_done(path: str | Path | None) -> int:
@@ -68,10 +79,12 @@ def rounds_done(path: str | Path | None) -> int:
 
 
 def load_checkpoint(path: str | Path, run: Evolution) -> int:
-    """Restore a run built from the same configuration, generators last; returns the rounds done.
+    """Restore a run built from the same configuration, generators last; returns the
+    rounds done.
 
-    Of a run's folder it is the newest checkpoint that is whole; those that are not are named on stderr. Raises
-    InputError where none is, and for one of another configuration or version.
+    Of a run's folder it is the newest checkpoint that is whole; those that are not are
+    named on stderr. Raises InputError where none is, and for one of another
+    configuration or version.
     """
     damages = []
     for folder in reversed(checkpoints(path)):
@@ -88,17 +101,24 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
 
 
 def _whole(folder: Path, run: Evolution) -> dict:
-    """The state in a checkpoint, and its memory restored; InputError where either is damaged."""
+    """The state in a checkpoint, and its memory restored; InputError where either is
+    damaged."""
     file = folder / STATE
     if name := altered(folder):
-        raise InputError(f"{folder / name}: missing or damaged; resume from an older checkpoint")
+        raise InputError(
+            f"{folder / name}: missing or damaged; resume from an older checkpoint"
+        )
     try:
         state = load_plain(read_regular(file, within=folder))
         written = state["format"]
     except Exception as error:  # a stranger's pickle can raise any exception
-        raise InputError(f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint") from error
+        raise InputError(
+            f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint"
+        ) from error
     if written != FORMAT:
-        raise InputError(f"{file}: of another version of this program ({written}, not {FORMAT}); begin a new run")
+        raise InputError(
+            f"{file}: of another version of this program ({written}, not {FORMAT}); begin a new run"
+        )
     if wrong := misfit(state, {"memory": [{"round": int, "crc32": int}]}):
         raise InputError(f"{file}: damaged ({wrong}); resume from an older checkpoint")
     run.memory.restore(state["memory"])
@@ -114,13 +134,21 @@ def _restore(folder: Path, state: dict, run: Evolution) -> None:
         restore_generators(state["generators"])
     except InputError:
         raise
-    except (LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
+    except (
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        ArithmeticError,
+    ) as error:
         reason = f"its learner is of another kind or shape ({error}); resume with the configuration of its run"
         raise InputError(f"{folder / STATE}: {reason}") from None
 
 
 def generator_states() -> dict:
-    """States of the global generators of torch, CUDA, numpy and python, as plain values and tensors."""
+    """States of the global generators of torch, CUDA, numpy and python, as plain values
+    and tensors."""
     state = np.random.get_state()
     assert isinstance(state, tuple)  # the global generator is a Mersenne Twister
     name, keys, position, has_gauss, cached = state
@@ -138,6 +166,8 @@ def restore_generators(states: dict) -> None:
     if torch.cuda.is_available() and states["cuda"]:
         torch.cuda.set_rng_state_all(states["cuda"])
     name, keys, position, has_gauss, cached = states["numpy"]
-    np.random.set_state((name, np.array(keys, dtype=np.uint32), position, has_gauss, cached))
+    np.random.set_state(
+        (name, np.array(keys, dtype=np.uint32), position, has_gauss, cached)
+    )
     version, internal, gauss = states["python"]
     random.setstate((version, tuple(internal), gauss))

@@ -1,4 +1,5 @@
-"""The batch by Stable-Baselines3's interface, and its policies as modules (extra `gym`)."""
+"""The batch by Stable-Baselines3's interface, and its policies as modules (extra
+`gym`)."""
 
 from typing import Any
 
@@ -16,11 +17,14 @@ from e2rl.sim.observation import ELAPSED, OBSERVATION_SIZE
 
 
 class SB3Env(VecEnv):
-    """A DrivingVectorEnv as a VecEnv. Seed and options of the first environment are the batch's."""
+    """A DrivingVectorEnv as a VecEnv. Seed and options of the first environment are the
+    batch's."""
 
     def __init__(self, batch: DrivingVectorEnv) -> None:
         self.batch = batch
-        super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
+        super().__init__(
+            batch.num_envs, batch.single_observation_space, batch.single_action_space
+        )
 
     @property
     def autoreset_mode(self) -> Any:
@@ -28,7 +32,9 @@ class SB3Env(VecEnv):
         return self.batch.autoreset_mode
 
     def reset(self) -> np.ndarray:
-        observation, info = self.batch.reset(seed=self._seeds[0], options=self._options[0])
+        observation, info = self.batch.reset(
+            seed=self._seeds[0], options=self._options[0]
+        )
         self.reset_infos = [row_of(info, row) for row in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
@@ -44,7 +50,10 @@ class SB3Env(VecEnv):
         seen = info.pop("final_obs", observation)
         infos = [row_of(last if ended else info, row) for row, ended in enumerate(done)]
         for row in done.nonzero()[0]:
-            infos[row] |= {"terminal_observation": seen[row], "TimeLimit.truncated": not terminated[row]}
+            infos[row] |= {
+                "terminal_observation": seen[row],
+                "TimeLimit.truncated": not terminated[row],
+            }
         return observation, reward, done, infos
 
     def close(self) -> None:
@@ -63,7 +72,8 @@ class SB3Env(VecEnv):
 
 
 class Deterministic(nn.Module):
-    """What `model.predict(observation, deterministic=True)` returns for e2rl's observation, in m/s^2 and rad/s.
+    """What `model.predict(observation, deterministic=True)` returns for e2rl's
+    observation, in m/s^2 and rad/s.
 
     The statistics of every VecNormalize of its environment come along.
     """
@@ -75,19 +85,24 @@ class Deterministic(nn.Module):
             env: of a loaded model, its VecNormalize included; None: it had none.
 
         Raises:
-            InputError: another observation, action or normalisation than the model was trained with.
+            InputError: another observation, action or normalisation than the model was
+                trained with.
         """
         super().__init__()
         check_spaces(model)
         driving = driving_of(model, env)
         self.low = torch.tensor(driving["low"])
         self.high = torch.tensor(driving["high"])
-        self.policy = type(model.policy)(**model.policy._get_constructor_parameters())  # a copy on the CPU
+        self.policy = type(model.policy)(
+            **model.policy._get_constructor_parameters()
+        )  # a copy on the CPU
         self.policy.load_state_dict(model.policy.state_dict())
         trained_in = env if env is not None else model.get_env()
         self.normalisers = normalisers_of(trained_in)
         check_wrappers(trained_in)
-        in_training = trained_in is model.get_env() is not None and model._last_obs is not None
+        in_training = (
+            trained_in is model.get_env() is not None and model._last_obs is not None
+        )
         if not in_training:
             check_last_observation(model, self.normalisers, steps=driving["steps"])
 
@@ -99,14 +114,17 @@ class Deterministic(nn.Module):
 
 
 def check_spaces(model: BaseAlgorithm) -> None:
-    """Raises InputError where a model maps other numbers than e2rl's observation to two in [-1, 1]."""
+    """Raises InputError where a model maps other numbers than e2rl's observation to two
+    in [-1, 1]."""
     shape = model.observation_space.shape
     if shape != (OBSERVATION_SIZE,):
         raise InputError(
             f"the model observes {list(shape or ())} numbers, not the {OBSERVATION_SIZE} of a moment: as an ego it "
             "gets no stacked or added ones; train it without that wrapper"
         )
-    low, high = (np.asarray(getattr(model.action_space, name)) for name in ("low", "high"))
+    low, high = (
+        np.asarray(getattr(model.action_space, name)) for name in ("low", "high")
+    )
     if not ((low == -1).all() and (high == 1).all()):
         raise InputError(
             f"the model's actions lie in [{low.min():g}, {high.max():g}], those of e2rl in [-1, 1]: train it without "
@@ -144,7 +162,8 @@ def bounds_line(driving: Driving) -> str:
 
 
 def normalisers_of(env: VecEnv | None) -> list[tuple[Tensor, Tensor, float]]:
-    """Mean, scale and clip of each VecNormalize of an environment, the first that an observation meets first."""
+    """Mean, scale and clip of each VecNormalize of an environment, the first that an
+    observation meets first."""
     normalisers: list[tuple[Tensor, Tensor, float]] = []
     while isinstance(env, VecEnvWrapper):
         if isinstance(env, VecNormalize) and env.norm_obs:
@@ -157,18 +176,25 @@ def normalisers_of(env: VecEnv | None) -> list[tuple[Tensor, Tensor, float]]:
 
 
 def check_wrappers(env: VecEnv | None) -> None:
-    """Raises InputError where gymnasium's wrappers change observations or actions of an environment."""
+    """Raises InputError where gymnasium's wrappers change observations or actions of an
+    environment."""
     if env is None:
         return
-    if any(any(env.env_is_wrapped(kind)) for kind in (gymnasium.ObservationWrapper, TransformAction)):
+    if any(
+        any(env.env_is_wrapped(kind))
+        for kind in (gymnasium.ObservationWrapper, TransformAction)
+    ):
         raise InputError(
             "a wrapper of gymnasium changes the model's observations or actions, and the policy's file would not have "
             "it: normalise by VecNormalize of Stable-Baselines3, which is saved, or pass a module of the whole map"
         )
 
 
-def check_last_observation(model: BaseAlgorithm, normalisers: list[tuple[Tensor, Tensor, float]], steps: int) -> None:
-    """Raises InputError where the last observation that a model holds was not normalised by these.
+def check_last_observation(
+    model: BaseAlgorithm, normalisers: list[tuple[Tensor, Tensor, float]], steps: int
+) -> None:
+    """Raises InputError where the last observation that a model holds was not
+    normalised by these.
 
     Undone, it has e2rl's elapsed fraction of the episode: one of k / steps.
     """
@@ -179,13 +205,19 @@ def check_last_observation(model: BaseAlgorithm, normalisers: list[tuple[Tensor,
             "a model that was loaded with an environment does not tell whether it was trained under VecNormalize: load "
             "it without one, and pass the VecNormalize, if it had any: save_policy(PPO.load(FILE), POLICY, env=ENV)"
         )
-    elapsed = torch.as_tensor(np.asarray(model._last_obs), dtype=torch.float64)[:, ELAPSED]
+    elapsed = torch.as_tensor(np.asarray(model._last_obs), dtype=torch.float64)[
+        :, ELAPSED
+    ]
     for mean, scale, _ in reversed(normalisers):
         elapsed = elapsed * scale[ELAPSED] + mean[ELAPSED]
     step = elapsed * steps
     whole = (step - step.round()).abs() < 0.01
     if not bool((whole & (step > -0.5) & (step < steps + 0.5)).all()):
-        missing = "with other statistics than those of env" if normalisers else "with normalised observations"
+        missing = (
+            "with other statistics than those of env"
+            if normalisers
+            else "with normalised observations"
+        )
         raise InputError(
             f"the model was trained {missing}: pass the VecNormalize that was saved with it, "
             "env=VecNormalize.load(FILE, e2rl.make_sb3_env(1))"

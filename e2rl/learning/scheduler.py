@@ -1,10 +1,12 @@
-"""The extension point for curricula: intensity, causal template, fraction of adversarial episodes, scene priorities.
+"""The extension point for curricula: intensity, causal template, fraction of
+adversarial episodes, scene priorities.
 
-Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay (Jiang et al. 2021). What is ranked
-is the regret p s: p is the recent failure rate of the ego in a scene's adversarial traffic, s the fraction of its
-critical moments that a teacher would survive, who knows no more than the ego does. Without a teacher, s = 1 - p: that
-is the learnability of Rutherford et al. ("No Regrets", 2024). It is 0 for a scene that is solved and for one that is
-hopeless.
+Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay
+(Jiang et al. 2021). What is ranked is the regret p s: p is the recent failure rate of
+the ego in a scene's adversarial traffic, s the fraction of its critical moments that a
+teacher would survive, who knows no more than the ego does. Without a teacher, s = 1 -
+p: that is the learnability of Rutherford et al. ("No Regrets", 2024). It is 0 for a
+scene that is solved and for one that is hopeless.
 """
 
 from collections.abc import Mapping
@@ -19,9 +21,21 @@ from e2rl.run.settings import check_range, configured
 from e2rl.traffic.traffic import FULL, TEMPLATES
 
 Choice = dict[str, int | float | str]  # a row of the table, by COLUMNS
-COLUMNS = ("round", "eta", "template", "draws", "left_out", "episodes", "failures", "failure_rate", "value")
+COLUMNS = (
+    "round",
+    "eta",
+    "template",
+    "draws",
+    "left_out",
+    "episodes",
+    "failures",
+    "failure_rate",
+    "value",
+)
 TEMPERATURE = 2.0  # of the ranks of regret: at 2 the first tenth of the scenes has a quarter of the draws
-STALENESS = 0.2  # fraction of the draws that goes by the rounds since a scene was last drawn
+STALENESS = (
+    0.2  # fraction of the draws that goes by the rounds since a scene was last drawn
+)
 SMOOTHING = 0.3  # weight of a round in a scene's moving failure rate
 BIN = 0.5  # intensities are counted under multiples of it
 
@@ -30,9 +44,10 @@ BIN = 0.5  # intensities are counted under multiples of it
 class Outcomes:
     """What became of the S attacks of a round.
 
-    eta [S]; template [S] int64; left_out [S] bool: no driver avoids it, so it did not enter D'; episodes [S] int64: how
-    many the learning policy drove in it; failures [S] int64: how many of these ended by contact or off the road;
-    survivable [S]: the share of its critical moments that the teacher would survive, NaN where none tells.
+    eta [S]; template [S] int64; left_out [S] bool: no driver avoids it, so it did not
+    enter D'; episodes [S] int64: how many the learning policy drove in it; failures [S]
+    int64: how many of these ended by contact or off the road; survivable [S]: the share
+    of its critical moments that the teacher would survive, NaN where none tells.
     """
 
     eta: Tensor
@@ -44,12 +59,18 @@ class Outcomes:
 
 
 def outcomes_of(
-    eta: Tensor, template: Tensor, drawn: Tensor, row: Tensor, failed: Tensor, survivable: Tensor
+    eta: Tensor,
+    template: Tensor,
+    drawn: Tensor,
+    row: Tensor,
+    failed: Tensor,
+    survivable: Tensor,
 ) -> Outcomes:
-    """Returns the Outcomes of attacks [S], of episodes [E] in rows `row` of the pool that failed or not, and were
-    survivable [E] in part.
+    """Returns the Outcomes of attacks [S], of episodes [E] in rows `row` of the pool
+    that failed or not, and were survivable [E] in part.
 
-    drawn [K] int64: the attack of each of the pool's first K rows; episodes in other rows do not count.
+    drawn [K] int64: the attack of each of the pool's first K rows; episodes in other
+    rows do not count.
     """
     count = len(eta)
     known = row < len(drawn)
@@ -57,42 +78,74 @@ def outcomes_of(
     failed = failed[known]
     told = survivable[known]
     left_out = torch.ones(count, dtype=torch.bool).index_fill(0, drawn, False)
-    episodes, failures = (torch.bincount(each, minlength=count) for each in (attack, attack[failed]))
-    share = torch.full((count,), torch.nan).index_copy(0, attack, told)  # the same in all episodes of a row
-    return Outcomes(eta, template, left_out=left_out, episodes=episodes, failures=failures, survivable=share)
+    episodes, failures = (
+        torch.bincount(each, minlength=count) for each in (attack, attack[failed])
+    )
+    share = torch.full((count,), torch.nan).index_copy(
+        0, attack, told
+    )  # the same in all episodes of a row
+    return Outcomes(
+        eta,
+        template,
+        left_out=left_out,
+        episodes=episodes,
+        failures=failures,
+        survivable=share,
+    )
 
 
-def tally(number: int, level: Tensor, outcomes: Outcomes, value: Mapping[tuple[float, str], float]) -> list[Choice]:
-    """The table of round `number`: a row for each intensity and causal template that was drawn or has a value.
+def tally(
+    number: int,
+    level: Tensor,
+    outcomes: Outcomes,
+    value: Mapping[tuple[float, str], float],
+) -> list[Choice]:
+    """The table of round `number`: a row for each intensity and causal template that
+    was drawn or has a value.
 
-    level [S]: the intensity under which each attack is counted; value: what the curriculum expects to learn from each
-    (eta, template), {} where it does not estimate this. Unknown numbers are NaN.
+    level [S]: the intensity under which each attack is counted; value: what the
+    curriculum expects to learn from each (eta, template), {} where it does not estimate
+    this. Unknown numbers are NaN.
     """
     arms = [
-        (round(eta, 4), TEMPLATES[code]) for eta, code in zip(level.tolist(), outcomes.template.tolist(), strict=True)
+        (round(eta, 4), TEMPLATES[code])
+        for eta, code in zip(level.tolist(), outcomes.template.tolist(), strict=True)
     ]
     value = {(round(eta, 4), name): number for (eta, name), number in value.items()}
     rows: list[Choice] = []
-    for arm in sorted({*arms, *value}, key=lambda each: (TEMPLATES.index(each[1]), each[0])):
+    for arm in sorted(
+        {*arms, *value}, key=lambda each: (TEMPLATES.index(each[1]), each[0])
+    ):
         of_arm = torch.tensor([each == arm for each in arms], dtype=torch.bool)
         draws = int(of_arm.sum())
         left_out = int(outcomes.left_out[of_arm].sum())
-        episodes, failures = (int(each[of_arm].sum()) for each in (outcomes.episodes, outcomes.failures))
+        episodes, failures = (
+            int(each[of_arm].sum()) for each in (outcomes.episodes, outcomes.failures)
+        )
         rate = failures / episodes if episodes else float("nan")
-        numbers = (draws, left_out, episodes, failures, rate, value.get(arm, float("nan")))
+        numbers = (
+            draws,
+            left_out,
+            episodes,
+            failures,
+            rate,
+            value.get(arm, float("nan")),
+        )
         rows.append(dict(zip(COLUMNS, (number, *arm, *numbers), strict=True)))
     return rows
 
 
 @configured("curriculum/adaptive")
 class CurriculumScheduler(Extension):
-    """State over S scenes. Per round: `draw` scenes and `choices` for them, read `fraction`, then `learn` from the
-    outcomes and `advance`.
+    """State over S scenes. Per round: `draw` scenes and `choices` for them, read
+    `fraction`, then `learn` from the outcomes and `advance`.
 
-    A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and a YAML file in conf/curriculum
-    with its `_target_` and settings. It overrides `etas` where the scenes of a round differ in intensity, `choices` and
-    `templates` where they differ in causal template as well. Its constructor takes its own settings by name and hands
-    on the others, `def __init__(self, *run, stairs, **scenes): super().__init__(*run, **scenes)`.
+    A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and
+    a YAML file in conf/curriculum with its `_target_` and settings. It overrides `etas`
+    where the scenes of a round differ in intensity, `choices` and `templates` where
+    they differ in causal template as well. Its constructor takes its own settings by
+    name and hands on the others, `def __init__(self, *run, stairs, **scenes):
+    super().__init__(*run, **scenes)`.
 
     Args:
         rounds: of the whole run.
@@ -102,10 +155,19 @@ class CurriculumScheduler(Extension):
     eta: float  # adversarial intensity of this round
     fraction: float  # of this round's episodes that are in adversarial traffic
     templates: tuple[str, ...] = (TEMPLATES[FULL],)
-    lasting: tuple[str, ...] = ()  # names of a subclass's attributes (numbers and tensors) that checkpoints hold
+    lasting: tuple[
+        str, ...
+    ] = ()  # names of a subclass's attributes (numbers and tensors) that checkpoints hold
 
     def __init__(
-        self, num_scenes: int, rounds: int, seed: int = 0, *, prioritised: bool, regret: bool, solvable_only: bool
+        self,
+        num_scenes: int,
+        rounds: int,
+        seed: int = 0,
+        *,
+        prioritised: bool,
+        regret: bool,
+        solvable_only: bool,
     ) -> None:
         if num_scenes < 1:
             raise InputError("curriculum: no scenes; check data.path and data.split")
@@ -124,89 +186,129 @@ class CurriculumScheduler(Extension):
         return torch.full((len(scenes),), float(self.eta))
 
     def choices(self, scenes: Tensor) -> tuple[Tensor, Tensor]:
-        """Intensities [S] and causal templates [S] int64 for this round's scenes [S]; by default `etas`, full for
-        all."""
+        """Intensities [S] and causal templates [S] int64 for this round's scenes [S];
+        by default `etas`, full for all."""
         return self.etas(scenes), torch.full((len(scenes),), FULL)
 
-    def around(self, count: int, spread: float, low: float = 0.0, high: float = float("inf")) -> Tensor:
-        """Intensities [count] drawn uniformly from [eta - spread, eta + spread], cut at `low` and `high`."""
+    def around(
+        self, count: int, spread: float, low: float = 0.0, high: float = float("inf")
+    ) -> Tensor:
+        """Intensities [count] drawn uniformly from [eta - spread, eta + spread], cut at
+        `low` and `high`."""
         first = max(self.eta - spread, low)
         last = min(self.eta + spread, high)
         return first + (last - first) * torch.rand(count, generator=self._generator)
 
     def regret(self) -> Tensor:
-        """p s [S] of the recent failure rate p and the fraction s of what the teacher would survive, 1 - p where that
-        is unknown; NaN for scenes never driven in adversarial traffic."""
-        return self._failing * torch.where(self._survivable.isnan(), 1 - self._failing, self._survivable)
+        """p s [S] of the recent failure rate p and the fraction s of what the teacher
+        would survive, 1 - p where that is unknown; NaN for scenes never driven in
+        adversarial traffic."""
+        return self._failing * torch.where(
+            self._survivable.isnan(), 1 - self._failing, self._survivable
+        )
 
     def priority(self) -> Tensor:
-        """Probability [S] with which scenes are drawn: 1 - STALENESS of it by rank of regret, scenes not yet driven in
-        adversarial traffic first, the rest by the rounds since they were last drawn."""
+        """Probability [S] with which scenes are drawn: 1 - STALENESS of it by rank of
+        regret, scenes not yet driven in adversarial traffic first, the rest by the
+        rounds since they were last drawn."""
         count = len(self._failing)
         if not self.prioritised:
             return torch.full((count,), 1 / count)
-        weight = (1 / ranks(self.regret().nan_to_num(nan=torch.inf))) ** (1 / TEMPERATURE)
+        weight = (1 / ranks(self.regret().nan_to_num(nan=torch.inf))) ** (
+            1 / TEMPERATURE
+        )
         age = (self.round - self._drawn).float()
         old = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
         return (1 - STALENESS) * weight / weight.sum() + STALENESS * old
 
     def draw(self, count: int) -> Tensor:
-        """Scenes [count] to synthesize for: each scene count // S times, the rest by priority without replacement."""
+        """Scenes [count] to synthesize for: each scene count // S times, the rest by
+        priority without replacement."""
         total = len(self._failing)
         check_range("learner.round.scenes", count, low=1)
         chosen = torch.arange(total).repeat(count // total)
         if count % total:
-            rest = torch.multinomial(self.priority().double(), count % total, generator=self._generator)
+            rest = torch.multinomial(
+                self.priority().double(), count % total, generator=self._generator
+            )
             chosen = torch.cat([chosen, rest])
         self._drawn[chosen] = self.round
         return chosen
 
-    def update(self, scene_index: Tensor, failed: Tensor, adversarial: Tensor, survivable: Tensor) -> None:
-        """Update with episodes [E]: scene, whether the ego failed, whether the traffic was adversarial, and the
-        fraction of its row's critical moments that the teacher would survive (NaN: unknown)."""
+    def update(
+        self,
+        scene_index: Tensor,
+        failed: Tensor,
+        adversarial: Tensor,
+        survivable: Tensor,
+    ) -> None:
+        """Update with episodes [E]: scene, whether the ego failed, whether the traffic
+        was adversarial, and the fraction of its row's critical moments that the teacher
+        would survive (NaN: unknown)."""
         scene_index = scene_index.cpu()
         adversarial = adversarial.cpu()
         told = adversarial & ~survivable.isnan() & self._teacher_tells
-        for known, value, of in ((self._failing, failed.float(), adversarial), (self._survivable, survivable, told)):
+        for known, value, of in (
+            (self._failing, failed.float(), adversarial),
+            (self._survivable, survivable, told),
+        ):
             scenes, inverse = scene_index[of].unique(return_inverse=True)
             total = torch.zeros(len(scenes)).index_add(0, inverse, value.cpu()[of])
             mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
             before = known[scenes]
-            known[scenes] = torch.where(before.isnan(), mean, before + SMOOTHING * (mean - before))
+            known[scenes] = torch.where(
+                before.isnan(), mean, before + SMOOTHING * (mean - before)
+            )
 
     def observe(self, outcomes: Outcomes) -> None:
         """Learn from what became of the round's attacks; by default nothing."""
 
     def level(self, eta: Tensor) -> Tensor:
-        """The intensities [S] under which those of attacks [S] are counted in curriculum.csv: multiples of BIN."""
+        """The intensities [S] under which those of attacks [S] are counted in
+        curriculum.csv: multiples of BIN."""
         return (eta / BIN).round() * BIN
 
     def values(self) -> dict[tuple[float, str], float]:
-        """What is expected to be learned from attacks by (eta, template), where the curriculum estimates it."""
+        """What is expected to be learned from attacks by (eta, template), where the
+        curriculum estimates it."""
         return {}
 
     def leave_out(self, scene_index: Tensor) -> None:
-        """Mark scenes whose adversarial traffic was left out because no driver survives it. They count as solved until
-        they are driven; otherwise they would come first in every draw."""
+        """Mark scenes whose adversarial traffic was left out because no driver survives
+        it. They count as solved until they are driven; otherwise they would come first
+        in every draw."""
         scene_index = scene_index.cpu()
         self._failing[scene_index] = self._failing[scene_index].nan_to_num(nan=0.0)
 
     def advance(self, collision_rate: float | None = None) -> None:
-        """Advance to the next round. collision_rate: the ego's in this round's adversarial traffic."""
+        """Advance to the next round. collision_rate: the ego's in this round's
+        adversarial traffic."""
         self.round += 1
 
     def summary(self) -> dict[str, float]:
         """Metrics to log."""
         regret = self.regret()
         seen = ~self._failing.isnan()
-        result = {"eta": self.eta, "fraction": self.fraction, "scenes_seen": seen.float().mean().item()}
+        result = {
+            "eta": self.eta,
+            "fraction": self.fraction,
+            "scenes_seen": seen.float().mean().item(),
+        }
         return result | ({"regret": regret[seen].mean().item()} if seen.any() else {})
 
     def state_dict(self) -> dict:
         """All state."""
         own = {name: getattr(self, name) for name in self.lasting}
-        scenes = {"failing": self._failing, "survivable": self._survivable, "drawn": self._drawn}
-        return scenes | {"round": self.round, "generator": self._generator.get_state(), "own": own}
+        scenes = {
+            "failing": self._failing,
+            "survivable": self._survivable,
+            "drawn": self._drawn,
+        }
+        return scenes | {
+            "round": self.round,
+            "generator": self._generator.get_state(),
+            "own": own,
+        }
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`; raises InputError if the number of scenes differs."""
@@ -225,7 +327,8 @@ class CurriculumScheduler(Extension):
 
 
 def ranks(value: Tensor) -> Tensor:
-    """Ranks [S] of values [S], 1 for the largest; equal values share the mean of their ranks."""
+    """Ranks [S] of values [S], 1 for the largest; equal values share the mean of their
+    ranks."""
     _, inverse, count = value.unique(return_inverse=True, return_counts=True)
     above = count.flip(0).cumsum(0).flip(0) - count
     return (above + (count + 1) / 2)[inverse]

@@ -1,4 +1,5 @@
-"""Curricula that follow a plan: constant, linear as in CAT (Zhang et al. 2023), and adaptive to a target band."""
+"""Curricula that follow a plan: constant, linear as in CAT (Zhang et al. 2023), and
+adaptive to a target band."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,26 +13,33 @@ from e2rl.run.settings import check_range, configured
 
 @configured("curriculum/constant")
 class ConstantCurriculum(CurriculumScheduler):
-    """Intensity and fraction never change: the control experiment. Settings: conf/curriculum/constant.yaml."""
+    """Intensity and fraction never change: the control experiment. Settings:
+    conf/curriculum/constant.yaml."""
 
-    def __init__(self, *run: int, eta: float | Sequence[float], fraction: float, **scenes: Any) -> None:
+    def __init__(
+        self, *run: int, eta: float | Sequence[float], fraction: float, **scenes: Any
+    ) -> None:
         super().__init__(*run, **scenes)
         check_range("curriculum.fraction", fraction, low=0, high=1)
-        self._cycle = torch.tensor([eta] if isinstance(eta, int | float) else list(eta), dtype=torch.float32)
+        self._cycle = torch.tensor(
+            [eta] if isinstance(eta, int | float) else list(eta), dtype=torch.float32
+        )
         check_range("curriculum.eta: intensities", len(self._cycle), low=1)
         check_range("curriculum.eta", float(self._cycle.min()), low=0)
         self.eta = self._cycle.mean().item()
         self.fraction = fraction
 
     def etas(self, scenes: Tensor) -> Tensor:
-        """The intensities in turn; a scene in the same place has the next one in the next round."""
+        """The intensities in turn; a scene in the same place has the next one in the
+        next round."""
         return self._cycle[(torch.arange(len(scenes)) + self.round) % len(self._cycle)]
 
 
 @configured("curriculum/linear")
 class LinearCurriculum(CurriculumScheduler):
-    """Intensity and fraction rise from the first round's values to the final ones, which are reached after `ramp` of
-    the rounds. Settings: conf/curriculum/linear.yaml."""
+    """Intensity and fraction rise from the first round's values to the final ones,
+    which are reached after `ramp` of the rounds. Settings: conf/curriculum/linear.yaml.
+    """
 
     def __init__(
         self,
@@ -54,7 +62,9 @@ class LinearCurriculum(CurriculumScheduler):
         self._spread = spread
 
     def _between(self, first: float, last: float) -> float:
-        return first + min(1.0, self.round / max(1.0, self._ramp * self.rounds)) * (last - first)
+        return first + min(1.0, self.round / max(1.0, self._ramp * self.rounds)) * (
+            last - first
+        )
 
     @property
     def eta(self) -> float:  # type: ignore[override]
@@ -73,8 +83,8 @@ class LinearCurriculum(CurriculumScheduler):
 
 @configured("curriculum/adaptive")
 class AdaptiveCurriculum(CurriculumScheduler):
-    """The intensity rises by eta_step a round below the target band of collision rates, and falls by it above.
-    Settings: conf/curriculum/adaptive.yaml."""
+    """The intensity rises by eta_step a round below the target band of collision rates,
+    and falls by it above. Settings: conf/curriculum/adaptive.yaml."""
 
     lasting = ("eta",)
 
@@ -112,5 +122,7 @@ class AdaptiveCurriculum(CurriculumScheduler):
         super().advance(collision_rate)
         if collision_rate is not None:
             low, high = self._band
-            moved = self.eta + self._step * ((collision_rate < low) - (collision_rate > high))
+            moved = self.eta + self._step * (
+                (collision_rate < low) - (collision_rate > high)
+            )
             self.eta = min(max(moved, self._bounds[0]), self._bounds[1])

@@ -1,5 +1,6 @@
-"""Supervised training for the stages imitation, bits and prior: turns of optimiser steps, each followed by a
-validation; the weights of the lowest held-out loss are chosen; an interrupted training goes on exactly."""
+"""Supervised training for the stages imitation, bits and prior: turns of optimiser
+steps, each followed by a validation; the weights of the lowest held-out loss are
+chosen; an interrupted training goes on exactly."""
 
 import math
 from abc import ABC, abstractmethod
@@ -19,12 +20,16 @@ from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.settings import Settings, settings_of
 from e2rl.run.terminal import Bar
 
-STATE, PROGRESS = "turns", ("history", "best", "chosen")  # a part of the run; what it holds of a training
+STATE, PROGRESS = (
+    "turns",
+    ("history", "best", "chosen"),
+)  # a part of the run; what it holds of a training
 MAX_GRAD_NORM = 1.0
 
 
 def stage_settings(config: DictConfig, kind: type[Settings]) -> Settings:
-    """Returns the settings of the stage that a configuration has chosen, with the run's seed."""
+    """Returns the settings of the stage that a configuration has chosen, with the run's
+    seed."""
     own = {key: value for key, value in resolved(config.stage).items() if key != "name"}
     return settings_of(kind, own | {"seed": config.seed}, where="stage")
 
@@ -32,8 +37,8 @@ def stage_settings(config: DictConfig, kind: type[Settings]) -> Settings:
 class Supervised(ABC):
     """A training in turns. A subclass defines `turn`, and its own part of the state.
 
-    history: one row a turn; best: the row of the turn with the lowest held-out loss, of the last one where nothing is
-    held out; chosen: the weights after it.
+    history: one row a turn; best: the row of the turn with the lowest held-out loss, of
+    the last one where nothing is held out; chosen: the weights after it.
     """
 
     def __init__(self) -> None:
@@ -44,7 +49,8 @@ class Supervised(ABC):
 
     @abstractmethod
     def turn(self) -> dict[str, float]:
-        """Train for a turn; returns losses, `held_out_loss` among them (NaN: nothing is held out)."""
+        """Train for a turn; returns losses, `held_out_loss` among them (NaN: nothing is
+        held out)."""
 
     @abstractmethod
     def weights(self) -> dict[str, Tensor]:
@@ -55,9 +61,15 @@ class Supervised(ABC):
         """Take weights that were chosen."""
 
     def fit(
-        self, name: str, turns: int, parts: Parts = NO_PARTS, about: Any = None, logger: RunLogger | None = None
+        self,
+        name: str,
+        turns: int,
+        parts: Parts = NO_PARTS,
+        about: Any = None,
+        logger: RunLogger | None = None,
     ) -> dict[str, float]:
-        """Do the turns that are missing and take the chosen weights; returns the row of their turn.
+        """Do the turns that are missing and take the chosen weights; returns the row of
+        their turn.
 
         Args:
             name: of the training.
@@ -70,25 +82,38 @@ class Supervised(ABC):
         begun = len(self.history)
         if logger is not None and self.writes:
             logger.forget(begun)
-        for number in (bar := Bar(range(begun, turns), name, turns, initial=begun, unit="turn")):
+        for number in (
+            bar := Bar(range(begun, turns), name, turns, initial=begun, unit="turn")
+        ):
             row = self.turn()
-            if self.best is None or not row["held_out_loss"] >= self.best["held_out_loss"]:
+            if (
+                self.best is None
+                or not row["held_out_loss"] >= self.best["held_out_loss"]
+            ):
                 self.best = row | {"turn": float(number)}
-                self.chosen = {key: value.detach().clone() for key, value in self.weights().items()}
+                self.chosen = {
+                    key: value.detach().clone() for key, value in self.weights().items()
+                }
             self.history.append(row)
             bar.set_postfix({key: f"{value:.3f}" for key, value in row.items()})
             state = self.state_dict()
             if self.writes:
                 parts.save(STATE, about, state)
                 if logger is not None:
-                    logger.log({f"train/{name}_{key}": value for key, value in row.items()}, number)
+                    logger.log(
+                        {f"train/{name}_{key}": value for key, value in row.items()},
+                        number,
+                    )
         assert self.best is not None
         self.set_weights(self.chosen)
         return self.best
 
     def state_dict(self) -> dict:
         """All that later turns depend on, the global generators included."""
-        return {"generators": generator_states(), **{name: getattr(self, name) for name in PROGRESS}}
+        return {
+            "generators": generator_states(),
+            **{name: getattr(self, name) for name in PROGRESS},
+        }
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
@@ -98,13 +123,20 @@ class Supervised(ABC):
 
 
 class Epochs(Supervised):
-    """Turns are passes over rows [M] of `data` in random order; scenes are held out by `scene_index` [M]."""
+    """Turns are passes over rows [M] of `data` in random order; scenes are held out by
+    `scene_index` [M]."""
 
     def __init__(
-        self, network: Any, data: TensorDictBase, settings: Any, parameters: nn.Module, weight_decay: float
+        self,
+        network: Any,
+        data: TensorDictBase,
+        settings: Any,
+        parameters: nn.Module,
+        weight_decay: float,
     ) -> None:
-        """network: with `device` and `normaliser`; settings: minibatch, learning_rate, held_out and seed; parameters:
-        the module whose parameters are trained. Raises InputError where no scene is left to train on."""
+        """network: with `device` and `normaliser`; settings: minibatch, learning_rate,
+        held_out and seed; parameters: the module whose parameters are trained. Raises
+        InputError where no scene is left to train on."""
         super().__init__()
         self.network = network
         self.settings = settings
@@ -113,12 +145,22 @@ class Epochs(Supervised):
         scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]
         count = max(round(settings.held_out * len(scenes)), int(settings.held_out > 0))
         if count == len(scenes):
-            reason = "of one scene none can be held out" if count == 1 else "no scene is left to train on"
-            raise InputError(f"stage.held_out={settings.held_out:g}: {reason}; pass more, or set it to 0")
+            reason = (
+                "of one scene none can be held out"
+                if count == 1
+                else "no scene is left to train on"
+            )
+            raise InputError(
+                f"stage.held_out={settings.held_out:g}: {reason}; pass more, or set it to 0"
+            )
         apart = torch.isin(data["scene_index"], scenes[:count])
-        self.train, self.held_out = (data[rows].to(network.device) for rows in (~apart, apart))
+        self.train, self.held_out = (
+            data[rows].to(network.device) for rows in (~apart, apart)
+        )
         network.normaliser.observe(self.train["observation"])
-        self.optimiser = torch.optim.AdamW(parameters.parameters(), settings.learning_rate, weight_decay=weight_decay)
+        self.optimiser = torch.optim.AdamW(
+            parameters.parameters(), settings.learning_rate, weight_decay=weight_decay
+        )
 
     @abstractmethod
     def loss(self, batch: TensorDictBase) -> Tensor:
@@ -129,14 +171,19 @@ class Epochs(Supervised):
         """The mean losses of data, which has rows, `loss` among them."""
 
     def turn(self) -> dict[str, float]:
-        """One pass over the training rows; returns the mean of its losses, and the held-out ones."""
-        order = torch.randperm(len(self.train), generator=self._generator).to(self.train.device)
+        """One pass over the training rows; returns the mean of its losses, and the
+        held-out ones."""
+        order = torch.randperm(len(self.train), generator=self._generator).to(
+            self.train.device
+        )
         seen = []
         for index in order.split(self.settings.minibatch):
             loss = self.loss(self.train[index])
             self.step(loss)
             seen.append(loss.detach())
-        measured = self.measure(self.held_out) if len(self.held_out) else {"loss": math.nan}
+        measured = (
+            self.measure(self.held_out) if len(self.held_out) else {"loss": math.nan}
+        )
         held_out = {f"held_out_{name}": value for name, value in measured.items()}
         return {"loss": torch.stack(seen).mean().item(), **held_out}
 
@@ -145,7 +192,10 @@ class Epochs(Supervised):
         take_step(self.optimiser, loss, max_grad_norm=MAX_GRAD_NORM)
 
     def state_dict(self) -> dict:
-        own = {"optimiser": self.optimiser.state_dict(), "order": self._generator.get_state()}
+        own = {
+            "optimiser": self.optimiser.state_dict(),
+            "order": self._generator.get_state(),
+        }
         return super().state_dict() | own | {"weights": dict(self.weights())}
 
     def load_state_dict(self, state: dict) -> None:
@@ -156,12 +206,19 @@ class Epochs(Supervised):
         self._generator.set_state(state["order"])
 
 
-def take_step(optimiser: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float) -> None:
-    """One step down the gradient of `loss`, its norm clipped; raises InputError if the loss is not finite."""
+def take_step(
+    optimiser: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float
+) -> None:
+    """One step down the gradient of `loss`, its norm clipped; raises InputError if the
+    loss is not finite."""
     if not torch.isfinite(loss):
-        raise InputError("learner: the loss is not finite; lower the learning_rate or check the observations")
+        raise InputError(
+            "learner: the loss is not finite; lower the learning_rate or check the observations"
+        )
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    parameters = [value for group in optimiser.param_groups for value in group["params"]]
+    parameters = [
+        value for group in optimiser.param_groups for value in group["params"]
+    ]
     torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm)
     optimiser.step()

@@ -1,4 +1,5 @@
-"""Verdicts, metrics and statistics of rollouts. The files imported here declare the package's own metrics."""
+"""Verdicts, metrics and statistics of rollouts. The files imported here declare the
+package's own metrics."""
 
 from e2rl.metrics import (  # noqa: F401
     contact,

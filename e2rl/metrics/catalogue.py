@@ -1,6 +1,7 @@
 """What a metric is, and the list of all that are declared.
 
-A metric is declared beside the function that computes it, by `columns`, or in any module by one call of `register`.
+A metric is declared beside the function that computes it, by `columns`, or in any
+module by one call of `register`.
 """
 
 import math
@@ -18,7 +19,8 @@ Compute = Callable[[Batch], Tensor | Batch]
 class Metric:
     """What a metric is, how it is averaged over rollouts, and how it is printed.
 
-    It is the mean of its column over the rollouts that know it (that are not NaN), unless other fields say otherwise.
+    It is the mean of its column over the rollouts that know it (that are not NaN),
+    unless other fields say otherwise.
     """
 
     name: str
@@ -33,7 +35,9 @@ class Metric:
     places: int = 0  # of a column of labels: expected number of labels at so many places, instead of the mean
     samples: str = ""  # of a metric that `metrics.realism` computes from pooled samples: those that it needs
     per_collision: bool = False  # known for collisions only: paired differences compare each group's own collisions
-    cost: bool = False  # of the computation: a difference in it is not marked as significant
+    cost: bool = (
+        False  # of the computation: a difference in it is not marked as significant
+    )
     event: bool = False  # happens to the ego in a rollout or not; of a search: in a scene, in any of its tries
     raised: float = math.nan  # value of a rollout in which the planner raised (`metrics.errored`); NaN: it knows none
     tables: str = ""  # closed-loop tables (`metrics=...` of evaluate.py) that show it, such as "main egos"; or new ones
@@ -46,22 +50,63 @@ class Metric:
 
 rate = partial(Metric, fraction=True)  # a metric in [0, 1]
 event = partial(rate, event=True)
-TABLES = ("main", "traffic", "adversaries", "methods", "egos", "public")  # of the package
+TABLES = (
+    "main",
+    "traffic",
+    "adversaries",
+    "methods",
+    "egos",
+    "public",
+)  # of the package
 ORDER = (  # of columns in every table (docs/method.md, section 10); others follow as they are declared
-    *("cfr", "cfr_preventable", "cfr_clean", "cfr_counted", "errored", "cfr_adv", "cfr_vru"),
+    *(
+        "cfr",
+        "cfr_preventable",
+        "cfr_clean",
+        "cfr_counted",
+        "errored",
+        "cfr_adv",
+        "cfr_vru",
+    ),
     *("cfr_object", "cfr_bg", "avoidable"),
     *("front", "side", "rear", "rir", "preventable", "counted", "at_fault"),
     *("relvel", "contact_time", "min_dtc", "ttc_c", "macc", "progress"),
-    *("aor_step", "aor_any", "real", "real_adv", "real_norm", "transport", "seconds_per_rollout", "nfe"),
+    *(
+        "aor_step",
+        "aor_any",
+        "real",
+        "real_adv",
+        "real_norm",
+        "transport",
+        "seconds_per_rollout",
+        "nfe",
+    ),
 )
 METRICS: dict[str, Metric] = {}  # of rollouts, in ORDER
-COMPUTE: dict[str, Compute] = {}  # functions of a batch: a dict of columns, or the column of the metric of that name
-EVENTS: list[str] = []  # columns of a row after its metrics: what happened, and what metrics rest on
-WORDS: dict[str, tuple[str, ...]] = {}  # columns that hold one of these words, or "" where the computed index is -1
+COMPUTE: dict[
+    str, Compute
+] = {}  # functions of a batch: a dict of columns, or the column of the metric of that name
+EVENTS: list[
+    str
+] = []  # columns of a row after its metrics: what happened, and what metrics rest on
+WORDS: dict[
+    str, tuple[str, ...]
+] = {}  # columns that hold one of these words, or "" where the computed index is -1
 SOURCE = ("dataset", "split", "method", "ego_policy")  # columns of a row of a run
-IDENTITY = ("scene_id", "location", "seed", "eta")  # columns of a row before its metrics
-LATER: dict[str, float | str] = {  # last columns of a row: what rows of earlier versions, which lack them, know of them
-    **{"errored": math.nan, "raised_by": "", "error": ""},  # whether, by whom ("ego", "traffic"), and with what message
+IDENTITY = (
+    "scene_id",
+    "location",
+    "seed",
+    "eta",
+)  # columns of a row before its metrics
+LATER: dict[
+    str, float | str
+] = {  # last columns of a row: what rows of earlier versions, which lack them, know of them
+    **{
+        "errored": math.nan,
+        "raised_by": "",
+        "error": "",
+    },  # whether, by whom ("ego", "traffic"), and with what message
     "cfr_object": math.nan,
     "left_out": math.nan,  # vehicles that come near in the recording and are neither driven nor replayed
 }
@@ -71,11 +116,18 @@ SPREAD_STAGE = "spread"
 STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own
 
 
-def declare(*metrics: Metric, events: Sequence[str] = (), words: Mapping[str, tuple[str, ...]] | None = None) -> None:
-    """Add metrics whose columns are in the rows already, or are added to them later; `events`: further columns of the
-    rows, `words`: those that hold words. Raises ValueError where a name is taken."""
+def declare(
+    *metrics: Metric,
+    events: Sequence[str] = (),
+    words: Mapping[str, tuple[str, ...]] | None = None,
+) -> None:
+    """Add metrics whose columns are in the rows already, or are added to them later;
+    `events`: further columns of the rows, `words`: those that hold words. Raises
+    ValueError where a name is taken."""
     if taken := [metric.name for metric in metrics if metric.name in METRICS]:
-        raise ValueError(f"metric {taken[0]}: name is taken; choose another, or unregister it first")
+        raise ValueError(
+            f"metric {taken[0]}: name is taken; choose another, or unregister it first"
+        )
     found = {**METRICS, **{metric.name: metric for metric in metrics}}
     rank = {name: place for place, name in enumerate(ORDER)}
     METRICS.clear()
@@ -85,9 +137,12 @@ def declare(*metrics: Metric, events: Sequence[str] = (), words: Mapping[str, tu
 
 
 def columns(
-    *metrics: Metric, events: Sequence[str] = (), words: Mapping[str, tuple[str, ...]] | None = None
+    *metrics: Metric,
+    events: Sequence[str] = (),
+    words: Mapping[str, tuple[str, ...]] | None = None,
 ) -> Callable[[Compute], Compute]:
-    """Decorator of a function batch -> {column: [B]}: declares the metrics that it computes (see `declare`)."""
+    """Decorator of a function batch -> {column: [B]}: declares the metrics that it
+    computes (see `declare`)."""
 
     def computes(compute: Compute) -> Compute:
         declare(*metrics, events=events, words=words)
@@ -102,7 +157,8 @@ def register(metric: Metric, compute: Compute | None = None) -> None:
 
     Args:
         metric: what it is.
-        compute: compute(batch) returns the metric's column [B], NaN where it is unknown, or a dict of columns: this
+        compute: compute(batch) returns the metric's column [B], NaN where it is
+            unknown, or a dict of columns: this
             one, and those that `weight` or `per` name. `score_rollouts` calls it on the CPU for at most 32 rollouts at
             once. The batch holds the tensors of `sim.rollouts.Rollouts` (positions in float64, 0 where invalid),
             `traffic` [B, N] bool, the simulated vehicles other than the ego, and the fields of
@@ -112,8 +168,12 @@ def register(metric: Metric, compute: Compute | None = None) -> None:
     Raises:
         ValueError: the name or the column is taken.
     """
-    if metric.name in COMPUTE or (compute is not None and metric.source in row_columns()):
-        raise ValueError(f"metric {metric.name}: name or column is taken; choose another, or unregister it first")
+    if metric.name in COMPUTE or (
+        compute is not None and metric.source in row_columns()
+    ):
+        raise ValueError(
+            f"metric {metric.name}: name or column is taken; choose another, or unregister it first"
+        )
     declare(metric)
     if compute is not None:
         COMPUTE[metric.name] = compute
@@ -127,17 +187,33 @@ def unregister(name: str) -> None:
 
 def table_names() -> tuple[str, ...]:
     """Names of the closed-loop tables."""
-    return tuple(dict.fromkeys([*TABLES, *(table for metric in METRICS.values() for table in metric.tables.split())]))
+    return tuple(
+        dict.fromkeys(
+            [
+                *TABLES,
+                *(
+                    table
+                    for metric in METRICS.values()
+                    for table in metric.tables.split()
+                ),
+            ]
+        )
+    )
 
 
 def table_metrics(table: str) -> tuple[Metric, ...]:
     """The metrics of a closed-loop table, in its order."""
-    return tuple(metric for metric in METRICS.values() if table in metric.tables.split())
+    return tuple(
+        metric for metric in METRICS.values() if table in metric.tables.split()
+    )
 
 
 def row_columns() -> tuple[str, ...]:
-    """Columns of a row: its identity, its metrics, events, what metrics are weighted or divided by, and LATER ones."""
+    """Columns of a row: its identity, its metrics, events, what metrics are weighted or
+    divided by, and LATER ones."""
     metrics = METRICS.values()
-    weights = [name for metric in metrics for name in (metric.weight, metric.per) if name]
+    weights = [
+        name for metric in metrics for name in (metric.weight, metric.per) if name
+    ]
     columns = (*IDENTITY, *(metric.source for metric in metrics), *EVENTS, *weights)
     return (*dict.fromkeys(name for name in columns if name not in LATER), *LATER)

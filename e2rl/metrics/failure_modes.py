@@ -1,9 +1,10 @@
 """Failures grouped into modes: the few ways in which a planner fails (docs/modes.md).
 
-A failure is a row of `score_rollouts` with a collision of the ego. Two failures are as far apart as the sum of the
-weights of what differs: from where the partner came, what both did, who was hit where, which duty was broken, how fast
-both were. Clusters of average linkage are cut at the distance THRESHOLD: another kind of approach, or another duty,
-makes a mode of its own, a single manoeuvre does not.
+A failure is a row of `score_rollouts` with a collision of the ego. Two failures are as
+far apart as the sum of the weights of what differs: from where the partner came, what
+both did, who was hit where, which duty was broken, how fast both were. Clusters of
+average linkage are cut at the distance THRESHOLD: another kind of approach, or another
+duty, makes a mode of its own, a single manoeuvre does not.
 """
 
 import math
@@ -23,15 +24,29 @@ Row = Mapping[str, Any]
 THRESHOLD = 1.0  # mean distance of two groups of failures up to which they are one mode
 SPEED_WEIGHT = 0.025  # of a difference of 1 m/s
 AGREED = 2 / 3  # fraction of a mode's failures that a word of its name is true of
-LEAST, MANY = 0.02, 10  # fraction of the failures that a mode has at least, and two where there are MANY failures
+LEAST, MANY = (
+    0.02,
+    10,
+)  # fraction of the failures that a mode has at least, and two where there are MANY failures
 SIDE = re.compile(r"(?: from the| on the)? (left|right)$")
 SPEEDS = ("ego_speed", "partner_speed")
 PLACES = 10  # at which `mode_coverage` looks: failures at fewer places give none
 
-_coverage = partial(Metric, decimals=1, column="mode", places=PLACES, per_collision=True, tables="adversaries")
+_coverage = partial(
+    Metric,
+    decimals=1,
+    column="mode",
+    places=PLACES,
+    per_collision=True,
+    tables="adversaries",
+)
 declare(
-    _coverage("mode_coverage", f"failure modes expected of collisions at {PLACES} places"),
-    _coverage("mode_coverage_counted", "the same, of collisions that count", weight="counted"),
+    _coverage(
+        "mode_coverage", f"failure modes expected of collisions at {PLACES} places"
+    ),
+    _coverage(
+        "mode_coverage_counted", "the same, of collisions that count", weight="counted"
+    ),
 )
 
 
@@ -56,7 +71,8 @@ def word(row: Row, column: str) -> str:
 
 
 def split_side(text: str) -> tuple[str, str]:
-    """Kind and side of a word: ("crossing", "left") of "crossing from the left", ("brakes", "") of "brakes"."""
+    """Kind and side of a word: ("crossing", "left") of "crossing from the left",
+    ("brakes", "") of "brakes"."""
     found = SIDE.search(text)
     return (text[: found.start()], found.group(1)) if found else (text, "")
 
@@ -67,8 +83,9 @@ def known_features(failures: Sequence[Row]) -> list[str]:
 
 
 def feature_vectors(failures: Sequence[Row]) -> np.ndarray:
-    """Vectors [n, F] of failures, whose distance is the sum of absolute differences: indicators of each word's kind and
-    side, with half of their weight (two of them change), and weighted speeds (unknown: the mean of the others)."""
+    """Vectors [n, F] of failures, whose distance is the sum of absolute differences:
+    indicators of each word's kind and side, with half of their weight (two of them
+    change), and weighted speeds (unknown: the mean of the others)."""
     columns = []
     for column in known_features(failures):
         words = [split_side(word(row, column)) for row in failures]
@@ -84,29 +101,41 @@ def feature_vectors(failures: Sequence[Row]) -> np.ndarray:
 
 
 def cluster_failures(failures: Sequence[Row]) -> list[int]:
-    """The mode of each failure, numbered from 1 by size. The order of the failures does not matter."""
+    """The mode of each failure, numbered from 1 by size. The order of the failures does
+    not matter."""
     if not failures:
         return []
     vectors = feature_vectors(failures)
-    order = sorted(range(len(failures)), key=lambda index: (*vectors[index], *identity(failures[index])))
+    order = sorted(
+        range(len(failures)),
+        key=lambda index: (*vectors[index], *identity(failures[index])),
+    )
     found = [1]
     if len(order) > 1:
         tree = linkage(pdist(vectors[order], "cityblock"), "average")
         found = fcluster(tree, THRESHOLD * (1 + 1e-9), "distance").tolist()
-    sizes = Counter(found)  # keeps the order of first appearance, which decides between equal sizes
-    number = {cluster: place for place, (cluster, _) in enumerate(sizes.most_common(), 1)}
+    sizes = Counter(
+        found
+    )  # keeps the order of first appearance, which decides between equal sizes
+    number = {
+        cluster: place for place, (cluster, _) in enumerate(sizes.most_common(), 1)
+    }
     return [number[cluster] for _, cluster in sorted(zip(order, found, strict=True))]
 
 
 def large_modes(modes: Sequence[int]) -> list[int]:
-    """The numbers, of the modes of all failures, that are worth a sentence each; the others are too small."""
+    """The numbers, of the modes of all failures, that are worth a sentence each; the
+    others are too small."""
     least = max(LEAST * len(modes), 2 if len(modes) >= MANY else 1)
     return sorted(mode for mode, count in Counter(modes).items() if count >= least)
 
 
 def identity(row: Row) -> tuple[str, ...]:
     """What tells a row from all others of a run, as text."""
-    return tuple(str(row.get(name, "")) for name in ("method", "eta", "ego_policy", "scene_id", "seed"))
+    return tuple(
+        str(row.get(name, ""))
+        for name in ("method", "eta", "ego_policy", "scene_id", "seed")
+    )
 
 
 def medoid(members: Sequence[Row]) -> int:
@@ -118,17 +147,27 @@ def medoid(members: Sequence[Row]) -> int:
 
 
 def mode_name(members: Sequence[Row]) -> str:
-    """A sentence of the words that are true of most members, such as "crossing from the right, partner turns left, ego
-    keeps speed: right of way". What they do not agree on is left out, and so is a duty that no row knows."""
+    """A sentence of the words that are true of most members, such as "crossing from the
+    right, partner turns left, ego keeps speed: right of way". What they do not agree on
+    is left out, and so is a duty that no row knows."""
     who = {"approach": "", "partner_manoeuvre": "partner ", "ego_manoeuvre": "ego "}
-    parts = [whose + text for column, whose in who.items() if (text := agreed_word(members, column))]
+    parts = [
+        whose + text
+        for column, whose in who.items()
+        if (text := agreed_word(members, column))
+    ]
     named = ", ".join(parts) or "various"
     duty = agreed_word(members, "duty")
-    return named + (f": {'no duty broken' if duty == 'none' else duty.replace('_', ' ')}" if duty else "")
+    return named + (
+        f": {'no duty broken' if duty == 'none' else duty.replace('_', ' ')}"
+        if duty
+        else ""
+    )
 
 
 def agreed_word(members: Sequence[Row], column: str) -> str:
-    """The word, or else its kind without the side, that holds for AGREED of the members; "" where there is none."""
+    """The word, or else its kind without the side, that holds for AGREED of the
+    members; "" where there is none."""
     words = [word(row, column) for row in members]
     for choice in (words, [split_side(text)[0] for text in words]):
         text, count = min(Counter(choice).items(), key=lambda item: (-item[1], item[0]))

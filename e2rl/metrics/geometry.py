@@ -1,8 +1,9 @@
-"""Exact overlap of oriented boxes, in addition to `scenes.boxes`: its area, and the parts of edges inside another box;
-and a broad phase with buckets: which of many items may lie at which of many points.
+"""Exact overlap of oriented boxes, in addition to `scenes.boxes`: its area, and the
+parts of edges inside another box; and a broad phase with buckets: which of many items
+may lie at which of many points.
 
-A box is a state (x, y, heading, speed) and a size (length, width); leading dimensions broadcast. Use float64 where an
-overlap of 1e-6 m2 decides.
+A box is a state (x, y, heading, speed) and a size (length, width); leading dimensions
+broadcast. Use float64 where an overlap of 1e-6 m2 decides.
 """
 
 import torch
@@ -12,53 +13,82 @@ from e2rl.scenes.boxes import corners, overlap, to_frame
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.neighbours import STANDING
 
-EDGES = ("left", "rear", "right", "front")  # edge i runs from corner i to corner i + 1 of scenes.boxes.corners
+EDGES = (
+    "left",
+    "rear",
+    "right",
+    "front",
+)  # edge i runs from corner i to corner i + 1 of scenes.boxes.corners
 MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
 
 
 def velocity(states: Tensor) -> Tensor:
     """Velocity vectors [..., 2] [m/s] of states [..., 4]: the speed along the heading."""
-    return states[..., 3:4] * torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
+    return states[..., 3:4] * torch.stack(
+        [states[..., 2].cos(), states[..., 2].sin()], -1
+    )
 
 
 def travel_heading(states: Tensor) -> Tensor:
-    """Direction [...] [rad] in which vehicles of states [..., 4] move: against their heading where they reverse."""
+    """Direction [...] [rad] in which vehicles of states [..., 4] move: against their
+    heading where they reverse."""
     heading = states[..., 2]
     speed = states[..., 3]
     return torch.where(speed < -STANDING, wrap(heading + torch.pi), heading)
 
 
-def pair_overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor, possible: Tensor) -> Tensor:
-    """Overlap area [...] [m2] of pairs of boxes; 0 where `possible` [...] is false or the area is at most MIN_AREA.
+def pair_overlap(
+    first: Tensor,
+    first_size: Tensor,
+    second: Tensor,
+    second_size: Tensor,
+    possible: Tensor,
+) -> Tensor:
+    """Overlap area [...] [m2] of pairs of boxes; 0 where `possible` [...] is false or
+    the area is at most MIN_AREA.
 
     The exact area is computed only for the pairs that `scenes.boxes.overlap` finds.
     """
     boxes = (first, first_size, second, second_size)
     meets = possible & overlap(*boxes)
-    area = overlap_area(*(box.expand(*meets.shape, box.shape[-1])[meets] for box in boxes))
+    area = overlap_area(
+        *(box.expand(*meets.shape, box.shape[-1])[meets] for box in boxes)
+    )
     result = torch.zeros(meets.shape, dtype=first.dtype, device=first.device)
     return result.masked_scatter(meets, area.masked_fill(area <= MIN_AREA, 0.0))
 
 
-def overlap_area(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
+def overlap_area(
+    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+) -> Tensor:
     """Exact area [...] [m2] of two boxes' intersection.
 
-    Green's theorem in the second box's frame: the boundary of the first box, every point of it clamped into the second
-    box, encloses exactly the intersection, so area = sum over edges of the integral of clamp(x) d clamp(y). The
-    integrand is continuous in the boxes, hence shared or collinear edges need no special case.
+    Green's theorem in the second box's frame: the boundary of the first box, every
+    point of it clamped into the second box, encloses exactly the intersection, so area
+    = sum over edges of the integral of clamp(x) d clamp(y). The integrand is continuous
+    in the boxes, hence shared or collinear edges need no special case.
     """
-    start, change, half, bounds = _edges_in_frame(first, first_size, other=second, other_size=second_size, zero=1.0)
+    start, change, half, bounds = _edges_in_frame(
+        first, first_size, other=second, other_size=second_size, zero=1.0
+    )
     begin, end = bounds[..., 1].clamp(0, 1)  # where y is inside the second box's width
     knots = torch.stack([begin, *(bounds[..., 0].maximum(begin).minimum(end)), end], -1)
     x = start[..., 0, None] + knots * change[..., 0, None]
     x = x.maximum(-half[..., 0, None]).minimum(half[..., 0, None])
-    integral = ((knots[..., 1:] - knots[..., :-1]) * (x[..., 1:] + x[..., :-1]) / 2).sum(-1)
+    integral = (
+        (knots[..., 1:] - knots[..., :-1]) * (x[..., 1:] + x[..., :-1]) / 2
+    ).sum(-1)
     return (integral * change[..., 1]).sum(-1).clamp(min=0)
 
 
-def edge_parts_inside(box: Tensor, size: Tensor, other: Tensor, other_size: Tensor) -> Tensor:
-    """Length [..., 4] [m] of each of the box's edges (order `EDGES`) that lies inside the other box."""
-    _, change, _, (enter, leave) = _edges_in_frame(box, size, other=other, other_size=other_size, zero=torch.finfo(box.dtype).tiny)
+def edge_parts_inside(
+    box: Tensor, size: Tensor, other: Tensor, other_size: Tensor
+) -> Tensor:
+    """Length [..., 4] [m] of each of the box's edges (order `EDGES`) that lies inside
+    the other box."""
+    _, change, _, (enter, leave) = _edges_in_frame(
+        box, size, other=other, other_size=other_size, zero=torch.finfo(box.dtype).tiny
+    )
     part = (leave.amin(-1).clamp(0, 1) - enter.amax(-1).clamp(0, 1)).clamp(min=0)
     return part * change.norm(dim=-1)
 
@@ -66,43 +96,66 @@ def edge_parts_inside(box: Tensor, size: Tensor, other: Tensor, other_size: Tens
 def _edges_in_frame(
     box: Tensor, size: Tensor, other: Tensor, other_size: Tensor, zero: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Start and change [..., 4, 2] of the box's edges in the frame of the other box, that box's half size [..., 1, 2],
-    and the fractions [2, ..., 4, 2] of each edge at which its x and y enter and leave that box; a change of 0 counts as
-    `zero` in them."""
+    """Start and change [..., 4, 2] of the box's edges in the frame of the other box,
+    that box's half size [..., 1, 2], and the fractions [2, ..., 4, 2] of each edge at
+    which its x and y enter and leave that box; a change of 0 counts as `zero` in them.
+    """
     start = to_frame(corners(box, size), other[..., None, :])
     change = start.roll(-1, -2) - start
     half = (other_size / 2)[..., None, :]
     divisor = torch.where(change == 0, torch.full_like(change, zero), change)
-    return start, change, half, torch.stack([(-half - start) / divisor, (half - start) / divisor]).sort(0).values
+    return (
+        start,
+        change,
+        half,
+        torch.stack([(-half - start) / divisor, (half - start) / divisor])
+        .sort(0)
+        .values,
+    )
 
 
 def edge_distances(box: Tensor, size: Tensor, point: Tensor) -> Tensor:
-    """Distance [..., 4] [m] from each of the box's edges (order `EDGES`) to a point [..., 2]."""
+    """Distance [..., 4] [m] from each of the box's edges (order `EDGES`) to a point
+    [..., 2]."""
     start = corners(box, size)
-    return from_segment(point[..., None, :], start, along=start.roll(-1, -2) - start).norm(dim=-1)
+    return from_segment(
+        point[..., None, :], start, along=start.roll(-1, -2) - start
+    ).norm(dim=-1)
 
 
 def from_segment(point: Tensor, start: Tensor, along: Tensor) -> Tensor:
-    """Vector [..., 2] [m] to a point from the nearest point of the segment from `start` to `start + along`."""
+    """Vector [..., 2] [m] to a point from the nearest point of the segment from `start`
+    to `start + along`."""
     offset = point - start
-    fraction = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-18)).clamp(0, 1)
+    fraction = (
+        (offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-18)
+    ).clamp(0, 1)
     return offset - fraction[..., None] * along
 
 
 def ragged(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """(group, index within it), each [counts.sum()], of groups with counts [n] int64 members."""
-    group = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+    """(group, index within it), each [counts.sum()], of groups with counts [n] int64
+    members."""
+    group = torch.repeat_interleave(
+        torch.arange(len(counts), device=counts.device), counts
+    )
     start = counts.cumsum(0) - counts
     return group, torch.arange(len(group), device=counts.device) - start[group]
 
 
 def candidates(
-    points: Tensor, point_group: Tensor, low: Tensor, high: Tensor, item_group: Tensor, cell: float
+    points: Tensor,
+    point_group: Tensor,
+    low: Tensor,
+    high: Tensor,
+    item_group: Tensor,
+    cell: float,
 ) -> tuple[Tensor, Tensor]:
     """Pairs (point index, item index) of the same group that share a cell.
 
-    points [n, D] m, their groups [n] int64 >= 0; items with bounds low, high [m, D] m, their groups [m]; cell size [m].
-    Every point inside an item's bounds [low, high] is among the pairs; each pair occurs once.
+    points [n, D] m, their groups [n] int64 >= 0; items with bounds low, high [m, D] m,
+    their groups [m]; cell size [m]. Every point inside an item's bounds [low, high] is
+    among the pairs; each pair occurs once.
     """
     empty = points.new_zeros(0, dtype=torch.int64)
     if not len(points) or not len(low):
@@ -113,12 +166,16 @@ def candidates(
     first = ((low - origin) / cell).floor().long().clamp(min=0)
     last = torch.minimum(((high - origin) / cell).floor().long(), extent - 1)
     span = (last - first + 1).clamp(min=0)
-    item, index = ragged(span.prod(-1))  # an item wholly outside the points' extent covers no cell
+    item, index = ragged(
+        span.prod(-1)
+    )  # an item wholly outside the points' extent covers no cell
     covered = []
     for axis in range(points.shape[1]):
         covered.append(first[item, axis] + index % span[item, axis])
         index = index // span[item, axis]
-    item_key, order = cell_key(item_group[item], torch.stack(covered, -1), extent=extent).sort()
+    item_key, order = cell_key(
+        item_group[item], torch.stack(covered, -1), extent=extent
+    ).sort()
     point_key = cell_key(point_group, cells, extent=extent)
     begin = torch.searchsorted(item_key, point_key)
     point, index = ragged(torch.searchsorted(item_key, point_key, right=True) - begin)

@@ -1,9 +1,11 @@
-"""How near a rollout comes to a preventable failure: a continuous verdict that guides a search.
+"""How near a rollout comes to a preventable failure: a continuous verdict that guides a
+search.
 
-Without a contact it is minus the least over time of the distance of the ego to a vehicle that moves relative to it, in
-time and space: (t^2 + d^2)^(1/2) of their closest approach at constant velocities, t s ahead and d m between the sides.
-A contact has 0 to 1, by how much of the ego's speed the competent driver in its place loses before its own contact; a
-preventable one has 2.
+Without a contact it is minus the least over time of the distance of the ego to a
+vehicle that moves relative to it, in time and space: (t^2 + d^2)^(1/2) of their closest
+approach at constant velocities, t s ahead and d m between the sides. A contact has 0 to
+1, by how much of the ego's speed the competent driver in its place loses before its own
+contact; a preventable one has 2.
 """
 
 import torch
@@ -23,12 +25,17 @@ PREVENTED = 2.0
 @columns(Metric("margin", "nearness to a preventable failure (docs/search.md)"))
 def margin_columns(batch: Batch) -> Batch:
     """margin [B]."""
-    return {"margin": torch.where(batch["hit"], contact_margin(batch), -approach_distance(batch).amin(1))}
+    return {
+        "margin": torch.where(
+            batch["hit"], contact_margin(batch), -approach_distance(batch).amin(1)
+        )
+    }
 
 
 def approach_distance(batch: Batch) -> Tensor:
-    """(t^2 + d^2)^(1/2) [B, T+1] of the ego's nearest closest approach at each step until its first contact, at most
-    FARTHEST; FARTHEST at step 0 and after a contact."""
+    """(t^2 + d^2)^(1/2) [B, T+1] of the ego's nearest closest approach at each step
+    until its first contact, at most FARTHEST; FARTHEST at step 0 and after a contact.
+    """
     states = batch["states"]
     valid = batch["valid"]
     size = batch["size"]
@@ -39,15 +46,26 @@ def approach_distance(batch: Batch) -> Tensor:
     time = (-(offset * closing).sum(-1) / speed.square().clamp(min=1e-6)).clamp(min=0)
     half = (size[:, :, 1] + size[:, :1, 1])[:, None] / 2  # as if side by side
     miss = ((offset + closing * time[..., None]).norm(dim=-1) - half).clamp(min=0)
-    counted = valid & valid[..., :1] & (batch["agent_type"] == VEHICLE)[:, None] & (speed > CLOSING)
+    counted = (
+        valid
+        & valid[..., :1]
+        & (batch["agent_type"] == VEHICLE)[:, None]
+        & (speed > CLOSING)
+    )
     counted = counted & steps_until(batch["stop"], states.shape[1])[..., None]
     counted[..., 0] = False
-    return torch.hypot(time, miss).masked_fill(~counted, FARTHEST).amin(-1).clamp(max=FARTHEST)
+    return (
+        torch.hypot(time, miss)
+        .masked_fill(~counted, FARTHEST)
+        .amin(-1)
+        .clamp(max=FARTHEST)
+    )
 
 
 def contact_margin(batch: Batch) -> Tensor:
-    """Of rollouts [B] with a contact: PREVENTED where it is preventable, else the fraction of the ego's speed that the
-    competent driver has lost at the step before the contact; 0 where the ego hardly moves."""
+    """Of rollouts [B] with a contact: PREVENTED where it is preventable, else the
+    fraction of the ego's speed that the competent driver has lost at the step before
+    the contact; 0 where the ego hardly moves."""
     row = torch.arange(len(batch["stop"]), device=batch["stop"].device)
     speed = batch["states"][row, batch["before"], 0, 3].abs()
     lost = 1 - batch["driver"][row, batch["before"], 3] / speed.clamp(min=CREEPING)

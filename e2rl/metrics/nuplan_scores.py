@@ -1,8 +1,10 @@
-"""nuPlan's closed-loop score of the ego in [0, 1] and its eight terms (`experiment=nuplan`).
+"""nuPlan's closed-loop score of the ego in [0, 1] and its eight terms
+(`experiment=nuplan`).
 
-Definitions and thresholds are those of nuplan-devkit 1.2 (docs/nuplan-scores.md, which tells what differs: lanes here
-are strips about centrelines, and intersections are where strips overlap). Terms look at the whole rollout, on through
-contacts. They are NaN where the ego overlaps a vehicle at the start or is absent at a step.
+Definitions and thresholds are those of nuplan-devkit 1.2 (docs/nuplan-scores.md, which
+tells what differs: lanes here are strips about centrelines, and intersections are where
+strips overlap). Terms look at the whole rollout, on through contacts. They are NaN
+where the ego overlaps a vehicle at the start or is absent at a step.
 """
 
 import math
@@ -16,20 +18,38 @@ from torch import Tensor
 
 from e2rl.metrics.catalogue import Batch, rate
 from e2rl.metrics.geometry import edge_parts_inside, velocity
-from e2rl.metrics.off_road import has_lines, inside_polygon, line_segments, near_lane, near_segments
+from e2rl.metrics.off_road import (
+    has_lines,
+    inside_polygon,
+    line_segments,
+    near_lane,
+    near_segments,
+)
 from e2rl.metrics.proximity import ego_path, route_completion
 from e2rl.scenes.boxes import corners, overlap, to_frame
 from e2rl.scenes.recording import CYCLIST, DT, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.sim.dynamics import wrap
 
-REAR_AXLE = 1.461 / 5.176  # of the length: nuPlan's vehicle, from its centre back to the rear axle
+REAR_AXLE = (
+    1.461 / 5.176
+)  # of the length: nuPlan's vehicle, from its centre back to the rear axle
 STOPPED = 0.05  # m/s: an ego or a track that is no faster stands at a collision
-AHEAD = math.radians(30)  # angle at the rear axle between the heading and another's centre
+AHEAD = math.radians(
+    30
+)  # angle at the rear axle between the heading and another's centre
 BEHIND = math.radians(150)
-ALLOWED = {(PEDESTRIAN, CYCLIST): 0, (VEHICLE,): 0, (OTHER,): 1}  # at-fault collisions that leave a score above 0
+ALLOWED = {
+    (PEDESTRIAN, CYCLIST): 0,
+    (VEHICLE,): 0,
+    (OTHER,): 1,
+}  # at-fault collisions that leave a score above 0
 MAX_OUTSIDE = 0.3  # m that a corner may lie outside the drivable area
 ENDS_MEET = 0.5  # m between the end of a lane and the start of one that follows it
-WINDOW, AGAINST, FAR_AGAINST = 1.0, 2.0, 6.0  # s, and metres against the lane's direction in it: score 0.5, 0
+WINDOW, AGAINST, FAR_AGAINST = (
+    1.0,
+    2.0,
+    6.0,
+)  # s, and metres against the lane's direction in it: score 0.5, 0
 LEAST_TTC = 0.95  # s
 MOVING = 0.005  # m/s: an ego that is slower has no time to collision
 MIN_PROGRESS = 0.2  # of the recorded distance
@@ -63,15 +83,21 @@ SCORES = (
     term("drivable_area_compliance", "nuPlan: no corner outside the drivable area"),
     term("driving_direction_compliance", "nuPlan: not against the lane's direction"),
     term("ego_is_making_progress", "nuPlan: a fifth of the recorded distance or more"),
-    term("time_to_collision_within_bound", "nuPlan: time to collision of 0.95 s or more throughout"),
-    term("ego_progress_along_expert_route", "nuPlan: fraction of the recorded distance"),
+    term(
+        "time_to_collision_within_bound",
+        "nuPlan: time to collision of 0.95 s or more throughout",
+    ),
+    term(
+        "ego_progress_along_expert_route", "nuPlan: fraction of the recorded distance"
+    ),
     term("speed_limit_compliance", "nuPlan: speeding, by how much and how long"),
     term("ego_is_comfortable", "nuPlan: acceleration, jerk and yaw within bounds"),
 )
 
 
 def nuplan_columns(batch: Batch) -> Batch:
-    """The score, product of MULTIPLIERS times the mean of WEIGHTS, and its terms, each [B] in [0, 1]."""
+    """The score, product of MULTIPLIERS times the mean of WEIGHTS, and its terms, each
+    [B] in [0, 1]."""
     batch = batch | {"track_speed": track_speed(batch)}
     places = places_of(batch)
     fault, new = at_fault(batch, places)
@@ -81,19 +107,28 @@ def nuplan_columns(batch: Batch) -> Batch:
         "drivable_area_compliance": drivable_area(batch),
         "driving_direction_compliance": driving_direction(batch),
         "ego_is_making_progress": (progress >= MIN_PROGRESS).to(progress),
-        "time_to_collision_within_bound": time_to_collision(batch, places, fault=fault, new=new),
+        "time_to_collision_within_bound": time_to_collision(
+            batch, places, fault=fault, new=new
+        ),
         "ego_progress_along_expert_route": progress,
         "speed_limit_compliance": speed_limit(batch),
         "ego_is_comfortable": comfort(batch["states"][:, :, 0], batch["size"][:, 0, 0]),
     }
-    mean = sum(weight * found[name] for name, weight in WEIGHTS.items()) / sum(WEIGHTS.values())
-    found["nuplan_score"] = mean * torch.stack([found[name] for name in MULTIPLIERS]).prod(0)
+    mean = sum(weight * found[name] for name, weight in WEIGHTS.items()) / sum(
+        WEIGHTS.values()
+    )
+    found["nuplan_score"] = mean * torch.stack(
+        [found[name] for name in MULTIPLIERS]
+    ).prod(0)
     unknown = batch["start_overlap"] | ~batch["valid"][..., 0].all(1)
-    return {name: value.masked_fill(unknown, torch.nan) for name, value in found.items()}
+    return {
+        name: value.masked_fill(unknown, torch.nan) for name, value in found.items()
+    }
 
 
 def track_speed(batch: Batch) -> Tensor:
-    """The magnitude of the velocity [B, T+1, N] m/s as nuPlan has it: objects have none."""
+    """The magnitude of the velocity [B, T+1, N] m/s as nuPlan has it: objects have
+    none."""
     speed = batch["states"][..., 3].abs()
     return speed.masked_fill((batch["agent_type"] == OTHER)[:, None], 0.0)
 
@@ -106,32 +141,43 @@ class Places(NamedTuple):
 
 
 def places_of(batch: Batch) -> Places:
-    """Where the ego is among the lanes, strips of half their width about the centreline."""
+    """Where the ego is among the lanes, strips of half their width about the
+    centreline."""
     states = batch["states"][:, :, 0]
     size = batch["size"][:, None, 0]
-    points = torch.cat([corners(states, size), rear_axle(states, size)[..., None, :]], -2)  # [B, T+1, 5, 2]
+    points = torch.cat(
+        [corners(states, size), rear_axle(states, size)[..., None, :]], -2
+    )  # [B, T+1, 5, 2]
     each = points[0, ..., 0].numel()
     point, lane, _ = lanes_at(points.flatten(1, 2), batch)
     used = torch.zeros_like(batch["lane_width"], dtype=torch.bool)
     used[point // each, lane] = True  # a few of hundreds
-    chosen = used.byte().argsort(dim=1, descending=True, stable=True)[:, : max(1, int(used.sum(1).amax()))]
+    chosen = used.byte().argsort(dim=1, descending=True, stable=True)[
+        :, : max(1, int(used.sum(1).amax()))
+    ]
     slot = used.long().cumsum(1) - 1
     inside = states.new_zeros(len(states) * each, chosen.shape[1])
     inside[point, slot[point // each, lane]] = 1.0
     inside = inside.view(*points.shape[:-1], -1)  # [B, T+1, 5, M] of the chosen lanes
-    together = connected(corners_inside=inside[..., :4, :], follows=linked(batch, chosen))
+    together = connected(
+        corners_inside=inside[..., :4, :], follows=linked(batch, chosen)
+    )
     return Places(loose=~together, crossing=inside[..., 4, :].sum(-1) > 1)
 
 
 def connected(corners_inside: Tensor, follows: Tensor) -> Tensor:
-    """Whether the corners of the ego lie in one lane, or in lanes that follow each other as the ego drives.
+    """Whether the corners of the ego lie in one lane, or in lanes that follow each
+    other as the ego drives.
 
-    Some lane X is, or is followed by, a lane of each front corner, and is, or follows, a lane of each rear corner; and
-    the rear corners' own lanes are one, or one follows the other.
+    Some lane X is, or is followed by, a lane of each front corner, and is, or follows,
+    a lane of each rear corner; and the rear corners' own lanes are one, or one follows
+    the other.
 
     Args:
-        corners_inside: [B, T+1, 4, M], 1 where a corner (front left, rear left, rear right, front right) is in a lane.
-        follows: [B, M, M], 1 at [j, i] where lane j is lane i, or begins where lane i ends.
+        corners_inside: [B, T+1, 4, M], 1 where a corner (front left, rear left, rear
+            right, front right) is in a lane.
+        follows: [B, M, M], 1 at [j, i] where lane j is lane i, or begins where lane i
+            ends.
 
     Returns:
         Bool [B, T+1].
@@ -146,28 +192,40 @@ def connected(corners_inside: Tensor, follows: Tensor) -> Tensor:
 
 
 def rear_axle(states: Tensor, size: Tensor) -> Tensor:
-    """Position [..., 2] of the rear axle of vehicles at states [..., 4] of size [..., 2]."""
+    """Position [..., 2] of the rear axle of vehicles at states [..., 4] of size [...,
+    2]."""
     heading = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
     return states[..., :2] - REAR_AXLE * size[..., :1] * heading
 
 
 def lanes_at(points: Tensor, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-    """(point in B * K, lane, direction [., 2]) of all pairs of a point [B, K, 2] and a segment of a lane in whose strip
-    it lies, between the lane's ends."""
+    """(point in B * K, lane, direction [., 2]) of all pairs of a point [B, K, 2] and a
+    segment of a lane in whose strip it lies, between the lane's ends."""
     owner, lane, ends = line_segments(batch["lane_points"], batch["lane_index"])
     rollout = torch.arange(len(points)).repeat_interleave(points.shape[1])
     points = points.flatten(0, 1)
-    point, near = near_segments(points, rollout, owner=owner, ends=ends, reach=batch["lane_width"][owner, lane] / 2)
+    point, near = near_segments(
+        points,
+        rollout,
+        owner=owner,
+        ends=ends,
+        reach=batch["lane_width"][owner, lane] / 2,
+    )
     along = torch.nn.functional.normalize(ends[near, 1] - ends[near, 0], dim=-1)
-    begins = torch.ones(len(lane) + 1, dtype=torch.bool)  # the last row: after the end of the last lane
+    begins = torch.ones(
+        len(lane) + 1, dtype=torch.bool
+    )  # the last row: after the end of the last lane
     begins[1:-1] = (lane.diff() != 0) | (owner.diff() != 0)
-    before, after = ((along * (points[point] - ends[near, end])).sum(-1) for end in (0, 1))
+    before, after = (
+        (along * (points[point] - ends[near, end])).sum(-1) for end in (0, 1)
+    )
     within = ~(begins[near] & (before < 0)) & ~(begins[near + 1] & (after > 0))
     return point[within], lane[near[within]], along[within]
 
 
 def linked(batch: Batch, chosen: Tensor) -> Tensor:
-    """1 at [B, j, i] where the chosen lane j [B, M] is lane i, or begins where lane i ends, else 0."""
+    """1 at [B, j, i] where the chosen lane j [B, M] is lane i, or begins where lane i
+    ends, else 0."""
     index = batch["lane_index"]
     count = batch["lane_width"].shape[1]
     at = torch.arange(index.shape[1]).expand(index.shape)
@@ -175,7 +233,9 @@ def linked(batch: Batch, chosen: Tensor) -> Tensor:
     ends = []
     for reduce in ("amin", "amax"):
         place = torch.zeros(len(index), count + 1, dtype=torch.int64)
-        place = place.scatter_reduce(1, slot, at, reduce, include_self=False).gather(1, chosen)
+        place = place.scatter_reduce(1, slot, at, reduce, include_self=False).gather(
+            1, chosen
+        )
         ends.append(batch["lane_points"].gather(1, place[..., None].expand(-1, -1, 2)))
     first, last = ends
     follows = torch.cdist(first, last) < ENDS_MEET
@@ -183,16 +243,19 @@ def linked(batch: Batch, chosen: Tensor) -> Tensor:
 
 
 def angle_at(axle: Tensor, heading: Tensor, centre: Tensor) -> Tensor:
-    """Angle [...] in [0, pi] at axle [..., 2] between the heading [...] and another's centre [..., 2]."""
+    """Angle [...] in [0, pi] at axle [..., 2] between the heading [...] and another's
+    centre [..., 2]."""
     gap = centre - axle
     return wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading).abs()
 
 
 def at_fault(batch: Batch, places: Places) -> tuple[Tensor, Tensor]:
-    """Bool [B, T+1, N] each: collisions at the ego's fault, and all, at the step at which an agent first meets the ego.
+    """Bool [B, T+1, N] each: collisions at the ego's fault, and all, at the step at
+    which an agent first meets the ego.
 
-    The ego is at fault if it moves and the other stands, as objects always do, if its front bumper meets the other, or
-    if the other, not behind it, meets it beside while the ego is not in one lane.
+    The ego is at fault if it moves and the other stands, as objects always do, if its
+    front bumper meets the other, or if the other, not behind it, meets it beside while
+    the ego is not in one lane.
     """
     touching = batch["area"] > 0
     new = touching & (touching.long().cumsum(1) == 1)
@@ -212,36 +275,55 @@ def at_fault(batch: Batch, places: Places) -> tuple[Tensor, Tensor]:
 
 
 def collision_score(fault: Tensor, agent_type: Tensor) -> Tensor:
-    """Product [B] over kinds of agents of max(0, 1 - collisions / (allowed + 1)); fault [B, T+1, N]."""
+    """Product [B] over kinds of agents of max(0, 1 - collisions / (allowed + 1)); fault
+    [B, T+1, N]."""
     score = torch.ones(len(fault), dtype=torch.float64)
     for kinds, allowed in ALLOWED.items():
-        number = (fault & torch.isin(agent_type, torch.tensor(kinds))[:, None]).sum((1, 2))
+        number = (fault & torch.isin(agent_type, torch.tensor(kinds))[:, None]).sum(
+            (1, 2)
+        )
         score *= (1 - number / (allowed + 1)).clamp(min=0)
     return score
 
 
 def drivable_area(batch: Batch) -> Tensor:
-    """1 [B] where all corners stay within MAX_OUTSIDE of a lane's strip or a drivable polygon, else 0; NaN without a
-    map."""
+    """1 [B] where all corners stay within MAX_OUTSIDE of a lane's strip or a drivable
+    polygon, else 0; NaN without a map."""
     states = batch["states"][:, :, 0]
     size = batch["size"][:, None, 0]
     where = corners(states, size)
     points = where.flatten(0, 2)
     rollout = torch.arange(len(states)).repeat_interleave(where[0, ..., 0].numel())
-    inside = near_lane(points, rollout, lane_points=batch["lane_points"], lane_index=batch["lane_index"], lane_width=batch["lane_width"], margin=MAX_OUTSIDE)
+    inside = near_lane(
+        points,
+        rollout,
+        lane_points=batch["lane_points"],
+        lane_index=batch["lane_index"],
+        lane_width=batch["lane_width"],
+        margin=MAX_OUTSIDE,
+    )
     polygons = batch["drivable_points"], batch["drivable_index"]
     rest = (~inside).nonzero()[:, 0]
     inside[rest] = inside_polygon(points[rest], rollout[rest], *polygons)
     owner, _, ends = line_segments(*polygons, closed=True)
-    near, _ = near_segments(points, rollout, owner=owner, ends=ends, reach=ends.new_full(owner.shape, MAX_OUTSIDE))
+    near, _ = near_segments(
+        points,
+        rollout,
+        owner=owner,
+        ends=ends,
+        reach=ends.new_full(owner.shape, MAX_OUTSIDE),
+    )
     inside[near] = True
     mapped = has_lines(batch["lane_index"]) | has_lines(batch["drivable_index"])
-    return inside.view(len(states), -1).all(1).to(states).masked_fill(~mapped, torch.nan)
+    return (
+        inside.view(len(states), -1).all(1).to(states).masked_fill(~mapped, torch.nan)
+    )
 
 
 def driving_direction(batch: Batch) -> Tensor:
-    """1, 0.5 or 0 [B] as the ego's centre moves at most AGAINST, FAR_AGAINST or more metres against the direction of
-    its lane within WINDOW; of several lanes the one that it follows best, and nothing outside all."""
+    """1, 0.5 or 0 [B] as the ego's centre moves at most AGAINST, FAR_AGAINST or more
+    metres against the direction of its lane within WINDOW; of several lanes the one
+    that it follows best, and nothing outside all."""
     centre = batch["states"][:, :, 0, :2]
     moved = torch.nn.functional.pad(centre.diff(dim=1), (0, 0, 1, 0)).flatten(0, 1)
     point, _, along = lanes_at(centre, batch)
@@ -251,13 +333,19 @@ def driving_direction(batch: Batch) -> Tensor:
     steps = round(WINDOW / DT) + 1  # of the devkit's sums
     before = torch.nn.functional.pad(way, (steps, 0))[:, :-steps]
     against = -(way - before).amin(1)
-    return torch.where(against < AGAINST, 1.0, torch.where(against < FAR_AGAINST, 0.5, 0.0)).to(centre)
+    return torch.where(
+        against < AGAINST, 1.0, torch.where(against < FAR_AGAINST, 0.5, 0.0)
+    ).to(centre)
 
 
-def time_to_collision(batch: Batch, places: Places, fault: Tensor, new: Tensor) -> Tensor:
-    """1 [B] where nothing would be met within LEAST_TTC at constant velocities, from any step; else 0.
+def time_to_collision(
+    batch: Batch, places: Places, fault: Tensor, new: Tensor
+) -> Tensor:
+    """1 [B] where nothing would be met within LEAST_TTC at constant velocities, from
+    any step; else 0.
 
-    Others count while they are ahead, or beside an ego that is not in one lane or on a crossing, until they meet it.
+    Others count while they are ahead, or beside an ego that is not in one lane or on a
+    crossing, until they meet it.
     """
     states = batch["states"]
     size = batch["size"]
@@ -266,26 +354,39 @@ def time_to_collision(batch: Batch, places: Places, fault: Tensor, new: Tensor) 
     length = size[:, None, :1]
     angle = angle_at(rear_axle(ego, length), ego[..., 2], centre=states[..., :2])
     beside = (places.loose | places.crossing)[..., None] & (angle <= BEHIND)
-    counted = batch["valid"] & ~(new.cumsum(1) > 0) & ((angle < AHEAD) | beside) & (speed[..., :1] > MOVING)
+    counted = (
+        batch["valid"]
+        & ~(new.cumsum(1) > 0)
+        & ((angle < AHEAD) | beside)
+        & (speed[..., :1] > MOVING)
+    )
     counted[..., 0] = False
-    reach = (size[:, :1] + size).norm(dim=-1)[:, None] + (speed[..., :1] + speed) * LEAST_TTC
+    reach = (size[:, :1] + size).norm(dim=-1)[:, None] + (
+        speed[..., :1] + speed
+    ) * LEAST_TTC
     counted &= (states[..., :2] - ego[..., :2]).norm(dim=-1) < reach
     row, step, agent = counted.nonzero(as_tuple=True)
     seconds = torch.arange(DT, LEAST_TTC, DT, dtype=states.dtype)[:, None]  # [K, 1]
     touches = overlap(
         first=projected(states[row, step, 0], speed[row, step, 0], seconds=seconds),
         first_size=size[row, 0],
-        second=projected(states[row, step, agent], speed[row, step, agent], seconds=seconds),
+        second=projected(
+            states[row, step, agent], speed[row, step, agent], seconds=seconds
+        ),
         second_size=size[row, agent],
     )
-    meets = torch.zeros(len(states), dtype=torch.bool).index_fill(0, row[touches.any(0)], True)
+    meets = torch.zeros(len(states), dtype=torch.bool).index_fill(
+        0, row[touches.any(0)], True
+    )
     return (~meets & ~fault.any((1, 2))).to(states)
 
 
 def projected(states: Tensor, speed: Tensor, seconds: Tensor) -> Tensor:
-    """States [K, Q, 4] of tracks [Q, 4] that go on along their heading with speed [Q] m/s for seconds [K, 1].
+    """States [K, Q, 4] of tracks [Q, 4] that go on along their heading with speed [Q]
+    m/s for seconds [K, 1].
 
-    nuPlan projects by the magnitude of the velocity, so one that reverses is projected forwards.
+    nuPlan projects by the magnitude of the velocity, so one that reverses is projected
+    forwards.
     """
     moving = torch.cat([states[:, :3], speed[:, None]], -1)
     place = moving[:, :2] + seconds[..., None] * velocity(moving)
@@ -293,16 +394,21 @@ def projected(states: Tensor, speed: Tensor, seconds: Tensor) -> Tensor:
 
 
 def expert_progress(batch: Batch) -> Tensor:
-    """min(1, max(d, f) / max(r, f)) [B] of d m driven along the r m that the recorded ego drove, f = PROGRESS_FLOOR.
+    """min(1, max(d, f) / max(r, f)) [B] of d m driven along the r m that the recorded
+    ego drove, f = PROGRESS_FLOOR.
 
     0 where the ego ends more than f behind its start.
     """
     last = torch.full_like(batch["stop"], batch["states"].shape[1] - 1)
     path, count = ego_path(batch["states"], batch["valid"], stop=last)
     recorded, known = ego_path(batch["logged"], batch["logged_valid"], stop=last)
-    fraction = route_completion(path, count, logged=batch["logged"], logged_valid=batch["logged_valid"])
+    fraction = route_completion(
+        path, count, logged=batch["logged"], logged_valid=batch["logged_valid"]
+    )
     pieces = torch.arange(1, recorded.shape[1]) < known[:, None]
-    distance = (recorded[:, 1:, :2] - recorded[:, :-1, :2]).norm(dim=-1).mul(pieces).sum(-1)
+    distance = (
+        (recorded[:, 1:, :2] - recorded[:, :-1, :2]).norm(dim=-1).mul(pieces).sum(-1)
+    )
     driven = fraction.nan_to_num(0.0) * distance
     ratio = driven.clamp(min=PROGRESS_FLOOR) / distance.clamp(min=PROGRESS_FLOOR)
     end = path[torch.arange(len(path)), (count - 1).clamp(min=0)]
@@ -311,8 +417,8 @@ def expert_progress(batch: Batch) -> Tensor:
 
 
 def speed_limit(batch: Batch) -> Tensor:
-    """max(0, 1 - mean overspeed / MAX_OVERSPEED) [B]; steps without a known limit count as none. NaN where rollouts do
-    not tell limits, as those read from files."""
+    """max(0, 1 - mean overspeed / MAX_OVERSPEED) [B]; steps without a known limit count
+    as none. NaN where rollouts do not tell limits, as those read from files."""
     speed = batch["states"][:, :, 0, 3]
     if "speed_limit" not in batch:
         return torch.full_like(speed[:, 0], torch.nan)
@@ -322,11 +428,13 @@ def speed_limit(batch: Batch) -> Tensor:
 
 
 def comfort(ego: Tensor, length: Tensor) -> Tensor:
-    """1 [B] where the motion of ego [B, T+1, 4] of length [B] m stays within COMFORT, else 0.
+    """1 [B] where the motion of ego [B, T+1, 4] of length [B] m stays within COMFORT,
+    else 0.
 
-    Accelerations are those of nuPlan's simulated ego. Its rear axle has a step's change of speed and none to the side,
-    which makes the total; the centre, d ahead, has d (w^2 + dw/dt) more along the vehicle, at yaw rate w. Each is
-    smoothed, then differentiated, by the devkit's Savitzky-Golay windows, and rounded as there.
+    Accelerations are those of nuPlan's simulated ego. Its rear axle has a step's change
+    of speed and none to the side, which makes the total; the centre, d ahead, has d
+    (w^2 + dw/dt) more along the vehicle, at yaw rate w. Each is smoothed, then
+    differentiated, by the devkit's Savitzky-Golay windows, and rounded as there.
     """
     turns = wrap(ego[..., 2].diff(dim=1))
     rear_axle = held_back(ego[..., 3].diff(dim=1) / DT)
@@ -343,16 +451,21 @@ def comfort(ego: Tensor, length: Tensor) -> Tensor:
         "longitudinal_jerk": smoothed(longitudinal, window=15, order=2, deriv=1),
         "jerk": smoothed(total, window=15, order=2, deriv=1),
     }
-    within = [(low < motion[name]) & (motion[name] < high) for name, (low, high) in COMFORT.items()]
+    within = [
+        (low < motion[name]) & (motion[name] < high)
+        for name, (low, high) in COMFORT.items()
+    ]
     return torch.from_numpy(np.stack(within).all((0, 2))).to(ego)
 
 
 def held_back(change: Tensor) -> Tensor:
-    """Values [B, T+1] of steps [B, T]: that of the step before each state, and at the start that of the first step."""
+    """Values [B, T+1] of steps [B, T]: that of the step before each state, and at the
+    start that of the first step."""
     return torch.cat([change[:, :1], change], 1)
 
 
 def smoothed(values: np.ndarray, window: int, order: int, deriv: int = 0) -> np.ndarray:
-    """A Savitzky-Golay filter of values [B, T+1] at steps of DT, or its derivative, to eight decimals."""
+    """A Savitzky-Golay filter of values [B, T+1] at steps of DT, or its derivative, to
+    eight decimals."""
     length = min(window, values.shape[-1])
     return savgol_filter(values, length, order, deriv=deriv, delta=DT, axis=-1).round(8)

@@ -1,7 +1,8 @@
-"""The ego's distance to others, acceleration, progress and fraction of the recorded path until its first contact
-(docs/method.md, section 10).
+"""The ego's distance to others, acceleration, progress and fraction of the recorded
+path until its first contact (docs/method.md, section 10).
 
-Vehicles that stand at the start: parked ones should stay, some of those on a lane should start.
+Vehicles that stand at the start: parked ones should stay, some of those on a lane
+should start.
 """
 
 from functools import partial
@@ -26,58 +27,89 @@ per_km = partial(Metric, unit="1/km", per="driven_km", tables="egos")
 
 @columns(
     Metric("min_dtc", "smallest gap to another agent", unit="m", tables="main methods"),
-    Metric("ttc_c", "time-to-collision cost, adversaries", tables="main adversaries methods"),
+    Metric(
+        "ttc_c",
+        "time-to-collision cost, adversaries",
+        tables="main adversaries methods",
+    ),
     Metric("ttc_c_all", "time-to-collision cost, all agents"),
     Metric("macc", "ego's mean |acceleration|", unit="m/s²", tables="main egos public"),
-    Metric("progress", "distance that the ego drives", unit="m", raised=0.0, tables="main egos public"),
-    rate("route_completion", "fraction of the recorded ego's path driven until contact", tables="public"),
+    Metric(
+        "progress",
+        "distance that the ego drives",
+        unit="m",
+        raised=0.0,
+        tables="main egos public",
+    ),
+    rate(
+        "route_completion",
+        "fraction of the recorded ego's path driven until contact",
+        tables="public",
+    ),
     per_km("failures_per_km", "`cfr`, of all that the ego drives", column="cfr"),
     per_km("counted_per_km", "the same of `cfr_counted`", column="cfr_counted"),
 )
 def motion_columns(batch: Batch) -> Batch:
-    """min_dtc, ttc_c, ttc_c_all, macc, progress, driven_km and route_completion over the steps 1..stop; NaN without any
-    agent to measure them on."""
+    """min_dtc, ttc_c, ttc_c_all, macc, progress, driven_km and route_completion over
+    the steps 1..stop; NaN without any agent to measure them on."""
     states = batch["states"]
     valid = batch["valid"]
     stop = batch["stop"]
     seen = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
     seen[..., 0] = False
-    gap = distance(states[:, :, :1], batch["size"][:, None, :1], second=states, second_size=batch["size"][:, None])
+    gap = distance(
+        states[:, :, :1],
+        batch["size"][:, None, :1],
+        second=states,
+        second_size=batch["size"][:, None],
+    )
     gap = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
     moving = velocity(states)
-    cost = closest_approach_cost(states[..., :2] - states[..., :1, :2], moving - moving[..., :1, :])
+    cost = closest_approach_cost(
+        states[..., :2] - states[..., :1, :2], moving - moving[..., :1, :]
+    )
     path, count = ego_path(states, valid, stop=stop)
     driven = progress(path, count)
     return {
-        "min_dtc": gap.masked_fill(gap.isinf(), torch.nan).masked_fill(batch["hit"], 0.0),
+        "min_dtc": gap.masked_fill(gap.isinf(), torch.nan).masked_fill(
+            batch["hit"], 0.0
+        ),
         "ttc_c": mean_worst_cost(cost, seen & batch["adversaries"][:, None]),
         "ttc_c_all": mean_worst_cost(cost, seen),
         "macc": mean_acceleration(path, count),
         "progress": driven,
         "driven_km": driven / 1000,
-        "route_completion": route_completion(path, count, logged=batch["logged"], logged_valid=batch["logged_valid"]),
+        "route_completion": route_completion(
+            path, count, logged=batch["logged"], logged_valid=batch["logged_valid"]
+        ),
     }
 
 
 def mean_worst_cost(cost: Tensor, counted: Tensor) -> Tensor:
-    """Mean [B] of each step's largest counted cost [B, T+1, N] over the steps that have one; NaN where none has."""
+    """Mean [B] of each step's largest counted cost [B, T+1, N] over the steps that have
+    one; NaN where none has."""
     known = counted.any(-1)
     worst = (cost * counted).amax(-1)
     return (worst * known).sum(-1) / known.sum(-1)  # 0 / 0 is NaN
 
 
 def ego_path(states: Tensor, valid: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
-    """The ego's valid states at steps 0..stop moved to the front [B, T+1, 4], and their number [B]."""
+    """The ego's valid states at steps 0..stop moved to the front [B, T+1, 4], and their
+    number [B]."""
     steps = torch.arange(states.shape[1], device=states.device)
     counted = valid[..., 0] & (steps <= stop[:, None])
     order = (~counted).byte().argsort(dim=-1, stable=True)
-    return states[:, :, 0].gather(1, order[..., None].expand(-1, -1, 4)), counted.sum(-1)
+    return states[:, :, 0].gather(1, order[..., None].expand(-1, -1, 4)), counted.sum(
+        -1
+    )
 
 
 def mean_acceleration(path: Tensor, count: Tensor) -> Tensor:
-    """Mean |central difference| [B] [m/s2] of the speed's moving average over full windows of SMOOTHING seconds.
+    """Mean |central difference| [B] [m/s2] of the speed's moving average over full
+    windows of SMOOTHING seconds.
 
-    path [B, T+1, 4] of `count` [B] states; NaN where it is shorter than a window and two steps.
+    path [B, T+1, 4] of `count` [B] states; NaN where it is shorter than a window and
+    two steps.
     """
     window = round(SMOOTHING / DT)
     if path.shape[1] < window + 2:
@@ -90,7 +122,8 @@ def mean_acceleration(path: Tensor, count: Tensor) -> Tensor:
 
 
 def progress(path: Tensor, count: Tensor) -> Tensor:
-    """Distance [B] [m] driven along the ego's own heading, each step along the mean of its two headings.
+    """Distance [B] [m] driven along the ego's own heading, each step along the mean of
+    its two headings.
 
     path [B, T+1, 4] of `count` [B] states; driving backwards counts negative.
     """
@@ -101,51 +134,83 @@ def progress(path: Tensor, count: Tensor) -> Tensor:
     return (driven * counted).sum(-1)
 
 
-def route_completion(path: Tensor, count: Tensor, logged: Tensor, logged_valid: Tensor) -> Tensor:
-    """Fraction [B] in [0, 1] of the recorded ego's path that lies behind the ego at the end of its path.
+def route_completion(
+    path: Tensor, count: Tensor, logged: Tensor, logged_valid: Tensor
+) -> Tensor:
+    """Fraction [B] in [0, 1] of the recorded ego's path that lies behind the ego at the
+    end of its path.
 
-    path [B, T+1, 4] of `count` [B] states; logged [B, T+1, N, 4], logged_valid [B, T+1, N]: the recording. The ego is
-    projected onto the nearest piece of the recorded way, as MetaDrive does. Where that jumps, as at a crossing of the
-    way with itself, it is followed from the start on instead. NaN where the ego is in no step, or where the recorded
-    way is shorter than LEAST_WAY.
+    path [B, T+1, 4] of `count` [B] states; logged [B, T+1, N, 4], logged_valid [B, T+1,
+    N]: the recording. The ego is projected onto the nearest piece of the recorded way,
+    as MetaDrive does. Where that jumps, as at a crossing of the way with itself, it is
+    followed from the start on instead. NaN where the ego is in no step, or where the
+    recorded way is shorter than LEAST_WAY.
     """
     steps = torch.full_like(count, logged.shape[1] - 1)
     recorded, known = ego_path(logged, logged_valid, stop=steps)
-    piece = torch.arange(recorded.shape[1] - 1, device=path.device) < (known - 1)[:, None]
+    piece = (
+        torch.arange(recorded.shape[1] - 1, device=path.device) < (known - 1)[:, None]
+    )
     length = recorded[..., :2].diff(dim=1).norm(dim=-1) * piece
     end = length.cumsum(-1)
-    place = _place_on(path[..., :2], count, way=recorded[..., :2], piece=piece, ends=torch.stack([end - length, end], -1))
+    place = _place_on(
+        path[..., :2],
+        count,
+        way=recorded[..., :2],
+        piece=piece,
+        ends=torch.stack([end - length, end], -1),
+    )
     whole = length.sum(-1)
-    return (place / whole).clamp(max=1).masked_fill((count == 0) | (whole < LEAST_WAY), torch.nan)
+    return (
+        (place / whole)
+        .clamp(max=1)
+        .masked_fill((count == 0) | (whole < LEAST_WAY), torch.nan)
+    )
 
 
-def _place_on(points: Tensor, count: Tensor, way: Tensor, piece: Tensor, ends: Tensor) -> Tensor:
-    """Metres [B] along ways [B, P, 2] at which the last of `count` [B] points [B, T, 2] is.
+def _place_on(
+    points: Tensor, count: Tensor, way: Tensor, piece: Tensor, ends: Tensor
+) -> Tensor:
+    """Metres [B] along ways [B, P, 2] at which the last of `count` [B] points [B, T, 2]
+    is.
 
-    piece [B, P-1]: which pieces are part of the way; ends [B, P-1, 2] m: along it, where they begin and end.
+    piece [B, P-1]: which pieces are part of the way; ends [B, P-1, 2] m: along it,
+    where they begin and end.
     """
     start = way[:, None, :-1]
     along = (way[:, 1:] - way[:, :-1])[:, None]
     offset = points[:, :, None] - start
-    fraction = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)).clamp(0, 1)
-    gap = (offset - fraction[..., None] * along).norm(dim=-1).masked_fill(~piece[:, None], torch.inf)
+    fraction = (
+        (offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
+    ).clamp(0, 1)
+    gap = (
+        (offset - fraction[..., None] * along)
+        .norm(dim=-1)
+        .masked_fill(~piece[:, None], torch.inf)
+    )
     place = ends[:, None, :, 0] + fraction * (ends[..., 1] - ends[..., 0])[:, None]
     nearest = place.gather(2, gap.argmin(-1, keepdim=True))[..., 0]
 
     moved = torch.nn.functional.pad(points.diff(dim=1).norm(dim=-1), (1, 0))
     inside = torch.arange(points.shape[1], device=points.device) < count[:, None]
     before = torch.nn.functional.pad(nearest[:, :-1], (1, 0))
-    rows = ((((nearest - before).abs() - moved) > WINDOW) & inside).any(1).nonzero()[:, 0]
+    rows = (
+        ((((nearest - before).abs() - moved) > WINDOW) & inside).any(1).nonzero()[:, 0]
+    )
     if len(rows):
-        nearest[rows] = _followed(place[rows], gap[rows], ends=ends[rows], moved=moved[rows])
+        nearest[rows] = _followed(
+            place[rows], gap[rows], ends=ends[rows], moved=moved[rows]
+        )
     return nearest.gather(1, (count - 1).clamp(min=0)[:, None])[:, 0]
 
 
 def _followed(place: Tensor, gap: Tensor, ends: Tensor, moved: Tensor) -> Tensor:
-    """Metres [R, T] along ways at which points are, one after another from the ways' starts on.
+    """Metres [R, T] along ways at which points are, one after another from the ways'
+    starts on.
 
-    place, gap [R, T, P]: of each point on each piece, metres along the way and beside it; ends [R, P, 2]: metres at
-    which the pieces begin and end; moved [R, T] m since the point before.
+    place, gap [R, T, P]: of each point on each piece, metres along the way and beside
+    it; ends [R, P, 2]: metres at which the pieces begin and end; moved [R, T] m since
+    the point before.
     """
     places = [torch.zeros_like(moved[:, 0])]
     for step in range(moved.shape[1]):
@@ -157,13 +222,19 @@ def _followed(place: Tensor, gap: Tensor, ends: Tensor, moved: Tensor) -> Tensor
 
 
 def moved(states: Tensor, valid: Tensor) -> Tensor:
-    """Bool [B, N]: at some valid step [B, T+1, N] farther than MOVED from its position at step 0."""
+    """Bool [B, N]: at some valid step [B, T+1, N] farther than MOVED from its position
+    at step 0."""
     distance = (states[..., :2] - states[:, :1, :, :2]).norm(dim=-1)
     return ((distance > MOVED) & valid).any(1)
 
 
 @columns(
-    rate("parked_moved", "parked vehicles that move > 2 m", weight="parked_vehicles", tables="traffic"),
+    rate(
+        "parked_moved",
+        "parked vehicles that move > 2 m",
+        weight="parked_vehicles",
+        tables="traffic",
+    ),
     rate(
         "starts",
         "standing vehicles that start, over the log's",
@@ -174,11 +245,13 @@ def moved(states: Tensor, valid: Tensor) -> Tensor:
     events=("parked_vehicles", "starters_log"),
 )
 def standing_columns(batch: Batch) -> Batch:
-    """parked_moved, starters and what they rest on, each [B], of `traffic` vehicles recorded throughout.
+    """parked_moved, starters and what they rest on, each [B], of `traffic` vehicles
+    recorded throughout.
 
-    parked_moved: fraction of the parked_vehicles that move. starters: vehicles slower than STANDING at the start, not
-    parked, that move; starters_log: those that move in the log. Unlike safety metrics these look at the whole rollout.
-    Nothing is known without `parked`, which rollouts read from files lack.
+    parked_moved: fraction of the parked_vehicles that move. starters: vehicles slower
+    than STANDING at the start, not parked, that move; starters_log: those that move in
+    the log. Unlike safety metrics these look at the whole rollout. Nothing is known
+    without `parked`, which rollouts read from files lack.
     """
     if "parked" not in batch:
         return {}

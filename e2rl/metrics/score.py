@@ -5,7 +5,18 @@ import math
 import torch
 from torch import Tensor
 
-from e2rl.metrics.catalogue import COMPUTE, IDENTITY, LATER, METRICS, SOURCE, WORDS, Batch, Metric, columns, row_columns
+from e2rl.metrics.catalogue import (
+    COMPUTE,
+    IDENTITY,
+    LATER,
+    METRICS,
+    SOURCE,
+    WORDS,
+    Batch,
+    Metric,
+    columns,
+    row_columns,
+)
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
 from e2rl.metrics.sideways import moved_into
@@ -20,7 +31,14 @@ CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
     Metric("transport_adversary", "path KL of the control, adversaries"),
     Metric("transport_others", "path KL of the control, other vehicles"),
     Metric("transport_anchor", "anchor jump"),
-    Metric("seconds_per_rollout", "wall time", unit="s", column="seconds", cost=True, tables="main traffic methods"),
+    Metric(
+        "seconds_per_rollout",
+        "wall time",
+        unit="s",
+        column="seconds",
+        cost=True,
+        tables="main traffic methods",
+    ),
     Metric(
         "nfe",
         "evaluations of the prior's network per rollout, one with a gradient twice",
@@ -29,20 +47,31 @@ CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
     ),
 )
 def recorded_columns(batch: Batch) -> Batch:
-    """What the rollout itself recorded, where known: the control's transport, wall time, network evaluations, and who
-    is not there."""
-    names = ("transport_adversary", "transport_others", "transport_anchor", "seconds", "nfe")
-    known = {name: batch[name].to(batch["states"].dtype) for name in names if name in batch}
+    """What the rollout itself recorded, where known: the control's transport, wall
+    time, network evaluations, and who is not there."""
+    names = (
+        "transport_adversary",
+        "transport_others",
+        "transport_anchor",
+        "seconds",
+        "nfe",
+    )
+    known = {
+        name: batch[name].to(batch["states"].dtype) for name in names if name in batch
+    }
     known |= {name: batch[name] for name in ("left_out",) if name in batch}
-    return known | ({"transport": known[names[0]] + known[names[1]]} if names[0] in known else {})
+    return known | (
+        {"transport": known[names[0]] + known[names[1]]} if names[0] in known else {}
+    )
 
 
 def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:
     """Rows and realism samples of B rollouts, both for `statistics.summarise`.
 
-    A row is a dict of plain numbers and words: the columns `catalogue.row_columns`, NaN where unknown, and those of
-    SOURCE that the rollouts tell. Its own realism rests on few samples; sets of rollouts pool them. Sets
-    `rollouts.driver`: the competent driver of the verdict in the ego's place, NaN without a collision.
+    A row is a dict of plain numbers and words: the columns `catalogue.row_columns`, NaN
+    where unknown, and those of SOURCE that the rollouts tell. Its own realism rests on
+    few samples; sets of rollouts pool them. Sets `rollouts.driver`: the competent
+    driver of the verdict in the ego's place, NaN without a collision.
     """
     rows = []
     samples = []
@@ -51,7 +80,11 @@ def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:
         part = rollouts[begin : begin + CHUNK]
         found, features, driver = score_batch(as_doubles(part))
         identity = {name: part.get(name) for name in (*SOURCE, *IDENTITY)}
-        rows += plain_rows(found | {name: value for name, value in identity.items() if value is not None}, len(part))
+        rows += plain_rows(
+            found
+            | {name: value for name, value in identity.items() if value is not None},
+            len(part),
+        )
         samples += features
         drivers.append(driver)
     rollouts.driver = torch.cat(drivers).float()
@@ -59,8 +92,11 @@ def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:
 
 
 def as_doubles(rollouts: Rollouts) -> Batch:
-    """The tensors of rollouts on the CPU, positions in float64, absent states zero (they may hold anything)."""
-    batch = {key: value.cpu() for key, value in rollouts.items() if isinstance(value, Tensor)}
+    """The tensors of rollouts on the CPU, positions in float64, absent states zero
+    (they may hold anything)."""
+    batch = {
+        key: value.cpu() for key, value in rollouts.items() if isinstance(value, Tensor)
+    }
     for key, mask in (("states", "valid"), ("logged", "logged_valid")):
         batch[key] = batch[key].double().masked_fill(~batch[mask][..., None], 0.0)
     for key in ("size", "lane_points", "lane_width", "drivable_points"):
@@ -69,11 +105,14 @@ def as_doubles(rollouts: Rollouts) -> Batch:
 
 
 def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
-    """Columns {name: [B]}, realism samples per rollout, and the competent driver's states [B, T+1, 4] of a batch."""
+    """Columns {name: [B]}, realism samples per rollout, and the competent driver's
+    states [B, T+1, 4] of a batch."""
     traffic = batch["simulated"].clone()
     traffic[:, 0] = False
     batch = batch | {"traffic": traffic} | first_contact(batch)
-    batch["valid"] = batch["valid"] & ~batch["born_inside"]  # nobody avoids who appears within the ego
+    batch["valid"] = (
+        batch["valid"] & ~batch["born_inside"]
+    )  # nobody avoids who appears within the ego
     batch["moved_into"] = moved_into(batch)
     verdicts, driver = judge(batch)
     batch = batch | verdicts | {"driver": driver}
@@ -82,23 +121,40 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
         found = compute(batch)
         result |= found if isinstance(found, dict) else {METRICS[name].source: found}
     result["cfr_clean"] = clean(result)
-    wrong = [name for name, column in result.items() if column.shape != batch["stop"].shape]
+    wrong = [
+        name for name, column in result.items() if column.shape != batch["stop"].shape
+    ]
     if wrong:
-        raise ValueError(f"{', '.join(wrong)}: a metric is one number per rollout, a tensor [{len(traffic)}] here")
+        raise ValueError(
+            f"{', '.join(wrong)}: a metric is one number per rollout, a tensor [{len(traffic)}] here"
+        )
     samples = traffic_samples(batch)
     once = torch.ones(1, 1, dtype=torch.float64)
     owner = torch.zeros(1, dtype=torch.int64)
     single = [realism([sample], owner, draws=once) for sample in samples]
-    return result | {name: torch.cat([values[name] for values in single]) for name in single[0]}, samples, driver
+    return (
+        result
+        | {name: torch.cat([values[name] for values in single]) for name in single[0]},
+        samples,
+        driver,
+    )
 
 
 def plain_rows(found: dict[str, Tensor | list], count: int) -> list[dict]:
-    """One dict of python values per rollout; NaN for columns of the catalogue that nothing computed.
+    """One dict of python values per rollout; NaN for columns of the catalogue that
+    nothing computed.
 
-    Columns of `catalogue.WORDS`, such as contact_type, become words; their index -1 becomes "".
+    Columns of `catalogue.WORDS`, such as contact_type, become words; their index -1
+    becomes "".
     """
-    lists = {name: value.tolist() if isinstance(value, Tensor) else value for name, value in found.items()}
+    lists = {
+        name: value.tolist() if isinstance(value, Tensor) else value
+        for name, value in found.items()
+    }
     for name, words in WORDS.items():
         lists[name] = [words[index] if index >= 0 else "" for index in lists[name]]
     unknown = dict.fromkeys(row_columns(), math.nan) | LATER | {"errored": 0.0}
-    return [unknown | {name: values[index] for name, values in lists.items()} for index in range(count)]
+    return [
+        unknown | {name: values[index] for name, values in lists.items()}
+        for index in range(count)
+    ]

@@ -18,7 +18,9 @@ from e2rl.sim.observation import features, placed_ego
 from e2rl.sim.static import static_scene
 from e2rl.sim.world import Agents, World
 
-HOLD = 5  # steps for which a planned action is held: 10 evaluations of the policy per plan
+HOLD = (
+    5  # steps for which a planned action is held: 10 evaluations of the policy per plan
+)
 
 
 class ObservingEgo(Ego):
@@ -28,7 +30,8 @@ class ObservingEgo(Ego):
 
     @abstractmethod
     def decide(self, observation: Tensor) -> Tensor:
-        """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) at observations [B, OBSERVATION_SIZE]."""
+        """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) at observations [B,
+        OBSERVATION_SIZE]."""
 
     @torch.no_grad()
     def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
@@ -37,9 +40,11 @@ class ObservingEgo(Ego):
 
     @torch.no_grad()
     def plan(self, world: World) -> Tensor:
-        """Planned states [B, PLAN_STEPS, 4]: the policy rolled forward, each action held HOLD steps.
+        """Planned states [B, PLAN_STEPS, 4]: the policy rolled forward, each action
+        held HOLD steps.
 
-        Vehicles follow their plans where these are known; all other agents keep their velocity.
+        Vehicles follow their plans where these are known; all other agents keep their
+        velocity.
         """
         static = static_scene(world.scene, mission_of(world.scene))
         expected = expected_states(world)
@@ -50,8 +55,19 @@ class ObservingEgo(Ego):
         pieces = []
         place = world.mission_s
         for done in range(0, PLAN_STEPS, HOLD):
-            ego = placed_ego(static.mission, world.step + done, state=state, action=action, present=present, on_road=present, place=place, agents=static.vehicle)
-            seen = features(static, ego, others_at(world, expected, step=done), ego.step / horizon)
+            ego = placed_ego(
+                static.mission,
+                world.step + done,
+                state=state,
+                action=action,
+                present=present,
+                on_road=present,
+                place=place,
+                agents=static.vehicle,
+            )
+            seen = features(
+                static, ego, others_at(world, expected, step=done), ego.step / horizon
+            )
             action = self.decide(seen)
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
@@ -63,16 +79,23 @@ class ObservingEgo(Ego):
 
 
 def others_at(world: World, expected: Tensor, step: int) -> Agents:
-    """All agents but the ego `step` steps from now, by their expected states [B, N, PLAN_STEPS + 1, 4]."""
+    """All agents but the ego `step` steps from now, by their expected states [B, N,
+    PLAN_STEPS + 1, 4]."""
     if step == 0:
         return world.others()
     states = expected[:, 1:, step]
     change = states - expected[:, 1:, step - 1]
-    return Agents(states, world.valid[:, 1:], accel=change[..., 3] / DT, turn_rate=dynamics.wrap(change[..., 2]) / DT)
+    return Agents(
+        states,
+        world.valid[:, 1:],
+        accel=change[..., 3] / DT,
+        turn_rate=dynamics.wrap(change[..., 2]) / DT,
+    )
 
 
 def expected_states(world: World) -> Tensor:
-    """States [B, N, PLAN_STEPS + 1, 4] of all agents at steps 0.. from now: as planned, else at constant velocity."""
+    """States [B, N, PLAN_STEPS + 1, 4] of all agents at steps 0.. from now: as planned,
+    else at constant velocity."""
     now = world.states[:, :, None]
     time = DT * torch.arange(PLAN_STEPS + 1, device=now.device, dtype=now.dtype)
     expected = dynamics.constant_velocity(world.states, time)
@@ -86,7 +109,8 @@ def expected_states(world: World) -> Tensor:
 @configured("ego/actor")
 @dataclass(eq=False)
 class ActorEgo(ObservingEgo):
-    """Drives by the actor's most central action; the learner updates `network` in place."""
+    """Drives by the actor's most central action; the learner updates `network` in
+    place."""
 
     hidden: Sequence[int] = setting()
     agent_units: int = setting(low=1)
@@ -101,18 +125,28 @@ class ActorEgo(ObservingEgo):
     device: str = setting()
 
     def __post_init__(self) -> None:
-        """Raises InputError for a checkpoint that is missing or whose actions have other bounds."""
+        """Raises InputError for a checkpoint that is missing or whose actions have
+        other bounds."""
         if not self.hidden:
             raise InputError("ego.hidden=[]: give the units of one layer at least")
         low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
         high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
-        sizes = self.hidden, self.agent_units, self.reference, self.slack, self.room, self.initial_std
+        sizes = (
+            self.hidden,
+            self.agent_units,
+            self.reference,
+            self.slack,
+            self.room,
+            self.initial_std,
+        )
         self.network = ActorCritic(low, high, *sizes, self.device)
         if self.checkpoint is not None:
             asked = self.network.architecture
             path = find_weights(self.checkpoint)
             self.network = read_actor(path, self.device)
-            own, wanted = ((of["low"], of["high"]) for of in (self.network.architecture, asked))
+            own, wanted = (
+                (of["low"], of["high"]) for of in (self.network.architecture, asked)
+            )
             if own != wanted:
                 raise InputError(
                     f"{path}: its actions have the bounds {own}, not {wanted}; set sim.max_* as in its run"

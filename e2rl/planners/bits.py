@@ -1,7 +1,9 @@
-"""A driver learned by bi-level imitation, in the manner of BITS (Xu et al. 2023): goals, plans to them, the best plan.
+"""A driver learned by bi-level imitation, in the manner of BITS (Xu et al. 2023):
+goals, plans to them, the best plan.
 
-Upper level: a distribution over goals beside the mission, of which `goals` are drawn. Lower level: a goal-conditioned
-policy plans to each of them, driven by the unicycle. The plan that costs least on a forecast of the others is chosen.
+Upper level: a distribution over goals beside the mission, of which `goals` are drawn.
+Lower level: a goal-conditioned policy plans to each of them, driven by the unicycle.
+The plan that costs least on a forecast of the others is chosen.
 """
 
 from dataclasses import dataclass
@@ -9,7 +11,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from e2rl.planners.bits_network import CELLS, BitsNetwork, drive_controls, load_bits, place
+from e2rl.planners.bits_network import (
+    CELLS,
+    BitsNetwork,
+    drive_controls,
+    load_bits,
+    place,
+)
 from e2rl.planners.candidates import Candidates
 from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import SCENE_KEYS, ScoringEgo
@@ -23,9 +31,15 @@ from e2rl.sim.world import World
 @configured("ego/bits")
 @dataclass(eq=False)
 class BitsEgo(ScoringEgo):
-    """Drives by the cheapest of the plans to goals that recorded drivers might have had."""
+    """Drives by the cheapest of the plans to goals that recorded drivers might have
+    had."""
 
-    READS = (*SCENE_KEYS, "agent_type", "logged", "logged_valid")  # `static_scene` wants the log; no feature shows it
+    READS = (
+        *SCENE_KEYS,
+        "agent_type",
+        "logged",
+        "logged_valid",
+    )  # `static_scene` wants the log; no feature shows it
 
     tuned = {"goals": (10, 80), "temperature": (0.3, 2.0)} | ScoringEgo.tuned
 
@@ -35,7 +49,11 @@ class BitsEgo(ScoringEgo):
 
     def __post_init__(self) -> None:
         """Raises InputError for a checkpoint that is missing or does not fit."""
-        self.network = BitsNetwork().eval() if self.checkpoint is None else load_bits(self.checkpoint)
+        self.network = (
+            BitsNetwork().eval()
+            if self.checkpoint is None
+            else load_bits(self.checkpoint)
+        )
         uniform = torch.rand(CELLS, generator=torch.Generator().manual_seed(0))
         self.noise = -(-uniform.clamp(1e-6, 1 - 1e-6).log()).log()  # Gumbel's
 
@@ -48,24 +66,46 @@ class BitsEgo(ScoringEgo):
         code = network.encode(observed(world))
         distance, side = self.drawn(*network.goals(code), start[:, 3])
         distance = torch.minimum(distance, path.stop_distance().clamp(min=0)[:, None])
-        return drive_controls(network.controls(code, start[:, 3], path.d, distance, side), start, path=path)
+        return drive_controls(
+            network.controls(code, start[:, 3], path.d, distance, side),
+            start,
+            path=path,
+        )
 
-    def drawn(self, logits: Tensor, residual: Tensor, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances and sides [B, goals] m of goals drawn without replacement (the Gumbel-max trick).
+    def drawn(
+        self, logits: Tensor, residual: Tensor, speed: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Distances and sides [B, goals] m of goals drawn without replacement (the
+        Gumbel-max trick).
 
-        The noise is the same in every scene and replan, so a plan depends on nothing but its World.
+        The noise is the same in every scene and replan, so a plan depends on nothing
+        but its World.
         """
-        cell = (logits / self.temperature + self.noise.to(logits.device)).topk(self.goals, 1).indices
-        return place(speed, cell, residual=residual.gather(1, cell[..., None].expand(-1, -1, 2)))
+        cell = (
+            (logits / self.temperature + self.noise.to(logits.device))
+            .topk(self.goals, 1)
+            .indices
+        )
+        return place(
+            speed, cell, residual=residual.gather(1, cell[..., None].expand(-1, -1, 2))
+        )
 
 
 def observed(world: World) -> Tensor:
-    """The environment's observations [B, D] of Worlds, but for the elapsed time, which is 0."""
+    """The environment's observations [B, D] of Worlds, but for the elapsed time, which
+    is 0."""
     static = static_scene(world.scene, mission_of(world.scene))
     state = world.states[:, 0]
     present = world.valid[:, 0]
     ego = placed_ego(
-        static.mission, world.step, state=state, action=world.ego_action(), present=present, on_road=present, place=world.mission_s, agents=static.vehicle
+        static.mission,
+        world.step,
+        state=state,
+        action=world.ego_action(),
+        present=present,
+        on_road=present,
+        place=world.mission_s,
+        agents=static.vehicle,
     )
     seen = features(static, ego, world.others(), world.step.to(state.dtype))
     return seen.index_fill(1, torch.tensor([ELAPSED], device=state.device), 0.0)

@@ -1,9 +1,12 @@
-"""The networks of the ego `bits`: scene encoder, goal head and goal-conditioned policy, and their file.
+"""The networks of the ego `bits`: scene encoder, goal head and goal-conditioned policy,
+and their file.
 
-Goals beside a mission: a grid of the places that a vehicle may have reached at the end of its plan.
+Goals beside a mission: a grid of the places that a vehicle may have reached at the end
+of its plan.
 
-A goal is a distance [m] along the mission from the vehicle's present place and a side [m] beside the mission (left
-positive). The grid covers the distances up to `reach`, in cells whose length grows with the vehicle's speed.
+A goal is a distance [m] along the mission from the vehicle's present place and a side
+[m] beside the mission (left positive). The grid covers the distances up to `reach`, in
+cells whose length grows with the vehicle's speed.
 """
 
 import json
@@ -39,16 +42,16 @@ def reach(speed: Tensor) -> Tensor:
 
 
 def place(speed: Tensor, cell: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances and sides [B, K] m of the goals at `cell` [B, K] with residual [B, K, 2], in cells from the cell's
-    centre; speed [B] m/s. No distance is negative."""
+    """Distances and sides [B, K] m of the goals at `cell` [B, K] with residual [B, K,
+    2], in cells from the cell's centre; speed [B] m/s. No distance is negative."""
     along = cell.div(SIDES, rounding_mode="floor") + 0.5 + residual[..., 0]
     across = cell % SIDES - (SIDES - 1) / 2 + residual[..., 1]
     return (along * reach(speed)[:, None] / DISTANCES).clamp(min=0), across * SIDE
 
 
 def cell_of(speed: Tensor, distance: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
-    """The cells [W] of goals distance, side [W] m, and their residuals [W, 2]: the inverse of `place`. A goal off the
-    grid counts to the nearest cell."""
+    """The cells [W] of goals distance, side [W] m, and their residuals [W, 2]: the
+    inverse of `place`. A goal off the grid counts to the nearest cell."""
     along = distance / reach(speed) * DISTANCES - 0.5
     across = side / SIDE + (SIDES - 1) / 2
     w = along.round().clamp(0, DISTANCES - 1)
@@ -57,8 +60,8 @@ def cell_of(speed: Tensor, distance: Tensor, side: Tensor) -> tuple[Tensor, Tens
 
 
 def needed_acceleration(speed: Tensor, distance: Tensor) -> Tensor:
-    """The constant acceleration [...] m/s^2 that drives `distance` [...] m within the horizon from speed [...] m/s: to
-    its end, or to a halt before it."""
+    """The constant acceleration [...] m/s^2 that drives `distance` [...] m within the
+    horizon from speed [...] m/s: to its end, or to a halt before it."""
     going = 2 * (distance - PLAN_SECONDS * speed) / PLAN_SECONDS**2
     halting = -speed.square() / (2 * distance.clamp(min=0.1))
     return torch.where(distance < PLAN_SECONDS * speed / 2, halting, going)
@@ -75,8 +78,9 @@ AROUND = SIDE  # m: the move leads at most so far beside the goal
 
 
 class Controls(NamedTuple):
-    """What the policy decides of K plans in each of B scenes: acceleration [B, K, KNOTS] m/s^2, shift [B, K] m beside
-    the mission where the plan leads, over time [B, K] s."""
+    """What the policy decides of K plans in each of B scenes: acceleration [B, K,
+    KNOTS] m/s^2, shift [B, K] m beside the mission where the plan leads, over time [B,
+    K] s."""
 
     acceleration: Tensor
     shift: Tensor
@@ -84,42 +88,70 @@ class Controls(NamedTuple):
 
 
 class BitsNetwork(nn.Module):
-    """Observation -> code; code -> distribution over goals; code and goal -> controls of a plan.
+    """Observation -> code; code -> distribution over goals; code and goal -> controls
+    of a plan.
 
-    Outputs start at zero: untrained, all goals are equally likely and every plan keeps its speed. dropout: fraction
-    of a code's numbers that are left out in training mode.
+    Outputs start at zero: untrained, all goals are equally likely and every plan keeps
+    its speed. dropout: fraction of a code's numbers that are left out in training mode.
     """
 
     def __init__(self, hidden: int = 64, dropout: float = 0.0) -> None:
         super().__init__()
-        self.architecture = {"observation": OBSERVATION_SIZE, "hidden": int(hidden), "cells": CELLS, "knots": KNOTS}
+        self.architecture = {
+            "observation": OBSERVATION_SIZE,
+            "hidden": int(hidden),
+            "cells": CELLS,
+            "knots": KNOTS,
+        }
         self.normaliser = Normaliser(OBSERVATION_SIZE)
-        layers = perceptron(OBSERVATION_SIZE, [2 * hidden], out=hidden, last_gain=2**0.5)
+        layers = perceptron(
+            OBSERVATION_SIZE, [2 * hidden], out=hidden, last_gain=2**0.5
+        )
         self.encoder = nn.Sequential(layers, nn.SiLU(), nn.Dropout(dropout))
         self.goal_head = perceptron(hidden, [hidden], out=3 * CELLS, last_gain=0.0)
-        self.policy = perceptron(hidden + GOAL_FEATURES, [hidden, hidden], out=KNOTS + 2, last_gain=0.0)
+        self.policy = perceptron(
+            hidden + GOAL_FEATURES, [hidden, hidden], out=KNOTS + 2, last_gain=0.0
+        )
 
     def encode(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
-        """Codes [B, hidden] of observations [B, D]; noise [B, D] is added to the normalised ones, in training."""
+        """Codes [B, hidden] of observations [B, D]; noise [B, D] is added to the
+        normalised ones, in training."""
         seen = self.normaliser(observation)
         return self.encoder(seen if noise is None else seen + noise)
 
     def goals(self, code: Tensor) -> tuple[Tensor, Tensor]:
-        """Of every goal's cell the logit [B, CELLS], and the place in it: residual [B, CELLS, 2] in cells."""
+        """Of every goal's cell the logit [B, CELLS], and the place in it: residual [B,
+        CELLS, 2] in cells."""
         logits, residual = self.goal_head(code).split([CELLS, 2 * CELLS], -1)
         return logits, residual.unflatten(-1, (CELLS, 2))
 
-    def controls(self, code: Tensor, speed: Tensor, offset: Tensor, distance: Tensor, side: Tensor) -> Controls:
-        """The policy's Controls of plans to the goals distance, side [B, K] m, from codes [B, hidden], speeds [B] m/s
-        and offsets [B] m beside the mission."""
+    def controls(
+        self,
+        code: Tensor,
+        speed: Tensor,
+        offset: Tensor,
+        distance: Tensor,
+        side: Tensor,
+    ) -> Controls:
+        """The policy's Controls of plans to the goals distance, side [B, K] m, from
+        codes [B, hidden], speeds [B] m/s and offsets [B] m beside the mission."""
         speed = speed[:, None].expand_as(distance)
         offset = offset[:, None]
-        features = [distance / reach(speed), distance / 50, needed_acceleration(speed, distance) / 4, side / 3]
+        features = [
+            distance / reach(speed),
+            distance / 50,
+            needed_acceleration(speed, distance) / 4,
+            side / 3,
+        ]
         features += [(side - offset) / 3, speed / 15]
         code = code[:, None].expand(-1, distance.shape[1], -1)
         out = self.policy(torch.cat([code, torch.stack(features, -1)], -1))
         shift = side + AROUND * out[..., KNOTS].tanh()
-        return Controls(between(out[..., :KNOTS], *ACCELERATION, 0.0), shift, time=between(out[..., -1], *TIME, 1.4))
+        return Controls(
+            between(out[..., :KNOTS], *ACCELERATION, 0.0),
+            shift,
+            time=between(out[..., -1], *TIME, 1.4),
+        )
 
     @property
     def device(self) -> torch.device:
@@ -134,23 +166,36 @@ def between(value: Tensor, low: float, high: float, start: float) -> Tensor:
 
 
 def drive_controls(controls: Controls, start: Tensor, path: RoutePath) -> Candidates:
-    """The Candidates [B, K] that Controls make of states start [B, 4] on their paths, by the unicycle."""
+    """The Candidates [B, K] that Controls make of states start [B, 4] on their paths,
+    by the unicycle."""
     held = controls.acceleration.repeat_interleave(PLAN_STEPS // KNOTS, -1)
     now = start[:, None, 3:].expand(*held.shape[:2], 1)
     speed = torch.cat([now, dynamics.bounded_speed(now, held * DT)], -1)
-    return drive(start, path, speed, controls.shift[..., None], controls.time[..., None])
+    return drive(
+        start, path, speed, controls.shift[..., None], controls.time[..., None]
+    )
 
 
 def save_bits(network: BitsNetwork, path: Path, origin: dict[str, Any]) -> None:
-    """Write a network to a safetensors file; origin: what made it (data, command, settings), kept in the header."""
-    header = {"format": FORMAT, "architecture": json.dumps(network.architecture), "origin": json.dumps(origin)}
+    """Write a network to a safetensors file; origin: what made it (data, command,
+    settings), kept in the header."""
+    header = {
+        "format": FORMAT,
+        "architecture": json.dumps(network.architecture),
+        "origin": json.dumps(origin),
+    }
     write_atomically(path, weight_bytes(network.state_dict(), header))
 
 
 def load_bits(checkpoint: str) -> BitsNetwork:
-    """The network in a file of `save_bits`, in a folder with one, or with "bundled" the package's own, trained on the
-    bundled scenes. Raises InputError, naming the file, where it is missing, damaged or of another architecture."""
-    path = Path(str(files("e2rl") / "assets" / "bits")) if checkpoint == "bundled" else Path(checkpoint)
+    """The network in a file of `save_bits`, in a folder with one, or with "bundled" the
+    package's own, trained on the bundled scenes. Raises InputError, naming the file,
+    where it is missing, damaged or of another architecture."""
+    path = (
+        Path(str(files("e2rl") / "assets" / "bits"))
+        if checkpoint == "bundled"
+        else Path(checkpoint)
+    )
     path = path / WEIGHTS if path.is_dir() else path
     if not path.is_file():
         raise InputError(
@@ -161,8 +206,14 @@ def load_bits(checkpoint: str) -> BitsNetwork:
         weights, header = read_weights(path)
         saved = json.loads(header["architecture"])
         hidden = saved["hidden"]
-        if header.get("format") != FORMAT or type(hidden) is not int or not 0 < hidden <= LARGEST:
-            raise ValueError(f"format {header.get('format')!r} instead of {FORMAT!r}, or {hidden} hidden units")
+        if (
+            header.get("format") != FORMAT
+            or type(hidden) is not int
+            or not 0 < hidden <= LARGEST
+        ):
+            raise ValueError(
+                f"format {header.get('format')!r} instead of {FORMAT!r}, or {hidden} hidden units"
+            )
         if wrong := unlike(partial(BitsNetwork, hidden), weights):
             raise ValueError(wrong)
         network = BitsNetwork(hidden)
@@ -171,5 +222,7 @@ def load_bits(checkpoint: str) -> BitsNetwork:
         network.load_state_dict(weights)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split("\n\t")[:2])
-        raise InputError(f"{path}: damaged, or of another architecture ({reason}); train it again") from error
+        raise InputError(
+            f"{path}: damaged, or of another architecture ({reason}); train it again"
+        ) from error
     return network.requires_grad_(False).eval()

@@ -1,4 +1,5 @@
-"""Candidates of a planner: speed profiles on lateral moves beside the mission, driven by the unicycle."""
+"""Candidates of a planner: speed profiles on lateral moves beside the mission, driven
+by the unicycle."""
 
 from typing import NamedTuple
 
@@ -21,38 +22,48 @@ REACH = int(dynamics.MAX_SPEED * PLAN_STEPS * DT / CELL) + 1  # entries of it
 
 
 class Candidates(NamedTuple):
-    """C candidates of each of B scenes: states [B, C, PLAN_STEPS, 4] at steps 1..; distance [B, C] m along the mission
-    to their end; shift [B, C] m beside the mission where they lead."""
+    """C candidates of each of B scenes: states [B, C, PLAN_STEPS, 4] at steps 1..;
+    distance [B, C] m along the mission to their end; shift [B, C] m beside the mission
+    where they lead."""
 
     states: Tensor
     distance: Tensor
     shift: Tensor
 
 
-def speed_profiles(speed: Tensor, accelerations: Tensor, caps: Tensor, braking: float) -> Tensor:
+def speed_profiles(
+    speed: Tensor, accelerations: Tensor, caps: Tensor, braking: float
+) -> Tensor:
     """Speeds [B, L, PLAN_STEPS + 1] every DT from speed [B] m/s on.
 
-    accelerations [L, 2] m/s^2: in the first second and after it; caps [B, K]: squared speeds of
-    `MissionPath.speed_caps`, kept by braking at up to `braking` m/s^2 where a profile does not brake harder itself.
+    accelerations [L, 2] m/s^2: in the first second and after it; caps [B, K]: squared
+    speeds of `MissionPath.speed_caps`, kept by braking at up to `braking` m/s^2 where a
+    profile does not brake harder itself.
     """
     node = torch.arange(NODES, device=speed.device)
     rate = torch.where(node < FIRST, accelerations[:, :1], accelerations[:, 1:])
     start = speed[:, None, None].expand(-1, len(accelerations), 1)
     wanted = dynamics.bounded_speed(start, rate * PLAN_DT)
-    return upsample(capped(torch.cat([start, wanted], -1), caps, slope=braking * PLAN_DT))
+    return upsample(
+        capped(torch.cat([start, wanted], -1), caps, slope=braking * PLAN_DT)
+    )
 
 
-def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Tensor) -> Candidates:
+def drive(
+    start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Tensor
+) -> Candidates:
     """The C = L S Candidates of L speed profiles on S lateral moves each.
 
-    A move leads `shift` m beside the mission over max(RETURN_LENGTH, time v) m, as `RoutePath` returns to its route.
-    Its headings become yaw rates, within MAX_YAW_RATE and the tyres' grip, which braking shares; the unicycle makes
-    states of them.
+    A move leads `shift` m beside the mission over max(RETURN_LENGTH, time v) m, as
+    `RoutePath` returns to its route. Its headings become yaw rates, within MAX_YAW_RATE
+    and the tyres' grip, which braking shares; the unicycle makes states of them.
 
-    start: states [B, 4]; speed: profiles [B, L, PLAN_STEPS + 1] m/s; shift m, time s: [B, L, S] or what broadcasts to
-    it.
+    start: states [B, 4]; speed: profiles [B, L, PLAN_STEPS + 1] m/s; shift m, time s:
+    [B, L, S] or what broadcasts to it.
     """
-    shift, time = (value.expand(*speed.shape[:2], value.shape[-1]) for value in (shift, time))
+    shift, time = (
+        value.expand(*speed.shape[:2], value.shape[-1]) for value in (shift, time)
+    )
     speed = speed[:, :, None]
     mean = (speed[..., 1:] + speed[..., :-1]) / 2
     accel = speed.diff(dim=-1) / DT
@@ -60,14 +71,25 @@ def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Te
     length = (time * start[:, 3, None, None]).clamp(min=RETURN_LENGTH)[..., None]
     beside = shift[..., None]
     turned = path.turned[:, None, None]
-    offset, slope = fading(path.d[:, None, None, None] - beside, turned[..., None], length=length, ahead=driven)
+    offset, slope = fading(
+        path.d[:, None, None, None] - beside,
+        turned[..., None],
+        length=length,
+        ahead=driven,
+    )
     table = heading_table(path)
     before, after, _ = between_entries(table, driven / CELL)
     inner = (1 - (after - before) / CELL * (beside + offset)).clamp(min=0.2)
     stretch = torch.hypot(inner, slope)
-    along = (driven.diff(dim=-1) * 2 / (stretch[..., 1:] + stretch[..., :-1])).cumsum(-1)
-    aimed = torch.lerp(*between_entries(table, along / CELL)) + torch.atan(slope[..., 1:] / inner[..., 1:])
-    grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt() / mean.clamp(min=1e-3)
+    along = (driven.diff(dim=-1) * 2 / (stretch[..., 1:] + stretch[..., :-1])).cumsum(
+        -1
+    )
+    aimed = torch.lerp(*between_entries(table, along / CELL)) + torch.atan(
+        slope[..., 1:] / inner[..., 1:]
+    )
+    grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt() / mean.clamp(
+        min=1e-3
+    )
     bound = torch.minimum(grip, dynamics.yaw_rate_bound(mean)).clamp(max=MAX_YAW_RATE)
     yaw_rate = steer(turned.expand_as(shift), aimed, bound=bound * DT) / DT
     actions = torch.stack([accel.expand_as(yaw_rate), yaw_rate], -1).flatten(1, 2)
@@ -76,8 +98,8 @@ def drive(start: Tensor, path: RoutePath, speed: Tensor, shift: Tensor, time: Te
 
 
 def steer(heading: Tensor, aimed: Tensor, bound: Tensor) -> Tensor:
-    """Turns [..., T] rad of each step from heading [...] to aimed [..., T] rad, within bound [..., T], which
-    broadcasts. What a bound withholds is made up later."""
+    """Turns [..., T] rad of each step from heading [...] to aimed [..., T] rad, within
+    bound [..., T], which broadcasts. What a bound withholds is made up later."""
     turns = []
     for aim, most in zip(aimed.unbind(-1), bound.unbind(-1), strict=True):
         turn = torch.clamp(aim - heading, -most, most)
@@ -87,7 +109,8 @@ def steer(heading: Tensor, aimed: Tensor, bound: Tensor) -> Tensor:
 
 
 def heading_table(path: RoutePath) -> Tensor:
-    """Headings [B, REACH] of the missions every CELL m ahead, relative to the heading at the ego's place, unwrapped."""
+    """Headings [B, REACH] of the missions every CELL m ahead, relative to the heading
+    at the ego's place, unwrapped."""
     grid = CELL * torch.arange(REACH, device=path.s.device, dtype=path.s.dtype)
     heading = interpolate(path.route, path.s[:, None] + grid)[1]
     return torch.nn.functional.pad(wrap(heading.diff(dim=-1)).cumsum(-1), (1, 0))

@@ -1,7 +1,8 @@
 """One interface for all egos: planners, the learned actor, users' code.
 
-A user's planner is a class and a YAML file in conf/ego with its `_target_` and arguments (docs/how-to/planner.md,
-examples/). It overrides `plan`, and `act` tracks the plan; or `act`, which maps observations to actions.
+A user's planner is a class and a YAML file in conf/ego with its `_target_` and
+arguments (docs/how-to/planner.md, examples/). It overrides `plan`, and `act` tracks the
+plan; or `act`, which maps observations to actions.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,11 +23,17 @@ from e2rl.sim import dynamics
 from e2rl.sim.world import World, without_future
 
 PLAN_STEPS = 50  # H: planned steps of DT
-RETURN_TIME, RETURN_LENGTH = 0.7, 1.5  # s, m: a lateral error decays over max(RETURN_LENGTH, RETURN_TIME * v)
+RETURN_TIME, RETURN_LENGTH = (
+    0.7,
+    1.5,
+)  # s, m: a lateral error decays over max(RETURN_LENGTH, RETURN_TIME * v)
 CATCH_UP = 1.0  # 1/s: rate at which a longitudinal error is corrected
-FASTEST = 50.0  # m/s: a plan that is faster, in its speeds or from pose to pose, is nonsense
+FASTEST = (
+    50.0  # m/s: a plan that is faster, in its speeds or from pose to pose, is nonsense
+)
 LARGEST = 100.0  # m/s^2, rad/s: so is a larger action
-# A plan that begins farther away is in another frame, or of another time; some begin on a lane beside.
+# A plan that begins farther away is in another frame, or of another time; some begin on
+# a lane beside.
 ALONG, ASIDE, TURNED = 2.0, 5.0, 1.0  # m, m, rad
 CREEP = 0.5  # m/s below which a heading may be anything
 JUMPS = f"a plan that is not finite, or jumps (above {FASTEST:g} m/s)"
@@ -40,10 +47,12 @@ BY_EGO = "raised by the ego"  # note on what its code raises
 
 
 class Ego(Extension):
-    """Drives the ego of B scenes at once, by its plans, a pure function of the World, or by its actions.
+    """Drives the ego of B scenes at once, by its plans, a pure function of the World,
+    or by its actions.
 
-    replan_every: steps between two plans (5 is 2 Hz, 1 every step), at most PLAN_STEPS; replays_log: the environment
-    moves this ego along its recording (`SimSettings.replay_ego`) and ignores its actions; tuned: what `e2rl tune`
+    replan_every: steps between two plans (5 is 2 Hz, 1 every step), at most PLAN_STEPS;
+    replays_log: the environment moves this ego along its recording
+    (`SimSettings.replay_ego`) and ignores its actions; tuned: what `e2rl tune`
     searches, {argument: (low, high) or (low, high, "log")}.
     """
 
@@ -55,15 +64,19 @@ class Ego(Extension):
         self.replan_every = replan_every
 
     def reset(self, world: World) -> None:  # noqa: B027 - most egos have no memory
-        """Called before the first plan of new episodes (world.step 0). An ego with memory clears it here."""
+        """Called before the first plan of new episodes (world.step 0). An ego with
+        memory clears it here."""
 
     def __new__(cls, *args: Any, **settings: Any) -> "Ego":
         if cls.plan is Ego.plan and cls.act is Ego.act:
-            raise TypeError(f"{cls.__name__} overrides neither plan nor act, so that it does not drive")
+            raise TypeError(
+                f"{cls.__name__} overrides neither plan nor act, so that it does not drive"
+            )
         return super().__new__(cls)
 
     def plan(self, world: World) -> Tensor:
-        """Planned states [B, PLAN_STEPS, 4] of the egos at steps 1.. from now, 0.1 s apart, without side effects.
+        """Planned states [B, PLAN_STEPS, 4] of the egos at steps 1.. from now, 0.1 s
+        apart, without side effects.
 
         By default, for an ego that acts, its present velocity held.
         """
@@ -71,10 +84,11 @@ class Ego(Extension):
         return dynamics.constant_velocity(world.states[:, 0], ahead)
 
     def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
-        """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) for the next step; by default it tracks the plan.
+        """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) for the next step; by
+        default it tracks the plan.
 
-        observation [B, D]: the environment's; plan [B, 1 + PLAN_STEPS, 4]: states of the last plan, now and at the
-        coming steps.
+        observation [B, D]: the environment's; plan [B, 1 + PLAN_STEPS, 4]: states of
+        the last plan, now and at the coming steps.
         """
         return track(world.states[:, 0], plan[:, 0], following=plan[:, 1])
 
@@ -85,21 +99,26 @@ def return_length(speed: Tensor) -> Tensor:
 
 
 def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
-    """Action [..., 2] with which a vehicle at state [..., 4] tracks a plan: `planned` now, `following` one step later.
+    """Action [..., 2] with which a vehicle at state [..., 4] tracks a plan: `planned`
+    now, `following` one step later.
 
-    Inverse dynamics to the following speed and heading, corrected by the deviation from the plan: a lateral error turns
-    the target heading towards the plan, a longitudinal error changes the target speed. A plan that obeys the unicycle
-    is tracked without error.
+    Inverse dynamics to the following speed and heading, corrected by the deviation from
+    the plan: a lateral error turns the target heading towards the plan, a longitudinal
+    error changes the target speed. A plan that obeys the unicycle is tracked without
+    error.
     """
     error = to_frame(state[..., :2], planned)
-    heading = following[..., 2] - torch.atan(error[..., 1] / return_length(state[..., 3]))
+    heading = following[..., 2] - torch.atan(
+        error[..., 1] / return_length(state[..., 3])
+    )
     speed = (following[..., 3] - CATCH_UP * error[..., 0]).clamp(min=0)
     aimed = torch.cat([following[..., :2], torch.stack([heading, speed], -1)], -1)
     return dynamics.inverse(torch.stack([state, aimed], -2))[..., 0, :]
 
 
 class RowsError(Exception):
-    """Rollouts of a batch end; rows: why, by row of the batch, empty where it is not known which.
+    """Rollouts of a batch end; rows: why, by row of the batch, empty where it is not
+    known which.
 
     The others of the batch are driven anew without them.
     """
@@ -116,7 +135,11 @@ def renumbered(rows: Tensor) -> Iterator[None]:
         yield
     except RowsError as error:
         numbers = rows.tolist()
-        error.rows = {numbers[row]: why for row, why in error.rows.items() if 0 <= row < len(numbers)}
+        error.rows = {
+            numbers[row]: why
+            for row, why in error.rows.items()
+            if 0 <= row < len(numbers)
+        }
         raise
 
 
@@ -137,7 +160,8 @@ class PlannerExited(PlannerError):
 
 
 class WrongPlan(PlannerError, InputError):
-    """A planner returned something else than a tensor of the shape asked for; begins: at the start of its rollouts.
+    """A planner returned something else than a tensor of the shape asked for; begins:
+    at the start of its rollouts.
 
     Bad input where the run begins with it, else the end of these rollouts.
     """
@@ -152,38 +176,53 @@ class NotFinite(ArithmeticError):
 
 
 def finite(values: Tensor, name: str) -> Tensor:
-    """The plans or actions [B, ...] of an ego; raises NotFinite where one is not finite."""
+    """The plans or actions [B, ...] of an ego; raises NotFinite where one is not
+    finite."""
     if not bool(values.isfinite().all()):
         raise NotFinite(f"the ego's {name} is NaN or infinite")
     return values
 
 
 def drivable(now: Tensor, given: Tensor, known: Tensor | int = PLAN_STEPS) -> Tensor:
-    """Bool [B]: the first `known` [B] states of given [B, H, 4] are finite and no faster than FASTEST, in their speeds
-    and from pose to pose, beginning at states now [B, 4]."""
+    """Bool [B]: the first `known` [B] states of given [B, H, 4] are finite and no
+    faster than FASTEST, in their speeds and from pose to pose, beginning at states now
+    [B, 4]."""
     moved = torch.cat([now[:, None, :2], given[..., :2]], 1).diff(dim=1).norm(dim=-1)
-    fine = (moved <= FASTEST * DT) & (given[..., 3].abs() <= FASTEST) & given.isfinite().all(-1)
-    counts = torch.arange(given.shape[1], device=given.device) < torch.as_tensor(known, device=given.device)[..., None]
+    fine = (
+        (moved <= FASTEST * DT)
+        & (given[..., 3].abs() <= FASTEST)
+        & given.isfinite().all(-1)
+    )
+    counts = (
+        torch.arange(given.shape[1], device=given.device)
+        < torch.as_tensor(known, device=given.device)[..., None]
+    )
     return (fine | ~counts).all(1)
 
 
 def strays(now: Tensor, first: Tensor) -> Tensor:
-    """Bool [B]: the first planned state [B, 4] is elsewhere than the ego at states now [B, 4] will be in a step."""
+    """Bool [B]: the first planned state [B, 4] is elsewhere than the ego at states now
+    [B, 4] will be in a step."""
     due = dynamics.constant_velocity(now, torch.full_like(now[:, :1], DT))[:, 0]
     moves = torch.minimum(now[:, 3].abs(), first[:, 3].abs()) > CREEP
     turned = dynamics.wrap(first[:, 2] - due[:, 2]).abs() > TURNED
-    away = to_frame(first[:, :2], due).abs() > torch.tensor([ALONG, ASIDE], device=due.device)
+    away = to_frame(first[:, :2], due).abs() > torch.tensor(
+        [ALONG, ASIDE], device=due.device
+    )
     return away.any(-1) | (turned & moves)
 
 
 def reverses(now: Tensor, planned: Tensor) -> Tensor:
-    """Bool [B]: a plan [B, H, 4] of an ego at states now [B, 4], which does not reverse, begins against its heading."""
+    """Bool [B]: a plan [B, H, 4] of an ego at states now [B, 4], which does not
+    reverse, begins against its heading."""
     moved = to_frame(planned[:, 1, :2], planned[:, 0])
     against = moved[:, 0] < -moved[:, 1].abs()
     return (now[:, 3] >= 0) & (against | (planned[:, 0, 3] < 0))
 
 
-def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str, begins: bool) -> Tensor:
+def checked(
+    given: Any, shape: tuple[int, ...], ego: Ego, method: str, begins: bool
+) -> Tensor:
     """Returns what `plan` or `act` of an ego returned.
 
     Args:
@@ -206,7 +245,9 @@ def checked(given: Any, shape: tuple[int, ...], ego: Ego, method: str, begins: b
         elif hasattr(given, "shape") and hasattr(given, "dtype"):
             found = f"{type(given).__module__.partition('.')[0]} {found} of {given.dtype} {list(given.shape)}"
         returned = f"{type(ego).__name__}.{method}: returns {found}"
-        wanted = f"expected a tensor of floats {list(shape)}{mend} (docs/how-to/planner.md)"
+        wanted = (
+            f"expected a tensor of floats {list(shape)}{mend} (docs/how-to/planner.md)"
+        )
         raise WrongPlan(f"{returned}, {wanted}", begins)
     return finite(given, "plan" if method == "plan" else "action")
 
@@ -216,8 +257,15 @@ def from_outside(ego: Ego) -> bool:
     return not type(ego).__module__.startswith("e2rl.")
 
 
-def ask(ego: Ego, method: str, world: World, *given: Tensor, scene: TensorDictBase | None = None) -> Any:
-    """What a method of the ego returns; one from outside the package is given copies, by `World.shown` of `scene`.
+def ask(
+    ego: Ego,
+    method: str,
+    world: World,
+    *given: Tensor,
+    scene: TensorDictBase | None = None,
+) -> Any:
+    """What a method of the ego returns; one from outside the package is given copies,
+    by `World.shown` of `scene`.
 
     Raises PlannerExited where it ends the program.
     """
@@ -233,9 +281,11 @@ def ask(ego: Ego, method: str, world: World, *given: Tensor, scene: TensorDictBa
 
 @contextmanager
 def answering(world: World) -> Iterator[None]:
-    """Notes on what is raised within that it is the ego's, which is asked about a world.
+    """Notes on what is raised within that it is the ego's, which is asked about a
+    world.
 
-    Raises TrafficNotFinite instead where the other vehicles of that world are NaN or infinite: no ego can answer then.
+    Raises TrafficNotFinite instead where the other vehicles of that world are NaN or
+    infinite: no ego can answer then.
     """
     try:
         yield
@@ -249,10 +299,12 @@ def answering(world: World) -> Iterator[None]:
 
 
 class EgoPlanner(TensorDictModuleBase):
-    """Writes the plan of an Ego in a DrivingEnv with `agents=True`: ("ego", "plan") [B, PLAN_STEPS, 4].
+    """Writes the plan of an Ego in a DrivingEnv with `agents=True`: ("ego", "plan") [B,
+    PLAN_STEPS, 4].
 
-    Plans every `replan_every` steps; in between, the key holds the rest of the last plan, its last state held. Reads
-    timestep, agents and, if present, the traffic's plan.
+    Plans every `replan_every` steps; in between, the key holds the rest of the last
+    plan, its last state held. Reads timestep, agents and, if present, the traffic's
+    plan.
     """
 
     in_keys = ["timestep", "agents"]
@@ -266,9 +318,15 @@ class EgoPlanner(TensorDictModuleBase):
         self.scene = base.scene
         self.bounds = base.action_spec.space
         start = self.scene["start"][:, :1]
-        self._plan = torch.zeros_like(start).repeat(1, 1 + PLAN_STEPS, 1)  # the state at the time of planning first
-        self._planned_at = torch.full(start.shape[:1], -PLAN_STEPS, device=start.device)  # step of planning
-        self._shown: TensorDictBase | None = None  # the scenes as a planner from outside sees them
+        self._plan = torch.zeros_like(start).repeat(
+            1, 1 + PLAN_STEPS, 1
+        )  # the state at the time of planning first
+        self._planned_at = torch.full(
+            start.shape[:1], -PLAN_STEPS, device=start.device
+        )  # step of planning
+        self._shown: TensorDictBase | None = (
+            None  # the scenes as a planner from outside sees them
+        )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         world = World.of(tensordict, self.scene)
@@ -277,7 +335,8 @@ class EgoPlanner(TensorDictModuleBase):
         return tensordict
 
     def plan(self, world: World) -> Tensor:
-        """States [B, 1 + PLAN_STEPS, 4] now and at the coming steps of the last plan; replans where due."""
+        """States [B, 1 + PLAN_STEPS, 4] now and at the coming steps of the last plan;
+        replans where due."""
         if bool((world.step == 0).any()):
             self._shown = without_future(self.scene) if from_outside(self.ego) else None
             self._ask("reset", world)
@@ -287,7 +346,13 @@ class EgoPlanner(TensorDictModuleBase):
             now = world.states[:, 0]
             answer = self._ask("plan", world)
             begins = bool((world.step == 0).all())
-            fresh = checked(answer, (len(now), PLAN_STEPS, 4), ego=self.ego, method="plan", begins=begins).to(now)
+            fresh = checked(
+                answer,
+                (len(now), PLAN_STEPS, 4),
+                ego=self.ego,
+                method="plan",
+                begins=begins,
+            ).to(now)
             self._refuse(due & ~drivable(now, fresh), JUMPS)
             astray = due & strays(now, fresh[:, 0])
             self._refuse(astray & reverses(now, fresh), BACKWARDS)
@@ -295,8 +360,12 @@ class EgoPlanner(TensorDictModuleBase):
             fresh = torch.cat([world.states[:, :1], fresh], 1)
             self._plan = torch.where(due[:, None, None], fresh, self._plan)
             self._planned_at = torch.where(due, world.step, self._planned_at)
-        ahead = (world.step - self._planned_at)[:, None] + torch.arange(1 + PLAN_STEPS, device=world.step.device)
-        return self._plan.gather(1, ahead.clamp(max=PLAN_STEPS)[..., None].expand(-1, -1, 4))
+        ahead = (world.step - self._planned_at)[:, None] + torch.arange(
+            1 + PLAN_STEPS, device=world.step.device
+        )
+        return self._plan.gather(
+            1, ahead.clamp(max=PLAN_STEPS)[..., None].expand(-1, -1, 4)
+        )
 
     def _ask(self, method: str, world: World, *given: Tensor) -> Any:
         return ask(self.ego, method, world, *given, scene=self._shown)
@@ -308,7 +377,8 @@ class EgoPlanner(TensorDictModuleBase):
 
 
 class EgoPolicy(EgoPlanner):
-    """An Ego as a TorchRL policy: writes its plan and the "action" [B, 2], within the action's bounds."""
+    """An Ego as a TorchRL policy: writes its plan and the "action" [B, 2], within the
+    action's bounds."""
 
     in_keys = ["observation", "timestep", "agents"]
     out_keys = ["action", ("ego", "plan")]
@@ -319,7 +389,9 @@ class EgoPolicy(EgoPlanner):
             plan = self.plan(world)
             answer = self._ask("act", world, tensordict["observation"], plan)
             begins = bool((world.step == 0).all())
-            action = checked(answer, (len(plan), 2), ego=self.ego, method="act", begins=begins)
+            action = checked(
+                answer, (len(plan), 2), ego=self.ego, method="act", begins=begins
+            )
             wild = (action.abs() > LARGEST).any(1)
             self._refuse(wild & reverses(world.states[:, 0], plan[:, 1:]), BACKWARDS)
             self._refuse(wild, WILD)

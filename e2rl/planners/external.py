@@ -1,4 +1,5 @@
-"""A planner in another process or language, behind a socket (docs/how-to/planner.md describes the protocol)."""
+"""A planner in another process or language, behind a socket (docs/how-to/planner.md
+describes the protocol)."""
 
 import os
 import time
@@ -7,7 +8,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from e2rl.planners.ego import JUMPS, LARGEST, PLAN_STEPS, WILD, Ego, PlannerError, drivable
+from e2rl.planners.ego import (
+    JUMPS,
+    LARGEST,
+    PLAN_STEPS,
+    WILD,
+    Ego,
+    PlannerError,
+    drivable,
+)
 from e2rl.planners.planner_link import (
     BadReply,
     PlannerFailed,
@@ -35,9 +44,11 @@ class PlannerDied(PlannerError):
 @configured("ego/external")
 @dataclass(eq=False)
 class ExternalEgo(Ego):
-    """Asks a planner outside of e2rl for the plans of all scenes of a batch by one message.
+    """Asks a planner outside of e2rl for the plans of all scenes of a batch by one
+    message.
 
-    Each process that drives scenes starts, or connects to, a planner of its own at its first plan.
+    Each process that drives scenes starts, or connects to, a planner of its own at its
+    first plan.
     """
 
     command: str | None = setting()
@@ -60,16 +71,20 @@ class ExternalEgo(Ego):
     def plan(self, world: World) -> Tensor:
         """The planner's plans [B, PLAN_STEPS, 4], continued at constant velocity.
 
-        Raises PlannerError where there is none for a scene, InputError where the planner cannot be started at all.
+        Raises PlannerError where there is none for a scene, InputError where the
+        planner cannot be started at all.
         """
         begun = self._begun(world)
         content = scene_messages(world, begun) + plan_message(world)
         replies = self._ask(content, len(world.step))
-        plans = plans_of(world.states[:, 0].cpu().float(), replies, steps=self.replan_every)
+        plans = plans_of(
+            world.states[:, 0].cpu().float(), replies, steps=self.replan_every
+        )
         return plans.to(world.states)
 
     def _begun(self, world: World) -> list[int]:
-        """Rows of the scenes that begin. A planner may have a memory, so it is asked once a step, in their order."""
+        """Rows of the scenes that begin. A planner may have a memory, so it is asked
+        once a step, in their order."""
         step = world.step.cpu()
         if len(step) != len(self._asked):
             self._asked = torch.full_like(step, torch.iinfo(step.dtype).max)
@@ -82,7 +97,8 @@ class ExternalEgo(Ego):
         return (step == 0).nonzero()[:, 0].tolist()
 
     def _ask(self, content: bytes, count: int) -> list[tuple[int, bytes]]:
-        """Kinds and payloads of the planner's replies, one for each of `count` scenes, in their order."""
+        """Kinds and payloads of the planner's replies, one for each of `count` scenes,
+        in their order."""
         link = self._connected(count)
         replies: dict[int, tuple[int, bytes]] = {}
         deadline = time.monotonic() + self.timeout * count
@@ -94,19 +110,26 @@ class ExternalEgo(Ego):
                 kind, payload = link.receive(deadline)
                 row = read_scene(kind, payload)
                 if row >= count or row in replies:
-                    raise BadReply(f"a reply for scene {row}, which was not asked for or answered before")
+                    raise BadReply(
+                        f"a reply for scene {row}, which was not asked for or answered before"
+                    )
                 replies[row] = kind, payload
         except TimeoutError:
             why = f"no reply within {self.timeout:g} s a scene ({len(replies)} of {count} scenes answered)"
-            raise self._dropped(PlannerTimedOut, f"{why}; see ego.timeout", replies=replies, count=count) from None
+            raise self._dropped(
+                PlannerTimedOut, f"{why}; see ego.timeout", replies=replies, count=count
+            ) from None
         except (OSError, EOFError):
-            raise self._dropped(PlannerDied, link.ending(), replies=replies, count=count) from None
+            raise self._dropped(
+                PlannerDied, link.ending(), replies=replies, count=count
+            ) from None
         except BadReply as error:
             raise self._dropped(BadReply, str(error), replies={}, count=count) from None
         return [replies[row] for row in range(count)]
 
     def _connected(self, count: int) -> PlannerLink:
-        """The link of this process; opened where there is none, at most 1 + restarts times."""
+        """The link of this process; opened where there is none, at most 1 + restarts
+        times."""
         if self._owner != os.getpid():  # forked: the parent's link is the parent's
             self._owner = os.getpid()
             self._starts = 0
@@ -114,10 +137,17 @@ class ExternalEgo(Ego):
         if self._link is not None:
             return self._link
         if self._starts > self.restarts:
-            raise self._gone(f"it was restarted {self.restarts} times; see ego.restarts", count)
+            raise self._gone(
+                f"it was restarted {self.restarts} times; see ego.restarts", count
+            )
         self._starts += 1
         try:
-            self._link = PlannerLink(self.command, self.address, replan_every=self.replan_every, timeout=self.start_timeout)
+            self._link = PlannerLink(
+                self.command,
+                self.address,
+                replan_every=self.replan_every,
+                timeout=self.start_timeout,
+            )
         except InputError as error:
             if self._starts == 1:
                 raise
@@ -129,9 +159,12 @@ class ExternalEgo(Ego):
     def _gone(why: str, count: int) -> PlannerDied:
         return PlannerDied(why, dict.fromkeys(range(count), why))
 
-    def _dropped(self, kind: type[PlannerError], why: str, replies: dict, count: int) -> PlannerError:
-        """The error for a request that was not answered in full; the link is closed. A planner that answers scene by
-        scene shows the one at fault: the first that has no answer."""
+    def _dropped(
+        self, kind: type[PlannerError], why: str, replies: dict, count: int
+    ) -> PlannerError:
+        """The error for a request that was not answered in full; the link is closed. A
+        planner that answers scene by scene shows the one at fault: the first that has
+        no answer."""
         if self._link is not None:
             self._link.close()
         self._link = None
@@ -140,8 +173,9 @@ class ExternalEgo(Ego):
 
 
 def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tensor:
-    """Plans [B, PLAN_STEPS, 4] from states now [B, 4] by replies of at least `steps` steps; actions are held for so
-    many. Raises PlannerError with the rows that have none."""
+    """Plans [B, PLAN_STEPS, 4] from states now [B, 4] by replies of at least `steps`
+    steps; actions are held for so many. Raises PlannerError with the rows that have
+    none."""
     failed: dict[int, str] = {}
     bad: dict[int, str] = {}
     given = torch.zeros(len(now), PLAN_STEPS, 4)
@@ -166,7 +200,8 @@ def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tenso
     given[:, :steps] = torch.where(acts[:, None, None], held, given[:, :steps])
     for why, wrong in {
         WILD: acts & ~(actions.abs() <= LARGEST).all(1),
-        f"a TRAJECTORY of fewer than the {steps} steps until the next plan": known < steps,
+        f"a TRAJECTORY of fewer than the {steps} steps until the next plan": known
+        < steps,
         JUMPS: ~drivable(now, given, known=known),
     }.items():
         bad = dict.fromkeys(wrong.nonzero()[:, 0].tolist(), why) | bad
@@ -176,7 +211,8 @@ def plans_of(now: Tensor, replies: list[tuple[int, bytes]], steps: int) -> Tenso
 
 
 def continued(given: Tensor, known: Tensor) -> Tensor:
-    """States [B, H, 4] whose first `known` [B] are given, at constant velocity after these."""
+    """States [B, H, 4] whose first `known` [B] are given, at constant velocity after
+    these."""
     ahead = torch.arange(given.shape[1])
     last = given[torch.arange(len(given)), known - 1]
     later = dynamics.constant_velocity(last, DT * (ahead + 1 - known[:, None]))

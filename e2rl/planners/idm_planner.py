@@ -20,7 +20,8 @@ REACTION = 0.5  # s ahead at which the speed caps are met
 @configured("ego/idm")
 @dataclass(eq=False)
 class IDMEgo(Ego):
-    """Stays on its mission and follows the nearest of `leaders` or red lights ahead; never changes lanes."""
+    """Stays on its mission and follows the nearest of `leaders` or red lights ahead;
+    never changes lanes."""
 
     desired_speed: float = setting(low=0.1)
     headway: float = setting(low=0)
@@ -32,13 +33,23 @@ class IDMEgo(Ego):
     replan_every: int = setting(low=1, high=PLAN_STEPS)
 
     def plan(self, world: World) -> Tensor:
-        """The current IDM acceleration held for the whole plan, within the path's speed caps."""
+        """The current IDM acceleration held for the whole plan, within the path's speed
+        caps."""
         path = MissionPath(world)
         speed = world.states[:, 0, 3]
-        caps = path.speed_caps(self.desired_speed, self.braking, self.use_limits, lights=False)
+        caps = path.speed_caps(
+            self.desired_speed, self.braking, self.use_limits, lights=False
+        )
         now = world.states[:, :, None]
         size = world.scene["size"]
-        found = leaders(path.s[:, None], path.route[:, None], agents=now, size=size, present=world.valid, free_gap=torch.inf)
+        found = leaders(
+            path.s[:, None],
+            path.route[:, None],
+            agents=now,
+            size=size,
+            present=world.valid,
+            free_gap=torch.inf,
+        )
         gap = found.gap[:, 0, 0]
         leading = found.speed[:, 0, 0].clamp(min=0)
         light = path.stop_distance(self.braking) + self.standstill_gap
@@ -47,11 +58,25 @@ class IDMEgo(Ego):
         if self.use_limits:
             limit = limit_at(path.mission, path.s)
             desired = torch.where(limit > 0, limit, desired)
-        driver = IDMParameters(self.headway, self.standstill_gap, acceleration=self.acceleration, braking=self.braking)
-        accel = idm_acceleration(speed, desired, gap=gap, leader_speed=leading, driver=driver, improved=True)
+        driver = IDMParameters(
+            self.headway,
+            self.standstill_gap,
+            acceleration=self.acceleration,
+            braking=self.braking,
+        )
+        accel = idm_acceleration(
+            speed, desired, gap=gap, leader_speed=leading, driver=driver, improved=True
+        )
         allowed = look_up(caps, (REACTION * speed)[:, None])[:, 0]
-        accel = torch.minimum(accel, ((allowed - speed) / REACTION).clamp(max=self.acceleration))
+        accel = torch.minimum(
+            accel, ((allowed - speed) / REACTION).clamp(max=self.acceleration)
+        )
         accel = accel.clamp(-self.hardest_braking, self.acceleration)
-        future = bounded_speed(speed[:, None], (accel * DT)[:, None].expand(-1, PLAN_STEPS), low=0.0, high=MAX_SPEED)
+        future = bounded_speed(
+            speed[:, None],
+            (accel * DT)[:, None].expand(-1, PLAN_STEPS),
+            low=0.0,
+            high=MAX_SPEED,
+        )
         future = torch.minimum(future, torch.maximum(desired, speed)[:, None])
         return path.drive(torch.cat([speed[:, None], future], 1))

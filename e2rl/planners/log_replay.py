@@ -1,4 +1,5 @@
-"""The recorded ego as a planner. With `sim.replay_ego=true` the environment follows the log exactly instead."""
+"""The recorded ego as a planner. With `sim.replay_ego=true` the environment follows the
+log exactly instead."""
 
 from dataclasses import dataclass
 
@@ -14,7 +15,8 @@ from e2rl.sim.world import World
 @configured("ego/replay")
 @dataclass(eq=False)
 class ReplayEgo(Ego):
-    """Plans the recording; unless the environment replays it, the unicycle tracks this plan.
+    """Plans the recording; unless the environment replays it, the unicycle tracks this
+    plan.
 
     After the recording's end the last speed and heading are held.
     """
@@ -28,7 +30,9 @@ class ReplayEgo(Ego):
         known = world.scene["logged_valid"][:, :, 0]
         steps = torch.arange(track.shape[1], device=track.device)
         last = torch.where(known, steps, 0).amax(1)
-        want = world.step[:, None] + torch.arange(1, PLAN_STEPS + 1, device=track.device)
+        want = world.step[:, None] + torch.arange(
+            1, PLAN_STEPS + 1, device=track.device
+        )
         at = want.minimum(last[:, None])
         row = torch.arange(len(track), device=track.device)[:, None]
         state = track[row, at]

@@ -1,6 +1,8 @@
-"""A policy of an ONNX file, which may be a stranger's: arithmetic alone, of bounded length and memory.
+"""A policy of an ONNX file, which may be a stranger's: arithmetic alone, of bounded
+length and memory.
 
-The file is looked through before a library reads it, as it is written: messages of fields of Protocol Buffers.
+The file is looked through before a library reads it, as it is written: messages of
+fields of Protocol Buffers.
 """
 
 import os
@@ -13,9 +15,17 @@ from torch import Tensor
 from e2rl.run.config import library
 from e2rl.run.errors import InputError
 
-MAX_FIELDS, MAX_REST = 200_000, 1 << 22  # fields, and bytes beside tensors: libraries need a hundred times as much
+MAX_FIELDS, MAX_REST = (
+    200_000,
+    1 << 22,
+)  # fields, and bytes beside tensors: libraries need a hundred times as much
 MAX_MEMORY = 1 << 30  # bytes of all tensors while it runs
-PARTS = {"model": {7: "graph"}, "graph": {1: "node", 5: "tensor"}, "node": {5: "attribute"}, "attribute": {5: "tensor"}}
+PARTS = {
+    "model": {7: "graph"},
+    "graph": {1: "node", 5: "tensor"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor"},
+}
 REFUSED = {
     ("attribute", 6): "a body of control flow (Loop, Scan, If)",
     ("attribute", 11): "bodies of control flow",
@@ -32,13 +42,16 @@ class OnnxPolicy:
     """A session of onnxruntime with one thread, in each process its own."""
 
     def __init__(self, content: bytes, where: str) -> None:
-        """content: of the file; where: its name in messages. Raises InputError where it holds more than arithmetic."""
+        """content: of the file; where: its name in messages. Raises InputError where it
+        holds more than arithmetic."""
         self.content = content
         self.where = where
         try:
             check_arithmetic(memoryview(content))
         except ValueError as error:
-            raise InputError(f"{where}: cannot be read as ONNX: {error}; export it again") from error
+            raise InputError(
+                f"{where}: cannot be read as ONNX: {error}; export it again"
+            ) from error
         self._open()
 
     def _open(self) -> None:
@@ -49,10 +62,14 @@ class OnnxPolicy:
         options.log_severity_level = 4  # what fails is raised
         options.add_session_config_entry("session.use_env_allocators", "1")
         try:
-            self.session = onnxruntime.InferenceSession(self.content, options, providers=["CPUExecutionProvider"])
+            self.session = onnxruntime.InferenceSession(
+                self.content, options, providers=["CPUExecutionProvider"]
+            )
         except Exception as error:  # onnxruntime's are of many kinds
             reason = " ".join(str(error).split())[:200]
-            raise InputError(f"{self.where}: cannot be read as ONNX ({reason}); export it again") from error
+            raise InputError(
+                f"{self.where}: cannot be read as ONNX ({reason}); export it again"
+            ) from error
         self.name = self.session.get_inputs()[0].name
         self._process = os.getpid()
 
@@ -68,12 +85,15 @@ def bound_memory() -> None:
     """Let all sessions of this process have MAX_MEMORY bytes of tensors together."""
     import onnxruntime as ort
 
-    info = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
+    info = ort.OrtMemoryInfo(
+        "Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT
+    )
     ort.create_and_register_allocator(info, ort.OrtArenaCfg({"max_mem": MAX_MEMORY}))
 
 
 def check_arithmetic(content: memoryview) -> None:
-    """Raises ValueError where the bytes of a ModelProto are none, are too many, or hold one of REFUSED."""
+    """Raises ValueError where the bytes of a ModelProto are none, are too many, or hold
+    one of REFUSED."""
     fields = 0
     rest = 0
     waiting = [("model", content)]
@@ -96,7 +116,9 @@ def check_arithmetic(content: memoryview) -> None:
             elif kind != "tensor":
                 rest += length
             if fields > MAX_FIELDS or rest > MAX_REST:
-                raise ValueError(f"it has more than {MAX_FIELDS} parts, or {MAX_REST} bytes beside its tensors")
+                raise ValueError(
+                    f"it has more than {MAX_FIELDS} parts, or {MAX_REST} bytes beside its tensors"
+                )
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:

@@ -1,6 +1,8 @@
-"""The connection to a planner outside of e2rl, the process that it runs in where e2rl starts it, and their messages.
+"""The connection to a planner outside of e2rl, the process that it runs in where e2rl
+starts it, and their messages.
 
-docs/how-to/planner.md has these field by field. All numbers have 4 bytes, little-endian.
+docs/how-to/planner.md has these field by field. All numbers have 4 bytes,
+little-endian.
 """
 
 import shlex
@@ -34,7 +36,8 @@ AGENT_WORDS = 10
 
 
 class BadReply(PlannerError):
-    """A reply that the protocol does not allow, or a plan that is not finite or no vehicle can drive."""
+    """A reply that the protocol does not allow, or a plan that is not finite or no
+    vehicle can drive."""
 
 
 class PlannerFailed(PlannerError):
@@ -57,8 +60,17 @@ def _scene(world: World, mission: Mission, row: int) -> bytes:
     lane = scene["lane_index"][on_lane]
     points = scene["lane_points"][on_lane]
     lanes = int(lane.max()) + 1 if len(lane) else 0
-    counts = [row, int(scene["scene_index"]), mission.points.shape[1], len(points), lanes, len(scene["light_points"])]
-    about = [scene[key][:lanes, None] for key in ("lane_width", "lane_left", "lane_right")]
+    counts = [
+        row,
+        int(scene["scene_index"]),
+        mission.points.shape[1],
+        len(points),
+        lanes,
+        len(scene["light_points"]),
+    ]
+    about = [
+        scene[key][:lanes, None] for key in ("lane_width", "lane_left", "lane_right")
+    ]
     parts = [
         torch.tensor(counts),
         torch.cat([scene["size"][0], mission.end[row, None]]),
@@ -76,13 +88,22 @@ def plan_message(world: World) -> bytes:
     count, agents = world.valid.shape
     scene = world.scene
     row = torch.arange(count, device=world.step.device)
-    lights = torch.arange(scene["light_state"].shape[-1], device=row.device).expand(count, -1)
+    lights = torch.arange(scene["light_state"].shape[-1], device=row.device).expand(
+        count, -1
+    )
     state = light_state_at(scene["light_state"], lights, step=world.step)
     number = torch.arange(agents, device=row.device).expand(count, -1)
-    fields = [number[..., None], scene["agent_type"][..., None], world.states, scene["size"]]
+    fields = [
+        number[..., None],
+        scene["agent_type"][..., None],
+        world.states,
+        scene["size"],
+    ]
     fields += [world.accel[..., None], world.turn_rate[..., None]]
     record = torch.cat([_words(field) for field in fields], -1)  # [B, N, AGENT_WORDS]
-    head = torch.stack([row, world.step, world.valid.sum(1), torch.full_like(row, lights.shape[1])], -1)
+    head = torch.stack(
+        [row, world.step, world.valid.sum(1), torch.full_like(row, lights.shape[1])], -1
+    )
     body = torch.cat([_words(head), _words(state), record.flatten(1)], 1)
     there = world.valid.repeat_interleave(AGENT_WORDS, 1)
     sent = torch.cat([there.new_ones(count, body.shape[1] - there.shape[1]), there], 1)
@@ -92,7 +113,9 @@ def plan_message(world: World) -> bytes:
 def read_scene(kind: int, payload: bytes) -> int:
     """The number of the scene that a reply is for."""
     if kind not in (TRAJECTORY, ACTION, FAILED) or len(payload) < 4:
-        raise BadReply(f"a message of kind {kind} and {len(payload)} bytes is no reply to PLAN")
+        raise BadReply(
+            f"a message of kind {kind} and {len(payload)} bytes is no reply to PLAN"
+        )
     return struct.unpack_from("<I", payload)[0]
 
 
@@ -107,13 +130,19 @@ def read_reply(kind: int, payload: bytes) -> np.ndarray:
     count = struct.unpack_from("<I", payload, 4)[0] if len(payload) >= 8 else 0
     if not 1 <= count <= PLAN_STEPS or len(payload) != 8 + 16 * count:
         size = f"{len(payload)} bytes for {count} states"
-        raise BadReply(f"a TRAJECTORY has 8 + 16 K bytes for 1 to {PLAN_STEPS} states; this one has {size}")
+        raise BadReply(
+            f"a TRAJECTORY has 8 + 16 K bytes for 1 to {PLAN_STEPS} states; this one has {size}"
+        )
     return np.frombuffer(payload, "<f4", offset=8).reshape(count, 4).astype(np.float32)
 
 
 def _words(values: Tensor) -> Tensor:
     """The 4 bytes of each number, as int32."""
-    return values.float().contiguous().view(torch.int32) if values.is_floating_point() else values.int()
+    return (
+        values.float().contiguous().view(torch.int32)
+        if values.is_floating_point()
+        else values.int()
+    )
 
 
 def _bytes(words: Tensor) -> bytes:
@@ -128,31 +157,54 @@ Process = subprocess.Popen[bytes]
 
 
 class PlannerLink:
-    """A connection over which greetings were exchanged; of the process that opened it, in which it is closed with the
-    link's last reference, or at the end."""
+    """A connection over which greetings were exchanged; of the process that opened it,
+    in which it is closed with the link's last reference, or at the end."""
 
-    def __init__(self, command: str | None, address: str | None, replan_every: int, timeout: float) -> None:
-        """Start `command` with an address as its last argument, or connect to the `address` of a planner that runs.
+    def __init__(
+        self,
+        command: str | None,
+        address: str | None,
+        replan_every: int,
+        timeout: float,
+    ) -> None:
+        """Start `command` with an address as its last argument, or connect to the
+        `address` of a planner that runs.
 
         Raises InputError where none answers within `timeout` s.
         """
         self.buffer = bytearray()
         """What came beyond the last message taken."""
-        self._name = f"ego.address={address}" if command is None else f"ego.command={command}"
+        self._name = (
+            f"ego.address={address}" if command is None else f"ego.command={command}"
+        )
         self._process = None
         begun = time.monotonic()
         deadline = begun + timeout
         try:
             if command is None:
-                self._socket = connect(str(address), None, deadline=begun + min(timeout, ANSWERS), name=self._name)
+                self._socket = connect(
+                    str(address),
+                    None,
+                    deadline=begun + min(timeout, ANSWERS),
+                    name=self._name,
+                )
             else:  # a connection does not need its path
-                with tempfile.TemporaryDirectory(prefix="e2rl-", ignore_cleanup_errors=True) as folder:
+                with tempfile.TemporaryDirectory(
+                    prefix="e2rl-", ignore_cleanup_errors=True
+                ) as folder:
                     self._process = start(command, f"unix:{folder}/planner")
-                    self._socket = connect(f"unix:{folder}/planner", self._process, deadline=deadline, name=self._name)
+                    self._socket = connect(
+                        f"unix:{folder}/planner",
+                        self._process,
+                        deadline=deadline,
+                        name=self._name,
+                    )
         except BaseException:
             close(None, self._process)
             raise
-        self.close = Finalize(self, close, (self._socket, self._process), exitpriority=10)
+        self.close = Finalize(
+            self, close, (self._socket, self._process), exitpriority=10
+        )
         self._greet(replan_every, deadline)
 
     def _greet(self, replan_every: int, deadline: float) -> None:
@@ -161,14 +213,20 @@ class PlannerLink:
             self.send(message(HELLO, about), deadline)
             kind, payload = self.receive(deadline)
             if kind != HELLO or len(payload) != 4:
-                raise BadReply(f"its first message is of kind {kind} and {len(payload)} bytes, not HELLO of 4")
+                raise BadReply(
+                    f"its first message is of kind {kind} and {len(payload)} bytes, not HELLO of 4"
+                )
             (version,) = struct.unpack("<I", payload)
         except (OSError, EOFError, BadReply) as error:
             self.close()
-            raise InputError(f"{self._name}: no planner answers there: {error or 'no HELLO in time'}") from error
+            raise InputError(
+                f"{self._name}: no planner answers there: {error or 'no HELLO in time'}"
+            ) from error
         if version != VERSION:
             self.close()
-            raise InputError(f"{self._name}: the planner speaks version {version} of the protocol, e2rl {VERSION}")
+            raise InputError(
+                f"{self._name}: the planner speaks version {version} of the protocol, e2rl {VERSION}"
+            )
 
     def send(self, content: bytes, deadline: float) -> None:
         """Send messages. Raises TimeoutError, or OSError where the connection broke."""
@@ -176,11 +234,14 @@ class PlannerLink:
         self._socket.sendall(content)
 
     def receive(self, deadline: float) -> tuple[int, bytes]:
-        """Kind and payload of the next message. Raises TimeoutError; EOFError or OSError where the connection broke;
-        BadReply where the payload is longer than any reply's."""
+        """Kind and payload of the next message. Raises TimeoutError; EOFError or
+        OSError where the connection broke; BadReply where the payload is longer than
+        any reply's."""
         kind, length = HEADER.unpack(self._take(HEADER.size, deadline))
         if length > MAX_REPLY:
-            raise BadReply(f"a message of kind {kind} announces {length} bytes; replies have at most {MAX_REPLY}")
+            raise BadReply(
+                f"a message of kind {kind} announces {length} bytes; replies have at most {MAX_REPLY}"
+            )
         return kind, self._take(length, deadline)
 
     def _take(self, count: int, deadline: float) -> bytes:
@@ -210,30 +271,44 @@ class PlannerLink:
 def start(command: str, address: str) -> Process:
     """The process of a command, which is given the address to listen at.
 
-    On Linux it ends with this process, with all that it has started (`e2rl.run.process_tree`). Raises InputError where
-    there is no such program.
+    On Linux it ends with this process, with all that it has started
+    (`e2rl.run.process_tree`). Raises InputError where there is no such program.
     """
     try:
         words = [*shlex.split(command), address]
         if shutil.which(words[0]) is None:
             raise FileNotFoundError(f"no program {words[0]}")
         guard = [sys.executable, "-I", "-S", process_tree.__file__]
-        return subprocess.Popen([*guard, *words], stdin=subprocess.PIPE, stdout=STDERR, start_new_session=True)
+        return subprocess.Popen(
+            [*guard, *words],
+            stdin=subprocess.PIPE,
+            stdout=STDERR,
+            start_new_session=True,
+        )
     except (OSError, ValueError, subprocess.SubprocessError) as error:
-        raise InputError(f"ego.command={command}: cannot be started: {error}") from error
+        raise InputError(
+            f"ego.command={command}: cannot be started: {error}"
+        ) from error
 
 
-def connect(address: str, process: Process | None, deadline: float, name: str) -> socket.socket:
-    """A socket connected to an address, unix:PATH or HOST:PORT, as soon as the planner listens."""
+def connect(
+    address: str, process: Process | None, deadline: float, name: str
+) -> socket.socket:
+    """A socket connected to an address, unix:PATH or HOST:PORT, as soon as the planner
+    listens."""
     while True:
         try:
             return _connected(address, name)
         except OSError as error:
             if process is not None and process.poll() is not None:
-                raise InputError(f"{name}: ended with status {process.returncode} before it listened") from error
+                raise InputError(
+                    f"{name}: ended with status {process.returncode} before it listened"
+                ) from error
             if time.monotonic() > deadline:
                 mend = "start the planner first, or let e2rl start it by ego.command"
-                raise InputError(f"{name}: nothing listens at {address} ({error}); {mend}") from error
+                raise InputError(
+                    f"{name}: nothing listens at {address} ({error}); {mend}"
+                ) from error
         time.sleep(PAUSE)
 
 

@@ -1,6 +1,8 @@
-"""ego=policy_file: the policy of an ONNX or TorchScript file, by the observation (docs/observation.md).
+"""ego=policy_file: the policy of an ONNX or TorchScript file, by the observation
+(docs/observation.md).
 
-An ONNX file holds arithmetic. A TorchScript file is a program, which may write files: run those that you trust.
+An ONNX file holds arithmetic. A TorchScript file is a program, which may write files:
+run those that you trust.
 """
 
 import io
@@ -38,7 +40,8 @@ EXAMPLE = 2  # observations that a network is traced with
 @configured("ego/policy_file")
 @dataclass(eq=False)
 class PolicyFileEgo(ObservingEgo):
-    """Drives by the actions of a file, on the CPU; those beyond the bounds are clipped to them."""
+    """Drives by the actions of a file, on the CPU; those beyond the bounds are clipped
+    to them."""
 
     file: str | None = setting()
     max_acceleration: float = setting()
@@ -46,20 +49,25 @@ class PolicyFileEgo(ObservingEgo):
     max_yaw_rate: float = setting()
 
     def __post_init__(self) -> None:
-        """Raises InputError where the file is none, maps other shapes, or takes longer than SECONDS to find out."""
+        """Raises InputError where the file is none, maps other shapes, or takes longer
+        than SECONDS to find out."""
         self.low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
         self.high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
         where = f"ego.file={self.file}"
-        self.policy = within_time(partial(open_policy, Path(self.file or ""), where), where)
+        self.policy = within_time(
+            partial(open_policy, Path(self.file or ""), where), where
+        )
 
     def decide(self, observation: Tensor) -> Tensor:
-        """The file's action [B, 2] at the observation; raises NotFinite where it is NaN or infinite."""
+        """The file's action [B, 2] at the observation; raises NotFinite where it is NaN
+        or infinite."""
         action = finite(self.policy(observation.float().cpu().clone()), "action")
         return torch.clamp(action, self.low, self.high).to(observation)
 
 
 def within_time(work: Callable[[], Any], where: str) -> Any:
-    """What work() returns or raises; raises InputError where it goes on for longer than SECONDS."""
+    """What work() returns or raises; raises InputError where it goes on for longer than
+    SECONDS."""
     ended: Future = Future()
 
     def run() -> None:
@@ -70,21 +78,34 @@ def within_time(work: Callable[[], Any], where: str) -> Any:
 
     Thread(target=run, daemon=True).start()  # what does not end is left behind
     if wait([ended], SECONDS).not_done:
-        raise InputError(f"{where}: opening it takes longer than {SECONDS} s; give a smaller policy")
+        raise InputError(
+            f"{where}: opening it takes longer than {SECONDS} s; give a smaller policy"
+        )
     return ended.result()
 
 
 def probe(policy: Callable[[Tensor], Any], where: str, count: int) -> None:
-    """Raises InputError where a policy does not map observations of a batch of `count` to actions."""
+    """Raises InputError where a policy does not map observations of a batch of `count`
+    to actions."""
     try:
         action = policy(torch.zeros(count, OBSERVATION_SIZE))
-        fits = isinstance(action, Tensor) and action.is_floating_point() and action.shape == (count, 2)
-        found = f"maps them to {action.dtype} {list(action.shape)}" if isinstance(action, Tensor) else type(action)
+        fits = (
+            isinstance(action, Tensor)
+            and action.is_floating_point()
+            and action.shape == (count, 2)
+        )
+        found = (
+            f"maps them to {action.dtype} {list(action.shape)}"
+            if isinstance(action, Tensor)
+            else type(action)
+        )
     except Exception as error:  # the file's own
         fits = False
         found = " ".join(str(error).split())[-300:]
     if not fits:
-        raise InputError(f"{where}: fails at observations [{count}, {OBSERVATION_SIZE}]: {found}; {MAPS}")
+        raise InputError(
+            f"{where}: fails at observations [{count}, {OBSERVATION_SIZE}]: {found}; {MAPS}"
+        )
 
 
 def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
@@ -94,11 +115,15 @@ def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
         TORCHSCRIPT: torchscript_policy,
     }
     if file.suffix not in kinds:
-        raise InputError(f"{where}: no kind of policy; pass POLICY{ONNX}, or POLICY{TORCHSCRIPT} of TorchScript")
+        raise InputError(
+            f"{where}: no kind of policy; pass POLICY{ONNX}, or POLICY{TORCHSCRIPT} of TorchScript"
+        )
     try:
         content = read_regular(file, MAX_FILE)
     except OSError as error:
-        raise InputError(f"{where}: cannot be read ({error.strerror}); pass a file of a policy") from error
+        raise InputError(
+            f"{where}: cannot be read ({error.strerror}); pass a file of a policy"
+        ) from error
     policy = kinds[file.suffix](content, where)
     for count in PROBED:
         probe(policy, where, count=count)
@@ -111,15 +136,23 @@ def torchscript_policy(content: bytes, where: str) -> Callable[[Tensor], Any]:
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
     except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0][:200]
-        raise InputError(f"{where}: no TorchScript archive ({reason}); write one by torch.jit.save") from error
+        raise InputError(
+            f"{where}: no TorchScript archive ({reason}); write one by torch.jit.save"
+        ) from error
     return torch.no_grad()(module)
 
 
 def write_policy(policy: nn.Module, file: Path) -> None:
-    """Write a module of such a map, whose argument is `observation`, as the suffix says; raises InputError."""
-    writers: dict[str, Callable[[nn.Module, Path], None]] = {ONNX: _write_onnx, TORCHSCRIPT: _write_torchscript}
+    """Write a module of such a map, whose argument is `observation`, as the suffix
+    says; raises InputError."""
+    writers: dict[str, Callable[[nn.Module, Path], None]] = {
+        ONNX: _write_onnx,
+        TORCHSCRIPT: _write_torchscript,
+    }
     if file.suffix not in writers:
-        raise InputError(f"{file}: no kind of policy; name it {ONNX}, or {TORCHSCRIPT} for TorchScript")
+        raise InputError(
+            f"{file}: no kind of policy; name it {ONNX}, or {TORCHSCRIPT} for TorchScript"
+        )
     if file.suffix == ONNX:
         library("onnxscript", str(file), extra="onnx")
     write_atomically(file, partial(writers[file.suffix], policy.eval()))
@@ -135,7 +168,9 @@ def _write_torchscript(policy: nn.Module, file: Path) -> None:
 
 
 def _write_onnx(policy: nn.Module, file: Path) -> None:
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it tells which packages it does without
+    logging.getLogger("torch.onnx").setLevel(
+        logging.ERROR
+    )  # it tells which packages it does without
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(

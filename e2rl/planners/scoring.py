@@ -1,4 +1,5 @@
-"""Costs of a planner's candidates by a forecast of others: contact, distance, drivable border, progress, comfort."""
+"""Costs of a planner's candidates by a forecast of others: contact, distance, drivable
+border, progress, comfort."""
 
 from dataclasses import dataclass
 
@@ -18,8 +19,8 @@ SLOW_TURN = 1.0  # m/s below which a turn rate says little of the path's curvatu
 
 @dataclass
 class Forecast:
-    """M agents of each of B scenes: poses [B, M, T, 3], speed [B, M, T], size [B, M, 2], seen [B, M]: the row holds an
-    agent."""
+    """M agents of each of B scenes: poses [B, M, T, 3], speed [B, M, T], size [B, M,
+    2], seen [B, M]: the row holds an agent."""
 
     poses: Tensor
     speed: Tensor
@@ -28,22 +29,27 @@ class Forecast:
 
 
 def nearest(world: World, count: int) -> tuple[Tensor, Tensor]:
-    """Agents [B, M] that come nearest to the ego within 3 s if all keep their velocity, and whether they are there
-    [B, M]; M: count, or fewer where a scene has no more rows."""
+    """Agents [B, M] that come nearest to the ego within 3 s if all keep their velocity,
+    and whether they are there [B, M]; M: count, or fewer where a scene has no more
+    rows."""
     times = torch.tensor(LOOK, device=world.states.device)
     xy = constant_velocity(world.states, times)[..., :2]
     gap = (xy - xy[:, :1]).square().sum(-1).amin(-1)
     there = world.valid.clone()
     there[:, 0] = False
-    found = gap.masked_fill(~there, torch.inf).topk(min(count, gap.shape[1]), largest=False)
+    found = gap.masked_fill(~there, torch.inf).topk(
+        min(count, gap.shape[1]), largest=False
+    )
     return found.indices, found.values < torch.inf
 
 
-def forecast(world: World, agents: Tensor, seen: Tensor, times: Tensor, hold: float, turn: float) -> Forecast:
+def forecast(
+    world: World, agents: Tensor, seen: Tensor, times: Tensor, hold: float, turn: float
+) -> Forecast:
     """The Forecast of agents [B, M] at times [T] s, evenly spaced from one spacing on.
 
-    The acceleration is held for `hold` s (never beyond a halt), the path's curvature for `turn` s; then the speed and
-    the heading stay.
+    The acceleration is held for `hold` s (never beyond a halt), the path's curvature
+    for `turn` s; then the speed and the heading stay.
     """
     row = torch.arange(len(agents), device=agents.device)[:, None]
     state = world.states[row, agents]
@@ -54,13 +60,20 @@ def forecast(world: World, agents: Tensor, seen: Tensor, times: Tensor, hold: fl
     speed = (state[..., 3:] + accel[..., None] * nodes.clamp(max=hold)).clamp(min=0)
     moved = (speed[..., 1:] + speed[..., :-1]) / 2 * step
     driven = torch.nn.functional.pad(moved.cumsum(-1), (1, 0))
-    curvature = (rate / state[..., 3].clamp(min=SLOW_TURN)).clamp(-MAX_CURVATURE, MAX_CURVATURE)[..., None]
+    curvature = (rate / state[..., 3].clamp(min=SLOW_TURN)).clamp(
+        -MAX_CURVATURE, MAX_CURVATURE
+    )[..., None]
     most = torch.maximum(state[..., 3:], speed) * turn
     heading = state[..., 2:3] + curvature * torch.minimum(driven, most)
     middle = (heading[..., 1:] + heading[..., :-1]) / 2
     x = state[..., 0:1] + (moved * middle.cos()).cumsum(-1)
     y = state[..., 1:2] + (moved * middle.sin()).cumsum(-1)
-    return Forecast(torch.stack([x, y, heading[..., 1:]], -1), speed[..., 1:], size=world.scene["size"][row, agents], seen=seen)
+    return Forecast(
+        torch.stack([x, y, heading[..., 1:]], -1),
+        speed[..., 1:],
+        size=world.scene["size"][row, agents],
+        seen=seen,
+    )
 
 
 MOVING = 3.0  # m/s from which on an agent's place becomes uncertain at the full rate
@@ -70,7 +83,9 @@ SLOW = 2.0  # m/s below which a contact is less and less the ego's own doing
 IMPACT = 10.0  # m/s of relative velocity that double the cost of a contact
 FARTHEST = 5.0  # m beyond the border from which on being farther costs no more
 ROAD_STRIDE = 2  # scored states between two look-ups of the drivable field
-JERK_TIME = 0.1  # s: weight of the first change of acceleration against mean accelerations
+JERK_TIME = (
+    0.1  # s: weight of the first change of acceleration against mean accelerations
+)
 
 
 @dataclass(eq=False)
@@ -91,37 +106,68 @@ class Weights:
     lateral_offset: float = setting(low=0)
 
 
-def score(world: World, candidates: Candidates, others: Forecast, steps: Tensor, weights: Weights) -> Tensor:
-    """Costs [B, C]; steps [T]: those that are scored, of the candidates (1 is the next) and of the forecast."""
+def score(
+    world: World,
+    candidates: Candidates,
+    others: Forecast,
+    steps: Tensor,
+    weights: Weights,
+) -> Tensor:
+    """Costs [B, C]; steps [T]: those that are scored, of the candidates (1 is the next)
+    and of the forecast."""
     states = candidates.states[:, :, steps - 1]
-    cost = meeting_cost(states, world.scene["size"][:, 0], others=others, times=steps * DT, weights=weights)
-    cost = cost + weights.off_road * beyond_border(states[:, :, ::ROAD_STRIDE], world, border=weights.border)
+    cost = meeting_cost(
+        states,
+        world.scene["size"][:, 0],
+        others=others,
+        times=steps * DT,
+        weights=weights,
+    )
+    cost = cost + weights.off_road * beyond_border(
+        states[:, :, ::ROAD_STRIDE], world, border=weights.border
+    )
     cost = cost + weights.comfort * discomfort(candidates.states, world)
-    return cost + weights.lateral_offset * candidates.shift.abs() - weights.progress * candidates.distance
+    return (
+        cost
+        + weights.lateral_offset * candidates.shift.abs()
+        - weights.progress * candidates.distance
+    )
 
 
-def meeting_cost(ego: Tensor, ego_size: Tensor, others: Forecast, times: Tensor, weights: Weights) -> Tensor:
-    """Costs [B, C] of candidates ego [B, C, T, 4] near others: the worst moment with each agent, summed over agents.
+def meeting_cost(
+    ego: Tensor, ego_size: Tensor, others: Forecast, times: Tensor, weights: Weights
+) -> Tensor:
+    """Costs [B, C] of candidates ego [B, C, T, 4] near others: the worst moment with
+    each agent, summed over agents.
 
-    A candidate ends at its first contact that is not from behind: what comes later costs nothing, or it would pay to
-    drive through somebody. Only pairs of poses that are near enough to cost something are compared as boxes. ego_size
-    [B, 2]; times [T] s.
+    A candidate ends at its first contact that is not from behind: what comes later
+    costs nothing, or it would pay to drive through somebody. Only pairs of poses that
+    are near enough to cost something are compared as boxes. ego_size [B, 2]; times [T]
+    s.
     """
     batch, count, steps, _ = ego.shape
     agents = others.seen.shape[1]
-    margin = weights.margin + weights.margin_growth * times * (others.speed / MOVING).clamp(max=1)  # [B, M, T]
+    margin = weights.margin + weights.margin_growth * times * (
+        others.speed / MOVING
+    ).clamp(max=1)  # [B, M, T]
     reach = (ego_size.norm(dim=-1)[:, None] + others.size.norm(dim=-1)) / 2
-    room = (reach[..., None] + margin + BESIDE)[:, None] + weights.headway * ego[:, :, None, :, 3]
+    room = (reach[..., None] + margin + BESIDE)[:, None] + weights.headway * ego[
+        :, :, None, :, 3
+    ]
     dx = ego[:, :, None, :, 0] - others.poses[:, None, :, :, 0]
     dy = ego[:, :, None, :, 1] - others.poses[:, None, :, :, 1]
     near = (dx * dx + dy * dy < room * room) & others.seen[:, None, :, None]
-    scene, candidate, agent, time = torch.unravel_index(near.view(-1).nonzero()[:, 0], near.shape)
+    scene, candidate, agent, time = torch.unravel_index(
+        near.view(-1).nonzero()[:, 0], near.shape
+    )
     mine = scene * count + candidate
     pair = scene * agents + agent
     cost, ends = pair_cost(
         ego.reshape(-1, 4)[mine * steps + time],
         ego_size[scene],
-        other=torch.cat([others.poses, others.speed[..., None]], -1).view(-1, 4)[pair * steps + time],
+        other=torch.cat([others.poses, others.speed[..., None]], -1).view(-1, 4)[
+            pair * steps + time
+        ],
         other_size=others.size.view(-1, 2)[pair],
         margin=margin.view(-1)[pair * steps + time],
         weights=weights,
@@ -135,14 +181,20 @@ def meeting_cost(ego: Tensor, ego_size: Tensor, others: Forecast, times: Tensor,
 
 
 def pair_cost(
-    ego: Tensor, ego_size: Tensor, other: Tensor, other_size: Tensor, margin: Tensor, weights: Weights
+    ego: Tensor,
+    ego_size: Tensor,
+    other: Tensor,
+    other_size: Tensor,
+    margin: Tensor,
+    weights: Weights,
 ) -> tuple[Tensor, Tensor]:
-    """Costs [Q] of pairs of states ego, other [Q, 4] of boxes ego_size, other_size [Q, 2]; and bool [Q]: they touch,
-    and not from behind.
+    """Costs [Q] of pairs of states ego, other [Q, 4] of boxes ego_size, other_size [Q,
+    2]; and bool [Q]: they touch, and not from behind.
 
-    Contact costs more at a higher relative velocity, and half where the ego stands. Without contact, what counts is the
-    fraction of `margin` [Q] m or of `headway` s that is missing, the latter before the ego's own speed closes the gap
-    to whom it has ahead. An agent behind the ego counts `rear`: its driver is to keep the distance.
+    Contact costs more at a higher relative velocity, and half where the ego stands.
+    Without contact, what counts is the fraction of `margin` [Q] m or of `headway` s
+    that is missing, the latter before the ego's own speed closes the gap to whom it has
+    ahead. An agent behind the ego counts `rear`: its driver is to keep the distance.
     """
     dx = other[:, 0] - ego[:, 0]
     dy = other[:, 1] - ego[:, 1]
@@ -171,21 +223,29 @@ def pair_cost(
     soon = (1 - along / (weights.headway * own).clamp(min=1e-3)).clamp(0, 1)
     in_line = beside < BESIDE
     behind = in_line & (ahead < 0)
-    cost = weights.contact * hit * severity + weights.near * torch.maximum(tight, soon * (in_line & (ahead > 0)))
+    cost = weights.contact * hit * severity + weights.near * torch.maximum(
+        tight, soon * (in_line & (ahead > 0))
+    )
     return cost * torch.where(behind, weights.rear, 1.0), hit & ~behind
 
 
 def beyond_border(states: Tensor, world: World, border: float) -> Tensor:
-    """Metres [B, C], summed over T, by which centres [B, C, T, 4] come nearer to the drivable border than `border`, or
-    leave it; only what exceeds the ego's present place counts."""
+    """Metres [B, C], summed over T, by which centres [B, C, T, 4] come nearer to the
+    drivable border than `border`, or leave it; only what exceeds the ego's present
+    place counts."""
     field = world.scene["field"]
     origin = world.scene["field_origin"]
     now = off_road(world.states[:, :1, :2], field, origin=origin).clamp(min=-border)
-    return (off_road(states[..., :2], field, origin=origin) - now[..., None]).clamp(0, FARTHEST).sum(-1)
+    return (
+        (off_road(states[..., :2], field, origin=origin) - now[..., None])
+        .clamp(0, FARTHEST)
+        .sum(-1)
+    )
 
 
 def discomfort(states: Tensor, world: World) -> Tensor:
-    """Mean |acceleration| [B, C] m/s^2 of candidates [B, C, T, 4], along and across, and JERK_TIME s of jerk now."""
+    """Mean |acceleration| [B, C] m/s^2 of candidates [B, C, T, 4], along and across,
+    and JERK_TIME s of jerk now."""
     speed = states[..., 3]
     turn = wrap(states[..., 2].diff(dim=-1)) / DT
     first = (speed[..., 0] - world.states[:, :1, 3]) / DT - world.accel[:, :1]

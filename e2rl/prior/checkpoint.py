@@ -1,4 +1,5 @@
-"""Prior checkpoints: safetensors with architecture and origin in the header; nothing is ever unpickled."""
+"""Prior checkpoints: safetensors with architecture and origin in the header; nothing is
+ever unpickled."""
 
 import hashlib
 import json
@@ -28,27 +29,47 @@ LARGEST = 1 << 12  # of a network's sizes
 def save_prior(prior: Prior, folder: Path, origin: dict) -> Path:
     """Write `prior-<hash of the weights>.safetensors` into folder and return its path.
 
-    origin: what made it (command, commit, data fingerprint, settings, validation), kept in the header as JSON.
+    origin: what made it (command, commit, data fingerprint, settings, validation), kept
+    in the header as JSON.
     """
     network = asdict(prior.denoiser.settings)
     architecture = {"denoiser": network, "features": FEATURES}
-    header = {"format": FORMAT, "architecture": json.dumps(architecture), "origin": json.dumps(origin)}
-    tensors = {key: value.detach().cpu().contiguous() for key, value in prior.state_dict().items()}
-    path = Path(folder) / f"prior-{hashlib.sha256(save(tensors)).hexdigest()[:12]}.safetensors"
+    header = {
+        "format": FORMAT,
+        "architecture": json.dumps(architecture),
+        "origin": json.dumps(origin),
+    }
+    tensors = {
+        key: value.detach().cpu().contiguous()
+        for key, value in prior.state_dict().items()
+    }
+    path = (
+        Path(folder)
+        / f"prior-{hashlib.sha256(save(tensors)).hexdigest()[:12]}.safetensors"
+    )
     write_atomically(path, weight_bytes(tensors, header))
     return path
 
 
 def load_prior(
-    checkpoint: str, sampler: SamplerSettings | None = None, bounds: BoundSettings | None = None, device: str = "cpu"
+    checkpoint: str,
+    sampler: SamplerSettings | None = None,
+    bounds: BoundSettings | None = None,
+    device: str = "cpu",
 ) -> tuple[Prior, dict]:
     """The frozen prior in a checkpoint file (or `bundled`), and its origin.
 
-    Raises InputError, naming the file, where it is missing, damaged or of another architecture.
+    Raises InputError, naming the file, where it is missing, damaged or of another
+    architecture.
     """
     path = Path(checkpoint)
-    if checkpoint == BUNDLED:  # shipped with the package, trained on the bundled scenes alone
-        path = max(Path(str(files("e2rl") / "assets" / "prior")).glob("prior-*.safetensors"), default=path)
+    if (
+        checkpoint == BUNDLED
+    ):  # shipped with the package, trained on the bundled scenes alone
+        path = max(
+            Path(str(files("e2rl") / "assets" / "prior")).glob("prior-*.safetensors"),
+            default=path,
+        )
     if not path.exists():
         raise InputError(
             f"prior.checkpoint={checkpoint}: no such file; train one with `python train.py stage=prior`, "
@@ -57,7 +78,9 @@ def load_prior(
     try:
         tensors, header = read_weights(path)
     except ValueError as error:
-        raise InputError(f"{path}: not a readable safetensors file ({error}); train the prior again") from error
+        raise InputError(
+            f"{path}: not a readable safetensors file ({error}); train the prior again"
+        ) from error
     if header.get("format") != FORMAT:
         raise InputError(
             f"{path}: format {header.get('format')!r}, expected {FORMAT!r}: no prior; train one by `python train.py "
@@ -67,8 +90,12 @@ def load_prior(
         architecture = json.loads(header["architecture"])
         origin = json.loads(header["origin"])
         if architecture["features"] != FEATURES:
-            raise ValueError(f"made for {architecture['features']} features, this version has {FEATURES}")
-        settings = settings_of(DenoiserSettings, architecture["denoiser"], where="denoiser")
+            raise ValueError(
+                f"made for {architecture['features']} features, this version has {FEATURES}"
+            )
+        settings = settings_of(
+            DenoiserSettings, architecture["denoiser"], where="denoiser"
+        )
         if max(settings.width, settings.blocks, settings.pair) > LARGEST:
             raise ValueError(f"a size above {LARGEST} in {settings}")
         if architecture.get("free_space"):
@@ -79,6 +106,10 @@ def load_prior(
         prior = make()
         prior.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError, InputError) as error:
-        reason = " ".join(str(error).split("\n\t")[:2])  # of torch's list of tensors that do not fit, the first
-        raise InputError(f"{path}: another architecture ({reason}); train the prior again") from error
+        reason = " ".join(
+            str(error).split("\n\t")[:2]
+        )  # of torch's list of tensors that do not fit, the first
+        raise InputError(
+            f"{path}: another architecture ({reason}); train the prior again"
+        ) from error
     return prior.requires_grad_(False).eval().to(device), origin

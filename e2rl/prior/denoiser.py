@@ -1,4 +1,5 @@
-"""The joint denoiser: vehicles attend to each other with pair features as attention biases and values."""
+"""The joint denoiser: vehicles attend to each other with pair features as attention
+biases and values."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -20,7 +21,8 @@ from e2rl.run.settings import configured, setting
 @configured("prior/default", "network")
 @dataclass(frozen=True)
 class DenoiserSettings:
-    """Sizes of the network (conf/prior/default.yaml); the width is a multiple of the heads."""
+    """Sizes of the network (conf/prior/default.yaml); the width is a multiple of the
+    heads."""
 
     width: int = setting(low=1)
     heads: int = setting(low=1)
@@ -30,15 +32,17 @@ class DenoiserSettings:
 
     def __post_init__(self) -> None:
         if self.heads and self.width % self.heads:
-            raise InputError(f"prior.network.width={self.width}: expected a multiple of heads={self.heads}")
+            raise InputError(
+                f"prior.network.width={self.width}: expected a multiple of heads={self.heads}"
+            )
 
 
 @dataclass
 class Encoding:
     """What the network computes of a scene once per replan, for all denoising steps.
 
-    nodes [B, V, W]; pairs [B, V, V, E]; of each block: the attention biases [B, heads, V, V] (-1e4 at absent vehicles)
-    and the nodes' part of the modulation [B, V, 6 W].
+    nodes [B, V, W]; pairs [B, V, V, E]; of each block: the attention biases [B, heads,
+    V, V] (-1e4 at absent vehicles) and the nodes' part of the modulation [B, V, 6 W].
     """
 
     nodes: Tensor
@@ -48,8 +52,16 @@ class Encoding:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Encoding":
         """An Encoding with `function` applied to every tensor."""
-        biases, modulations = ([function(value) for value in values] for values in (self.biases, self.modulations))
-        return Encoding(function(self.nodes), function(self.pairs), biases=biases, modulations=modulations)
+        biases, modulations = (
+            [function(value) for value in values]
+            for values in (self.biases, self.modulations)
+        )
+        return Encoding(
+            function(self.nodes),
+            function(self.pairs),
+            biases=biases,
+            modulations=modulations,
+        )
 
     def repeat(self, count: int) -> "Encoding":
         """The same scenes `count` times along the batch."""
@@ -57,7 +69,8 @@ class Encoding:
 
 
 class Block(nn.Module):
-    """Attention over vehicles and an MLP, modulated by noise level and node (adaLN-Zero, Peebles and Xie 2023)."""
+    """Attention over vehicles and an MLP, modulated by noise level and node
+    (adaLN-Zero, Peebles and Xie 2023)."""
 
     def __init__(self, width: int, heads: int, pair: int, dropout: float):
         super().__init__()
@@ -69,13 +82,21 @@ class Block(nn.Module):
         self.pair_value = nn.Linear(heads * pair, width)
         self.out = nn.Linear(width, width)
         hidden = 3 * width
-        self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU(), nn.Dropout(dropout), nn.Linear(hidden, width))
+        self.mlp = nn.Sequential(
+            nn.Linear(width, hidden),
+            nn.GELU(),
+            nn.Dropout(dropout),
+            nn.Linear(hidden, width),
+        )
         self.drop = nn.Dropout(dropout)
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
-    def forward(self, h: Tensor, modulation: Tensor, bias: Tensor, pairs: Tensor) -> Tensor:
-        """h [B, V, W] after the block; modulation [B, V, 6 W]; bias [B, heads, V, V]; pairs [B, V, V, E]."""
+    def forward(
+        self, h: Tensor, modulation: Tensor, bias: Tensor, pairs: Tensor
+    ) -> Tensor:
+        """h [B, V, W] after the block; modulation [B, V, 6 W]; bias [B, heads, V, V];
+        pairs [B, V, V, E]."""
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, -1)
         batch, vehicles, width = h.shape
         each = width // self.heads
@@ -85,16 +106,25 @@ class Block(nn.Module):
             .permute(2, 0, 3, 1, 4)
             .flatten(1, 2)
         )
-        logits = torch.baddbmm(bias.flatten(0, 1), q, k.transpose(1, 2), alpha=1 / math.sqrt(each))
+        logits = torch.baddbmm(
+            bias.flatten(0, 1), q, k.transpose(1, 2), alpha=1 / math.sqrt(each)
+        )
         weight = self.drop(torch.softmax(logits, -1))
-        mixed = (weight @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
-        pair = (weight.unflatten(0, (batch, self.heads)).transpose(1, 2) @ pairs).flatten(2)
+        mixed = (
+            (weight @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
+        )
+        pair = (
+            weight.unflatten(0, (batch, self.heads)).transpose(1, 2) @ pairs
+        ).flatten(2)
         h = torch.addcmul(h, gate_a, self.out(mixed + self.pair_value(pair)))
-        return torch.addcmul(h, gate_m, self.mlp(torch.addcmul(shift_m, self.norm_mlp(h), scale_m)))
+        return torch.addcmul(
+            h, gate_m, self.mlp(torch.addcmul(shift_m, self.norm_mlp(h), scale_m))
+        )
 
 
 class Denoiser(nn.Module):
-    """x0 = alpha x + sigma F(x, t | scene), jointly over vehicles. The noise level t may differ between them."""
+    """x0 = alpha x + sigma F(x, t | scene), jointly over vehicles. The noise level t
+    may differ between them."""
 
     node_mean: Tensor
     node_std: Tensor
@@ -109,54 +139,91 @@ class Denoiser(nn.Module):
         self.register_buffer("node_mean", torch.zeros(NODE))
         self.register_buffer("node_std", torch.ones(NODE))
         dropout = nn.Dropout(settings.dropout)
-        self.encode_node = nn.Sequential(nn.Linear(NODE, 2 * width), nn.GELU(), dropout, nn.Linear(2 * width, width))
-        self.encode_pair = nn.Sequential(nn.Linear(EDGE, 48), nn.GELU(), nn.Linear(48, settings.pair), nn.GELU())
+        self.encode_node = nn.Sequential(
+            nn.Linear(NODE, 2 * width), nn.GELU(), dropout, nn.Linear(2 * width, width)
+        )
+        self.encode_pair = nn.Sequential(
+            nn.Linear(EDGE, 48), nn.GELU(), nn.Linear(48, settings.pair), nn.GELU()
+        )
         self.bias = nn.Linear(settings.pair, settings.heads * settings.blocks)
         self.embed_x = nn.Linear(SIZE, width)
-        self.embed_level = nn.Sequential(nn.Linear(32, width), nn.GELU(), nn.Linear(width, width))
+        self.embed_level = nn.Sequential(
+            nn.Linear(32, width), nn.GELU(), nn.Linear(width, width)
+        )
         scales = torch.tensor([0.0, 1.0, 0.0, 0.0, 1.0, 0.0]).repeat_interleave(width)
         self.register_buffer("unit_scale", scales, persistent=False)
-        self.register_buffer("frequencies", torch.logspace(-0.3, 1.7, 16), persistent=False)
+        self.register_buffer(
+            "frequencies", torch.logspace(-0.3, 1.7, 16), persistent=False
+        )
         sizes = (width, settings.heads, settings.pair, settings.dropout)
-        self.blocks = cast(Iterable[Block], nn.ModuleList(Block(*sizes) for _ in range(settings.blocks)))
+        self.blocks = cast(
+            Iterable[Block],
+            nn.ModuleList(Block(*sizes) for _ in range(settings.blocks)),
+        )
         last = nn.Linear(width, SIZE)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(nn.LayerNorm(width), last)
 
     def encode(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
-        """Encoding of node features [B, V, NODE], pair features [B, V, V, EDGE] and presence [B, V]."""
+        """Encoding of node features [B, V, NODE], pair features [B, V, V, EDGE] and
+        presence [B, V]."""
         if self._learns() or not is_on():
             return self.encoding(nodes, pairs, present=present)
-        node, pair, *rest = fused_encoding(self.settings)(nodes, pairs, present, *self._read)
-        return Encoding(node, pair, biases=rest[: self.settings.blocks], modulations=rest[self.settings.blocks :])
+        node, pair, *rest = fused_encoding(self.settings)(
+            nodes, pairs, present, *self._read
+        )
+        return Encoding(
+            node,
+            pair,
+            biases=rest[: self.settings.blocks],
+            modulations=rest[self.settings.blocks :],
+        )
 
     def encoding(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
         """`encode`, operation by operation."""
         node = self.encode_node(((nodes - self.node_mean) / self.node_std).clamp(-6, 6))
         pair = self.encode_pair(pairs)
-        absent = torch.zeros_like(present, dtype=pair.dtype).masked_fill(~present, -1e4)[:, None, None, :]
+        absent = torch.zeros_like(present, dtype=pair.dtype).masked_fill(
+            ~present, -1e4
+        )[:, None, None, :]
         bias = self.bias(pair).permute(0, 3, 1, 2) + absent
-        # The modulation is linear in node and level: the nodes' part is the same for all levels.
+        # The modulation is linear in node and level: the nodes' part is the same for
+        # all levels.
         modulations = [node @ block.modulation.weight.T for block in self.blocks]
-        return Encoding(node, pair, biases=[part.contiguous() for part in bias.chunk(self.settings.blocks, 1)], modulations=modulations)
+        return Encoding(
+            node,
+            pair,
+            biases=[part.contiguous() for part in bias.chunk(self.settings.blocks, 1)],
+            modulations=modulations,
+        )
 
     def modulated(self, level: Tensor) -> list[Tensor]:
-        """The level's part of each block's modulation [..., V, 6 W], of level [..., V]; scales are around 1."""
+        """The level's part of each block's modulation [..., V, 6 W], of level [..., V];
+        scales are around 1."""
         angle = level[..., None] * self.frequencies
         level = self.embed_level(torch.cat([torch.sin(angle), torch.cos(angle)], -1))
         return [block.modulation(level) + self.unit_scale for block in self.blocks]
 
     def forward(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
-        """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or [1, V] for all scenes."""
-        if self._learns() or len(level) > 1 or not is_on() or (torch.is_grad_enabled() and x.requires_grad):
+        """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or
+        [1, V] for all scenes."""
+        if (
+            self._learns()
+            or len(level) > 1
+            or not is_on()
+            or (torch.is_grad_enabled() and x.requires_grad)
+        ):
             return self.estimate(x, level, encoding=encoding)
         scene = encoding.nodes, encoding.pairs, *encoding.biases, *encoding.modulations
         return fused_estimate(self.settings)(x, level, *scene, *self._read)
 
     def _learns(self) -> bool:
-        """Whether dropout acts, or gradients by the weights are wanted: fused functions have neither."""
-        return self.training or (torch.is_grad_enabled() and self.embed_x.weight.requires_grad)
+        """Whether dropout acts, or gradients by the weights are wanted: fused functions
+        have neither."""
+        return self.training or (
+            torch.is_grad_enabled() and self.embed_x.weight.requires_grad
+        )
 
     @cached_property
     def _read(self) -> list[Tensor]:
@@ -166,7 +233,13 @@ class Denoiser(nn.Module):
     def estimate(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
         """`forward`, operation by operation."""
         h = self.embed_x(x) + encoding.nodes
-        parts = zip(self.blocks, encoding.biases, encoding.modulations, self.modulated(level), strict=True)
+        parts = zip(
+            self.blocks,
+            encoding.biases,
+            encoding.modulations,
+            self.modulated(level),
+            strict=True,
+        )
         for block, bias, of_node, of_level in parts:
             h = block(h, of_node + of_level, bias, encoding.pairs)
         alpha = self.schedule.alpha(level)[..., None]
@@ -181,7 +254,9 @@ class _Module(nn.Module):
         super().__init__()
         self.network = Denoiser(settings).eval()
         self.method = method
-        self.names = [name for name, _ in (*self.named_parameters(), *self.named_buffers())]
+        self.names = [
+            name for name, _ in (*self.named_parameters(), *self.named_buffers())
+        ]
         self.sizes = [" ".join(map(str, value.shape)) for value in self.network._read]
 
     def forward(self, *given: Any) -> Any:
@@ -189,30 +264,51 @@ class _Module(nn.Module):
 
     def call(self, weights: Iterable[Tensor], *given: Any) -> Any:
         """The method with these weights and constants."""
-        return torch.func.functional_call(self, dict(zip(self.names, weights, strict=True)), given)
+        return torch.func.functional_call(
+            self, dict(zip(self.names, weights, strict=True)), given
+        )
 
 
 @cache
 def fused_estimate(settings: DenoiserSettings) -> Fused:
-    """`Denoiser.estimate` of networks of these sizes: of x, level, nodes, pairs, biases, modulations and weights."""
+    """`Denoiser.estimate` of networks of these sizes: of x, level, nodes, pairs,
+    biases, modulations and weights."""
     module = _Module(settings, "estimate")
     blocks = settings.blocks
 
-    def denoise(x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *given: Tensor) -> Tensor:
-        encoding = Encoding(nodes, pairs, biases=list(given[:blocks]), modulations=list(given[blocks : 2 * blocks]))
+    def denoise(
+        x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *given: Tensor
+    ) -> Tensor:
+        encoding = Encoding(
+            nodes,
+            pairs,
+            biases=list(given[:blocks]),
+            modulations=list(given[blocks : 2 * blocks]),
+        )
         return module.call(given[2 * blocks :], x, level, encoding)
 
-    scene = [f"B V {settings.width}", f"B V V {settings.pair}", *[f"B {settings.heads} V V"] * blocks]
+    scene = [
+        f"B V {settings.width}",
+        f"B V V {settings.pair}",
+        *[f"B {settings.heads} V V"] * blocks,
+    ]
     scene += [f"B V {6 * settings.width}"] * blocks
-    return Fused(denoise, (f"B V {SIZE}", "1 V", *scene, *module.sizes), constants=len(module.sizes))
+    return Fused(
+        denoise,
+        (f"B V {SIZE}", "1 V", *scene, *module.sizes),
+        constants=len(module.sizes),
+    )
 
 
 @cache
 def fused_encoding(settings: DenoiserSettings) -> Fused:
-    """`Denoiser.encoding` of networks of these sizes: nodes, pairs, biases and modulations."""
+    """`Denoiser.encoding` of networks of these sizes: nodes, pairs, biases and
+    modulations."""
     module = _Module(settings, "encoding")
 
-    def encode(nodes: Tensor, pairs: Tensor, present: Tensor, *weights: Tensor) -> tuple[Tensor, ...]:
+    def encode(
+        nodes: Tensor, pairs: Tensor, present: Tensor, *weights: Tensor
+    ) -> tuple[Tensor, ...]:
         found = module.call(weights, nodes, pairs, present)
         return found.nodes, found.pairs, *found.biases, *found.modulations
 

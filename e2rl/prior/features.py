@@ -1,4 +1,5 @@
-"""Inputs of the denoiser: features of each vehicle (nodes) and of each pair of vehicles (edges), in vehicle frames."""
+"""Inputs of the denoiser: features of each vehicle (nodes) and of each pair of vehicles
+(edges), in vehicle frames."""
 
 import torch
 from torch import Tensor
@@ -20,16 +21,30 @@ COMFORT_LATERAL, COMFORT_BRAKE = 2.5, 1.2  # m/s^2
 DRIVER = IDMParameters(headway=1.0, standstill_gap=2.0, acceleration=1.5, braking=2.0)
 NODE = 51 + PAST + 4
 EDGE = 15
-SIDED_NODE = (2, 3, 4, *range(9, 22), *range(51 + PAST, NODE))  # features that change sign under a mirror image
+SIDED_NODE = (
+    2,
+    3,
+    4,
+    *range(9, 22),
+    *range(51 + PAST, NODE),
+)  # features that change sign under a mirror image
 SIDED_EDGE = (1, 3, 5, 13)
 
 
 @fused(ROUTED, "B V", ("B V 3", "B V 3", "B V 3:int64"), "B:int64", "B:bool")
-def node_features(routed: RoutedScene, state: LaneState, followed: Leaders, step: Tensor, estimated: Tensor) -> Tensor:
-    """[B, V, NODE] from lane states [B, V], the `leaders_ahead` and the simulated step [B].
+def node_features(
+    routed: RoutedScene,
+    state: LaneState,
+    followed: Leaders,
+    step: Tensor,
+    estimated: Tensor,
+) -> Tensor:
+    """[B, V, NODE] from lane states [B, V], the `leaders_ahead` and the simulated step
+    [B].
 
-    estimated [B] bool: the states are a causal observer's estimates (a recording's start) instead of exact ones
-    (simulated later on); how far the present speed and acceleration can be trusted depends on it.
+    estimated [B] bool: the states are a causal observer's estimates (a recording's
+    start) instead of exact ones (simulated later on); how far the present speed and
+    acceleration can be trusted depends on it.
     """
     v = state.v.clamp(min=0)  # who reverses is to halt: it is seen as if it stood
     length, width = routed.size[:, : v.shape[1]].unbind(-1)
@@ -37,70 +52,123 @@ def node_features(routed: RoutedScene, state: LaneState, followed: Leaders, step
     limit = routed.limit.gather(-1, at[..., None])[..., 0]
     known = limit > 0
     near = torch.exp(-followed.gap.clamp(min=0) / 20.0)
-    closing = torch.where(followed.gap < FREE_GAP, (v[..., None] - followed.speed) / 5.0, 0.0)
+    closing = torch.where(
+        followed.gap < FREE_GAP, (v[..., None] - followed.speed) / 5.0, 0.0
+    )
     lead = torch.stack([near, closing], -1).flatten(2).unbind(-1)
     gap = followed.gap[..., 0]
     gap_speed = followed.speed[..., 0]
     desired_speed = torch.where(known, limit, 15.0).clamp(min=1.0)
-    idm = idm_acceleration(v, desired_speed, gap=gap, leader_speed=gap_speed, driver=DRIVER, improved=False).clamp(-6.0, 2.0)
-    motion = [v / 10, state.a / 2, state.d, state.d1 * 5, state.d2 * 20, (v < 0.5).float()]
-    speed_limit = [known.float(), torch.where(known, (limit - v) / 10, 0.0), torch.where(known, limit / 15, 0.0)]
+    idm = idm_acceleration(
+        v, desired_speed, gap=gap, leader_speed=gap_speed, driver=DRIVER, improved=False
+    ).clamp(-6.0, 2.0)
+    motion = [
+        v / 10,
+        state.a / 2,
+        state.d,
+        state.d1 * 5,
+        state.d2 * 20,
+        (v < 0.5).float(),
+    ]
+    speed_limit = [
+        known.float(),
+        torch.where(known, (limit - v) / 10, 0.0),
+        torch.where(known, limit / 15, 0.0),
+    ]
     kind = [length / 5, width / 2, routed.parked.float(), routed.has_lane.float()]
     need = (v * v / (2 * gap.clamp(min=1.0))).clamp(max=8) / 4
-    speed = [(v / 10) ** 2, torch.sqrt(v.clamp(min=0) + 1e-3) / 3, estimated[:, None].float().expand_as(v)]
+    speed = [
+        (v / 10) ** 2,
+        torch.sqrt(v.clamp(min=0) + 1e-3) / 3,
+        estimated[:, None].float().expand_as(v),
+    ]
     features = [*motion, *speed_limit, *_route_features(routed, state), *lead, idm / 2]
-    features += [*_light_features(routed, state, step=step), *kind, (gap < FREE_GAP).float(), need, *speed]
-    return torch.stack([*features, *past_features(routed.past, state.v, estimated=estimated)], -1)
+    features += [
+        *_light_features(routed, state, step=step),
+        *kind,
+        (gap < FREE_GAP).float(),
+        need,
+        *speed,
+    ]
+    return torch.stack(
+        [*features, *past_features(routed.past, state.v, estimated=estimated)], -1
+    )
 
 
 def _route_features(routed: RoutedScene, state: LaneState) -> list[Tensor]:
-    """Curvatures and turns of the route ahead, lateral acceleration, speed to spare for curves, rest of the route."""
+    """Curvatures and turns of the route ahead, lateral acceleration, speed to spare for
+    curves, rest of the route."""
     offsets = torch.tensor((*CURVATURE_AT, *TURN_AT, 0.0), device=state.s.device)
     _, heading, curvature = interpolate(routed.points, state.s[..., None] + offsets)
     count = len(CURVATURE_AT)
-    turn = (heading[..., count:-1] - heading[..., -1:] + torch.pi) % (2 * torch.pi) - torch.pi
-    curve = curve_speed(state, routed.points, lateral=COMFORT_LATERAL, brake=COMFORT_BRAKE)
+    turn = (heading[..., count:-1] - heading[..., -1:] + torch.pi) % (
+        2 * torch.pi
+    ) - torch.pi
+    curve = curve_speed(
+        state, routed.points, lateral=COMFORT_LATERAL, brake=COMFORT_BRAKE
+    )
     rest = torch.where(routed.open, routed.length - state.s, 200.0).clamp(-10.0, 200.0)
     ahead = [*(curvature[..., :count] * 15).clamp(-3, 3).unbind(-1), *turn.unbind(-1)]
     ahead += [state.kappa * state.v, ((curve - state.v) / 5).clamp(-2, 2)]
     return [*ahead, torch.exp(-rest.clamp(min=0) / 30), (rest < 200).float()]
 
 
-def curve_speed(state: LaneState, points: Tensor, lateral: float, brake: float) -> Tensor:
-    """Highest speed now [B, V] from which all curves within 80 m can be met at `lateral` m/s^2, braking at `brake`."""
+def curve_speed(
+    state: LaneState, points: Tensor, lateral: float, brake: float
+) -> Tensor:
+    """Highest speed now [B, V] from which all curves within 80 m can be met at
+    `lateral` m/s^2, braking at `brake`."""
     ahead = torch.arange(0.0, 80.0, 4.0, device=state.s.device)
     curvature = interpolate(points, state.s[..., None] + ahead)[2].abs()
-    return torch.sqrt(lateral / curvature.clamp(min=1e-4) + 2 * brake * ahead).min(-1).values
+    return (
+        torch.sqrt(lateral / curvature.clamp(min=1e-4) + 2 * brake * ahead)
+        .min(-1)
+        .values
+    )
 
 
-def leaders_ahead(routed: RoutedScene, s: Tensor, agents: Tensor, present: Tensor) -> Leaders:
-    """Leaders [B, V, 3] of vehicles at arc lengths s [B, V] once agents [B, N, 4] have kept their velocity for
-    LEADER_AT."""
+def leaders_ahead(
+    routed: RoutedScene, s: Tensor, agents: Tensor, present: Tensor
+) -> Leaders:
+    """Leaders [B, V, 3] of vehicles at arc lengths s [B, V] once agents [B, N, 4] have
+    kept their velocity for LEADER_AT."""
     there = constant_velocity(agents, torch.tensor(LEADER_AT, device=agents.device))
     return leaders(s, routed.points, agents=there, size=routed.size, present=present)
 
 
-def _light_features(routed: RoutedScene, state: LaneState, step: Tensor) -> list[Tensor]:
-    """Of each light of the route: nearness, red, yellow, green, and the braking that stops at it."""
+def _light_features(
+    routed: RoutedScene, state: LaneState, step: Tensor
+) -> list[Tensor]:
+    """Of each light of the route: nearness, red, yellow, green, and the braking that
+    stops at it."""
     colours = light_state_at(routed.light_state, routed.light, step=step)
     ahead = routed.light_s - state.s[..., None]
     seen = (routed.light >= 0) & (ahead > -1.0) & (ahead < 120.0)
     need = (state.v[..., None] ** 2 / (2 * ahead.clamp(min=1.0))).clamp(max=8.0)
-    is_colour = [(seen & (colours == colour)).float() for colour in (LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN)]
+    is_colour = [
+        (seen & (colours == colour)).float()
+        for colour in (LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN)
+    ]
     braking = torch.where(seen & (colours != LIGHT_GREEN), need / 4, 0.0)
-    each = torch.stack([torch.where(seen, 1 - ahead / 120.0, 0.0), *is_colour, braking], -1)  # [B, V, lights, 5]
+    each = torch.stack(
+        [torch.where(seen, 1 - ahead / 120.0, 0.0), *is_colour, braking], -1
+    )  # [B, V, lights, 5]
     return list(each.flatten(2).unbind(-1))
 
 
 def past_features(past: Tensor, v: Tensor, estimated: Tensor) -> list[Tensor]:
-    """PAST + 4 features [B, V] of the second before the start; 0 where states are exact, which do not need them.
+    """PAST + 4 features [B, V] of the second before the start; 0 where states are
+    exact, which do not need them.
 
-    The speed in each 0.1 s against the present one, then lateral position and heading 0.5 s and 1 s ago.
+    The speed in each 0.1 s against the present one, then lateral position and heading
+    0.5 s and 1 s ago.
     """
     ahead = torch.cat([torch.zeros_like(past[..., :1, 0]), past[..., 0]], -1)
     change = ((-ahead.diff(dim=-1) / DT - v[..., None]) / 2).clamp(-2, 2)
     at = past[..., PAST // 2 - 1 :: PAST // 2, :]
-    features = torch.cat([change, at[..., 1].clamp(-5, 5), 5 * at[..., 2].clamp(-1, 1)], -1)
+    features = torch.cat(
+        [change, at[..., 1].clamp(-5, 5), 5 * at[..., 2].clamp(-1, 1)], -1
+    )
     return list((features * estimated[:, None, None]).unbind(-1))
 
 
@@ -126,9 +194,28 @@ def edge_features(routed: RoutedScene, state: LaneState) -> Tensor:
     other = own.transpose(1, 2)
     meet = routed.conflict & (own > -3) & (other > -3)
     arrival = own / v[..., None].clamp(min=1.0) - other / v[:, None, :].clamp(min=1.0)
-    position = [along / 30, across / 10, torch.cos(turn), torch.sin(turn), vx / 10, vy / 10]
-    nearness = [torch.exp(-distance / 20), closing / 10, torch.exp(-distance / 5), meet.float()]
+    position = [
+        along / 30,
+        across / 10,
+        torch.cos(turn),
+        torch.sin(turn),
+        vx / 10,
+        vy / 10,
+    ]
+    nearness = [
+        torch.exp(-distance / 20),
+        closing / 10,
+        torch.exp(-distance / 5),
+        meet.float(),
+    ]
     meeting = [torch.exp(-own.clamp(min=0) / 30), torch.exp(-other.clamp(min=0) / 30)]
-    meeting += [torch.cos(routed.crossing), torch.sin(routed.crossing), torch.tanh(arrival / 3)]
+    meeting += [
+        torch.cos(routed.crossing),
+        torch.sin(routed.crossing),
+        torch.tanh(arrival / 3),
+    ]
     zero = torch.zeros_like(own)
-    return torch.stack([*position, *nearness, *(torch.where(meet, value, zero) for value in meeting)], -1)
+    return torch.stack(
+        [*position, *nearness, *(torch.where(meet, value, zero) for value in meeting)],
+        -1,
+    )

@@ -1,14 +1,25 @@
-"""Free-space plans, for vehicles without a lane: the same x, read as accelerations and path curvatures.
+"""Free-space plans, for vehicles without a lane: the same x, read as accelerations and
+path curvatures.
 
-The acceleration knots mean what they mean on a route. The two lateral knots are curvatures of the driven path, half way
-along and at the end of the lateral horizon: linear in between, from the current curvature on, and held after the end.
+The acceleration knots mean what they mean on a route. The two lateral knots are
+curvatures of the driven path, half way along and at the end of the lateral horizon:
+linear in between, from the current curvature on, and held after the end.
 """
 
 import torch
 from torch import Tensor
 
 from e2rl.prior import lane_relative
-from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS, SIZE, LaneState, lateral_horizon, ridge, select, speeds
+from e2rl.prior.lane_relative import (
+    ACCEL_SCALE,
+    KNOTS,
+    SIZE,
+    LaneState,
+    lateral_horizon,
+    ridge,
+    select,
+    speeds,
+)
 from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
@@ -22,15 +33,18 @@ def curvature_scale(v: Tensor) -> Tensor:
 
 
 def _segments(travelled: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Shares of the first and the second half of the lateral horizon that are driven, and the metres beyond it."""
+    """Shares of the first and the second half of the lateral horizon that are driven,
+    and the metres beyond it."""
     u = (2 * travelled / reach).clamp(max=2.0)
     return u.clamp(max=1.0), (u - 1).clamp(min=0.0), (travelled - reach).clamp(min=0)
 
 
 def decode(x: Tensor, state: LaneState) -> LaneState:
-    """Planned motion (fields [..., V, HORIZON]) of x [..., V, SIZE], by integrating curvature over travelled distance.
+    """Planned motion (fields [..., V, HORIZON]) of x [..., V, SIZE], by integrating
+    curvature over travelled distance.
 
-    Of the Frenet fields, s advances with the travelled distance, d is held, d1 and d2 are 0.
+    Of the Frenet fields, s advances with the travelled distance, d is held, d1 and d2
+    are 0.
     """
     v, travelled = speeds(state, ACCEL_SCALE * x[..., :KNOTS])
     scale = curvature_scale(state.v)[..., None]
@@ -40,7 +54,16 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     first, second, beyond = _segments(travelled, reach)
     now = state.kappa[..., None]
     kappa = now + (half - now) * first + (end - half) * second
-    turned = 0.5 * reach * (now * first + (half - now) * first**2 / 2 + half * second + (end - half) * second**2 / 2)
+    turned = (
+        0.5
+        * reach
+        * (
+            now * first
+            + (half - now) * first**2 / 2
+            + half * second
+            + (end - half) * second**2 / 2
+        )
+    )
     heading = state.heading[..., None] + turned + end * beyond
     before = torch.cat([state.heading[..., None], heading[..., :-1]], -1)
     step = torch.diff(travelled, dim=-1, prepend=torch.zeros_like(travelled[..., :1]))
@@ -50,19 +73,37 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     accel = (v - torch.cat([state.v[..., None], v[..., :-1]], -1)) / DT
     s = state.s[..., None] + travelled
     zero = torch.zeros_like(v)
-    return LaneState(s, state.d[..., None] + zero, d1=zero, d2=zero, v=v, a=accel, x=xs, y=ys, heading=heading, kappa=kappa)
+    return LaneState(
+        s,
+        state.d[..., None] + zero,
+        d1=zero,
+        d2=zero,
+        v=v,
+        a=accel,
+        x=xs,
+        y=ys,
+        heading=heading,
+        kappa=kappa,
+    )
 
 
 @fused(f"B V {SIZE}", "B V", "B V P 2!", "B V:bool")
-def decode_plans(x: Tensor, state: LaneState, points: Tensor, on_lane: Tensor) -> LaneState:
-    """Planned motion of every vehicle, on its route where on_lane [B, V], in free space elsewhere."""
-    return select(on_lane, lane_relative.decode(x, state, points=points), other=decode(x, state))
+def decode_plans(
+    x: Tensor, state: LaneState, points: Tensor, on_lane: Tensor
+) -> LaneState:
+    """Planned motion of every vehicle, on its route where on_lane [B, V], in free space
+    elsewhere."""
+    return select(
+        on_lane, lane_relative.decode(x, state, points=points), other=decode(x, state)
+    )
 
 
 def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tensor:
-    """Lateral knots [..., V, 2] whose path has the recorded headings [..., V, HORIZON], by ridge least squares.
+    """Lateral knots [..., V, 2] whose path has the recorded headings [..., V, HORIZON],
+    by ridge least squares.
 
-    The heading is linear in the curvature knots once the travelled distance (from `knots`, m/s^2) is known.
+    The heading is linear in the curvature knots once the travelled distance (from
+    `knots`, m/s^2) is known.
     """
     _, travelled = speeds(state, knots)
     reach = lateral_horizon(state.v)[..., None]
@@ -73,4 +114,6 @@ def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tens
     given = 0.5 * reach * state.kappa[..., None] * (first - first**2 / 2)
     turn = wrap(heading - state.heading[..., None])
     unit = torch.stack([scale * half, scale * end], -1) * known[..., None]
-    return ridge(unit, (turn - given) * known, damping=1e-3 * torch.eye(2, device=unit.device)).clamp(-6.0, 6.0)
+    return ridge(
+        unit, (turn - given) * known, damping=1e-3 * torch.eye(2, device=unit.device)
+    ).clamp(-6.0, 6.0)

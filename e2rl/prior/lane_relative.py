@@ -1,8 +1,9 @@
 """Lane-relative plans: accelerations along a route and lateral offsets from it.
 
-x [..., 12] of a vehicle holds 10 acceleration knots at 0.5, 1.0, ..., 5.0 s (the knot at 0 is the current acceleration)
-and two lateral knots: the offset half way along and at the end of the lateral horizon. The decoder is closed form and
-differentiable. A vehicle leaves its route by its offset only, and one that stands cannot move sideways.
+x [..., 12] of a vehicle holds 10 acceleration knots at 0.5, 1.0, ..., 5.0 s (the knot
+at 0 is the current acceleration) and two lateral knots: the offset half way along and
+at the end of the lateral horizon. The decoder is closed form and differentiable. A
+vehicle leaves its route by its offset only, and one that stands cannot move sideways.
 """
 
 from collections.abc import Callable
@@ -23,19 +24,27 @@ KNOTS = 10
 SIZE = KNOTS + 2
 KNOT_STEPS = HORIZON // KNOTS
 ACCEL_SCALE = 1.0  # m/s^2 a unit of x
-OFFSET_SCALE, BEND_SCALE = 0.5, 0.15  # m a unit of x: end offset; half-way offset from the mean of now and the end
-LEAST_STRETCH = 0.3  # m of a vehicle's line per m of its route, at least: deep inside a bend
+OFFSET_SCALE, BEND_SCALE = (
+    0.5,
+    0.15,
+)  # m a unit of x: end offset; half-way offset from the mean of now and the end
+LEAST_STRETCH = (
+    0.3  # m of a vehicle's line per m of its route, at least: deep inside a bend
+)
 LEAK = 0.05  # gradient that passes where the speed is held at 0
-# Weight of the squared second differences of fitted accelerations: what changes faster is noise of the recording.
+# Weight of the squared second differences of fitted accelerations: what changes faster
+# is noise of the recording.
 ROUGHNESS = 0.3
 
 
 @dataclass
 class LaneState:
-    """Frenet and Cartesian states of vehicles, each [B, V]; of planned motion each [B, V, HORIZON].
+    """Frenet and Cartesian states of vehicles, each [B, V]; of planned motion each [B,
+    V, HORIZON].
 
-    s, d [m]: arc length and offset (left positive); d1, d2: first and second derivative of d over travelled distance;
-    v [m/s], a [m/s^2]; x, y [m], heading [rad]; kappa [1/m]: curvature of the driven path.
+    s, d [m]: arc length and offset (left positive); d1, d2: first and second derivative
+    of d over travelled distance; v [m/s], a [m/s^2]; x, y [m], heading [rad]; kappa
+    [1/m]: curvature of the driven path.
     """
 
     s: Tensor
@@ -58,12 +67,19 @@ class LaneState:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "LaneState":
         """A LaneState with `function` applied to every field."""
-        return LaneState(*(function(getattr(self, field.name)) for field in fields(self)))
+        return LaneState(
+            *(function(getattr(self, field.name)) for field in fields(self))
+        )
 
     def put(self, rows: tuple[Tensor, ...], other: "LaneState") -> "LaneState":
         """A LaneState with `rows` of every field replaced by `other`."""
         fresh = vars(other)
-        return LaneState(**{name: old.index_put(rows, fresh[name]) for name, old in vars(self).items()})
+        return LaneState(
+            **{
+                name: old.index_put(rows, fresh[name])
+                for name, old in vars(self).items()
+            }
+        )
 
     def states(self) -> Tensor:
         """[..., 4]: x, y, heading, speed."""
@@ -71,44 +87,78 @@ class LaneState:
 
 
 def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:
-    """The fields of `one` for vehicles rows [B, V], of `other` elsewhere; fields [B, V] or [B, V, HORIZON]."""
+    """The fields of `one` for vehicles rows [B, V], of `other` elsewhere; fields [B, V]
+    or [B, V, HORIZON]."""
     rows = rows.view(*rows.shape, *[1] * (one.v.ndim - rows.ndim))
     names = [field.name for field in fields(LaneState)]
-    return LaneState(*(torch.where(rows, getattr(one, name), getattr(other, name)) for name in names))
+    return LaneState(
+        *(torch.where(rows, getattr(one, name), getattr(other, name)) for name in names)
+    )
 
 
-def locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor | None = None) -> LaneState:
-    """LaneState of vehicles states [B, V, 4] on their routes points [B, V, P, 2]; hint [B, V]: expected arc length."""
+def locate(
+    states: Tensor,
+    accel: Tensor,
+    yaw_rate: Tensor,
+    points: Tensor,
+    hint: Tensor | None = None,
+) -> LaneState:
+    """LaneState of vehicles states [B, V, 4] on their routes points [B, V, P, 2]; hint
+    [B, V]: expected arc length."""
     given = states, accel, yaw_rate, points
     return locate_anywhere(*given) if hint is None else locate_near(*given, hint)
 
 
 @fused("B V 4", "B V", "B V", "B V P 2!")
-def locate_anywhere(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor) -> LaneState:
+def locate_anywhere(
+    states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor
+) -> LaneState:
     """`locate` without a hint."""
     return _locate(states, accel, yaw_rate=yaw_rate, points=points, hint=None)
 
 
 @fused("B V 4", "B V", "B V", "B V P 2!", "B V")
-def locate_near(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor) -> LaneState:
+def locate_near(
+    states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor
+) -> LaneState:
     """`locate` with a hint."""
-    return _locate(states, accel, yaw_rate=yaw_rate, points=points, hint=hint[..., None])
+    return _locate(
+        states, accel, yaw_rate=yaw_rate, points=points, hint=hint[..., None]
+    )
 
 
-def _locate(states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor | None) -> LaneState:
-    s, d, _ = (value[..., 0] for value in project(states[..., None, :2], points, hint=hint))
-    heading, curvature = (value[..., 0] for value in interpolate(points, s[..., None])[1:])
+def _locate(
+    states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor | None
+) -> LaneState:
+    s, d, _ = (
+        value[..., 0] for value in project(states[..., None, :2], points, hint=hint)
+    )
+    heading, curvature = (
+        value[..., 0] for value in interpolate(points, s[..., None])[1:]
+    )
     turn = wrap(states[..., 2] - heading)
     v = states[..., 3]
     kappa = (yaw_rate / at_least(v, 1.0)).clamp(-0.25, 0.25)
     d1 = torch.tan(turn.clamp(-1.0, 1.0)) * (1 - curvature * d).clamp(min=LEAST_STRETCH)
     d2 = (kappa - curvature).clamp(-0.1, 0.1)
-    return LaneState(s, d, d1=d1, d2=d2, v=v, a=accel, x=states[..., 0], y=states[..., 1], heading=states[..., 2], kappa=kappa)
+    return LaneState(
+        s,
+        d,
+        d1=d1,
+        d2=d2,
+        v=v,
+        a=accel,
+        x=states[..., 0],
+        y=states[..., 1],
+        heading=states[..., 2],
+        kappa=kappa,
+    )
 
 
 @cache
 def _speed_basis(device: torch.device) -> Tensor:
-    """[HORIZON, KNOTS + 1]: speed gained up to each step per unit of each acceleration knot (trapezoids, exact)."""
+    """[HORIZON, KNOTS + 1]: speed gained up to each step per unit of each acceleration
+    knot (trapezoids, exact)."""
     time = torch.arange(HORIZON + 1, dtype=torch.float64) / KNOT_STEPS
     hat = (1 - (time[:, None] - torch.arange(KNOTS + 1)).abs()).clamp(min=0)
     return ((hat[1:] + hat[:-1]) / 2 * DT).cumsum(0).float().to(device)
@@ -116,21 +166,26 @@ def _speed_basis(device: torch.device) -> Tensor:
 
 @cache
 def _distance_basis(device: torch.device) -> Tensor:
-    """[HORIZON, KNOTS + 1]: distance gained up to each step per unit of each acceleration knot."""
+    """[HORIZON, KNOTS + 1]: distance gained up to each step per unit of each
+    acceleration knot."""
     basis = _speed_basis(device)
-    return ((torch.cat([torch.zeros_like(basis[:1]), basis[:-1]]) + basis) / 2 * DT).cumsum(0)
+    return (
+        (torch.cat([torch.zeros_like(basis[:1]), basis[:-1]]) + basis) / 2 * DT
+    ).cumsum(0)
 
 
 @cache
 def _offset_basis(device: torch.device) -> Tensor:
-    """[4, 4]: polynomial coefficients of u^3..u^6 from (d(1/2), d(1), d'(1), d''(1)) less the given lower terms."""
+    """[4, 4]: polynomial coefficients of u^3..u^6 from (d(1/2), d(1), d'(1), d''(1))
+    less the given lower terms."""
     power = torch.arange(3, 7, dtype=torch.float64)
     rows = [0.5**power, torch.ones(4, dtype=torch.float64), power, power * (power - 1)]
     return torch.linalg.inv(torch.stack(rows)).float().to(device)
 
 
 def distance_weights(device: torch.device | None = None) -> Tensor:
-    """[KNOTS]: metres that a unit of each acceleration knot adds to the travelled distance, mean over the horizon."""
+    """[KNOTS]: metres that a unit of each acceleration knot adds to the travelled
+    distance, mean over the horizon."""
     return _distance_basis(device or torch.device("cpu")).mean(0)[1:]
 
 
@@ -142,7 +197,8 @@ def lateral_horizon(v: Tensor) -> Tensor:
 def offset_coefficients(state: LaneState, half: Tensor, end: Tensor) -> Tensor:
     """Coefficients [..., 7] of d(u), u = travelled distance / lateral_horizon.
 
-    The polynomial starts as the state does, passes `half` [m] at u = 1/2 and `end` at u = 1, where it is flat.
+    The polynomial starts as the state does, passes `half` [m] at u = 1/2 and `end` at u
+    = 1, where it is flat.
     """
     reach = lateral_horizon(state.v)
     low = torch.stack([state.d, state.d1 * reach, 0.5 * state.d2 * reach**2], -1)
@@ -154,11 +210,15 @@ def offset_coefficients(state: LaneState, half: Tensor, end: Tensor) -> Tensor:
 
 
 def speeds(state: LaneState, knots: Tensor) -> tuple[Tensor, Tensor]:
-    """Speed and travelled distance [..., HORIZON] at each step for acceleration knots [..., KNOTS], m/s^2.
+    """Speed and travelled distance [..., HORIZON] at each step for acceleration knots
+    [..., KNOTS], m/s^2.
 
     Speeds are held at 0 from below; a small gradient still passes there.
     """
-    free = state.v[..., None] + torch.cat([state.a[..., None], knots], -1) @ _speed_basis(knots.device).T
+    free = (
+        state.v[..., None]
+        + torch.cat([state.a[..., None], knots], -1) @ _speed_basis(knots.device).T
+    )
     below = free.clamp(max=0)
     v = free.clamp(min=0) + LEAK * (below - below.detach())
     before = torch.cat([state.v[..., None], v[..., :-1]], -1)
@@ -166,24 +226,31 @@ def speeds(state: LaneState, knots: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def split(x: Tensor, state: LaneState) -> tuple[Tensor, Tensor, Tensor]:
-    """Acceleration knots [..., KNOTS] m/s^2 and lateral offsets half way and at the end [...], m, of x [..., SIZE]."""
+    """Acceleration knots [..., KNOTS] m/s^2 and lateral offsets half way and at the end
+    [...], m, of x [..., SIZE]."""
     end = OFFSET_SCALE * x[..., KNOTS + 1]
     half = 0.5 * (state.d + end) + BEND_SCALE * x[..., KNOTS]
     return ACCEL_SCALE * x[..., :KNOTS], half, end
 
 
 def decode(
-    x: Tensor, state: LaneState, points: Tensor, steps: slice = slice(None), along: tuple[Tensor, Tensor] | None = None
+    x: Tensor,
+    state: LaneState,
+    points: Tensor,
+    steps: slice = slice(None),
+    along: tuple[Tensor, Tensor] | None = None,
 ) -> LaneState:
-    """Planned motion [..., V, HORIZON] of x [..., V, SIZE] on routes [..., V, P, 2], or those `steps` of it; along: the
-    routes' tangents, see `interpolate`."""
+    """Planned motion [..., V, HORIZON] of x [..., V, SIZE] on routes [..., V, P, 2], or
+    those `steps` of it; along: the routes' tangents, see `interpolate`."""
     knots, half, end = split(x, state)
     v, travelled = speeds(state, knots)
     accel = torch.diff(v, dim=-1, prepend=state.v[..., None])[..., steps] / DT
     v = v[..., steps]
     travelled = travelled[..., steps]
     reach = lateral_horizon(state.v)[..., None]
-    d, d1, d2 = polynomial(offset_coefficients(state, half, end=end), (travelled / reach).clamp(max=1.0))
+    d, d1, d2 = polynomial(
+        offset_coefficients(state, half, end=end), (travelled / reach).clamp(max=1.0)
+    )
     d1 = d1 / reach
     d2 = d2 / reach**2
     s = state.s[..., None] + travelled
@@ -191,7 +258,18 @@ def decode(
     normal = torch.stack([-torch.sin(heading), torch.cos(heading)], -1)
     xy = xy + d[..., None] * normal
     heading = heading + torch.atan(d1 / (1 - curvature * d).clamp(min=LEAST_STRETCH))
-    return LaneState(s, d, d1=d1, d2=d2, v=v, a=accel, x=xy[..., 0], y=xy[..., 1], heading=heading, kappa=curvature + d2)
+    return LaneState(
+        s,
+        d,
+        d1=d1,
+        d2=d2,
+        v=v,
+        a=accel,
+        x=xy[..., 0],
+        y=xy[..., 1],
+        heading=heading,
+        kappa=curvature + d2,
+    )
 
 
 @fused(f"B V {SIZE}", "B V", "B V P 2!")
@@ -208,7 +286,8 @@ def decode_options(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
 
 
 class _Polynomial(torch.autograd.Function):
-    """Horner's rule with its derivative in closed form; autograd would record a hundred small operations."""
+    """Horner's rule with its derivative in closed form; autograd would record a hundred
+    small operations."""
 
     @staticmethod
     def forward(ctx: Any, c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -231,24 +310,36 @@ class _Polynomial(torch.autograd.Function):
             powers.append(powers[-1] * u)
         table = torch.stack(powers, -2)  # [..., 7, H]
         of_value, of_first, of_second = (
-            (table[..., : 7 - shift, :] * grad[..., None, :]).sum(-1) for shift, grad in enumerate(grads)
+            (table[..., : 7 - shift, :] * grad[..., None, :]).sum(-1)
+            for shift, grad in enumerate(grads)
         )
         power = torch.arange(7, device=c.device, dtype=c.dtype)
         pad = torch.nn.functional.pad
-        of_c = of_value + power * pad(of_first, (1, 0)) + power * (power - 1) * pad(of_second, (2, 0))
-        return of_c.sum_to_size(c.shape), grads[0] * first + grads[1] * second + grads[2] * third
+        of_c = (
+            of_value
+            + power * pad(of_first, (1, 0))
+            + power * (power - 1) * pad(of_second, (2, 0))
+        )
+        return of_c.sum_to_size(c.shape), grads[0] * first + grads[1] * second + grads[
+            2
+        ] * third
 
 
 def polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Value, first and second derivative (in u) of the polynomial c [..., 7] at u [..., H]."""
+    """Value, first and second derivative (in u) of the polynomial c [..., 7] at u [...,
+    H]."""
     return _Polynomial.apply(c, u)
 
 
-def fit(track: LaneState, known: Tensor | None, state: LaneState) -> tuple[Tensor, Tensor]:
-    """x [..., V, SIZE] that reproduces recorded motion, and its mean error [..., V] in m.
+def fit(
+    track: LaneState, known: Tensor | None, state: LaneState
+) -> tuple[Tensor, Tensor]:
+    """x [..., V, SIZE] that reproduces recorded motion, and its mean error [..., V] in
+    m.
 
-    track: fields s, d, v [..., V, HORIZON] of the steps ahead; known: their mask, None: all; state: at the start. Ridge
-    least squares on speed and distance for the knots (second differences damped), on offset for the lateral knots.
+    track: fields s, d, v [..., V, HORIZON] of the steps ahead; known: their mask, None:
+    all; state: at the start. Ridge least squares on speed and distance for the knots
+    (second differences damped), on offset for the lateral knots.
     """
     knots = _fit_knots(track, known, state=state)
     known = torch.ones_like(track.v) if known is None else known
@@ -258,28 +349,46 @@ def fit(track: LaneState, known: Tensor | None, state: LaneState) -> tuple[Tenso
     base = polynomial(offset_coefficients(state, zero, end=zero), u)[0]
     still = state.map(torch.zeros_like)
     still.v = state.v
-    parts = [polynomial(offset_coefficients(still, *pair), u)[0] for pair in ((zero + 1, zero), (zero, zero + 1))]
+    parts = [
+        polynomial(offset_coefficients(still, *pair), u)[0]
+        for pair in ((zero + 1, zero), (zero, zero + 1))
+    ]
     basis = torch.stack(parts, -1) * known[..., None]
     # In units of x: half = (d + end) / 2 + BEND_SCALE x_0, end = OFFSET_SCALE x_1.
-    unit = torch.stack([BEND_SCALE * basis[..., 0], OFFSET_SCALE * (basis[..., 1] + 0.5 * basis[..., 0])], -1)
+    unit = torch.stack(
+        [
+            BEND_SCALE * basis[..., 0],
+            OFFSET_SCALE * (basis[..., 1] + 0.5 * basis[..., 0]),
+        ],
+        -1,
+    )
     rest = (track.d - base - 0.5 * state.d[..., None] * parts[0]) * known
     lateral = ridge(unit, rest, damping=torch.diag(unit.new_tensor([0.05, 0.02])))
-    left = (rest - (unit * lateral[..., None, :]).sum(-1)).abs() + (track.s - state.s[..., None] - travelled).abs()
+    left = (rest - (unit * lateral[..., None, :]).sum(-1)).abs() + (
+        track.s - state.s[..., None] - travelled
+    ).abs()
     error = (left * known).sum(-1) / known.sum(-1).clamp(min=1)
     return torch.cat([knots / ACCEL_SCALE, lateral], -1), error
 
 
 def ridge(unit: Tensor, target: Tensor, damping: Tensor) -> Tensor:
-    """Weights [..., D] of columns unit [..., H, D] that fit target [..., H], with damping [D, D] on their squares."""
+    """Weights [..., D] of columns unit [..., H, D] that fit target [..., H], with
+    damping [D, D] on their squares."""
     right = (unit * target[..., None]).sum(-2)
-    if torch.compiler.is_compiling() and unit.shape[-1] == 2:  # Cramer's rule, as the compiler has no `solve`
+    if (
+        torch.compiler.is_compiling() and unit.shape[-1] == 2
+    ):  # Cramer's rule, as the compiler has no `solve`
         one, two = unit.unbind(-1)
         a = (one * one).sum(-1)
         b = (one * two).sum(-1)
         d = (two * two).sum(-1)
         a, d, (e, f) = a + damping[0, 0], d + damping[1, 1], right.unbind(-1)
-        return torch.stack([d * e - b * f, a * f - b * e], -1) / (a * d - b * b)[..., None]
-    return torch.linalg.solve(unit.transpose(-1, -2) @ unit + damping, right[..., None])[..., 0]
+        return (
+            torch.stack([d * e - b * f, a * f - b * e], -1) / (a * d - b * b)[..., None]
+        )
+    return torch.linalg.solve(
+        unit.transpose(-1, -2) @ unit + damping, right[..., None]
+    )[..., 0]
 
 
 def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tensor:
@@ -288,15 +397,26 @@ def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tens
     basis = _speed_basis(device)
     distance = _distance_basis(device)
     time = DT * torch.arange(1, HORIZON + 1, device=device)
-    weight = torch.ones_like(track.v)[..., None] if known is None else known.to(basis.dtype)[..., None]
+    weight = (
+        torch.ones_like(track.v)[..., None]
+        if known is None
+        else known.to(basis.dtype)[..., None]
+    )
     rows_of_all, inverse = _fit_of_all(device)
     rows = torch.cat([weight * basis[:, 1:], 0.5 * weight * distance[:, 1:]], -2)
     speed = track.v - state.v[..., None] - state.a[..., None] * basis[:, 0]
-    driven = track.s - state.s[..., None] - state.v[..., None] * time - state.a[..., None] * distance[:, 0]
+    driven = (
+        track.s
+        - state.s[..., None]
+        - state.v[..., None] * time
+        - state.a[..., None] * distance[:, 0]
+    )
     target = torch.cat([weight[..., 0] * speed, 0.5 * weight[..., 0] * driven], -1)
     damp, bend = _roughness(device)
     pull = bend * state.a[..., None]
-    if known is None and torch.compiler.is_compiling():  # the same system for all, which is solved already
+    if (
+        known is None and torch.compiler.is_compiling()
+    ):  # the same system for all, which is solved already
         return ((target @ rows_of_all + pull) @ inverse).clamp(-8.0, 5.0)
     gram = rows.transpose(-1, -2) @ rows + damp
     right = (rows.transpose(-1, -2) @ target[..., None])[..., 0] + pull
@@ -305,15 +425,22 @@ def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tens
 
 @cache
 def _roughness(device: torch.device) -> tuple[Tensor, Tensor]:
-    """The damping [KNOTS, KNOTS] of fitted knots, and the pull [KNOTS] of a present acceleration of 1 on them."""
+    """The damping [KNOTS, KNOTS] of fitted knots, and the pull [KNOTS] of a present
+    acceleration of 1 on them."""
     second = torch.diff(torch.eye(KNOTS + 1, device=device), n=2, dim=0)
-    damp = ROUGHNESS * second[:, 1:].T @ second[:, 1:] + 1e-3 * torch.eye(KNOTS, device=device)
+    damp = ROUGHNESS * second[:, 1:].T @ second[:, 1:] + 1e-3 * torch.eye(
+        KNOTS, device=device
+    )
     return damp, -ROUGHNESS * second[:, 1:].T @ second[:, 0]
 
 
 @cache
 def _fit_of_all(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Of motion that is known throughout: the rows [2 HORIZON, KNOTS] of the least squares, and the inverse of their
-    damped Gram matrix [KNOTS, KNOTS]."""
-    rows = torch.cat([_speed_basis(device)[:, 1:], 0.5 * _distance_basis(device)[:, 1:]])
-    return rows, torch.linalg.inv(rows.double().T @ rows.double() + _roughness(device)[0]).float()
+    """Of motion that is known throughout: the rows [2 HORIZON, KNOTS] of the least
+    squares, and the inverse of their damped Gram matrix [KNOTS, KNOTS]."""
+    rows = torch.cat(
+        [_speed_basis(device)[:, 1:], 0.5 * _distance_basis(device)[:, 1:]]
+    )
+    return rows, torch.linalg.inv(
+        rows.double().T @ rows.double() + _roughness(device)[0]
+    ).float()

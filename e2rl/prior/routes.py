@@ -1,4 +1,5 @@
-"""Route choice, a distribution over each vehicle's route candidates, and scenes whose vehicles are assigned one."""
+"""Route choice, a distribution over each vehicle's route candidates, and scenes whose
+vehicles are assigned one."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -18,20 +19,31 @@ CONFLICT_STRIDE = 2  # vertices: conflicts are looked for every 4 m
 CONFLICT_RANGE = 80  # vertices from the route's start on
 CONFLICT_GAP = 2.5  # m: routes nearer than this are in conflict
 START = 20.0  # m: arc length near which a route passes its vehicle's start
-ROUTE_FIELDS = ("points", "length", "open", "limit", "light", "light_s")  # scene["route_..."] of the assigned candidate
+ROUTE_FIELDS = (
+    "points",
+    "length",
+    "open",
+    "limit",
+    "light",
+    "light_s",
+)  # scene["route_..."] of the assigned candidate
 
 
 @dataclass
 class RoutedScene:
-    """Tensors of B scenes that stay the same while these run. It holds no map, so that it is cheap to copy.
+    """Tensors of B scenes that stay the same while these run. It holds no map, so that
+    it is cheap to copy.
 
-    Metadata `vehicle_axes`: axes of length V, None for one of all agents; 1 where nothing is said.
+    Metadata `vehicle_axes`: axes of length V, None for one of all agents; 1 where
+    nothing is said.
 
-    size [B, N, 2]; light_state [B, T+1, L]; past [B, V, 10, 3]: see the scene. Of the assigned route candidates: route
-    [B, V], their index; points [B, V, P, 2]; length [B, V]; open [B, V]: the route ends at the map's border; limit
-    [B, V, P]; light, light_s [B, V, 2]. conflict [B, V, V] bool: the routes of i and j meet; conflict_s [B, V, V]: arc
-    length on i's route where it first does; crossing [B, V, V]: angle between them there [rad]. modelled [B, V]: the
-    prior moves the vehicle or conditions on it; parked [B, V]; has_lane [B, V]: else it is represented in free space.
+    size [B, N, 2]; light_state [B, T+1, L]; past [B, V, 10, 3]: see the scene. Of the
+    assigned route candidates: route [B, V], their index; points [B, V, P, 2]; length
+    [B, V]; open [B, V]: the route ends at the map's border; limit [B, V, P]; light,
+    light_s [B, V, 2]. conflict [B, V, V] bool: the routes of i and j meet; conflict_s
+    [B, V, V]: arc length on i's route where it first does; crossing [B, V, V]: angle
+    between them there [rad]. modelled [B, V]: the prior moves the vehicle or conditions
+    on it; parked [B, V]; has_lane [B, V]: else it is represented in free space.
     """
 
     size: Tensor = field(metadata={"vehicle_axes": None})
@@ -54,30 +66,55 @@ class RoutedScene:
 
 # Shapes of a RoutedScene's tensors, see `fused`; X agents in all.
 ROUTED = (
-    *("B X 2", "B T L:int64", "B V 10 3", "B V:int64", "B V P 2!", "B V", "B V:bool", "B V P", "B V 2:int64", "B V 2"),
+    *(
+        "B X 2",
+        "B T L:int64",
+        "B V 10 3",
+        "B V:int64",
+        "B V P 2!",
+        "B V",
+        "B V:bool",
+        "B V P",
+        "B V 2:int64",
+        "B V 2",
+    ),
     *("B V V:bool", "B V V", "B V V", "B V:bool", "B V:bool", "B V:bool"),
 )
 
 
 def take_route(values: Tensor, route: Tensor) -> Tensor:
     """values [B, V, R, ...] at route [B, V] -> [B, V, ...]."""
-    index = route.reshape(*route.shape, *[1] * (values.ndim - 2)).expand(*route.shape, 1, *values.shape[3:])
+    index = route.reshape(*route.shape, *[1] * (values.ndim - 2)).expand(
+        *route.shape, 1, *values.shape[3:]
+    )
     return values.gather(2, index).squeeze(2)
 
 
 def route_scene(scene: TensorDictBase, route: Tensor) -> RoutedScene:
     """The RoutedScene of scenes [B] whose vehicles follow candidates route [B, V]."""
     vehicles = route.shape[1]
-    assigned = {name: take_route(scene[f"route_{name}"], route) for name in ROUTE_FIELDS}
+    assigned = {
+        name: take_route(scene[f"route_{name}"], route) for name in ROUTE_FIELDS
+    }
     valid = scene["valid"][:, :vehicles]
     parked = scene["parked"][:, :vehicles]
     has_lane = take_route(scene["route_valid"], route)
     all_rows = torch.arange(vehicles, device=route.device)
     pairs = [_conflicts(points, all_rows)[0] for points in assigned["points"]]
-    conflict, conflict_s, crossing = (torch.stack(parts) for parts in zip(*pairs, strict=True))
+    conflict, conflict_s, crossing = (
+        torch.stack(parts) for parts in zip(*pairs, strict=True)
+    )
     both = valid & ~parked & has_lane
-    given = {"size": scene["size"], "light_state": scene["light_state"], "past": scene["past"][:, :vehicles]}
-    meet = {"conflict": conflict & both[:, :, None] & both[:, None, :], "conflict_s": conflict_s, "crossing": crossing}
+    given = {
+        "size": scene["size"],
+        "light_state": scene["light_state"],
+        "past": scene["past"][:, :vehicles],
+    }
+    meet = {
+        "conflict": conflict & both[:, :, None] & both[:, None, :],
+        "conflict_s": conflict_s,
+        "crossing": crossing,
+    }
     kind = {"modelled": valid & ~parked, "parked": parked, "has_lane": has_lane}
     return RoutedScene(route=route, **given, **assigned, **meet, **kind)
 
@@ -85,19 +122,39 @@ def route_scene(scene: TensorDictBase, route: Tensor) -> RoutedScene:
 def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
     """The lane states [B, V] of the vehicles at the start of scenes [B]."""
     start, accel, yaw_rate = (
-        scene[key][:, : routed.route.shape[1]] for key in ("start", "start_accel", "start_yaw_rate")
+        scene[key][:, : routed.route.shape[1]]
+        for key in ("start", "start_accel", "start_yaw_rate")
     )
-    return locate(start, accel, yaw_rate=yaw_rate, points=routed.points, hint=torch.full_like(routed.length, START))
+    return locate(
+        start,
+        accel,
+        yaw_rate=yaw_rate,
+        points=routed.points,
+        hint=torch.full_like(routed.length, START),
+    )
 
 
 def reroute(
-    routed: RoutedScene, scene: TensorDictBase, route: Tensor, moved: Tensor, off_lane: Tensor, off_lane_path: Tensor
+    routed: RoutedScene,
+    scene: TensorDictBase,
+    route: Tensor,
+    moved: Tensor,
+    off_lane: Tensor,
+    off_lane_path: Tensor,
 ) -> RoutedScene:
-    """`routed` with the vehicles `moved` [B, V] on new lines: candidates route [B, V] or, where off_lane [B, V], the
-    off_lane_path [B, V, P, 2]. Such a path has no lights; its limit is the highest of the candidate's."""
+    """`routed` with the vehicles `moved` [B, V] on new lines: candidates route [B, V]
+    or, where off_lane [B, V], the off_lane_path [B, V, P, 2]. Such a path has no
+    lights; its limit is the highest of the candidate's."""
     off_lane = off_lane & moved
-    lane = {name: take_route(scene[f"route_{name}"], route) for name in (*ROUTE_FIELDS, "valid")}
-    path: dict[str, Any] = {"points": off_lane_path, "length": SPACING * (off_lane_path.shape[2] - 1), "open": False}
+    lane = {
+        name: take_route(scene[f"route_{name}"], route)
+        for name in (*ROUTE_FIELDS, "valid")
+    }
+    path: dict[str, Any] = {
+        "points": off_lane_path,
+        "length": SPACING * (off_lane_path.shape[2] - 1),
+        "open": False,
+    }
     path |= {"limit": lane["limit"].amax(-1, keepdim=True), "light": -1, "light_s": 0.0}
 
     def change(old: Tensor, on_lane: Tensor, on_path: Tensor | float) -> Tensor:
@@ -106,23 +163,42 @@ def reroute(
         new = torch.where(off_lane.view(*off_lane.shape, *extra), on_path, on_lane)
         return torch.where(moved.view(*moved.shape, *extra), new, old)
 
-    changed = {name: change(getattr(routed, name), lane[name], path[name]) for name in ROUTE_FIELDS}
-    pairs = [value.clone() for value in (routed.conflict, routed.conflict_s, routed.crossing)]
+    changed = {
+        name: change(getattr(routed, name), lane[name], path[name])
+        for name in ROUTE_FIELDS
+    }
+    pairs = [
+        value.clone() for value in (routed.conflict, routed.conflict_s, routed.crossing)
+    ]
     for b in moved.any(1).nonzero()[:, 0].tolist():
         rows = moved[b].nonzero()[:, 0]
-        for old, own, other in zip(pairs, *_conflicts(changed["points"][b], rows), strict=True):
+        for old, own, other in zip(
+            pairs, *_conflicts(changed["points"][b], rows), strict=True
+        ):
             old[b][:, rows], old[b][rows] = other.T, own
     both = routed.modelled & lane["valid"]
-    changed |= {"conflict": pairs[0] & both[:, :, None] & both[:, None], "conflict_s": pairs[1], "crossing": pairs[2]}
+    changed |= {
+        "conflict": pairs[0] & both[:, :, None] & both[:, None],
+        "conflict_s": pairs[1],
+        "crossing": pairs[2],
+    }
     has_lane = change(routed.has_lane, lane["valid"], True)
-    return replace(routed, route=torch.where(moved, route, routed.route), has_lane=has_lane, **changed)
+    return replace(
+        routed,
+        route=torch.where(moved, route, routed.route),
+        has_lane=has_lane,
+        **changed,
+    )
 
 
-def _conflicts(points: Tensor, rows: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+def _conflicts(
+    points: Tensor, rows: Tensor
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Where the routes of vehicles rows [C] first meet every route of points [V, P, 2].
 
-    Returns conflict, conflict_s and crossing (see RoutedScene) [C, V] twice: of each of rows with each route, and of
-    each route with each of rows. One scene at a time, so that its pairs stay in the cache.
+    Returns conflict, conflict_s and crossing (see RoutedScene) [C, V] twice: of each of
+    rows with each route, and of each route with each of rows. One scene at a time, so
+    that its pairs stay in the cache.
     """
     line = points[:, :CONFLICT_RANGE:CONFLICT_STRIDE]
     vehicles, count, _ = line.shape
@@ -133,23 +209,39 @@ def _conflicts(points: Tensor, rows: Tensor) -> tuple[tuple[Tensor, ...], tuple[
     conflict = meets & (rows[:, None] != torch.arange(vehicles, device=rows.device))
     tangent = torch.gradient(line, dim=1)[0]
     angle = torch.atan2(tangent[..., 1], tangent[..., 0])
-    crossing = (angle.gather(1, other.T).T - angle[rows].gather(1, first) + torch.pi) % (2 * torch.pi) - torch.pi
+    crossing = (
+        angle.gather(1, other.T).T - angle[rows].gather(1, first) + torch.pi
+    ) % (2 * torch.pi) - torch.pi
     spacing = SPACING * CONFLICT_STRIDE
-    return (conflict, first * spacing, crossing), (conflict, other * spacing, wrap(-crossing))
+    return (conflict, first * spacing, crossing), (
+        conflict,
+        other * spacing,
+        wrap(-crossing),
+    )
 
 
 @fused("C K V K")
 def first_conflicts(apart: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Whether lines [C, V] are in conflict, of their distances [C, K, V, K], and the first vertex of each that is."""
+    """Whether lines [C, V] are in conflict, of their distances [C, K, V, K], and the
+    first vertex of each that is."""
     if torch.compiler.is_compiling():  # without truth values, which are slow
-        left = torch.arange(apart.shape[1], 0, -1, dtype=apart.dtype, device=apart.device)
+        left = torch.arange(
+            apart.shape[1], 0, -1, dtype=apart.dtype, device=apart.device
+        )
         own, others = (
-            torch.where(apart < CONFLICT_GAP, each, 0.0).amax((1, 3)) for each in (left[:, None, None], left)
+            torch.where(apart < CONFLICT_GAP, each, 0.0).amax((1, 3))
+            for each in (left[:, None, None], left)
         )
         count = apart.shape[1]
-        return own > 0, torch.where(own > 0, count - own, 0.0).long(), torch.where(own > 0, count - others, 0.0).long()
+        return (
+            own > 0,
+            torch.where(own > 0, count - own, 0.0).long(),
+            torch.where(own > 0, count - others, 0.0).long(),
+        )
     near = apart < CONFLICT_GAP
-    meets = near.any(3)  # [C, K, V]: this vertex of a row's route meets the other route somewhere
+    meets = near.any(
+        3
+    )  # [C, K, V]: this vertex of a row's route meets the other route somewhere
     # The first of several points, where they share a stretch.
     return meets.any(1), meets.float().argmax(1), near.any(1).float().argmax(2)
 
@@ -159,7 +251,8 @@ TURN_AT = (10.0, 20.0, 35.0, 55.0, 80.0)  # m ahead
 
 
 class Moment(NamedTuple):
-    """The first V vehicles at a moment: states [B, V, 4], yaw_rate [B, V] rad/s, step [B]."""
+    """The first V vehicles at a moment: states [B, V, 4], yaw_rate [B, V] rad/s, step
+    [B]."""
 
     states: Tensor
     yaw_rate: Tensor
@@ -169,8 +262,12 @@ class Moment(NamedTuple):
 def start_of(scene: TensorDictBase) -> Moment:
     """The vehicles at the start of scenes [B]."""
     vehicles = scene["route_log"].shape[1]
-    step = torch.zeros(len(scene["start"]), dtype=torch.long, device=scene["start"].device)
-    return Moment(scene["start"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles], step=step)
+    step = torch.zeros(
+        len(scene["start"]), dtype=torch.long, device=scene["start"].device
+    )
+    return Moment(
+        scene["start"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles], step=step
+    )
 
 
 def candidate_features(scene: TensorDictBase, now: Moment) -> Tensor:
@@ -178,25 +275,33 @@ def candidate_features(scene: TensorDictBase, now: Moment) -> Tensor:
     vehicles = now.states.shape[1]
     points = scene["route_points"][:, :vehicles]
     length = scene["route_length"][:, :vehicles]
-    s, d, heading = (value[..., 0] for value in project(now.states[:, :, None, None, :2], points))
+    s, d, heading = (
+        value[..., 0] for value in project(now.states[:, :, None, None, :2], points)
+    )
     v = now.states[..., 3].clamp(min=0)[..., None].expand_as(s)
     at = s[..., None] + torch.tensor((0.0, *TURN_AT), device=s.device)
     angle = interpolate(points, at)[1]
     turn = wrap(angle[..., 1:] - angle[..., :1])
     curvature = turn.abs().diff(dim=-1, prepend=torch.zeros_like(turn[..., :1])).abs()
-    tight = (curvature / torch.tensor([10.0, 10.0, 15.0, 20.0, 25.0], device=s.device)).amax(-1)
+    tight = (
+        curvature / torch.tensor([10.0, 10.0, 15.0, 20.0, 25.0], device=s.device)
+    ).amax(-1)
     excess = (v**2 * tight / 4 - 1).clamp(0, 4)
     at = (s / SPACING).long().clamp(0, points.shape[3] - 1)[..., None]
     limit = scene["route_limit"][:, :vehicles].gather(-1, at)[..., 0]
     light = scene["route_light"][:, :vehicles, :, 0]
     colour = light_state_at(scene["light_state"], light, step=now.step)
-    green, red = ((light >= 0) & (colour == state) for state in (LIGHT_GREEN, LIGHT_RED))
+    green, red = (
+        (light >= 0) & (colour == state) for state in (LIGHT_GREEN, LIGHT_RED)
+    )
     rank = torch.arange(s.shape[-1], device=s.device).expand_as(s)
     rest = (length - s).clamp(0, 100) / 50
     bend = (now.yaw_rate[..., None] / v.clamp(min=2.0) - turn[..., 0] / 10.0) * 10
     aside = wrap(now.states[..., 2][..., None] - heading) * 3
     features = [d.abs(), d, aside, *turn.unbind(-1), rest, v / 10, excess, bend]
-    return torch.stack([*features, green.float(), red.float(), rank / 3, (v - limit) / 10], -1)
+    return torch.stack(
+        [*features, green.float(), red.float(), rank / 3, (v - limit) / 10], -1
+    )
 
 
 class RouteChoice(nn.Module):
@@ -204,24 +309,39 @@ class RouteChoice(nn.Module):
 
     def __init__(self, width: int = 64):
         super().__init__()
-        hidden = [nn.Linear(FEATURES, width), nn.GELU(), nn.Linear(width, width), nn.GELU()]
+        hidden = [
+            nn.Linear(FEATURES, width),
+            nn.GELU(),
+            nn.Linear(width, width),
+            nn.GELU(),
+        ]
         self.net = nn.Sequential(*hidden, nn.Linear(width, 1))
 
     def forward(self, scene: TensorDictBase, now: Moment | None = None) -> Tensor:
-        """Logits [B, V, R] of the first V vehicles now (None: of all at the start); -inf where there is no candidate,
-        except for the first that is not recorded, straight ahead, of a vehicle without any."""
+        """Logits [B, V, R] of the first V vehicles now (None: of all at the start);
+        -inf where there is no candidate, except for the first that is not recorded,
+        straight ahead, of a vehicle without any."""
         now = start_of(scene) if now is None else now
-        valid, recorded = (scene[f"route_{name}"][:, : now.states.shape[1]] for name in ("valid", "recorded"))
-        first = torch.zeros_like(valid).scatter(-1, recorded.int().argmin(-1, keepdim=True), True)
+        valid, recorded = (
+            scene[f"route_{name}"][:, : now.states.shape[1]]
+            for name in ("valid", "recorded")
+        )
+        first = torch.zeros_like(valid).scatter(
+            -1, recorded.int().argmin(-1, keepdim=True), True
+        )
         possible = valid | (first & ~valid.any(-1, keepdim=True))
-        return self.net(candidate_features(scene, now))[..., 0].masked_fill(~possible, -torch.inf)
+        return self.net(candidate_features(scene, now))[..., 0].masked_fill(
+            ~possible, -torch.inf
+        )
 
 
 def sample_route(logits: Tensor, temperature: float, uniform: Tensor) -> Tensor:
-    """A candidate [...] of logits [..., R] for each uniform number [...] in [0, 1), by inverting the distribution
-    function; temperature 0: the most likely."""
+    """A candidate [...] of logits [..., R] for each uniform number [...] in [0, 1), by
+    inverting the distribution function; temperature 0: the most likely."""
     if temperature <= 0:
         return logits.argmax(-1)
     total = torch.softmax(logits / temperature, -1).cumsum(-1)
-    below = uniform.clamp(max=1 - 1e-6)[..., None] * total[..., -1:]  # never past the last possible one
+    below = (
+        uniform.clamp(max=1 - 1e-6)[..., None] * total[..., -1:]
+    )  # never past the last possible one
     return (total <= below).sum(-1)

@@ -1,6 +1,7 @@
 """Top-down maps of traffic on matplotlib axes, and figures as images.
 
-World coordinates are metres with y up. A figure has 72 points per inch, so lengths of layouts are in points.
+World coordinates are metres with y up. A figure has 72 points per inch, so lengths of
+layouts are in points.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,10 +41,22 @@ UNDATED = {"CreationDate": None, "Producer": None, "Creator": None}  # of a PDF
 VERGE = 0.8  # m added to a lane's drawn width, because the gap between neighbouring lanes is road, too
 
 # Outlines in units of half the length and half the width, the front at x = 1.
-BODY = ((1, 0.62), (0.9, 1), (-0.93, 1), (-1, 0.75), (-1, -0.75), (-0.93, -1), (0.9, -1), (1, -0.62))
+BODY = (
+    (1, 0.62),
+    (0.9, 1),
+    (-0.93, 1),
+    (-1, 0.75),
+    (-1, -0.75),
+    (-0.93, -1),
+    (0.9, -1),
+    (1, -0.62),
+)
 WINDSCREEN = ((0.52, 0.72), (0.2, 0.8), (0.2, -0.8), (0.52, -0.72))
 BOX = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-CIRCLE = tuple((np.cos(angle), np.sin(angle)) for angle in np.linspace(0, 2 * np.pi, 48, endpoint=False))
+CIRCLE = tuple(
+    (np.cos(angle), np.sin(angle))
+    for angle in np.linspace(0, 2 * np.pi, 48, endpoint=False)
+)
 
 
 class Shape(NamedTuple):
@@ -56,7 +69,8 @@ class Shape(NamedTuple):
 
 
 class Trail(NamedTuple):
-    """A path [k, 2] m that fades towards its beginning, with its colour and its width [m] at the end."""
+    """A path [k, 2] m that fades towards its beginning, with its colour and its width
+    [m] at the end."""
 
     path: np.ndarray
     colour: Colour
@@ -66,8 +80,8 @@ class Trail(NamedTuple):
 class TrafficMap:
     """A road, drawn once, and the traffic that each `show` replaces.
 
-    axes: where to draw. metres: the world's length along the axes' width, which fixes the scale.
-    `scale` is in points per metre.
+    axes: where to draw. metres: the world's length along the axes' width, which fixes
+    the scale. `scale` is in points per metre.
     """
 
     def __init__(self, axes: Axes, road: Road, metres: float):
@@ -79,19 +93,27 @@ class TrafficMap:
         axes.spines[:].set_visible(False)
         lanes = road.lanes()
         widths = (road.lane_width + VERGE) * self.scale
-        # Agg clips lines without a fill at the canvas by their middle, which would cut wide ones: hence a clear fill.
-        surface = LineCollection(lanes, linewidths=widths, colors=ROAD, facecolors=CLEAR)
+        # Agg clips lines without a fill at the canvas by their middle, which would cut
+        # wide ones: hence a clear fill.
+        surface = LineCollection(
+            lanes, linewidths=widths, colors=ROAD, facecolors=CLEAR
+        )
         surface.set(capstyle="round", joinstyle="round")
         self.trails = LineCollection([])
         self.shapes = PolyCollection([], zorder=3)
         axes.add_collection(PolyCollection(road.polygons(), facecolors=ROAD))
         axes.add_collection(surface)
-        axes.add_collection(LineCollection(lanes, linewidths=0.16 * self.scale, colors=CENTRELINE))
+        axes.add_collection(
+            LineCollection(lanes, linewidths=0.16 * self.scale, colors=CENTRELINE)
+        )
         axes.add_collection(self.trails)
         axes.add_collection(self.shapes)
 
-    def show(self, centre: np.ndarray, trails: Sequence[Trail], shapes: Sequence[Shape]) -> None:
-        """Move the map's centre [2] m, and draw trails and then shapes, the last on top."""
+    def show(
+        self, centre: np.ndarray, trails: Sequence[Trail], shapes: Sequence[Shape]
+    ) -> None:
+        """Move the map's centre [2] m, and draw trails and then shapes, the last on
+        top."""
         low = centre - self.reach
         high = centre + self.reach
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
@@ -112,8 +134,11 @@ class TrafficMap:
         )
 
 
-def placed(outline: Sequence[tuple[float, float]], state: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """World points [k, 2] m of an outline at a state (x, y, heading, ...), for a size (length, width)."""
+def placed(
+    outline: Sequence[tuple[float, float]], state: np.ndarray, size: np.ndarray
+) -> np.ndarray:
+    """World points [k, 2] m of an outline at a state (x, y, heading, ...), for a size
+    (length, width)."""
     local = np.array(outline) * size / 2
     cos = np.cos(state[2])
     sin = np.sin(state[2])
@@ -122,21 +147,33 @@ def placed(outline: Sequence[tuple[float, float]], state: np.ndarray, size: np.n
 
 def vehicle(state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
     """A car's body, and its windscreen, which shows where its front is."""
-    body = Shape(placed(BODY, state, size=size), colour, edge=("black", 0.4), width=0.12)
+    body = Shape(
+        placed(BODY, state, size=size), colour, edge=("black", 0.4), width=0.12
+    )
     return [body, Shape(placed(WINDSCREEN, state, size=size), ("black", 0.45))]
 
 
-def agent(kind: str, state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
-    """An agent of one of the kinds of `recording.AGENT_TYPES`: a pedestrian as a disc, a cyclist as a slim box with a
-    disc, and all others as vehicles of a colour."""
+def agent(
+    kind: str, state: np.ndarray, size: np.ndarray, colour: Colour
+) -> list[Shape]:
+    """An agent of one of the kinds of `recording.AGENT_TYPES`: a pedestrian as a disc,
+    a cyclist as a slim box with a disc, and all others as vehicles of a colour."""
     if kind not in ("pedestrian", "cyclist"):
         return vehicle(state, size, colour=colour)
-    bicycle = Shape(placed(BOX, state, size=np.maximum(size, (1.7, 0.5))), VULNERABLE, edge=("black", 0.4))
-    return [*([bicycle] if kind == "cyclist" else []), disc(state[:2], 0.45, fill=VULNERABLE, edge=("black", 0.4))]
+    bicycle = Shape(
+        placed(BOX, state, size=np.maximum(size, (1.7, 0.5))),
+        VULNERABLE,
+        edge=("black", 0.4),
+    )
+    return [
+        *([bicycle] if kind == "cyclist" else []),
+        disc(state[:2], 0.45, fill=VULNERABLE, edge=("black", 0.4)),
+    ]
 
 
 def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:
-    """A dot at a point of contact [2] m and a ring around it, which widens as `phase` goes from 0 to 1."""
+    """A dot at a point of contact [2] m and a ring around it, which widens as `phase`
+    goes from 0 to 1."""
     radius = 1.9 + 2.6 * phase
     width = 0.34 - 0.18 * phase
     return [
@@ -146,7 +183,9 @@ def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:
     ]
 
 
-def disc(centre: np.ndarray, radius: float, fill: Colour, edge: Colour, width: float = 0.1) -> Shape:
+def disc(
+    centre: np.ndarray, radius: float, fill: Colour, edge: Colour, width: float = 0.1
+) -> Shape:
     return Shape(centre + radius * np.array(CIRCLE), fill, edge=edge, width=width)
 
 
@@ -155,19 +194,37 @@ def new_figure(width: float, height: float, dpi: float = 72) -> Figure:
     return Figure((width / 72, height / 72), dpi, facecolor=PANEL)
 
 
-def new_panels(count: int, side: float, gap: float, head: float, foot: float = 0) -> tuple[Figure, list[Axes]]:
-    """A figure of square axes in a row; in points: their sides, and the spaces between, above and below them."""
+def new_panels(
+    count: int, side: float, gap: float, head: float, foot: float = 0
+) -> tuple[Figure, list[Axes]]:
+    """A figure of square axes in a row; in points: their sides, and the spaces between,
+    above and below them."""
     height = head + side + foot
     figure = new_figure(count * (side + gap) - gap, height)
-    grid = {"left": 0, "right": 1, "bottom": foot / height, "top": 1 - head / height, "wspace": gap / side}
+    grid = {
+        "left": 0,
+        "right": 1,
+        "bottom": foot / height,
+        "top": 1 - head / height,
+        "wspace": gap / side,
+    }
     return figure, list(figure.subplots(1, count, squeeze=False, gridspec_kw=grid)[0])
 
 
-def add_legend(figure: Figure | SubFigure, colours: Mapping[str, Colour], size: float) -> None:
+def add_legend(
+    figure: Figure | SubFigure, colours: Mapping[str, Colour], size: float
+) -> None:
     """What the colours mean, in one row at the figure's lower left; font of `size`."""
     handles = [Patch(facecolor=colour, label=text) for text, colour in colours.items()]
-    style = {"frameon": False, "handlelength": 1.4, "handleheight": 0.9, "columnspacing": 1.4}
-    figure.legend(handles=handles, ncols=len(handles), loc="lower left", fontsize=size, **style)
+    style = {
+        "frameon": False,
+        "handlelength": 1.4,
+        "handleheight": 0.9,
+        "columnspacing": 1.4,
+    }
+    figure.legend(
+        handles=handles, ncols=len(handles), loc="lower left", fontsize=size, **style
+    )
 
 
 def without_formulas(figure: Figure) -> None:
@@ -185,7 +242,12 @@ def image_of(figure: Figure) -> Image.Image:
 
 
 def save_figure(path: Path, figure: Figure) -> None:
-    """Write a figure as PNG and, beside it, as PDF: vectors with their fonts. The same figure makes the same bytes."""
+    """Write a figure as PNG and, beside it, as PDF: vectors with their fonts. The same
+    figure makes the same bytes."""
     write_atomically(path, partial(image_of(figure).save, format="PNG", optimize=True))
     with rc_context({"pdf.fonttype": 42}):  # TrueType, which journals ask for
-        write_beside(path, ".pdf", content=partial(figure.savefig, format="pdf", metadata=UNDATED))
+        write_beside(
+            path,
+            ".pdf",
+            content=partial(figure.savefig, format="pdf", metadata=UNDATED),
+        )

@@ -1,9 +1,11 @@
-"""The replay of a failure in the HTML report: the motion of all agents, of the competent driver in the ego's place and
-of the recorded ego.
+"""The replay of a failure in the HTML report: the motion of all agents, of the
+competent driver in the ego's place and of the recorded ego.
 
-Arrays of whole numbers as short text, which a browser decodes without a library (e2rl/assets/report/decode.js).
+Arrays of whole numbers as short text, which a browser decodes without a library
+(e2rl/assets/report/decode.js).
 
-Smooth motion has small second differences, whose upper bytes are zero; deflate makes next to nothing of them.
+Smooth motion has small second differences, whose upper bytes are zero; deflate makes
+next to nothing of them.
 """
 
 import base64
@@ -24,18 +26,21 @@ from e2rl.traffic.traffic import POINT_STEPS, REPLAN_STEPS
 
 
 def quantised(values: np.ndarray, quantum: float | np.ndarray) -> np.ndarray:
-    """Values as int64 multiples of a quantum; they must fit into 29 bits, so that second differences fit into 31."""
+    """Values as int64 multiples of a quantum; they must fit into 29 bits, so that
+    second differences fit into 31."""
     return np.rint(np.asarray(values, np.float64) / quantum).astype(np.int64)
 
 
 def second_difference(values: np.ndarray) -> np.ndarray:
-    """Second difference along the last axis, with zeros before the first value: two cumulative sums undo it."""
+    """Second difference along the last axis, with zeros before the first value: two
+    cumulative sums undo it."""
     ahead = [(0, 0)] * (values.ndim - 1) + [(2, 0)]
     return np.diff(np.pad(values, ahead), n=2, axis=-1)
 
 
 def encode(values: np.ndarray) -> str:
-    """Whole numbers in C order as base64 of zlib of their zigzag code, uint32, all lowest bytes first."""
+    """Whole numbers in C order as base64 of zlib of their zigzag code, uint32, all
+    lowest bytes first."""
     flat = np.asarray(values, np.int64).ravel()
     zigzag = ((flat << 1) ^ (flat >> 63)).astype("<u4")
     planes = zigzag.view(np.uint8).reshape(-1, 4).T
@@ -43,15 +48,22 @@ def encode(values: np.ndarray) -> str:
 
 
 KINDS = ("cyclist", "pedestrian")  # of agents, drawn as such whoever drives them
-CHANNELS = {"x": 0.01, "y": 0.01, "heading": 0.001, "speed": 0.01, "present": 1.0, "gap": 0.01}  # quanta: m, rad, m/s
+CHANNELS = {
+    "x": 0.01,
+    "y": 0.01,
+    "heading": 0.001,
+    "speed": 0.01,
+    "present": 1.0,
+    "gap": 0.01,
+}  # quanta: m, rad, m/s
 MAP_QUANTUM = 0.05  # m
 
 
 class Track(NamedTuple):
     """A box in motion: size (length, width) [m], states [K, 4], present [K] bool.
 
-    role: ego, adversary, traffic (simulated), replayed, cyclist, pedestrian; or somebody else in the ego's place:
-    driver (the competent one), evasion, recorded.
+    role: ego, adversary, traffic (simulated), replayed, cyclist, pedestrian; or
+    somebody else in the ego's place: driver (the competent one), evasion, recorded.
     """
 
     role: str
@@ -61,13 +73,15 @@ class Track(NamedTuple):
 
 
 def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str, Any]:
-    """The replay of a failure, from the start to AFTER steps beyond the contact, for the data block of the page. Of a
-    rollout without a contact: as many steps as of the failure `beside` it in the same scene, with that one's partner.
+    """The replay of a failure, from the start to AFTER steps beyond the contact, for
+    the data block of the page. Of a rollout without a contact: as many steps as of the
+    failure `beside` it in the same scene, with that one's partner.
 
-    `tracks` has the role, length and width [m] of each track, `partner` and `contact` are a track and a step, `point`
-    [m] is where they touch; without a contact the last step and None. `motion` encodes the second differences over time
-    of the CHANNELS [6, tracks, K] in their quanta; the gap [m] is that of the ego, and of those in its place, to the
-    partner. `plans` may be None.
+    `tracks` has the role, length and width [m] of each track, `partner` and `contact`
+    are a track and a step, `point` [m] is where they touch; without a contact the last
+    step and None. `motion` encodes the second differences over time of the CHANNELS [6,
+    tracks, K] in their quanta; the gap [m] is that of the ego, and of those in its
+    place, to the partner. `plans` may be None.
     """
     rollout = failure.rollout
     contact = failure.contact
@@ -80,32 +94,47 @@ def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str,
     rows = np.union1d(np.flatnonzero(rollout.valid[:steps].any(0)), partner)
     driven = rollout.states[:steps], rollout.valid[:steps]
     tracks = [
-        Track(role_of(rollout, row), rollout.size[row], *(part[:, row] for part in driven)) for row in rows.tolist()
+        Track(
+            role_of(rollout, row), rollout.size[row], *(part[:, row] for part in driven)
+        )
+        for row in rows.tolist()
     ]
     tracks += other_egos(rollout, steps)
     other = int(np.searchsorted(rows, partner))
     motion = np.stack([channels_of(track, tracks[other]) for track in tracks], 1)
     quanta = np.array(list(CHANNELS.values()))[:, None, None]
     return {
-        "tracks": [[track.role, *(round(float(side), 2) for side in track.size)] for track in tracks],
+        "tracks": [
+            [track.role, *(round(float(side), 2) for side in track.size)]
+            for track in tracks
+        ],
         "partner": other,
         "contact": steps - 1 if contact is None else contact,
-        "point": None if contact is None else contact_point(rollout, contact, partner=partner).round(2).tolist(),
+        "point": None
+        if contact is None
+        else contact_point(rollout, contact, partner=partner).round(2).tolist(),
         "dt": rollout.dt,
         "motion": encode(second_difference(quantised(motion, quanta))),
         "plans": encoded_plans(rollout, rows) if rollout.plans is not None else None,
     }
 
 
-def replay_data(pairs: Iterable[tuple[Failure, Failure | None]], count: int) -> dict[str, Any]:
-    """The fields of the data block that hold `count` replays, of failures and what is beside them; scenes share their
-    map."""
+def replay_data(
+    pairs: Iterable[tuple[Failure, Failure | None]], count: int
+) -> dict[str, Any]:
+    """The fields of the data block that hold `count` replays, of failures and what is
+    beside them; scenes share their map."""
     maps: dict[str, int] = {}
     replays = []
     for one, beside in tqdm(pairs, "replays", count, leave=False, disable=None):
         number = maps.setdefault(json.dumps(encoded_map(one.rollout)), len(maps))
         replays.append(failure_replay(one, beside) | {"map": number})
-    return {"maps": list(map(json.loads, maps)), "replays": replays, "channels": CHANNELS, "map_quantum": MAP_QUANTUM}
+    return {
+        "maps": list(map(json.loads, maps)),
+        "replays": replays,
+        "channels": CHANNELS,
+        "map_quantum": MAP_QUANTUM,
+    }
 
 
 def role_of(rollout: Rollout, row: int) -> str:
@@ -121,8 +150,9 @@ def role_of(rollout: Rollout, row: int) -> str:
 
 
 def other_egos(rollout: Rollout, steps: int) -> list[Track]:
-    """Others in the ego's place: the careful and competent driver of UN R157 as the verdict has it, the recording, and
-    the evasion that the search found; where the file has them."""
+    """Others in the ego's place: the careful and competent driver of UN R157 as the
+    verdict has it, the recording, and the evasion that the search found; where the file
+    has them."""
     ego = rollout.ego
     always = np.ones(steps, bool)
     known = {
@@ -138,28 +168,48 @@ def other_egos(rollout: Rollout, steps: int) -> list[Track]:
 
 
 def channels_of(track: Track, partner: Track) -> np.ndarray:
-    """The CHANNELS [6, K] of a track; where it is absent its pose is held, which takes next to no bytes."""
+    """The CHANNELS [6, K] of a track; where it is absent its pose is held, which takes
+    next to no bytes."""
     states = held(track.states, track.present)
     states[:, 2] = np.unwrap(states[:, 2])
     gap = np.zeros(len(states))
     if track.role in ("ego", "driver", "evasion", "recorded"):
-        boxes = (states, track.size, held(partner.states, partner.present), partner.size)
-        first, first_size, second, second_size = (torch.as_tensor(box, dtype=torch.float64) for box in boxes)
-        gap = separation(first, first_size, second=second, second_size=second_size).clamp(min=0).numpy()
+        boxes = (
+            states,
+            track.size,
+            held(partner.states, partner.present),
+            partner.size,
+        )
+        first, first_size, second, second_size = (
+            torch.as_tensor(box, dtype=torch.float64) for box in boxes
+        )
+        gap = (
+            separation(first, first_size, second=second, second_size=second_size)
+            .clamp(min=0)
+            .numpy()
+        )
     return np.concatenate([states.T, [track.present, gap]])
 
 
 def held(states: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """States [K, 4] with those of absent steps replaced by the last present ones, before any by the first."""
+    """States [K, 4] with those of absent steps replaced by the last present ones,
+    before any by the first."""
     step = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
-    return np.nan_to_num(states[np.where(step < 0, present.argmax(), step)].astype(np.float64))
+    return np.nan_to_num(
+        states[np.where(step < 0, present.argmax(), step)].astype(np.float64)
+    )
 
 
 def encoded_plans(rollout: Rollout, rows: np.ndarray) -> dict[str, Any]:
-    """Plans of the ego and the adversaries: `agents`, their tracks; `points` [A, R, 2, K] as second differences in the
-    quantum of x; `targets` [A, R], the track that an adversary aims at, -1 for none. Steps between plans: `every`,
-    between points: `spacing`."""
-    assert rollout.planners is not None and rollout.plans is not None and rollout.targets is not None
+    """Plans of the ego and the adversaries: `agents`, their tracks; `points` [A, R, 2,
+    K] as second differences in the quantum of x; `targets` [A, R], the track that an
+    adversary aims at, -1 for none. Steps between plans: `every`, between points:
+    `spacing`."""
+    assert (
+        rollout.planners is not None
+        and rollout.plans is not None
+        and rollout.targets is not None
+    )
     known = np.isin(rollout.planners, rows)
     points = rollout.plans[:, known].transpose(1, 0, 3, 2)
     targets = rollout.targets[:, known].T
@@ -174,8 +224,9 @@ def encoded_plans(rollout: Rollout, rows: np.ndarray) -> dict[str, Any]:
 
 
 def encoded_map(rollout: Rollout) -> dict[str, str]:
-    """The map of a rollout: of `lane` and `drivable` lines the points [M, 2], all x, then all y, as second differences
-    in MAP_QUANTUM, and the number of points of each line; the lanes' widths in MAP_QUANTUM."""
+    """The map of a rollout: of `lane` and `drivable` lines the points [M, 2], all x,
+    then all y, as second differences in MAP_QUANTUM, and the number of points of each
+    line; the lanes' widths in MAP_QUANTUM."""
     result = {"lane_width": encode(quantised(rollout.lane_width, MAP_QUANTUM))}
     for name in ("lane", "drivable"):
         points = quantised(getattr(rollout, f"{name}_points").T, MAP_QUANTUM)

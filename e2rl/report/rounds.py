@@ -1,4 +1,5 @@
-"""What a round of evolution looked like: one line, videos of attacks that hit the ego, and the curriculum's choices."""
+"""What a round of evolution looked like: one line, videos of attacks that hit the ego,
+and the curriculum's choices."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,8 +22,14 @@ def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
     """A round in one line of at most 100 characters, errored rollouts apart."""
     hit = metrics.get("synthesizer/contact", float("nan"))
     left_out = metrics["synthesizer/left_out"]
-    found = {name.rpartition("/errored_")[2]: count for name, count in metrics.items() if "/errored_" in name}
-    reasons = ", ".join(f"{count:.0f} {reason.replace('_', ' ')}" for reason, count in found.items())
+    found = {
+        name.rpartition("/errored_")[2]: count
+        for name, count in metrics.items()
+        if "/errored_" in name
+    }
+    reasons = ", ".join(
+        f"{count:.0f} {reason.replace('_', ' ')}" for reason, count in found.items()
+    )
     errored = f", without a score: {reasons}" if reasons else ""
     left = f", {left_out:.0f} left out" if left_out else ""
     return (
@@ -32,12 +39,19 @@ def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
 
 
 def save_videos(
-    traffic: Mapping[str, Tensor], scenes: SceneSet, number: int, method: str, folder: Path, count: int
+    traffic: Mapping[str, Tensor],
+    scenes: SceneSet,
+    number: int,
+    method: str,
+    folder: Path,
+    count: int,
 ) -> Iterator[Path]:
-    """Write at most `count` videos of attacks in a round's traffic that hit the ego, videos/round-<number>-<k>.gif.
+    """Write at most `count` videos of attacks in a round's traffic that hit the ego,
+    videos/round-<number>-<k>.gif.
 
     Args:
-        traffic: of the memory: scene_index [R], states [R, T+1, N, 4], valid, adversaries, eta.
+        traffic: of the memory: scene_index [R], states [R, T+1, N, 4], valid,
+            adversaries, eta.
         number: of the round, from 1.
         method: name of the attack, for the captions.
 
@@ -46,23 +60,30 @@ def save_videos(
     """
     for k, row in enumerate(hits(traffic, scenes)[:count].tolist()):
         path = folder / "videos" / f"round-{number:03d}-{k + 1}.gif"
-        save_animation(path, replay_of(traffic, row, scenes=scenes, method=method).frames())
+        save_animation(
+            path, replay_of(traffic, row, scenes=scenes, method=method).frames()
+        )
         yield path
 
 
 def hits(traffic: Mapping[str, Tensor], scenes: SceneSet) -> Tensor:
-    """Rows [H] of traffic in which an attack ended in a contact of the ego, one of a scene."""
+    """Rows [H] of traffic in which an attack ended in a contact of the ego, one of a
+    scene."""
     scene = scenes.batch(traffic["scene_index"])
     tracks = {name: traffic[name] for name in ("states", "valid")} | {
         name: scene[name] for name in ("size", "agent_type")
     }
-    rows = (first_contact(tracks)["hit"] & traffic["adversaries"].any(1)).nonzero()[:, 0]
+    rows = (first_contact(tracks)["hit"] & traffic["adversaries"].any(1)).nonzero()[
+        :, 0
+    ]
     places = traffic["scene_index"][rows]
     first = [k for k in range(len(rows)) if places[k] not in places[:k]]
     return rows[first]
 
 
-def replay_of(traffic: Mapping[str, Tensor], row: int, scenes: SceneSet, method: str) -> Replay:
+def replay_of(
+    traffic: Mapping[str, Tensor], row: int, scenes: SceneSet, method: str
+) -> Replay:
     """The replay of one row of a round's traffic."""
     shown = ("scene_index", "states", "valid", "adversaries")
     own: dict[str, Any] = {name: traffic[name][row : row + 1] for name in shown}
@@ -70,6 +91,8 @@ def replay_of(traffic: Mapping[str, Tensor], row: int, scenes: SceneSet, method:
     about = {"dataset": "", "split": "train", "method": method, "ego_policy": "actor"}
     eta = traffic["eta"][row : row + 1].double().round(decimals=2)
     names: dict[str, Any] = {name: [value] for name, value in about.items()}
-    rollouts = Rollouts.in_scenes(scenes, index, **own, seed=index, eta=eta, seconds=torch.zeros(1), **names)
+    rollouts = Rollouts.in_scenes(
+        scenes, index, **own, seed=index, eta=eta, seconds=torch.zeros(1), **names
+    )
     rows, _ = score_rollouts(rollouts)
     return Replay(rollouts.rollout(0), rows[0], metres=METRES, pixels=PIXELS)

@@ -1,4 +1,5 @@
-"""Videos: a rollout as an animated GIF or as MP4, and which failures of a run are worth one."""
+"""Videos: a rollout as an animated GIF or as MP4, and which failures of a run are worth
+one."""
 
 import subprocess
 from collections.abc import Iterable, Sequence
@@ -17,18 +18,29 @@ from e2rl.run.files import write_atomically
 FRAME_MS = 100  # real time at 10 Hz
 LAST_MS = 1200  # the last frame of a GIF stays a little before the video starts again
 COLOURS = 160  # of the GIF's palette
-KEYS = (drawing.EGO, drawing.ADVERSARY, drawing.BACKGROUND, drawing.VULNERABLE, drawing.INK)  # always in the palette
+KEYS = (
+    drawing.EGO,
+    drawing.ADVERSARY,
+    drawing.BACKGROUND,
+    drawing.VULNERABLE,
+    drawing.INK,
+)  # always in the palette
 MP4 = (  # H.264 as all players take it; the file names the matrix of its colours, since players guess another
     f"-y -v error -f rawvideo -pix_fmt rgb24 -s {{}}x{{}} -r {1000 / FRAME_MS:g} -i - -c:v libx264 -pix_fmt yuv420p"
     " -crf 20 -movflags +faststart -f mp4 -vf crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt709"
 )
 
 
-def save_animation(path: Path, frames: Iterable[Image.Image], colours: int = COLOURS) -> None:
-    """Write a video at 10 Hz, by the ending of its path an endless GIF, or an MP4 without an odd row or column; raises
-    InputError for other endings, and where MP4 needs what is not installed."""
+def save_animation(
+    path: Path, frames: Iterable[Image.Image], colours: int = COLOURS
+) -> None:
+    """Write a video at 10 Hz, by the ending of its path an endless GIF, or an MP4
+    without an odd row or column; raises InputError for other endings, and where MP4
+    needs what is not installed."""
     if path.suffix not in (".gif", ".mp4"):
-        raise InputError(f"{path}: no such kind of video; choose a name that ends in .gif or .mp4")
+        raise InputError(
+            f"{path}: no such kind of video; choose a name that ends in .gif or .mp4"
+        )
     if path.suffix == ".mp4":
         library("imageio_ffmpeg", str(path), extra="mp4")  # before the frames are drawn
     write = write_mp4 if path.suffix == ".mp4" else partial(write_gif, colours=colours)
@@ -36,38 +48,76 @@ def save_animation(path: Path, frames: Iterable[Image.Image], colours: int = COL
 
 
 def write_gif(frames: Sequence[Image.Image], path: Path, colours: int) -> None:
-    """Write an endless GIF; all frames share a palette, from the first, middle and last one and the KEYS."""
-    swatch = np.tile(np.repeat([[255 * part for part in to_rgb(each)] for each in KEYS], 8, 0), (frames[0].width, 1, 1))
-    parts = [*(np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)), swatch.transpose(1, 0, 2)]
+    """Write an endless GIF; all frames share a palette, from the first, middle and last
+    one and the KEYS."""
+    swatch = np.tile(
+        np.repeat([[255 * part for part in to_rgb(each)] for each in KEYS], 8, 0),
+        (frames[0].width, 1, 1),
+    )
+    parts = [
+        *(np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)),
+        swatch.transpose(1, 0, 2),
+    ]
     sample = Image.fromarray(np.concatenate(parts).astype(np.uint8))
-    palette = sample.quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    palette = sample.quantize(
+        colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
+    )
+    first, *others = [
+        frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames
+    ]
     duration = [FRAME_MS] * len(others) + [LAST_MS]
-    first.save(path, format="GIF", save_all=True, append_images=others, loop=0, duration=duration)
+    first.save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=others,
+        loop=0,
+        duration=duration,
+    )
 
 
 def write_mp4(frames: Sequence[Image.Image], path: Path) -> None:
     """Write an MP4 by the program of imageio-ffmpeg, or another that it finds."""
     try:
-        command = [library("imageio_ffmpeg", "MP4", extra="mp4").get_ffmpeg_exe(), *MP4.format(*frames[0].size).split(), path]
-        subprocess.run(command, input=b"".join(map(Image.Image.tobytes, frames)), capture_output=True, check=True)
+        command = [
+            library("imageio_ffmpeg", "MP4", extra="mp4").get_ffmpeg_exe(),
+            *MP4.format(*frames[0].size).split(),
+            path,
+        ]
+        subprocess.run(
+            command,
+            input=b"".join(map(Image.Image.tobytes, frames)),
+            capture_output=True,
+            check=True,
+        )
     except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", b"").decode(errors="replace") or str(error)
-        raise InputError(f"MP4: ffmpeg failed ({said.splitlines()[-1]}); mend that, or write a GIF") from error
+        raise InputError(
+            f"MP4: ffmpeg failed ({said.splitlines()[-1]}); mend that, or write a GIF"
+        ) from error
 
 
 def found_failures(rows: Sequence[dict], count: int) -> list[dict]:
     """Returns the first `count` rows, one per scene, in which the ego hits a vehicle.
 
-    Adversarial rollouts (eta > 0) come first, then failures that count, then kinds of contact that are not among the
-    chosen, then hits of adversaries.
+    Adversarial rollouts (eta > 0) come first, then failures that count, then kinds of
+    contact that are not among the chosen, then hits of adversaries.
     """
-    hits = sorted((row for row in rows if row["cfr"] == 1), key=lambda row: row["cfr_adv"] != 1)
+    hits = sorted(
+        (row for row in rows if row["cfr"] == 1), key=lambda row: row["cfr_adv"] != 1
+    )
     chosen: list[dict] = []
     while hits and len(chosen) < count:
         kinds = [row["contact_type"] for row in chosen]
         chosen.append(
-            min(hits, key=lambda row: (row["eta"] <= 0, row["counted"] != 1, kinds.count(row["contact_type"])))
+            min(
+                hits,
+                key=lambda row: (
+                    row["eta"] <= 0,
+                    row["counted"] != 1,
+                    kinds.count(row["contact_type"]),
+                ),
+            )
         )
         hits = [row for row in hits if row["scene_id"] != chosen[-1]["scene_id"]]
     return chosen

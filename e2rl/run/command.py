@@ -1,4 +1,5 @@
-"""A command that Hydra configures: `--help` prints all options; an unknown option is answered with the nearest name."""
+"""A command that Hydra configures: `--help` prints all options; an unknown option is
+answered with the nearest name."""
 
 import logging
 import os
@@ -26,7 +27,9 @@ from e2rl.run.run import Run, how_to_go_on
 from e2rl.run.settings import conf_folder
 from e2rl.run.trust import nodes
 
-BEFORE_QUOTE = re.compile(r"(\\+)(?='|\Z)")  # elsewhere Hydra keeps backslashes as they are
+BEFORE_QUOTE = re.compile(
+    r"(\\+)(?='|\Z)"
+)  # elsewhere Hydra keeps backslashes as they are
 
 
 def run_command(
@@ -36,9 +39,11 @@ def run_command(
     begun: Callable[[DictConfig, Sequence[str]], Run] = Run.of,
     alone: bool = True,
 ) -> None:
-    """Do the work of a command that Hydra configures by conf/<name>.yaml; with -m, a sweep, in a run for each job.
+    """Do the work of a command that Hydra configures by conf/<name>.yaml; with -m, a
+    sweep, in a run for each job.
 
-    A sweep goes on after a job that is refused for bad input, names it at the end, and ends with status 2.
+    A sweep goes on after a job that is refused for bad input, names it at the end, and
+    ends with status 2.
 
     Args:
         may_change: keys that may be others when a run is resumed.
@@ -53,9 +58,13 @@ def run_command(
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors arrive here as they are
 
     sweep = Sweep()
-    OmegaConf.register_new_resolver("new_folder", new_folder, replace=True, use_cache=True)
+    OmegaConf.register_new_resolver(
+        "new_folder", new_folder, replace=True, use_cache=True
+    )
 
-    @hydra.main(version_base="1.3", config_path=str(conf_folder().resolve()), config_name=name)
+    @hydra.main(
+        version_base="1.3", config_path=str(conf_folder().resolve()), config_name=name
+    )
     def command(config: DictConfig) -> None:
         try:
             with sweep.job(), ending(lambda: how_to_go_on(config)):
@@ -69,9 +78,14 @@ def run_command(
                     work(run)
         finally:
             end_log()
-            if not any(item.startswith("hydra.run.dir=") for item in HydraConfig.get().overrides.hydra):
+            if not any(
+                item.startswith("hydra.run.dir=")
+                for item in HydraConfig.get().overrides.hydra
+            ):
                 with suppress(OSError):
-                    os.rmdir(HydraConfig.get().runtime.output_dir)  # where nothing was written into it
+                    os.rmdir(
+                        HydraConfig.get().runtime.output_dir
+                    )  # where nothing was written into it
 
     with ending():
         try:
@@ -105,12 +119,15 @@ class Sweep:
         """Raises InputError that names the refused jobs, where there are any."""
         if self._refused:
             names = "; ".join(self._refused)
-            raise InputError(f"{len(self._refused)} of {len(self._jobs)} jobs of the sweep were refused: {names}")
+            raise InputError(
+                f"{len(self._refused)} of {len(self._jobs)} jobs of the sweep were refused: {names}"
+            )
 
 
 def with_path(argument: str) -> str:
-    """A command line's KEY=PATH as Hydra reads it: ~ is the home folder, and what its grammar has no place for, such as
-    letters beyond ASCII, is quoted. Anything else as it is."""
+    """A command line's KEY=PATH as Hydra reads it: ~ is the home folder, and what its
+    grammar has no place for, such as letters beyond ASCII, is quoted. Anything else as
+    it is."""
     option, _, value = argument.partition("=")
     if not value or option.startswith("-") or value[0] in "[{'\"":
         return argument
@@ -123,15 +140,19 @@ def with_path(argument: str) -> str:
 
 
 def end_log() -> None:
-    """End the run's log, so that what else this process logs neither goes there nor creates the file again."""
+    """End the run's log, so that what else this process logs neither goes there nor
+    creates the file again."""
     root = logging.getLogger()
-    for handler in [each for each in root.handlers if isinstance(each, logging.FileHandler)]:
+    for handler in [
+        each for each in root.handlers if isinstance(each, logging.FileHandler)
+    ]:
         root.removeHandler(handler)
         handler.close()
 
 
 def new_folder(parent: str) -> str:
-    """Returns parent/DATE/TIME, a folder made now: of commands that begin in one second each has its own."""
+    """Returns parent/DATE/TIME, a folder made now: of commands that begin in one second
+    each has its own."""
     now = datetime.now()
     name = f"{now:%Y-%m-%d}/{now:%H-%M-%S}"
     with suppress(OSError):  # Hydra makes it, too, and says what is wrong
@@ -145,10 +166,12 @@ def new_folder(parent: str) -> str:
 
 
 def check_keys(config: DictConfig, name: str) -> None:
-    """Raises InputError for keys that conf/<name>.yaml does not have, which do nothing: added by +, or by an experiment
-    of another command."""
+    """Raises InputError for keys that conf/<name>.yaml does not have, which do nothing:
+    added by +, or by an experiment of another command."""
     known = [*map(str, load_config(name)), *_groups(name)]
-    if wrong := [_told(str(key), _near(str(key), known)) for key in config if key not in known]:
+    if wrong := [
+        _told(str(key), _near(str(key), known)) for key in config if key not in known
+    ]:
         raise InputError(f"{'; '.join(wrong)} ({' '.join(program())})")
 
 
@@ -169,50 +192,87 @@ def help_text(name: str, arguments: Sequence[str]) -> str:
 
 def _file_texts(folders: Sequence[Path], group: str, name: str) -> Iterator[str]:
     """A group's file under a heading, and those of the group that it builds on."""
-    file = next((each for folder in folders if (each := folder / group / f"{name}.yaml").is_file()), None)
+    file = next(
+        (
+            each
+            for folder in folders
+            if (each := folder / group / f"{name}.yaml").is_file()
+        ),
+        None,
+    )
     if file is None:
         yield f"### {group}={name}: none of {', '.join(choices(group))}"
         return
-    others = ", ".join(sorted(path.stem for folder in folders for path in (folder / group).glob("*.yaml")))
+    others = ", ".join(
+        sorted(
+            path.stem for folder in folders for path in (folder / group).glob("*.yaml")
+        )
+    )
     yield f"### {group}={name} (of: {others})\n\n{file.read_text()}"
     for base in _content(file).get("defaults", ()):
         if isinstance(base, str) and base != "_self_":
             yield from _file_texts(folders, group, name=base)
 
 
-DATA = dict.fromkeys(("waymo", "nuscenes", "nuplan", "lyft"), "scenarionet") | {"av2": "argoverse2"}  # their readers
+DATA = dict.fromkeys(("waymo", "nuscenes", "nuplan", "lyft"), "scenarionet") | {
+    "av2": "argoverse2"
+}  # their readers
 
 
 def told(name: str, arguments: Sequence[str], said: str) -> str:
-    """Returns Hydra's message on a wrong option or choice, shortened, with the valid ones."""
+    """Returns Hydra's message on a wrong option or choice, shortened, with the valid
+    ones."""
     if found := re.search("Could not find '(.+)/(.+?)'", said):
         group, file = found.groups()
         known = choices(group)
-        near = [DATA[file]] if group == "data" and file in DATA else get_close_matches(file, known, 1, 0.5)
+        near = (
+            [DATA[file]]
+            if group == "data" and file in DATA
+            else get_close_matches(file, known, 1, 0.5)
+        )
         own = f"one of your own is FOLDER/{group}/{file}.yaml, with --config-dir FOLDER"
-        return _told(f"{group}={file}", [f"{group}={each}" for each in near], otherwise=f"of {', '.join(known)}; {own}")
+        return _told(
+            f"{group}={file}",
+            [f"{group}={each}" for each in near],
+            otherwise=f"of {', '.join(known)}; {own}",
+        )
     if found := re.search("Ambiguous value for argument '(.+?)=(.*?)'", said):
         return f"{found[1]}={found[2]}: {as_a_list(found[1], found[2])}; a sweep, a run for each, is -m"
     if found := re.search("Could not override '(.+?)'", said):
         groups = () if any(_further(arguments)) else _groups(name)
-        config = load_config(name, [argument for argument in arguments if argument.split("=")[0] in groups])
+        config = load_config(
+            name,
+            [argument for argument in arguments if argument.split("=")[0] in groups],
+        )
         known = [key for key, _ in nodes(OmegaConf.to_container(config))]
         if found[1] in known:
             return f"{found[1]}: what it does not have yet is added by +: '+{found[1]}=...'"
         group = found[1].partition(".")[0]
-        others = [f"{group}={each}" for each in choices(group) if group in groups and _has(name, group, choice=each, key=found[1])]
-        return _told(found[1], others and [f"{found[1]} with {', '.join(others)}"] or _near(found[1], known))
+        others = [
+            f"{group}={each}"
+            for each in choices(group)
+            if group in groups and _has(name, group, choice=each, key=found[1])
+        ]
+        return _told(
+            found[1],
+            others
+            and [f"{found[1]} with {', '.join(others)}"]
+            or _near(found[1], known),
+        )
     return said
 
 
 def _has(name: str, group: str, choice: str, key: str) -> bool:
     """Whether a file of a group has an option."""
     config = load_config(name, [f"{group}={choice}"])
-    return key in [each for each, _ in nodes(OmegaConf.to_container(config[group]), group)]
+    return key in [
+        each for each, _ in nodes(OmegaConf.to_container(config[group]), group)
+    ]
 
 
 def _near(given: str, known: Sequence[str]) -> list[str]:
-    """The options that an option which is none may stand for: those of its last name, or the nearest."""
+    """The options that an option which is none may stand for: those of its last name,
+    or the nearest."""
     last = given.rpartition(".")[2]
     same = [key for key in known if key.rpartition(".")[2] == last]
     return same[:3] or get_close_matches(given, known, 1, 0.6)
@@ -233,15 +293,23 @@ def _further(arguments: Sequence[str]) -> Iterator[Path]:
 
 def _content(file: Path) -> dict[str, Any]:
     content = OmegaConf.to_container(OmegaConf.load(file))
-    return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
+    return (
+        {str(key): value for key, value in content.items()}
+        if isinstance(content, dict)
+        else {}
+    )
 
 
 def _groups(name: str) -> dict[str, str | None]:
-    """The groups that a command's configuration chooses from, with the file that it chooses."""
+    """The groups that a command's configuration chooses from, with the file that it
+    chooses."""
     groups: dict[str, str | None] = {}
     for entry in _content(conf_folder() / f"{name}.yaml")["defaults"]:
         if isinstance(entry, dict):
-            groups |= {key.removeprefix("override ").removeprefix("/"): value for key, value in entry.items()}
+            groups |= {
+                key.removeprefix("override ").removeprefix("/"): value
+                for key, value in entry.items()
+            }
         elif entry != "_self_":  # the configuration that it builds on
             groups |= _groups(entry)
     return groups

@@ -38,31 +38,47 @@ def _hydra() -> Iterator[GlobalHydra]:
 
 
 def load_config(name: str = "evaluate", overrides: Sequence[str] = ()) -> DictConfig:
-    """Returns the configuration conf/<name>.yaml with Hydra overrides, outside of the scripts."""
+    """Returns the configuration conf/<name>.yaml with Hydra overrides, outside of the
+    scripts."""
     with _hydra():
         return compose(name, list(overrides))
 
 
 def assigned(key: str, value: object) -> str:
-    """Returns `key=value` for Hydra's command line, quoted for Hydra but not yet for a shell."""
+    """Returns `key=value` for Hydra's command line, quoted for Hydra but not yet for a
+    shell."""
     text = str(value)
-    return f"{key}={text}" if re.fullmatch(r"[\w./:+@%-]+", text) else f"{key}='" + text.replace("'", "\\'") + "'"
+    return (
+        f"{key}={text}"
+        if re.fullmatch(r"[\w./:+@%-]+", text)
+        else f"{key}='" + text.replace("'", "\\'") + "'"
+    )
 
 
 def load_choice(group: str, name: str) -> DictConfig:
-    """Returns the file conf/<group>/<name>.yaml, of the running script's search path where there is one. Raises
-    InputError where there is none of this name; it lists the choices."""
-    if not CHOICE.fullmatch(name):  # a path could lead out of conf/, into a stranger's folder
+    """Returns the file conf/<group>/<name>.yaml, of the running script's search path
+    where there is one. Raises InputError where there is none of this name; it lists the
+    choices."""
+    if not CHOICE.fullmatch(
+        name
+    ):  # a path could lead out of conf/, into a stranger's folder
         raise InputError(f"{group}={name}: no name of a file in conf/{group}")
     further = HydraConfig.get().overrides.hydra if HydraConfig.initialized() else ()
-    changes = [f"+{group}={name}", *(each for each in further if each.startswith("hydra.searchpath"))]
+    changes = [
+        f"+{group}={name}",
+        *(each for each in further if each.startswith("hydra.searchpath")),
+    ]
     with _hydra() as hydra:
         try:
             loader = hydra.config_loader()
-            return loader.load_configuration(None, changes, RunMode.RUN, validate_sweep_overrides=False)[group]
+            return loader.load_configuration(
+                None, changes, RunMode.RUN, validate_sweep_overrides=False
+            )[group]
         except HydraException as error:
             known = ", ".join(choices(group))
-            raise InputError(f"{group}={name}: none of {known}; add a file to the group in conf/") from error
+            raise InputError(
+                f"{group}={name}: none of {known}; add a file to the group in conf/"
+            ) from error
 
 
 def choices(group: str) -> list[str]:
@@ -71,15 +87,20 @@ def choices(group: str) -> list[str]:
         return hydra.config_loader().get_group_options(group)
 
 
-def with_changes(config: DictConfig, changes: Mapping[str, Any], where: str, group: str) -> DictConfig:
-    """Returns a copy of a configuration with changes of dotted keys; InputError where there is no such key in it."""
+def with_changes(
+    config: DictConfig, changes: Mapping[str, Any], where: str, group: str
+) -> DictConfig:
+    """Returns a copy of a configuration with changes of dotted keys; InputError where
+    there is no such key in it."""
     changed = copy.deepcopy(config)
     OmegaConf.set_struct(changed, True)
     try:
         for key, value in changes.items():
             OmegaConf.update(changed, key, value, merge=True)
     except OmegaConfBaseException as error:
-        raise InputError(f"{where}: {str(error).splitlines()[0]}; compare it with conf/{group}") from error
+        raise InputError(
+            f"{where}: {str(error).splitlines()[0]}; compare it with conf/{group}"
+        ) from error
     return changed
 
 
@@ -91,12 +112,13 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 
 
 class Extension:
-    """What a configuration may name by `_target_`: sources, egos, traffic, curricula, learners."""
+    """What a configuration may name by `_target_`: sources, egos, traffic, curricula,
+    learners."""
 
 
 def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
-    """Returns what `_target_` of a group builds, users' code included. Raises InputError where it cannot be built or
-    is no `kind`."""
+    """Returns what `_target_` of a group builds, users' code included. Raises
+    InputError where it cannot be built or is no `kind`."""
     settings = {key: value for key, value in config.items() if key != "name"}
     target = settings.get("_target_")
     try:
@@ -104,13 +126,23 @@ def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
     except (InputError, MemoryError, torch.OutOfMemoryError):
         raise
     except SystemExit as error:  # of outside code, perhaps as it is imported
-        raise InputError(f"{where}={target}: it called sys.exit({error.code!r}) instead of being built") from error
+        raise InputError(
+            f"{where}={target}: it called sys.exit({error.code!r}) instead of being built"
+        ) from error
     except Exception as error:  # outside code raises anything
-        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+        cause = (
+            error.__cause__
+            if isinstance(error, InstantiationException) and error.__cause__
+            else error
+        )
         reason = f"{where}={target}: cannot be built: {type(cause).__name__}: {cause}"
-        raise InputError(f"{reason}; check the class path and its arguments in conf/{where}") from error
+        raise InputError(
+            f"{reason}; check the class path and its arguments in conf/{where}"
+        ) from error
     if not isinstance(made, kind):
-        raise InputError(f"{where}={target}: is no {kind.__module__}.{kind.__name__}; subclass it")
+        raise InputError(
+            f"{where}={target}: is no {kind.__module__}.{kind.__name__}; subclass it"
+        )
     return made
 
 
@@ -126,7 +158,9 @@ class Machine:
 
 def machine_of(config: DictConfig) -> Machine:
     """Returns these settings of a run; InputError for impossible ones."""
-    return settings_of(Machine, {each.name: config.get(each.name) for each in fields(Machine)})
+    return settings_of(
+        Machine, {each.name: config.get(each.name) for each in fields(Machine)}
+    )
 
 
 def check_device(key: str, device: str) -> None:
@@ -134,11 +168,14 @@ def check_device(key: str, device: str) -> None:
     try:
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:
-        raise InputError(f"{key}={device}: {str(error).splitlines()[0]}; use {key}=cpu or cuda") from error
+        raise InputError(
+            f"{key}={device}: {str(error).splitlines()[0]}; use {key}=cpu or cuda"
+        ) from error
 
 
 def check_list(key: str, value: Any) -> None:
-    """Raises InputError for a text of several values, where the values of `key` are a list."""
+    """Raises InputError for a text of several values, where the values of `key` are a
+    list."""
     if isinstance(value, str) and "," in value:
         raise InputError(f"{key}={value}: {as_a_list(key, value)}")
 
@@ -150,25 +187,31 @@ def as_a_list(key: str, value: str) -> str:
 
 
 def set_up(config: DictConfig) -> None:
-    """Import the plugins; set the threads, the device and the seeds of torch, numpy and python. Raises InputError for a
-    plugin or device that is not there, and a size that is impossible."""
+    """Import the plugins; set the threads, the device and the seeds of torch, numpy and
+    python. Raises InputError for a plugin or device that is not there, and a size that
+    is impossible."""
     machine_of(config)
     check_list("plugins", config.plugins)
     import_plugins(config.plugins, "plugins: ")
     torch.set_num_threads(config.threads)
     check_device("device", config.device)
-    seed = config.get("seed", 0)  # first weights and exploration; evaluation's noise has seeds of its own
+    seed = config.get(
+        "seed", 0
+    )  # first weights and exploration; evaluation's noise has seeds of its own
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)
     random.seed(seed)
 
 
 def library(name: str, where: str, extra: str) -> Any:
-    """Returns a module of an optional library; InputError, beginning with `where`, where it cannot be imported."""
+    """Returns a module of an optional library; InputError, beginning with `where`,
+    where it cannot be imported."""
     try:
         return import_module(name)
     except ImportError as error:
-        raise InputError(f"{where}: {name} cannot be imported ({error}); {how_to_install(extra)}") from error
+        raise InputError(
+            f"{where}: {name} cannot be imported ({error}); {how_to_install(extra)}"
+        ) from error
 
 
 def import_plugins(names: Sequence[str], option: str) -> None:
@@ -177,4 +220,6 @@ def import_plugins(names: Sequence[str], option: str) -> None:
         try:
             import_module(name)
         except ImportError as error:
-            raise InputError(f"{option}{name}: {error}; install it or put its folder on PYTHONPATH") from error
+            raise InputError(
+                f"{option}{name}: {error}; install it or put its folder on PYTHONPATH"
+            ) from error

@@ -1,5 +1,6 @@
-"""Import this first in a command: Ctrl-C ends it in one line from then on, also while heavy libraries load; so does a
-disk on which no temporary file can be written, which these libraries need.
+"""Import this first in a command: Ctrl-C ends it in one line from then on, also while
+heavy libraries load; so does a disk on which no temporary file can be written, which
+these libraries need.
 
 `e2rl.run.endings.ending` takes over once the command knows how it can go on.
 """
@@ -16,10 +17,15 @@ def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(128 + number)
 
 
-if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not in the background, which is deaf to it
+if (
+    signal.getsignal(signal.SIGINT) is signal.default_int_handler
+):  # not in the background, which is deaf to it
     signal.signal(signal.SIGINT, _leave)
 try:
     tempfile.gettempdir()
 except FileNotFoundError as none:
-    print(f"error: {none.strerror}; free space, or name a writable folder by TMPDIR", file=sys.stderr)
+    print(
+        f"error: {none.strerror}; free space, or name a writable folder by TMPDIR",
+        file=sys.stderr,
+    )
     sys.exit(1)

@@ -6,13 +6,16 @@ from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 CHECKOUT = Path(__file__).parents[2]
-EXTRA = re.compile(r"(?P<requirement>[^;]+?)\s*;.*\bextra == ['\"](?P<extra>[\w-]+)['\"]")
+EXTRA = re.compile(
+    r"(?P<requirement>[^;]+?)\s*;.*\bextra == ['\"](?P<extra>[\w-]+)['\"]"
+)
 
 
 def how_to_install(extra: str) -> str:
     """Returns the command that installs an extra of pyproject.toml here, for a message.
 
-    e2rl is in no registry: in a checkout it is installed from there, elsewhere the libraries are named.
+    e2rl is in no registry: in a checkout it is installed from there, elsewhere the
+    libraries are named.
     """
     if (CHECKOUT / "pyproject.toml").is_file():
         place = "." if Path.cwd() == CHECKOUT else str(CHECKOUT)
@@ -27,7 +30,11 @@ def requirements(extra: str) -> list[str]:
         lines = requires("e2rl") or []
     except PackageNotFoundError:
         lines = []
-    found = [match for match in map(EXTRA.fullmatch, lines) if match and match["extra"] == extra]
+    found = [
+        match
+        for match in map(EXTRA.fullmatch, lines)
+        if match and match["extra"] == extra
+    ]
     return [match["requirement"] for match in found]
 
 

@@ -1,6 +1,7 @@
 """Files that appear whole or not at all, and whose later changes are detected.
 
-Weights in safetensors files, with a hash of what was written in the header: an altered file is noticed.
+Weights in safetensors files, with a hash of what was written in the header: an altered
+file is noticed.
 
 Files of earlier versions have no hash; of those only the form is checked.
 """
@@ -36,21 +37,41 @@ from torch import Tensor, nn
 from e2rl.run.errors import InputError
 
 MAX_FILE = 1 << 30  # bytes of a file of a run
-MAX_RECORD = 1 << 22  # bytes of a file of plain values that a command writes about a run
+MAX_RECORD = (
+    1 << 22
+)  # bytes of a file of plain values that a command writes about a run
 MAX_HASHED = 1 << 36  # bytes of a file whose content is not held, weights
 MAX_ARRAYS = 1 << 30  # bytes of one npz, unpacked
 WAIT = 5  # s that another run's workers have to end
 LOGGER = "wandb"
 HASH = "sha256"  # key in the header of a file of weights
 SEAL = "sha256.json"  # of a sealed folder: {file: hash}
-LONG_NAME, SHORT_NAME = 230, 50  # bytes of a name that leave room for more; characters of a longer one that are kept
+LONG_NAME, SHORT_NAME = (
+    230,
+    50,
+)  # bytes of a name that leave room for more; characters of a longer one that are kept
 ANY_WRITE = 0o222  # permissions to write
 MOST_LINKS = 40  # that lead to one file, as on Linux
-DESCRIPTOR = re.compile(r"/(?:dev|proc/(?P<process>\d+)(?:/task/\d+)?)/fd/(?P<number>\d+)")
-FORMULA = re.compile(r"'*(\s*[=+\-@\uff1d\uff0b\uff0d\uff20]|[\t\r\n])")  # what a spreadsheet may run; full-width too
+DESCRIPTOR = re.compile(
+    r"/(?:dev|proc/(?P<process>\d+)(?:/task/\d+)?)/fd/(?P<number>\d+)"
+)
+FORMULA = re.compile(
+    r"'*(\s*[=+\-@\uff1d\uff0b\uff0d\uff20]|[\t\r\n])"
+)  # what a spreadsheet may run; full-width too
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-ESTIMATE = re.compile(rf"{NUMBER}(?: \[{NUMBER}, {NUMBER}\])?\*?(?: \(\d+\))?")  # +2.1 [+0.4, +3.9]* (12)
-DAMAGED = (OSError, EOFError, LookupError, TypeError, ValueError, RuntimeError, MemoryError, SyntaxError)
+ESTIMATE = re.compile(
+    rf"{NUMBER}(?: \[{NUMBER}, {NUMBER}\])?\*?(?: \(\d+\))?"
+)  # +2.1 [+0.4, +3.9]* (12)
+DAMAGED = (
+    OSError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+    RuntimeError,
+    MemoryError,
+    SyntaxError,
+)
 
 
 def cache_folder() -> Path:
@@ -58,15 +79,19 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "e2rl"
 
 
-def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) -> io.BufferedReader:
+def open_regular(
+    path: Path, limit: int = MAX_FILE, within: Path | None = None
+) -> io.BufferedReader:
     """Open a regular file to read, which never blocks.
 
     Args:
         limit: bytes that it has at most.
-        within: folder in which it lies once links are followed, as the files of a run do.
+        within: folder in which it lies once links are followed, as the files of a run
+            do.
 
     Raises:
-        OSError: where it is missing, a folder, a pipe, a device, larger, or a link to somewhere else.
+        OSError: where it is missing, a folder, a pipe, a device, larger, or a link to
+            somewhere else.
     """
     if within is not None and not leads_into(path, within):
         raise OSError(errno.EPERM, f"a link out of {within}", str(path))
@@ -83,21 +108,27 @@ def open_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) 
         raise
 
 
-def read_regular(path: Path, limit: int = MAX_FILE, within: Path | None = None) -> bytes:
+def read_regular(
+    path: Path, limit: int = MAX_FILE, within: Path | None = None
+) -> bytes:
     """Returns the bytes of a file as `open_regular` opens it; raises as it does."""
     with open_regular(path, limit, within=within) as file:
         return file.read()
 
 
 def check_folder(folder: Path) -> None:
-    """Raises InputError where a run's folder, which may be a stranger's, holds a link out of it, a pipe or a device.
+    """Raises InputError where a run's folder, which may be a stranger's, holds a link
+    out of it, a pipe or a device.
 
-    The folder of LOGGER is left out, which links to its own logs: nothing is read there.
+    The folder of LOGGER is left out, which links to its own logs: nothing is read
+    there.
     """
     for place, folders, files in os.walk(folder):
         for path in (Path(place, name) for name in (*folders, *files)):
             if path.is_symlink() and not leads_into(path, folder):
-                raise InputError(f"{path}: a link out of the run's folder; put there what it leads to")
+                raise InputError(
+                    f"{path}: a link out of the run's folder; put there what it leads to"
+                )
             if not (path.is_symlink() or path.is_dir() or path.is_file()):
                 raise InputError(f"{path}: no regular file; remove it")
         folders[:] = [name for name in folders if Path(place, name) != folder / LOGGER]
@@ -111,18 +142,22 @@ def leads_into(path: Path, folder: Path) -> bool:
 def csv_text(rows: Iterable[Iterable]) -> str:
     """Returns rows of values as CSV, for `CsvReader`.
 
-    A spreadsheet runs a text that begins as a formula does. Names come from strangers' data, so such a text begins with
-    an apostrophe instead. Numbers stay as they are.
+    A spreadsheet runs a text that begins as a formula does. Names come from strangers'
+    data, so such a text begins with an apostrophe instead. Numbers stay as they are.
     """
     lines: list[str] = []
     ending = "\r\n"  # so that cells with either are quoted
     writer = csv.writer(SimpleNamespace(write=lines.append), lineterminator=ending)
-    writer.writerows([escaped_cell(value) if isinstance(value, str) else value for value in row] for row in rows)
+    writer.writerows(
+        [escaped_cell(value) if isinstance(value, str) else value for value in row]
+        for row in rows
+    )
     return "".join(f"{line.removesuffix(ending)}\n" for line in lines)
 
 
 def escaped_cell(text: str) -> str:
-    """Returns the text as a cell that no spreadsheet runs; `plain_cell` gives the text back."""
+    """Returns the text as a cell that no spreadsheet runs; `plain_cell` gives the text
+    back."""
     return f"'{text}" if FORMULA.match(text) and not ESTIMATE.fullmatch(text) else text
 
 
@@ -132,7 +167,8 @@ def plain_cell(text: str) -> str:
 
 
 class CsvReader(csv.DictReader):
-    """The rows of a CSV file that `csv_text` wrote, by their heads; csv.Error where it is damaged."""
+    """The rows of a CSV file that `csv_text` wrote, by their heads; csv.Error where it
+    is damaged."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         super().__init__(lines, strict=True)
@@ -144,20 +180,28 @@ class CsvReader(csv.DictReader):
 
     def __next__(self) -> dict[str, Any]:
         row = super().__next__()
-        return {key: plain_cell(value) if isinstance(value, str) else value for key, value in row.items()}
+        return {
+            key: plain_cell(value) if isinstance(value, str) else value
+            for key, value in row.items()
+        }
 
 
-def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]) -> None:
-    """Write a file under a temporary name beside it, then rename it, so that no reader meets half a file.
+def write_atomically(
+    path: Path, content: bytes | str | Callable[[Path], object]
+) -> None:
+    """Write a file under a temporary name beside it, then rename it, so that no reader
+    meets half a file.
 
-    A link is followed: what it leads to is replaced. A device, a pipe and an open file of this process (/dev/stdout)
-    are written through. Missing parent folders are made.
+    A link is followed: what it leads to is replaced. A device, a pipe and an open file
+    of this process (/dev/stdout) are written through. Missing parent folders are made.
 
     Args:
-        content: the bytes or text of the file, or a function that writes the file whose path it is given.
+        content: the bytes or text of the file, or a function that writes the file whose
+            path it is given.
 
     Raises:
-        OSError: where it cannot be written, a folder, a socket and a read-only file among them. It names `path`, and
+        OSError: where it cannot be written, a folder, a socket and a read-only file
+            among them. It names `path`, and
             nothing is left behind.
     """
     path = Path(path)
@@ -173,7 +217,8 @@ def write_atomically(path: Path, content: bytes | str | Callable[[Path], object]
 
 
 def is_stream(path: Path) -> bool:
-    """Returns whether a path is a device, a pipe or an open file of this process, beside which nothing is written.
+    """Returns whether a path is a device, a pipe or an open file of this process,
+    beside which nothing is written.
 
     Raises:
         OSError: for a folder, a socket, a disk, and a loop of links.
@@ -193,7 +238,8 @@ def is_stream(path: Path) -> bool:
 
 
 def descriptor_of(path: Path) -> int | None:
-    """Returns the number of the open file of this process that a path such as /dev/stdout names; None: it names none.
+    """Returns the number of the open file of this process that a path such as
+    /dev/stdout names; None: it names none.
 
     Where that is a file, it is not to be replaced, since more follows in it.
     """
@@ -220,7 +266,9 @@ def _write_through(path: Path, content: bytes | str | Callable[[Path], object]) 
     for stream in filter(None, (sys.stdout, sys.stderr)):
         stream.flush()
     number = descriptor_of(path)
-    with open(os.open(path, os.O_WRONLY) if number is None else os.dup(number), "wb") as file:
+    with open(
+        os.open(path, os.O_WRONLY) if number is None else os.dup(number), "wb"
+    ) as file:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
@@ -231,7 +279,9 @@ def _replace(path: Path, content: bytes | str | Callable[[Path], object]) -> Non
         raise PermissionError(errno.EACCES, "read-only", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     part = _part_of(path)
-    handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
+    handle = os.open(
+        part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600
+    )
     if mode is None:
         mode = stat.S_IMODE(os.fstat(handle).st_mode)  # as the umask has it
     os.close(handle)
@@ -249,15 +299,23 @@ def _replace(path: Path, content: bytes | str | Callable[[Path], object]) -> Non
 
 def _part_of(path: Path) -> Path:
     """Returns a name beside a path, of which there is none yet, for what it will be."""
-    name = path.name if len(os.fsencode(path.name)) <= LONG_NAME else path.name[:SHORT_NAME]
+    name = (
+        path.name
+        if len(os.fsencode(path.name)) <= LONG_NAME
+        else path.name[:SHORT_NAME]
+    )
     return path.with_name(f".{name}.{secrets.token_hex(8)}.part")
 
 
-def write_beside(path: Path, suffix: str, content: bytes | str | Callable[[Path], object]) -> None:
-    """Write a file of the name of `path` with another suffix; nothing where `path` is a stream.
+def write_beside(
+    path: Path, suffix: str, content: bytes | str | Callable[[Path], object]
+) -> None:
+    """Write a file of the name of `path` with another suffix; nothing where `path` is a
+    stream.
 
     Raises:
-        OSError: where it cannot be written, and for a link out of its folder, which nobody has named.
+        OSError: where it cannot be written, and for a link out of its folder, which
+            nobody has named.
     """
     if is_stream(path):
         return
@@ -269,7 +327,8 @@ def write_beside(path: Path, suffix: str, content: bytes | str | Callable[[Path]
 
 @contextmanager
 def written_whole(folder: Path) -> Iterator[Path]:
-    """An empty folder under a temporary name beside `folder`, renamed to it where the block ends well, else removed."""
+    """An empty folder under a temporary name beside `folder`, renamed to it where the
+    block ends well, else removed."""
     folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
     part = _part_of(folder)
@@ -284,15 +343,27 @@ def written_whole(folder: Path) -> Iterator[Path]:
 
 def seal(folder: Path) -> None:
     """Write the hashes of a folder's files into it, for `altered`."""
-    hashes = {path.name: sha256_of(path) for path in sorted(folder.iterdir()) if path.name != SEAL}
+    hashes = {
+        path.name: sha256_of(path)
+        for path in sorted(folder.iterdir())
+        if path.name != SEAL
+    }
     write_atomically(folder / SEAL, json.dumps(hashes, indent=1))
 
 
 def altered(folder: Path) -> str | None:
-    """The name of the first file of a sealed folder that is not what was written; None: all are."""
+    """The name of the first file of a sealed folder that is not what was written; None:
+    all are."""
     try:
         hashes = json.loads(read_regular(folder / SEAL, MAX_RECORD, within=folder))
-        return next((name for name, known in hashes.items() if sha256_of(folder / name, folder) != known), None)
+        return next(
+            (
+                name
+                for name, known in hashes.items()
+                if sha256_of(folder / name, folder) != known
+            ),
+            None,
+        )
     except FileNotFoundError as error:
         return Path(error.filename).name
     except (OSError, ValueError, AttributeError, RecursionError):
@@ -306,7 +377,8 @@ def sha256_of(path: Path, within: Path | None = None) -> str:
 
 
 def hash_files(paths: Iterable[Path]) -> bytes:
-    """SHA-256 of the names and contents of files, for `Source.fingerprint`; of a pipe or a link to nothing of its name.
+    """SHA-256 of the names and contents of files, for `Source.fingerprint`; of a pipe
+    or a link to nothing of its name.
 
     Raises InputError for a file that cannot be read.
     """
@@ -319,13 +391,16 @@ def hash_files(paths: Iterable[Path]) -> bytes:
             with open_regular(path, sys.maxsize) as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
         except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}; make it readable, or remove it") from error
+            raise InputError(
+                f"{path}: cannot be read: {error.strerror}; make it readable, or remove it"
+            ) from error
     return digest.digest()
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock of `path` among processes: others wait at the beginning of their block."""
+    """Hold the lock of `path` among processes: others wait at the beginning of their
+    block."""
     name = path.with_name(f".{path.name}.lock")
     while True:
         handle = os.open(name, os.O_RDWR | os.O_CREAT, 0o644)
@@ -345,7 +420,8 @@ def locked(path: Path) -> Iterator[None]:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Hold a run's folder for this process alone; raises InputError where another process is at work there."""
+    """Hold a run's folder for this process alone; raises InputError where another
+    process is at work there."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         for remaining in reversed(range(WAIT)):
@@ -357,67 +433,102 @@ def alone_in(folder: Path) -> Iterator[None]:
                     raise InputError(
                         f"{folder}: another process is at work in this run; wait for it, or end it"
                     ) from None
-                time.sleep(1.0)  # workers of a process that was killed end soon, but not at once
+                time.sleep(
+                    1.0
+                )  # workers of a process that was killed end soon, but not at once
         yield
     finally:
         os.close(handle)
 
 
-def read_arrays(file: Path | IO[bytes], most: int = MAX_ARRAYS) -> dict[str, np.ndarray]:
-    """The arrays of an npz, none of them pickled; ValueError where it is damaged or claims more than `most` bytes."""
+def read_arrays(
+    file: Path | IO[bytes], most: int = MAX_ARRAYS
+) -> dict[str, np.ndarray]:
+    """The arrays of an npz, none of them pickled; ValueError where it is damaged or
+    claims more than `most` bytes."""
     if isinstance(file, Path) and not file.is_file():
         raise ValueError("no regular file")
     try:
         with zipfile.ZipFile(file) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > most:
-            raise ValueError(f"unpacks to {size / 1e6:.0f} MB, more than {most / 1e6:.0f}")
+            raise ValueError(
+                f"unpacks to {size / 1e6:.0f} MB, more than {most / 1e6:.0f}"
+            )
         with np.load(file, allow_pickle=False) as arrays:
             return {key: _truth(np.asarray(arrays[key])) for key in arrays.files}
     except (*DAMAGED, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+        raise ValueError(
+            str(error).splitlines()[0] if str(error) else type(error).__name__
+        ) from error
 
 
 def misfit(value: Any, shape: Any, where: str = "it") -> str | None:
-    """What in plain nested containers, as of JSON, has another shape than it must; None: nothing.
+    """What in plain nested containers, as of JSON, has another shape than it must;
+    None: nothing.
 
-    shape: a type or several; [shape] for a list of any length; {name: shape} for a dict with these keys and others; a
-    shape under the name ... is that of every other key.
+    shape: a type or several; [shape] for a list of any length; {name: shape} for a dict
+    with these keys and others; a shape under the name ... is that of every other key.
     """
     if isinstance(shape, dict):
         if not isinstance(value, dict):
             return f"{where} is no object"
-        parts = [(f"{where}.{name}", name, each) for name, each in shape.items() if name is not ...]
+        parts = [
+            (f"{where}.{name}", name, each)
+            for name, each in shape.items()
+            if name is not ...
+        ]
         missing = next((at for at, name, _ in parts if name not in value), None)
         if missing:
             return f"{missing} is missing"
-        others = [(f"{where}.{name}", name, shape[...]) for name in value if name not in shape] if ... in shape else []
-        return next((found for at, name, each in parts + others if (found := misfit(value[name], each, where=at))), None)
+        others = (
+            [
+                (f"{where}.{name}", name, shape[...])
+                for name in value
+                if name not in shape
+            ]
+            if ... in shape
+            else []
+        )
+        return next(
+            (
+                found
+                for at, name, each in parts + others
+                if (found := misfit(value[name], each, where=at))
+            ),
+            None,
+        )
     if isinstance(shape, list):
         if not isinstance(value, list):
             return f"{where} is no list"
-        each = (misfit(part, shape[0], where=f"{where}[{index}]") for index, part in enumerate(value))
+        each = (
+            misfit(part, shape[0], where=f"{where}[{index}]")
+            for index, part in enumerate(value)
+        )
         return next((found for found in each if found), None)
     return None if isinstance(value, shape) else f"{where} is {str(value)[:40]!r}"
 
 
 def _truth(array: np.ndarray) -> np.ndarray:
     """The array; one of truth values with bytes 0 and 1 only, as numpy counts on."""
-    return array.view(np.uint8) != 0 if array.dtype.kind == "b" and array.shape else array
+    return (
+        array.view(np.uint8) != 0 if array.dtype.kind == "b" and array.shape else array
+    )
 
 
 # --- weights
 
 
 def weight_bytes(weights: Mapping[str, Tensor], header: Mapping[str, str]) -> bytes:
-    """The content of a file with weights, header and hash: equal weights make equal bytes."""
+    """The content of a file with weights, header and hash: equal weights make equal
+    bytes."""
     plain = {key: value.detach().cpu().contiguous() for key, value in weights.items()}
     return _in_order(save(plain, {**header, HASH: _digest(plain, header)}))
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Weights and header, without the hash, of a safetensors file; ValueError where it is none, where it is not what
-    was written, and where a weight is NaN or infinite."""
+    """Weights and header, without the hash, of a safetensors file; ValueError where it
+    is none, where it is not what was written, and where a weight is NaN or infinite."""
     try:
         with safe_open(path, "pt") as file:
             header = dict(file.metadata() or {})
@@ -427,28 +538,39 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     written = header.pop(HASH, None)
     if written is not None and written != _digest(weights, header):
         raise ValueError("its content is not what was written")
-    bad = [key for key, value in weights.items() if value.is_floating_point() and not bool(value.isfinite().all())]
+    bad = [
+        key
+        for key, value in weights.items()
+        if value.is_floating_point() and not bool(value.isfinite().all())
+    ]
     if bad:
         raise ValueError(f"{bad[0]} holds NaN or infinite values")
     return weights, header
 
 
 def unlike(make: Callable[[], nn.Module], weights: Mapping[str, Tensor]) -> str | None:
-    """What in the weights has another name or shape than in a network, of which nothing is allocated; None: nothing."""
+    """What in the weights has another name or shape than in a network, of which nothing
+    is allocated; None: nothing."""
     with torch.device("meta"):
         own = make().state_dict()
     if other := sorted(set(own) ^ set(weights)):
         return f"{other[0]} is {'missing' if other[0] in own else 'unknown'}"
     wrong = (name for name, value in own.items() if value.shape != weights[name].shape)
     return next(
-        (f"{name} has shape {tuple(weights[name].shape)}, not {tuple(own[name].shape)}" for name in wrong), None
+        (
+            f"{name} has shape {tuple(weights[name].shape)}, not {tuple(own[name].shape)}"
+            for name in wrong
+        ),
+        None,
     )
 
 
 def _in_order(content: bytes) -> bytes:
     """A safetensors file with its header's keys in order, which safetensors shuffles."""
     end = 8 + int.from_bytes(content[:8], "little")
-    head = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    head = json.dumps(
+        json.loads(content[8:end]), sort_keys=True, separators=(",", ":")
+    ).encode()
     head += b" " * (-len(head) % 8)  # the tensors stay aligned
     return len(head).to_bytes(8, "little") + head + content[end:]
 

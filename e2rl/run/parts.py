@@ -1,4 +1,5 @@
-"""The parts of a run that are done, each on disk as it ends: a run that was killed goes on from them."""
+"""The parts of a run that are done, each on disk as it ends: a run that was killed goes
+on from them."""
 
 import hashlib
 import io
@@ -21,11 +22,13 @@ HASHED = b"e2rl-sha256:"
 class Parts:
     """The parts of a run's stage that are done, in folder/parts/<stage>.
 
-    A part holds plain values and tensors. It counts where its file is whole and its identity is the one asked for.
+    A part holds plain values and tensors. It counts where its file is whole and its
+    identity is the one asked for.
 
     Args:
         folder: of the run; None: nothing is written.
-        about: what all parts of the stage depend on besides the run's inputs, such as the weights of a round.
+        about: what all parts of the stage depend on besides the run's inputs, such as
+            the weights of a round.
     """
 
     folder: Path | None = None
@@ -33,9 +36,14 @@ class Parts:
     about: str = ""
 
     def result(
-        self, name: str, identity: Any, compute: Callable[[], Any], valid: Callable[[Any], bool] = lambda found: True
+        self,
+        name: str,
+        identity: Any,
+        compute: Callable[[], Any],
+        valid: Callable[[Any], bool] = lambda found: True,
     ) -> Any:
-        """Returns the part `name`, where it is there and valid; else compute(), which is written."""
+        """Returns the part `name`, where it is there and valid; else compute(), which
+        is written."""
         found = self.load(name, identity)
         if found is None or not valid(found):
             found = compute()
@@ -43,23 +51,36 @@ class Parts:
         return found
 
     def load(self, name: str, identity: Any) -> Any:
-        """Returns the value of a part; None where it is not there, damaged, or of another identity."""
+        """Returns the value of a part; None where it is not there, damaged, or of
+        another identity."""
         if self.folder is None or not self._file(name).is_file():
             return None
         try:
             part = read_state(self._file(name), self.folder)
             known = [part[key] for key in ("format", "about", "identity")]
             return part["value"] if known == [FORMAT, self.about, identity] else None
-        except (ValueError, TypeError, LookupError):  # damaged, or a stranger's: the part is done again
+        except (
+            ValueError,
+            TypeError,
+            LookupError,
+        ):  # damaged, or a stranger's: the part is done again
             return None
 
     def save(self, name: str, identity: Any, value: Any) -> None:
-        """Write a part, in place of an older one of its name; a link or a pipe there is not written through."""
+        """Write a part, in place of an older one of its name; a link or a pipe there is
+        not written through."""
         if self.folder is not None:
             file = self._file(name)
-            if file.is_symlink() or (file.exists() and not file.is_file() and not file.is_dir()):
+            if file.is_symlink() or (
+                file.exists() and not file.is_file() and not file.is_dir()
+            ):
                 file.unlink()
-            part = {"format": FORMAT, "about": self.about, "identity": identity, "value": value}
+            part = {
+                "format": FORMAT,
+                "about": self.about,
+                "identity": identity,
+                "value": value,
+            }
             write_atomically(file, state_bytes(part))
 
     def _file(self, name: str) -> Path:
@@ -71,19 +92,24 @@ NO_PARTS = Parts()
 
 
 def state_bytes(state: Any) -> bytes:
-    """Returns plain values and tensors in torch's format, after its hash: as bytes, a full disk is an OSError."""
+    """Returns plain values and tensors in torch's format, after its hash: as bytes, a
+    full disk is an OSError."""
     content = io.BytesIO()
     torch.save(state, content)
     return HASHED + hashlib.sha256(content.getvalue()).digest() + content.getvalue()
 
 
 def read_state(file: Path, folder: Path | None = None) -> Any:
-    """Returns what `state_bytes` made, on the CPU; nothing but plain values and tensors is unpickled. Raises ValueError
-    where the file is damaged, or lies outside of `folder` once links are followed."""
+    """Returns what `state_bytes` made, on the CPU; nothing but plain values and tensors
+    is unpickled. Raises ValueError where the file is damaged, or lies outside of
+    `folder` once links are followed."""
     try:
         content = read_regular(file, within=folder)
         begin = len(HASHED) + hashlib.sha256().digest_size
-        if content[: len(HASHED)] != HASHED or hashlib.sha256(content[begin:]).digest() != content[len(HASHED) : begin]:
+        if (
+            content[: len(HASHED)] != HASHED
+            or hashlib.sha256(content[begin:]).digest() != content[len(HASHED) : begin]
+        ):
             raise ValueError("not what was written, or of an earlier version")
         return load_plain(content[begin:])
     except Exception as error:  # damaged bytes raise anything
@@ -91,11 +117,15 @@ def read_state(file: Path, folder: Path | None = None) -> Any:
 
 
 def load_plain(content: bytes) -> Any:
-    """Returns what torch.save wrote, plain values and tensors on the CPU. Raises ValueError where it would grow as it
-    is read, as torch packs nothing and repeats nothing; damaged bytes raise anything."""
+    """Returns what torch.save wrote, plain values and tensors on the CPU. Raises
+    ValueError where it would grow as it is read, as torch packs nothing and repeats
+    nothing; damaged bytes raise anything."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
-    packed = any(each.compress_type != zipfile.ZIP_STORED for each in members) or content[:2] != b"PK"
+    packed = (
+        any(each.compress_type != zipfile.ZIP_STORED for each in members)
+        or content[:2] != b"PK"
+    )
     if packed or sum(each.file_size for each in members) > len(content):
         raise ValueError("packed")
     value = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
@@ -107,7 +137,11 @@ def load_plain(content: bytes) -> Any:
         if id(part) not in known and isinstance(part, dict | list | tuple):
             waiting += part.values() if isinstance(part, dict) else part
         elif id(part) not in known and isinstance(part, torch.Tensor):
-            size += part.numel() * part.element_size() if part.layout == torch.strided else MAX_FILE
+            size += (
+                part.numel() * part.element_size()
+                if part.layout == torch.strided
+                else MAX_FILE
+            )
         known.add(id(part))
     if size > MAX_FILE:
         raise ValueError(f"its tensors have {size / 1e6:.0f} MB")

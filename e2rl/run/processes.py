@@ -1,6 +1,8 @@
-"""Jobs spread over forked processes that share the parent's memory, or over the workers of a Ray cluster.
+"""Jobs spread over forked processes that share the parent's memory, or over the workers
+of a Ray cluster.
 
-The processes end with their parent: on Ctrl-C, on SIGTERM, on an error, and where it is killed.
+The processes end with their parent: on Ctrl-C, on SIGTERM, on an error, and where it is
+killed.
 """
 
 import ctypes
@@ -32,7 +34,11 @@ _work: Callable[[int], bytes]  # of a forked worker, which has it without its be
 
 def cores() -> int:
     """Returns how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
 
 
 def in_processes(
@@ -44,11 +50,12 @@ def in_processes(
 ) -> Iterator[Result]:
     """Returns function(job) of each job, in their order, computed by several processes.
 
-    Forks share the parent's scenes and weights, and Ray workers are sent them, so results do not depend on `processes`.
-    Raises InputError where a process was killed.
+    Forks share the parent's scenes and weights, and Ray workers are sent them, so
+    results do not depend on `processes`. Raises InputError where a process was killed.
 
     Args:
-        processes: number of forked processes of one thread each, or Ray workers. With one process or one job nothing is
+        processes: number of forked processes of one thread each, or Ray workers. With
+            one process or one job nothing is
             forked.
         cost: the jobs of greatest cost start first.
         ended: called with each job that has ended, in whatever order they do.
@@ -61,7 +68,11 @@ def in_processes(
         return
     order = sorted(range(len(jobs)), key=lambda k: -cost(jobs[k]))
     work = partial(_packed, function)
-    with _forked(work, jobs, processes=processes) if isinstance(processes, int) else processes.tasks(work, jobs) as submit:
+    with (
+        _forked(work, jobs, processes=processes)
+        if isinstance(processes, int)
+        else processes.tasks(work, jobs) as submit
+    ):
         with interrupts_held():
             futures = {submit(k): k for k in order}
         early = {}
@@ -76,17 +87,22 @@ def in_processes(
 
 
 def _packed(function: Callable[[Job], Result], job: Job) -> bytes:
-    """The result as bytes: tensors sent directly would each hold a shared-memory file open."""
+    """The result as bytes: tensors sent directly would each hold a shared-memory file
+    open."""
     buffer = io.BytesIO()
     torch.save(function(job), buffer)
     return buffer.getvalue()
 
 
 @contextmanager
-def _forked(work: Callable[[Job], bytes], jobs: Sequence[Job], processes: int) -> Iterator[Callable[[int], Future]]:
+def _forked(
+    work: Callable[[Job], bytes], jobs: Sequence[Job], processes: int
+) -> Iterator[Callable[[int], Future]]:
     """A function that submits a job by its number to forked workers."""
     try:
-        with worker_pool(min(processes, len(jobs)), "fork", _adopt, lambda number: work(jobs[number])) as pool:
+        with worker_pool(
+            min(processes, len(jobs)), "fork", _adopt, lambda number: work(jobs[number])
+        ) as pool:
             yield lambda number: pool.submit(_do, number)
     except BrokenProcessPool as error:
         raise InputError(
@@ -109,16 +125,22 @@ def _do(number: int) -> bytes:
 
 @contextmanager
 def worker_pool(
-    processes: int, method: str, begin: Callable[..., object] | None = None, *arguments: Any
+    processes: int,
+    method: str,
+    begin: Callable[..., object] | None = None,
+    *arguments: Any,
 ) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes of one thread each, started by `method` (fork or spawn), which call begin(*arguments) first.
+    """A pool of processes of one thread each, started by `method` (fork or spawn),
+    which call begin(*arguments) first.
 
-    Left by an exception, KeyboardInterrupt included, it kills its workers instead of waiting for them, with what these
-    have started, such as the programs of a planner.
+    Left by an exception, KeyboardInterrupt included, it kills its workers instead of
+    waiting for them, with what these have started, such as the programs of a planner.
     """
     others = descendants(os.getpid())
     given = (os.getpid(), begin, arguments)
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context(method), _begin, given)
+    pool = ProcessPoolExecutor(
+        processes, multiprocessing.get_context(method), _begin, given
+    )
     with adopting():
         try:
             yield pool
@@ -131,7 +153,9 @@ def worker_pool(
 
 def _begin(parent: int, begin: Callable[..., object] | None, arguments: tuple) -> None:
     """Make this process a worker of `parent`."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # sent to all processes of a terminal; the parent decides
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # sent to all processes of a terminal; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_parent(parent)
     torch.set_num_threads(1)
@@ -140,7 +164,8 @@ def _begin(parent: int, begin: Callable[..., object] | None, arguments: tuple) -
 
 
 def die_with_parent(parent: int) -> None:
-    """On Linux: let the kernel kill this process when `parent` is gone, however it went."""
+    """On Linux: let the kernel kill this process when `parent` is gone, however it
+    went."""
     if sys.platform != "linux":
         return
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -150,7 +175,8 @@ def die_with_parent(parent: int) -> None:
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Ctrl-C waits until the end of the block, and forever in the processes that it starts: their parent ends them."""
+    """Ctrl-C waits until the end of the block, and forever in the processes that it
+    starts: their parent ends them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -160,7 +186,8 @@ def interrupts_held() -> Iterator[None]:
 
 @contextmanager
 def without_main() -> Iterator[None]:
-    """Processes that the block spawns do not import the running script, which would run again without a main guard."""
+    """Processes that the block spawns do not import the running script, which would run
+    again without a main guard."""
     main = sys.modules["__main__"]
     file = vars(main).pop("__file__", None)
     spec = getattr(main, "__spec__", None)

@@ -31,31 +31,44 @@ VARIABLES = {  # of Ray, where the environment has none of its own
 
 @dataclass(frozen=True)
 class RayWorkers:
-    """Workers of one torch thread each, of the cluster at RAY_ADDRESS, or else `count` (None: one a core) started here;
-    they import `modules` first, such as plugins. Raises InputError where Ray is not installed."""
+    """Workers of one torch thread each, of the cluster at RAY_ADDRESS, or else `count`
+    (None: one a core) started here; they import `modules` first, such as plugins.
+    Raises InputError where Ray is not installed."""
 
     count: int | None = None
     modules: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if find_spec("ray") is None:
-            raise InputError(f"launcher=ray: Ray is not installed; {how_to_install('ray')}")
+            raise InputError(
+                f"launcher=ray: Ray is not installed; {how_to_install('ray')}"
+            )
 
     @contextmanager
-    def tasks(self, function: Callable[[Any], bytes], jobs: Sequence) -> Iterator[Callable[[int], Future]]:
-        """Gives a function that submits a job by its number. Function and jobs are sent once, whole.
+    def tasks(
+        self, function: Callable[[Any], bytes], jobs: Sequence
+    ) -> Iterator[Callable[[int], Future]]:
+        """Gives a function that submits a job by its number. Function and jobs are sent
+        once, whole.
 
-        Left by an exception, it cancels the tasks. Raises InputError where a job lost its worker RETRIES + 1 times, or
-        where what is sent, such as an ego of one's own, cannot be pickled. What a task raised is raised here.
+        Left by an exception, it cancels the tasks. Raises InputError where a job lost
+        its worker RETRIES + 1 times, or where what is sent, such as an ego of one's
+        own, cannot be pickled. What a task raised is raised here.
         """
         ray = self.connect()
         begun = []
-        task = ray.remote(num_cpus=1, max_retries=RETRIES, scheduling_strategy="SPREAD")(_work)
+        task = ray.remote(
+            num_cpus=1, max_retries=RETRIES, scheduling_strategy="SPREAD"
+        )(_work)
         try:
-            given = [ray.put((function, jobs))]  # in a list it arrives as a reference, which a worker resolves once
+            given = [
+                ray.put((function, jobs))
+            ]  # in a list it arrives as a reference, which a worker resolves once
         except (TypeError, AttributeError, PicklingError) as error:
             reason = str(error).strip().splitlines()[0]
-            raise InputError(f"launcher=ray: cannot be sent to workers: {reason}; set launcher=processes") from error
+            raise InputError(
+                f"launcher=ray: cannot be sent to workers: {reason}; set launcher=processes"
+            ) from error
 
         def submit(number: int) -> Future:
             begun.append(task.remote(given, number, self.modules, _code(), is_on()))
@@ -76,8 +89,8 @@ class RayWorkers:
             raise
 
     def connect(self) -> Any:
-        """Returns the module ray, connected to the cluster; first to be called in the main thread, where signals
-        arrive."""
+        """Returns the module ray, connected to the cluster; first to be called in the
+        main thread, where signals arrive."""
         for name, value in VARIABLES.items():
             os.environ.setdefault(name, value)
         ray = importlib.import_module("ray")
@@ -85,21 +98,37 @@ class RayWorkers:
             return ray
         address = os.environ.get(ADDRESS)
         before = signal.getsignal(signal.SIGTERM)
-        here = {} if address else {"address": "local", "num_cpus": self.count, "include_dashboard": False}
+        here = (
+            {}
+            if address
+            else {
+                "address": "local",
+                "num_cpus": self.count,
+                "include_dashboard": False,
+            }
+        )
         try:
             ray.init(log_to_driver=False, **here)
         except Exception as error:  # of many types
             reason = " ".join(str(error).split())[:300]
-            raise InputError(f"launcher=ray: no cluster at {address or 'this machine'}: {reason}") from error
-        with suppress(ValueError, TypeError):  # where this is not the main thread, Ray has set no handler either
+            raise InputError(
+                f"launcher=ray: no cluster at {address or 'this machine'}: {reason}"
+            ) from error
+        with suppress(
+            ValueError, TypeError
+        ):  # where this is not the main thread, Ray has set no handler either
             signal.signal(signal.SIGTERM, before)  # e2rl.run.endings says how to go on
         return ray
 
 
-def _work(given: list, number: int, modules: tuple[str, ...], code: str, compiled: bool) -> bytes:
+def _work(
+    given: list, number: int, modules: tuple[str, ...], code: str, compiled: bool
+) -> bytes:
     """The result of a job, in a worker."""
     if code != _code():
-        raise InputError("launcher=ray: a worker has another version of e2rl or torch; install the same everywhere")
+        raise InputError(
+            "launcher=ray: a worker has another version of e2rl or torch; install the same everywhere"
+        )
     torch.set_num_threads(1)
     switch(compiled)
     for name in modules:
@@ -116,7 +145,12 @@ def _sent(reference: Any) -> tuple[Callable[[Any], bytes], Sequence]:
 
 @cache
 def _code() -> str:
-    """Torch's version and a hash of e2rl's code, the scripts apart, which an installed package holds, too."""
+    """Torch's version and a hash of e2rl's code, the scripts apart, which an installed
+    package holds, too."""
     package = Path(__file__).parents[1]
-    own = (path for path in sorted(package.rglob("*.py")) if path.relative_to(package).parts[0] != "scripts")
+    own = (
+        path
+        for path in sorted(package.rglob("*.py"))
+        if path.relative_to(package).parts[0] != "scripts"
+    )
     return torch.__version__ + hash_files(own).hex()

@@ -1,4 +1,5 @@
-"""What a command shows while it works: a bar on a terminal, a line now and then in a file."""
+"""What a command shows while it works: a bar on a terminal, a line now and then in a
+file."""
 
 import shutil
 import sys
@@ -13,15 +14,20 @@ FIRST, EVERY = 10.0, 30.0  # s until the first line, and between lines
 
 
 def terminal_width() -> int:
-    """Returns the columns of the terminal, between 60 and 100; 100 where the output is no terminal."""
+    """Returns the columns of the terminal, between 60 and 100; 100 where the output is
+    no terminal."""
     return min(max(shutil.get_terminal_size((WIDEST, 24)).columns, NARROWEST), WIDEST)
 
 
 def column_groups(sizes: Sequence[int], width: int) -> list[list[int]]:
-    """Returns the columns that stand side by side, in groups of at most `width`: the first, and some of the others."""
+    """Returns the columns that stand side by side, in groups of at most `width`: the
+    first, and some of the others."""
     groups = [[0]]
     for column in range(1, len(sizes)):
-        if len(groups[-1]) > 1 and sum(sizes[each] + 2 for each in groups[-1]) + sizes[column] > width:
+        if (
+            len(groups[-1]) > 1
+            and sum(sizes[each] + 2 for each in groups[-1]) + sizes[column] > width
+        ):
             groups.append([0])
         groups[-1].append(column)
     return groups
@@ -32,11 +38,14 @@ def duration(seconds: float) -> str:
     minutes = round(seconds / 60)
     if minutes < 1:
         return f"{max(round(seconds), 1)} s"
-    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+    return (
+        f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+    )
 
 
 class Bar(tqdm):
-    """A progress bar on stderr; where that is no terminal, a line after 10 s, and then every 30 s, if work is done.
+    """A progress bar on stderr; where that is no terminal, a line after 10 s, and then
+    every 30 s, if work is done.
 
     A line says how long the rest takes at the pace so far.
     """
@@ -45,7 +54,9 @@ class Bar(tqdm):
         """Takes what tqdm takes."""
         self.as_lines = sys.stderr is None or not sys.stderr.isatty()
         self._line_due = time.monotonic() + FIRST
-        super().__init__(*args, disable=sys.stderr is None, **settings)  # as after `2>&-`
+        super().__init__(
+            *args, disable=sys.stderr is None, **settings
+        )  # as after `2>&-`
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:
         """Show the state: draw the bar, or write a line where one is due."""

@@ -1,6 +1,8 @@
-"""Oriented boxes: separation, overlap and distance of pairs, batched over leading dimensions that broadcast.
+"""Oriented boxes: separation, overlap and distance of pairs, batched over leading
+dimensions that broadcast.
 
-A box is a pose [..., >= 3] (x, y, heading, further columns ignored) and a size [..., 2] (length, width).
+A box is a pose [..., >= 3] (x, y, heading, further columns ignored) and a size [..., 2]
+(length, width).
 """
 
 import torch
@@ -13,7 +15,9 @@ def corners(pose: Tensor, size: Tensor) -> Tensor:
     sin = pose[..., 2].sin()
     forward = torch.stack([cos, sin], -1) * size[..., :1] / 2
     left = torch.stack([-sin, cos], -1) * size[..., 1:] / 2
-    offsets = torch.stack([forward + left, left - forward, -forward - left, forward - left], -2)
+    offsets = torch.stack(
+        [forward + left, left - forward, -forward - left, forward - left], -2
+    )
     return pose[..., None, :2] + offsets
 
 
@@ -22,14 +26,23 @@ def to_frame(points: Tensor, pose: Tensor) -> Tensor:
     delta = points - pose[..., :2]
     cos = pose[..., 2].cos()
     sin = pose[..., 2].sin()
-    return torch.stack([cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]], -1)
+    return torch.stack(
+        [
+            cos * delta[..., 0] + sin * delta[..., 1],
+            cos * delta[..., 1] - sin * delta[..., 0],
+        ],
+        -1,
+    )
 
 
-def separation(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
-    """Largest gap [...] [m] over the four face normals (separating axis theorem), differentiable.
+def separation(
+    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+) -> Tensor:
+    """Largest gap [...] [m] over the four face normals (separating axis theorem),
+    differentiable.
 
-    Negative exactly where the interiors overlap (then minus the penetration depth); where positive, a lower bound of
-    the distance.
+    Negative exactly where the interiors overlap (then minus the penetration depth);
+    where positive, a lower bound of the distance.
     """
     dx = second[..., 0] - first[..., 0]
     dy = second[..., 1] - first[..., 1]
@@ -51,10 +64,14 @@ def separation(first: Tensor, first_size: Tensor, second: Tensor, second_size: T
     return torch.maximum(gap_first, gap_second)
 
 
-def overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
-    """Bool [...]: the interiors overlap. A broad phase by centre distance first, so that only near pairs cost much.
+def overlap(
+    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+) -> Tensor:
+    """Bool [...]: the interiors overlap. A broad phase by centre distance first, so
+    that only near pairs cost much.
 
-    Picks the near pairs by index, which waits for the device; where that matters use `separation(...) < 0`.
+    Picks the near pairs by index, which waits for the device; where that matters use
+    `separation(...) < 0`.
     """
     reach = (first_size.norm(dim=-1) + second_size.norm(dim=-1)) / 2
     near = (first[..., :2] - second[..., :2]).square().sum(-1) < reach.square()
@@ -65,20 +82,35 @@ def overlap(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tens
     return near.masked_scatter(near, separation(*picked) < 0)
 
 
-def distance(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
-    """Distance [...] [m] between two boxes, 0 where they overlap; the nearest points include a corner of one."""
-    return signed_distance(first, first_size, second=second, second_size=second_size).clamp(min=0)
+def distance(
+    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+) -> Tensor:
+    """Distance [...] [m] between two boxes, 0 where they overlap; the nearest points
+    include a corner of one."""
+    return signed_distance(
+        first, first_size, second=second, second_size=second_size
+    ).clamp(min=0)
 
 
-def signed_distance(first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor) -> Tensor:
+def signed_distance(
+    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+) -> Tensor:
     """`distance`, with minus the penetration depth where the boxes overlap."""
 
-    def corner_gap(box: Tensor, size: Tensor, other: Tensor, other_size: Tensor) -> Tensor:
-        local = to_frame(corners(other, other_size), box[..., None, :]).abs() - size[..., None, :] / 2
+    def corner_gap(
+        box: Tensor, size: Tensor, other: Tensor, other_size: Tensor
+    ) -> Tensor:
+        local = (
+            to_frame(corners(other, other_size), box[..., None, :]).abs()
+            - size[..., None, :] / 2
+        )
         return local.clamp(min=0).square().sum(-1).amin(-1)
 
     apart = separation(first, first_size, second=second, second_size=second_size)
     squared = torch.minimum(
-        corner_gap(first, first_size, second, second_size), corner_gap(second, second_size, first, first_size)
+        corner_gap(first, first_size, second, second_size),
+        corner_gap(second, second_size, first, first_size),
     )
-    return torch.where(apart < 0, apart, squared.clamp(min=1e-12).sqrt() * (squared > 0))
+    return torch.where(
+        apart < 0, apart, squared.clamp(min=1e-12).sqrt() * (squared > 0)
+    )

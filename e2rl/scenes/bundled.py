@@ -1,7 +1,9 @@
-"""Source of the scenes that come with the package: synthetic traffic on synthetic maps, one archive per split.
+"""Source of the scenes that come with the package: synthetic traffic on synthetic maps,
+one archive per split.
 
-Format e2rl-scenes/1 (npz, readable without pickle; written by tools/scenegen/archive.py): positions in mm, headings in
-1e-4 rad and speeds in mm/s as int32; states as second differences over time, which compress well; ragged parts one
+Format e2rl-scenes/1 (npz, readable without pickle; written by
+tools/scenegen/archive.py): positions in mm, headings in 1e-4 rad and speeds in mm/s as
+int32; states as second differences over time, which compress well; ragged parts one
 after another, with counts.
 """
 
@@ -29,7 +31,9 @@ FORMAT = "e2rl-scenes/1"
 FRAMES = 111
 CURRENT = 10
 MILLI = 1e-3
-UNIT = np.array([MILLI, MILLI, 1e-4, MILLI])  # m, m, rad, m/s per stored step of x, y, heading, speed
+UNIT = np.array(
+    [MILLI, MILLI, 1e-4, MILLI]
+)  # m, m, rad, m/s per stored step of x, y, heading, speed
 MEND = "restore the file from git, or write it again with tools/generate_scenes.py"
 
 
@@ -37,7 +41,8 @@ MEND = "restore the file from git, or write it again with tools/generate_scenes.
 class SceneMap:
     """The map of one synthetic place.
 
-    drivable: polygons; lights: lane id -> [T] states over the whole simulation of the place at 10 Hz.
+    drivable: polygons; lights: lane id -> [T] states over the whole simulation of the
+    place at 10 Hz.
     """
 
     name: str
@@ -46,13 +51,34 @@ class SceneMap:
     lights: dict[str, np.ndarray]
 
     def recording(
-        self, scene_id: str, first: int, states: np.ndarray, valid: np.ndarray, size: np.ndarray, ego: int
+        self,
+        scene_id: str,
+        first: int,
+        states: np.ndarray,
+        valid: np.ndarray,
+        size: np.ndarray,
+        ego: int,
     ) -> Recording:
-        """Returns a recording of vehicles on this map, whose first frame is frame `first` of the lights."""
-        lights = {lane: state[first : first + len(states)] for lane, state in self.lights.items()}
+        """Returns a recording of vehicles on this map, whose first frame is frame
+        `first` of the lights."""
+        lights = {
+            lane: state[first : first + len(states)]
+            for lane, state in self.lights.items()
+        }
         where = (scene_id, self.name, "bundled")
         kind = np.full(len(size), VEHICLE)
-        return Recording(*where, states, valid, size, kind, ego, self.lanes, self.drivable, lights, CURRENT)
+        return Recording(
+            *where,
+            states,
+            valid,
+            size,
+            kind,
+            ego,
+            self.lanes,
+            self.drivable,
+            lights,
+            CURRENT,
+        )
 
 
 @dataclass
@@ -74,26 +100,36 @@ class BundledSource(Source):
 
 
 def asset_bytes(split: str) -> bytes:
-    """Returns the archive of a split; raises InputError where the split is unknown, or its file missing or altered."""
+    """Returns the archive of a split; raises InputError where the split is unknown, or
+    its file missing or altered."""
     if split not in SPLITS:
-        raise InputError(f"split {split!r} of the bundled scenes: expected one of {', '.join(SPLITS)}")
+        raise InputError(
+            f"split {split!r} of the bundled scenes: expected one of {', '.join(SPLITS)}"
+        )
     path = files("e2rl") / "assets" / "scenes" / f"{split}.npz"
     if not path.is_file():
-        raise InputError(f"bundled scenes: {path} is missing; reinstall the package or restore the file from git")
+        raise InputError(
+            f"bundled scenes: {path} is missing; reinstall the package or restore the file from git"
+        )
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != SHA256[split]:
-        raise InputError(f"bundled scenes: {path} is damaged: not what comes with the package; {MEND}")
+        raise InputError(
+            f"bundled scenes: {path} is damaged: not what comes with the package; {MEND}"
+        )
     return content
 
 
 def unpack(split: str) -> dict[str, np.ndarray]:
-    """Returns the arrays of a split's archive; raises InputError where they are damaged or of another format."""
+    """Returns the arrays of a split's archive; raises InputError where they are damaged
+    or of another format."""
     try:
         arrays = read_arrays(io.BytesIO(asset_bytes(split)))
         if str(arrays.get("format")) != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
     except ValueError as error:
-        raise InputError(f"bundled scenes {split}: damaged ({error}); {MEND}") from error
+        raise InputError(
+            f"bundled scenes {split}: damaged ({error}); {MEND}"
+        ) from error
     return arrays
 
 
@@ -102,11 +138,20 @@ def _split(values: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
 
 
 def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
-    """Returns the maps of an archive; what is parked there is among the tracks of recordings."""
+    """Returns the maps of an archive; what is parked there is among the tracks of
+    recordings."""
     ids = [str(name) for name in arrays["lane_id"]]
     centrelines = _split(arrays["lane_points"] * MILLI, arrays["lane_counts"])
-    rows = zip(centrelines, arrays["lane_width"] * MILLI, arrays["lane_speed"] * MILLI, strict=True)
-    lanes = [Lane(points, float(width), speed_limit=float(speed)) for points, width, speed in rows]
+    rows = zip(
+        centrelines,
+        arrays["lane_width"] * MILLI,
+        arrays["lane_speed"] * MILLI,
+        strict=True,
+    )
+    lanes = [
+        Lane(points, float(width), speed_limit=float(speed))
+        for points, width, speed in rows
+    ]
     for kind in ("exits", "left", "right"):
         for a, b in arrays[kind]:
             getattr(lanes[a], kind).append(ids[b])
@@ -120,7 +165,10 @@ def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
             str(name),
             {ids[k]: lanes[k] for k in own["lanes"][m]},
             drivable=[polygons[k] for k in own["polygons"][m]],
-            lights={ids[arrays["light_lane"][k]]: arrays["light_states"][k] for k in own["lights"][m]},
+            lights={
+                ids[arrays["light_lane"][k]]: arrays["light_states"][k]
+                for k in own["lights"][m]
+            },
         )
         for m, name in enumerate(arrays["map_name"])
     ]
@@ -133,14 +181,25 @@ def read_recordings(arrays: dict[str, np.ndarray]) -> list[Recording]:
     states = np.cumsum(np.cumsum(arrays["states"], axis=1), axis=1) * UNIT
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
     states[~arrays["valid"]] = 0.0
-    scenes = [arrays[key] for key in ("scene_id", "scene_map", "scene_first", "scene_ego")]
-    tracks = [_split(values, counts) for values in (states, arrays["valid"], arrays["size"] * MILLI)]
+    scenes = [
+        arrays[key] for key in ("scene_id", "scene_map", "scene_first", "scene_ego")
+    ]
+    tracks = [
+        _split(values, counts)
+        for values in (states, arrays["valid"], arrays["size"] * MILLI)
+    ]
     return [
-        maps[index].recording(str(scene_id), first, states.swapaxes(0, 1), valid.T, size, int(ego))
-        for scene_id, index, first, ego, states, valid, size in zip(*scenes, *tracks, strict=True)
+        maps[index].recording(
+            str(scene_id), first, states.swapaxes(0, 1), valid.T, size, int(ego)
+        )
+        for scene_id, index, first, ego, states, valid, size in zip(
+            *scenes, *tracks, strict=True
+        )
     ]
 
 
 @lru_cache(maxsize=1)
 def _recordings_by_id(split: str) -> dict[str, Recording]:
-    return {recording.scene_id: recording for recording in read_recordings(unpack(split))}
+    return {
+        recording.scene_id: recording for recording in read_recordings(unpack(split))
+    }

@@ -1,9 +1,11 @@
-"""Source of CommonRoad scenarios: XML files of format 2018b and 2020a, read by commonroad-io (extra `commonroad`).
+"""Source of CommonRoad scenarios: XML files of format 2018b and 2020a, read by
+commonroad-io (extra `commonroad`).
 
-The ego is the obstacle that stands where a planning problem starts. Most scenarios have none there, since their authors
-took the vehicle out to plan for it: then the ego is the vehicle, recorded at the start frame, that moves for the most
-frames, of several the one that drives farthest. Of a long scenario, which makes several scenes, each has an ego of its
-own, which is chosen by its simulated steps.
+The ego is the obstacle that stands where a planning problem starts. Most scenarios have
+none there, since their authors took the vehicle out to plan for it: then the ego is the
+vehicle, recorded at the start frame, that moves for the most frames, of several the one
+that drives farthest. Of a long scenario, which makes several scenes, each has an ego of
+its own, which is chosen by its simulated steps.
 """
 
 import io
@@ -19,7 +21,17 @@ import numpy as np
 from e2rl.run.errors import InputError
 from e2rl.scenes.log_files import LogFiles, bounded_memory
 from e2rl.scenes.plausibility import check
-from e2rl.scenes.recording import CYCLIST, DT, HISTORY, OTHER, PEDESTRIAN, VEHICLE, Lane, Recording, light_colour
+from e2rl.scenes.recording import (
+    CYCLIST,
+    DT,
+    HISTORY,
+    OTHER,
+    PEDESTRIAN,
+    VEHICLE,
+    Lane,
+    Recording,
+    light_colour,
+)
 from e2rl.scenes.smoothing import FRAME_STEPS, latest_frames, resample_uniform
 
 TYPES = {  # by the name of an ObstacleType
@@ -27,12 +39,34 @@ TYPES = {  # by the name of an ObstacleType
     **dict.fromkeys(["priorityVehicle", "parkedVehicle"], VEHICLE),
     **{"bicycle": CYCLIST, "pedestrian": PEDESTRIAN},
 }
-PAVED = {"shoulder", "busLane"}  # LaneletTypes on which a car does not drive, though it could
-FOR_OTHERS = {*PAVED, "sidewalk", "crosswalk", "bicycleLane", "busStop", "border", "parking"}
+PAVED = {
+    "shoulder",
+    "busLane",
+}  # LaneletTypes on which a car does not drive, though it could
+FOR_OTHERS = {
+    *PAVED,
+    "sidewalk",
+    "crosswalk",
+    "bicycleLane",
+    "busStop",
+    "border",
+    "parking",
+}
 FOR_OTHERS |= {"restricted", "restricted_area"}
 CARS = {"vehicle", "car"}  # RoadUsers
 MOVES, NEAR = 0.5, 1.0  # m/s, m: a vehicle that moves; from a planning problem's start
-NUMBERS = {"x", "y", "z", "exact", "intervalStart", "intervalEnd", "length", "width", "radius", "orientation"}
+NUMBERS = {
+    "x",
+    "y",
+    "z",
+    "exact",
+    "intervalStart",
+    "intervalEnd",
+    "length",
+    "width",
+    "radius",
+    "orientation",
+}
 MAX_DEPTH, LARGEST_ANGLE = 32, 1000.0  # elements; rad
 STEPS = 80  # simulated steps of a scene, by default
 
@@ -41,7 +75,8 @@ STEPS = 80  # simulated steps of a scene, by default
 class CommonRoadSource(LogFiles):
     """The CommonRoad scenarios (*.xml) in a folder or zip.
 
-    A scenario that leaves less than half of the simulated steps after its start frame, the tenth, makes no scene.
+    A scenario that leaves less than half of the simulated steps after its start frame,
+    the tenth, makes no scene.
     """
 
     holds = "CommonRoad scenarios"
@@ -51,13 +86,20 @@ class CommonRoadSource(LogFiles):
 
     def read(self, log: str) -> Iterator[Recording]:
         with bounded_memory():
-            recording = read_scenario(self.content(log), self.starts, steps=self.build.steps)
-        if len(recording.states) - self.build.steps // 2 >= min(self.starts or (HISTORY,)):
+            recording = read_scenario(
+                self.content(log), self.starts, steps=self.build.steps
+            )
+        if len(recording.states) - self.build.steps // 2 >= min(
+            self.starts or (HISTORY,)
+        ):
             yield recording
 
 
-def read_scenario(content: bytes, starts: Sequence[int] | None = None, steps: int = STEPS) -> Recording:
-    """Returns the recording in an XML file at 10 Hz, with an ego for each window that has a vehicle at its start.
+def read_scenario(
+    content: bytes, starts: Sequence[int] | None = None, steps: int = STEPS
+) -> Recording:
+    """Returns the recording in an XML file at 10 Hz, with an ego for each window that
+    has a vehicle at its start.
 
     Args:
         content: of the file.
@@ -69,23 +111,32 @@ def read_scenario(content: bytes, starts: Sequence[int] | None = None, steps: in
 
     _check_content(content)
     scenario, problems = XMLFileReader(io.BytesIO(content)).open()
-    recording, begun = _recording(scenario, list(problems.planning_problem_dict.values()))
+    recording, begun = _recording(
+        scenario, list(problems.planning_problem_dict.values())
+    )
     present = recording.valid & (recording.agent_type == VEHICLE)
     frames = recording.start_frames(starts, steps) or [HISTORY]
     for start in frames:
         span = slice(start, start + steps + 1) if len(frames) > 1 else slice(None)
         there = present[min(start, len(present) - 1)]
-        recording.egos[start] = _ego(recording.states[span], present[span], there=there, begun=begun)
-    return replace(recording, ego=next((ego for ego in recording.egos.values() if ego >= 0), -1))
+        recording.egos[start] = _ego(
+            recording.states[span], present[span], there=there, begun=begun
+        )
+    return replace(
+        recording, ego=next((ego for ego in recording.egos.values() if ego >= 0), -1)
+    )
 
 
 def _check_content(content: bytes) -> None:
-    """Raise InputError for a document type, as scenarios have none, and it may name files or grow when it is expanded;
-    for deep nesting; and for numbers that are infinite, NaN, or no angles, with which commonroad-io would not end."""
+    """Raise InputError for a document type, as scenarios have none, and it may name
+    files or grow when it is expanded; for deep nesting; and for numbers that are
+    infinite, NaN, or no angles, with which commonroad-io would not end."""
     opened: list[str] = []
 
     def refuse(*_: object) -> None:
-        raise InputError("holds a document type declaration, which no CommonRoad scenario needs; remove it")
+        raise InputError(
+            "holds a document type declaration, which no CommonRoad scenario needs; remove it"
+        )
 
     def begin(name: str, _: object) -> None:
         opened.append(name)
@@ -97,7 +148,9 @@ def _check_content(content: bytes) -> None:
             most = LARGEST_ANGLE if "orientation" in opened[-2:] else inf
             number = float(value)
             if not (isfinite(number) and abs(number) <= most):
-                raise InputError(f"{'/'.join(opened[-3:])} is {value.strip()[:40]}; repair it")
+                raise InputError(
+                    f"{'/'.join(opened[-3:])} is {value.strip()[:40]}; repair it"
+                )
 
     parser = expat.ParserCreate()
     parser.buffer_text = True  # a text comes whole
@@ -109,10 +162,13 @@ def _check_content(content: bytes) -> None:
 
 
 def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
-    """Returns the recording, still without an ego, and the tracks that begin where a planning problem does."""
+    """Returns the recording, still without an ego, and the tracks that begin where a
+    planning problem does."""
     low, high = FRAME_STEPS
     if not low <= scenario.dt <= high:
-        raise InputError(f"timeStepSize={scenario.dt:g}: expected {low:g} to {high:g} s; repair it")
+        raise InputError(
+            f"timeStepSize={scenario.dt:g}: expected {low:g} to {high:g} s; repair it"
+        )
     obstacles = [*scenario.dynamic_obstacles, *scenario.static_obstacles]
     tracks = [_states(obstacle) for obstacle in scenario.dynamic_obstacles]
     if not tracks:
@@ -130,8 +186,13 @@ def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
         for state in tracks[index] if moves else [obstacle.initial_state]:
             at = state.time_step - first if moves else slice(None)
             states[at, index], valid[at, index] = _state(state, boxes[index][1]), True
-    kinds = np.array([TYPES.get(obstacle.obstacle_type.value, OTHER) for obstacle in obstacles])
-    started = [_started(problem.initial_state, states, valid=valid, first=first) for problem in problems]
+    kinds = np.array(
+        [TYPES.get(obstacle.obstacle_type.value, OTHER) for obstacle in obstacles]
+    )
+    started = [
+        _started(problem.initial_state, states, valid=valid, first=first)
+        for problem in problems
+    ]
     seconds = np.arange(count) * scenario.dt
     states, valid = resample_uniform(states, valid, ts=seconds)
     lanes, drivable = _map(scenario.lanelet_network)
@@ -154,35 +215,51 @@ def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
 
 
 def _states(obstacle: Any) -> list:
-    """The states of a dynamic obstacle in order; raises InputError where its motion is no trajectory."""
+    """The states of a dynamic obstacle in order; raises InputError where its motion is
+    no trajectory."""
     trajectory = getattr(obstacle.prediction, "trajectory", None)
     if obstacle.prediction is not None and trajectory is None:
-        raise InputError(f"obstacle {obstacle.obstacle_id} has occupancy sets, no trajectory; leave it out")
+        raise InputError(
+            f"obstacle {obstacle.obstacle_id} has occupancy sets, no trajectory; leave it out"
+        )
     return [obstacle.initial_state, *(trajectory.state_list if trajectory else ())]
 
 
 def _state(state: Any, offset: np.ndarray) -> list[float]:
-    """x, y of the box's middle, heading and speed; raises InputError where they are intervals."""
+    """x, y of the box's middle, heading and speed; raises InputError where they are
+    intervals."""
     if state.is_uncertain_position or state.is_uncertain_orientation:
-        raise InputError(f"a state at time step {state.time_step} is uncertain; give exact positions and orientations")
+        raise InputError(
+            f"a state at time step {state.time_step} is uncertain; give exact positions and orientations"
+        )
     cos = np.cos(state.orientation)
     sin = np.sin(state.orientation)
     x, y = state.position[:2] + np.array([[cos, -sin], [sin, cos]]) @ offset
-    given = vars(state)  # of some kinds of state velocity_y is a second component, of others only derived
+    given = vars(
+        state
+    )  # of some kinds of state velocity_y is a second component, of others only derived
     along = given.get("velocity") or 0.0
     speed = np.copysign(np.hypot(along, given.get("velocity_y") or 0.0), along)
     return [x, y, state.orientation, float(speed)]
 
 
 def _box(shape: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Length and width [2] of the box around a shape, and its middle [2] seen from the shape's origin."""
+    """Length and width [2] of the box around a shape, and its middle [2] seen from the
+    shape's origin."""
     pose = SimpleNamespace(position=np.zeros(2), orientation=0.0, hitch=0.0)
-    left, low, right, high = shape.compute_occupancy_for_state(pose).shapely_object.bounds
-    return np.array([right - left, high - low]), np.array([(left + right) / 2, (low + high) / 2])
+    left, low, right, high = shape.compute_occupancy_for_state(
+        pose
+    ).shapely_object.bounds
+    return np.array([right - left, high - low]), np.array(
+        [(left + right) / 2, (low + high) / 2]
+    )
 
 
-def _started(begin: Any, states: np.ndarray, valid: np.ndarray, first: int) -> int | None:
-    """The track nearest to a planning problem's initial state, None where none is within NEAR."""
+def _started(
+    begin: Any, states: np.ndarray, valid: np.ndarray, first: int
+) -> int | None:
+    """The track nearest to a planning problem's initial state, None where none is
+    within NEAR."""
     frame = begin.time_step - first
     if not 0 <= frame < len(states):
         return None
@@ -191,13 +268,17 @@ def _started(begin: Any, states: np.ndarray, valid: np.ndarray, first: int) -> i
     return int(away.argmin()) if away.min() < NEAR else None
 
 
-def _ego(states: np.ndarray, present: np.ndarray, there: np.ndarray, begun: list[int]) -> int:
+def _ego(
+    states: np.ndarray, present: np.ndarray, there: np.ndarray, begun: list[int]
+) -> int:
     """Returns the ego's track in a window; -1 where no vehicle is there at its start.
 
-    One of `begun`, else the vehicle that moves for the most frames, of several the one that drives farthest.
+    One of `begun`, else the vehicle that moves for the most frames, of several the one
+    that drives farthest.
 
     Args:
-        states: [F, A, 4] of the simulated steps; of the whole log, where it makes one scene.
+        states: [F, A, 4] of the simulated steps; of the whole log, where it makes one
+            scene.
         present: [F, A] bool, the vehicles that are there.
         there: [A] bool, those at the start frame.
         begun: tracks that begin where a planning problem does.
@@ -215,7 +296,13 @@ def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
     drivable = []
     for lanelet in network.lanelets:
         kinds = FOR_OTHERS & {kind.value for kind in lanelet.lanelet_type or ()}
-        users = {user.value for user in (*(lanelet.user_one_way or ()), *(lanelet.user_bidirectional or ()))}
+        users = {
+            user.value
+            for user in (
+                *(lanelet.user_one_way or ()),
+                *(lanelet.user_bidirectional or ()),
+            )
+        }
         left = lanelet.left_vertices[:, :2]
         right = lanelet.right_vertices[:, :2]
         if kinds <= PAVED:
@@ -235,24 +322,46 @@ def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
 
 def _speed_limit(network: Any, lanelet: Any) -> float:
     """The lowest limit [m/s] of a lanelet's traffic signs, 0 for none."""
-    signs = (network.find_traffic_sign_by_id(sign) for sign in lanelet.traffic_signs or ())
-    elements = (element for sign in signs if sign is not None for element in sign.traffic_sign_elements)
+    signs = (
+        network.find_traffic_sign_by_id(sign) for sign in lanelet.traffic_signs or ()
+    )
+    elements = (
+        element
+        for sign in signs
+        if sign is not None
+        for element in sign.traffic_sign_elements
+    )
     limits = [
         float(element.additional_values[0])
         for element in elements
-        if element.traffic_sign_element_id.name == "MAX_SPEED" and element.additional_values
+        if element.traffic_sign_element_id.name == "MAX_SPEED"
+        and element.additional_values
     ]
     return min(limits, default=0.0)
 
 
-def _lights(network: Any, lanes: dict[str, Lane], steps: np.ndarray) -> dict[str, np.ndarray]:
-    """Light states [F] at time steps [F], by the lanes that the light lets in: the successors of the lanelet at whose
-    end it stands. A lanelet with several lights is left out, since each may be for another direction."""
+def _lights(
+    network: Any, lanes: dict[str, Lane], steps: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Light states [F] at time steps [F], by the lanes that the light lets in: the
+    successors of the lanelet at whose end it stands. A lanelet with several lights is
+    left out, since each may be for another direction."""
     lights: dict[str, np.ndarray] = {}
     for lanelet in network.lanelets:
-        light = network.find_traffic_light_by_id(*lanelet.traffic_lights) if len(lanelet.traffic_lights) == 1 else None
+        light = (
+            network.find_traffic_light_by_id(*lanelet.traffic_lights)
+            if len(lanelet.traffic_lights) == 1
+            else None
+        )
         if light is None or not light.active or light.traffic_light_cycle is None:
             continue
-        cycle = [light_colour(light.get_state_at_time_step(int(step)).value) for step in steps]
-        lights |= {str(lane): np.array(cycle, np.int8) for lane in lanelet.successor if str(lane) in lanes}
+        cycle = [
+            light_colour(light.get_state_at_time_step(int(step)).value)
+            for step in steps
+        ]
+        lights |= {
+            str(lane): np.array(cycle, np.int8)
+            for lane in lanelet.successor
+            if str(lane) in lanes
+        }
     return lights

@@ -1,4 +1,5 @@
-"""The drivable area as a field, metres beyond its border on a 1 m grid, and its look-up (docs/method.md, section 1)."""
+"""The drivable area as a field, metres beyond its border on a 1 m grid, and its look-up
+(docs/method.md, section 1)."""
 
 import numpy as np
 import torch
@@ -16,21 +17,26 @@ SEAM = 0.2  # m from the borders of two polygons within which what lies between 
 class DrivableArea:
     """The drivable area of a log, of which scenes have fields.
 
-    A point is off the road when it lies outside every polygon and farther than half the width + MARGIN from every lane
-    centreline. Polygons that adjoin with a seam, as many maps draw them, are one: cells within SEAM of two are inside.
+    A point is off the road when it lies outside every polygon and farther than half the
+    width + MARGIN from every lane centreline. Polygons that adjoin with a seam, as many
+    maps draw them, are one: cells within SEAM of two are inside.
     """
 
-    def __init__(self, lines: list[np.ndarray], widths: np.ndarray, polygons: list[np.ndarray]) -> None:
+    def __init__(
+        self, lines: list[np.ndarray], widths: np.ndarray, polygons: list[np.ndarray]
+    ) -> None:
         """lines: of lanes, points every 1 m; widths [lanes] m; polygons: [P, 2] each."""
         self.lanes = LaneCover(lines, widths)
         self.polygons = polygons
 
-    def field(self, origin: np.ndarray, center: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
-        """Field [cells, cells] float16 of m beyond the border (negative inside) around center [2] m from the scene's
-        origin [2], and the centre [2] of its cell (0, 0).
+    def field(
+        self, origin: np.ndarray, center: np.ndarray, cells: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Field [cells, cells] float16 of m beyond the border (negative inside) around
+        center [2] m from the scene's origin [2], and the centre [2] of its cell (0, 0).
 
-        Outside the field is exact to 0.1 m (the points' spacing, widths in steps of 0.1 m); inside it is at most the
-        depth, since each shape is taken by itself.
+        Outside the field is exact to 0.1 m (the points' spacing, widths in steps of 0.1
+        m); inside it is at most the depth, since each shape is taken by itself.
         """
         corner = center - (cells - 1) / 2 * CELL
         x, y = corner[:, None] + np.arange(cells) * CELL
@@ -43,18 +49,28 @@ class DrivableArea:
         return field.astype(np.float16), corner
 
 
-def _near(x: np.ndarray, y: np.ndarray, points: np.ndarray, reach: float) -> tuple[slice, slice]:
-    """The cells, at x [G] and y [G], within `reach` m of the bounding box of points [P, 2]."""
+def _near(
+    x: np.ndarray, y: np.ndarray, points: np.ndarray, reach: float
+) -> tuple[slice, slice]:
+    """The cells, at x [G] and y [G], within `reach` m of the bounding box of points [P,
+    2]."""
     ends = zip((x, y), points.min(0) - reach, points.max(0) + reach, strict=True)
-    rows, columns = (slice(*np.searchsorted(axis, [low, np.nextafter(high, np.inf)])) for axis, low, high in ends)
+    rows, columns = (
+        slice(*np.searchsorted(axis, [low, np.nextafter(high, np.inf)]))
+        for axis, low, high in ends
+    )
     return rows, columns
 
 
-def _lower(field: np.ndarray, near: np.ndarray, x: np.ndarray, y: np.ndarray, ring: np.ndarray) -> None:
-    """Lower the field [G, G] of cells at x [G], y [G] to the distance beyond a polygon [P, 2], and count in `near`
-    [G, G] the cells within SEAM of its border, both in place.
+def _lower(
+    field: np.ndarray, near: np.ndarray, x: np.ndarray, y: np.ndarray, ring: np.ndarray
+) -> None:
+    """Lower the field [G, G] of cells at x [G], y [G] to the distance beyond a polygon
+    [P, 2], and count in `near` [G, G] the cells within SEAM of its border, both in
+    place.
 
-    The distance from a tile's middle bounds that of its cells, so cells outside which cannot change are not searched.
+    The distance from a tile's middle bounds that of its cells, so cells outside which
+    cannot change are not searched.
     """
     rows, columns = _near(x, y, points=ring, reach=FAR)
     part = field[rows, columns]
@@ -69,7 +85,9 @@ def _lower(field: np.ndarray, near: np.ndarray, x: np.ndarray, y: np.ndarray, ri
     least = least.repeat(TILE, 0).repeat(TILE, 1)[: len(x), : len(y)]
     inside = np.zeros(part.shape, bool)
     box = _near(x, y, points=ring, reach=0.0)
-    inside[box] = Path(ring).contains_points(cell[box].reshape(-1, 2)).reshape(inside[box].shape)
+    inside[box] = (
+        Path(ring).contains_points(cell[box].reshape(-1, 2)).reshape(inside[box].shape)
+    )
     change = inside | (least < part)
     border = _border_distance(dense, tree, points=cell[change])
     part[change] = np.minimum(part[change], np.where(inside[change], -border, border))
@@ -80,30 +98,46 @@ def _dense(ring: np.ndarray) -> np.ndarray:
     """A closed ring [P, 2] with points at most DENSE apart."""
     side = np.concatenate([ring[1:], ring[:1]]) - ring
     count = np.maximum(np.ceil(np.sqrt(np.vecdot(side, side)) / DENSE), 1).astype(int)
-    share = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count, count)
+    share = (
+        np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    ) / np.repeat(count, count)
     return np.repeat(ring, count, 0) + share[:, None] * np.repeat(side, count, 0)
 
 
-def _border_distance(dense: np.ndarray, tree: cKDTree, points: np.ndarray) -> np.ndarray:
-    """Distance [Q] of points [Q, 2] from a closed ring: to the two segments that meet at its nearest dense vertex."""
+def _border_distance(
+    dense: np.ndarray, tree: cKDTree, points: np.ndarray
+) -> np.ndarray:
+    """Distance [Q] of points [Q, 2] from a closed ring: to the two segments that meet
+    at its nearest dense vertex."""
     index = tree.query(points)[1]
     best = np.full(len(points), np.inf)
-    for a, b in ((dense[index - 1], dense[index]), (dense[index], dense[(index + 1) % len(dense)])):
+    for a, b in (
+        (dense[index - 1], dense[index]),
+        (dense[index], dense[(index + 1) % len(dense)]),
+    ):
         along = b - a
         t = ((points - a) * along).sum(1) / np.maximum((along**2).sum(1), 1e-12)
-        best = np.minimum(best, np.linalg.norm(points - a - np.clip(t, 0, 1)[:, None] * along, axis=1))
+        best = np.minimum(
+            best, np.linalg.norm(points - a - np.clip(t, 0, 1)[:, None] * along, axis=1)
+        )
     return best
 
 
-def off_road(points: Tensor, field: Tensor, origin: Tensor, row: Tensor | None = None) -> Tensor:
-    """Metres [B, ...] that points [B, ..., 2] lie beyond the drivable border; negative inside.
+def off_road(
+    points: Tensor, field: Tensor, origin: Tensor, row: Tensor | None = None
+) -> Tensor:
+    """Metres [B, ...] that points [B, ..., 2] lie beyond the drivable border; negative
+    inside.
 
-    field [B, G, G]: value at cells of CELL m, first index along x; origin [B, 2]: centre of cell (0, 0). Bilinear
-    between cell centres, FAR outside the grid. row [B] int64: which rows of larger field and origin the points are on;
-    default: each its own. Differentiable in the points; the cost does not depend on them.
+    field [B, G, G]: value at cells of CELL m, first index along x; origin [B, 2]:
+    centre of cell (0, 0). Bilinear between cell centres, FAR outside the grid. row [B]
+    int64: which rows of larger field and origin the points are on; default: each its
+    own. Differentiable in the points; the cost does not depend on them.
     """
     row = torch.arange(points.shape[0], device=points.device) if row is None else row
-    return off_road_rows(points.flatten(1, -2), field, origin, row).view(points.shape[:-1])
+    return off_road_rows(points.flatten(1, -2), field, origin, row).view(
+        points.shape[:-1]
+    )
 
 
 @fused("R K 2", "F G G:float16", "F 2", "R:int64")
@@ -115,7 +149,9 @@ def off_road_rows(points: Tensor, field: Tensor, origin: Tensor, row: Tensor) ->
     low = cell.detach().floor().clamp(0, cells - 2)
     share = (cell - low).clamp(0, 1)
     index = (low[..., 0] * cells + low[..., 1]).long() + row[:, None] * cells**2
-    four = index[..., None] + torch.arange(2, device=index.device) * cells  # rows x and x + 1 of the cell
+    four = (
+        index[..., None] + torch.arange(2, device=index.device) * cells
+    )  # rows x and x + 1 of the cell
     four = four[..., None] + torch.arange(2, device=index.device)
     value = field.flatten()[four].to(points.dtype)
     sx = share[..., 0]
@@ -135,6 +171,10 @@ def off_road_at(x: Tensor, y: Tensor, field: Tensor, origin: Tensor) -> Tensor:
     sx = (x - low_x).clamp(0, 1)
     sy = (y - low_y).clamp(0, 1)
     first, second, third, fourth = (
-        values.gather(1, index + row * cells + column).to(x.dtype) for row in (0, 1) for column in (0, 1)
+        values.gather(1, index + row * cells + column).to(x.dtype)
+        for row in (0, 1)
+        for column in (0, 1)
     )
-    return torch.lerp(torch.lerp(first, second, sy), torch.lerp(third, fourth, sy), sx).masked_fill(outside, FAR)
+    return torch.lerp(
+        torch.lerp(first, second, sy), torch.lerp(third, fourth, sy), sx
+    ).masked_fill(outside, FAR)

@@ -1,7 +1,8 @@
 """Headings of recorded tracks, mended from motion and neighbours.
 
-Detectors take the front of a box for its back, lose its direction for some frames, and let what stands turn. A box is
-the same turned by pi, and no vehicle turns while it stands or faster than it can be steered.
+Detectors take the front of a box for its back, lose its direction for some frames, and
+let what stands turn. A box is the same turned by pi, and no vehicle turns while it
+stands or faster than it can be steered.
 """
 
 import numpy as np
@@ -12,17 +13,29 @@ from e2rl.scenes.recording import DT, HIDDEN, PEDESTRIAN
 
 MAX_STEP = 5.0  # m from one frame to the next; more is a jump
 HALF = 3  # frames before and after over which the direction of motion is taken
-STRAIGHT = 0.8  # of the path driven in this time: the least displacement that has a direction
+STRAIGHT = (
+    0.8  # of the path driven in this time: the least displacement that has a direction
+)
 MOVES, BACKWARDS = 0.5, 5.0  # m/s: has a direction; up to which a vehicle may reverse
 AGAINST = 0.5  # cosine between heading and motion, beyond which they agree or disagree
-# In rad of turning from one frame to the next. Of a slow vehicle at least a fifth of the headings must point forwards
-# for all to be turned forwards, (1 - SLOW / TURNED) / 2; with fewer it reverses, and these few are wrong.
+# In rad of turning from one frame to the next. Of a slow vehicle at least a fifth of
+# the headings must point forwards for all to be turned forwards, (1 - SLOW / TURNED) /
+# 2; with fewer it reverses, and these few are wrong.
 FAST_COST = 1.0  # of a frame of fast motion backwards
-SLOW_COST, SLOW = 0.02, 1.0  # of a frame of slow motion backwards; of all of a track at most
-TURNED_COST, TURNED = 0.1, 1.67  # of a frame that is turned round; of all of a track at most
+SLOW_COST, SLOW = (
+    0.02,
+    1.0,
+)  # of a frame of slow motion backwards; of all of a track at most
+TURNED_COST, TURNED = (
+    0.1,
+    1.67,
+)  # of a frame that is turned round; of all of a track at most
 CONVENTION = 3  # tracks turned as a whole, and more than half of those that are fast, are no fault of single tracks
 SPIKES = ((7, 0.35), (21, 1.0))  # frames of a median filter, rad from it
-WINDOW, STANDS = 11, 0.15  # frames; m/s of the line through their positions, below which a vehicle stands
+WINDOW, STANDS = (
+    11,
+    0.15,
+)  # frames; m/s of the line through their positions, below which a vehicle stands
 APART = 1.0  # m between two frames at which a vehicle stands at two places
 NEIGHBOURS = 5  # moving frames beside a stop that say its heading
 LOST = 10  # frames without the track, beyond which such neighbours say nothing
@@ -30,10 +43,14 @@ CLUSTER = 0.15  # rad about the heading that most frames of a standing vehicle a
 HELD = 0.1  # rad that a heading must turn while it stands to count as repaired
 
 
-def mend_headings(states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray) -> tuple[np.ndarray, dict[str, int]]:
-    """Returns tracks whose headings are neither turned round nor spiked, and the count of mended tracks by a phrase.
+def mend_headings(
+    states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray
+) -> tuple[np.ndarray, dict[str, int]]:
+    """Returns tracks whose headings are neither turned round nor spiked, and the count
+    of mended tracks by a phrase.
 
-    The sign of a speed turns with its heading. Pedestrians, who turn on the spot, keep theirs.
+    The sign of a speed turns with its heading. Pedestrians, who turn on the spot, keep
+    theirs.
 
     Args:
         states: tracks at 10 Hz [F, A, 4]: x, y [m], heading [rad], signed speed [m/s].
@@ -46,15 +63,22 @@ def mend_headings(states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray)
     states[..., 2] = np.where(turned, wrap(states[..., 2] + np.pi), states[..., 2])
     states[..., 3] = np.where(turned, -states[..., 3], states[..., 3])
     spiked = _interpolate_spikes(states, valid & rides)
-    counts = {"headings turned round": int(turned.any(0).sum()), "heading spikes": spiked}
+    counts = {
+        "headings turned round": int(turned.any(0).sum()),
+        "heading spikes": spiked,
+    }
     return states, {phrase: count for phrase, count in counts.items() if count}
 
 
-def hold_headings(states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray) -> tuple[np.ndarray, int]:
-    """Returns tracks whose headings do not change while they stand, and the number of tracks that this turns by HELD.
+def hold_headings(
+    states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Returns tracks whose headings do not change while they stand, and the number of
+    tracks that this turns by HELD.
 
-    A heading passes from that before the stop to that after it; at an end of a track it is the other one, and where
-    a track only stands, the one that most of its frames agree on.
+    A heading passes from that before the stop to that after it; at an end of a track it
+    is the other one, and where a track only stands, the one that most of its frames
+    agree on.
 
     Args:
         states: tracks at 10 Hz [F, A, 4], already of `mend_headings`.
@@ -67,15 +91,23 @@ def hold_headings(states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray)
     for agent in np.flatnonzero(standing.any(0)):
         frames = np.flatnonzero(valid[:, agent])
         heading = np.unwrap(states[frames, agent, 2])
-        held = _held(frames, heading, standing=standing[frames, agent], position=states[frames, agent, :2])
-        out[frames, agent, 2] = np.where(standing[frames, agent], wrap(held), states[frames, agent, 2])
+        held = _held(
+            frames,
+            heading,
+            standing=standing[frames, agent],
+            position=states[frames, agent, :2],
+        )
+        out[frames, agent, 2] = np.where(
+            standing[frames, agent], wrap(held), states[frames, agent, 2]
+        )
         count += bool((np.abs(held - heading) > HELD).any())
     return out, count
 
 
 def standing_frames(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Returns whether tracks [F, A, 2] stand [F, A]: in WINDOW frames about then, or in all that there are on end, the
-    line through their positions has a slope of at most STANDS."""
+    """Returns whether tracks [F, A, 2] stand [F, A]: in WINDOW frames about then, or in
+    all that there are on end, the line through their positions has a slope of at most
+    STANDS."""
     standing = np.zeros(valid.shape, bool)
     edge = np.diff(np.pad(valid.T, ((0, 0), (1, 1))).astype(np.int8))
     agent, start = np.nonzero(edge == 1)
@@ -86,10 +118,16 @@ def standing_frames(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
         velocity = np.einsum("k,krc->rc", _slope(frames), position[at, agent[runs]])
         standing[at, agent[runs]] = np.linalg.norm(velocity, axis=-1) < STANDS
     if len(valid) >= WINDOW:
-        origin = np.where(valid, position[..., 0], np.inf).min(0), np.where(valid, position[..., 1], np.inf).min(0)
+        origin = (
+            np.where(valid, position[..., 0], np.inf).min(0),
+            np.where(valid, position[..., 1], np.inf).min(0),
+        )
         place = np.where(valid[..., None], position - np.stack(origin, -1), 0.0)
         velocity = convolve1d(place, _slope(WINDOW)[::-1], axis=0, mode="constant")
-        whole = convolve1d(valid.astype(int), np.ones(WINDOW, int), axis=0, mode="constant") == WINDOW
+        whole = (
+            convolve1d(valid.astype(int), np.ones(WINDOW, int), axis=0, mode="constant")
+            == WINDOW
+        )
         slow = whole & (np.linalg.norm(velocity, axis=-1) < STANDS)
         standing |= maximum_filter1d(slow, WINDOW, axis=0, mode="constant")
     return standing
@@ -101,8 +139,11 @@ def _slope(frames: int) -> np.ndarray:
     return time / (time**2).sum()
 
 
-def _held(frames: np.ndarray, heading: np.ndarray, standing: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """The headings [K] of a track at its valid frames [K], held where it stands [K]; heading [K]: without wraps."""
+def _held(
+    frames: np.ndarray, heading: np.ndarray, standing: np.ndarray, position: np.ndarray
+) -> np.ndarray:
+    """The headings [K] of a track at its valid frames [K], held where it stands [K];
+    heading [K]: without wraps."""
     held = heading.copy()
     away = np.linalg.norm(np.diff(position, axis=0), axis=-1) > APART
     edges = np.flatnonzero(np.diff(standing) | away) + 1
@@ -124,36 +165,55 @@ def _held(frames: np.ndarray, heading: np.ndarray, standing: np.ndarray, positio
 
 
 def _agreed(heading: np.ndarray) -> float:
-    """The median of the headings [K] within CLUSTER of the one, the earliest, that most are near to."""
+    """The median of the headings [K] within CLUSTER of the one, the earliest, that most
+    are near to."""
     ordered = np.sort(heading)
-    near = np.searchsorted(ordered, heading + CLUSTER, side="right") - np.searchsorted(ordered, heading - CLUSTER)
-    return float(np.median(heading[np.abs(heading - heading[near.argmax()]) <= CLUSTER]))
+    near = np.searchsorted(ordered, heading + CLUSTER, side="right") - np.searchsorted(
+        ordered, heading - CLUSTER
+    )
+    return float(
+        np.median(heading[np.abs(heading - heading[near.argmax()]) <= CLUSTER])
+    )
 
 
 def _motion(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Mean velocities [F, A, 2] m/s over HALF frames to both sides, 0 where these have no one direction; the recorded
-    ones of a frame that stands alone."""
+    """Mean velocities [F, A, 2] m/s over HALF frames to both sides, 0 where these have
+    no one direction; the recorded ones of a frame that stands alone."""
     step = np.diff(states[..., :2], axis=0)
     length = np.linalg.norm(step, axis=-1)
     known = valid[1:] & valid[:-1] & (length <= MAX_STEP)
-    columns = np.concatenate([np.where(known[..., None], step, 0.0), np.where(known, length, 0.0)[..., None]], -1)
+    columns = np.concatenate(
+        [
+            np.where(known[..., None], step, 0.0),
+            np.where(known, length, 0.0)[..., None],
+        ],
+        -1,
+    )
     columns = np.concatenate([columns, known[..., None]], -1)
     total = np.concatenate([np.zeros_like(columns[:1]), np.cumsum(columns, axis=0)])
     frame = np.arange(len(valid))
-    moved = total[np.minimum(frame + HALF, len(valid) - 1)] - total[np.maximum(frame - HALF, 0)]
+    moved = (
+        total[np.minimum(frame + HALF, len(valid) - 1)]
+        - total[np.maximum(frame - HALF, 0)]
+    )
     straight = np.linalg.norm(moved[..., :2], axis=-1) >= STRAIGHT * moved[..., 2]
     mean = moved[..., :2] * straight[..., None] / np.maximum(moved[..., 3:] * DT, DT)
-    recorded = states[..., 3:] * np.stack([np.cos(states[..., 2]), np.sin(states[..., 2])], -1)
+    recorded = states[..., 3:] * np.stack(
+        [np.cos(states[..., 2]), np.sin(states[..., 2])], -1
+    )
     return np.where(moved[..., 3:] > 0, mean, recorded)
 
 
 def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Which headings [F, A] are those of the back: the choice for each track that turns least and drives backwards
-    least. Slow motion backwards alone turns nothing round: it is reversing."""
+    """Which headings [F, A] are those of the back: the choice for each track that turns
+    least and drives backwards least. Slow motion backwards alone turns nothing round:
+    it is reversing."""
     heading = states[..., 2]
     velocity = _motion(states, valid)
     speed = np.linalg.norm(velocity, axis=-1)
-    along = (velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)) / np.maximum(speed, 1e-9)
+    along = (
+        velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
+    ) / np.maximum(speed, 1e-9)
     moves = valid & (speed > MOVES)
     fast = valid & (speed > BACKWARDS)
     flips = np.abs(wrap(np.diff(heading, axis=0))) > np.pi / 2
@@ -162,10 +222,16 @@ def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     turned = np.zeros(valid.shape, bool)
     agents = np.flatnonzero(odd)
     slow = moves & ~fast
-    cost = fast * FAST_COST + slow * np.minimum(SLOW_COST, SLOW / np.maximum(slow.sum(0), 1))
+    cost = fast * FAST_COST + slow * np.minimum(
+        SLOW_COST, SLOW / np.maximum(slow.sum(0), 1)
+    )
     turning = np.minimum(TURNED_COST, TURNED / np.maximum(valid.sum(0), 1))
-    backwards = np.stack([cost * (along < -AGAINST), cost * (along > AGAINST) + turning], -1)
-    turned[:, agents] = _least_cost(heading[:, agents], valid[:, agents], own=backwards[:, agents])
+    backwards = np.stack(
+        [cost * (along < -AGAINST), cost * (along > AGAINST) + turning], -1
+    )
+    turned[:, agents] = _least_cost(
+        heading[:, agents], valid[:, agents], own=backwards[:, agents]
+    )
     drives = fast.any(0)
     whole = drives & ((turned & fast).sum(0) > 0.5 * fast.sum(0))
     if whole.sum() >= CONVENTION and whole.sum() > 0.5 * drives.sum():
@@ -175,14 +241,17 @@ def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 def _flips_in_a_gap(heading: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Whether a track [F, A] comes back from a gap turned by more than pi / 2 [A]."""
-    last = np.maximum.accumulate(np.where(valid, np.arange(len(valid))[:, None], -1), axis=0)[:-1]
+    last = np.maximum.accumulate(
+        np.where(valid, np.arange(len(valid))[:, None], -1), axis=0
+    )[:-1]
     turn = heading[1:] - heading[np.maximum(last, 0), np.arange(valid.shape[1])]
     return (valid[1:] & (last >= 0) & (np.abs(wrap(turn)) > np.pi / 2)).any(0)
 
 
 def _least_cost(heading: np.ndarray, valid: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Whether to turn each heading [F, A] round, at the least sum of turning from frame to frame [rad] and of the costs
-    [F, A, 2] of the recorded heading and the turned one (Viterbi's algorithm). Turning in a gap costs less."""
+    """Whether to turn each heading [F, A] round, at the least sum of turning from frame
+    to frame [rad] and of the costs [F, A, 2] of the recorded heading and the turned one
+    (Viterbi's algorithm). Turning in a gap costs less."""
     frames, agents = valid.shape
     total = np.zeros((agents, 2))
     last = np.full(agents, -1)
@@ -191,8 +260,12 @@ def _least_cost(heading: np.ndarray, valid: np.ndarray, own: np.ndarray) -> np.n
     for frame in range(frames):
         here = valid[frame]
         turn = np.abs(wrap(heading[frame] - heading[np.maximum(last, 0), column]))
-        weight = np.where(last >= 0, 1 / (1 + DT * np.maximum(frame - last - 1, 0)), 0.0)
-        change = np.stack([turn * weight, (np.pi - turn) * weight], -1)  # [A, 2]: keeps its side, or turns
+        weight = np.where(
+            last >= 0, 1 / (1 + DT * np.maximum(frame - last - 1, 0)), 0.0
+        )
+        change = np.stack(
+            [turn * weight, (np.pi - turn) * weight], -1
+        )  # [A, 2]: keeps its side, or turns
         other = total[:, ::-1] + change[:, 1:]
         same = total + change[:, :1]
         source[frame] = np.where(here[:, None] & (other < same), [1, 0], [0, 1])
@@ -207,8 +280,8 @@ def _least_cost(heading: np.ndarray, valid: np.ndarray, own: np.ndarray) -> np.n
 
 
 def _interpolate_spikes(states: np.ndarray, valid: np.ndarray) -> int:
-    """Replace headings far from the median of their neighbours while a track moves, in place; returns of how many
-    tracks."""
+    """Replace headings far from the median of their neighbours while a track moves, in
+    place; returns of how many tracks."""
     least = min(height for _, height in SPIKES)
     jump = np.abs(wrap(np.diff(states[..., 2], axis=0))) > least
     moving = valid & ~standing_frames(states[..., :2], valid)
@@ -220,15 +293,20 @@ def _interpolate_spikes(states: np.ndarray, valid: np.ndarray) -> int:
         runs = np.split(heading, np.flatnonzero(np.diff(frames) > HIDDEN + 1) + 1)
         spike = np.concatenate([_spikes(run) for run in runs]) & moving[frames, agent]
         if spike.any() and not spike.all():
-            states[frames[spike], agent, 2] = wrap(np.interp(frames[spike], frames[~spike], heading[~spike]))
+            states[frames[spike], agent, 2] = wrap(
+                np.interp(frames[spike], frames[~spike], heading[~spike])
+            )
             count += 1
     return count
 
 
 def _spikes(heading: np.ndarray) -> np.ndarray:
-    """Returns which headings [K] of frames without a long gap, and without wraps, are far from their median."""
+    """Returns which headings [K] of frames without a long gap, and without wraps, are
+    far from their median."""
     spike = np.zeros(len(heading), bool)
     for window, height in SPIKES:
         if len(heading) >= window:
-            spike |= np.abs(heading - median_filter(heading, window, mode="mirror")) > height
+            spike |= (
+                np.abs(heading - median_filter(heading, window, mode="mirror")) > height
+            )
     return spike

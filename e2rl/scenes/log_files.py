@@ -13,17 +13,27 @@ from e2rl.run.errors import InputError
 from e2rl.run.files import hash_files, open_regular, read_regular
 from e2rl.scenes.source import Source
 
-MAX_BYTES = 1 << 26  # of one log; the largest pickle of nuScenes v1.0-mini has 4 MB, the largest XML of NGSIM as well
+MAX_BYTES = (
+    1 << 26
+)  # of one log; the largest pickle of nuScenes v1.0-mini has 4 MB, the largest XML of NGSIM as well
 MAX_MEMORY = 1 << 30  # bytes that reading one log may take
 PIECE = 4096  # bytes of a zip unpacked at a time: at most 7,000 times as many come out
-DAMAGED = (*(OSError, EOFError, KeyError, ValueError, RuntimeError), zipfile.BadZipFile, zlib.error, lzma.LZMAError)
+DAMAGED = (
+    *(OSError, EOFError, KeyError, ValueError, RuntimeError),
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+)
 
 
 class LogFiles(Source):
-    """A source whose logs are the files of one ending in the folder or zip at `path`. A subclass defines `read`."""
+    """A source whose logs are the files of one ending in the folder or zip at `path`. A
+    subclass defines `read`."""
 
     ending: ClassVar[str]  # of a log's name, with the dot
-    ignored: ClassVar[tuple[str, ...]] = ()  # names of files with that ending that are no logs
+    ignored: ClassVar[
+        tuple[str, ...]
+    ] = ()  # names of files with that ending that are no logs
 
     def logs(self) -> list[str]:
         root = self.root()
@@ -32,27 +42,38 @@ class LogFiles(Source):
             names = [str(file.relative_to(root)) for file in files if not file.is_dir()]
         elif root.is_file() and zipfile.is_zipfile(root):
             with self.archive() as archive:
-                names = [name for name in sorted(archive.namelist()) if name.endswith(self.ending)]
+                names = [
+                    name
+                    for name in sorted(archive.namelist())
+                    if name.endswith(self.ending)
+                ]
         else:
             raise InputError(f"data.path={root}: neither a folder nor a zip file")
         names = [name for name in names if Path(name).name not in self.ignored]
         if not names:
-            raise InputError(f"data.path={root}: holds no {self.ending} scenario; pass a folder or zip of {self.holds}")
+            raise InputError(
+                f"data.path={root}: holds no {self.ending} scenario; pass a folder or zip of {self.holds}"
+            )
         return names
 
     def fingerprint(self) -> bytes:
         root = self.root()
-        return hash_files([root] if root.is_file() else [root / log for log in self.logs()])
+        return hash_files(
+            [root] if root.is_file() else [root / log for log in self.logs()]
+        )
 
     def archive(self) -> zipfile.ZipFile:
         """Returns the zip at `path`; raises InputError where its directory is damaged."""
         try:
             return zipfile.ZipFile(self.root())
         except DAMAGED as error:
-            raise InputError(f"data.path={self.path}: damaged zip ({error}); copy or export it again") from error
+            raise InputError(
+                f"data.path={self.path}: damaged zip ({error}); copy or export it again"
+            ) from error
 
     def content(self, log: str) -> bytes:
-        """Returns the bytes of one log; raises InputError where they cannot be read or are more than MAX_BYTES."""
+        """Returns the bytes of one log; raises InputError where they cannot be read or
+        are more than MAX_BYTES."""
         root = self.root()
         if root.is_file():
             with self.archive() as archive:
@@ -60,22 +81,29 @@ class LogFiles(Source):
         try:
             return read_regular(root / log, MAX_BYTES)
         except OSError as error:
-            raise InputError(f"{log} in {root}: cannot be read: {error.strerror}; copy or export it again") from error
+            raise InputError(
+                f"{log} in {root}: cannot be read: {error.strerror}; copy or export it again"
+            ) from error
 
 
 def check_file(file: Path, most: int = MAX_BYTES) -> None:
-    """Raises InputError for a file of a log that is no regular one, has more than `most` bytes, or is not readable."""
+    """Raises InputError for a file of a log that is no regular one, has more than
+    `most` bytes, or is not readable."""
     try:
         open_regular(file, most).close()
     except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}; copy it again, or leave it out") from error
+        raise InputError(
+            f"{file}: cannot be read: {error.strerror}; copy it again, or leave it out"
+        ) from error
 
 
 @contextmanager
 def bounded_memory(most: int = MAX_MEMORY) -> Iterator[None]:
-    """The block may allocate `most` bytes: libraries that believe what a file says it holds would take all there is.
+    """The block may allocate `most` bytes: libraries that believe what a file says it
+    holds would take all there is.
 
-    Raises InputError where it asks for more. Without effect where the system does not tell what a process has.
+    Raises InputError where it asks for more. Without effect where the system does not
+    tell what a process has.
     """
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])
@@ -84,7 +112,10 @@ def bounded_memory(most: int = MAX_MEMORY) -> Iterator[None]:
         return
     soft, hard = before = resource.getrlimit(resource.RLIMIT_DATA)
     asked = pages * resource.getpagesize() + most
-    resource.setrlimit(resource.RLIMIT_DATA, (asked if soft == resource.RLIM_INFINITY else min(asked, soft), hard))
+    resource.setrlimit(
+        resource.RLIMIT_DATA,
+        (asked if soft == resource.RLIM_INFINITY else min(asked, soft), hard),
+    )
     try:
         yield
     except MemoryError as error:
@@ -96,12 +127,17 @@ def bounded_memory(most: int = MAX_MEMORY) -> Iterator[None]:
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Returns a member of a zip, read piece by piece, so that little more is unpacked than the size it claims."""
+    """Returns a member of a zip, read piece by piece, so that little more is unpacked
+    than the size it claims."""
     try:
         if archive.getinfo(name).file_size > MAX_BYTES:
-            raise ValueError(f"it has more than the {MAX_BYTES / 1e6:.0f} MB of a log; cut it into scenarios")
+            raise ValueError(
+                f"it has more than the {MAX_BYTES / 1e6:.0f} MB of a log; cut it into scenarios"
+            )
         with archive.open(name) as stream:
             return b"".join(iter(lambda: stream.read(PIECE), b""))
     except DAMAGED as error:
         where = f"{name} in {archive.filename}"
-        raise InputError(f"{where}: cannot be read: {error}; copy or export it again") from error
+        raise InputError(
+            f"{where}: cannot be read: {error}; copy or export it again"
+        ) from error

@@ -1,4 +1,5 @@
-"""The recorded path of a vehicle as a route, for missions that no lane route fits (lane changes, car parks)."""
+"""The recorded path of a vehicle as a route, for missions that no lane route fits (lane
+changes, car parks)."""
 
 import numpy as np
 
@@ -12,27 +13,40 @@ STRIDE = 0.5  # m between the recorded points that are kept: standing vehicles j
 
 
 def route_from_log(graph: LaneGraph, track: np.ndarray, vertices: int) -> Route:
-    """The route along a recorded track [Q, 4], from BEHIND m before its start and on along the nearest lane at its end.
+    """The route along a recorded track [Q, 4], from BEHIND m before its start and on
+    along the nearest lane at its end.
 
-    Where no lane goes on, the route is open MARGIN m after the track's end, so that the vehicle leaves the scene there
-    instead of driving where nothing is known. Limits and lanes are those of the nearest lane at each vertex.
+    Where no lane goes on, the route is open MARGIN m after the track's end, so that the
+    vehicle leaves the scene there instead of driving where nothing is known. Limits and
+    lanes are those of the nearest lane at each vertex.
     """
     arc = arc_length(track[:, :2])
     kept = track[np.unique(np.floor(arc / STRIDE), return_index=True)[1]]
     direction = np.array([np.cos(track[0, 2]), np.sin(track[0, 2])])
-    line = np.concatenate([track[:1, :2] - BEHIND * direction, kept[:, :2], track[-1:, :2]])
+    line = np.concatenate(
+        [track[:1, :2] - BEHIND * direction, kept[:, :2], track[-1:, :2]]
+    )
     known = arc_length(line)[-1] + MARGIN
     onward = graph.candidates(track[-1, :2], track[-1, 2], track[-1, 3], 1, vertices)
     if onward:
         ahead = int(np.ceil((onward[0].vehicle_s + JOIN) / SPACING))
-        used = onward[0].points[ahead : max(int(onward[0].length / SPACING) + 1, ahead + 1)]
+        used = onward[0].points[
+            ahead : max(int(onward[0].length / SPACING) + 1, ahead + 1)
+        ]
         line = np.concatenate([line, used])
         known = max(known, arc_length(line)[-1])
     line = np.concatenate([line, line[-1:] + vertices * SPACING * _end_direction(line)])
     at = np.arange(vertices) * SPACING
     points = smooth_vertices(points_at(line, arc_length(line), at=at))
     lanes, limit = _lanes_along(graph, points, length=known)
-    return Route(points, min(known, at[-1]), open=bool(known < at[-1]), lanes=lanes, limit=limit, vehicle_s=BEHIND)
+    return Route(
+        points,
+        min(known, at[-1]),
+        open=bool(known < at[-1]),
+        lanes=lanes,
+        limit=limit,
+        vehicle_s=BEHIND,
+    )
 
 
 def _end_direction(line: np.ndarray) -> np.ndarray:
@@ -42,12 +56,16 @@ def _end_direction(line: np.ndarray) -> np.ndarray:
     return back / np.linalg.norm(back)
 
 
-def _lanes_along(graph: LaneGraph, points: np.ndarray, length: float) -> tuple[list[tuple[str, float]], np.ndarray]:
-    """Lanes (id, arc length at which they begin) under the first `length` m of route vertices [P, 2], and the speed
-    limit [P] there."""
+def _lanes_along(
+    graph: LaneGraph, points: np.ndarray, length: float
+) -> tuple[list[tuple[str, float]], np.ndarray]:
+    """Lanes (id, arc length at which they begin) under the first `length` m of route
+    vertices [P, 2], and the speed limit [P] there."""
     lanes: dict[str, float] = {}
     limit = np.zeros(len(points), np.float32)
-    for index, (point, angle) in enumerate(zip(points, tangent_angle(points), strict=True)):
+    for index, (point, angle) in enumerate(
+        zip(points, tangent_angle(points), strict=True)
+    ):
         near = graph.near_lanes(point, angle)
         if near and index * SPACING <= length:
             limit[index] = graph.lanes[near[0][0]].speed_limit

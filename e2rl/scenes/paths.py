@@ -7,7 +7,9 @@ from torch import Tensor
 
 Angle = TypeVar("Angle", float, np.ndarray, Tensor)
 
-WHEELBASE = 0.6  # of the body's length; the axles lie 0.3 lengths before and behind its centre
+WHEELBASE = (
+    0.6  # of the body's length; the axles lie 0.3 lengths before and behind its centre
+)
 
 
 def wrap(angle: Angle) -> Angle:
@@ -24,7 +26,8 @@ def arc_length(points: np.ndarray) -> np.ndarray:
 
 
 def points_at(line: np.ndarray, arc: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Points [Q, 2] of a polyline [P, 2] at arc lengths `at` [Q]; arc [P]: its own. It goes on straight at its end."""
+    """Points [Q, 2] of a polyline [P, 2] at arc lengths `at` [Q]; arc [P]: its own. It
+    goes on straight at its end."""
     points = np.stack([np.interp(at, arc, line[:, axis]) for axis in range(2)], 1)
     beyond = at > arc[-1]
     if beyond.any():
@@ -34,7 +37,8 @@ def points_at(line: np.ndarray, arc: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def resample(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Points [Q, 2] nearly every `spacing` m along points [P, 2]: the length is divided evenly."""
+    """Points [Q, 2] nearly every `spacing` m along points [P, 2]: the length is divided
+    evenly."""
     arc = arc_length(points)
     count = max(int(np.ceil(arc[-1] / spacing)), 1) + 1
     at = np.arange(count) * (arc[-1] / (count - 1))

@@ -1,6 +1,8 @@
-"""What the names in a pickle of plain data stand for: numpy arrays, their types, and a few builtins.
+"""What the names in a pickle of plain data stand for: numpy arrays, their types, and a
+few builtins.
 
-A name is never imported or called. The few in NAMES are carried out here, with checked arguments.
+A name is never imported or called. The few in NAMES are carried out here, with checked
+arguments.
 """
 
 import re
@@ -14,9 +16,31 @@ import numpy as np
 MAX_ITEMS = 20_000_000  # of an array, and of all that a reader meets who follows every reference
 DTYPE = re.compile(r"[?]|[biufc](1|2|4|8|16)|[SU][1-9]\d{0,4}|O[48]?")
 TEXTS = frozenset([str])
-KEYS = (str, int, float, bytes, type(None), np.str_, np.integer, np.floating)  # hashed without recursion
+KEYS = (
+    str,
+    int,
+    float,
+    bytes,
+    type(None),
+    np.str_,
+    np.integer,
+    np.floating,
+)  # hashed without recursion
 RECONSTRUCT = "numpy._core.multiarray._reconstruct"
-PLAIN = ("set", "frozenset", "list", "dict", "tuple", "int", "float", "bool", "str", "bytes", "bytearray", "complex")
+PLAIN = (
+    "set",
+    "frozenset",
+    "list",
+    "dict",
+    "tuple",
+    "int",
+    "float",
+    "bool",
+    "str",
+    "bytes",
+    "bytearray",
+    "complex",
+)
 NAMES = {f"builtins.{name}" for name in PLAIN} | {
     "collections.defaultdict",
     "_codecs.encode",  # bytes in protocols 0 to 2
@@ -37,14 +61,16 @@ class Name:
 
 @dataclass
 class Unbuilt:
-    """An array (dtype None) or a numpy type of which the pickle has yet to give the state."""
+    """An array (dtype None) or a numpy type of which the pickle has yet to give the
+    state."""
 
     dtype: str | None = None
     value: Any = None
 
 
 def as_keys(values: Sequence[Any]) -> Iterable[Hashable]:
-    """Keys of a dict or items of a set; refuses what could be hashed recursively or collide at will."""
+    """Keys of a dict or items of a set; refuses what could be hashed recursively or
+    collide at will."""
     return values if TEXTS.issuperset(map(type, values)) else map(_as_key, values)
 
 
@@ -61,11 +87,24 @@ def called(path: str, arguments: tuple) -> Any:
             return Unbuilt()
         case "dtype", [str(name), *_] if DTYPE.fullmatch(name):
             return Unbuilt(name)
-        case "scalar", [np.dtype(kind=kind) as dtype, bytes() | str() as data] if kind != "O":
+        case "scalar", [np.dtype(kind=kind) as dtype, bytes() | str() as data] if (
+            kind != "O"
+        ):
             return array_of(data, dtype, shape=(), order="C")[()]
-        case "_frombuffer", [bytes() | bytearray() as data, np.dtype() as dtype, tuple(shape), "C" | "F" as order]:
+        case "_frombuffer", [
+            bytes() | bytearray() as data,
+            np.dtype() as dtype,
+            tuple(shape),
+            "C" | "F" as order,
+        ]:
             return array_of(data, dtype, shape=shape, order=order)
-        case "_frombuffer", [bytes() | bytearray() as data, np.dtype() as dtype, tuple(shape), "K", tuple(axes)]:
+        case "_frombuffer", [
+            bytes() | bytearray() as data,
+            np.dtype() as dtype,
+            tuple(shape),
+            "K",
+            tuple(axes),
+        ]:
             return array_of(data, dtype, shape=shape, order="C").transpose(axes)
         case "encode", [str(text), "latin1" | "latin-1"]:
             return text.encode("latin-1")
@@ -87,15 +126,25 @@ def called(path: str, arguments: tuple) -> Any:
 
 
 def dtype_of(name: str, state: Any) -> np.dtype:
-    """A numpy type of plain elements; state: version, byte order, no parts and no fields, sizes, flags."""
+    """A numpy type of plain elements; state: version, byte order, no parts and no
+    fields, sizes, flags."""
     version, order, *parts = state
-    if version != 3 or order not in ("<", ">", "|", "=") or parts[:3] != [None, None, None]:
-        raise ValueError(f"holds arrays of other elements than numbers and text ({name})")
+    if (
+        version != 3
+        or order not in ("<", ">", "|", "=")
+        or parts[:3] != [None, None, None]
+    ):
+        raise ValueError(
+            f"holds arrays of other elements than numbers and text ({name})"
+        )
     return np.dtype(name) if order in "|=" else np.dtype(name).newbyteorder(order)
 
 
-def array_of(data: Any, dtype: np.dtype, shape: tuple, order: Literal["C", "F"]) -> np.ndarray:
-    """An array of exactly the bytes (or, of objects, the list) that the pickle holds for it."""
+def array_of(
+    data: Any, dtype: np.dtype, shape: tuple, order: Literal["C", "F"]
+) -> np.ndarray:
+    """An array of exactly the bytes (or, of objects, the list) that the pickle holds
+    for it."""
     if not isinstance(dtype, np.dtype) or type(shape) is not tuple or len(shape) > 8:
         raise ValueError("holds an array without type or shape")
     if not all(type(size) is int and 0 <= size <= MAX_ITEMS for size in shape):
@@ -111,12 +160,19 @@ def array_of(data: Any, dtype: np.dtype, shape: tuple, order: Literal["C", "F"])
     if isinstance(data, str):  # written by Python 2
         data = data.encode("latin-1")
     if not isinstance(data, bytes | bytearray) or len(data) != count * dtype.itemsize:
-        raise ValueError(f"holds an array of shape {shape} and type {dtype} without its data")
+        raise ValueError(
+            f"holds an array of shape {shape} and type {dtype} without its data"
+        )
     if not count:
         return np.zeros(shape, dtype.newbyteorder("="))
     if dtype.kind == "b":  # a byte that is neither 0 nor 1 would miscount
         return (np.frombuffer(data, np.uint8) != 0).reshape(shape, order=order)
     flat = np.frombuffer(data, dtype)
-    if dtype.kind == "U" and flat.view(np.dtype("u4").newbyteorder(dtype.byteorder)).max() > 0x10FFFF:
+    if (
+        dtype.kind == "U"
+        and flat.view(np.dtype("u4").newbyteorder(dtype.byteorder)).max() > 0x10FFFF
+    ):
         raise ValueError("holds text that is no Unicode")
-    return (flat if dtype.isnative else flat.astype(dtype.newbyteorder("="))).reshape(shape, order=order)
+    return (flat if dtype.isnative else flat.astype(dtype.newbyteorder("="))).reshape(
+        shape, order=order
+    )

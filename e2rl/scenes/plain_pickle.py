@@ -1,13 +1,17 @@
-"""Pickles of plain data, read without running them: containers, numbers, text and numpy arrays.
+"""Pickles of plain data, read without running them: containers, numbers, text and numpy
+arrays.
 
-A pickle is a program for a stack machine, whose opcodes the standard library's `pickletools` documents. The machine
-here is the standard library's own in Python, with the opcodes that plain data needs and no others. A class or function
-that a file names is a name and no more: the few that arrays and sets are made of are carried out by plain_objects.py,
-with checked arguments, and all others are refused. The standard library's fast machine would not do: it hashes, calls
-and allocates what a file says before anybody can look.
+A pickle is a program for a stack machine, whose opcodes the standard library's
+`pickletools` documents. The machine here is the standard library's own in Python, with
+the opcodes that plain data needs and no others. A class or function that a file names
+is a name and no more: the few that arrays and sets are made of are carried out by
+plain_objects.py, with checked arguments, and all others are refused. The standard
+library's fast machine would not do: it hashes, calls and allocates what a file says
+before anybody can look.
 
-What the file may cost is bounded, too: depth, opcodes, and the items that a reader meets who follows every reference.
-A container is complete when it is referred to a second time, so that nothing holds itself.
+What the file may cost is bounded, too: depth, opcodes, and the items that a reader
+meets who follows every reference. A container is complete when it is referred to a
+second time, so that nothing holds itself.
 """
 
 import pickle
@@ -17,21 +21,39 @@ from typing import Any
 
 import numpy as np
 
-from e2rl.scenes.plain_objects import MAX_ITEMS, NAMES, Name, Unbuilt, array_of, as_keys, called, dtype_of
+from e2rl.scenes.plain_objects import (
+    MAX_ITEMS,
+    NAMES,
+    Name,
+    Unbuilt,
+    array_of,
+    as_keys,
+    called,
+    dtype_of,
+)
 
-MAX_OPCODES, MAX_CONTAINERS = 5_000_000, 500_000  # the longest genuine log known has 150,000 and 80,000
+MAX_OPCODES, MAX_CONTAINERS = (
+    5_000_000,
+    500_000,
+)  # the longest genuine log known has 150,000 and 80,000
 MAX_DEPTH = 64
 MAX_BITS = 64  # of a whole number
-HOLDING = frozenset([tuple, list, dict, set, frozenset, np.ndarray, Unbuilt])  # types that hold or stand for others
+HOLDING = frozenset(
+    [tuple, list, dict, set, frozenset, np.ndarray, Unbuilt]
+)  # types that hold or stand for others
 LIBRARY: Any = pickle._Unpickler
-MOVED = {"__builtin__": "builtins", "numpy.core": "numpy._core"}  # modules under their old names
+MOVED = {
+    "__builtin__": "builtins",
+    "numpy.core": "numpy._core",
+}  # modules under their old names
 
 
 def load_plain(content: bytes) -> Any:
-    """Returns the plain data in a pickle. Raises ValueError, or what damaged bytes make the standard library raise.
+    """Returns the plain data in a pickle. Raises ValueError, or what damaged bytes make
+    the standard library raise.
 
-    defaultdicts become dicts and bytearrays bytes. Arrays have this machine's byte order; where it is the pickle's,
-    they are not writeable.
+    defaultdicts become dicts and bytearrays bytes. Arrays have this machine's byte
+    order; where it is the pickle's, they are not writeable.
     """
     machine = _Machine(BytesIO(content), encoding="latin-1")
     made = machine.run()
@@ -42,7 +64,8 @@ def load_plain(content: bytes) -> Any:
 
 
 class _Machine(LIBRARY):
-    """The standard library's machine; handlers that hash, call, grow or share objects are replaced."""
+    """The standard library's machine; handlers that hash, call, grow or share objects
+    are replaced."""
 
     def __init__(self, file: BytesIO, *, encoding: str) -> None:
         super().__init__(file, encoding=encoding)
@@ -52,7 +75,9 @@ class _Machine(LIBRARY):
         self.stack: list[Any] = []
         self.append = self.stack.append
         self.containers = 0
-        self.shared: dict[int, tuple[Any, int, int]] = {}  # by id: a container that is complete, its depth and items
+        self.shared: dict[
+            int, tuple[Any, int, int]
+        ] = {}  # by id: a container that is complete, its depth and items
 
     def run(self) -> Any:
         """Returns what the program leaves at its end."""
@@ -63,7 +88,9 @@ class _Machine(LIBRARY):
         except pickle._Stop as end:  # type: ignore[attr-defined]
             return end.value
         except KeyError as error:
-            raise ValueError(f"uses {error}, which is none of its objects and no opcode of plain data") from error
+            raise ValueError(
+                f"uses {error}, which is none of its objects and no opcode of plain data"
+            ) from error
         raise ValueError(f"has more than {MAX_OPCODES} opcodes")
 
     def fetch(self, index: int) -> None:
@@ -76,8 +103,9 @@ class _Machine(LIBRARY):
         self.append(value)
 
     def measure(self, value: Any, level: int) -> tuple[int, int]:
-        """Returns (depth, items) of an object at `level` of another one: how deep it nests, and how many items it holds
-        if all references are followed. What is shared was measured before, so the walk is over a tree."""
+        """Returns (depth, items) of an object at `level` of another one: how deep it
+        nests, and how many items it holds if all references are followed. What is
+        shared was measured before, so the walk is over a tree."""
         kind = type(value)
         known = self.shared.get(id(value))
         if known is not None:
@@ -120,7 +148,9 @@ class _Machine(LIBRARY):
         """Returns the container on the top of the stack, which is about to take more."""
         target = self.stack[-1]
         if type(target) is not kind:
-            raise ValueError(f"adds items of a {kind.__name__} to a {type(target).__name__}")
+            raise ValueError(
+                f"adds items of a {kind.__name__} to a {type(target).__name__}"
+            )
         if id(target) in self.shared:
             raise ValueError("adds to a container that is in use already")
         return target
@@ -184,15 +214,20 @@ class _Machine(LIBRARY):
             target.value = dtype_of(target.dtype, state)
         else:
             _, shape, dtype, fortran, data = state
-            target.value = array_of(data, dtype, shape=shape, order="F" if fortran else "C")
+            target.value = array_of(
+                data, dtype, shape=shape, order="F" if fortran else "C"
+            )
         self.append(target.value)
 
 
 Handler = Callable[[_Machine], Any]
 
 
-def _handler(name: str, before: Handler | None = None, after: Handler | None = None) -> Handler:
-    """Returns the standard library's handler of an opcode, with a check before or after it."""
+def _handler(
+    name: str, before: Handler | None = None, after: Handler | None = None
+) -> Handler:
+    """Returns the standard library's handler of an opcode, with a check before or after
+    it."""
     own = LIBRARY.dispatch[getattr(pickle, name)[0]]
 
     def handle(machine: _Machine) -> None:
@@ -210,14 +245,21 @@ AS_THEY_ARE = (
     "UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 "
     "PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL"
 )
-CONTAINERS = "MARK EMPTY_LIST EMPTY_DICT EMPTY_SET EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 TUPLE LIST"
+CONTAINERS = (
+    "MARK EMPTY_LIST EMPTY_DICT EMPTY_SET EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 TUPLE LIST"
+)
 OWN: dict[str, Handler] = {
     **{name: _handler(name) for name in AS_THEY_ARE.split()},
     **{name: _handler(name, before=_Machine.counted) for name in CONTAINERS.split()},
-    **{name: _handler(name, after=_Machine.bounded) for name in ("INT", "LONG", "LONG1", "LONG4")},
+    **{
+        name: _handler(name, after=_Machine.bounded)
+        for name in ("INT", "LONG", "LONG1", "LONG4")
+    },
     "GET": lambda machine: machine.fetch(int(machine.readline())),
     "BINGET": lambda machine: machine.fetch(machine.read(1)[0]),
-    "LONG_BINGET": lambda machine: machine.fetch(int.from_bytes(machine.read(4), "little")),
+    "LONG_BINGET": lambda machine: machine.fetch(
+        int.from_bytes(machine.read(4), "little")
+    ),
     "FRAME": lambda machine: machine.read(8),  # of use to those who read from streams
     "BYTEARRAY8": _handler("BINBYTES8"),  # the other allocates what it only announces
     "APPEND": _Machine.append_item,

@@ -1,7 +1,8 @@
-"""The code of a data source: the modules that its class comes from, and what a user's ones import from beside them.
+"""The code of a data source: the modules that its class comes from, and what a user's
+ones import from beside them.
 
-The cache of scenes is keyed by it, so that an edited reader does not get the scenes of the old one; and messages name
-the line of it that failed.
+The cache of scenes is keyed by it, so that an edited reader does not get the scenes of
+the old one; and messages name the line of it that failed.
 """
 
 import ast
@@ -18,16 +19,20 @@ INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
 
 
 def code_hash(kind: type) -> str | None:
-    """Returns the SHA-256 of a class's code; None where it is in no file, as in an interactive session.
+    """Returns the SHA-256 of a class's code; None where it is in no file, as in an
+    interactive session.
 
-    Of the package's own modules it holds those in which the class and its bases are defined: what these call is
-    covered by the version of the scene builder. Of others it also holds all that they import, at whatever depth, from
-    the folder in which their top-level module or package lies.
+    Of the package's own modules it holds those in which the class and its bases are
+    defined: what these call is covered by the version of the scene builder. Of others
+    it also holds all that they import, at whatever depth, from the folder in which
+    their top-level module or package lies.
 
     Args:
         kind: a class; its bases from the standard library do not count.
     """
-    names = dict.fromkeys(each.__module__ for each in kind.__mro__ if not _is_standard(each.__module__))
+    names = dict.fromkeys(
+        each.__module__ for each in kind.__mro__ if not _is_standard(each.__module__)
+    )
     files: dict[str, Path | None] = {}
     for name in names:
         files[name] = _loaded_file(name)
@@ -43,13 +48,16 @@ def code_hash(kind: type) -> str | None:
 
 
 def failed_line(kind: type, trace: TracebackType | None) -> str:
-    """Returns "file:line" of the last call of a traceback that is in a user's code; "" where there is none.
+    """Returns "file:line" of the last call of a traceback that is in a user's code; ""
+    where there is none.
 
     Args:
         kind: the class that was called, to whose folder the code belongs.
         trace: of the exception.
     """
-    names = [each.__module__ for each in kind.__mro__ if not _is_standard(each.__module__)]
+    names = [
+        each.__module__ for each in kind.__mro__ if not _is_standard(each.__module__)
+    ]
     files = [(name, _loaded_file(name)) for name in names if not _is_own(name)]
     folders = [_folder(name, file) for name, file in files if file]
     known = {str(file) for _, file in files}
@@ -58,9 +66,14 @@ def failed_line(kind: type, trace: TracebackType | None) -> str:
         name = trace.tb_frame.f_code.co_filename
         trace_line = trace.tb_lineno
         path = Path(name)
-        beside = any(path.is_relative_to(folder) and not _is_installed(path, folder) for folder in folders)
+        beside = any(
+            path.is_relative_to(folder) and not _is_installed(path, folder)
+            for folder in folders
+        )
         module = trace.tb_frame.f_globals.get("__name__", "")
-        interactive = name.startswith("<") and not _is_own(module) and not _is_standard(module)
+        interactive = (
+            name.startswith("<") and not _is_own(module) and not _is_standard(module)
+        )
         if (beside and not _is_own(module)) or name in known or interactive:
             line = f"{name}:{trace_line}"
         trace = trace.tb_next
@@ -76,7 +89,8 @@ def _is_standard(module: str) -> bool:
 
 
 def _is_installed(path: Path, folder: Path) -> bool:
-    """Returns whether a file below a folder belongs to a library that is installed there."""
+    """Returns whether a file below a folder belongs to a library that is installed
+    there."""
     return bool(INSTALLED & set(path.relative_to(folder).parts))
 
 
@@ -87,14 +101,16 @@ def _loaded_file(module: str) -> Path | None:
 
 
 def _folder(module: str, file: Path) -> Path:
-    """Returns the folder in which the top-level module or package of a module lies; of a library, the package."""
+    """Returns the folder in which the top-level module or package of a module lies; of
+    a library, the package."""
     depth = module.count(".") + (file.name == "__init__.py")
     folder = file.parents[depth]
     return file.parents[max(depth - 1, 0)] if folder.name in INSTALLED else folder
 
 
 def _imported_files(module: str, file: Path | None) -> dict[str, Path | None]:
-    """Returns the files, by module, that a module imports from its folder, and what these import from it."""
+    """Returns the files, by module, that a module imports from its folder, and what
+    these import from it."""
     if file is None:
         return {}
     folder = _folder(module, file)
@@ -114,9 +130,11 @@ def _imported_files(module: str, file: Path | None) -> dict[str, Path | None]:
 
 
 def _imports(file: Path, package: str) -> Iterator[str]:
-    """Yields the dotted names that a file may import, from anywhere in it; none of one that is no Python.
+    """Yields the dotted names that a file may import, from anywhere in it; none of one
+    that is no Python.
 
-    A relative import that leads out of its package is none: files that catch its error name another.
+    A relative import that leads out of its package is none: files that catch its error
+    name another.
     """
     try:
         tree = ast.parse(file.read_bytes())
@@ -135,7 +153,8 @@ def _imports(file: Path, package: str) -> Iterator[str]:
 
 
 def _located(names: Iterator[str]) -> Iterator[tuple[str, Path]]:
-    """Yields the modules that dotted names stand for, with the packages around them, and their files."""
+    """Yields the modules that dotted names stand for, with the packages around them,
+    and their files."""
     for name in names:
         if _is_standard(name):
             continue
@@ -143,7 +162,9 @@ def _located(names: Iterator[str]) -> Iterator[tuple[str, Path]]:
         folders = None
         for depth in range(len(parts)):
             part = ".".join(parts[: depth + 1])
-            spec = getattr(sys.modules.get(part), "__spec__", None) or PathFinder.find_spec(part, folders)
+            spec = getattr(
+                sys.modules.get(part), "__spec__", None
+            ) or PathFinder.find_spec(part, folders)
             if spec is None:
                 break
             if spec.has_location and spec.origin:

@@ -1,4 +1,5 @@
-"""What a source yields: one recorded or generated piece of traffic with its map, on the host, in numpy."""
+"""What a source yields: one recorded or generated piece of traffic with its map, on the
+host, in numpy."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +19,12 @@ COLOURS = {  # by the words in the names of logs; of several, such as "red yello
     **dict.fromkeys(("YELLOW", "AMBER", "CAUTION"), LIGHT_YELLOW),
     **dict.fromkeys(("GREEN", "GO"), LIGHT_GREEN),
 }
-NO_SIGNAL = {"FLASHING", "BLINKING", "OFF", "INACTIVE"}  # words of lights that let nobody wait for another colour
+NO_SIGNAL = {
+    "FLASHING",
+    "BLINKING",
+    "OFF",
+    "INACTIVE",
+}  # words of lights that let nobody wait for another colour
 DT = 0.1  # s, the time step of every recording, scene and simulation
 HIDDEN = 5  # steps of absence, at most, of an agent that is merely out of sight; after more it appears anew
 HISTORY = 10  # frames of history before a start frame that is chosen here
@@ -30,8 +36,9 @@ MAX_NAME = 128  # characters of the name of a scene, a place or a data set
 class Lane:
     """One lane's centreline, in driving direction.
 
-    points [P, 2] m; width m (0 or NaN: unknown); speed_limit m/s (0: unknown); exits, left, right: ids of successor and
-    neighbour lanes; heights [P] m or None (tells the levels of bridges apart).
+    points [P, 2] m; width m (0 or NaN: unknown); speed_limit m/s (0: unknown); exits,
+    left, right: ids of successor and neighbour lanes; heights [P] m or None (tells the
+    levels of bridges apart).
     """
 
     points: np.ndarray
@@ -44,10 +51,12 @@ class Lane:
 
 
 def light_colour(name: object, otherwise: int = LIGHT_UNKNOWN) -> int:
-    """Returns the state of a light that a log calls `name`, `otherwise` where that tells none.
+    """Returns the state of a light that a log calls `name`, `otherwise` where that
+    tells none.
 
-    LANE_STATE_ARROW_STOP, TRAFFIC_LIGHT_RED and redYellow are red. A light that flashes or is off is LIGHT_UNKNOWN:
-    yellow means care and red a stop sign there, and neither turns green.
+    LANE_STATE_ARROW_STOP, TRAFFIC_LIGHT_RED and redYellow are red. A light that flashes
+    or is off is LIGHT_UNKNOWN: yellow means care and red a stop sign there, and neither
+    turns green.
     """
     words = set(str(name).upper().replace("-", "_").replace(" ", "_").split("_"))
     if words & NO_SIGNAL:
@@ -77,11 +86,14 @@ FEW_FRAMES = "fewer than two frames of different time stamps; leave it out"
 
 
 def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[str]:
-    """Returns the id of a lane's neighbour, if it is one of `lanes` and no oncoming one, which maps name as well."""
+    """Returns the id of a lane's neighbour, if it is one of `lanes` and no oncoming
+    one, which maps name as well."""
     other = lanes.get(str(neighbour))
     if other is None:
         return []
-    same = np.dot(lane.points[-1] - lane.points[0], other.points[-1] - other.points[0]) > 0
+    same = (
+        np.dot(lane.points[-1] - lane.points[0], other.points[-1] - other.points[0]) > 0
+    )
     return [str(neighbour)] if same else []
 
 
@@ -89,13 +101,15 @@ def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[s
 class Recording:
     """Tracks and map of one log at 10 Hz.
 
-    states [F, A, 4]: x, y [m], heading [rad], speed [m/s]; valid [F, A]; size [A, 2]: length, width [m];
-    agent_type [A]; ego: index of the ego's track; lights: lane id -> [F] light state; drivable: polygons [P, 2];
-    current: the start frame, with at least one frame of history before it; None where the log names none;
-    egos: the ego's track by start frame, where it is not the same for all (-1: nobody is there);
-    heights [F, A] m (NaN: unknown) or None: of the tracks, which tell who is on a bridge (e2rl/scenes/levels.py);
-    towed: tracks of trailers that nobody drives, but a replay shows; coupled: of vehicles with their trailers;
-    repairs: how often reading mended something, by a phrase in the plural, such as "headings turned round".
+    states [F, A, 4]: x, y [m], heading [rad], speed [m/s]; valid [F, A]; size [A, 2]:
+    length, width [m]; agent_type [A]; ego: index of the ego's track; lights: lane id ->
+    [F] light state; drivable: polygons [P, 2]; current: the start frame, with at least
+    one frame of history before it; None where the log names none; egos: the ego's track
+    by start frame, where it is not the same for all (-1: nobody is there); heights [F,
+    A] m (NaN: unknown) or None: of the tracks, which tell who is on a bridge
+    (e2rl/scenes/levels.py); towed: tracks of trailers that nobody drives, but a replay
+    shows; coupled: of vehicles with their trailers; repairs: how often reading mended
+    something, by a phrase in the plural, such as "headings turned round".
     """
 
     scene_id: str
@@ -121,10 +135,12 @@ class Recording:
         return sorted({self.ego, *self.egos.values()} - {-1})
 
     def start_frames(self, starts: Sequence[int] | None, steps: int) -> list[int]:
-        """Returns the start frames of `windows`; none where the log is too short for them.
+        """Returns the start frames of `windows`; none where the log is too short for
+        them.
 
         Args:
-            starts: those that are asked for, of which each must leave half of the steps recorded; None: the log's own,
+            starts: those that are asked for, of which each must leave half of the steps
+                recorded; None: the log's own,
                 or, where it names none, as many as fit one after another (at least one).
             steps: simulated steps of a scene.
         """
@@ -135,27 +151,38 @@ class Recording:
             return [self._own_start(steps)]
         return list(range(HISTORY, frames - steps, steps + HISTORY + 1)) or [HISTORY]
 
-    def windows(self, starts: Sequence[int] | None, steps: int) -> Iterator["Recording"]:
+    def windows(
+        self, starts: Sequence[int] | None, steps: int
+    ) -> Iterator["Recording"]:
         """Yields the recordings of `steps` simulated steps that this log makes.
 
-        Those of several, or of `starts`, have ids of the form `id@start`. A start frame of the log's own that leaves
-        too little past or future is moved, which counts as a repair.
+        Those of several, or of `starts`, have ids of the form `id@start`. A start frame
+        of the log's own that leaves too little past or future is moved, which counts as
+        a repair.
 
         Args:
             starts, steps: see `start_frames`.
         """
         frames = self.start_frames(starts, steps)
         repairs = Counter(self.repairs)
-        repairs[MOVED_START] += not starts and self.current is not None and frames != [self.current]
+        repairs[MOVED_START] += (
+            not starts and self.current is not None and frames != [self.current]
+        )
         for start in frames:
-            name = f"{self.scene_id}@{start}" if starts or len(frames) > 1 else self.scene_id
+            name = (
+                f"{self.scene_id}@{start}"
+                if starts or len(frames) > 1
+                else self.scene_id
+            )
             ego = self.egos.get(start, self.ego)
             yield replace(self, current=start, scene_id=name, ego=ego, repairs=+repairs)
 
     def _own_start(self, steps: int) -> int:
-        """Returns the log's own start frame, or the first with enough past and future where it has not.
+        """Returns the log's own start frame, or the first with enough past and future
+        where it has not.
 
-        Enough are HISTORY frames with the ego before it, and half of the steps after it.
+        Enough are HISTORY frames with the ego before it, and half of the steps after
+        it.
         """
         assert self.current is not None
         last = len(self.states) - steps // 2
@@ -169,13 +196,20 @@ class Recording:
 
     def has_ego(self) -> bool:
         """Returns whether the ego is recorded at the start frame."""
-        return 0 <= self.ego < self.valid.shape[1] and bool(self.valid[self.current, self.ego])
+        return 0 <= self.ego < self.valid.shape[1] and bool(
+            self.valid[self.current, self.ego]
+        )
 
     def validate_names(self) -> "Recording":
-        """Returns self; raises InputError for a name that is no short text: files, tables and messages hold it."""
+        """Returns self; raises InputError for a name that is no short text: files,
+        tables and messages hold it."""
         for what in ("scene_id", "location", "dataset"):
             name = getattr(self, what)
-            if not isinstance(name, str) or not name.isprintable() or len(name) > MAX_NAME:
+            if (
+                not isinstance(name, str)
+                or not name.isprintable()
+                or len(name) > MAX_NAME
+            ):
                 raise InputError(
                     f"its {what} {ascii(name)[:60]} is no line of {MAX_NAME} printable characters; rename it"
                 )
@@ -184,57 +218,119 @@ class Recording:
         return self
 
     def validate_fields(self) -> "Recording":
-        """Returns self; raises InputError naming the scene and a field that is of another kind, type or shape."""
-        frames, agents = self.valid.shape if isinstance(self.valid, np.ndarray) and self.valid.ndim == 2 else (-1, -1)
+        """Returns self; raises InputError naming the scene and a field that is of
+        another kind, type or shape."""
+        frames, agents = (
+            self.valid.shape
+            if isinstance(self.valid, np.ndarray) and self.valid.ndim == 2
+            else (-1, -1)
+        )
         shape = f"{frames} frames, {agents} agents"
         if agents < 0 or self.valid.dtype != bool:
-            raise self._wrong("valid", self.valid, expected="a bool array [frames, agents]")
+            raise self._wrong(
+                "valid", self.valid, expected="a bool array [frames, agents]"
+            )
         for name, kinds, columns, text in ARRAYS:
             value = getattr(self, name)
-            sizes = (frames, agents, columns) if name == "states" else (agents, columns)[: 1 + (columns > 0)]
-            if not isinstance(value, np.ndarray) or value.dtype.kind not in kinds or value.shape != sizes:
-                raise self._wrong(name, value, expected=f"{text}, as valid is of {shape}")
+            sizes = (
+                (frames, agents, columns)
+                if name == "states"
+                else (agents, columns)[: 1 + (columns > 0)]
+            )
+            if (
+                not isinstance(value, np.ndarray)
+                or value.dtype.kind not in kinds
+                or value.shape != sizes
+            ):
+                raise self._wrong(
+                    name, value, expected=f"{text}, as valid is of {shape}"
+                )
         if not ((self.agent_type >= VEHICLE) & (self.agent_type <= OTHER)).all():
-            raise self._wrong("agent_type", self.agent_type, expected=f"numbers from {VEHICLE} to {OTHER}")
+            raise self._wrong(
+                "agent_type",
+                self.agent_type,
+                expected=f"numbers from {VEHICLE} to {OTHER}",
+            )
         for name, types, text in FIELDS:
             value = getattr(self, name)
             if not isinstance(value, types) or isinstance(value, bool):
                 raise self._wrong(name, value, expected=text)
-        if self.heights is not None and not _are_numbers(self.heights, (frames, agents)):
-            raise self._wrong("heights", self.heights, expected=f"numbers [frames, agents], as valid is of {shape}")
+        if self.heights is not None and not _are_numbers(
+            self.heights, (frames, agents)
+        ):
+            raise self._wrong(
+                "heights",
+                self.heights,
+                expected=f"numbers [frames, agents], as valid is of {shape}",
+            )
         for name in ("towed", "coupled"):
             if not all(_is_index(track, agents) for track in getattr(self, name)):
-                raise self._wrong(name, getattr(self, name), expected=f"a tuple of tracks from 0 to {agents - 1}")
+                raise self._wrong(
+                    name,
+                    getattr(self, name),
+                    expected=f"a tuple of tracks from 0 to {agents - 1}",
+                )
         self._validate_map(frames)
         return self
 
     def _validate_map(self, frames: int) -> None:
-        """Raises InputError for lanes, polygons and lights that are of another kind, type or length."""
+        """Raises InputError for lanes, polygons and lights that are of another kind,
+        type or length."""
         for name, lane in self.lanes.items():
             if not isinstance(name, str) or not isinstance(lane, Lane):
-                raise self._wrong("lanes", {name: lane}, expected="a Lane by a text each")
+                raise self._wrong(
+                    "lanes", {name: lane}, expected="a Lane by a text each"
+                )
             for part in ("points", "heights"):
                 value = getattr(lane, part)
-                if not isinstance(value, np.ndarray) and not (part == "heights" and value is None):
-                    raise self._wrong(f"lanes[{name!r}].{part}", value, expected="an array")
-            if lane.heights is not None and not _are_numbers(lane.heights, lane.points.shape[:1]):
+                if not isinstance(value, np.ndarray) and not (
+                    part == "heights" and value is None
+                ):
+                    raise self._wrong(
+                        f"lanes[{name!r}].{part}", value, expected="an array"
+                    )
+            if lane.heights is not None and not _are_numbers(
+                lane.heights, lane.points.shape[:1]
+            ):
                 count = len(lane.points) if lane.points.ndim else 0
-                raise self._wrong(f"lanes[{name!r}].heights", lane.heights, expected=f"{count} numbers, one of each point")
+                raise self._wrong(
+                    f"lanes[{name!r}].heights",
+                    lane.heights,
+                    expected=f"{count} numbers, one of each point",
+                )
             for part in ("width", "speed_limit"):
                 if not isinstance(getattr(lane, part), int | float | np.number):
-                    raise self._wrong(f"lanes[{name!r}].{part}", getattr(lane, part), expected="a number")
+                    raise self._wrong(
+                        f"lanes[{name!r}].{part}",
+                        getattr(lane, part),
+                        expected="a number",
+                    )
             for part in ("exits", "left", "right"):
                 value = getattr(lane, part)
-                if not isinstance(value, list | tuple) or not all(isinstance(other, str) for other in value):
-                    raise self._wrong(f"lanes[{name!r}].{part}", value, expected="a list of ids of lanes, which are texts")
+                if not isinstance(value, list | tuple) or not all(
+                    isinstance(other, str) for other in value
+                ):
+                    raise self._wrong(
+                        f"lanes[{name!r}].{part}",
+                        value,
+                        expected="a list of ids of lanes, which are texts",
+                    )
         for ring in self.drivable:
             if not isinstance(ring, np.ndarray):
-                raise self._wrong("drivable", ring, expected="a list of arrays [points, 2]")
+                raise self._wrong(
+                    "drivable", ring, expected="a list of arrays [points, 2]"
+                )
         for name, light in self.lights.items():
-            known = isinstance(light, np.ndarray) and light.dtype.kind in "iu" and light.shape == (frames,)
+            known = (
+                isinstance(light, np.ndarray)
+                and light.dtype.kind in "iu"
+                and light.shape == (frames,)
+            )
             if name not in self.lanes or not known:
                 raise self._wrong(
-                    f"lights[{name!r}]", light, expected=f"an integer array of {frames} states, by the id of a lane"
+                    f"lights[{name!r}]",
+                    light,
+                    expected=f"an integer array of {frames} states, by the id of a lane",
                 )
 
     def _wrong(self, name: str, value: object, expected: str) -> InputError:
@@ -244,23 +340,31 @@ class Recording:
             if isinstance(value, np.ndarray)
             else f"{type(value).__name__} {' '.join(ascii(value).split())[:40]}"
         )
-        return InputError(f"scene {self.scene_id!r}: its {name} is {kind}; expected {expected}")
+        return InputError(
+            f"scene {self.scene_id!r}: its {name} is {kind}; expected {expected}"
+        )
 
     def validate_log(self) -> "Recording":
-        """Returns self; raises InputError naming the scene where tracks, ego or lanes cannot make a scene."""
+        """Returns self; raises InputError naming the scene where tracks, ego or lanes
+        cannot make a scene."""
         if problem := self._log_problem():
             raise InputError(f"scene {self.scene_id!r}: {problem}")
         return self
 
     def validate_start(self) -> "Recording":
-        """Returns self; raises InputError naming the scene where the start frame cannot be one."""
+        """Returns self; raises InputError naming the scene where the start frame cannot
+        be one."""
         frames = len(self.states)
         scene = f"scene {self.scene_id!r}"
         if self.current is None or not 1 <= self.current < frames - 1:
             start = f"start frame {self.current}"
-            raise InputError(f"{scene}: {start} leaves no history or no future in {frames} frames")
+            raise InputError(
+                f"{scene}: {start} leaves no history or no future in {frames} frames"
+            )
         if not self.valid[self.current, self.ego]:
-            raise InputError(f"{scene}: the ego is not recorded at the start frame {self.current}")
+            raise InputError(
+                f"{scene}: the ego is not recorded at the start frame {self.current}"
+            )
         return self
 
     def _log_problem(self) -> str | None:
@@ -300,7 +404,11 @@ def _are_numbers(values: np.ndarray, shape: tuple[int, ...]) -> bool:
 
 def _is_index(value: object, count: int) -> bool:
     """Returns whether a value is one of 0 .. count - 1."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) < count
+    return (
+        isinstance(value, int | np.integer)
+        and not isinstance(value, bool)
+        and 0 <= int(value) < count
+    )
 
 
 def _are_points(points: np.ndarray) -> bool:

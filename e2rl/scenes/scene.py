@@ -1,8 +1,10 @@
-"""The Scene: a TensorDict of one situation, padded and masked, and the SceneSet that holds many.
+"""The Scene: a TensorDict of one situation, padded and masked, and the SceneSet that
+holds many.
 
-Shapes (leading batch omitted): N agents = V vehicles (the ego first; those that are not `valid` appear later, and only
-a replay shows them) + others; T simulated steps; R route candidates of P vertices; S lights; M, D map points; L lanes.
-Positions are relative to the scene's origin, in m; angles in rad.
+Shapes (leading batch omitted): N agents = V vehicles (the ego first; those that are not
+`valid` appear later, and only a replay shows them) + others; T simulated steps; R route
+candidates of P vertices; S lights; M, D map points; L lanes. Positions are relative to
+the scene's origin, in m; angles in rad.
 
 | key | shape | |
 | --- | --- | --- |
@@ -49,25 +51,38 @@ KEYS_BY_DIMS = {  # number of dims of one scene: keys
 }
 KEYS = {key: dims for dims, keys in KEYS_BY_DIMS.items() for key in keys.split()}
 PART = 64  # scenes at once, where all of a set are gone through
-LARGE = 4096  # numbers of a scene's tensor above which `copy_into` copies scene by scene
+LARGE = (
+    4096  # numbers of a scene's tensor above which `copy_into` copies scene by scene
+)
 RAGGED = {  # keys whose first dims differ between scenes: the value that pads them
-    **dict.fromkeys(("light_state", "light_points", "lane_points", "lane_width", "drivable_points"), 0),
-    **dict.fromkeys(("lane_index", "lane_exits", "lane_left", "lane_right", "drivable_index"), -1),
+    **dict.fromkeys(
+        ("light_state", "light_points", "lane_points", "lane_width", "drivable_points"),
+        0,
+    ),
+    **dict.fromkeys(
+        ("lane_index", "lane_exits", "lane_left", "lane_right", "drivable_index"), -1
+    ),
 }
 
 
 def validate(scene: TensorDictBase, name: str) -> None:
-    """Raises InputError naming the scene and the key that is not finite or of other dims."""
+    """Raises InputError naming the scene and the key that is not finite or of other
+    dims."""
     for key, dims in KEYS.items():
         value = scene[key]
-        if value.ndim != dims or (value.is_floating_point() and not torch.isfinite(value).all()):
-            raise InputError(f"scene {name!r}: {key} has not {dims} dims, or holds NaN or infinite values")
+        if value.ndim != dims or (
+            value.is_floating_point() and not torch.isfinite(value).all()
+        ):
+            raise InputError(
+                f"scene {name!r}: {key} has not {dims} dims, or holds NaN or infinite values"
+            )
     if not scene["valid"][0] or scene["route_log"][0] < 0:
         raise InputError(f"scene {name!r}: the ego is absent or has no route")
 
 
 def content_hash(scene: Mapping[str, np.ndarray]) -> str:
-    """Returns the SHA-256 of the arrays of a scene; the size to which ragged ones are padded does not matter."""
+    """Returns the SHA-256 of the arrays of a scene; the size to which ragged ones are
+    padded does not matter."""
     digest = hashlib.sha256()
     for key in sorted(scene):
         value = unpadded(scene[key], RAGGED[key]) if key in RAGGED else scene[key]
@@ -77,9 +92,12 @@ def content_hash(scene: Mapping[str, np.ndarray]) -> str:
 
 
 def unpadded(value: np.ndarray, fill: float) -> np.ndarray:
-    """Returns an array without the rows at the end of each axis that hold nothing but `fill`."""
+    """Returns an array without the rows at the end of each axis that hold nothing but
+    `fill`."""
     for axis in range(value.ndim):
-        used = (value != fill).any(axis=tuple(other for other in range(value.ndim) if other != axis))
+        used = (value != fill).any(
+            axis=tuple(other for other in range(value.ndim) if other != axis)
+        )
         kept = int(np.flatnonzero(used)[-1]) + 1 if used.any() else 0
         value = value[(slice(None),) * axis + (slice(kept),)]
     return value
@@ -89,9 +107,10 @@ def unpadded(value: np.ndarray, fill: float) -> np.ndarray:
 class SceneSet:
     """Scenes of one data set and split, with their names.
 
-    scenes [S]: in memory, or mapped from the cache, in which case only what is used of them is read; dropped: counts
-    recordings left out, by reason; number: of each scene's noise, by default its position; files: SHA-256 of the data's
-    files, "" where unknown.
+    scenes [S]: in memory, or mapped from the cache, in which case only what is used of
+    them is read; dropped: counts recordings left out, by reason; number: of each
+    scene's noise, by default its position; files: SHA-256 of the data's files, "" where
+    unknown.
     """
 
     scenes: TensorDict
@@ -107,7 +126,8 @@ class SceneSet:
         self.number = self.number or list(range(len(self.scene_id)))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Returns what another process gets: these scenes alone, not the file or the tensors that they are part of."""
+        """Returns what another process gets: these scenes alone, not the file or the
+        tensors that they are part of."""
         return vars(self) | {"scenes": self.scenes.clone()}
 
     def __len__(self) -> int:
@@ -119,9 +139,17 @@ class SceneSet:
         return self.scenes["logged"].shape[1] - 1
 
     def hashes(self) -> list[str]:
-        """Returns the `content_hash` of each scene, of what is used: what a file says of itself may be forged."""
-        columns = {key: value.cpu().numpy() for key, value in self.scenes.items() if key != "scene_index"}
-        return [content_hash({key: value[row] for key, value in columns.items()}) for row in range(len(self))]
+        """Returns the `content_hash` of each scene, of what is used: what a file says
+        of itself may be forged."""
+        columns = {
+            key: value.cpu().numpy()
+            for key, value in self.scenes.items()
+            if key != "scene_index"
+        }
+        return [
+            content_hash({key: value[row] for key, value in columns.items()})
+            for row in range(len(self))
+        ]
 
     def batch(self, indices: Sequence[int] | Tensor) -> TensorDict:
         """Returns the scenes [B] at `indices`, as a copy."""
@@ -132,16 +160,20 @@ class SceneSet:
         return (self.batch(index) for index in torch.arange(len(self)).split(size))
 
     def index(self, which: int | str) -> int:
-        """Returns the index of a scene given by index or id; raises InputError where there is none."""
+        """Returns the index of a scene given by index or id; raises InputError where
+        there is none."""
         if isinstance(which, int) and 0 <= which < len(self):
             return which
         if which in self.scene_id:
             return self.scene_id.index(which)
         example = f"or the id of a scene, such as {self.scene_id[0]}"
-        raise InputError(f"scene={which}: expected an index below {len(self)} {example}")
+        raise InputError(
+            f"scene={which}: expected an index below {len(self)} {example}"
+        )
 
     def copy_into(self, batch: TensorDict, rows: Tensor, indices: Tensor) -> None:
-        """Overwrites rows [b] (ascending) of a batch of scenes by the scenes at `indices` [b], in place."""
+        """Overwrites rows [b] (ascending) of a batch of scenes by the scenes at
+        `indices` [b], in place."""
         whole = len(rows) == len(batch)
         for key, source in self.scenes.items():
             target = batch[key]
@@ -149,25 +181,39 @@ class SceneSet:
             there = source.device == target.device
             if whole and there:  # a second copy would cost more pages than the first
                 torch.index_select(source, 0, indices, out=target)
-            elif there and not source.is_cuda and source[0].numel() > LARGE:  # scene by scene, without a copy between
+            elif (
+                there and not source.is_cuda and source[0].numel() > LARGE
+            ):  # scene by scene, without a copy between
                 for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
                     target[row].copy_(source[index])
             else:
-                target.index_copy_(0, rows, source.index_select(0, indices).to(target.device))
+                target.index_copy_(
+                    0, rows, source.index_select(0, indices).to(target.device)
+                )
 
     def first(self, count: int | None) -> "SceneSet":
         """Returns the first `count` scenes (all for None)."""
         return self if count is None else self.chosen(range(min(count, len(self))))
 
     def chosen(self, indices: Sequence[int]) -> "SceneSet":
-        """Returns the scenes at `indices`, which keep their noise; the first ones are not copied."""
+        """Returns the scenes at `indices`, which keep their noise; the first ones are
+        not copied."""
         count = len(indices)
         if list(indices) == list(range(len(self))):
             return self
-        scenes = self.scenes[:count] if list(indices) == list(range(count)) else self.batch(indices)
+        scenes = (
+            self.scenes[:count]
+            if list(indices) == list(range(count))
+            else self.batch(indices)
+        )
         scenes["scene_index"] = torch.arange(count, device=scenes["scene_index"].device)
-        columns = {name: getattr(self, name) for name in ("scene_id", "location", "number")}
-        chosen: dict[str, Any] = {name: [column[index] for index in indices] for name, column in columns.items()}
+        columns = {
+            name: getattr(self, name) for name in ("scene_id", "location", "number")
+        }
+        chosen: dict[str, Any] = {
+            name: [column[index] for index in indices]
+            for name, column in columns.items()
+        }
         return replace(self, scenes=scenes, **chosen)
 
     def to(self, device: torch.device | str) -> "SceneSet":

@@ -1,7 +1,9 @@
-"""The cache of scenes: one file for each set, mapped into the memory of all processes that read it.
+"""The cache of scenes: one file for each set, mapped into the memory of all processes
+that read it.
 
-A file holds every key's array [S, ...] of all scenes, padded to the set's largest scene; an index as JSON; and END: the
-length of the index, FORMAT, and the SHA-256 of all that is before it.
+A file holds every key's array [S, ...] of all scenes, padded to the set's largest
+scene; an index as JSON; and END: the length of the index, FORMAT, and the SHA-256 of
+all that is before it.
 """
 
 import hashlib
@@ -35,7 +37,8 @@ NAME = re.compile(r"scenes-[0-9a-f]{64}\.map")  # of a file of the cache
 
 @dataclass
 class Index:
-    """What is known of a set besides its arrays. layout: each key's type, and the shape to which it is padded."""
+    """What is known of a set besides its arrays. layout: each key's type, and the shape
+    to which it is padded."""
 
     scene_id: list[str] = field(default_factory=list)
     location: list[str] = field(default_factory=list)
@@ -44,18 +47,23 @@ class Index:
     split: str = ""
     dropped: dict[str, int] = field(default_factory=Counter)
 
-    def add(self, scene_id: str, location: str, scene: Mapping[str, np.ndarray]) -> None:
+    def add(
+        self, scene_id: str, location: str, scene: Mapping[str, np.ndarray]
+    ) -> None:
         """Adds a scene; raises InputError where it does not fit to those before it."""
         for key, value in scene.items():
             kind, largest = self.layout.setdefault(key, (value.dtype.str, value.shape))
             if largest != value.shape and key not in RAGGED:
-                raise InputError(f"scenes of different {key} shapes cannot be one set; build them with equal settings")
+                raise InputError(
+                    f"scenes of different {key} shapes cannot be one set; build them with equal settings"
+                )
             self.layout[key] = kind, tuple(map(max, largest, value.shape))
         self.scene_id.append(scene_id)
         self.location.append(location)
 
     def places(self) -> tuple[dict[str, slice], int]:
-        """Returns the bytes of a file that each key's array has, and how many all have, at least one."""
+        """Returns the bytes of a file that each key's array has, and how many all have,
+        at least one."""
         found = {}
         begin = 0
         for key, (kind, shape) in self.layout.items():
@@ -69,24 +77,32 @@ class Index:
         layout = self.layout
         count = len(self.scene_id)
         places = self.places()[0]
-        return {key: content[places[key]].view(kind).reshape(count, *shape) for key, (kind, shape) in layout.items()}
+        return {
+            key: content[places[key]].view(kind).reshape(count, *shape)
+            for key, (kind, shape) in layout.items()
+        }
 
 
-Build = Callable[[Index], Iterator[Mapping[str, np.ndarray]]]  # yields a set's scenes when they are in its index
+Build = Callable[
+    [Index], Iterator[Mapping[str, np.ndarray]]
+]  # yields a set's scenes when they are in its index
 
 
 def cached(path: Path, build: Build, gigabytes: float) -> SceneSet:
-    """Returns the scenes in a cache file; where it is not there or damaged, it is built.
+    """Returns the scenes in a cache file; where it is not there or damaged, it is
+    built.
 
-    Of several processes one builds, and the others wait for it. Raises InputError where the file, which has a NAME,
-    cannot be written. gigabytes: see `make_room`.
+    Of several processes one builds, and the others wait for it. Raises InputError where
+    the file, which has a NAME, cannot be written. gigabytes: see `make_room`.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path):
             found = read(path)
             if found is None:
-                for left in path.parent.glob(f".{path.name}.*.part"):  # of a process that was killed while it built
+                for left in path.parent.glob(
+                    f".{path.name}.*.part"
+                ):  # of a process that was killed while it built
                     left.unlink(missing_ok=True)
                 write_atomically(path, lambda part: write(part, build))
                 make_room(path, gigabytes)
@@ -97,11 +113,14 @@ def cached(path: Path, build: Build, gigabytes: float) -> SceneSet:
             return found
     except OSError as error:
         mend = "free space, or pass another, writable folder"
-        raise InputError(f"data.cache={path.parent}: cannot be made or written ({error}); {mend}") from error
+        raise InputError(
+            f"data.cache={path.parent}: cannot be made or written ({error}); {mend}"
+        ) from error
 
 
 def uncached(build: Build) -> SceneSet:
-    """Returns the scenes that `build` yields, in a file that is removed at once and lives as long as it is mapped."""
+    """Returns the scenes that `build` yields, in a file that is removed at once and
+    lives as long as it is mapped."""
     with TemporaryDirectory() as folder:
         write(Path(folder) / "scenes", build)
         found = read(Path(folder) / "scenes")
@@ -110,7 +129,8 @@ def uncached(build: Build) -> SceneSet:
 
 
 def read(path: Path) -> SceneSet | None:
-    """Returns the scenes in a cache file, None where it is not there or not what was written.
+    """Returns the scenes in a cache file, None where it is not there or not what was
+    written.
 
     They are mapped copy-on-write: whoever changes them changes the own process's only.
     """
@@ -119,21 +139,40 @@ def read(path: Path) -> SceneSet | None:
     try:
         content = np.asarray(np.memmap(path, np.uint8, "c"))
         length, name, digest = END.unpack(content[-END.size :].tobytes())
-        if name != FORMAT or hashlib.sha256(content.data[: -END.size]).digest() != digest:
+        if (
+            name != FORMAT
+            or hashlib.sha256(content.data[: -END.size]).digest() != digest
+        ):
             raise ValueError("its content is not what was written")
         index = Index(**json.loads(content[: -END.size][-length:].tobytes()))
-        scenes = {key: torch.from_numpy(value) for key, value in index.arrays(content).items()}
-    except (ValueError, TypeError, LookupError, AttributeError, struct.error, OSError) as error:
+        scenes = {
+            key: torch.from_numpy(value) for key, value in index.arrays(content).items()
+        }
+    except (
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        struct.error,
+        OSError,
+    ) as error:
         tqdm.write(f"rebuilding the damaged cache file {path}: {error}", sys.stderr)
         return None
     count = len(index.scene_id)
     rows = TensorDict(scenes | {"scene_index": torch.arange(count)}, [count])
-    about = index.scene_id, index.location, index.dataset, index.split, dict(index.dropped)
+    about = (
+        index.scene_id,
+        index.location,
+        index.dataset,
+        index.split,
+        dict(index.dropped),
+    )
     return SceneSet(rows, *about)
 
 
 def write(path: Path, build: Build) -> None:
-    """Writes the file of a set. Scenes wait in a temporary file until the largest is known: they may be many."""
+    """Writes the file of a set. Scenes wait in a temporary file until the largest is
+    known: they may be many."""
     index = Index()
     shapes: list[list[tuple[int, ...]]] = []
     with TemporaryFile(dir=path.parent) as waiting:
@@ -145,7 +184,9 @@ def write(path: Path, build: Build) -> None:
         size = index.places()[1]
         with path.open("wb") as file:
             file.truncate(size)
-            if hasattr(os, "posix_fallocate"):  # so that a full disk is an error here, and no crash of the mapping
+            if hasattr(
+                os, "posix_fallocate"
+            ):  # so that a full disk is an error here, and no crash of the mapping
                 os.posix_fallocate(file.fileno(), 0, size)
         content = np.memmap(path, np.uint8, "r+")
         arrays = index.arrays(content)
@@ -153,7 +194,9 @@ def write(path: Path, build: Build) -> None:
             for (key, rows), shape in zip(arrays.items(), own, strict=True):
                 if shape != rows.shape[1:]:
                     rows[number] = RAGGED[key]
-                value = np.ndarray(shape, rows.dtype, waiting.read(prod(shape) * rows.itemsize))
+                value = np.ndarray(
+                    shape, rows.dtype, waiting.read(prod(shape) * rows.itemsize)
+                )
                 place: tuple[Any, ...] = (number, *map(slice, shape))
                 rows[place] = value
         content.flush()
@@ -165,14 +208,22 @@ def write(path: Path, build: Build) -> None:
 
 
 def make_room(path: Path, gigabytes: float) -> None:
-    """Removes the cache files that were not used for longest, until all have so many 10^9 bytes; not `path`.
+    """Removes the cache files that were not used for longest, until all have so many
+    10^9 bytes; not `path`.
 
     Whoever has mapped a file keeps what is in it.
     """
-    known = [(file.stat(), file) for file in path.parent.iterdir() if NAME.fullmatch(file.name)]
+    known = [
+        (file.stat(), file)
+        for file in path.parent.iterdir()
+        if NAME.fullmatch(file.name)
+    ]
     total = sum(about.st_size for about, _ in known)
     for about, file in sorted(known, key=lambda entry: entry[0].st_mtime):
         if total > gigabytes * 1e9 and file != path:
             file.unlink(missing_ok=True)
             total -= about.st_size
-            tqdm.write(f"data.cache_gb={gigabytes:g}: removed {file}, which was not used for longest", sys.stderr)
+            tqdm.write(
+                f"data.cache_gb={gigabytes:g}: removed {file}, which was not used for longest",
+                sys.stderr,
+            )

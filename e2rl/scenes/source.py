@@ -1,8 +1,9 @@
 """Sources of scenes: from a group in conf/data to a SceneSet.
 
-A source is one dataclass and one YAML file in conf/data, whose `_target_` names the class; an outside package adds its
-own in the same way. The class says which logs there are and reads one log. `Source` does the rest: start frames,
-parallel building, a cache keyed by content and by the code of the class, and the count of what is left out.
+A source is one dataclass and one YAML file in conf/data, whose `_target_` names the
+class; an outside package adds its own in the same way. The class says which logs there
+are and reads one log. `Source` does the rest: start frames, parallel building, a cache
+keyed by content and by the code of the class, and the count of what is left out.
 """
 
 import hashlib
@@ -29,7 +30,13 @@ from e2rl.run.errors import InputError
 from e2rl.run.extras import how_to_install
 from e2rl.run.files import cache_folder
 from e2rl.run.processes import interrupts_held, without_main, worker_pool
-from e2rl.run.settings import check_range, check_settings, file_values, setting, settings_of
+from e2rl.run.settings import (
+    check_range,
+    check_settings,
+    file_values,
+    setting,
+    settings_of,
+)
 from e2rl.run.terminal import Bar
 from e2rl.scenes.builder import BuildSettings, SceneBuilder, ego_overlaps
 from e2rl.scenes.reader_code import code_hash, failed_line
@@ -43,18 +50,25 @@ from e2rl.scenes.versions import MARK, RECORDED, check_versions, version_of
 OVERLAP = "ego overlaps a vehicle at the start"  # why scenes are left out
 TOO_SHORT = "too short for a start frame"
 NO_EGO = "nobody to be the ego at the start"
-NO_VERSION = "without such a version"  # or it is invalid, where the log itself makes scenes, too
+NO_VERSION = (
+    "without such a version"  # or it is invalid, where the log itself makes scenes, too
+)
 VERSION = 14  # of the scene builder: raise it when the same recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
-NO_MATTER = "path", "cache", "cache_gb", "workers"  # settings that do not change the scenes
+NO_MATTER = (
+    "path",
+    "cache",
+    "cache_gb",
+    "workers",
+)  # settings that do not change the scenes
 
 
 class Row(NamedTuple):
     """What one recording made: a scene's arrays, or the reason why there is none.
 
-    usual: whether sound data have such recordings, too; repairs: what was mended in its tracks and map; they stand with
-    the first recording of a log alone.
+    usual: whether sound data have such recordings, too; repairs: what was mended in its
+    tracks and map; they stand with the first recording of a log alone.
     """
 
     scene_id: str
@@ -67,16 +81,22 @@ class Row(NamedTuple):
 
 
 def default_of(key: str, file: str = "data/source", **rule: Any) -> Any:
-    """Returns a dataclass field whose default is that of conf/<file>.yaml; rule: see `setting`."""
-    return field(default_factory=lambda: file_values(file)[key], metadata=setting(**rule).metadata)
+    """Returns a dataclass field whose default is that of conf/<file>.yaml; rule: see
+    `setting`."""
+    return field(
+        default_factory=lambda: file_values(file)[key],
+        metadata=setting(**rule).metadata,
+    )
 
 
 @dataclass
 class Source(Extension, ABC):
-    """Where recordings come from. A subclass is a dataclass whose fields are the keys of its YAML file.
+    """Where recordings come from. A subclass is a dataclass whose fields are the keys
+    of its YAML file.
 
-    It defines `logs` and `read`, and `fingerprint` where its scenes are to be cached. path: file or folder of the logs,
-    for sources that need one; the other settings of every source: conf/data/source.yaml.
+    It defines `logs` and `read`, and `fingerprint` where its scenes are to be cached.
+    path: file or folder of the logs, for sources that need one; the other settings of
+    every source: conf/data/source.yaml.
     """
 
     path: str | None = None
@@ -89,10 +109,14 @@ class Source(Extension, ABC):
     workers: int = default_of("workers")
     build: BuildSettings = field(default_factory=BuildSettings)
 
-    code: ClassVar[str | None] = None  # hash of the code that defines the class, as it was when it was imported
+    code: ClassVar[str | None] = (
+        None  # hash of the code that defines the class, as it was when it was imported
+    )
     has_splits: ClassVar[bool] = False  # whether `split` chooses among the recordings
     holds: ClassVar[str] = "recorded logs"  # what `path` holds, for messages
-    mend: ClassVar[str] = ""  # what to do with a damaged log; "": any error of `read` but InputError is the class's own
+    mend: ClassVar[str] = (
+        ""  # what to do with a damaged log; "": any error of `read` but InputError is the class's own
+    )
     extra: ClassVar[str] = ""  # of e2rl, with the library that `read` imports
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -107,14 +131,17 @@ class Source(Extension, ABC):
 
     @abstractmethod
     def logs(self) -> list[str]:
-        """Returns the names of the logs, in order; messages name them. Raises InputError where there is none."""
+        """Returns the names of the logs, in order; messages name them. Raises
+        InputError where there is none."""
 
     @abstractmethod
     def read(self, log: str) -> Iterator[Recording]:
-        """Yields the recordings of one log, perhaps in another process. Raises InputError for a bad log."""
+        """Yields the recordings of one log, perhaps in another process. Raises
+        InputError for a bad log."""
 
     def fingerprint(self) -> bytes | None:
-        """Returns what changes whenever the recordings do (see `hash_files`); None: the scenes are not cached."""
+        """Returns what changes whenever the recordings do (see `hash_files`); None: the
+        scenes are not cached."""
         return None
 
     @property
@@ -125,10 +152,14 @@ class Source(Extension, ABC):
     def root(self) -> Path:
         """Returns `path`; raises InputError where it is not set or not there."""
         if not self.path:
-            raise InputError(f"data.path is not set; pass data.path=FOLDER_OR_ZIP of {self.holds}")
+            raise InputError(
+                f"data.path is not set; pass data.path=FOLDER_OR_ZIP of {self.holds}"
+            )
         path = Path(self.path).expanduser()
         if not path.exists():
-            raise InputError(f"data.path={self.path}: no such file or folder; pass one that holds {self.holds}")
+            raise InputError(
+                f"data.path={self.path}: no such file or folder; pass one that holds {self.holds}"
+            )
         return path
 
     def recordings(self) -> Iterator[Recording]:
@@ -138,33 +169,55 @@ class Source(Extension, ABC):
                 yield from windows
 
     def load(self, most: int | None = None) -> SceneSet:
-        """Returns all scenes or the first `most`, from the cache where they are there; raises InputError for bad input.
+        """Returns all scenes or the first `most`, from the cache where they are there;
+        raises InputError for bad input.
 
-        For the first `most`, no more logs are built than they take, unless the cache has all.
+        For the first `most`, no more logs are built than they take, unless the cache
+        has all.
         """
-        if type(self).__module__ == "__mp_main__":  # a worker that imports its script anew would wait for its parent
-            raise InputError('a script that defines its own source needs `if __name__ == "__main__":` around its calls')
+        if (
+            type(self).__module__ == "__mp_main__"
+        ):  # a worker that imports its script anew would wait for its parent
+            raise InputError(
+                'a script that defines its own source needs `if __name__ == "__main__":` around its calls'
+            )
         content = self._called("fingerprint", self.fingerprint)
         if content is None or self.code is None:
             return uncached(partial(self._built, most))
         folder = Path(self.cache) if self.cache else cache_folder()
         every = folder / self._file(content, None)
         if most is None or every.exists():
-            scenes = cached(every, partial(self._built, None), gigabytes=self.cache_gb).first(most)
+            scenes = cached(
+                every, partial(self._built, None), gigabytes=self.cache_gb
+            ).first(most)
         else:
-            scenes = cached(folder / self._file(content, most), partial(self._built, most), gigabytes=self.cache_gb)
+            scenes = cached(
+                folder / self._file(content, most),
+                partial(self._built, most),
+                gigabytes=self.cache_gb,
+            )
         return replace(scenes, files=hashlib.sha256(content).hexdigest())
 
     def log_names(self) -> list[str]:
-        """Returns `logs`, checked; raises InputError where it fails, or returns anything else than a list of texts."""
+        """Returns `logs`, checked; raises InputError where it fails, or returns
+        anything else than a list of texts."""
         names = self._called("logs", self.logs)
-        if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-            wrong = type(names).__name__ if not isinstance(names, list | tuple) else "other than texts"
-            raise InputError(f"{type(self).__name__}.logs returns {wrong}; return a list of the names of logs")
+        if not isinstance(names, list | tuple) or not all(
+            isinstance(name, str) for name in names
+        ):
+            wrong = (
+                type(names).__name__
+                if not isinstance(names, list | tuple)
+                else "other than texts"
+            )
+            raise InputError(
+                f"{type(self).__name__}.logs returns {wrong}; return a list of the names of logs"
+            )
         return list(names)
 
     def _called(self, name: str, method: Callable[[], Any]) -> Any:
-        """Returns what a method of the class does; InputError, with the line, where a user's code raises."""
+        """Returns what a method of the class does; InputError, with the line, where a
+        user's code raises."""
         try:
             return method()
         except InputError:
@@ -179,19 +232,31 @@ class Source(Extension, ABC):
 
     def _file(self, content: bytes, most: int | None) -> str:
         """Returns the name of the cache file of the first `most` scenes."""
-        settings = asdict(self) | {"split": self.split_name, "source": type(self).__qualname__}
-        settings = {key: value for key, value in settings.items() if key not in NO_MATTER}
-        about = json.dumps([VERSION, self.code, settings, most], sort_keys=True, default=str).encode()
+        settings = asdict(self) | {
+            "split": self.split_name,
+            "source": type(self).__qualname__,
+        }
+        settings = {
+            key: value for key, value in settings.items() if key not in NO_MATTER
+        }
+        about = json.dumps(
+            [VERSION, self.code, settings, most], sort_keys=True, default=str
+        ).encode()
         return f"scenes-{hashlib.sha256(about + content).hexdigest()}.map"
 
     def _windows(self, log: str) -> Iterator[list[Recording]]:
-        """Yields the recordings that one log makes, those of the same tracks and map together."""
+        """Yields the recordings that one log makes, those of the same tracks and map
+        together."""
         with self.named(log):
             for recording in self._read(log):
                 recording.validate_names().validate_fields()
                 if len(self.versions) > 1:  # all are of one place, or else of one log
-                    recording = replace(recording, location=recording.location or recording.scene_id)
-                for version in filter(None, (version_of(recording, name) for name in self.versions)):
+                    recording = replace(
+                        recording, location=recording.location or recording.scene_id
+                    )
+                for version in filter(
+                    None, (version_of(recording, name) for name in self.versions)
+                ):
                     yield list(couple(version).windows(self.starts, self.build.steps))
 
     def _read(self, log: str) -> Iterator[Recording]:
@@ -217,27 +282,46 @@ class Source(Extension, ABC):
             if not self.extra:
                 raise
             mend = how_to_install(self.extra)
-            raise InputError(f"{log}: a library of its reader cannot be imported ({error}); {mend}") from error
-        except (Exception, SystemExit) as error:  # damaged files raise anything, and so do mistakes in a class
+            raise InputError(
+                f"{log}: a library of its reader cannot be imported ({error}); {mend}"
+            ) from error
+        except (
+            Exception,
+            SystemExit,
+        ) as error:  # damaged files raise anything, and so do mistakes in a class
             line = failed_line(type(self), error.__traceback__)
             if self.mend:
                 at = f" at {line}" if line else ""
-                raise InputError(f"{log}: is none of {self.holds}: {_cause(error)}{at}; {self.mend}") from error
+                raise InputError(
+                    f"{log}: is none of {self.holds}: {_cause(error)}{at}; {self.mend}"
+                ) from error
             if not line:
                 raise
             name = f"{type(self).__name__}.read"
-            raise InputError(f"{log}: {name} failed at {line}: {_cause(error)}; mend it there") from error
+            raise InputError(
+                f"{log}: {name} failed at {line}: {_cause(error)}; mend it there"
+            ) from error
 
     def _rows_of(self, log: str) -> list[Row]:
         """Returns what the recordings of one log make."""
         try:
-            rows = [row for windows in self._windows(log) for row in self._rows(log, windows)]
+            rows = [
+                row
+                for windows in self._windows(log)
+                for row in self._rows(log, windows)
+            ]
         except InputError as error:
             if isinstance(error.__cause__, ImportError):  # no log can be read
                 raise
             return [Row(log, reason=str(error))]
         short = f"{TOO_SHORT} and half of data.build.steps={self.build.steps}, which may be set lower"
-        return rows or [Row(log, reason=short if RECORDED in self.versions else NO_VERSION, usual=True)]
+        return rows or [
+            Row(
+                log,
+                reason=short if RECORDED in self.versions else NO_VERSION,
+                usual=True,
+            )
+        ]
 
     def _rows(self, log: str, windows: list[Recording]) -> Iterator[Row]:
         """Yields what recordings of the same tracks and map make."""
@@ -254,19 +338,29 @@ class Source(Extension, ABC):
                 scene = builder.scene(window)
                 validate(scene, window.scene_id)
             except InputError as error:
-                beside = RECORDED in self.versions and any(f"{MARK}{name}" in row.scene_id for name in self.versions)
-                yield row._replace(reason=NO_VERSION if beside else _naming(log, error), usual=beside)
+                beside = RECORDED in self.versions and any(
+                    f"{MARK}{name}" in row.scene_id for name in self.versions
+                )
+                yield row._replace(
+                    reason=NO_VERSION if beside else _naming(log, error), usual=beside
+                )
                 continue
             if overlapped := ego_overlaps(scene):
-                yield row._replace(reason=OVERLAP.replace("a vehicle", overlapped), usual=True)
+                yield row._replace(
+                    reason=OVERLAP.replace("a vehicle", overlapped), usual=True
+                )
             else:
-                yield row._replace(scene={key: value.numpy() for key, value in scene.items()})
+                yield row._replace(
+                    scene={key: value.numpy() for key, value in scene.items()}
+                )
 
     def rows(self, most: int | None = None) -> Generator[Row]:
-        """Yields what the logs make, in their order, of which `most` scenes are asked for (None: all).
+        """Yields what the logs make, in their order, of which `most` scenes are asked
+        for (None: all).
 
-        `workers` processes build, never far ahead of what is asked for; this one where there is work for one, or for
-        FEW scenes. Where logs share ids of scenes, those of all but the first name their log.
+        `workers` processes build, never far ahead of what is asked for; this one where
+        there is work for one, or for FEW scenes. Where logs share ids of scenes, those
+        of all but the first name their log.
         """
         logs = self.log_names()
         show = partial(Bar, desc="building scenes", total=len(logs), unit="log")
@@ -280,7 +374,9 @@ class Source(Extension, ABC):
         if min(self.workers, len(logs)) <= 1 or (most is not None and most <= FEW):
             yield from map(self._rows_of, logs)
             return
-        own = type(self).__module__ == "__main__"  # then the workers need the script that defines it
+        own = (
+            type(self).__module__ == "__main__"
+        )  # then the workers need the script that defines it
         try:
             with worker_pool(self.workers, "spawn") as pool:
                 coming = iter(logs)
@@ -297,9 +393,11 @@ class Source(Extension, ABC):
             ) from error
 
     def _built(self, most: int | None, index: Index) -> Iterator[dict[str, np.ndarray]]:
-        """Yields the scenes of all logs, or the first `most`, when they are in the index.
+        """Yields the scenes of all logs, or the first `most`, when they are in the
+        index.
 
-        Raises InputError for an invalid one, unless `skip_invalid`, and where there is none.
+        Raises InputError for an invalid one, unless `skip_invalid`, and where there is
+        none.
         """
         index.split = self.split_name
         with closing(self.rows(most)) as rows:  # the progress bar ends before a message
@@ -316,11 +414,17 @@ class Source(Extension, ABC):
                     index.dropped["invalid"] += 1
                     tqdm.write(f"left out {row.scene_id}: {row.reason}", sys.stderr)
                 else:
-                    raise InputError(f"{row.reason} (data.skip_invalid=true leaves such scenes out)")
+                    raise InputError(
+                        f"{row.reason} (data.skip_invalid=true leaves such scenes out)"
+                    )
         if not index.scene_id:
-            left_out = ", ".join(f"{count} {reason}" for reason, count in index.dropped.items())
+            left_out = ", ".join(
+                f"{count} {reason}" for reason, count in index.dropped.items()
+            )
             data = self.path or f"split {self.split_name}"
-            raise InputError(f"no valid scene in {data} ({left_out}); see the messages above, or pass other data")
+            raise InputError(
+                f"no valid scene in {data} ({left_out}); see the messages above, or pass other data"
+            )
 
 
 def load_scenes(
@@ -331,14 +435,16 @@ def load_scenes(
     scenes: str | Path | None = None,
     files: str = "",
 ) -> SceneSet:
-    """Returns at most `num_scenes` scenes of a source, or of the source that a `data` group (conf/data/*.yaml) names.
-    Raises InputError for a source that cannot be built, for a missing or empty path, for a scene of the list that is
-    not there and, unless data.skip_invalid, for an invalid scene.
+    """Returns at most `num_scenes` scenes of a source, or of the source that a `data`
+    group (conf/data/*.yaml) names. Raises InputError for a source that cannot be built,
+    for a missing or empty path, for a scene of the list that is not there and, unless
+    data.skip_invalid, for an invalid scene.
 
     Args:
         split: overrides the source's own where `Source.has_splits`.
         starts: overrides the source's start frames.
-        scenes: a list (e2rl/scenes/scene_list.py), of which all or the first `num_scenes` are taken.
+        scenes: a list (e2rl/scenes/scene_list.py), of which all or the first
+            `num_scenes` are taken.
         files: see `listed_scenes`.
     """
     if num_scenes is not None:
@@ -354,20 +460,30 @@ def load_scenes(
 
 
 def source_of(data: Mapping) -> Source:
-    """Returns the source that the `_target_` of a `data` group names, with the other keys as its settings."""
+    """Returns the source that the `_target_` of a `data` group names, with the other
+    keys as its settings."""
     target = str(data.get("_target_"))
     try:
         kind = get_class(target)
     except Exception as error:  # importing a module raises anything
         reason = error.__cause__ or error
-        raise InputError(f"data={target}: cannot be built: {reason}; name a subclass of Source as _target_") from error
+        raise InputError(
+            f"data={target}: cannot be built: {reason}; name a subclass of Source as _target_"
+        ) from error
     if not issubclass(kind, Source):
-        raise InputError(f"data={target}: is no e2rl.scenes.source.Source; subclass it, and define logs() and read()")
-    return settings_of(kind, {key: value for key, value in data.items() if key != "_target_"}, where="data")
+        raise InputError(
+            f"data={target}: is no e2rl.scenes.source.Source; subclass it, and define logs() and read()"
+        )
+    return settings_of(
+        kind,
+        {key: value for key, value in data.items() if key != "_target_"},
+        where="data",
+    )
 
 
 def _told_apart(log: str, rows: list[Row], known: set[str]) -> Iterator[Row]:
-    """Yields the rows of a log with ids that no earlier scene has: ID:FILE or ID:FILE@START where theirs are taken.
+    """Yields the rows of a log with ids that no earlier scene has: ID:FILE or
+    ID:FILE@START where theirs are taken.
 
     Args:
         log: its name.
@@ -378,8 +494,16 @@ def _told_apart(log: str, rows: list[Row], known: set[str]) -> Iterator[Row]:
     mark = "" if known.isdisjoint(scene_ids) else f":{Path(log).stem}"
     for row in rows:
         if row.scene is not None:
-            marks = chain([mark, f":{Path(log).with_suffix('')}"], map(f"{mark}:{{}}".format, count(2)))
-            scene_id = next(filter(partial(_is_free, known=known), (_marked(row.scene_id, each) for each in marks)))
+            marks = chain(
+                [mark, f":{Path(log).with_suffix('')}"],
+                map(f"{mark}:{{}}".format, count(2)),
+            )
+            scene_id = next(
+                filter(
+                    partial(_is_free, known=known),
+                    (_marked(row.scene_id, each) for each in marks),
+                )
+            )
             known.add(scene_id)
             row = row._replace(scene_id=scene_id)
         yield row
@@ -387,11 +511,14 @@ def _told_apart(log: str, rows: list[Row], known: set[str]) -> Iterator[Row]:
 
 def _is_free(scene_id: str, known: set[str]) -> bool:
     """Returns whether an id can be a scene's, and none of `known` is."""
-    return scene_id not in known and scene_id.isprintable() and len(scene_id) <= MAX_NAME
+    return (
+        scene_id not in known and scene_id.isprintable() and len(scene_id) <= MAX_NAME
+    )
 
 
 def _marked(scene_id: str, mark: str) -> str:
-    """Returns the id of a scene with a mark behind that of its log, before the start frame of a window."""
+    """Returns the id of a scene with a mark behind that of its log, before the start
+    frame of a window."""
     name, at, start = scene_id.rpartition("@")
     return f"{name}{mark}{at}{start}" if at else f"{scene_id}{mark}"
 

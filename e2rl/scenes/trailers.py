@@ -1,6 +1,8 @@
-"""Trailers that a log records as vehicles of their own: which these are, and what becomes of them.
+"""Trailers that a log records as vehicles of their own: which these are, and what
+becomes of them.
 
-Simulated traffic would drive a trailer as a vehicle that follows its tractor, and farther and farther behind it.
+Simulated traffic would drive a trailer as a vehicle that follows its tractor, and
+farther and farther behind it.
 """
 
 from collections import Counter
@@ -15,20 +17,27 @@ from e2rl.scenes.recording import DT, VEHICLE, Recording
 DRIVEN, DRIVES = 5.0, 1.0  # m that a pair drives, m/s above which its frames count
 FRAMES = 30  # of a pair that drives: followers keep a distance for a second or two, too
 REACH = 2.5  # m at most from a tractor's rear to its trailer's front
-ASIDE, OVERLAP = 0.5, 0.5  # m at most by which a trailer's front is beside its tractor's rear, in line, and before it
+ASIDE, OVERLAP = (
+    0.5,
+    0.5,
+)  # m at most by which a trailer's front is beside its tractor's rear, in line, and before it
 HEADWAY = 0.25  # s: nobody follows another vehicle at that distance
 PLAY = 0.2  # m by which that distance varies, in nine of ten frames
 ALIGNED = 0.2  # rad between both up to which they are one long box
 LONGEST = 5  # vehicles of a road train
-STRAIGHTENS = 20  # frames in which a trailer that is not seen comes in line with its tractor
+STRAIGHTENS = (
+    20  # frames in which a trailer that is not seen comes in line with its tractor
+)
 JOINED = "trailers joined to their tractors"
 TURNING = "trailers that turn against their tractors, which only a replay shows"
 
 
 def couple(recording: Recording) -> Recording:
-    """Returns the recording with the trailers that stay behind their tractors as one vehicle with them.
+    """Returns the recording with the trailers that stay behind their tractors as one
+    vehicle with them.
 
-    Those that turn against them are marked as `towed`, but for the ego's, which are left out. Both count as repairs.
+    Those that turn against them are marked as `towed`, but for the ego's, which are
+    left out. Both count as repairs.
 
     Args:
         recording: of a log, with fields of the right types and shapes.
@@ -40,15 +49,21 @@ def couple(recording: Recording) -> Recording:
             break
         for tractor, trailer in pairs:
             turns = _turns(recording, tractor, trailer=trailer)
-            recording = _marked(recording, tractor, trailer=trailer) if turns else _joined(recording, tractor, trailer=trailer)
+            recording = (
+                _marked(recording, tractor, trailer=trailer)
+                if turns
+                else _joined(recording, tractor, trailer=trailer)
+            )
             repairs[TURNING if turns else JOINED] += 1
     return replace(recording, repairs=repairs)
 
 
 def _pairs(recording: Recording) -> list[tuple[int, int]]:
-    """Returns tractors and their trailers: vehicles that drive at one distance from rear to front, too short to follow.
+    """Returns tractors and their trailers: vehicles that drive at one distance from
+    rear to front, too short to follow.
 
-    A vehicle is in one pair at most: the next one of a road train is found once the first are joined.
+    A vehicle is in one pair at most: the next one of a road train is found once the
+    first are joined.
     """
     speed = np.abs(recording.states[..., 3]) * recording.valid
     drives = (speed.sum(0) * DT > DRIVEN) & (recording.agent_type == VEHICLE)
@@ -56,11 +71,19 @@ def _pairs(recording: Recording) -> list[tuple[int, int]]:
     front, rear = _ends(recording.states, recording.size[:, 0])
     fixed = {*recording.all_egos(), *recording.towed}  # no trailers
     found = []
-    for tractor, trailer in sorted(_near_pairs(front, rear, moving=moving, valid=recording.valid)):
+    for tractor, trailer in sorted(
+        _near_pairs(front, rear, moving=moving, valid=recording.valid)
+    ):
         frames = np.flatnonzero(moving[:, tractor] & recording.valid[:, trailer])
         offset = front[frames, trailer] - rear[frames, tractor]
         distances = np.linalg.norm(offset, axis=-1)
-        if len(frames) < FRAMES or trailer in fixed or not _behind(recording, tractor, trailer=trailer, frames=frames, offset=offset):
+        if (
+            len(frames) < FRAMES
+            or trailer in fixed
+            or not _behind(
+                recording, tractor, trailer=trailer, frames=frames, offset=offset
+            )
+        ):
             continue
         middle = np.median(distances)
         play = np.quantile(np.abs(distances - middle), 0.9)
@@ -75,8 +98,11 @@ def _pairs(recording: Recording) -> list[tuple[int, int]]:
     return pairs
 
 
-def _near_pairs(front: np.ndarray, rear: np.ndarray, moving: np.ndarray, valid: np.ndarray) -> set[tuple[int, int]]:
-    """Returns pairs of tracks of which the first moves and has the other's front within REACH of its rear at a frame.
+def _near_pairs(
+    front: np.ndarray, rear: np.ndarray, moving: np.ndarray, valid: np.ndarray
+) -> set[tuple[int, int]]:
+    """Returns pairs of tracks of which the first moves and has the other's front within
+    REACH of its rear at a frame.
 
     Args:
         front, rear: [F, A, 2] m.
@@ -87,7 +113,9 @@ def _near_pairs(front: np.ndarray, rear: np.ndarray, moving: np.ndarray, valid: 
     for frame in np.flatnonzero(moving.any(1)):
         tractors = np.flatnonzero(moving[frame])
         trailers = np.flatnonzero(valid[frame] & driving)
-        near = cKDTree(front[frame, trailers]).query_ball_point(rear[frame, tractors], REACH)
+        near = cKDTree(front[frame, trailers]).query_ball_point(
+            rear[frame, tractors], REACH
+        )
         pairs |= {
             (int(tractor), int(trailers[index]))
             for tractor, indices in zip(tractors, near, strict=True)
@@ -97,8 +125,16 @@ def _near_pairs(front: np.ndarray, rear: np.ndarray, moving: np.ndarray, valid: 
     return pairs
 
 
-def _behind(recording: Recording, tractor: int, trailer: int, frames: np.ndarray, *, offset: np.ndarray) -> bool:
-    """Returns whether a trailer's front is behind its tractor's rear, and not beside it, where both are in line.
+def _behind(
+    recording: Recording,
+    tractor: int,
+    trailer: int,
+    frames: np.ndarray,
+    *,
+    offset: np.ndarray,
+) -> bool:
+    """Returns whether a trailer's front is behind its tractor's rear, and not beside
+    it, where both are in line.
 
     offset: [frames, 2] m from that rear to that front.
     """
@@ -107,25 +143,35 @@ def _behind(recording: Recording, tractor: int, trailer: int, frames: np.ndarray
     if not in_line.any():
         return True
     ahead = (offset * np.stack([np.cos(heading), np.sin(heading)], -1)).sum(-1)[in_line]
-    aside = (offset * np.stack([-np.sin(heading), np.cos(heading)], -1)).sum(-1)[in_line]
+    aside = (offset * np.stack([-np.sin(heading), np.cos(heading)], -1)).sum(-1)[
+        in_line
+    ]
     return bool(np.median(np.abs(aside)) < ASIDE and np.median(ahead) < OVERLAP)
 
 
 def _ends(states: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the middles of the fronts and of the rears [F, A, 2] m of boxes at states [F, A, 4]; length [A] m."""
-    ahead = np.stack([np.cos(states[..., 2]), np.sin(states[..., 2])], -1) * length[:, None] / 2
+    """Returns the middles of the fronts and of the rears [F, A, 2] m of boxes at states
+    [F, A, 4]; length [A] m."""
+    ahead = (
+        np.stack([np.cos(states[..., 2]), np.sin(states[..., 2])], -1)
+        * length[:, None]
+        / 2
+    )
     return states[..., :2] + ahead, states[..., :2] - ahead
 
 
 def _turns(recording: Recording, tractor: int, trailer: int) -> bool:
     """Returns whether a trailer is at an angle to its tractor at any frame."""
     both = recording.valid[:, tractor] & recording.valid[:, trailer]
-    angle = wrap(recording.states[both, tractor, 2] - recording.states[both, trailer, 2])
+    angle = wrap(
+        recording.states[both, tractor, 2] - recording.states[both, trailer, 2]
+    )
     return bool(np.quantile(np.abs(angle), 0.95) > ALIGNED)
 
 
 def _marked(recording: Recording, tractor: int, trailer: int) -> Recording:
-    """Returns the recording with a trailer that only a replay shows; without it, where the ego is the tractor."""
+    """Returns the recording with a trailer that only a replay shows; without it, where
+    the ego is the tractor."""
     if tractor in recording.all_egos():
         valid = recording.valid.copy()
         valid[:, trailer] = False
@@ -134,10 +180,12 @@ def _marked(recording: Recording, tractor: int, trailer: int) -> Recording:
 
 
 def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
-    """Returns the recording with both as one vehicle, in the tractor's track; the trailer's is empty.
+    """Returns the recording with both as one vehicle, in the tractor's track; the
+    trailer's is empty.
 
-    Its box reaches from the tractor's front to the trailer's rear; where one of both is not there, its angle to the
-    other passes from that before to that after, and beyond these to 0 within STRAIGHTENS frames.
+    Its box reaches from the tractor's front to the trailer's rear; where one of both is
+    not there, its angle to the other passes from that before to that after, and beyond
+    these to 0 within STRAIGHTENS frames.
     """
     pair = [tractor, trailer]
     states = recording.states.copy()
@@ -153,8 +201,16 @@ def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
     angles = [_angle_to_chord(chord, states[:, each, 2], known=both) for each in pair]
     along = alone[:, 2] + np.where(there[:, 0], *angles)
     direction = np.stack([np.cos(along), np.sin(along)], -1)
-    direction = np.where(both[:, None], chord / np.maximum(np.linalg.norm(chord, axis=-1), 1e-6)[:, None], direction)
-    middle = np.where(there[:, :1], front[:, 0] - direction * length / 2, rear[:, 1] + direction * length / 2)
+    direction = np.where(
+        both[:, None],
+        chord / np.maximum(np.linalg.norm(chord, axis=-1), 1e-6)[:, None],
+        direction,
+    )
+    middle = np.where(
+        there[:, :1],
+        front[:, 0] - direction * length / 2,
+        rear[:, 1] + direction * length / 2,
+    )
     heading = np.arctan2(direction[:, 1], direction[:, 0])
     joined = np.concatenate([middle, heading[:, None], alone[:, 3:]], 1)
     either = np.asarray(there.any(1))
@@ -165,13 +221,25 @@ def _joined(recording: Recording, tractor: int, trailer: int) -> Recording:
     heights = recording.heights
     if heights is not None:
         heights = heights.copy()
-        heights[:, tractor] = np.where(there[:, 0], heights[:, tractor], heights[:, trailer])
+        heights[:, tractor] = np.where(
+            there[:, 0], heights[:, tractor], heights[:, trailer]
+        )
     coupled = (*recording.coupled, tractor)
-    return replace(recording, states=states, valid=valid, size=size, heights=heights, coupled=coupled)
+    return replace(
+        recording,
+        states=states,
+        valid=valid,
+        size=size,
+        heights=heights,
+        coupled=coupled,
+    )
 
 
-def _angle_to_chord(chord: np.ndarray, heading: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Returns the angles [F] rad from a heading to a chord, interpolated where the chord is unknown.
+def _angle_to_chord(
+    chord: np.ndarray, heading: np.ndarray, known: np.ndarray
+) -> np.ndarray:
+    """Returns the angles [F] rad from a heading to a chord, interpolated where the
+    chord is unknown.
 
     Args:
         chord: [F, 2] m.
@@ -181,4 +249,6 @@ def _angle_to_chord(chord: np.ndarray, heading: np.ndarray, known: np.ndarray) -
     frames = np.flatnonzero(known)
     angle = wrap(np.arctan2(chord[frames, 1], chord[frames, 0]) - heading[frames])
     ends = frames[0] - STRAIGHTENS, frames[-1] + STRAIGHTENS
-    return np.interp(np.arange(len(known)), [ends[0], *frames, ends[1]], [0.0, *angle, 0.0])
+    return np.interp(
+        np.arange(len(known)), [ends[0], *frames, ends[1]], [0.0, *angle, 0.0]
+    )

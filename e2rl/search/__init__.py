@@ -1,1 +1,2 @@
-"""The attack with a budget: tries of a scene that differ, spent where they find most (docs/search.md)."""
+"""The attack with a budget: tries of a scene that differ, spent where they find most
+(docs/search.md)."""

@@ -1,4 +1,5 @@
-"""Which family is tried next in which scene: Thompson sampling over chances learned from tries."""
+"""Which family is tried next in which scene: Thompson sampling over chances learned
+from tries."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +9,13 @@ from torch import Tensor
 
 from e2rl.search.tries import Family
 
-CHANCE_TRIES = 10.0  # first tries of scenes that a family's chance stands for at the start
-SCENE_TRIES, FAMILY_TRIES = 2.0, 4.0  # after which the next in the scene, and of the family there, has half the chance
+CHANCE_TRIES = (
+    10.0  # first tries of scenes that a family's chance stands for at the start
+)
+SCENE_TRIES, FAMILY_TRIES = (
+    2.0,
+    4.0,
+)  # after which the next in the scene, and of the family there, has half the chance
 CONTACT, CLOSER, FARTHER, LEAST = 0.75, 2.0, 0.15, 0.1  # see `nearness`
 
 
@@ -17,11 +23,13 @@ CONTACT, CLOSER, FARTHER, LEAST = 0.75, 2.0, 0.15, 0.1  # see `nearness`
 class Portfolio:
     """Chances of F families in N scenes: that a try finds what the search is for.
 
-    A family has a chance m of the first try in a scene. Its law is that of a rate: Gamma with shape CHANCE_TRIES times
-    the family's own chance + what was found, and rate CHANCE_TRIES + the x of its tries so far. In a scene with n
-    tries, k of them of the family, the chance is x m, with
+    A family has a chance m of the first try in a scene. Its law is that of a rate:
+    Gamma with shape CHANCE_TRIES times the family's own chance + what was found, and
+    rate CHANCE_TRIES + the x of its tries so far. In a scene with n tries, k of them of
+    the family, the chance is x m, with
 
-        x = nearness(margin of the nearest) / ((1 + n / SCENE_TRIES) (1 + k / FAMILY_TRIES)).
+        x = nearness(margin of the nearest) / ((1 + n / SCENE_TRIES) (1 + k /
+        FAMILY_TRIES)).
 
     Unless it `learns`, every family has the same chance everywhere.
     """
@@ -31,37 +39,55 @@ class Portfolio:
     learns: bool = True
 
     def __post_init__(self) -> None:
-        prior = torch.tensor([family.chance for family in self.families], dtype=torch.float64)
+        prior = torch.tensor(
+            [family.chance for family in self.families], dtype=torch.float64
+        )
         self.tried = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
         self.nearest = torch.full((self.scenes,), torch.nan, dtype=torch.float64)
-        self.found, self.exposed = CHANCE_TRIES * prior, torch.full_like(prior, CHANCE_TRIES)  # and the x of the tries
-        self.spent = torch.tensor([CHANCE_TRIES * family.nfe for family in self.families], dtype=torch.float64)
-        self.driven = torch.full_like(prior, CHANCE_TRIES)  # tries that have spent so many NFE
+        self.found, self.exposed = (
+            CHANCE_TRIES * prior,
+            torch.full_like(prior, CHANCE_TRIES),
+        )  # and the x of the tries
+        self.spent = torch.tensor(
+            [CHANCE_TRIES * family.nfe for family in self.families], dtype=torch.float64
+        )
+        self.driven = torch.full_like(
+            prior, CHANCE_TRIES
+        )  # tries that have spent so many NFE
 
-    def tell(self, scene: int, family: int, found: float, margin: float, nfe: float) -> None:
+    def tell(
+        self, scene: int, family: int, found: float, margin: float, nfe: float
+    ) -> None:
         """Learn from a try whose find is worth 0 to 1."""
         self.found[family] += found
         self.exposed[family] += self.share(slice(scene, scene + 1))[0, family]
         self.tried[scene, family] += 1
         self.spent[family] += nfe
         self.driven[family] += 1
-        self.nearest[scene] = torch.fmax(self.nearest[scene], torch.tensor(margin, dtype=torch.float64))
+        self.nearest[scene] = torch.fmax(
+            self.nearest[scene], torch.tensor(margin, dtype=torch.float64)
+        )
 
     def forget(self, scene: int) -> None:
-        """Forget what the tries of a scene have told of it: something else is searched for now."""
+        """Forget what the tries of a scene have told of it: something else is searched
+        for now."""
         self.tried[scene], self.nearest[scene] = 0.0, torch.nan
 
     def share(self, scenes: slice = slice(None)) -> Tensor:
         """x [N, F] of some scenes: what is left of the chances of a first try."""
         tried = self.tried[scenes]
-        before = (1 + tried.sum(1, keepdim=True) / SCENE_TRIES) * (1 + tried / FAMILY_TRIES)
+        before = (1 + tried.sum(1, keepdim=True) / SCENE_TRIES) * (
+            1 + tried / FAMILY_TRIES
+        )
         return nearness(self.nearest[scenes])[:, None] / before
 
     def worth(self, generator: torch.Generator) -> Tensor:
-        """A draw of the chances [N, F] per NFE, relative to the most expensive family; those of a scene as if tried one
-        after another, the best first."""
+        """A draw of the chances [N, F] per NFE, relative to the most expensive family;
+        those of a scene as if tried one after another, the best first."""
         if not self.learns:
-            return torch.rand(self.tried.shape, generator=generator, dtype=torch.float64)
+            return torch.rand(
+                self.tried.shape, generator=generator, dtype=torch.float64
+            )
         chance = torch._standard_gamma(self.found, generator=generator) / self.exposed
         cost = self.spent / self.driven
         worth = self.share() * chance * cost.amax() / cost
@@ -71,6 +97,9 @@ class Portfolio:
 
 
 def nearness(margin: Tensor) -> Tensor:
-    """How likely a find is in scenes whose nearest try has this margin, beside one without a try (NaN), which has 1."""
-    near = (CONTACT + torch.where(margin > 0, CLOSER, FARTHER) * margin.clamp(max=1)).clamp(min=LEAST)
+    """How likely a find is in scenes whose nearest try has this margin, beside one
+    without a try (NaN), which has 1."""
+    near = (
+        CONTACT + torch.where(margin > 0, CLOSER, FARTHER) * margin.clamp(max=1)
+    ).clamp(min=LEAST)
     return near.nan_to_num(1.0)

@@ -1,4 +1,5 @@
-"""DrivingEnv: a batch of B scenes; actions drive the ego, given trajectories drive the traffic."""
+"""DrivingEnv: a batch of B scenes; actions drive the ego, given trajectories drive the
+traffic."""
 
 from dataclasses import dataclass
 
@@ -17,7 +18,14 @@ from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, features, placed_eg
 from e2rl.sim.reward import check_weights
 from e2rl.sim.static import static_scene, write_rows
 from e2rl.sim.step import CONTACTS, Outcome, StepConfig, hold_step
-from e2rl.sim.world import AGENT_KEYS, START_KEYS, Agents, Trajectories, World, trajectories_at
+from e2rl.sim.world import (
+    AGENT_KEYS,
+    START_KEYS,
+    Agents,
+    Trajectories,
+    World,
+    trajectories_at,
+)
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
 OF_SCENE = (*START_KEYS, "size", "agent_type", "field_origin", "light_state")
@@ -33,7 +41,8 @@ def touches(metrics: TensorDictBase) -> Tensor:
 @configured("sim/default")
 @dataclass
 class SimSettings:
-    """Bounds of the ego's action, what ends an episode, and the weights of the reward (conf/sim/default.yaml)."""
+    """Bounds of the ego's action, what ends an episode, and the weights of the reward
+    (conf/sim/default.yaml)."""
 
     max_acceleration: float = setting(low=0.1, high=100.0)
     max_braking: float = setting(low=0.1, high=100.0)
@@ -48,20 +57,24 @@ class SimSettings:
 class DrivingEnv(EnvBase):
     """Closed-loop driving in batches of recorded or synthesized scenes.
 
-    Keys of a step: action [B, 2] (m/s^2, rad/s); observation [B, OBSERVATION_SIZE]; reward, done, terminated, truncated
-    [B, 1]; scene_index, timestep [B, 1] int64; metrics: contact (with a vehicle), contact_vru (with a pedestrian or
-    cyclist), contact_object, off_road [B, 1] bool at this step and progress [B, 1], m along the mission since the
-    start. With agents=True also agents: states [B, N, 4], valid [B, N], accel and turn_rate [B, N], for policies that
-    plan. Maps stay in `scene`.
+    Keys of a step: action [B, 2] (m/s^2, rad/s); observation [B, OBSERVATION_SIZE];
+    reward, done, terminated, truncated [B, 1]; scene_index, timestep [B, 1] int64;
+    metrics: contact (with a vehicle), contact_vru (with a pedestrian or cyclist),
+    contact_object, off_road [B, 1] bool at this step and progress [B, 1], m along the
+    mission since the start. With agents=True also agents: states [B, N, 4], valid [B,
+    N], accel and turn_rate [B, N], for policies that plan. Maps stay in `scene`.
 
-    An episode terminates at contact and off the road (settings). It is truncated after the scenes' T steps or when the
-    ego leaves the scene. A reset takes the scenes "scene_index" [B, 1] of its input; without this key it draws them
-    uniformly. The traffic is that of `set_traffic`, by default the recording.
+    An episode terminates at contact and off the road (settings). It is truncated after
+    the scenes' T steps or when the ego leaves the scene. A reset takes the scenes
+    "scene_index" [B, 1] of its input; without this key it draws them uniformly. The
+    traffic is that of `set_traffic`, by default the recording.
 
-    `set_seed` seeds the draws, those of transforms among them: it decides the episodes from the next reset on.
+    `set_seed` seeds the draws, those of transforms among them: it decides the episodes
+    from the next reset on.
 
-    With hold > 1 a step of the environment is so many steps of 0.1 s with the same action: rewards are summed, and an
-    episode that ends in between stays at that moment. `timestep` and T count steps of 0.1 s.
+    With hold > 1 a step of the environment is so many steps of 0.1 s with the same
+    action: rewards are summed, and an episode that ends in between stays at that
+    moment. `timestep` and T count steps of 0.1 s.
     """
 
     def __init__(
@@ -74,10 +87,12 @@ class DrivingEnv(EnvBase):
         hold: int = 1,
         observed=True,
     ) -> None:
-        """observed: false for egos that do not read the observation, which is then empty. Raises InputError if hold is
-        below 1."""
+        """observed: false for egos that do not read the observation, which is then
+        empty. Raises InputError if hold is below 1."""
         if hold < 1:
-            raise InputError(f"DrivingEnv: hold={hold}; an action lasts at least one step")
+            raise InputError(
+                f"DrivingEnv: hold={hold}; an action lasts at least one step"
+            )
         super().__init__(device=device, batch_size=[batch_size])
         self.scenes = scenes
         self.settings = settings
@@ -91,11 +106,17 @@ class DrivingEnv(EnvBase):
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
         """The running scenes, in one storage for the environment's lifetime: a reset overwrites its rows."""
         self.horizon = self.scene["logged"].shape[1] - 1
-        low = torch.tensor([-settings.max_braking, -settings.max_yaw_rate], device=device)
-        high = torch.tensor([settings.max_acceleration, settings.max_yaw_rate], device=device)
+        low = torch.tensor(
+            [-settings.max_braking, -settings.max_yaw_rate], device=device
+        )
+        high = torch.tensor(
+            [settings.max_acceleration, settings.max_yaw_rate], device=device
+        )
         weights = torch.tensor(check_weights(settings.reward), device=device)
         ends = settings.end_on_contact, settings.end_off_road, settings.end_when_gone
-        self._config = StepConfig(torch.tensor(ends, device=device), weights, low=low, high=high)
+        self._config = StepConfig(
+            torch.tensor(ends, device=device), weights, low=low, high=high
+        )
         self.clock = 0
         """Steps simulated so far, resets or not."""
         self._trajectories = Trajectories(self.scene)
@@ -105,17 +126,32 @@ class DrivingEnv(EnvBase):
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
         action = torch.zeros_like(start[:, :2])
         place = start_place(mission, start)
-        self._ego = placed_ego(mission, flags.long(), state=start, action=action, present=flags, on_road=flags, place=place, agents=self._static.vehicle)
-        self._features = torch.zeros(batch_size, width, device=device)  # as last observed
+        self._ego = placed_ego(
+            mission,
+            flags.long(),
+            state=start,
+            action=action,
+            present=flags,
+            on_road=flags,
+            place=place,
+            agents=self._static.vehicle,
+        )
+        self._features = torch.zeros(
+            batch_size, width, device=device
+        )  # as last observed
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
     def _make_specs(self, batch: int, agents: int) -> None:
         low = self._config.low
         high = self._config.high
-        self.action_spec = Bounded(low.repeat(batch, 1), high.repeat(batch, 1), device=self.device)
+        self.action_spec = Bounded(
+            low.repeat(batch, 1), high.repeat(batch, 1), device=self.device
+        )
 
         def flag(size: int = 1) -> Binary:
-            return Binary(size, shape=(batch, size), dtype=torch.bool, device=self.device)
+            return Binary(
+                size, shape=(batch, size), dtype=torch.bool, device=self.device
+            )
 
         def number(*size: int, dtype: torch.dtype = torch.float32) -> Unbounded:
             return Unbounded((batch, *(size or (1,))), dtype=dtype, device=self.device)
@@ -134,7 +170,9 @@ class DrivingEnv(EnvBase):
             valid = flag(agents)
             accel = number(agents)
             turn = number(agents)
-            specs["agents"] = group(states=states, valid=valid, accel=accel, turn_rate=turn)
+            specs["agents"] = group(
+                states=states, valid=valid, accel=accel, turn_rate=turn
+            )
         self.observation_spec = group(**specs)
         self.reward_spec = number()
         self.full_done_spec = group(done=flag(), terminated=flag(), truncated=flag())
@@ -145,35 +183,44 @@ class DrivingEnv(EnvBase):
                 generator.manual_seed(seed)
 
     def set_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
-        """Set the traffic of environments rows [b] int64 from their next reset on, instead of the recording.
+        """Set the traffic of environments rows [b] int64 from their next reset on,
+        instead of the recording.
 
-        states [b, T+1, N, 4], valid [b, T+1, N]; step 0 must be the scene's start. The ego's row is ignored;
-        pedestrians, cyclists and others keep replaying the log. Raises InputError on a wrong shape or NaN.
+        states [b, T+1, N, 4], valid [b, T+1, N]; step 0 must be the scene's start. The
+        ego's row is ignored; pedestrians, cyclists and others keep replaying the log.
+        Raises InputError on a wrong shape or NaN.
         """
         self._trajectories.schedule(rows, states, valid)
 
     def write_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
-        """Overwrite the vehicles' traffic of environments rows [b] at the coming steps; steps beyond T are dropped.
+        """Overwrite the vehicles' traffic of environments rows [b] at the coming steps;
+        steps beyond T are dropped.
 
         states [b, V, H, 4], valid [b, V, H].
         """
         self._trajectories.write(rows, self._ego.step[rows], states, valid)
 
     def write_agents(self, rows: Tensor, agents: Tensor, states: Tensor) -> None:
-        """Overwrite the traffic of vehicles agents [K] of environments rows [K] at the coming steps; steps beyond T are
-        dropped. states [K, H, 4]; the others' traffic stays."""
+        """Overwrite the traffic of vehicles agents [K] of environments rows [K] at the
+        coming steps; steps beyond T are dropped. states [K, H, 4]; the others' traffic
+        stays."""
         self._trajectories.write_agents(rows, agents, self._ego.step[rows], states)
 
     def world(self) -> World:
-        """The current World. Its `scene` is the environment's own storage, which the next reset overwrites."""
+        """The current World. Its `scene` is the environment's own storage, which the
+        next reset overwrites."""
         ego = self._ego
         begins = (self._ego.step == 0)[:, None]
         own = ego.state, ego.present, ego.action[:, 0], ego.action[:, 1]
         start = (self.scene[key] for key in START_KEYS)
-        driven = trajectories_at(self._trajectories.states, self._trajectories.valid, step=ego.step)
+        driven = trajectories_at(
+            self._trajectories.states, self._trajectories.valid, step=ego.step
+        )
         agents = {}
         for key, mine, first, later in zip(AGENT_KEYS, own, start, driven, strict=True):
-            known = torch.where(begins[..., None] if first.ndim > 2 else begins, first, later)
+            known = torch.where(
+                begins[..., None] if first.ndim > 2 else begins, first, later
+            )
             agents[key] = torch.cat([mine[:, None], known[:, 1:]], 1)
         return World(self.scene, ego.step, **agents, mission_s=ego.pose.s)
 
@@ -184,7 +231,9 @@ class DrivingEnv(EnvBase):
         index = given.get("_reset", every).view(batch).nonzero().squeeze(-1)
         chosen = given.get("scene_index", None)
         if chosen is None:
-            rows = torch.randint(len(self.scenes), (len(index),), generator=self._generator)
+            rows = torch.randint(
+                len(self.scenes), (len(index),), generator=self._generator
+            )
         else:
             rows = chosen.view(batch)[index].cpu()
         self.scenes.copy_into(self.scene, index, rows)
@@ -201,28 +250,60 @@ class DrivingEnv(EnvBase):
             self._features = self._features.index_copy(0, index, seen)
         ego = self._ego
         outcome = dict.fromkeys((*FLAGS, *METRICS), torch.zeros_like(ego.present))
-        return self._output(outcome | {"observation": self._features, "progress": ego.pose.s - ego.start_s})
+        return self._output(
+            outcome
+            | {"observation": self._features, "progress": ego.pose.s - ego.start_s}
+        )
 
     def _beginning(self, index: Tensor) -> TensorDict:
-        """What a reset of environments index [b] needs of their scenes; of routes and recording, that of the ego."""
+        """What a reset of environments index [b] needs of their scenes; of routes and
+        recording, that of the ego."""
         scene = {name: self.scene[name].index_select(0, index) for name in OF_SCENE}
-        scene |= {name: self.scene[name][:, :1][index] for name in (f"route_{key}" for key in OF_ROUTE)}
-        scene |= {name: self.scene[name][:, :, :1][index] for name in ("logged", "logged_valid")}
-        scene["field"] = self.scene["field"][: len(index)]  # storage that write_rows leaves alone
+        scene |= {
+            name: self.scene[name][:, :1][index]
+            for name in (f"route_{key}" for key in OF_ROUTE)
+        }
+        scene |= {
+            name: self.scene[name][:, :, :1][index]
+            for name in ("logged", "logged_valid")
+        }
+        scene["field"] = self.scene["field"][
+            : len(index)
+        ]  # storage that write_rows leaves alone
         return TensorDict(scene, batch_size=[len(index)], device=self.device)
 
-    def _restart(self, index: Tensor, scene: TensorDictBase, mission: Mission) -> EgoState:
-        """Write, and return, the start states [b] of environments index [b] in scenes scene [b]."""
-        start = self.scene["start"][:, :1, :2]  # of all environments: the fields stay where they are
-        on_road = off_road(start, self.scene["field"], origin=self.scene["field_origin"])[index, 0] <= 0
-        action = torch.stack([scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1)
+    def _restart(
+        self, index: Tensor, scene: TensorDictBase, mission: Mission
+    ) -> EgoState:
+        """Write, and return, the start states [b] of environments index [b] in scenes
+        scene [b]."""
+        start = self.scene["start"][
+            :, :1, :2
+        ]  # of all environments: the fields stay where they are
+        on_road = (
+            off_road(start, self.scene["field"], origin=self.scene["field_origin"])[
+                index, 0
+            ]
+            <= 0
+        )
+        action = torch.stack(
+            [scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1
+        )
         flags = torch.ones_like(on_road), on_road
         state = scene["start"][:, 0]
         fresh = placed_ego(
-            mission, torch.zeros_like(index), state, action, *flags, start_place(mission, state), scene["valid"][:, 1:]
+            mission,
+            torch.zeros_like(index),
+            state,
+            action,
+            *flags,
+            start_place(mission, state),
+            scene["valid"][:, 1:],
         )
 
-        self._ego = self._ego.merged(fresh, lambda old, new: old.index_copy(0, index, new))
+        self._ego = self._ego.merged(
+            fresh, lambda old, new: old.index_copy(0, index, new)
+        )
         return fresh
 
     @torch.no_grad()  # the stored state must not accumulate an autograd graph
@@ -231,7 +312,15 @@ class DrivingEnv(EnvBase):
         tracks = self._trajectories.states, self._trajectories.valid
         recording = self.scene["logged"], self.scene["logged_valid"]
         given = recording if self.settings.replay_ego else tensordict["action"]
-        self._ego, outcome = hold_step(self.hold, self._look, ego=self._ego, given=given, tracks=tracks, static=self._static, config=self._config)
+        self._ego, outcome = hold_step(
+            self.hold,
+            self._look,
+            ego=self._ego,
+            given=given,
+            tracks=tracks,
+            static=self._static,
+            config=self._config,
+        )
         self._features = outcome["observation"]
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 
@@ -244,11 +333,15 @@ class DrivingEnv(EnvBase):
             "observation": outcome["observation"],
             "scene_index": self.scene["scene_index"][:, None].clone(),
             "timestep": self._ego.step[:, None].clone(),
-            "metrics": TensorDict({name: outcome[name][:, None] for name in METRICS}, shape, device=device),
+            "metrics": TensorDict(
+                {name: outcome[name][:, None] for name in METRICS}, shape, device=device
+            ),
             "done": flags["terminated"] | flags["truncated"],
             **flags,
         }
         if self.agents:
             now = self.world()
-            result["agents"] = TensorDict({key: getattr(now, key) for key in AGENT_KEYS}, shape, device=device)
+            result["agents"] = TensorDict(
+                {key: getattr(now, key) for key in AGENT_KEYS}, shape, device=device
+            )
         return TensorDict(result, shape, device=device)

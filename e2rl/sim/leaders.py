@@ -1,7 +1,8 @@
 """Leaders: the nearest agent ahead of each vehicle along its route.
 
-Most agents are far from most routes, so only near pairs are projected: routes are cut into stretches with bounding
-boxes, and an agent is compared with the vertices of the stretches near it.
+Most agents are far from most routes, so only near pairs are projected: routes are cut
+into stretches with bounding boxes, and an agent is compared with the vertices of the
+stretches near it.
 """
 
 from typing import NamedTuple
@@ -17,10 +18,13 @@ FREE_GAP = 200.0  # m: the gap of a vehicle without a leader
 STRETCH = 10  # vertices
 
 
-# Called, because a field `index` of a class statement hides tuple.index for the type checker.
-class Leaders(NamedTuple("Leaders", [("gap", Tensor), ("speed", Tensor), ("index", Tensor)])):
-    """Per vehicle and moment [B, V, T]: gap from bumper to bumper [m], the leader's speed along the route [m/s], its
-    index."""
+# Called, because a field `index` of a class statement hides tuple.index for the type
+# checker.
+class Leaders(
+    NamedTuple("Leaders", [("gap", Tensor), ("speed", Tensor), ("index", Tensor)])
+):
+    """Per vehicle and moment [B, V, T]: gap from bumper to bumper [m], the leader's
+    speed along the route [m/s], its index."""
 
 
 def leaders(
@@ -32,25 +36,40 @@ def leaders(
     d: Tensor | None = None,
     free_gap: float = FREE_GAP,
 ) -> Leaders:
-    """The nearest agent ahead of each vehicle whose box is within GATE_MARGIN of the vehicle's lateral range.
+    """The nearest agent ahead of each vehicle whose box is within GATE_MARGIN of the
+    vehicle's lateral range.
 
     Fields [B, V, T]: at T moments of the agents.
 
-    s [B, V]: arc lengths of the vehicles on their routes points [B, V, P, 2], where they are all the while; agents
-    [B, M, T, 4], size [B, M, 2] and present [B, M]: of all agents, the vehicles in rows 0..V-1. A vehicle's lateral
-    range is its width around the route; with offsets d [B, V] it also covers the distance from the offset back to the
-    route. Without a leader nearer than `free_gap` m, the gap is `free_gap` and the speed is the vehicle's own.
+    s [B, V]: arc lengths of the vehicles on their routes points [B, V, P, 2], where
+    they are all the while; agents [B, M, T, 4], size [B, M, 2] and present [B, M]: of
+    all agents, the vehicles in rows 0..V-1. A vehicle's lateral range is its width
+    around the route; with offsets d [B, V] it also covers the distance from the offset
+    back to the route. Without a leader nearer than `free_gap` m, the gap is `free_gap`
+    and the speed is the vehicle's own.
     """
     moments = agents.shape[2]
-    reach = size[:, : s.shape[1], 1] / 2 + GATE_MARGIN + (torch.zeros_like(s) if d is None else d.abs())
+    reach = (
+        size[:, : s.shape[1], 1] / 2
+        + GATE_MARGIN
+        + (torch.zeros_like(s) if d is None else d.abs())
+    )
     room = reach[..., None] + size.norm(dim=-1)[:, None] / 2
-    pairs = scene, vehicle, other, moment, _ = _near_pairs(points, s, xy=agents[..., :2], room=room, present=present)
+    pairs = scene, vehicle, other, moment, _ = _near_pairs(
+        points, s, xy=agents[..., :2], room=room, present=present
+    )
     aside = torch.zeros_like(s) if d is None else d
     gap, along, leads = ahead_of(s, aside, agents, size, points, *pairs)
     table = gap.new_full((*s.shape, moments, agents.shape[1]), free_gap)
     pair = scene, vehicle, moment, other
-    nearest, index = table.index_put(pair, torch.where(leads > 0, gap, free_gap)).min(-1)
-    speed = torch.zeros_like(table).index_put(pair, along).gather(-1, index[..., None])[..., 0]
+    nearest, index = table.index_put(pair, torch.where(leads > 0, gap, free_gap)).min(
+        -1
+    )
+    speed = (
+        torch.zeros_like(table)
+        .index_put(pair, along)
+        .gather(-1, index[..., None])[..., 0]
+    )
     speed = torch.where(nearest < free_gap, speed, agents[:, : s.shape[1], :, 3])
     return Leaders(nearest.clamp(max=free_gap), speed, index=index)
 
@@ -68,12 +87,18 @@ def ahead_of(
     moment: Tensor,
     vertex: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of pairs [Q] of a vehicle and an agent at a moment, by the nearest vertex of the vehicle's route: the gap m, the
-    agent's speed along the route m/s, and 1 where it is a leader (see `leaders`), else 0."""
+    """Of pairs [Q] of a vehicle and an agent at a moment, by the nearest vertex of the
+    vehicle's route: the gap m, the agent's speed along the route m/s, and 1 where it is
+    a leader (see `leaders`), else 0."""
     own = scene, vehicle
     agent = agents[scene, other, moment]
     box = size[scene, other]
-    at, offset, heading = onto_segments(agent[:, :2], vertex, last=points.shape[2] - 2, take=lambda index: points[*own, index])
+    at, offset, heading = onto_segments(
+        agent[:, :2],
+        vertex,
+        last=points.shape[2] - 2,
+        take=lambda index: points[*own, index],
+    )
     turn = agent[:, 2] - heading
     cos = torch.cos(turn)
     sin = torch.sin(turn)
@@ -84,18 +109,27 @@ def ahead_of(
     low = d[own].clamp(max=0)
     high = d[own].clamp(min=0)
     offset = offset - torch.minimum(torch.maximum(offset, low), high)
-    return gap, agent[:, 3] * cos, torch.where((offset.abs() < side) & (ahead > 0), 1.0, 0.0)
+    return (
+        gap,
+        agent[:, 3] * cos,
+        torch.where((offset.abs() < side) & (ahead > 0), 1.0, 0.0),
+    )
 
 
-def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Tensor) -> tuple[Tensor, ...]:
-    """Pairs (scene, vehicle, agent, moment, index of the nearest vertex; each [Q]) of present agents xy [B, M, T, 2]
-    within room [B, V, M] m of the vehicle's route and not behind it. Where the route comes by an agent more than once,
-    the first time counts. A route continues straight beyond its last vertex."""
+def _near_pairs(
+    points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Tensor
+) -> tuple[Tensor, ...]:
+    """Pairs (scene, vehicle, agent, moment, index of the nearest vertex; each [Q]) of
+    present agents xy [B, M, T, 2] within room [B, V, M] m of the vehicle's route and
+    not behind it. Where the route comes by an agent more than once, the first time
+    counts. A route continues straight beyond its last vertex."""
     vehicles, count = points.shape[1:3]
     moments = xy.shape[2]
     stretches = _stretches(points)  # [B, V, C, 2, STRETCH + 1]
     low, high = torch.aminmax(stretches, dim=-1)
-    ends = SPACING * (STRETCH * torch.arange(1, low.shape[2] + 1, device=s.device)).clamp(max=count - 1)
+    ends = SPACING * (
+        STRETCH * torch.arange(1, low.shape[2] + 1, device=s.device)
+    ).clamp(max=count - 1)
     to_come = (ends >= s[..., None] - SPACING).to(s.dtype)
     itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)
     counts = present[:, :vehicles, None] & present[:, None] & ~itself
@@ -106,21 +140,25 @@ def _near_pairs(points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Te
     b, v, m = (counts.repeat_interleave(moments, -1) & some).nonzero(as_tuple=True)
     there = flat[b, m]
     within = far[b, v, m]
-    near = _near(low[b, v], high[b, v], xy=there[:, None], far=within[:, None]) & (to_come[b, v] > 0)
+    near = _near(low[b, v], high[b, v], xy=there[:, None], far=within[:, None]) & (
+        to_come[b, v] > 0
+    )
     near[:, -1] |= _beyond(ends_at[0][b, v], ends_at[1][b, v], xy=there, far=within)
     pair, stretch = near.nonzero(as_tuple=True)
     gap = stretches[b[pair], v[pair], stretch] - flat[b, m][pair][..., None]
     nearest, index = gap.square().sum(1).min(-1)
     table = nearest.new_full(near.shape, torch.inf).index_put((pair, stretch), nearest)
-    vertex = torch.zeros_like(table, dtype=torch.long).index_put((pair, stretch), STRETCH * stretch + index)
+    vertex = torch.zeros_like(table, dtype=torch.long).index_put(
+        (pair, stretch), STRETCH * stretch + index
+    )
     chosen = _first_passage(table, within.square())
     vertex = vertex.gather(1, chosen[:, None])[:, 0].clamp(max=count - 1)
     return b, v, m // moments, m % moments, vertex
 
 
 def _first_passage(squared: Tensor, reach: Tensor) -> Tensor:
-    """Index [Q] of the first stretch that is nearer to an agent than the next one is, and within reach; without any,
-    of the nearest.
+    """Index [Q] of the first stretch that is nearer to an agent than the next one is,
+    and within reach; without any, of the nearest.
 
     squared [Q, C], reach [Q]: squared distances.
     """
@@ -131,23 +169,37 @@ def _first_passage(squared: Tensor, reach: Tensor) -> Tensor:
 
 @fused("B V C 2", "B V C 2", "B V 2", "B V 2", "B V C", "B Q 2", "B V Q")
 def near_some(
-    low: Tensor, high: Tensor, before: Tensor, last: Tensor, to_come: Tensor, xy: Tensor, far: Tensor
+    low: Tensor,
+    high: Tensor,
+    before: Tensor,
+    last: Tensor,
+    to_come: Tensor,
+    xy: Tensor,
+    far: Tensor,
 ) -> Tensor:
-    """1 where points xy [B, Q, 2] are within far [B, V, Q] m of the box, low to high, of a stretch that is to come (1,
-    else 0), or of the route's straight continuation beyond its last two vertices; else 0."""
-    near = _near(low[..., None, :], high[..., None, :], xy=xy[:, None, None], far=far[:, :, None])
+    """1 where points xy [B, Q, 2] are within far [B, V, Q] m of the box, low to high,
+    of a stretch that is to come (1, else 0), or of the route's straight continuation
+    beyond its last two vertices; else 0."""
+    near = _near(
+        low[..., None, :], high[..., None, :], xy=xy[:, None, None], far=far[:, :, None]
+    )
     beyond = _beyond(before[:, :, None], last[:, :, None], xy=xy[:, None], far=far)
-    return torch.maximum(torch.where(near, to_come[..., None], 0.0).amax(2), torch.where(beyond, 1.0, 0.0))
+    return torch.maximum(
+        torch.where(near, to_come[..., None], 0.0).amax(2),
+        torch.where(beyond, 1.0, 0.0),
+    )
 
 
 def _near(low: Tensor, high: Tensor, xy: Tensor, far: Tensor) -> Tensor:
-    """Bool [...]: points xy [..., 2] are within far [...] m of boxes low to high [..., 2]."""
+    """Bool [...]: points xy [..., 2] are within far [...] m of boxes low to high [...,
+    2]."""
     x, y = torch.maximum(low - xy, xy - high).clamp(min=0).unbind(-1)
     return x.square() + y.square() < far.square()
 
 
 def _beyond(before: Tensor, last: Tensor, xy: Tensor, far: Tensor) -> Tensor:
-    """Bool [...]: points are within far m of a line that goes on straight beyond its last two vertices [..., 2]."""
+    """Bool [...]: points are within far m of a line that goes on straight beyond its
+    last two vertices [..., 2]."""
     tip = last - before
     unit = tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     past = xy - last
@@ -156,8 +208,9 @@ def _beyond(before: Tensor, last: Tensor, xy: Tensor, far: Tensor) -> Tensor:
 
 
 def _stretches(points: Tensor) -> Tensor:
-    """Stretches [B, V, C, 2, STRETCH + 1] of routes points [B, V, P, 2]; each begins with the last vertex of the one
-    before, and the last one is filled up with the route's end."""
+    """Stretches [B, V, C, 2, STRETCH + 1] of routes points [B, V, P, 2]; each begins
+    with the last vertex of the one before, and the last one is filled up with the
+    route's end."""
     missing = -(points.shape[2] - 1) % STRETCH
     if missing:
         points = torch.cat([points, points[:, :, -1:].expand(-1, -1, missing, -1)], 2)
@@ -165,7 +218,8 @@ def _stretches(points: Tensor) -> Tensor:
 
 
 class IDMParameters(NamedTuple):
-    """Headway T [s], standstill gap s0 [m], maximum acceleration a and comfortable braking b [m/s^2], exponent n."""
+    """Headway T [s], standstill gap s0 [m], maximum acceleration a and comfortable
+    braking b [m/s^2], exponent n."""
 
     headway: float
     standstill_gap: float
@@ -176,25 +230,40 @@ class IDMParameters(NamedTuple):
 
 def desired_gap(speed: Tensor, leader_speed: Tensor, driver: IDMParameters) -> Tensor:
     """s* [...] m behind a leader: s0 + max(0, v T + v (v - v_leader) / (2 sqrt(a b)))."""
-    closing = speed * (speed - leader_speed) / (2 * (driver.acceleration * driver.braking) ** 0.5)
+    closing = (
+        speed
+        * (speed - leader_speed)
+        / (2 * (driver.acceleration * driver.braking) ** 0.5)
+    )
     return driver.standstill_gap + (speed * driver.headway + closing).clamp(min=0)
 
 
 def idm_acceleration(
-    speed: Tensor, desired_speed: Tensor, gap: Tensor, leader_speed: Tensor, driver: IDMParameters, improved: bool
+    speed: Tensor,
+    desired_speed: Tensor,
+    gap: Tensor,
+    leader_speed: Tensor,
+    driver: IDMParameters,
+    improved: bool,
 ) -> Tensor:
-    """IDM acceleration [...] m/s^2: the free-road term less a (s* / s)^2. Speeds in m/s; gap s [...] m, inf: no leader.
+    """IDM acceleration [...] m/s^2: the free-road term less a (s* / s)^2. Speeds in
+    m/s; gap s [...] m, inf: no leader.
 
-    Treiber, Hennecke and Helbing, Physical Review E 62 (2000), eqs. (3) and (4), whose free-road term is
-    a (1 - (v / v0)^n). `improved`: above the desired speed v0 it is -b (1 - (v0 / v)^(a n / b)), which brakes by b at
-    most (Treiber and Kesting, Traffic Flow Dynamics, 2013, eq. 11.23).
+    Treiber, Hennecke and Helbing, Physical Review E 62 (2000), eqs. (3) and (4), whose
+    free-road term is a (1 - (v / v0)^n). `improved`: above the desired speed v0 it is
+    -b (1 - (v0 / v)^(a n / b)), which brakes by b at most (Treiber and Kesting, Traffic
+    Flow Dynamics, 2013, eq. 11.23).
     """
     a = driver.acceleration
     b = driver.braking
     n = driver.exponent
-    interaction = (desired_gap(speed, leader_speed, driver=driver) / gap.clamp(min=0.1)) ** 2
+    interaction = (
+        desired_gap(speed, leader_speed, driver=driver) / gap.clamp(min=0.1)
+    ) ** 2
     if not improved:
         return a * (1 - (speed / desired_speed).clamp(min=0) ** n - interaction)
     below = a * (1 - (speed / desired_speed).clamp(0, 1) ** n)
-    above = -b * (1 - (desired_speed / speed.clamp(min=1e-3)).clamp(max=1) ** (a * n / b))
+    above = -b * (
+        1 - (desired_speed / speed.clamp(min=1e-3)).clamp(max=1) ** (a * n / b)
+    )
     return torch.where(speed > desired_speed, above, below) - a * interaction

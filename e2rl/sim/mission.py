@@ -1,4 +1,5 @@
-"""The ego's mission, the route candidate that fits its recording, with speed limits and end; traffic lights."""
+"""The ego's mission, the route candidate that fits its recording, with speed limits and
+end; traffic lights."""
 
 from typing import NamedTuple
 
@@ -11,9 +12,11 @@ from e2rl.scenes.route import BEHIND, SPACING, project
 
 
 def light_state_at(light_state: Tensor, light: Tensor, step: Tensor) -> Tensor:
-    """States [B, ...] of the lights with indices light [B, ...] at steps [B]; LIGHT_UNKNOWN where the index is -1.
+    """States [B, ...] of the lights with indices light [B, ...] at steps [B];
+    LIGHT_UNKNOWN where the index is -1.
 
-    light_state [B, T + 1, S]: recorded states; the last one is held beyond the recording.
+    light_state [B, T + 1, S]: recorded states; the last one is held beyond the
+    recording.
     """
     if not light_state.shape[-1]:
         return torch.full_like(light, LIGHT_UNKNOWN)
@@ -27,17 +30,25 @@ def lights_of(light_state: Tensor, light: Tensor) -> Tensor:
     """`light_state_at` at every step: [B, T + 1, K] of light [B, K]."""
     if not light_state.shape[-1]:
         return light.new_full((*light_state.shape[:2], light.shape[1]), LIGHT_UNKNOWN)
-    state = light_state.gather(2, light.clamp(min=0)[:, None].expand(-1, light_state.shape[1], -1))
+    state = light_state.gather(
+        2, light.clamp(min=0)[:, None].expand(-1, light_state.shape[1], -1)
+    )
     return state.masked_fill((light < 0)[:, None], LIGHT_UNKNOWN)
 
 
 def stop_line_distance(
-    state: Tensor, ahead: Tensor, speed: Tensor, red_braking: float, yellow_braking: float
+    state: Tensor,
+    ahead: Tensor,
+    speed: Tensor,
+    red_braking: float,
+    yellow_braking: float,
 ) -> Tensor:
-    """Metres [...] to the next stop line that binds, inf for none; state, ahead [..., K]: of K lights.
+    """Metres [...] to the next stop line that binds, inf for none; state, ahead [...,
+    K]: of K lights.
 
-    A red light binds if braking at less than red_braking m/s^2 from speed [...] m/s halts before its line, a yellow
-    light at less than yellow_braking. A vehicle that cannot halt in time continues.
+    A red light binds if braking at less than red_braking m/s^2 from speed [...] m/s
+    halts before its line, a yellow light at less than yellow_braking. A vehicle that
+    cannot halt in time continues.
     """
     needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))
     red = (state == LIGHT_RED) & (needed < red_braking)
@@ -48,10 +59,13 @@ def stop_line_distance(
 def ran_red(light_state: Tensor, light: Tensor, line: Tensor, front: Tensor) -> Tensor:
     """Step [Q] int64 at which vehicles last crossed a stop line at red, -1 for never.
 
-    light_state [Q, T + 1, S]; light, line [Q, K]: indices of lights (-1 none) and arc lengths of their stop lines;
-    front [Q, T + 1]: arc length of the front bumper, on the same route.
+    light_state [Q, T + 1, S]; light, line [Q, K]: indices of lights (-1 none) and arc
+    lengths of their stop lines; front [Q, T + 1]: arc length of the front bumper, on
+    the same route.
     """
-    crossed = (front[:, :-1, None] < line[:, None]) & (front[:, 1:, None] >= line[:, None])
+    crossed = (front[:, :-1, None] < line[:, None]) & (
+        front[:, 1:, None] >= line[:, None]
+    )
     wrong = crossed & (lights_of(light_state, light)[:, 1:] == LIGHT_RED)
     steps = torch.arange(1, front.shape[1], device=front.device)
     return torch.where(wrong.any(-1), steps, -1).amax(1)
@@ -60,9 +74,9 @@ def ran_red(light_state: Tensor, light: Tensor, line: Tensor, front: Tensor) -> 
 class Mission(NamedTuple):
     """Mission routes of B scenes.
 
-    points [B, P, 2]: vertices; limit [B, P]: speed limits [m/s], 0 unknown; end [B]: arc length [m] at which the map
-    ends, else inf; light [B, 2]: indices of the lights, -1: none; light_s [B, 2]: arc lengths of their stop
-    lines.
+    points [B, P, 2]: vertices; limit [B, P]: speed limits [m/s], 0 unknown; end [B]:
+    arc length [m] at which the map ends, else inf; light [B, 2]: indices of the lights,
+    -1: none; light_s [B, 2]: arc lengths of their stop lines.
     """
 
     points: Tensor
@@ -81,11 +95,18 @@ def mission_of(scene: TensorDictBase) -> Mission:
         return scene[key][row, 0, pick]
 
     end = of("route_length").masked_fill(~of("route_open"), torch.inf)
-    return Mission(of("route_points"), of("route_limit"), end=end, light=of("route_light"), light_s=of("route_light_s"))
+    return Mission(
+        of("route_points"),
+        of("route_limit"),
+        end=end,
+        light=of("route_light"),
+        light_s=of("route_light_s"),
+    )
 
 
 def start_place(mission: Mission, state: Tensor) -> Tensor:
-    """Arc length [B] m of egos at their start states [B, 4] on their missions, which begin at most BEHIND m before."""
+    """Arc length [B] m of egos at their start states [B, 4] on their missions, which
+    begin at most BEHIND m before."""
     hint = torch.full_like(state[:, :1], BEHIND)
     return project(state[:, None, :2], mission.points, hint=hint)[0][:, 0]
 

@@ -1,4 +1,5 @@
-"""The reward of a step: TERMS, and their weighted sum (weights in conf/sim/default.yaml)."""
+"""The reward of a step: TERMS, and their weighted sum (weights in
+conf/sim/default.yaml)."""
 
 from collections.abc import Mapping
 
@@ -8,15 +9,27 @@ from torch import Tensor
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
 
-TERMS = ("progress", "contact", "fault", "off_road", "comfort", "acceleration", "speeding", "lane_offset")
-LEAST_TOP_SPEED = 5.0  # m/s: progress at this speed is rewarded even where the recorded ego stands
+TERMS = (
+    "progress",
+    "contact",
+    "fault",
+    "off_road",
+    "comfort",
+    "acceleration",
+    "speeding",
+    "lane_offset",
+)
+LEAST_TOP_SPEED = (
+    5.0  # m/s: progress at this speed is rewarded even where the recorded ego stands
+)
 
 
 def rewarded_progress(progress: Tensor, limit: Tensor, top_speed: Tensor) -> Tensor:
-    """The part [B] m of a step's progress [B] m that is rewarded: driving faster than allowed does not pay.
+    """The part [B] m of a step's progress [B] m that is rewarded: driving faster than
+    allowed does not pay.
 
-    Allowed is the recorded ego's top_speed [B] m/s, which counts as at least LEAST_TOP_SPEED, and no more than the
-    speed limit [B] m/s where it is known (not 0).
+    Allowed is the recorded ego's top_speed [B] m/s, which counts as at least
+    LEAST_TOP_SPEED, and no more than the speed limit [B] m/s where it is known (not 0).
     """
     allowed = top_speed.clamp(min=LEAST_TOP_SPEED)
     allowed = torch.where(limit > 0, torch.minimum(limit, allowed), allowed)
@@ -60,10 +73,13 @@ def reward_terms(
 
 
 def check_weights(weights: Mapping[str, float]) -> list[float]:
-    """The weights in the order of TERMS; raises InputError for an unknown name or a missing term."""
+    """The weights in the order of TERMS; raises InputError for an unknown name or a
+    missing term."""
     wrong = set(weights) ^ set(TERMS)
     if wrong:
-        raise InputError(f"sim.reward: {', '.join(sorted(wrong))} missing or unknown; give exactly {', '.join(TERMS)}")
+        raise InputError(
+            f"sim.reward: {', '.join(sorted(wrong))} missing or unknown; give exactly {', '.join(TERMS)}"
+        )
     return [float(weights[name]) for name in TERMS]
 
 

@@ -1,4 +1,5 @@
-"""The file of a rollout: an npz of format e2rl-rollout/1, readable without pickle (docs/method.md, section 11)."""
+"""The file of a rollout: an npz of format e2rl-rollout/1, readable without pickle
+(docs/method.md, section 11)."""
 
 import hashlib
 import io
@@ -19,26 +20,50 @@ FORMAT = "e2rl-rollout/1"
 ROLLOUTS = "rollouts"  # folder of a run with a file per rollout
 MAX_BYTES = 1 << 27  # of a file, unpacked
 MOST = 1e6  # intensity
-FARTHEST, FASTEST, LONGEST, TURNED = 1e5, 150.0, 100.0, 1e3  # m, m/s, m and rad of an agent
-PLAIN = re.compile(r"[a-z0-9.@+-]+(_[a-z0-9.@+-]+)*")  # part of a file name that stands for itself
-STEM, DIGITS = 200, 10  # characters of a file name without its ending, and of the hash after it
-UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")  # also what turns text round
+FARTHEST, FASTEST, LONGEST, TURNED = (
+    1e5,
+    150.0,
+    100.0,
+    1e3,
+)  # m, m/s, m and rad of an agent
+PLAIN = re.compile(
+    r"[a-z0-9.@+-]+(_[a-z0-9.@+-]+)*"
+)  # part of a file name that stands for itself
+STEM, DIGITS = (
+    200,
+    10,
+)  # characters of a file name without its ending, and of the hash after it
+UNPRINTABLE = re.compile(
+    r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)  # also what turns text round
 
 
-def array(kinds: str, shape: str, low: float | None = None, high: float | None = None, **options: Any) -> Any:
+def array(
+    kinds: str,
+    shape: str,
+    low: float | None = None,
+    high: float | None = None,
+    **options: Any,
+) -> Any:
     """A field of a rollout file.
 
     Args:
-        kinds: numpy's kinds of elements that it may have: U text, b bool, i and u whole numbers, f floats.
-        shape: per axis a size, or a letter for a size that is the same wherever the letter stands; "": one value.
-        low, high: bounds of its values. They are lowered by the number of agents where `high` is below 0.
+        kinds: numpy's kinds of elements that it may have: U text, b bool, i and u whole
+            numbers, f floats.
+        shape: per axis a size, or a letter for a size that is the same wherever the
+            letter stands; "": one value.
+        low, high: bounds of its values. They are lowered by the number of agents where
+            `high` is below 0.
     """
-    return field(metadata={"kinds": kinds, "shape": shape, "low": low, "high": high}, **options)
+    return field(
+        metadata={"kinds": kinds, "shape": shape, "low": low, "high": high}, **options
+    )
 
 
 @dataclass(kw_only=True)
 class Road:
-    """A map without padding: lane l is lane_points[lane_offsets[l]:lane_offsets[l + 1]], drivable polygons alike."""
+    """A map without padding: lane l is lane_points[lane_offsets[l]:lane_offsets[l +
+    1]], drivable polygons alike."""
 
     lane_points: np.ndarray = array("f", "M2")
     lane_offsets: np.ndarray = array("iu", "L")
@@ -48,20 +73,29 @@ class Road:
 
     def lanes(self) -> list[np.ndarray]:
         """Centreline [P, 2] m of each lane."""
-        return [part for part in np.split(self.lane_points, self.lane_offsets[1:-1]) if len(part)]
+        return [
+            part
+            for part in np.split(self.lane_points, self.lane_offsets[1:-1])
+            if len(part)
+        ]
 
     def polygons(self) -> list[np.ndarray]:
         """Ring [P, 2] m of each drivable polygon."""
-        return [part for part in np.split(self.drivable_points, self.drivable_offsets[1:-1]) if len(part)]
+        return [
+            part
+            for part in np.split(self.drivable_points, self.drivable_offsets[1:-1])
+            if len(part)
+        ]
 
 
 @dataclass(kw_only=True)
 class Rollout(Road):
     """One rollout as numpy arrays without padding: the content of its file.
 
-    Optional are `ran_light` [N], the step at which each vehicle last crossed a stop line at red; `evasion` and `driver`
-    [T+1, 4], the ego as the search for evasions and as the competent driver of the verdict drive it; `plans`
-    [R, P, K, 2] m and `targets` [R, P] of the agents `planners` [P] at each of R replans.
+    Optional are `ran_light` [N], the step at which each vehicle last crossed a stop
+    line at red; `evasion` and `driver` [T+1, 4], the ego as the search for evasions and
+    as the competent driver of the verdict drive it; `plans` [R, P, K, 2] m and
+    `targets` [R, P] of the agents `planners` [P] at each of R replans.
     """
 
     scene_id: str = array("U", "")
@@ -96,29 +130,48 @@ class Rollout(Road):
 
     @classmethod
     def read(cls, path: Path, within: Path | None = None) -> "Rollout":
-        """The rollout of a file, which lies in the folder `within` once links are followed. Raises InputError, naming
-        the file, where it is none."""
+        """The rollout of a file, which lies in the folder `within` once links are
+        followed. Raises InputError, naming the file, where it is none."""
         path = Path(path)
         try:
             with open_regular(path, MAX_BYTES, within=within) as file:
                 data = read_arrays(file, MAX_BYTES)
         except (OSError, ValueError) as error:
-            raise InputError(f"{path}: no readable rollout ({error}); run evaluate.py again to rewrite it") from error
+            raise InputError(
+                f"{path}: no readable rollout ({error}); run evaluate.py again to rewrite it"
+            ) from error
         known = fields(cls)
-        missing = [each.name for each in known if each.default is not None and each.name not in data]
+        missing = [
+            each.name
+            for each in known
+            if each.default is not None and each.name not in data
+        ]
         if missing or str(data.get("format")) != FORMAT:
             raise InputError(
                 f"{path}: not of format {FORMAT} (missing: {', '.join(missing) or 'nothing'}; format: "
                 f"{data.get('format')}); give a folder that evaluate.py wrote"
             )
         if wrong := _misfit(data, known) or _odd_agents(data) or _odd_map(data):
-            raise InputError(f"{path}: damaged: {wrong}; run evaluate.py again to rewrite it")
-        found: dict[str, Any] = {each.name: data[each.name] for each in known if each.name in data}
-        return cls(**{name: value if value.shape else value.item() for name, value in found.items()})
+            raise InputError(
+                f"{path}: damaged: {wrong}; run evaluate.py again to rewrite it"
+            )
+        found: dict[str, Any] = {
+            each.name: data[each.name] for each in known if each.name in data
+        }
+        return cls(
+            **{
+                name: value if value.shape else value.item()
+                for name, value in found.items()
+            }
+        )
 
     def write(self, folder: Path) -> Path:
         """Write its file into a folder, whole or not at all; returns its path."""
-        known: dict[str, Any] = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+        known: dict[str, Any] = {
+            name: np.asarray(value)
+            for name, value in vars(self).items()
+            if value is not None
+        }
         buffer = io.BytesIO()
         np.savez_compressed(buffer, format=np.array(FORMAT), **known)
         path = Path(folder) / self.name
@@ -135,12 +188,21 @@ class Failure:
 
     @classmethod
     def read(cls, run: Path, row: Mapping[str, Any]) -> "Failure":
-        """The failure of a row of a run's table, with the rollout from its file; InputError where they do not fit."""
+        """The failure of a row of a run's table, with the rollout from its file;
+        InputError where they do not fit."""
         path = Path(run) / ROLLOUTS / rollout_name(row)
         rollout = Rollout.read(path, run)
-        (steps, agents), step, partner = rollout.valid.shape, row["contact_step"], row["partner"]
-        if rollout.name != path.name or (step == step and not (step in range(steps) and partner in range(agents))):
-            raise InputError(f"{path}: does not fit to its row of the table; run evaluate.py again to rewrite both")
+        (steps, agents), step, partner = (
+            rollout.valid.shape,
+            row["contact_step"],
+            row["partner"],
+        )
+        if rollout.name != path.name or (
+            step == step and not (step in range(steps) and partner in range(agents))
+        ):
+            raise InputError(
+                f"{path}: does not fit to its row of the table; run evaluate.py again to rewrite both"
+            )
         return cls(rollout, row)
 
     @property
@@ -161,17 +223,22 @@ def rollout_name(row: Mapping[str, Any]) -> str:
 
 
 def rollout_key(row: Mapping[str, Any]) -> str:
-    """<method>__<ego>__<eta>__<scene_id>__<seed> of a row or rollout, as `file_stem` writes it."""
+    """<method>__<ego>__<eta>__<scene_id>__<seed> of a row or rollout, as `file_stem`
+    writes it."""
     eta = float(row["eta"])
     short = f"{eta:g}" if float(f"{eta:g}") == eta else eta
-    return file_stem(row["method"], row["ego_policy"], short, row["scene_id"], row["seed"])
+    return file_stem(
+        row["method"], row["ego_policy"], short, row["scene_id"], row["seed"]
+    )
 
 
 def file_stem(*parts: object) -> str:
-    """The parts, joined by '__', as a file name without its ending; other parts have another name.
+    """The parts, joined by '__', as a file name without its ending; other parts have
+    another name.
 
-    Others than letters, digits and . _ @ + - become '-', and long names are cut. Then, and where a part has capitals,
-    which some file systems do not tell apart, a hash of the parts follows after '~'.
+    Others than letters, digits and . _ @ + - become '-', and long names are cut. Then,
+    and where a part has capitals, which some file systems do not tell apart, a hash of
+    the parts follows after '~'.
     """
     texts = [str(part) for part in parts]
     stem = "__".join(re.sub(r"[^A-Za-z0-9._@+-]", "-", text) for text in texts)
@@ -181,7 +248,8 @@ def file_stem(*parts: object) -> str:
 
 
 def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | None:
-    """Which array of a file has another type, shape or range than its field; None: none."""
+    """Which array of a file has another type, shape or range than its field; None:
+    none."""
     sizes: dict[str, int] = {}
     given = [each for each in known if each.name in data]
     for each in given:
@@ -207,7 +275,9 @@ def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | Non
         high = each.metadata["high"]
         if low is not None:
             most = high + sizes["N"] if high < 0 else high
-            if not ((data[each.name] >= low) & (data[each.name] <= most)).all():  # NaN is not, either
+            if not (
+                (data[each.name] >= low) & (data[each.name] <= most)
+            ).all():  # NaN is not, either
                 return f"{each.name} is out of range"
     return None
 
@@ -237,4 +307,8 @@ def _odd_map(data: Mapping[str, np.ndarray]) -> str | None:
             return f"{name}_offsets do not divide {name}_points"
         if not np.isfinite(data[f"{name}_points"]).all():
             return f"{name}_points are NaN or infinite"
-    return None if np.isfinite(data["lane_width"]).all() else "lane_width is NaN or infinite"
+    return (
+        None
+        if np.isfinite(data["lane_width"]).all()
+        else "lane_width is NaN or infinite"
+    )

@@ -1,4 +1,5 @@
-"""What a rollout is: `Rollouts`, a batch as padded tensors; `Rollout` is one of them, as its file holds it."""
+"""What a rollout is: `Rollouts`, a batch as padded tensors; `Rollout` is one of them,
+as its file holds it."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,17 +17,19 @@ from e2rl.sim.rollout_file import Road, Rollout
 
 TEXTS = ("scene_id", "location", "dataset", "split", "method", "ego_policy")
 MAP = ("lane_points", "lane_index", "lane_width", "drivable_points", "drivable_index")
-PADDING = dict.fromkeys(("lane_index", "drivable_index", "ran_light", "routes", "targets"), -1) | dict.fromkeys(
-    ("evasion", "driver"), torch.nan
-)  # where it is not 0
+PADDING = dict.fromkeys(
+    ("lane_index", "drivable_index", "ran_light", "routes", "targets"), -1
+) | dict.fromkeys(("evasion", "driver"), torch.nan)  # where it is not 0
 
 
 class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` and `split` are fields, not methods
-    """B rollouts of N agents, the ego first, over T steps of DT; step 0 is the start. Everything lies on the CPU.
+    """B rollouts of N agents, the ego first, over T steps of DT; step 0 is the start.
+    Everything lies on the CPU.
 
-    Indexing and `torch.cat` work as for tensors: `rollouts[mask]`, `rollouts[3]` (without the leading B). What is None
-    is not known. Vehicles have the rows 0 .. V-1. `torch.cat` pads maps and tracks to the largest, and does not know
-    what one of them does not.
+    Indexing and `torch.cat` work as for tensors: `rollouts[mask]`, `rollouts[3]`
+    (without the leading B). What is None is not known. Vehicles have the rows 0 .. V-1.
+    `torch.cat` pads maps and tracks to the largest, and does not know what one of them
+    does not.
     """
 
     states: Tensor  # [B, T+1, N, 4]: x, y [m], heading [rad], speed [m/s]
@@ -51,20 +54,32 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
     method: list[str] | None = None
     ego_policy: list[str] | None = None
     parked: Tensor | None = None  # [B, N] bool
-    ran_light: Tensor | None = None  # [B, N] int64: step of the last stop line crossed at red, -1 never
-    speed_limit: Tensor | None = None  # [B, T+1] m/s: of the ego's mission where it is, 0 unknown
+    ran_light: Tensor | None = (
+        None  # [B, N] int64: step of the last stop line crossed at red, -1 never
+    )
+    speed_limit: Tensor | None = (
+        None  # [B, T+1] m/s: of the ego's mission where it is, 0 unknown
+    )
     routes: Tensor | None = None  # [B, V] int64: route candidates followed, -1 none
     contact: Tensor | None = None  # [B] bool: the ego touched a vehicle
-    left_out: Tensor | None = None  # [B] int64: vehicles that come near in the recording and are not there
+    left_out: Tensor | None = (
+        None  # [B] int64: vehicles that come near in the recording and are not there
+    )
     transport_adversary: Tensor | None = None  # [B]: path KL of the control
     transport_others: Tensor | None = None  # [B]
     transport_anchor: Tensor | None = None  # [B]: anchor jump
     seconds: Tensor | None = None  # [B]: wall time
     nfe: Tensor | None = None  # [B]: evaluations of the prior's network
     plans: Tensor | None = None  # [B, R, V, K, 2] m: at each of R replans
-    targets: Tensor | None = None  # [B, R, V] int64: whom each vehicle aims at, 0 the ego, -1 nobody
-    evasion: Tensor | None = None  # [B, T+1, 4]: of the ego (metrics.evasion), NaN: none was found
-    driver: Tensor | None = None  # [B, T+1, 4]: the competent driver in the ego's place, NaN: no collision
+    targets: Tensor | None = (
+        None  # [B, R, V] int64: whom each vehicle aims at, 0 the ego, -1 nobody
+    )
+    evasion: Tensor | None = (
+        None  # [B, T+1, 4]: of the ego (metrics.evasion), NaN: none was found
+    )
+    driver: Tensor | None = (
+        None  # [B, T+1, 4]: the competent driver in the ego's place, NaN: no collision
+    )
 
     @classmethod
     def in_scenes(
@@ -77,7 +92,8 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
         replays_ego: bool = False,
         **known: Any,
     ) -> "Rollouts":
-        """Rollouts of scenes, those at index [B], with what these tell: sizes, types, recording, map and names.
+        """Rollouts of scenes, those at index [B], with what these tell: sizes, types,
+        recording, map and names.
 
         Args:
             scene: the batch of these scenes, where it is at hand.
@@ -87,11 +103,16 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
         scene = scenes.batch(index) if scene is None else scene
         start = scene["valid"]
         kind = scene["agent_type"]
-        slots = torch.arange(start.shape[1], device=start.device) < scene["route_log"].shape[1]
+        slots = (
+            torch.arange(start.shape[1], device=start.device)
+            < scene["route_log"].shape[1]
+        )
         simulated = start & slots & (kind == VEHICLE)
         simulated[:, 0] &= not replays_ego
         names = {"scene_id": scenes.scene_id, "location": scenes.location}
-        if (left_out := scene.get("left_out", None)) is not None:  # scenes made by hand may lack it
+        if (
+            left_out := scene.get("left_out", None)
+        ) is not None:  # scenes made by hand may lack it
             late = ~start & slots & (kind == VEHICLE) & valid.any(1)
             known["left_out"] = left_out - late.sum(-1)
         return cls(
@@ -99,70 +120,119 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
             valid=valid,
             simulated=simulated,
             logged_valid=scene["logged_valid"] & start[:, None],
-            **{name: scene[name] for name in ("size", "agent_type", "parked", "logged", *MAP)},
-            **{name: [values[i] for i in index.tolist()] for name, values in names.items()},
+            **{
+                name: scene[name]
+                for name in ("size", "agent_type", "parked", "logged", *MAP)
+            },
+            **{
+                name: [values[i] for i in index.tolist()]
+                for name, values in names.items()
+            },
             **known,
             batch_size=[len(index)],
         ).cpu()
 
     @classmethod
     def of(cls, rollouts: Sequence[Rollout]) -> "Rollouts":
-        """Rollouts, padded to the longest; without plans, targets, evasion and driver, which drawings alone need."""
+        """Rollouts, padded to the longest; without plans, targets, evasion and driver,
+        which drawings alone need."""
 
         def pad(name: str, fill: float = 0) -> Tensor:
             arrays = [torch.as_tensor(getattr(rollout, name)) for rollout in rollouts]
-            shape = [max(sizes) for sizes in zip(*(each.shape for each in arrays), strict=True)]
+            shape = [
+                max(sizes)
+                for sizes in zip(*(each.shape for each in arrays), strict=True)
+            ]
             result = torch.full((len(arrays), *shape), fill, dtype=arrays[0].dtype)
             for row, each in zip(result, arrays, strict=True):
                 row[tuple(slice(length) for length in each.shape)] = each
             return result
 
-        tracks = ("states", "valid", "size", "simulated", "adversaries", "logged", "logged_valid")
+        tracks = (
+            "states",
+            "valid",
+            "size",
+            "simulated",
+            "adversaries",
+            "logged",
+            "logged_valid",
+        )
         padded = (*tracks, "lane_points", "lane_width", "drivable_points")
-        lines: dict[str, list[Tensor]] = {"lane": [], "drivable": []}  # the line number of each point
+        lines: dict[str, list[Tensor]] = {
+            "lane": [],
+            "drivable": [],
+        }  # the line number of each point
         for each in rollouts:
             for name, numbers in lines.items():
                 counts = np.diff(getattr(each, f"{name}_offsets"))
-                numbers.append(torch.from_numpy(np.repeat(np.arange(len(counts)), counts)))
-        codes = [torch.tensor([AGENT_TYPES.index(kind) for kind in each.agent_type.tolist()]) for each in rollouts]
+                numbers.append(
+                    torch.from_numpy(np.repeat(np.arange(len(counts)), counts))
+                )
+        codes = [
+            torch.tensor([AGENT_TYPES.index(kind) for kind in each.agent_type.tolist()])
+            for each in rollouts
+        ]
         lights = all(rollout.ran_light is not None for rollout in rollouts)
         return cls(
             **{name: pad(name) for name in padded},
             agent_type=pad_sequence(codes, batch_first=True),
-            **{f"{name}_index": pad_sequence(each, True, padding_value=-1) for name, each in lines.items()},
+            **{
+                f"{name}_index": pad_sequence(each, True, padding_value=-1)
+                for name, each in lines.items()
+            },
             ran_light=pad("ran_light", -1) if lights else None,
             seed=torch.tensor([rollout.seed for rollout in rollouts]),
-            eta=torch.tensor([rollout.eta for rollout in rollouts], dtype=torch.float64),
-            **{name: [getattr(rollout, name) for rollout in rollouts] for name in TEXTS},
+            eta=torch.tensor(
+                [rollout.eta for rollout in rollouts], dtype=torch.float64
+            ),
+            **{
+                name: [getattr(rollout, name) for rollout in rollouts] for name in TEXTS
+            },
             batch_size=[len(rollouts)],
         )
 
     @classmethod
     def from_npz(cls, paths: Path | Iterable[Path]) -> "Rollouts":
-        """The rollouts of one or several files, padded. Raises InputError, naming the file, where one is damaged."""
-        return cls.of([Rollout.read(path) for path in ([paths] if isinstance(paths, str | Path) else paths)])
+        """The rollouts of one or several files, padded. Raises InputError, naming the
+        file, where one is damaged."""
+        return cls.of(
+            [
+                Rollout.read(path)
+                for path in ([paths] if isinstance(paths, str | Path) else paths)
+            ]
+        )
 
     def to_npz(self, folder: Path) -> list[Path]:
         """Write a file for each of B rollouts into a folder; returns their paths."""
         return [self.rollout(index).write(folder) for index in range(len(self))]
 
     def rollout(self, index: int) -> Rollout:
-        """One of B rollouts as numpy arrays. Plans are those of the ego and of the adversaries."""
+        """One of B rollouts as numpy arrays. Plans are those of the ego and of the
+        adversaries."""
         row = self[index]
         plans: dict[str, Any] = {}
         if row.plans is not None:
             planners = row.adversaries[: row.plans.shape[1]].bool().clone()
             planners[0] = True
             plans["planners"] = planners.nonzero()[:, 0].numpy()
-            plans |= {"plans": row.plans[:, planners].float().numpy(), "targets": row.targets[:, planners].numpy()}
+            plans |= {
+                "plans": row.plans[:, planners].float().numpy(),
+                "targets": row.targets[:, planners].numpy(),
+            }
         texts: dict[str, Any] = {name: str(getattr(row, name) or "") for name in TEXTS}
         return Rollout(
             **texts,
             seed=int(row.seed),
             eta=float(row.eta),
             agent_type=np.array(AGENT_TYPES)[row.agent_type.numpy()],
-            **{name: getattr(row, name).float().numpy() for name in ("states", "size", "logged")},
-            **{name: getattr(row, name).numpy() for name in ("valid", "simulated", "adversaries", "logged_valid")},
+            **{
+                name: getattr(row, name).float().numpy()
+                for name in ("states", "size", "logged")
+            },
+            **{
+                name: getattr(row, name).numpy()
+                for name in ("valid", "simulated", "adversaries", "logged_valid")
+            },
             **vars(road_of(row)),
             ran_light=None if row.ran_light is None else row.ran_light.numpy(),
             evasion=_known_track(row.evasion),
@@ -175,9 +245,14 @@ _tensorclass_function = Rollouts.__torch_function__
 
 
 def _torch_function(
-    cls: type[Rollouts], func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    cls: type[Rollouts],
+    func: Any,
+    types: Any,
+    args: tuple[Any, ...] = (),
+    kwargs: dict[str, Any] | None = None,
 ) -> Any:
-    """A tensor's function of Rollouts, `torch.cat` of those that differ in size or in what is known among them."""
+    """A tensor's function of Rollouts, `torch.cat` of those that differ in size or in
+    what is known among them."""
     kwargs = dict(kwargs or {})
     if func is torch.cat:
         parts = aligned(args[0] if args else kwargs.pop("tensors"))
@@ -189,7 +264,8 @@ Rollouts.__torch_function__ = classmethod(_torch_function)
 
 
 def aligned(parts: Sequence[Rollouts]) -> list[Rollouts]:
-    """Rollouts whose tensors have the same sizes but for B, padded, and that know the same."""
+    """Rollouts whose tensors have the same sizes but for B, padded, and that know the
+    same."""
     columns: dict[str, list[Any]] = {}
     for name in Rollouts.__dataclass_fields__:
         values = [getattr(part, name) for part in parts]
@@ -198,25 +274,40 @@ def aligned(parts: Sequence[Rollouts]) -> list[Rollouts]:
         elif name not in (*TEXTS, "batch_size"):
             columns[name] = padded(values, fill=PADDING.get(name, 0))
     return [
-        part.replace(**{name: column[index] for name, column in columns.items()}) for index, part in enumerate(parts)
+        part.replace(**{name: column[index] for name, column in columns.items()})
+        for index, part in enumerate(parts)
     ]
 
 
 def padded(values: Sequence[Tensor], fill: float) -> list[Tensor]:
     """Tensors [B, ...] with the largest sizes among them in all dims but the first."""
-    shape = [max(sizes) for sizes in zip(*(value.shape[1:] for value in values), strict=True)]
+    shape = [
+        max(sizes) for sizes in zip(*(value.shape[1:] for value in values), strict=True)
+    ]
     results = []
     for value in values:
-        room = [end for size, most in zip(value.shape[1:], shape, strict=True) for end in (most - size, 0)]
-        results.append(torch.nn.functional.pad(value, room[::-1], value=fill) if any(room) else value)
+        room = [
+            end
+            for size, most in zip(value.shape[1:], shape, strict=True)
+            for end in (most - size, 0)
+        ]
+        results.append(
+            torch.nn.functional.pad(value, room[::-1], value=fill)
+            if any(room)
+            else value
+        )
     return results
 
 
 def road_of(scene: Rollouts | TensorDictBase) -> Road:
     """The map of one scene or rollout, without its padding."""
     found = {name: scene.get(name) for name in MAP}
-    lanes, lane_offsets, whole = polylines(found["lane_points"], found["lane_index"], minimum=2)
-    rings, ring_offsets, _ = polylines(found["drivable_points"], found["drivable_index"], minimum=3)
+    lanes, lane_offsets, whole = polylines(
+        found["lane_points"], found["lane_index"], minimum=2
+    )
+    rings, ring_offsets, _ = polylines(
+        found["drivable_points"], found["drivable_index"], minimum=3
+    )
     return Road(
         lane_points=lanes,
         lane_offsets=lane_offsets,
@@ -226,8 +317,11 @@ def road_of(scene: Rollouts | TensorDictBase) -> Road:
     )
 
 
-def polylines(points: Tensor, index: Tensor, minimum: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(points [M, 2] float32, offsets [L + 1] int64, line numbers [L]) of padded points [P, 2] with index [P].
+def polylines(
+    points: Tensor, index: Tensor, minimum: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points [M, 2] float32, offsets [L + 1] int64, line numbers [L]) of padded points
+    [P, 2] with index [P].
 
     Lines of fewer than `minimum` points are left out.
     """

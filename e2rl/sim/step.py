@@ -1,6 +1,8 @@
-"""One simulation step of B scenes, as a pure function of tensors, and several under one action.
+"""One simulation step of B scenes, as a pure function of tensors, and several under one
+action.
 
-Only the ego's motion is integrated; the other agents' states are looked up in given trajectories.
+Only the ego's motion is integrated; the other agents' states are looked up in given
+trajectories.
 """
 
 from typing import NamedTuple
@@ -17,17 +19,23 @@ from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
 from e2rl.sim.static import STATIC, FrenetPose, StaticScene, follow
 from e2rl.sim.world import AGENTS, Agents, trajectories_at
 
-Tracks = tuple[Tensor, Tensor]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
+Tracks = tuple[
+    Tensor, Tensor
+]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
 Outcome = dict[str, Tensor]  # see `step`
-CONTACTS = ("contact", "contact_vru", "contact_object")  # with a vehicle, a pedestrian or cyclist, an object
+CONTACTS = (
+    "contact",
+    "contact_vru",
+    "contact_object",
+)  # with a vehicle, a pedestrian or cyclist, an object
 FLAGS = (*CONTACTS, "off_road", "terminated", "truncated")
 
 
 class StepConfig(NamedTuple):
     """What a step needs to know of the settings.
 
-    ends [3] bool: whether contact, leaving the road and leaving the scene end an episode; weights [8] of reward.TERMS;
-    low, high [2]: bounds of the action.
+    ends [3] bool: whether contact, leaving the road and leaving the scene end an
+    episode; weights [8] of reward.TERMS; low, high [2]: bounds of the action.
     """
 
     ends: Tensor
@@ -37,9 +45,9 @@ class StepConfig(NamedTuple):
 
 
 class Driven(NamedTuple):
-    """Egos after a step (`EgoState`, whose pose is s, d, heading), and of its outcome reward and progress, each [B];
-    truths [8, B], 0 or 1: FLAGS, and whether the egos are still in the scene and have been on the road; inside [B, M],
-    0 or 1."""
+    """Egos after a step (`EgoState`, whose pose is s, d, heading), and of its outcome
+    reward and progress, each [B]; truths [8, B], 0 or 1: FLAGS, and whether the egos
+    are still in the scene and have been on the road; inside [B, M], 0 or 1."""
 
     state: Tensor
     action: Tensor
@@ -65,16 +73,18 @@ def step(
 
     Args:
         ego: the egos of B scenes now.
-        given: their actions [B, 2] (acceleration m/s^2, yaw rate rad/s), which are clamped to the bounds; or the
+        given: their actions [B, 2] (acceleration m/s^2, yaw rate rad/s), which are
+            clamped to the bounds; or the
             recording, which they follow, and leave the scene at its end.
         tracks: what all agents do.
         look: whether a policy looks at the observation.
         ended: [B] bool, egos that stay where they are.
 
     Returns:
-        The egos, and observation [B, D] ([B, 0] without a look), reward, CONTACTS, off_road, terminated, truncated and
-        progress (m along the mission since the start), each [B]. Whoever appears within the ego touches it only after
-        they have been apart once, as in `metrics.contact.since_birth`.
+        The egos, and observation [B, D] ([B, 0] without a look), reward, CONTACTS,
+        off_road, terminated, truncated and progress (m along the mission since the
+        start), each [B]. Whoever appears within the ego touches it only after they have
+        been apart once, as in `metrics.contact.since_birth`.
     """
     horizon = tracks[0].shape[1] - 1
     now = (ego.step + 1).clamp(max=horizon)
@@ -89,14 +99,49 @@ def step(
         driven = drive(ego, given, now, others, *tracks, static, config, stay)
         *flags, present, on_road = (driven.truths > 0).unbind()
         pose = FrenetPose(driven.s, driven.d, heading=driven.heading)
-        moved = EgoState(now, driven.state, action=driven.action, pose=pose, present=present, been_on_road=on_road, start_s=ego.start_s, inside=driven.inside > 0)
-        seen = features(static, moved, others, now / horizon) if look else ego.state[:, :0]
-        numbers = {"observation": seen, "reward": driven.reward, "progress": driven.progress}
+        moved = EgoState(
+            now,
+            driven.state,
+            action=driven.action,
+            pose=pose,
+            present=present,
+            been_on_road=on_road,
+            start_s=ego.start_s,
+            inside=driven.inside > 0,
+        )
+        seen = (
+            features(static, moved, others, now / horizon) if look else ego.state[:, :0]
+        )
+        numbers = {
+            "observation": seen,
+            "reward": driven.reward,
+            "progress": driven.progress,
+        }
         return moved, numbers | dict(zip(FLAGS, flags, strict=True))
-    return _step(ego, given, now=now, others=others, tracks=tracks, static=static, config=config, look=look, ended=ended)
+    return _step(
+        ego,
+        given,
+        now=now,
+        others=others,
+        tracks=tracks,
+        static=static,
+        config=config,
+        look=look,
+        ended=ended,
+    )
 
 
-@fused(EGO_STATE, "B 2!", "B:int64", AGENTS, "B T N 4!", "B T N:bool!", STATIC, ("3:bool!", "8", "2", "2"), "B:bool")
+@fused(
+    EGO_STATE,
+    "B 2!",
+    "B:int64",
+    AGENTS,
+    "B T N 4!",
+    "B T N:bool!",
+    STATIC,
+    ("3:bool!", "8", "2", "2"),
+    "B:bool",
+)
 def drive(
     ego: EgoState,
     given: Tensor,
@@ -108,11 +153,32 @@ def drive(
     config: StepConfig,
     ended: Tensor,
 ) -> Driven:
-    """`step` of actions without a look; now [B] is the step that the egos come to, at which others are met."""
-    moved, of = _step(ego, given, now=now, others=others, tracks=(states, known), static=static, config=config, look=False, ended=ended)
-    truths = torch.stack([*(of[name] for name in FLAGS), moved.present, moved.been_on_road]).to(given.dtype)
+    """`step` of actions without a look; now [B] is the step that the egos come to, at
+    which others are met."""
+    moved, of = _step(
+        ego,
+        given,
+        now=now,
+        others=others,
+        tracks=(states, known),
+        static=static,
+        config=config,
+        look=False,
+        ended=ended,
+    )
+    truths = torch.stack(
+        [*(of[name] for name in FLAGS), moved.present, moved.been_on_road]
+    ).to(given.dtype)
     inside = moved.inside.to(given.dtype)
-    return Driven(moved.state, moved.action, *moved.pose, of["reward"], of["progress"], truths, inside)
+    return Driven(
+        moved.state,
+        moved.action,
+        *moved.pose,
+        of["reward"],
+        of["progress"],
+        truths,
+        inside,
+    )
 
 
 def _step(
@@ -135,16 +201,45 @@ def _step(
         present = ego.present & given[1]
     action = dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0]
     pose = follow(static, state[:, :2], hint=ego.pose.s + ego.state[:, 3] * DT)
-    moved = EgoState(now, state, action=action, pose=pose, present=present, been_on_road=ego.been_on_road, start_s=ego.start_s, inside=ego.inside)
+    moved = EgoState(
+        now,
+        state,
+        action=action,
+        pose=pose,
+        present=present,
+        been_on_road=ego.been_on_road,
+        start_s=ego.start_s,
+        inside=ego.inside,
+    )
     if ended is not None:
         stay = ended
-        moved = ego.merged(moved, lambda old, new: torch.where(stay.view(-1, *[1] * (new.ndim - 1)), old, new))
+        moved = ego.merged(
+            moved,
+            lambda old, new: torch.where(
+                stay.view(-1, *[1] * (new.ndim - 1)), old, new
+            ),
+        )
         _, state, action, pose, present, *_ = moved
     seen = (observe if look else glance)(static, moved, others, now / horizon)
     both = ego.state, state
-    near = passed(seen.neighbours, both, tracks=tracks, row=static.row, step=ego.step, size=static.size, half_size=static.half_size)
+    near = passed(
+        seen.neighbours,
+        both,
+        tracks=tracks,
+        row=static.row,
+        step=ego.step,
+        size=static.size,
+        half_size=static.half_size,
+    )
     hit = (near.gap < 0) & others.present & present[:, None]
-    inside = since_birth(hit, ego.inside, present=others.present, valid=tracks[1], row=static.row, now=now)
+    inside = since_birth(
+        hit,
+        ego.inside,
+        present=others.present,
+        valid=tracks[1],
+        row=static.row,
+        now=now,
+    )
     hit = hit & ~inside
     kinds = static.vehicle, ~(static.vehicle | static.plain), static.plain
     contacts = [some(hit & kind) for kind in kinds]
@@ -152,9 +247,23 @@ def _step(
     off_road = off & ego.been_on_road & present
     gone = ~present | (pose.s >= static.mission.end)
     touched = contacts[0] | contacts[1] | contacts[2]
-    fault = own_fault(ego.state[:, 3], near, hit=hit, static=static, tracks=tracks, before=ego.step)
-    progress = rewarded_progress(pose.s - ego.pose.s, seen.limit, top_speed=static.top_speed)
-    terms = reward_terms(progress, touched, fault=fault, off_road=off_road, action=action, last_action=ego.action, speed=state[:, 3], limit=seen.limit, offset=pose.d)
+    fault = own_fault(
+        ego.state[:, 3], near, hit=hit, static=static, tracks=tracks, before=ego.step
+    )
+    progress = rewarded_progress(
+        pose.s - ego.pose.s, seen.limit, top_speed=static.top_speed
+    )
+    terms = reward_terms(
+        progress,
+        touched,
+        fault=fault,
+        off_road=off_road,
+        action=action,
+        last_action=ego.action,
+        speed=state[:, 3],
+        limit=seen.limit,
+        offset=pose.d,
+    )
     on_contact, off_the_road, when_gone = config.ends.unbind()
     outcome = {
         "observation": seen.features,
@@ -165,16 +274,28 @@ def _step(
         "truncated": (now >= horizon) | (gone & when_gone),
         "progress": pose.s - ego.start_s,
     }
-    return moved._replace(present=~gone, been_on_road=ego.been_on_road | ~off, inside=inside), outcome
+    return moved._replace(
+        present=~gone, been_on_road=ego.been_on_road | ~off, inside=inside
+    ), outcome
 
 
-def since_birth(overlap: Tensor, inside: Tensor, present: Tensor, valid: Tensor, row: Tensor, now: Tensor) -> Tensor:
-    """Returns the agents [B, M] bool that have overlapped the ego ever since they appeared.
+def since_birth(
+    overlap: Tensor,
+    inside: Tensor,
+    present: Tensor,
+    valid: Tensor,
+    row: Tensor,
+    now: Tensor,
+) -> Tensor:
+    """Returns the agents [B, M] bool that have overlapped the ego ever since they
+    appeared.
 
     Args:
-        overlap, present: [B, M] bool, who overlaps the ego and who is there at this step.
+        overlap, present: [B, M] bool, who overlaps the ego and who is there at this
+            step.
         inside: [B, M] bool, this function's result of the step before.
-        valid: [B, T+1, N] bool, presence of all agents, the ego first; row [B, 1]: 0 .. B - 1; now [B]: this step.
+        valid: [B, T+1, N] bool, presence of all agents, the ego first; row [B, 1]: 0 ..
+            B - 1; now [B]: this step.
     """
     eager = not torch.compiler.is_compiling() and not overlap.is_cuda
     if eager and not bool((overlap | inside).any()):
@@ -194,14 +315,30 @@ def hold_step(
     static: StaticScene,
     config: StepConfig,
 ) -> tuple[EgoState, Outcome]:
-    """`hold` times `step` under one action: rewards are summed, flags are of any step; a policy looks after the last.
+    """`hold` times `step` under one action: rewards are summed, flags are of any step;
+    a policy looks after the last.
 
-    Egos whose episode ends stay at that moment, which is also the one they observe; the others observe the last one.
+    Egos whose episode ends stay at that moment, which is also the one they observe; the
+    others observe the last one.
     """
-    ego, outcome = step(ego, given, tracks=tracks, static=static, config=config, look=look and hold == 1)
+    ego, outcome = step(
+        ego, given, tracks=tracks, static=static, config=config, look=look and hold == 1
+    )
     for last in range(2, hold + 1):
         ended = outcome["terminated"] | outcome["truncated"]
-        ego, later = step(ego, given, tracks=tracks, static=static, config=config, look=look and last == hold, ended=ended)
+        ego, later = step(
+            ego,
+            given,
+            tracks=tracks,
+            static=static,
+            config=config,
+            look=look and last == hold,
+            ended=ended,
+        )
         flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
-        outcome = later | flags | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
+        outcome = (
+            later
+            | flags
+            | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
+        )
     return ego, outcome

@@ -1,1 +1,2 @@
-"""Traffic: the interface of methods that drive the other vehicles, simple methods, and the TorchRL transform."""
+"""Traffic: the interface of methods that drive the other vehicles, simple methods, and
+the TorchRL transform."""

@@ -1,5 +1,5 @@
-"""Rolling out what can be: where a planner or a traffic method raises, or a state becomes NaN or infinite, these
-rollouts end, each with its reason, and the others go on.
+"""Rolling out what can be: where a planner or a traffic method raises, or a state
+becomes NaN or infinite, these rollouts end, each with its reason, and the others go on.
 """
 
 import errno
@@ -11,29 +11,53 @@ from typing import TypeVar
 import torch
 from tensordict import TensorDictBase
 
-from e2rl.planners.ego import BY_EGO, NotFinite, PlannerError, RowsError, TrafficNotFinite, WrongPlan
+from e2rl.planners.ego import (
+    BY_EGO,
+    NotFinite,
+    PlannerError,
+    RowsError,
+    TrafficNotFinite,
+    WrongPlan,
+)
 from e2rl.run.errors import InputError
 from e2rl.sim.rollouts import Rollouts
 
 NOT_FINITE = "a state was NaN or infinite"
 EGO, TRAFFIC = "ego", "traffic"  # by whom a rollout errored
-OF_THE_RUN = (InputError, MemoryError, torch.OutOfMemoryError)  # errors that are no single rollout's
-EXHAUSTED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE, errno.ENFILE)  # nor these
+OF_THE_RUN = (
+    InputError,
+    MemoryError,
+    torch.OutOfMemoryError,
+)  # errors that are no single rollout's
+EXHAUSTED = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EROFS,
+    errno.EIO,
+    errno.ENOMEM,
+    errno.EMFILE,
+    errno.ENFILE,
+)  # nor these
 
 Task = TypeVar("Task")
 Batch = TypeVar("Batch", Rollouts, TensorDictBase)
 
 
 def attempt(
-    roll_out: Callable[[Sequence[Task]], Batch], tasks: Sequence[Task], begins: bool = False
+    roll_out: Callable[[Sequence[Task]], Batch],
+    tasks: Sequence[Task],
+    begins: bool = False,
 ) -> tuple[list[tuple[list[Task], Batch]], list[tuple[Task, dict]]]:
-    """(the tasks that could be rolled out, in parts with their rollouts; the others with the reasons).
+    """(the tasks that could be rolled out, in parts with their rollouts; the others
+    with the reasons).
 
-    roll_out(tasks) returns Rollouts, or a TensorDict with states [B, ..., C] and valid [B, ...]. What raises for a
-    batch is looked for by halving the batch, where a RowsError does not name it.
+    roll_out(tasks) returns Rollouts, or a TensorDict with states [B, ..., C] and valid
+    [B, ...]. What raises for a batch is looked for by halving the batch, where a
+    RowsError does not name it.
 
     Args:
-        begins: the run begins with these rollouts, so that a planner whose first plan is a WrongPlan, which is then
+        begins: the run begins with these rollouts, so that a planner whose first plan
+            is a WrongPlan, which is then
             raised, has a mistake in its code.
     """
     try:
@@ -53,8 +77,17 @@ def attempt(
             first = attempt(roll_out, tasks[:half])
             second = attempt(roll_out, tasks[half:])
             return first[0] + second[0], first[1] + second[1]
-        reason = NOT_FINITE if isinstance(error, TrafficNotFinite) else f"raised {type(error).__name__}"
-        why = {"reason": reason, "detail": str(error), "traceback": traceback.format_exc(), "raised_by": raiser(error)}
+        reason = (
+            NOT_FINITE
+            if isinstance(error, TrafficNotFinite)
+            else f"raised {type(error).__name__}"
+        )
+        why = {
+            "reason": reason,
+            "detail": str(error),
+            "traceback": traceback.format_exc(),
+            "raised_by": raiser(error),
+        }
         rows = rows or {0: str(error)}
         others = [task for row, task in enumerate(tasks) if row not in rows]
         own = [(tasks[row], why | {"detail": detail}) for row, detail in rows.items()]
@@ -75,7 +108,8 @@ def attempt(
 
 
 def raiser(error: BaseException) -> str:
-    """Returns by whom something was raised: EGO where its code raised, or had no plan that can be driven."""
+    """Returns by whom something was raised: EGO where its code raised, or had no plan
+    that can be driven."""
     noted = BY_EGO in getattr(error, "__notes__", ())
     return EGO if noted or isinstance(error, PlannerError | NotFinite) else TRAFFIC
 
@@ -83,7 +117,9 @@ def raiser(error: BaseException) -> str:
 def summary_of(errored: Iterable[dict]) -> str:
     """The reasons with their counts, and the first one's own words, for a message."""
     entries = list(errored)
-    counts = ", ".join(f"{count} {reason}" for reason, count in count_reasons(entries).items())
+    counts = ", ".join(
+        f"{count} {reason}" for reason, count in count_reasons(entries).items()
+    )
     return f"{counts} ({entries[0]['detail'][:200]})"
 
 

@@ -1,4 +1,5 @@
-"""The fused functions of rollouts and learning: what `compile` of a configuration means, before the first rollout."""
+"""The fused functions of rollouts and learning: what `compile` of a configuration
+means, before the first rollout."""
 
 import sys
 
@@ -19,16 +20,38 @@ from e2rl.sim import leaders, observation, step
 from e2rl.traffic.e2 import anchoring, control, foresight, interception, kernels
 
 MODULES = (
-    *(anchoring, bounds, control, drivable_area, features, foresight, free_space, interception, kernels),
-    *(lane_graph_planner, lane_relative, leaders, observation, preventable, prior, reference, route, routes, step),
+    *(
+        anchoring,
+        bounds,
+        control,
+        drivable_area,
+        features,
+        foresight,
+        free_space,
+        interception,
+        kernels,
+    ),
+    *(
+        lane_graph_planner,
+        lane_relative,
+        leaders,
+        observation,
+        preventable,
+        prior,
+        reference,
+        route,
+        routes,
+        step,
+    ),
 )
 
 
 def prepare_fused(config: DictConfig) -> None:
-    """Switch fused functions on or off as `compile` says, and write what auto means here into the configuration.
+    """Switch fused functions on or off as `compile` says, and write what auto means
+    here into the configuration.
 
-    auto: on where all are compiled on this machine already. Raises InputError for another value, and where they are to
-    be compiled and there is no compiler.
+    auto: on where all are compiled on this machine already. Raises InputError for
+    another value, and where they are to be compiled and there is no compiler.
     """
     asked = config.get("compile", False)  # runs of earlier versions have none
     if asked not in ("auto", True, False):
@@ -38,7 +61,10 @@ def prepare_fused(config: DictConfig) -> None:
     sampler = SamplerSettings()
     network = DenoiserSettings()
     found += fused_encoding(network), fused_estimate(network)
-    found += fused_step(sampler, SIZE), fused_controlled_step(sampler, SIZE, limited=False)
+    found += (
+        fused_step(sampler, SIZE),
+        fused_controlled_step(sampler, SIZE, limited=False),
+    )
     missing = [each for each in found if not each.file.exists()]
     on = asked is not False and config.device == "cpu"
     if on and missing and asked == "auto":
@@ -48,7 +74,9 @@ def prepare_fused(config: DictConfig) -> None:
             print(told, file=sys.stderr)
     elif on and missing:
         check_compiler("compile")
-        done = in_processes(Fused.compile, missing, processes=cores(), cost=lambda each: 1.0)
+        done = in_processes(
+            Fused.compile, missing, processes=cores(), cost=lambda each: 1.0
+        )
         for _ in Bar(done, "compiling", len(missing), unit="function"):
             pass
     if asked == "auto":

@@ -1,7 +1,9 @@
-"""Rows of the states of traffic methods, groups of scenes of similar size, and noise that depends on a seed alone.
+"""Rows of the states of traffic methods, groups of scenes of similar size, and noise
+that depends on a seed alone.
 
-Half of a batch is padding, and small groups are mostly overhead: so scenes of similar size are planned together.
-Vehicles and other agents fill their rows from the front, so a group is cropped by slicing.
+Half of a batch is padding, and small groups are mostly overhead: so scenes of similar
+size are planned together. Vehicles and other agents fill their rows from the front, so
+a group is cropped by slicing.
 """
 
 from collections.abc import Callable
@@ -15,7 +17,9 @@ from torch import Tensor
 from e2rl.prior.prior import Context
 from e2rl.sim.world import World
 
-Value = TypeVar("Value")  # a tensor, a TensorDict, a (nested) dataclass of them, or None
+Value = TypeVar(
+    "Value"
+)  # a tensor, a TensorDict, a (nested) dataclass of them, or None
 
 
 def take_rows(value: Value, rows: Tensor) -> Value:
@@ -35,16 +39,21 @@ def put_rows(value: Value, rows: Tensor, new: Value) -> Value:
 
 
 def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
-    """Map function over every tensor or TensorDict of a value and its counterparts in others; the rest is kept."""
+    """Map function over every tensor or TensorDict of a value and its counterparts in
+    others; the rest is kept."""
     if isinstance(value, Tensor | TensorDictBase | SceneRows):
         return function(value, *others)
     if isinstance(value, tuple):  # a named tuple
-        return type(value)(*(map_tensors(function, *part) for part in zip(value, *others, strict=True)))
+        return type(value)(
+            *(map_tensors(function, *part) for part in zip(value, *others, strict=True))
+        )
     if not is_dataclass(value) or isinstance(value, type):
         return value
     names = [field.name for field in fields(value)]
     parts = {name: [getattr(each, name) for each in (value, *others)] for name in names}
-    return replace(value, **{name: map_tensors(function, *part) for name, part in parts.items()})
+    return replace(
+        value, **{name: map_tensors(function, *part) for name, part in parts.items()}
+    )
 
 
 def of_scenes(context: Context, rows: Tensor) -> Context:
@@ -54,37 +63,67 @@ def of_scenes(context: Context, rows: Tensor) -> Context:
 
 def mapped(context: Context, function: Callable[[Tensor], Tensor]) -> Context:
     """A Context with `function` applied to every tensor."""
-    return replace(map_tensors(function, context), encoding=context.encoding.map(function))
+    return replace(
+        map_tensors(function, context), encoding=context.encoding.map(function)
+    )
 
 
-def noise_of(seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool = False) -> Tensor:
-    """Random numbers [B, *shape] that depend only on each scene's seed [B] and draw number [B], not on the
-    batch: standard normal, or uniform in [0, 1)."""
+def noise_of(
+    seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool = False
+) -> Tensor:
+    """Random numbers [B, *shape] that depend only on each scene's seed [B] and draw
+    number [B], not on the batch: standard normal, or uniform in [0, 1)."""
     rows = []
     for value, number in torch.stack([seed, draw], -1).tolist():
-        generator = torch.Generator().manual_seed((value * 1_000_003 + number) % (2**63))
-        rows.append((torch.rand if uniform else torch.randn)(shape, generator=generator))
+        generator = torch.Generator().manual_seed(
+            (value * 1_000_003 + number) % (2**63)
+        )
+        rows.append(
+            (torch.rand if uniform else torch.randn)(shape, generator=generator)
+        )
     return (torch.stack(rows) if rows else torch.empty(0, *shape)).to(seed.device)
 
 
-ROWS = 160, 1024  # vehicle rows of a group: SHRUNK applies from the first number on, the second is the maximum
+ROWS = (
+    160,
+    1024,
+)  # vehicle rows of a group: SHRUNK applies from the first number on, the second is the maximum
 SHRUNK = 0.55  # a scene of at most this fraction of the group's largest scene starts a new group
-OF_ALL = {"size", "start", "start_accel", "start_yaw_rate", "valid", "agent_type", "parked"}  # keys with all agents
-OF_VEHICLES = {"past", "route_points", "route_length", "route_open", "route_valid", "route_recorded", "route_limit"}
+OF_ALL = {
+    "size",
+    "start",
+    "start_accel",
+    "start_yaw_rate",
+    "valid",
+    "agent_type",
+    "parked",
+}  # keys with all agents
+OF_VEHICLES = {
+    "past",
+    "route_points",
+    "route_length",
+    "route_open",
+    "route_valid",
+    "route_recorded",
+    "route_limit",
+}
 OF_VEHICLES |= {"route_light", "route_light_s", "route_log"}
 
 
 def no_vehicles() -> Any:
-    """Returns a dataclass field of a state whose tensor [B, ...] has no vehicle axis; others are [B, V, ...].
+    """Returns a dataclass field of a state whose tensor [B, ...] has no vehicle axis;
+    others are [B, V, ...].
 
-    Metadata `vehicle_axes` says so: 0 here, 2 for pairs [B, V, V], None for a tensor of all agents that never changes.
+    Metadata `vehicle_axes` says so: 0 here, 2 for pairs [B, V, V], None for a tensor of
+    all agents that never changes.
     """
     return field(metadata={"vehicle_axes": 0})
 
 
 @dataclass(frozen=True)
 class Group:
-    """Scenes rows [G] int64 of a batch, and their numbers of vehicle rows and other agents' rows in use."""
+    """Scenes rows [G] int64 of a batch, and their numbers of vehicle rows and other
+    agents' rows in use."""
 
     rows: Tensor
     vehicles: int
@@ -92,7 +131,8 @@ class Group:
 
 
 def group_scenes(world: World) -> list[Group]:
-    """The scenes of a batch in groups by vehicles in use (see ROWS and SHRUNK; one scene at least)."""
+    """The scenes of a batch in groups by vehicles in use (see ROWS and SHRUNK; one
+    scene at least)."""
     width = world.scene["route_log"].shape[1]
     used = world.valid | world.scene["valid"]
     position = torch.arange(1, used.shape[1] + 1, device=used.device)
@@ -107,7 +147,11 @@ def group_scenes(world: World) -> list[Group]:
     for end in range(1, len(sizes) + 1):
         size = sizes[begin]
         filled = sizes[begin] * (end - begin)
-        if end < len(sizes) and filled + size <= ROWS[1] and (filled < ROWS[0] or sizes[end] > SHRUNK * size):
+        if (
+            end < len(sizes)
+            and filled + size <= ROWS[1]
+            and (filled < ROWS[0] or sizes[end] > SHRUNK * size)
+        ):
             continue
         rows = order[begin:end]
         groups.append(Group(rows, size, others=int(others[rows].max())))
@@ -116,9 +160,11 @@ def group_scenes(world: World) -> list[Group]:
 
 
 class SceneRows:
-    """Rows of scenes with the vehicles and others in use, read by key as a TensorDict is.
+    """Rows of scenes with the vehicles and others in use, read by key as a TensorDict
+    is.
 
-    A tensor is taken when it is read first: maps are large, and most of them are not read in most replans.
+    A tensor is taken when it is read first: maps are large, and most of them are not
+    read in most replans.
     """
 
     def __init__(self, scene: TensorDictBase, group: Group) -> None:
@@ -129,7 +175,9 @@ class SceneRows:
     def __getitem__(self, key: Any) -> Any:
         """The tensor of a name, or what rows hold, as SceneRows."""
         if not isinstance(key, str):
-            return SceneRows(self._scene, replace(self._group, rows=self._group.rows[key]))
+            return SceneRows(
+                self._scene, replace(self._group, rows=self._group.rows[key])
+            )
         if key not in self._taken:
             self._taken[key] = self._take(key)
         return self._taken[key]
@@ -139,33 +187,57 @@ class SceneRows:
         vehicles = self._group.vehicles
         if key in OF_ALL:
             width = self._scene["route_log"].shape[1]
-            agents = torch.cat([torch.arange(vehicles), width + torch.arange(self._group.others)])
+            agents = torch.cat(
+                [torch.arange(vehicles), width + torch.arange(self._group.others)]
+            )
             return self._scene[key][rows][:, agents.to(rows.device)]
-        return self._scene[key][rows, :vehicles] if key in OF_VEHICLES else self._scene[key][rows]
+        return (
+            self._scene[key][rows, :vehicles]
+            if key in OF_VEHICLES
+            else self._scene[key][rows]
+        )
 
 
 def crop_world(world: World, group: Group) -> World:
     """The group's World [G]."""
     width = world.scene["route_log"].shape[1]
     rows = group.rows
-    agents = torch.cat([torch.arange(group.vehicles), width + torch.arange(group.others)]).to(rows.device)
-    states, valid, accel = (getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel"))
+    agents = torch.cat(
+        [torch.arange(group.vehicles), width + torch.arange(group.others)]
+    ).to(rows.device)
+    states, valid, accel = (
+        getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel")
+    )
     scene = cast(TensorDictBase, SceneRows(world.scene, group))
     mission_s = None if world.mission_s is None else world.mission_s[rows]
     turn_rate = world.turn_rate[rows][:, agents]
-    return World(scene, world.step[rows], states=states, valid=valid, accel=accel, turn_rate=turn_rate, mission_s=mission_s)
+    return World(
+        scene,
+        world.step[rows],
+        states=states,
+        valid=valid,
+        accel=accel,
+        turn_rate=turn_rate,
+        mission_s=mission_s,
+    )
 
 
 def crop_state(value: Any, group: Group, width: int, axes: int | None = 1) -> Any:
-    """Returns the group's part of a state of scenes of `width` vehicle rows; axes: of a tensor, see `no_vehicles`."""
+    """Returns the group's part of a state of scenes of `width` vehicle rows; axes: of a
+    tensor, see `no_vehicles`."""
     if is_dataclass(value) and not isinstance(value, type):
         parts = {
-            each.name: crop_state(getattr(value, each.name), group, width=width, axes=axes_of(each)) for each in fields(value)
+            each.name: crop_state(
+                getattr(value, each.name), group, width=width, axes=axes_of(each)
+            )
+            for each in fields(value)
         }
         return replace(value, **parts)
     value = value[group.rows]
     if axes is None:
-        return torch.cat([value[:, : group.vehicles], value[:, width : width + group.others]], 1)
+        return torch.cat(
+            [value[:, : group.vehicles], value[:, width : width + group.others]], 1
+        )
     return value[(slice(None), *[slice(group.vehicles)] * axes)]
 
 
@@ -173,7 +245,12 @@ def write_state(full: Any, part: Any, group: Group, axes: int | None = 1) -> Non
     """Writes the group's part of a state back, in place."""
     if is_dataclass(full):
         for each in fields(full):
-            write_state(getattr(full, each.name), getattr(part, each.name), group=group, axes=axes_of(each))
+            write_state(
+                getattr(full, each.name),
+                getattr(part, each.name),
+                group=group,
+                axes=axes_of(each),
+            )
     elif axes == 2:
         index = torch.arange(group.vehicles)
         full[group.rows[:, None, None], index[:, None], index] = part

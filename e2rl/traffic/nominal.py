@@ -1,8 +1,10 @@
-"""The prior as background traffic: every 0.5 s an uncontrolled joint sample, given what is known of the ego.
+"""The prior as background traffic: every 0.5 s an uncontrolled joint sample, given what
+is known of the ego.
 
-Traffic predicts the ego from its state and past, as other drivers see it: on the route that its motion makes
-likeliest. So no planner can mislead its adversaries by what it announces as its plan (docs/adversaries.md). With
-`knowledge` "plan" it is told the plan and the mission.
+Traffic predicts the ego from its state and past, as other drivers see it: on the route
+that its motion makes likeliest. So no planner can mislead its adversaries by what it
+announces as its plan (docs/adversaries.md). With `knowledge` "plan" it is told the plan
+and the mission.
 """
 
 from collections.abc import Callable
@@ -17,26 +19,40 @@ from torch import Tensor
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate, select
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routes import Moment, RoutedScene, reroute
-from e2rl.prior.stratified_sampling import main_direction, stratified_noise, stratified_uniform
+from e2rl.prior.stratified_sampling import (
+    main_direction,
+    stratified_noise,
+    stratified_uniform,
+)
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
-from e2rl.traffic.grouping import clone, crop_state, crop_world, group_scenes, no_vehicles, noise_of, write_state
+from e2rl.traffic.grouping import (
+    clone,
+    crop_state,
+    crop_world,
+    group_scenes,
+    no_vehicles,
+    noise_of,
+    write_state,
+)
 from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan
 
 KNOWLEDGE = ("predicted", "plan")
 LOOK = 5  # steps of the ego's plan over which its current yaw rate is estimated
-React = Callable[[Tensor, Tensor], Tensor]  # rows [G], planned states [G, V, HORIZON, 4] -> the egos' [G, HORIZON, 4]
+React = Callable[
+    [Tensor, Tensor], Tensor
+]  # rows [G], planned states [G, V, HORIZON, 4] -> the egos' [G, HORIZON, 4]
 
 
 @dataclass
 class PriorState:
     """B scenes driven by the prior; every tensor has the batch first.
 
-    seed [B]: of the scene's noise; replans [B]: replans so far; routed: the vehicles' routes; lane [B, V]: lane states
-    at the end of the executed plans.
+    seed [B]: of the scene's noise; replans [B]: replans so far; routed: the vehicles'
+    routes; lane [B, V]: lane states at the end of the executed plans.
     """
 
     seed: Tensor = no_vehicles()
@@ -52,9 +68,11 @@ Own = TypeVar("Own", bound=PriorState)
 class Replan:
     """What a group of G scenes is replanned from.
 
-    state: the method's, its lane states now; world: the scenes now; ego_plan [G, HORIZON, 4]: the ego's motion, known
-    or predicted; noise [K, G, V, ..., SIZE]: standard normal; react: from planned states [G, V, HORIZON, 4] to
-    the ego's own answer [G, HORIZON, 4], None where it cannot be asked; before: in which the ego was predicted.
+    state: the method's, its lane states now; world: the scenes now; ego_plan [G,
+    HORIZON, 4]: the ego's motion, known or predicted; noise [K, G, V, ..., SIZE]:
+    standard normal; react: from planned states [G, V, HORIZON, 4] to the ego's own
+    answer [G, HORIZON, 4], None where it cannot be asked; before: in which the ego was
+    predicted.
     """
 
     state: State
@@ -78,22 +96,32 @@ class NominalTraffic(Traffic):
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
         """Returns the states of scenes [B] with routes drawn from the prior."""
-        uniform = noise_of(seed, torch.zeros_like(seed), shape=tuple(scenes["route_valid"].shape[1:2]), uniform=True)
+        uniform = noise_of(
+            seed,
+            torch.zeros_like(seed),
+            shape=tuple(scenes["route_valid"].shape[1:2]),
+            uniform=True,
+        )
         scenes = self.as_seen(World.at_start(scenes)).scene
-        routed, lane = self.prior.start(scenes, self.prior.choose_routes(scenes, uniform))
+        routed, lane = self.prior.start(
+            scenes, self.prior.choose_routes(scenes, uniform)
+        )
         return PriorState(seed, torch.zeros_like(seed), routed=routed, lane=lane)
 
     def replan(
         self, state: State, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[State, TrafficPlan]:
-        """Returns states and plans of the coming HORIZON steps; scenes of similar size are planned together."""
+        """Returns states and plans of the coming HORIZON steps; scenes of similar size
+        are planned together."""
         world = self.as_seen(world)
         ego_plan = ego_plan.detach()
         noise = self.noise(state)
         batch, width = state.routed.route.shape
         whole = clone(state)
         states = world.states.new_zeros(batch, width, HORIZON, 4)
-        present = torch.zeros(batch, width, HORIZON, dtype=torch.bool, device=states.device)
+        present = torch.zeros(
+            batch, width, HORIZON, dtype=torch.bool, device=states.device
+        )
         for group in group_scenes(world):
             rows = group.rows
             vehicles = group.vehicles
@@ -101,23 +129,39 @@ class NominalTraffic(Traffic):
             there = crop_world(world, group)
             part = self._expecting(part, there)
             announced = (ego_plan[rows], None)
-            known, context = announced if self.knowledge == "plan" else self.predicted_ego(part, there)
+            known, context = (
+                announced
+                if self.knowledge == "plan"
+                else self.predicted_ego(part, there)
+            )
             part = replace(part, lane=self.lane_now(part, there, ego_plan=known))
             answer = None if react is None else partial(react, rows)
-            now = Replan(part, there, ego_plan=known, noise=noise[:, rows, :vehicles], react=answer, before=context)
+            now = Replan(
+                part,
+                there,
+                ego_plan=known,
+                noise=noise[:, rows, :vehicles],
+                react=answer,
+                before=context,
+            )
             part, x0, context = self.replan_group(now)
             plan = self.prior.plan(x0, context)
-            part = replace(part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS))
+            part = replace(
+                part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS)
+            )
             write_state(whole, part, group=group)
             states[rows, :vehicles] = plan.states()
-            valid = world.valid[rows, :vehicles, None]  # a vehicle that has left does not return
+            valid = world.valid[
+                rows, :vehicles, None
+            ]  # a vehicle that has left does not return
             present[rows, :vehicles] = plan.on_map & valid
         return whole, TrafficPlan(states, present, route=whole.routed.route)
 
     @torch.no_grad()
     def as_seen(self, world: World) -> World:
-        """Returns the World as other drivers see it: the ego's mission is the route that it is expected to follow, the
-        one that its present motion makes likeliest; told its plan, they know its mission, too."""
+        """Returns the World as other drivers see it: the ego's mission is the route
+        that it is expected to follow, the one that its present motion makes likeliest;
+        told its plan, they know its mission, too."""
         if self.knowledge == "plan":
             return world
         scene = world.scene.copy()
@@ -129,38 +173,56 @@ class NominalTraffic(Traffic):
 
     def _expecting(self, state: State, world: World) -> State:
         """Returns the state with the ego on the route that it is expected to follow."""
-        expected = torch.cat([world.scene["route_log"][:, :1], state.routed.route[:, 1:]], 1)
+        expected = torch.cat(
+            [world.scene["route_log"][:, :1], state.routed.route[:, 1:]], 1
+        )
         moved = expected != state.routed.route
-        return onto(state, world, route=expected, moved=moved) if bool(moved.any()) else state
+        return (
+            onto(state, world, route=expected, moved=moved)
+            if bool(moved.any())
+            else state
+        )
 
     def replan_group(self, now: Replan) -> tuple[State, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
-        context = self.encode(now.state, now.world, ego_plan=now.ego_plan, known=now.before)
+        context = self.encode(
+            now.state, now.world, ego_plan=now.ego_plan, known=now.before
+        )
         return now.state, self.prior.sample(context, now.noise).x0, context
 
     @torch.no_grad()
     def predicted_ego(self, state: State, world: World) -> tuple[Tensor, Context]:
-        """Returns states [G, HORIZON, 4] of the ego, predicted from its state and past: its row of the joint clean
-        estimate, which is nearer to what egos drive than a sample; and the context of that."""
+        """Returns states [G, HORIZON, 4] of the ego, predicted from its state and past:
+        its row of the joint clean estimate, which is nearer to what egos drive than a
+        sample; and the context of that."""
         action = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1)
-        seen = dynamics.rollout(world.states[:, 0], action[:, None].expand(-1, HORIZON, -1))
+        seen = dynamics.rollout(
+            world.states[:, 0], action[:, None].expand(-1, HORIZON, -1)
+        )
         lane = self.lane_now(state, world, ego_plan=seen)
-        context = self.prior.encode(state.routed, lane, world.states, world.valid, world.step, None)
-        return self.prior.decode(self.prior.estimate(context), context).states()[:, 0], context
+        context = self.prior.encode(
+            state.routed, lane, world.states, world.valid, world.step, None
+        )
+        return self.prior.decode(self.prior.estimate(context), context).states()[
+            :, 0
+        ], context
 
     def noise(self, state: State) -> Tensor:
         """Returns standard normal noise [K, B, V, SIZE] of the next replan."""
         shape = (self.prior.sampler.steps, state.routed.route.shape[1], SIZE)
         return noise_of(state.seed, 1 + state.replans, shape=shape).transpose(0, 1)
 
-    def encode(self, state: State, world: World, ego_plan: Tensor, known: Context | None = None) -> Context:
+    def encode(
+        self, state: State, world: World, ego_plan: Tensor, known: Context | None = None
+    ) -> Context:
         """Returns the prior's context of a replan; known: see `Prior.encode`."""
         now = world.states, world.valid, world.step
         return self.prior.encode(state.routed, state.lane, *now, ego_plan, known)
 
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
-        """Returns the current lane states: the ego's from its state and planned yaw rate; the others' places on their
-        routes from their states, how they go on from their plans."""
+        """Returns the current lane states: the ego's from its state and planned yaw
+        rate; the others' places on their routes from their states, how they go on from
+        their plans."""
         lane = state.lane
         routed = state.routed
         yaw_rate = wrap(ego_plan[:, LOOK - 1, 2] - world.states[:, 0, 2]) / (LOOK * DT)
@@ -169,24 +231,39 @@ class NominalTraffic(Traffic):
         v = torch.where(ego, world.states[:, :1, 3], lane.v)
         accel = torch.where(ego, world.accel[:, :1], lane.a)
         turning = torch.where(ego, yaw_rate[:, None], lane.kappa * lane.v)
-        now = locate(world.states[:, : ego.shape[1]], accel, yaw_rate=turning, points=routed.points, hint=lane.s + ego * v / 2)
+        now = locate(
+            world.states[:, : ego.shape[1]],
+            accel,
+            yaw_rate=turning,
+            points=routed.points,
+            hint=lane.s + ego * v / 2,
+        )
         projected = {name: torch.ones_like(ego) for name in ("s", "d", "d1")}
         projected["d2"] = ego | ~routed.has_lane
 
         def merged(name: str) -> Tensor:
-            return torch.where(projected.get(name, ego), getattr(now, name), getattr(lane, name))
+            return torch.where(
+                projected.get(name, ego), getattr(now, name), getattr(lane, name)
+            )
 
         return LaneState(*(merged(field.name) for field in fields(LaneState)))
 
     @torch.no_grad()
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
-        """Returns joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is unknown, stratified over S samples,
-        without acceleration bounds: those hold for 0.5 s; applied over 5 s they cost a tenth of the accuracy."""
-        prior, (count, batch), vehicles = self.prior, seed.shape, scene["route_log"].shape[1]
+        """Returns joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is
+        unknown, stratified over S samples, without acceleration bounds: those hold for
+        0.5 s; applied over 5 s they cost a tenth of the accuracy."""
+        prior, (count, batch), vehicles = (
+            self.prior,
+            seed.shape,
+            scene["route_log"].shape[1],
+        )
 
         def draw(number: int, *shape: int, uniform: bool = False) -> Tensor:
             numbers = torch.full((count * batch,), number)
-            return noise_of(seed.flatten(), numbers, shape=shape, uniform=uniform).unflatten(0, (count, batch))
+            return noise_of(
+                seed.flatten(), numbers, shape=shape, uniform=uniform
+            ).unflatten(0, (count, batch))
 
         order = draw(0, 2, vehicles, uniform=True).unbind(2)
         position = draw(2, 2, vehicles, uniform=True)[0].unbind(1)
@@ -195,20 +272,37 @@ class NominalTraffic(Traffic):
         noise = stratified_noise(noise, direction, order=order[1], position=position[1])
         step = torch.zeros(batch, dtype=torch.long, device=seed.device)
         plans = []
-        for uniform, one in zip(stratified_uniform(order[0], position[0]), noise, strict=True):
+        for uniform, one in zip(
+            stratified_uniform(order[0], position[0]), noise, strict=True
+        ):
             routed, lane = prior.start(scene, prior.choose_routes(scene, uniform))
-            context = prior.encode(routed, lane, scene["start"], scene["valid"], step, None)
+            context = prior.encode(
+                routed, lane, scene["start"], scene["valid"], step, None
+            )
             plans.append(prior.decode(prior.sample(context, one).x0, context).states())
         return torch.stack(plans, 1)
 
 
 def onto(
-    state: Own, world: World, route: Tensor, moved: Tensor, off_lane: Tensor | None = None, paths: Tensor | None = None
+    state: Own,
+    world: World,
+    route: Tensor,
+    moved: Tensor,
+    off_lane: Tensor | None = None,
+    paths: Tensor | None = None,
 ) -> Own:
-    """Returns states [B] with vehicles moved [B, V] on candidates route [B, V], or, off_lane [B, V], on paths
-    [B, V, P, 2], and with their poses there."""
-    lines = torch.zeros_like(moved) if off_lane is None else off_lane, state.routed.points if paths is None else paths
+    """Returns states [B] with vehicles moved [B, V] on candidates route [B, V], or,
+    off_lane [B, V], on paths [B, V, P, 2], and with their poses there."""
+    lines = (
+        torch.zeros_like(moved) if off_lane is None else off_lane,
+        state.routed.points if paths is None else paths,
+    )
     routed = reroute(state.routed, world.scene, route, moved, *lines)
     old = state.lane
-    lane = locate(world.states[:, : route.shape[1]], old.a, yaw_rate=old.kappa * old.v, points=routed.points)
+    lane = locate(
+        world.states[:, : route.shape[1]],
+        old.a,
+        yaw_rate=old.kappa * old.v,
+        points=routed.points,
+    )
     return replace(state, routed=routed, lane=select(moved, lane, other=old))

@@ -1,7 +1,9 @@
-"""The extension point for traffic: recordings, car-following, the prior, e2 and the baselines.
+"""The extension point for traffic: recordings, car-following, the prior, e2 and the
+baselines.
 
-A method is a class with one or two methods, and a YAML file in conf/synthesizer with its `_target_`, a `name` and its
-settings. A complete example, in which every vehicle brakes to a halt:
+A method is a class with one or two methods, and a YAML file in conf/synthesizer with
+its `_target_`, a `name` and its settings. A complete example, in which every vehicle
+brakes to a halt:
 
     class Halt(Traffic):
         stochastic = False
@@ -36,24 +38,30 @@ from e2rl.run.config import Extension
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 
-# Causal templates of an attack, codes in tensors. single: one vehicle acts on the ego; pair: two do; chain: one does,
-# and one more acts on it from afar, through others if necessary; full: as many as the method is set to.
+# Causal templates of an attack, codes in tensors. single: one vehicle acts on the ego;
+# pair: two do; chain: one does, and one more acts on it from afar, through others if
+# necessary; full: as many as the method is set to.
 TEMPLATES = ("single", "pair", "chain", "full")
 SINGLE, PAIR, CHAIN, FULL = range(len(TEMPLATES))
 
 REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, for every method
-POINT_STEPS = 5  # steps between two points of a plan that are kept in a rollout's file: 0.5 s
+POINT_STEPS = (
+    5  # steps between two points of a plan that are kept in a rollout's file: 0.5 s
+)
 State = Any  # of B running scenes: a tensor, a TensorDict or a (nested) dataclass of them, batch first; or None
 
 
 @dataclass
 class TrafficPlan:
-    """Planned motion of the vehicles of B scenes over the coming HORIZON steps. Outputs that are None do not apply.
+    """Planned motion of the vehicles of B scenes over the coming HORIZON steps. Outputs
+    that are None do not apply.
 
-    states [B, V, HORIZON, 4]: the ego's row is ignored; present [B, V, HORIZON] bool: false from the step on at which a
-    vehicle has left; adversary [B, V] bool: under adversarial control; target [B, V] int64: whom each vehicle under
-    control acts on, 0 the ego, -1 nobody; route [B, V] int64: route candidates followed, -1 none (None: the recorded
-    ones); path_kl, anchor_jump [B, V]: discrete path KL of the control, and energy of the anchoring, since the start.
+    states [B, V, HORIZON, 4]: the ego's row is ignored; present [B, V, HORIZON] bool:
+    false from the step on at which a vehicle has left; adversary [B, V] bool: under
+    adversarial control; target [B, V] int64: whom each vehicle under control acts on, 0
+    the ego, -1 nobody; route [B, V] int64: route candidates followed, -1 none (None:
+    the recorded ones); path_kl, anchor_jump [B, V]: discrete path KL of the control,
+    and energy of the anchoring, since the start.
     """
 
     states: Tensor
@@ -66,16 +74,19 @@ class TrafficPlan:
 
 
 class Traffic(Extension, ABC):
-    """Drives all vehicles but the ego of B scenes at once. Built as `_target_(prior=prior, **settings)`.
+    """Drives all vehicles but the ego of B scenes at once. Built as
+    `_target_(prior=prior, **settings)`.
 
-    stochastic: seeds matter; adversarial: the intensity eta matters; follows_template: `reset` takes causal templates,
-    template [B] int64 (None: full for all); follows_decisions: and decisions [B, D] (e2rl/traffic/e2/decisions.py;
-    None: by rule); predicts: plans can be compared with the log in open loop; replays_log: it is the recording itself;
-    queries_ego: `replan` takes `react`, which returns the ego's states against a plan: react(rows [G] of the batch,
-    states [G, V, HORIZON, 4]) -> [G, HORIZON, 4]; knowledge, responsibility: what it knows of the ego and owes it, in
-    words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the settings that a tuning varies, by
-    dotted name, the gain first; on_decision: called with what the method decides, if it tells (e2: a `Selection` of
-    adversaries).
+    stochastic: seeds matter; adversarial: the intensity eta matters; follows_template:
+    `reset` takes causal templates, template [B] int64 (None: full for all);
+    follows_decisions: and decisions [B, D] (e2rl/traffic/e2/decisions.py; None: by
+    rule); predicts: plans can be compared with the log in open loop; replays_log: it is
+    the recording itself; queries_ego: `replan` takes `react`, which returns the ego's
+    states against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) ->
+    [G, HORIZON, 4]; knowledge, responsibility: what it knows of the ego and owes it, in
+    words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the
+    settings that a tuning varies, by dotted name, the gain first; on_decision: called
+    with what the method decides, if it tells (e2: a `Selection` of adversaries).
     """
 
     stochastic = True
@@ -94,39 +105,54 @@ class Traffic(Extension, ABC):
         """prior: the frozen prior of the run; methods without a prior ignore it."""
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
-        """Returns the state of new episodes in scenes [B], with noise seeds [B] int64 and intensities eta [B]."""
+        """Returns the state of new episodes in scenes [B], with noise seeds [B] int64
+        and intensities eta [B]."""
         return None
 
     @abstractmethod
-    def replan(self, state: State, world: World, ego_plan: Tensor) -> tuple[State, TrafficPlan]:
+    def replan(
+        self, state: State, world: World, ego_plan: Tensor
+    ) -> tuple[State, TrafficPlan]:
         """Returns the new state and plan.
 
-        Called every REPLAN_STEPS steps; the first REPLAN_STEPS steps of a plan are executed unchanged.
+        Called every REPLAN_STEPS steps; the first REPLAN_STEPS steps of a plan are
+        executed unchanged.
 
         Args:
             state: what `reset` or the last replan returned.
             world: the B scenes now.
-            ego_plan: [B, >= HORIZON, 4], states that the ego announces, for a method whose knowledge is its plan.
+            ego_plan: [B, >= HORIZON, 4], states that the ego announces, for a method
+                whose knowledge is its plan.
         """
 
     def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
-        """Returns joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start frames; seed [S, B] int64.
+        """Returns joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start
+        frames; seed [S, B] int64.
 
         By default those of the first replan, given an ego that keeps its velocity.
         """
         world = World.at_start(scene)
         ego_plan = keep_velocity(world.states[:, 0])
         eta = torch.zeros(len(world.step), device=seed.device)
-        plans = [self.replan(self.reset(scene, one, eta=eta), world, ego_plan=ego_plan)[1].states for one in seed]
+        plans = [
+            self.replan(self.reset(scene, one, eta=eta), world, ego_plan=ego_plan)[
+                1
+            ].states
+            for one in seed
+        ]
         return torch.stack(plans, 1)
 
 
 def keep_velocity(states: Tensor, steps: Tensor | None = None) -> Tensor:
-    """Returns states [..., H, 4] of agents [..., 4] after `steps` [H] (or [..., H]) steps at constant velocity; default
-    1..HORIZON."""
-    steps = torch.arange(1, HORIZON + 1, device=states.device) if steps is None else steps
+    """Returns states [..., H, 4] of agents [..., 4] after `steps` [H] (or [..., H])
+    steps at constant velocity; default 1..HORIZON."""
+    steps = (
+        torch.arange(1, HORIZON + 1, device=states.device) if steps is None else steps
+    )
     distance = states[..., 3, None] * DT * steps
-    direction = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)[..., None, :]
+    direction = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)[
+        ..., None, :
+    ]
     xy = states[..., None, :2] + distance[..., None] * direction
     return torch.cat([xy, states[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
 
@@ -137,9 +163,11 @@ def steps_ahead(world: World) -> Tensor:
 
 
 class PlanLog:
-    """Collects the plans of B scenes that replan at the same steps, every REPLAN_STEPS from the start on.
+    """Collects the plans of B scenes that replan at the same steps, every REPLAN_STEPS
+    from the start on.
 
-    `last`: the plan that came last; `acted` [B, V] bool: who has been an adversary in any plan.
+    `last`: the plan that came last; `acted` [B, V] bool: who has been an adversary in
+    any plan.
     """
 
     last: TrafficPlan
@@ -159,40 +187,53 @@ class PlanLog:
         self.last = plan
 
     def plans(self, ego_plans: Tensor) -> dict[str, Tensor]:
-        """Returns plans [B, R, V, K, 2] m, at POINT_STEPS, 2 POINT_STEPS .. steps after each of R replans, and targets
-        [B, R, V] (0 the ego, -1 nobody). ego_plans [B, T, H, 4], of every step, become row 0."""
+        """Returns plans [B, R, V, K, 2] m, at POINT_STEPS, 2 POINT_STEPS .. steps after
+        each of R replans, and targets [B, R, V] (0 the ego, -1 nobody). ego_plans [B,
+        T, H, 4], of every step, become row 0."""
         plans = torch.stack(self.paths, 1)
         plans[:, :, 0] = points_of(ego_plans[:, ::REPLAN_STEPS]).cpu()
         return {"plans": plans, "targets": torch.stack(self.targets, 1)}
 
     def routes(self, scene: TensorDictBase) -> Tensor:
-        """Returns the route candidates [B, V] int64 that were followed last; by default the recorded ones."""
-        return scene["route_log"].clamp(min=0) if self.last.route is None else self.last.route
+        """Returns the route candidates [B, V] int64 that were followed last; by default
+        the recorded ones."""
+        return (
+            scene["route_log"].clamp(min=0)
+            if self.last.route is None
+            else self.last.route
+        )
 
     def transport(self) -> dict[str, Tensor]:
-        """Returns what control cost each rollout [B]: path KL of adversaries and of others, energy of anchoring."""
+        """Returns what control cost each rollout [B]: path KL of adversaries and of
+        others, energy of anchoring."""
         zero = torch.zeros(self.acted.shape)
         acted = self.acted
-        kl, jump = (zero if value is None else value.cpu() for value in (self.last.path_kl, self.last.anchor_jump))
+        kl, jump = (
+            zero if value is None else value.cpu()
+            for value in (self.last.path_kl, self.last.anchor_jump)
+        )
         costs = {"adversary": kl * acted, "others": kl * ~acted, "anchor": jump}
         return {f"transport_{name}": value.sum(-1) for name, value in costs.items()}
 
 
 def points_of(states: Tensor) -> Tensor:
-    """Returns the positions [..., K, 2] of states [..., H, 4] at every POINT_STEPS-th planned step."""
+    """Returns the positions [..., K, 2] of states [..., H, 4] at every POINT_STEPS-th
+    planned step."""
     return states[..., POINT_STEPS - 1 :: POINT_STEPS, :2]
 
 
 @contextmanager
 def counted_nfe(traffic: Traffic) -> Iterator[list[int]]:
-    """Yields the NFE of a method within the block, one number per call of the prior's network: its joint samples, twice
-    where a gradient is wanted."""
+    """Yields the NFE of a method within the block, one number per call of the prior's
+    network: its joint samples, twice where a gradient is wanted."""
     nfe = list[int]()
     prior = getattr(traffic, "prior", None)
     if not isinstance(prior, Prior):
         yield nfe
         return
-    hook = prior.denoiser.register_forward_hook(lambda _, given, x0: nfe.append(len(x0) * (1 + x0.requires_grad)))
+    hook = prior.denoiser.register_forward_hook(
+        lambda _, given, x0: nfe.append(len(x0) * (1 + x0.requires_grad))
+    )
     try:
         yield nfe
     finally:

@@ -1,4 +1,5 @@
-"""AdversarialSynthesizer: the TorchRL transform that sets the scene and the traffic of every episode."""
+"""AdversarialSynthesizer: the TorchRL transform that sets the scene and the traffic of
+every episode."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,7 +10,15 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from e2rl.planners.ego import PLAN_STEPS, Ego, answering, ask, checked, from_outside, renumbered
+from e2rl.planners.ego import (
+    PLAN_STEPS,
+    Ego,
+    answering,
+    ask,
+    checked,
+    from_outside,
+    renumbered,
+)
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
@@ -20,21 +29,30 @@ from e2rl.traffic.e2.decisions import OWES
 from e2rl.traffic.e2.reaiming import Reaiming
 from e2rl.traffic.grouping import put_rows, take_rows
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
-from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan, keep_velocity
+from e2rl.traffic.traffic import (
+    REPLAN_STEPS,
+    State,
+    Traffic,
+    TrafficPlan,
+    keep_velocity,
+)
 
 Draw = Callable[[int], Tensor]  # count -> pool rows [count] of new episodes
 
 
 class AdversarialSynthesizer(Transform):
-    """Draws a pool row for every new episode, injects its scene, and drives its traffic.
+    """Draws a pool row for every new episode, injects its scene, and drives its
+    traffic.
 
-    Rows with recorded or stored traffic replay it; with a reaction, vehicles of those with an intensity may leave their
-    trajectories every REPLAN_STEPS simulated steps. LIVE rows are replanned by the traffic method every REPLAN_STEPS
-    steps. It is given ("ego", "plan") [B, H, 4], which the policy has just written (without this key, constant
-    velocity), and may not look at it (`Traffic.knowledge`).
+    Rows with recorded or stored traffic replay it; with a reaction, vehicles of those
+    with an intensity may leave their trajectories every REPLAN_STEPS simulated steps.
+    LIVE rows are replanned by the traffic method every REPLAN_STEPS steps. It is given
+    ("ego", "plan") [B, H, 4], which the policy has just written (without this key,
+    constant velocity), and may not look at it (`Traffic.knowledge`).
 
-    Writes ("traffic", ...): row [B, 1] int64 and, with a traffic method, plan [B, V, H, 4]: states planned for the
-    coming steps, only for the policy, not stacked over time. Everything else about a plan is handed to `on_plan`.
+    Writes ("traffic", ...): row [B, 1] int64 and, with a traffic method, plan [B, V, H,
+    4]: states planned for the coming steps, only for the policy, not stacked over time.
+    Everything else about a plan is handed to `on_plan`.
     """
 
     def __init__(
@@ -45,15 +63,18 @@ class AdversarialSynthesizer(Transform):
         ego: Ego | None = None,
         reaction: Reaiming | None = None,
     ) -> None:
-        """draw: `env.set_seed` seeds its `generator`, if it has one; traffic: drives LIVE rows; ego: the ego that a
-        method with `queries_ego` queries; reaction: None, nobody leaves replayed traffic."""
+        """draw: `env.set_seed` seeds its `generator`, if it has one; traffic: drives
+        LIVE rows; ego: the ego that a method with `queries_ego` queries; reaction:
+        None, nobody leaves replayed traffic."""
         super().__init__()
         self.pool = pool
         self.draw = draw
         self.traffic = traffic
         self.ego = ego
         self.reaction = reaction
-        self.on_plan: Callable[[TrafficPlan], None] | None = None  # called with every new plan
+        self.on_plan: Callable[[TrafficPlan], None] | None = (
+            None  # called with every new plan
+        )
         self._next_reaction = 0  # the environment's clock at which vehicles react next
         nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
         self._drawn = nothing  # [B] pool row of each episode
@@ -62,10 +83,13 @@ class AdversarialSynthesizer(Transform):
         self._planned_at = nothing  # [B] step of the last replan, per environment
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Let the environment's `set_seed`, which skips transforms, reach the draws and the reaction."""
+        """Let the environment's `set_seed`, which skips transforms, reach the draws and
+        the reaction."""
         super().set_container(container)
         if self.parent is not None:  # a Compose may have no environment yet
-            found = (getattr(part, "generator", None) for part in (self.draw, self.reaction))
+            found = (
+                getattr(part, "generator", None) for part in (self.draw, self.reaction)
+            )
             self._env.generators.update(each for each in found if each is not None)
 
     @property
@@ -77,12 +101,18 @@ class AdversarialSynthesizer(Transform):
         assert self.traffic is not None
         return self.traffic
 
-    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
+    def _reset_env_preprocess(
+        self, tensordict: TensorDictBase | None
+    ) -> TensorDictBase:
         env = self._env
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=env.batch_size, device=env.device)
         mask = tensordict.get("_reset", None)
-        mask = torch.ones(env.batch_size, dtype=torch.bool) if mask is None else mask.view(env.batch_size).cpu()
+        mask = (
+            torch.ones(env.batch_size, dtype=torch.bool)
+            if mask is None
+            else mask.view(env.batch_size).cpu()
+        )
         rows = mask.nonzero()[:, 0]
         if not len(self._drawn):
             self._drawn = torch.zeros(env.batch_size, dtype=torch.int64)
@@ -90,7 +120,9 @@ class AdversarialSynthesizer(Transform):
         self._inject(rows)
         if self.reaction is not None:
             self._begin_reaction(self.reaction, rows)
-        tensordict["scene_index"] = self.pool.scene_index[self._drawn][:, None].to(env.device)
+        tensordict["scene_index"] = self.pool.scene_index[self._drawn][:, None].to(
+            env.device
+        )
         return tensordict
 
     def _inject(self, rows: Tensor) -> None:
@@ -98,7 +130,9 @@ class AdversarialSynthesizer(Transform):
         source = self.pool.source[self._drawn[rows]]
         stored = source >= 0
         if bool(stored.any()):
-            self._env.set_traffic(rows[stored].to(self._env.device), *self.pool.tracks(source[stored]))
+            self._env.set_traffic(
+                rows[stored].to(self._env.device), *self.pool.tracks(source[stored])
+            )
 
     def _begin_reaction(self, reaction: Reaiming, rows: Tensor) -> None:
         """Who reacts in the new episodes of environments rows [b]."""
@@ -106,33 +140,55 @@ class AdversarialSynthesizer(Transform):
         drawn = self._drawn[rows]
         eta = self.pool.eta[drawn] * (self.pool.source[drawn] != LIVE)
         owes = self.pool.decisions[drawn, OWES] >= 0.5
-        attack = eta.to(env.device), self.pool.template[drawn].to(env.device), owes.to(env.device)
+        attack = (
+            eta.to(env.device),
+            self.pool.template[drawn].to(env.device),
+            owes.to(env.device),
+        )
         if len(rows) == len(self._drawn):
             self._next_reaction = env.clock
         rows = rows.to(env.device)
         reaction.begin(rows, *attack, self._stored_adversaries()[rows], env.horizon)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         if self.traffic is not None:
             self._begin(tensordict_reset["timestep"][:, 0] == 0)
         written = self._write(tensordict_reset)
         known = tensordict is not None and ("traffic", "plan") in tensordict.keys(True)
-        if self.traffic is not None and not known:  # a collector would stack what the first reset returns
-            del written["traffic", "plan"]  # it is constant velocity, which is also the default without a plan
+        if (
+            self.traffic is not None and not known
+        ):  # a collector would stack what the first reset returns
+            del written[
+                "traffic", "plan"
+            ]  # it is constant velocity, which is also the default without a plan
         return written
 
     def _begin(self, first: Tensor) -> None:
-        """Reset the traffic method's state and the plan in environments first [B] bool, which have just been reset."""
+        """Reset the traffic method's state and the plan in environments first [B] bool,
+        which have just been reset."""
         env = self._env
         rows = first.nonzero()[:, 0]
         world = env.world()
         drawn = self._drawn[rows.cpu()]
-        seed, eta = (getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta"))
+        seed, eta = (
+            getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta")
+        )
         begins = not len(self._planned_at)
         whole = begins or len(rows) == len(first)
-        names = {"template": self._method.follows_template, "decisions": self._method.follows_decisions}
-        given = {name: getattr(self.pool, name)[drawn].to(env.device) for name, follows in names.items() if follows}
-        fresh = self._method.reset(world.scene if whole else world.scene[rows], seed, eta, **given)
+        names = {
+            "template": self._method.follows_template,
+            "decisions": self._method.follows_decisions,
+        }
+        given = {
+            name: getattr(self.pool, name)[drawn].to(env.device)
+            for name, follows in names.items()
+            if follows
+        }
+        fresh = self._method.reset(
+            world.scene if whole else world.scene[rows], seed, eta, **given
+        )
         self._state = fresh if whole else put_rows(self._state, rows, new=fresh)
         if begins:
             shape = (*world.scene["route_log"].shape, HORIZON, 4)
@@ -142,7 +198,8 @@ class AdversarialSynthesizer(Transform):
         self._planned_at[rows] = -REPLAN_STEPS
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Before a step: replan the live traffic of environments in which a replan is due; let vehicles react."""
+        """Before a step: replan the live traffic of environments in which a replan is
+        due; let vehicles react."""
         if self.traffic is not None:
             step = tensordict["timestep"][:, 0]
             live = (self.pool.source[self._drawn] == LIVE).to(step.device)
@@ -169,10 +226,20 @@ class AdversarialSynthesizer(Transform):
                 )
             ego_plan = keep_velocity(world.states[:, 0])  # nobody is told it
         whole = len(rows) == len(world.step)
-        state, now = (self._state, world) if whole else (take_rows(self._state, rows), take_rows(world, rows))
-        queries = {"react": Lookahead(self.ego, now)} if self._method.queries_ego and self.ego is not None else {}
+        state, now = (
+            (self._state, world)
+            if whole
+            else (take_rows(self._state, rows), take_rows(world, rows))
+        )
+        queries = (
+            {"react": Lookahead(self.ego, now)}
+            if self._method.queries_ego and self.ego is not None
+            else {}
+        )
         with renumbered(rows):
-            state, plan = self._method.replan(state, now, ego_plan if whole else ego_plan[rows], **queries)
+            state, plan = self._method.replan(
+                state, now, ego_plan if whole else ego_plan[rows], **queries
+            )
         self._state = state if whole else put_rows(self._state, rows, new=state)
         self._plan[rows] = plan.states.to(self._plan.dtype)
         if self.on_plan is not None:
@@ -180,7 +247,9 @@ class AdversarialSynthesizer(Transform):
         self._planned_at[rows] = world.step[rows]
         self._env.write_traffic(rows, plan.states, plan.present)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+    ) -> TensorDictBase:
         return self._write(next_tensordict)
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -192,14 +261,21 @@ class AdversarialSynthesizer(Transform):
             replayed = (self.pool.source[self._drawn] != LIVE).to(device)
             if bool(replayed.any()):
                 now = self._env.world().states[:, : self._plan.shape[1]]
-                keys["plan"] = torch.where(replayed[:, None, None, None], keep_velocity(now), keys["plan"])
-        tensordict["traffic"] = TensorDict(keys, batch_size=tensordict.batch_size, device=device)
+                keys["plan"] = torch.where(
+                    replayed[:, None, None, None], keep_velocity(now), keys["plan"]
+                )
+        tensordict["traffic"] = TensorDict(
+            keys, batch_size=tensordict.batch_size, device=device
+        )
         return tensordict
 
     def _plan_from(self, step: Tensor) -> Tensor:
-        """States [B, V, H, 4] planned for the steps after `step` [B]; the last state is held."""
+        """States [B, V, H, 4] planned for the steps after `step` [B]; the last state is
+        held."""
         age = (step - self._planned_at.clamp(min=0)).clamp(min=0)
-        ahead = (age[:, None] + torch.arange(HORIZON, device=age.device)).clamp(max=HORIZON - 1)
+        ahead = (age[:, None] + torch.arange(HORIZON, device=age.device)).clamp(
+            max=HORIZON - 1
+        )
         if bool((age == age[0]).all()):  # as where all scenes are replanned together
             return self._plan.index_select(2, ahead[0])
         row = torch.arange(len(age), device=age.device)[:, None]
@@ -216,8 +292,11 @@ class AdversarialSynthesizer(Transform):
             adversaries = torch.where((source > RECORDED)[:, None], stored, adversaries)
         return adversaries.to(env.device)
 
-    def _post_step_mdp_hooks(self, tensordict: TensorDictBase, tensordict_: TensorDictBase):
-        """Pass the plan (0.8 kB per vehicle and step) to the policy only, without a spec and not stacked over time."""
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ):
+        """Pass the plan (0.8 kB per vehicle and step) to the policy only, without a
+        spec and not stacked over time."""
         if self.traffic is not None:
             tensordict_["traffic", "plan"] = tensordict["next", "traffic", "plan"]
             for key in (("traffic", "plan"), ("next", "traffic", "plan")):
@@ -229,14 +308,16 @@ class AdversarialSynthesizer(Transform):
         """Declares the ("traffic", ...) keys."""
         env = self._env
         row = Unbounded((*env.batch_size, 1), dtype=torch.int64, device=env.device)
-        observation_spec["traffic"] = Composite(row=row, shape=env.batch_size, device=env.device)
+        observation_spec["traffic"] = Composite(
+            row=row, shape=env.batch_size, device=env.device
+        )
         return observation_spec
 
 
 @dataclass
 class Lookahead:
-    """The ego's reaction to a plan of the other vehicles: its own policy, a black box, rolled out in scenes [B] against
-    the plan; period: steps between two ego plans."""
+    """The ego's reaction to a plan of the other vehicles: its own policy, a black box,
+    rolled out in scenes [B] against the plan; period: steps between two ego plans."""
 
     ego: Ego
     world: World
@@ -244,25 +325,39 @@ class Lookahead:
 
     @torch.no_grad()
     def __call__(self, rows: Tensor, planned: Tensor) -> Tensor:
-        """The egos' states [G, HORIZON, 4] in scenes rows [G] against vehicles planned [G, V, HORIZON, 4], but for
-        row 0; agents without a plan keep their velocity."""
+        """The egos' states [G, HORIZON, 4] in scenes rows [G] against vehicles planned
+        [G, V, HORIZON, 4], but for row 0; agents without a plan keep their velocity."""
         whole = len(rows) == len(self.world.step) and bool((rows.diff() > 0).all())
         world = self.world if whole else replace(take_rows(self.world, rows), plan=None)
-        world = world.shown() if from_outside(self.ego) else world  # of now: it is asked about steps to come
+        world = (
+            world.shown() if from_outside(self.ego) else world
+        )  # of now: it is asked about steps to come
         states = world.states
         vehicles = planned.shape[1]
         pieces = []
-        ends = torch.arange(self.period, HORIZON + self.period, self.period, device=states.device)
+        ends = torch.arange(
+            self.period, HORIZON + self.period, self.period, device=states.device
+        )
         moved = constant_velocity(states[:, vehicles:], DT * ends)
         now = world
         for number, after in enumerate(ends.tolist()):
             with renumbered(rows), answering(now):
                 answer = ask(self.ego, "plan", world=now, scene=world.scene)
-                plan = checked(answer, (len(now.step), PLAN_STEPS, 4), ego=self.ego, method="plan", begins=False)
+                plan = checked(
+                    answer,
+                    (len(now.step), PLAN_STEPS, 4),
+                    ego=self.ego,
+                    method="plan",
+                    begins=False,
+                )
             pieces.append(plan[:, : self.period])
             ego = pieces[-1][:, -1:]
             others = planned[:, 1:, min(after, HORIZON) - 1]
-            place = None if now.mission_s is None else now.mission_s + DT * pieces[-1][..., 3].sum(1)
+            place = (
+                None
+                if now.mission_s is None
+                else now.mission_s + DT * pieces[-1][..., 3].sum(1)
+            )
             states = torch.cat([ego, others, moved[:, :, number]], 1)
             now = replace(now, step=world.step + after, states=states, mission_s=place)
         return torch.cat(pieces, 1)[:, :HORIZON]

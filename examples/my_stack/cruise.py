@@ -1,4 +1,5 @@
-"""A planner: it drives along its mission, holding its speed or braking for whoever is near on its path."""
+"""A planner: it drives along its mission, holding its speed or braking for whoever is
+near on its path."""
 
 import torch
 
@@ -19,7 +20,16 @@ class Cruise(Ego):
     def plan(self, world):
         """[B, 50, 4] x, y, heading, speed."""
         speed = world.states[:, 0, 3:]
-        x, y = to_frame(world.states[:, 1:, :2], world.states[:, :1]).unbind(-1)  # of the others, in the ego's frame
+        x, y = to_frame(world.states[:, 1:, :2], world.states[:, :1]).unbind(
+            -1
+        )  # of the others, in the ego's frame
         ahead = world.valid[:, 1:] & (x > 0) & (y.abs() < 1.8)
-        near = x.masked_fill(~ahead, torch.inf).amin(1, keepdim=True) - 5.0 < self.time_gap * speed
-        return MissionPath(world).drive((speed - self.braking * near * DT * torch.arange(PLAN_STEPS + 1)).clamp(min=0))
+        near = (
+            x.masked_fill(~ahead, torch.inf).amin(1, keepdim=True) - 5.0
+            < self.time_gap * speed
+        )
+        return MissionPath(world).drive(
+            (speed - self.braking * near * DT * torch.arange(PLAN_STEPS + 1)).clamp(
+                min=0
+            )
+        )

@@ -1,4 +1,5 @@
-"""An objective of the attack: adversaries want to be just in front of their target, instead of meeting it."""
+"""An objective of the attack: adversaries want to be just in front of their target,
+instead of meeting it."""
 
 from dataclasses import dataclass
 
@@ -11,12 +12,14 @@ from e2rl.traffic.e2.potentials import LENGTH, PotentialSettings, with_ego
 
 @dataclass(frozen=True)
 class CutInFront(PotentialSettings):
-    """V_adv is the mean distance to the place `ahead` m in front of the target, in units of 2 m."""
+    """V_adv is the mean distance to the place `ahead` m in front of the target, in
+    units of 2 m."""
 
     ahead: float = setting(low=0.0)
 
     def adversarial(self, states, context, temperature):
-        """[B, V] of states [B, V, T, 4]; the ego, row 0, and the target are no part of the gradient."""
+        """[B, V] of states [B, V, T, 4]; the ego, row 0, and the target are no part of
+        the gradient."""
         states = with_ego(states, context)
         index = context.target.clamp(min=0)  # [B, V]; -1: does not act
         target = states.detach().gather(1, index[..., None, None].expand_as(states))

@@ -1,14 +1,25 @@
-"""A curriculum: the intensity climbs one stair whenever the ego has coped with the present one."""
+"""A curriculum: the intensity climbs one stair whenever the ego has coped with the
+present one."""
 
 from e2rl.learning.scheduler import CurriculumScheduler
 
 
 class Staircase(CurriculumScheduler):
-    """Starts on the first of `stairs`; goes up after a round with a collision rate of at most `coped`."""
+    """Starts on the first of `stairs`; goes up after a round with a collision rate of
+    at most `coped`."""
 
     lasting = ("_level",)
 
-    def __init__(self, num_scenes, rounds, seed=0, stairs=(0.5, 1.0, 2.0, 3.0), coped=0.3, fraction=0.5, **scenes):
+    def __init__(
+        self,
+        num_scenes,
+        rounds,
+        seed=0,
+        stairs=(0.5, 1.0, 2.0, 3.0),
+        coped=0.3,
+        fraction=0.5,
+        **scenes,
+    ):
         super().__init__(num_scenes, rounds, seed, **scenes)
         self._stairs = list(stairs)
         self._coped = coped

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-sys.path.insert(0, str(FOLDER))  # the benchmarks are scripts beside each other, as their command sees them
+sys.path.insert(
+    0, str(FOLDER)
+)  # the benchmarks are scripts beside each other, as their command sees them
 
 import run  # noqa: E402
 
@@ -38,10 +40,17 @@ def test_every_benchmark_runs(name, tmp_path, monkeypatch):
     rows = json.loads(path.read_text())
     assert rows and {row["benchmark"] for row in rows} == {name}
     if name.startswith("peer_"):  # they are not installed where the tests run
-        assert all(row["value"] or row["variant"].startswith("absent: ") for row in rows)
+        assert all(
+            row["value"] or row["variant"].startswith("absent: ") for row in rows
+        )
         return
-    assert all(row["value"] > 0 and row["threads"] == 1 and row["versions"]["torch"] for row in rows)
-    assert len({(row["variant"], row["batch"], row["unit"], row["processes"]) for row in rows}) == len(rows)
+    assert all(
+        row["value"] > 0 and row["threads"] == 1 and row["versions"]["torch"]
+        for row in rows
+    )
+    assert len(
+        {(row["variant"], row["batch"], row["unit"], row["processes"]) for row in rows}
+    ) == len(rows)
 
 
 def test_impossible_sizes_are_refused(tmp_path):

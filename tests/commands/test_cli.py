@@ -1,4 +1,5 @@
-"""One command `e2rl`: it lists what there is, knows its version, and finds its modules from any folder."""
+"""One command `e2rl`: it lists what there is, knows its version, and finds its modules
+from any folder."""
 
 import subprocess
 import sys
@@ -24,11 +25,17 @@ def said(monkeypatch, capsys, *arguments):
 def test_help_version_and_the_nearest_command(monkeypatch, capsys):
     text = said(monkeypatch, capsys, "--help")
     assert text == said(monkeypatch, capsys) and all(name in text for name in COMMANDS)
-    assert {line.split()[1] for line in EXAMPLES.splitlines() if line.startswith("  e2rl ")} <= set(COMMANDS)
-    assert said(monkeypatch, capsys, "--version").strip() == f"e2rl {PROJECT['version']}"
+    assert {
+        line.split()[1] for line in EXAMPLES.splitlines() if line.startswith("  e2rl ")
+    } <= set(COMMANDS)
+    assert (
+        said(monkeypatch, capsys, "--version").strip() == f"e2rl {PROJECT['version']}"
+    )
     with pytest.raises(SystemExit) as stopped:
         said(monkeypatch, capsys, "evalute")
-    assert stopped.value.code == 2 and "did you mean evaluate?" in capsys.readouterr().err
+    assert (
+        stopped.value.code == 2 and "did you mean evaluate?" in capsys.readouterr().err
+    )
 
 
 def test_every_command_is_a_module_with_a_main():
@@ -39,9 +46,15 @@ def test_every_command_is_a_module_with_a_main():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["evaluate", "train", "prior-tables", "skeleton", "tune"])
+@pytest.mark.parametrize(
+    "name", ["evaluate", "train", "prior-tables", "skeleton", "tune"]
+)
 def test_a_command_shows_its_configuration_in_an_empty_folder(name, tmp_path):
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from e2rl.commands.cli import main; main()"
     command = [sys.executable, "-c", code, name, "--cfg", "job"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "_target_: e2rl.traffic.e2.e2.E2" in done.stdout, done.stderr
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0 and "_target_: e2rl.traffic.e2.e2.E2" in done.stdout, (
+        done.stderr
+    )

@@ -15,7 +15,13 @@ pytestmark = pytest.mark.slow
 
 
 def run(command, folder, world, monkeypatch, *options):
-    given = [*SHORT, f"data.cache={world / 'bundled'}", f"hydra.run.dir={folder}", "seeds=[0]", *options]
+    given = [
+        *SHORT,
+        f"data.cache={world / 'bundled'}",
+        f"hydra.run.dir={folder}",
+        "seeds=[0]",
+        *options,
+    ]
     monkeypatch.setattr(sys, "argv", ["e2rl", *given])
     try:
         command.main()
@@ -23,16 +29,31 @@ def run(command, folder, world, monkeypatch, *options):
         GlobalHydra.instance().clear()
 
 
-def test_the_prior_s_tables_have_rows_of_all_stages(world, tmp_path, monkeypatch, capsys):
+def test_the_prior_s_tables_have_rows_of_all_stages(
+    world, tmp_path, monkeypatch, capsys
+):
     """Open loop, spread, closed loop and meta-metric of two scenes."""
     run(
-        prior_tables, tmp_path / "run", world, monkeypatch, "open_loop_samples=2", "spread_samples=2", "meta_rollouts=2"
+        prior_tables,
+        tmp_path / "run",
+        world,
+        monkeypatch,
+        "open_loop_samples=2",
+        "spread_samples=2",
+        "meta_rollouts=2",
     )
-    assert "bundled/tune, 2 scenes, 1 seed." in capsys.readouterr().out, "the closed loop's, not the samples"
+    assert "bundled/tune, 2 scenes, 1 seed." in capsys.readouterr().out, (
+        "the closed loop's, not the samples"
+    )
     rows = read_metrics(tmp_path / "run" / "metrics.json")
-    found = {stage: [row for row in rows if row.get("stage") == stage] for stage in (*STAGES, None)}
+    found = {
+        stage: [row for row in rows if row.get("stage") == stage]
+        for stage in (*STAGES, None)
+    }
     methods = ["replay", "constant_velocity", "idm", "nominal"]
-    assert {stage: [row["method"] for row in part] for stage, part in found.items()} == {
+    assert {
+        stage: [row["method"] for row in part] for stage, part in found.items()
+    } == {
         OPEN_LOOP_STAGE: methods[1:],
         META_STAGE: methods,
         SPREAD_STAGE: ["nominal"],
@@ -41,14 +62,39 @@ def test_the_prior_s_tables_have_rows_of_all_stages(world, tmp_path, monkeypatch
     for stage, metrics in STAGES.items():
         known = [metric.name for metric in metrics if metric.name != "real_split_half"]
         assert all(set(known) <= set(row["metrics"]) for row in found[stage])
-    meta = {row["method"]: row["metrics"]["meta_metric"]["mean"] for row in found[META_STAGE]}
-    assert max(meta, key=meta.get) == "replay" and "real_split_half" in found[META_STAGE][0]["metrics"]
-    assert found[None][0]["metrics"]["real"]["mean"] == 1, "the replayed log is wholly like itself"
+    meta = {
+        row["method"]: row["metrics"]["meta_metric"]["mean"]
+        for row in found[META_STAGE]
+    }
+    assert (
+        max(meta, key=meta.get) == "replay"
+        and "real_split_half" in found[META_STAGE][0]["metrics"]
+    )
+    assert found[None][0]["metrics"]["real"]["mean"] == 1, (
+        "the replayed log is wholly like itself"
+    )
     text = (tmp_path / "run" / "tables.md").read_text()
-    assert all(word in text for word in ("min_ade_5", "meta_metric", "cfr_bg", "nominal", "constant_velocity"))
+    assert all(
+        word in text
+        for word in (
+            "min_ade_5",
+            "meta_metric",
+            "cfr_bg",
+            "nominal",
+            "constant_velocity",
+        )
+    )
 
 
 def test_the_skeleton_is_drawn(world, tmp_path, monkeypatch, capsys):
     run(skeleton_figure, tmp_path / "run", world=world, monkeypatch=monkeypatch)
-    drawn = {path.name for path in (tmp_path / "run").glob("*.p*") if path.suffix in (".png", ".pdf")}
-    assert drawn == {f"{name}.{suffix}" for name in ("skeleton", "anchoring") for suffix in ("png", "pdf")}
+    drawn = {
+        path.name
+        for path in (tmp_path / "run").glob("*.p*")
+        if path.suffix in (".png", ".pdf")
+    }
+    assert drawn == {
+        f"{name}.{suffix}"
+        for name in ("skeleton", "anchoring")
+        for suffix in ("png", "pdf")
+    }

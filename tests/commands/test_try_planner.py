@@ -1,4 +1,5 @@
-"""`e2rl try` drives a class of one's own by evaluate's protocol, and says what is wrong with one that it cannot."""
+"""`e2rl try` drives a class of one's own by evaluate's protocol, and says what is wrong
+with one that it cannot."""
 
 import sys
 
@@ -48,18 +49,30 @@ def folder(tmp_path, monkeypatch):
     ("planner", "message"),
     [
         ("{name}:Stedy", "has no Stedy; it has Steady"),
-        ("{name}:Other", "Other is no planner; make it a subclass of e2rl.planners.ego.Ego"),
+        (
+            "{name}:Other",
+            "Other is no planner; make it a subclass of e2rl.planners.ego.Ego",
+        ),
         ("{name}:Wide", "Wide needs gap; give defaults, or add --set gap=VALUE"),
         ("{name}", "name a class, as MODULE:CLASS or FILE.py:CLASS"),
         ("nowhere:Steady", "no module nowhere in"),
         ("nowhere.py:Steady", "no file nowhere.py"),
-        ("broken:Steady", "broken cannot be imported: ZeroDivisionError: division by zero; mend that"),
+        (
+            "broken:Steady",
+            "broken cannot be imported: ZeroDivisionError: division by zero; mend that",
+        ),
         ("lacking.py:Steady", "lacking needs no_such_library, which is not installed"),
-        ("{name}:Ego", "Ego overrides neither plan nor act, so that it does not drive; name Steady, Wide"),
+        (
+            "{name}:Ego",
+            "Ego overrides neither plan nor act, so that it does not drive; name Steady, Wide",
+        ),
         ("{name}:Idle", "Idle overrides neither plan nor act"),
         ("random.py:Steady", "rename random.py: a module random is loaded already"),
         ("random:Steady", "rename random.py: a module random is loaded already"),
-        ("sys.py:Steady", "rename sys.py: a module sys is loaded already, a part of Python"),
+        (
+            "sys.py:Steady",
+            "rename sys.py: a module sys is loaded already, a part of Python",
+        ),
     ],
 )
 def test_a_planner_that_cannot_be_driven_is_one_line(folder, capsys, planner, message):
@@ -87,19 +100,51 @@ def test_it_writes_a_command_line_of_evaluate(folder, monkeypatch, form):
 
     planner = form.format(name=folder[1])
     real = try_planner.import_module
-    monkeypatch.setattr(try_planner, "import_module", lambda name: ran(name) if "scripts" in name else real(name))
+    monkeypatch.setattr(
+        try_planner,
+        "import_module",
+        lambda name: ran(name) if "scripts" in name else real(name),
+    )
     with pytest.raises(Ran):
-        main(["--planner", planner, "--scenes", "3", "eta=1.0", "--set", "replan_every=4", "--out", "a run"])
+        main(
+            [
+                "--planner",
+                planner,
+                "--scenes",
+                "3",
+                "eta=1.0",
+                "--set",
+                "replan_every=4",
+                "--out",
+                "a run",
+            ]
+        )
     assert sys.argv == [
-        *("e2rl evaluate", "ego=class", f"ego._target_={folder[1]}.Steady", "+ego.replan_every=4"),
+        *(
+            "e2rl evaluate",
+            "ego=class",
+            f"ego._target_={folder[1]}.Steady",
+            "+ego.replan_every=4",
+        ),
         *("num_scenes=3", "hydra.run.dir='a run'", "eta=1.0"),
     ]
 
 
 @pytest.mark.slow
 def test_it_drives_the_class_and_names_it(folder, capsys):
-    small = ["data.split=tune", "tries=1", "seeds=[0]", "processes=1", "data.build.steps=20", "report=false"]
+    small = [
+        "data.split=tune",
+        "tries=1",
+        "seeds=[0]",
+        "processes=1",
+        "data.build.steps=20",
+        "report=false",
+    ]
     main(["--planner", f"{folder[1]}:Steady", "--scenes", "1", "--out", "run", *small])
     rows = read_rows(folder[0] / "run" / "rollouts.csv")
-    assert {row["ego_policy"] for row in rows} == {"Steady"} and {row["method"] for row in rows} == {"e2", "nominal"}
-    assert capsys.readouterr().out.startswith("Drives Steady in the first of bundled scenes against e2, nominal")
+    assert {row["ego_policy"] for row in rows} == {"Steady"} and {
+        row["method"] for row in rows
+    } == {"e2", "nominal"}
+    assert capsys.readouterr().out.startswith(
+        "Drives Steady in the first of bundled scenes against e2, nominal"
+    )

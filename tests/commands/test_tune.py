@@ -1,4 +1,5 @@
-"""`e2rl tune` on two short bundled scenes: what it writes, and a study that goes on in another run."""
+"""`e2rl tune` on two short bundled scenes: what it writes, and a study that goes on in
+another run."""
 
 import json
 
@@ -16,9 +17,18 @@ def tune(tmp_path, monkeypatch, capsys):
     def run(*options, wrong=False):
         folder = tmp_path / f"run-{len(runs)}"
         runs.append(folder)
-        study = [f"tuning.study={tmp_path / 's'}", "prior.sampler.steps=2", "processes=1"]
+        study = [
+            f"tuning.study={tmp_path / 's'}",
+            "prior.sampler.steps=2",
+            "processes=1",
+        ]
         given = [*SHORT, *study, f"hydra.run.dir={folder}", *options]
-        status, said = call("e2rl/commands/cli.py", ["tune", *given], monkeypatch=monkeypatch, capsys=capsys)
+        status, said = call(
+            "e2rl/commands/cli.py",
+            ["tune", *given],
+            monkeypatch=monkeypatch,
+            capsys=capsys,
+        )
         assert status == (2 if wrong else 0), said
         return error_line(said) if wrong else folder
 
@@ -26,17 +36,27 @@ def tune(tmp_path, monkeypatch, capsys):
 
 
 def test_an_adversary_is_tuned_and_the_study_goes_on(tune):
-    """Rollouts are those of the method's own YAML; another budget or method is another study."""
+    """Rollouts are those of the method's own YAML; another budget or method is another
+    study."""
     e2 = ["synthesizer=e2", "tuning.sweep=2"]
     tune(*e2, "tuning.trials=1")
     run = tune(*e2, "tuning.trials=3")
     result = json.loads((run / "tuning.json").read_text())
     tried = [trial["parameters"]["interception.lateral"] for trial in result["trials"]]
-    assert tried == pytest.approx([load_choice("synthesizer", "e2").interception.lateral, 0.5, 4.0])
-    assert {"cfr", "aor_step", "aor_step nominal", "real_adv"} <= set(result["trials"][0]["metrics"])
+    assert tried == pytest.approx(
+        [load_choice("synthesizer", "e2").interception.lateral, 0.5, 4.0]
+    )
+    assert {"cfr", "aor_step", "aor_step nominal", "real_adv"} <= set(
+        result["trials"][0]["metrics"]
+    )
     assert "interception:\n  lateral: " in (run / "tuned.yaml").read_text()
-    assert len((run / "curves.csv").read_text().splitlines()) == 5 and (run / "curves.png").exists()
-    assert "differs in objective; name another file" in tune(*e2, "tuning.attack.off_road=0.1", wrong=True)
+    assert (
+        len((run / "curves.csv").read_text().splitlines()) == 5
+        and (run / "curves.png").exists()
+    )
+    assert "differs in objective; name another file" in tune(
+        *e2, "tuning.attack.off_road=0.1", wrong=True
+    )
 
 
 @pytest.mark.parametrize(
@@ -54,6 +74,13 @@ def test_what_cannot_be_tuned_is_told(tune, options, what):
 def test_a_planner_is_tuned_in_the_traffic_of_all_methods(tune):
     run = tune("tuning.group=ego", "ego=sampling", "tuning.trials=2", "tuning.sweep=0")
     result = json.loads((run / "tuning.json").read_text())
-    assert len(result["trials"]) == 2 and set(result["best"]) <= set(load_choice("ego", "sampling"))
-    assert {"collision nominal@0", "collision e2@2"} <= set(result["trials"][0]["metrics"])
-    assert "margin: " in (run / "tuned.yaml").read_text() and not (run / "curves.csv").exists()
+    assert len(result["trials"]) == 2 and set(result["best"]) <= set(
+        load_choice("ego", "sampling")
+    )
+    assert {"collision nominal@0", "collision e2@2"} <= set(
+        result["trials"][0]["metrics"]
+    )
+    assert (
+        "margin: " in (run / "tuned.yaml").read_text()
+        and not (run / "curves.csv").exists()
+    )

@@ -1,11 +1,19 @@
-"""Searches with a budget: spent but not much exceeded, the same however they run, and gone on with after a kill."""
+"""Searches with a budget: spent but not much exceeded, the same however they run, and
+gone on with after a kill."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from e2rl.evaluation.budget import Plan, build_plans, failures_of, search_all, spend, write_tries
+from e2rl.evaluation.budget import (
+    Plan,
+    build_plans,
+    failures_of,
+    search_all,
+    spend,
+    write_tries,
+)
 from e2rl.evaluation.protocol import Method, Setup, Work
 from e2rl.evaluation.trials import PlannerTrials
 from e2rl.planners.idm_planner import IDMEgo
@@ -24,13 +32,22 @@ LATE = Family("late", "e2", ranges={"patience": 2.0})
 
 
 def setup_of():
-    return Setup(scenes(3, steps=30), IDMEgo(), ego_name="idm", sim=SimSettings(), batch=2, evasions=False)
+    return Setup(
+        scenes(3, steps=30),
+        IDMEgo(),
+        ego_name="idm",
+        sim=SimSettings(),
+        batch=2,
+        evasions=False,
+    )
 
 
 def plan_of():
     on = Method("e2", synthesizer(), eta=2.0)
     settings = replace(SearchSettings(), cover=1)
-    return Plan("search", [RULE, LATE], traffic={"rule": on, "late": on}, settings=settings)
+    return Plan(
+        "search", [RULE, LATE], traffic={"rule": on, "late": on}, settings=settings
+    )
 
 
 @pytest.fixture(scope="module")
@@ -45,14 +62,19 @@ def plan():
 
 def found(setup, plan, processes=1, parts=NO_PARTS, tries=4.0, unit="tries"):
     work = Work(processes=processes, parts=parts)
-    (((rows, samples, errored), told),) = spend([(setup, plan, 3, range(3), tries, unit)], work)
+    (((rows, samples, errored), told),) = spend(
+        [(setup, plan, 3, range(3), tries, unit)], work
+    )
     assert len(rows) == len(samples) == len(told) and not errored
     return told
 
 
 def known(told):
     """What does not depend on the clock."""
-    return [{name: value for name, value in row.items() if name != "seconds"} for row in told]
+    return [
+        {name: value for name, value in row.items() if name != "seconds"}
+        for row in told
+    ]
 
 
 def test_a_budget_of_tries_is_spent_and_not_exceeded(setup, plan):
@@ -63,14 +85,18 @@ def test_a_budget_of_tries_is_spent_and_not_exceeded(setup, plan):
     assert len({(row["scene_id"], row["seed"]) for row in told}) == len(told)
 
 
-@pytest.mark.parametrize(("unit", "budget"), [("tries", 2.4), ("nfe", 90.0), ("nfe", 333.0)])
+@pytest.mark.parametrize(
+    ("unit", "budget"), [("tries", 2.4), ("nfe", 90.0), ("nfe", 333.0)]
+)
 def test_what_is_returned_is_within_the_budget(setup, plan, unit, budget):
     """Rows, samples and lines of tries; one more try would exceed it."""
     ((scored, told),) = spend([(setup, plan, 3, range(3), budget, unit)])
     rows, samples, _ = scored
     assert len(rows) == len(samples) == len(told) > 0
     cost = {"tries": [1.0] * len(rows), "nfe": [row["nfe"] for row in rows]}[unit]
-    assert sum(cost) / 3 == pytest.approx(told[-1][unit]) and told[-1][unit] <= budget * (1 + 1e-9)
+    assert sum(cost) / 3 == pytest.approx(told[-1][unit]) and told[-1][
+        unit
+    ] <= budget * (1 + 1e-9)
     assert (sum(cost) + 2 * max(cost)) / 3 > budget or unit == "nfe"
 
 
@@ -82,7 +108,9 @@ class Crashes(IDMEgo):
         self.speeds = speeds
 
     def plan(self, world):
-        if bool(torch.isin(world.scene["start"][:, 0, 3], torch.tensor(self.speeds)).any()):
+        if bool(
+            torch.isin(world.scene["start"][:, 0, 3], torch.tensor(self.speeds)).any()
+        ):
             raise KeyError("lane")
         return super().plan(world)
 
@@ -94,7 +122,9 @@ def test_a_planner_that_always_raises_does_not_use_up_the_budget(plan):
         [(replace(own, ego=Crashes([6.0, 7.0, 8.0])), plan, 3, range(3), 50.0, "tries")]
     )
     assert len(rows) == len(errored) == len(told) == RAISES * 3
-    (((rows, _, _), told),) = spend([(replace(own, ego=Crashes([7.0])), plan, 3, range(3), 8.0, "tries")])
+    (((rows, _, _), told),) = spend(
+        [(replace(own, ego=Crashes([7.0])), plan, 3, range(3), 8.0, "tries")]
+    )
     names = [row["scene_id"] for row in rows]
     crashed = own.scenes.scene_id[1]
     assert names.count(crashed) == RAISES < len(names) / 2
@@ -103,7 +133,10 @@ def test_a_planner_that_always_raises_does_not_use_up_the_budget(plan):
 
 def test_a_budget_that_ends_within_a_round_goes_to_scenes_at_random(setup, plan):
     firsts = {
-        told[0]["scene_id"] for _, told in spend([(setup, plan, seed, range(3), 0.3, "tries") for seed in range(4)])
+        told[0]["scene_id"]
+        for _, told in spend(
+            [(setup, plan, seed, range(3), 0.3, "tries") for seed in range(4)]
+        )
     }
     assert len(firsts) > 1
 
@@ -121,25 +154,40 @@ def test_a_search_goes_on_where_it_was_killed(setup, plan, tmp_path):
     for file in files[-2:]:
         file.unlink()
     assert known(found(setup, plan, parts=parts)) == known(whole)
-    assert {file: file.stat().st_mtime_ns for file in times} == times, "what was done is not done again"
+    assert {file: file.stat().st_mtime_ns for file in times} == times, (
+        "what was done is not done again"
+    )
     assert sorted(tmp_path.rglob("tries-*.pt")) == files
 
 
 def test_the_tries_that_hit_an_ego_are_driven_again_as_they_were(setup, plan, tmp_path):
     (((rows, _, _), told),) = spend([(setup, plan, 3, range(3), 4.0, "tries")])
     chosen = [k for k in range(len(told)) if k % 3 != 1]
-    write_tries(tmp_path / "tries.csv", [row | {"margin": 0.5 if k in chosen else -1.0} for k, row in enumerate(told)])
+    write_tries(
+        tmp_path / "tries.csv",
+        [row | {"margin": 0.5 if k in chosen else -1.0} for k, row in enumerate(told)],
+    )
     parts = failures_of(tmp_path / "tries.csv", "idm", plan=plan, setup=setup)
     again = {}
     for part, method, tasks in parts:
-        again |= {(row["scene_id"], row["seed"]): row for row in part.score(method, tasks)[0]}
+        again |= {
+            (row["scene_id"], row["seed"]): row for row in part.score(method, tasks)[0]
+        }
     keys = [(told[k]["scene_id"], told[k]["seed"]) for k in chosen]
-    before = {(row["scene_id"], row["seed"]): row for row in rows if (row["scene_id"], row["seed"]) in keys}
+    before = {
+        (row["scene_id"], row["seed"]): row
+        for row in rows
+        if (row["scene_id"], row["seed"]) in keys
+    }
     assert again.keys() == before.keys() and len(before) == len(chosen) > 4
     for key, row in before.items():
         for name in ("progress", "min_dtc", "transport"):
-            assert again[key][name] == pytest.approx(row[name], rel=1e-3, abs=1e-3), name
-    measured = PlannerTrials(setup, [], seeds=[0], make=lambda _: setup.ego, failures=parts)({})
+            assert again[key][name] == pytest.approx(row[name], rel=1e-3, abs=1e-3), (
+                name
+            )
+    measured = PlannerTrials(
+        setup, [], seeds=[0], make=lambda _: setup.ego, failures=parts
+    )({})
     assert measured["progress"] == pytest.approx(
         sum(row["progress"] for row in before.values()) / len(before), rel=1e-3
     )
@@ -153,19 +201,34 @@ def test_tries_that_are_not_of_this_search_are_refused(setup, plan, tmp_path):
     write_tries(file, [row | {"margin": -1.0} for row in told])
     with pytest.raises(InputError, match="no try of search hits idm"):
         failures_of(file, "idm", plan=plan, setup=setup)
-    for change, what in (({"family": "other"}, "family other"), ({"scene_id": "elsewhere"}, "scene=elsewhere")):
+    for change, what in (
+        ({"family": "other"}, "family other"),
+        ({"scene_id": "elsewhere"}, "scene=elsewhere"),
+    ):
         write_tries(file, [row | {"margin": 1.0} | change for row in told])
         with pytest.raises(InputError, match=what):
             failures_of(file, "idm", plan=plan, setup=setup)
     write_tries(file, [row | {"margin": 1.0} for row in told])
     with pytest.raises(InputError, match="a try of Own depends on those before it"):
-        failures_of(file, "idm", plan=replace(plan, search=type("Own", (Search,), {})), setup=setup)
+        failures_of(
+            file,
+            "idm",
+            plan=replace(plan, search=type("Own", (Search,), {})),
+            setup=setup,
+        )
 
 
 def test_a_method_that_evaluates_no_network_has_no_budget_of_evaluations(setup):
     traffic = {"still": Method("still", ConstantVelocity(), eta=0.0)}
-    still = Plan("still", [Family("still", "still", ranges={})], traffic=traffic, settings=SearchSettings())
-    with pytest.raises(InputError, match="still evaluate no network.*budget_unit=tries"):
+    still = Plan(
+        "still",
+        [Family("still", "still", ranges={})],
+        traffic=traffic,
+        settings=SearchSettings(),
+    )
+    with pytest.raises(
+        InputError, match="still evaluate no network.*budget_unit=tries"
+    ):
         search_all([setup], [plan_of(), still], budget=640.0, unit="nfe", seeds=[0])
 
 
@@ -176,25 +239,39 @@ def test_a_line_for_each_try(setup, plan, tmp_path):
 
 
 def plans(*overrides):
-    return build_plans(load_config("evaluate", ["budget=640", *overrides]), small_prior())
+    return build_plans(
+        load_config("evaluate", ["budget=640", *overrides]), small_prior()
+    )
 
 
 def test_a_row_for_each_method_and_variant_and_its_families_from_the_configuration():
-    portfolio, e2, other = plans("methods=[search,e2]", "+variants.other={search.cover: 3}")
+    portfolio, e2, other = plans(
+        "methods=[search,e2]", "+variants.other={search.cover: 3}"
+    )
     assert [each.name for each in (portfolio, e2, other)] == ["search", "e2", "other"]
-    assert len(portfolio.families) > 3 and {family.name for family in portfolio.families} == set(portfolio.traffic)
+    assert len(portfolio.families) > 3 and {
+        family.name for family in portfolio.families
+    } == set(portfolio.traffic)
     assert (len(e2.families), e2.settings.bandit) == (1, False)
-    assert other.settings == replace(portfolio.settings, cover=3) and len(other.families) == len(portfolio.families)
+    assert other.settings == replace(portfolio.settings, cover=3) and len(
+        other.families
+    ) == len(portfolio.families)
 
 
 def test_no_family_of_the_search_is_told_the_plan_of_the_ego():
     (portfolio,) = plans("methods=[search]")
-    assert {method.traffic.knowledge for method in portfolio.traffic.values()} == {"predicted"}
+    assert {method.traffic.knowledge for method in portfolio.traffic.values()} == {
+        "predicted"
+    }
 
 
 def test_a_variant_of_the_prior_is_driven_by_its_own():
     e2, short = plans("methods=[e2]", "+variants.short={prior.sampler.steps: 2}")
-    assert short.traffic["short"].traffic.prior.sampler.steps == 2 < e2.traffic["e2"].traffic.prior.sampler.steps
+    assert (
+        short.traffic["short"].traffic.prior.sampler.steps
+        == 2
+        < e2.traffic["e2"].traffic.prior.sampler.steps
+    )
 
 
 class Broken(ConstantVelocity):
@@ -204,10 +281,25 @@ class Broken(ConstantVelocity):
 
 def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
     broken = Method("broken", Broken(), eta=0.0)
-    plan = Plan("search", [Family("broken", "broken", ranges={}, nfe=100.0)], traffic={"broken": broken}, settings=SearchSettings())
-    for budget, unit, tries in ((400.0, "nfe", 4), (3.0, "tries", 3), (1.0, "seconds", 1)):
-        (((rows, _, errored), told),) = spend([(setup, plan, 0, range(3), budget, unit)])
-        assert not told and len(rows) == len(errored) == 3 * tries and all(row["errored"] == 1 for row in rows)
+    plan = Plan(
+        "search",
+        [Family("broken", "broken", ranges={}, nfe=100.0)],
+        traffic={"broken": broken},
+        settings=SearchSettings(),
+    )
+    for budget, unit, tries in (
+        (400.0, "nfe", 4),
+        (3.0, "tries", 3),
+        (1.0, "seconds", 1),
+    ):
+        (((rows, _, errored), told),) = spend(
+            [(setup, plan, 0, range(3), budget, unit)]
+        )
+        assert (
+            not told
+            and len(rows) == len(errored) == 3 * tries
+            and all(row["errored"] == 1 for row in rows)
+        )
 
 
 @pytest.mark.parametrize(
@@ -216,8 +308,14 @@ def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
         ("search.families=null", "name at least one"),
         ("+search.families.odd={method: e3}", "e3"),
         ("+search.families.odd={speed: 1}", r"search\.families\.odd: decision speed"),
-        ("+search.families.odd={changes: {reselekt: 1}}", r"search\.families\.odd\.changes"),
-        ("+search.families.odd={method: ccdiff, patience: 2}", r"search\.families\.odd\.patience: ccdiff"),
+        (
+            "+search.families.odd={changes: {reselekt: 1}}",
+            r"search\.families\.odd\.changes",
+        ),
+        (
+            "+search.families.odd={method: ccdiff, patience: 2}",
+            r"search\.families\.odd\.patience: ccdiff",
+        ),
         ("eta=[1,2]", "one intensity"),
     ],
 )

@@ -1,12 +1,25 @@
-"""The egos of a run: the same noise, paired differences, pooled trainings; those of a configuration."""
+"""The egos of a run: the same noise, paired differences, pooled trainings; those of a
+configuration."""
 
 import math
 
 import pytest
 import torch
 
-from e2rl.evaluation.ego_set import EgoSet, build_egos, pool_trainings, recorded_acceleration
-from e2rl.evaluation.protocol import Method, Setup, Work, drive_all, record, run_protocol
+from e2rl.evaluation.ego_set import (
+    EgoSet,
+    build_egos,
+    pool_trainings,
+    recorded_acceleration,
+)
+from e2rl.evaluation.protocol import (
+    Method,
+    Setup,
+    Work,
+    drive_all,
+    record,
+    run_protocol,
+)
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
@@ -38,10 +51,20 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     egos = {"one": slow(), "same": slow(), "fast_0": slow(12.0), "fast_1": slow(9.0)}
     pairs = [("same", "one"), ("fast", "one"), ("fast", "same")]
-    chosen = EgoSet(egos, ["one", "same", "fast"], pairs=pairs, trainings={"fast": ["fast_0", "fast_1"]})
+    chosen = EgoSet(
+        egos,
+        ["one", "same", "fast"],
+        pairs=pairs,
+        trainings={"fast": ["fast_0", "fast_1"]},
+    )
     scenes = small_scenes(3)
     scenes.location[:] = ["a", "b", "c"]
-    scored = drive_all(chosen.setups(setup_of(scenes)), METHODS, seeds=[0], work=Work(folder / ROLLOUTS))
+    scored = drive_all(
+        chosen.setups(setup_of(scenes)),
+        METHODS,
+        seeds=[0],
+        work=Work(folder / ROLLOUTS),
+    )
     return record(*scored, folder, chosen.metric_rows), folder
 
 
@@ -49,25 +72,41 @@ def test_every_ego_has_its_rows_and_files_and_drives_as_if_alone(run, tmp_path):
     rows, folder = run
     assert [row["ego"] for row in rows] == ["one", "same", "fast_0", "fast_1", "fast"]
     lines = read_rows(folder / TABLE)
-    assert [line["ego_policy"] for line in lines] == ["one"] * 3 + ["same"] * 3 + ["fast_0"] * 3 + ["fast_1"] * 3
+    assert [line["ego_policy"] for line in lines] == ["one"] * 3 + ["same"] * 3 + [
+        "fast_0"
+    ] * 3 + ["fast_1"] * 3
     assert len(list((folder / ROLLOUTS).glob("*.npz"))) == 12
-    (alone,) = run_protocol(setup_of(small_scenes(3), slow(12.0)), METHODS, seeds=[0], folder=tmp_path)
-    assert alone["metrics"]["progress"]["mean"] == rows[2]["metrics"]["progress"]["mean"]
+    (alone,) = run_protocol(
+        setup_of(small_scenes(3), slow(12.0)), METHODS, seeds=[0], folder=tmp_path
+    )
+    assert (
+        alone["metrics"]["progress"]["mean"] == rows[2]["metrics"]["progress"]["mean"]
+    )
 
 
 def test_an_ego_does_not_differ_from_itself_at_all(run):
     paired = run[0][1]["paired"]["ego one"]
-    known = {name: value for name, value in paired.items() if value["n"] and name != "seconds_per_rollout"}
+    known = {
+        name: value
+        for name, value in paired.items()
+        if value["n"] and name != "seconds_per_rollout"
+    }
     assert {"cfr", "progress", "macc", "failures_per_km"} <= set(known)
     for value in known.values():
         assert value["difference"] == 0
-        assert math.isnan(value["low"]) and math.isnan(value["high"]), "three places are too few for an interval"
+        assert math.isnan(value["low"]) and math.isnan(value["high"]), (
+            "three places are too few for an interval"
+        )
     assert paired["progress"]["relative"] == 0
 
 
 def test_trainings_are_pooled_and_compared_with_the_same_rollouts_of_another(run):
     one, _, first, second, pooled = run[0]
-    assert (pooled["n_rollouts"], pooled["n_trainings"], one.get("n_trainings")) == (6, 2, None)
+    assert (pooled["n_rollouts"], pooled["n_trainings"], one.get("n_trainings")) == (
+        6,
+        2,
+        None,
+    )
     means = [row["metrics"]["progress"]["mean"] for row in (first, second, pooled)]
     assert means[2] == pytest.approx((means[0] + means[1]) / 2)
     paired = pooled["paired"]["ego one"]["progress"]
@@ -76,22 +115,35 @@ def test_trainings_are_pooled_and_compared_with_the_same_rollouts_of_another(run
     assert paired["relative"] == pytest.approx(means[2] / base - 1)
 
 
-def test_a_guard_is_missed_where_the_trained_ego_accelerates_more_than_the_recorded(run):
+def test_a_guard_is_missed_where_the_trained_ego_accelerates_more_than_the_recorded(
+    run,
+):
     rows = run[0]
-    strict, loose = (guard_table(rows, "one", after="fast", planner="same", recorded=recorded) for recorded in (0.0, 100.0))
-    verdicts = [{row[0].split(" ")[0]: row[-1] for row in table.rows} for table in (strict, loose)]
-    assert [verdict["macc"] for verdict in verdicts] == ["missed", "met"] and verdicts[0]["progress"] == "met"
+    strict, loose = (
+        guard_table(rows, "one", after="fast", planner="same", recorded=recorded)
+        for recorded in (0.0, 100.0)
+    )
+    verdicts = [
+        {row[0].split(" ")[0]: row[-1] for row in table.rows}
+        for table in (strict, loose)
+    ]
+    assert [verdict["macc"] for verdict in verdicts] == ["missed", "met"] and verdicts[
+        0
+    ]["progress"] == "met"
 
 
 def rows_of(values, ego, training=None):
-    """Labelled rows of progress values, each in a place of its own, and no realism samples."""
+    """Labelled rows of progress values, each in a place of its own, and no realism
+    samples."""
     scored, features = score_rollouts(random_rollouts(len(values)))
     rows = [
         row | {"progress": value, "scene_id": str(index), "location": "", "seed": 0}
         for index, (row, value) in enumerate(zip(scored, values, strict=True))
     ]
     rows = labelled(rows, "made", split="test", method="nominal", ego=ego)
-    return [row | ({} if training is None else {"training": training}) for row in rows], features
+    return [
+        row | ({} if training is None else {"training": training}) for row in rows
+    ], features
 
 
 def test_trainings_that_differ_widen_the_interval_that_places_alone_do_not():
@@ -101,11 +153,20 @@ def test_trainings_that_differ_widen_the_interval_that_places_alone_do_not():
     rows = first + second
     samples = features + more
     pooled, copies = pool_trainings(rows, samples, trainings={"a": ["a_0", "a_1"]})
-    result = {row["ego"]: row["metrics"]["progress"] for row in metric_rows(rows + pooled, samples + copies, draws=200, realism_draws=2)}
-    alone, both = ([result[name][end] for end in ("low", "mean", "high")] for name in ("a_0", "a"))
+    result = {
+        row["ego"]: row["metrics"]["progress"]
+        for row in metric_rows(
+            rows + pooled, samples + copies, draws=200, realism_draws=2
+        )
+    }
+    alone, both = (
+        [result[name][end] for end in ("low", "mean", "high")] for name in ("a_0", "a")
+    )
     assert alone == pytest.approx([10, 10, 10], abs=0.05) and alone[0] < alone[2]
     assert both == pytest.approx([10, 15, 20], abs=0.05)
-    assert not any("training" in row for row in rows), "the rows themselves stay as they are"
+    assert not any("training" in row for row in rows), (
+        "the rows themselves stay as they are"
+    )
 
 
 def test_the_recorded_acceleration_is_that_of_the_logged_speeds():
@@ -127,42 +188,98 @@ def config_of(*overrides):
 
 
 def test_an_entry_is_a_file_with_changes_whose_first_weights_do_not_depend_on_the_other_egos():
-    chosen = build_egos(config_of("+egos.a={ego: lane_graph, max_risk: 0.3}", "+egos.x={ego: actor}"), "")
-    assert isinstance(chosen.egos["a"], LaneGraphEgo) and chosen.egos["a"].max_risk == 0.3
-    alone = build_egos(config_of("+egos.x={ego: actor}"), "").egos["x"].network.weights()
-    assert all((alone[name] == value).all() for name, value in chosen.egos["x"].network.weights().items())
+    chosen = build_egos(
+        config_of("+egos.a={ego: lane_graph, max_risk: 0.3}", "+egos.x={ego: actor}"),
+        "",
+    )
+    assert (
+        isinstance(chosen.egos["a"], LaneGraphEgo) and chosen.egos["a"].max_risk == 0.3
+    )
+    alone = (
+        build_egos(config_of("+egos.x={ego: actor}"), "").egos["x"].network.weights()
+    )
+    assert all(
+        (alone[name] == value).all()
+        for name, value in chosen.egos["x"].network.weights().items()
+    )
 
 
 def test_table_4_compares_every_ego_with_one_of_them():
     chosen = build_egos(config_of("experiment=table4"), "ego")
-    names = ["replay", "idm", "lane_graph", "sampling", "pdm_closed", "lane_graph_tuned", "bits", "actor_untrained"]
+    names = [
+        "replay",
+        "idm",
+        "lane_graph",
+        "sampling",
+        "pdm_closed",
+        "lane_graph_tuned",
+        "bits",
+        "actor_untrained",
+    ]
     names.append("actor")
     assert list(chosen.egos) == names
-    assert chosen.pairs == [(name, "lane_graph") for name in names if name != "lane_graph"]
-    trained, untrained = (chosen.egos[name].network.weights() for name in ("actor", "actor_untrained"))
+    assert chosen.pairs == [
+        (name, "lane_graph") for name in names if name != "lane_graph"
+    ]
+    trained, untrained = (
+        chosen.egos[name].network.weights() for name in ("actor", "actor_untrained")
+    )
     assert any((trained[name] != untrained[name]).any() for name in trained)
 
 
 def test_the_experiment_compares_what_was_trained_with_each_other_ego():
     chosen = build_egos(config_of(*TRAINED), "")
-    assert list(chosen.egos) == ["before", "after", "lane_graph", "sampling"] and not chosen.trainings
-    assert chosen.pairs == [("after", "before"), ("after", "lane_graph"), ("after", "sampling")]
+    assert (
+        list(chosen.egos) == ["before", "after", "lane_graph", "sampling"]
+        and not chosen.trainings
+    )
+    assert chosen.pairs == [
+        ("after", "before"),
+        ("after", "lane_graph"),
+        ("after", "sampling"),
+    ]
 
 
 def test_several_checkpoints_are_trainings_of_one_name():
-    chosen = build_egos(config_of(*LEARNING, "egos.after.checkpoints=[bundled,bundled]"), "")
-    assert list(chosen.egos) == ["before", "after_0", "after_1", "lane_graph", "sampling"]
-    assert chosen.trainings == {"after": ["after_0", "after_1"]} and "after" in chosen.names
+    chosen = build_egos(
+        config_of(*LEARNING, "egos.after.checkpoints=[bundled,bundled]"), ""
+    )
+    assert list(chosen.egos) == [
+        "before",
+        "after_0",
+        "after_1",
+        "lane_graph",
+        "sampling",
+    ]
+    assert (
+        chosen.trainings == {"after": ["after_0", "after_1"]}
+        and "after" in chosen.names
+    )
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (LEARNING, "egos.after.checkpoint: needed; give the folder that train.py wrote"),
-        ([*LEARNING, "egos.after.checkpoints=[a,nowhere]"], "egos.after: a: no actor there"),
-        (["+egos.a={ego: idm, speed: 3}"], "egos.a: Key 'speed' .*compare it with conf/ego/idm"),
-        (["+egos.a_0={ego: idm}", "+egos.a={ego: actor, checkpoints: [x, y]}"], "egos.a: a_0 is the name of another"),
-        ([*TRAINED, "methods=[e2]"], "policy_learning compares nominal driving; name nominal, too"),
+        (
+            LEARNING,
+            "egos.after.checkpoint: needed; give the folder that train.py wrote",
+        ),
+        (
+            [*LEARNING, "egos.after.checkpoints=[a,nowhere]"],
+            "egos.after: a: no actor there",
+        ),
+        (
+            ["+egos.a={ego: idm, speed: 3}"],
+            "egos.a: Key 'speed' .*compare it with conf/ego/idm",
+        ),
+        (
+            ["+egos.a_0={ego: idm}", "+egos.a={ego: actor, checkpoints: [x, y]}"],
+            "egos.a: a_0 is the name of another",
+        ),
+        (
+            [*TRAINED, "methods=[e2]"],
+            "policy_learning compares nominal driving; name nominal, too",
+        ),
     ],
 )
 def test_what_cannot_be_is_named_with_its_remedy(overrides, message):

@@ -1,4 +1,5 @@
-"""modes.json: fractions, verdicts and typical rollouts of a run's modes, their table, and replays of them."""
+"""modes.json: fractions, verdicts and typical rollouts of a run's modes, their table,
+and replays of them."""
 
 import math
 
@@ -12,14 +13,27 @@ from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
 
 
 def crashes(kind, number, method="e2", eta=2.0, **changes):
-    source = {"dataset": "d", "split": "s", "method": method, "ego_policy": "idm", "eta": eta}
-    return [failure(kind, scene=f"{kind['approach']} {index}") | source | changes for index in range(number)]
+    source = {
+        "dataset": "d",
+        "split": "s",
+        "method": method,
+        "ego_policy": "idm",
+        "eta": eta,
+    }
+    return [
+        failure(kind, scene=f"{kind['approach']} {index}") | source | changes
+        for index in range(number)
+    ]
 
 
 def run_rows():
     rows = crashes(CROSSING, 6, counted=1.0, preventable=1.0, at_fault=0.0)
-    rows += crashes(CROSSING, 2, method="random", counted=0.0, preventable=math.nan, at_fault=0.0)
-    rows += crashes(REAR_END, 4, method="random", counted=1.0, preventable=0.0, at_fault=1.0)
+    rows += crashes(
+        CROSSING, 2, method="random", counted=0.0, preventable=math.nan, at_fault=0.0
+    )
+    rows += crashes(
+        REAR_END, 4, method="random", counted=1.0, preventable=0.0, at_fault=1.0
+    )
     return rows + crashes(CROSSING, 5, method="nominal", eta=0.0, cfr=0.0, approach="")
 
 
@@ -29,35 +43,92 @@ def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):
     write_json(tmp_path / MODES_FILE, found)
     assert read_modes(tmp_path / MODES_FILE) == found
     crossing, rear_end = found["modes"]
-    assert (found["failures"], found["rollouts"], found["unknown"]) == (12, 17, ["duty"])
-    assert crossing["name"] == "crossing from the right, partner turns left, ego keeps speed"
+    assert (found["failures"], found["rollouts"], found["unknown"]) == (
+        12,
+        17,
+        ["duty"],
+    )
+    assert (
+        crossing["name"]
+        == "crossing from the right, partner turns left, ego keeps speed"
+    )
     assert (crossing["count"], crossing["fraction"]) == (8, pytest.approx(8 / 12))
     assert [group["count"] for group in crossing["groups"]] == [6, 2, 0]
-    assert [group["fraction"] for group in crossing["groups"]] == [1.0, pytest.approx(1 / 3), None]
-    assert (crossing["counted"], crossing["preventable"], crossing["at_fault"]) == (0.75, 1.0, 0.0)
-    assert rear_end["at_fault"] == 1 and rear_end["avoidable"] is None and rear_end["ego_speed"] == 10
-    assert [(group["failures"], group["modes"]) for group in found["groups"]] == [(6, 1), (6, 2), (0, 0)]
+    assert [group["fraction"] for group in crossing["groups"]] == [
+        1.0,
+        pytest.approx(1 / 3),
+        None,
+    ]
+    assert (crossing["counted"], crossing["preventable"], crossing["at_fault"]) == (
+        0.75,
+        1.0,
+        0.0,
+    )
+    assert (
+        rear_end["at_fault"] == 1
+        and rear_end["avoidable"] is None
+        and rear_end["ego_speed"] == 10
+    )
+    assert [(group["failures"], group["modes"]) for group in found["groups"]] == [
+        (6, 1),
+        (6, 2),
+        (0, 0),
+    ]
     assert [row.get("mode") for row in rows] == [1] * 8 + [2] * 4 + [None] * 5
     for mode in found["modes"]:
         typical = mode["typical"]
-        same = [row for row in rows if all(row[name] == typical[name] for name in ("method", "scene_id", "seed"))]
+        same = [
+            row
+            for row in rows
+            if all(
+                row[name] == typical[name] for name in ("method", "scene_id", "seed")
+            )
+        ]
         assert [row["mode"] for row in same] == [mode["mode"]]
         assert typical["file"] == rollout_name(same[0])
 
 
 def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
     (table,) = mode_tables(find_modes(run_rows()))
-    assert table.head[:5] == ["", "failures", "e2 η=2 [%]", "random η=2 [%]", "nominal [%]"]
-    assert table.head[5:] == ["preventable [%]", "counts [%]", "at fault [%]", "ego [m/s]", "partner [m/s]"]
+    assert table.head[:5] == [
+        "",
+        "failures",
+        "e2 η=2 [%]",
+        "random η=2 [%]",
+        "nominal [%]",
+    ]
+    assert table.head[5:] == [
+        "preventable [%]",
+        "counts [%]",
+        "at fault [%]",
+        "ego [m/s]",
+        "partner [m/s]",
+    ]
     first, second, last = table.rows
-    assert first[0].startswith("1. crossing") and first[1:7] == ["8", "100", "33", "–", "100", "75"]
+    assert first[0].startswith("1. crossing") and first[1:7] == [
+        "8",
+        "100",
+        "33",
+        "–",
+        "100",
+        "75",
+    ]
     assert second[1:] == ["4", "0", "67", "–", "0", "100", "100", "10.0", "5.0"]
     assert last[1:5] == ["12", "6 in 1 mode", "6 in 2 modes", "0 in 0 modes"]
     assert "without duty" in table.caption and "avoidable" in table.caption
 
 
 def test_small_modes_are_gathered_but_keep_their_numbers():
-    rows = crashes(CROSSING, 20) + crashes(REAR_END, 1) + crashes(REAR_END | {"approach": "oncoming"}, 1)
+    rows = (
+        crashes(CROSSING, 20)
+        + crashes(REAR_END, 1)
+        + crashes(REAR_END | {"approach": "oncoming"}, 1)
+    )
     found = find_modes(rows)
-    assert [(mode["mode"], mode["name"], mode["count"]) for mode in found["modes"]][1:] == [(0, "other", 2)]
-    assert sorted(row["mode"] for row in rows)[-2:] == [2, 3] and found["groups"][0]["modes"] == 1
+    assert [(mode["mode"], mode["name"], mode["count"]) for mode in found["modes"]][
+        1:
+    ] == [(0, "other", 2)]
+    assert (
+        sorted(row["mode"] for row in rows)[-2:] == [2, 3]
+        and found["groups"][0]["modes"] == 1
+    )

@@ -1,4 +1,5 @@
-"""The protocol: paired noise, rows and files of every rollout, and agreement with the independent scorer."""
+"""The protocol: paired noise, rows and files of every rollout, and agreement with the
+independent scorer."""
 
 import pytest
 import torch
@@ -24,30 +25,63 @@ def setup_of(scene_set, batch=64):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """(rows, folder) of two methods on two scenes and seeds, in batches that do not divide them evenly."""
+    """(rows, folder) of two methods on two scenes and seeds, in batches that do not
+    divide them evenly."""
     folder = tmp_path_factory.mktemp("run")
     on = synthesizer()
     methods = [Method("nominal", on), Method("e2", on, eta=3.0)]
-    rows = run_protocol(setup_of(scenes(SCENES, steps=80), 3), methods, seeds=SEEDS, folder=folder, stage="test")
+    rows = run_protocol(
+        setup_of(scenes(SCENES, steps=80), 3),
+        methods,
+        seeds=SEEDS,
+        folder=folder,
+        stage="test",
+    )
     return rows, folder
 
 
 def test_a_row_for_each_method_and_a_line_and_a_file_for_each_rollout(run):
     rows, folder = run
-    assert [(row["method"], row["eta"], row["stage"]) for row in rows] == [("nominal", 0, "test"), ("e2", 3, "test")]
-    assert all((row["n_scenes"], row["n_seeds"], row["n_rollouts"]) == (2, 2, 4) for row in rows)
-    assert [row["method"] for row in read_metrics(folder / METRICS_FILE)] == ["nominal", "e2"]
-    assert [group["method"] for group in read_modes(folder / MODES_FILE)["groups"]] == ["nominal", "e2"]
-    keys = {(line["method"], line["scene_id"], line["seed"]) for line in read_rows(folder / TABLE)}
+    assert [(row["method"], row["eta"], row["stage"]) for row in rows] == [
+        ("nominal", 0, "test"),
+        ("e2", 3, "test"),
+    ]
+    assert all(
+        (row["n_scenes"], row["n_seeds"], row["n_rollouts"]) == (2, 2, 4)
+        for row in rows
+    )
+    assert [row["method"] for row in read_metrics(folder / METRICS_FILE)] == [
+        "nominal",
+        "e2",
+    ]
+    assert [group["method"] for group in read_modes(folder / MODES_FILE)["groups"]] == [
+        "nominal",
+        "e2",
+    ]
+    keys = {
+        (line["method"], line["scene_id"], line["seed"])
+        for line in read_rows(folder / TABLE)
+    }
     files = [Rollout.read(path) for path in (folder / ROLLOUTS).glob("*.npz")]
-    assert {(file.method, file.scene_id, file.seed) for file in files} == keys and len(files) == len(keys) == 8
+    assert {(file.method, file.scene_id, file.seed) for file in files} == keys and len(
+        files
+    ) == len(keys) == 8
     for file in files:
-        assert file.seed in SEEDS and file.ego_policy == "idm" and file.states.shape[0] == 81
-        assert file.adversaries.any() == (file.method == "e2") and not file.adversaries[0]
+        assert (
+            file.seed in SEEDS
+            and file.ego_policy == "idm"
+            and file.states.shape[0] == 81
+        )
+        assert (
+            file.adversaries.any() == (file.method == "e2") and not file.adversaries[0]
+        )
 
 
 def test_methods_share_the_noise_of_a_scene_and_seed():
-    assert scene_seed(3, 1) == scene_seed(3, 1) and len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
+    assert (
+        scene_seed(3, 1) == scene_seed(3, 1)
+        and len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
+    )
     methods = [Method("one", synthesizer()), Method("two", synthesizer())]
     twice = run_protocol(setup_of(scenes(SCENES)), methods, seeds=[4])
     one, two = (row["metrics"] for row in twice)
@@ -62,13 +96,23 @@ def test_processes_change_nothing_but_the_time(tmp_path):
     scene_set = scenes(3, steps=20)
     folders = (tmp_path / "one", tmp_path / "two")
     for processes, folder in enumerate(folders, 1):
-        methods = [Method("nominal", synthesizer(), eta=0.0), Method("e2", synthesizer(), eta=3.0)]
-        run_protocol(setup_of(scene_set, 2), methods, seeds=SEEDS, folder=folder, processes=processes)
+        methods = [
+            Method("nominal", synthesizer(), eta=0.0),
+            Method("e2", synthesizer(), eta=3.0),
+        ]
+        run_protocol(
+            setup_of(scene_set, 2),
+            methods,
+            seeds=SEEDS,
+            folder=folder,
+            processes=processes,
+        )
     same_runs(*folders)
 
 
 class Stopped(Setup):
-    """A setup whose user presses Ctrl-C after so many batches; `done`: (method, scene, seed) that were rolled out."""
+    """A setup whose user presses Ctrl-C after so many batches; `done`: (method, scene,
+    seed) that were rolled out."""
 
     left = 0
     done: list
@@ -83,31 +127,49 @@ class Stopped(Setup):
 
 
 def stopping_run(folder, stops, scene_set):
-    """A run that is interrupted after so many batches each time, and then ends; returns what was rolled out."""
+    """A run that is interrupted after so many batches each time, and then ends; returns
+    what was rolled out."""
     done = []
     for left in (*stops, 100):
         setup = Stopped(scene_set, IDMEgo(), ego_name="idm", sim=SimSettings(), batch=2)
         setup.left = left
         setup.done = done
-        methods = [Method("nominal", ConstantVelocity()), Method("ambush", Ambush(), eta=2.0)]
+        methods = [
+            Method("nominal", ConstantVelocity()),
+            Method("ambush", Ambush(), eta=2.0),
+        ]
         try:
-            run_protocol(setup, methods, seeds=SEEDS, folder=folder, parts=Parts(folder))
+            run_protocol(
+                setup, methods, seeds=SEEDS, folder=folder, parts=Parts(folder)
+            )
         except KeyboardInterrupt:
-            assert left < 100 and not (folder / TABLE).exists(), "no table of half a run"
+            assert left < 100 and not (folder / TABLE).exists(), (
+                "no table of half a run"
+            )
     return done
 
 
 def same_runs(one, other):
-    """Whether two folders have the same rows, metrics and rollouts, bit for bit, wall times apart."""
+    """Whether two folders have the same rows, metrics and rollouts, bit for bit, wall
+    times apart."""
     timed = {"seconds_per_rollout", "seconds", "evasion_seconds"}
     tables = [read_rows(folder / TABLE) for folder in (one, other)]
-    rows = [[{k: str(v) for k, v in row.items() if k not in timed} for row in table] for table in tables]
+    rows = [
+        [{k: str(v) for k, v in row.items() if k not in timed} for row in table]
+        for table in tables
+    ]
     assert rows[0] == rows[1]
     metrics = [read_metrics(folder / METRICS_FILE) for folder in (one, other)]
     for row, twin in zip(*metrics, strict=True):
-        known = [{k: str(v) for k, v in each["metrics"].items() if "seconds" not in k} for each in (row, twin)]
+        known = [
+            {k: str(v) for k, v in each["metrics"].items() if "seconds" not in k}
+            for each in (row, twin)
+        ]
         assert known[0] == known[1]
-    files = [{path.name: path.read_bytes() for path in (f / ROLLOUTS).glob("*.npz")} for f in (one, other)]
+    files = [
+        {path.name: path.read_bytes() for path in (f / ROLLOUTS).glob("*.npz")}
+        for f in (one, other)
+    ]
     assert files[0] == files[1]
 
 

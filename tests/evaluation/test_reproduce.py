@@ -1,4 +1,5 @@
-"""reproduce=RUN_DIR: the table of a run again, from its folder alone, with its configuration, scenes and weights."""
+"""reproduce=RUN_DIR: the table of a run again, from its folder alone, with its
+configuration, scenes and weights."""
 
 import csv
 import json
@@ -19,7 +20,12 @@ from e2rl.sim.rollout_file import rollout_key
 from tests.evaluation.test_protocol import same_runs
 from tests.scripts import arguments, call, error_line, left_behind
 
-QUICK = ["seeds=[0]", "processes=1", "methods=[constant_velocity,nominal]", "prior.sampler.steps=2"]
+QUICK = [
+    "seeds=[0]",
+    "processes=1",
+    "methods=[constant_velocity,nominal]",
+    "prior.sampler.steps=2",
+]
 
 
 def table(eta=1.0):
@@ -28,9 +34,26 @@ def table(eta=1.0):
     def numbers(mean):
         return {"mean": mean, "low": 0.1, "high": math.nan, "n": 4}
 
-    metrics = {"cfr": numbers(0.25), "real": numbers(0.75), "seconds_per_rollout": numbers(1.5)}
-    row = {"dataset": "d", "split": "s", "method": "e2", "ego": "idm", "eta": eta, "n_rollouts": 4, "git": "abc"}
-    paired = {"nominal": {"cfr": {"difference": 0.2}, "seconds_per_rollout": {"difference": 1.0}}}
+    metrics = {
+        "cfr": numbers(0.25),
+        "real": numbers(0.75),
+        "seconds_per_rollout": numbers(1.5),
+    }
+    row = {
+        "dataset": "d",
+        "split": "s",
+        "method": "e2",
+        "ego": "idm",
+        "eta": eta,
+        "n_rollouts": 4,
+        "git": "abc",
+    }
+    paired = {
+        "nominal": {
+            "cfr": {"difference": 0.2},
+            "seconds_per_rollout": {"difference": 1.0},
+        }
+    }
     return [row | {"metrics": metrics, "paired": paired}]
 
 
@@ -44,13 +67,27 @@ def test_tables_are_equal_but_for_wall_times_and_where_they_were_made():
 
 def test_each_number_that_differs_is_named_with_both_values():
     now = table()
-    now[0]["metrics"]["cfr"]["mean"], now[0]["paired"]["nominal"]["cfr"]["difference"] = 0.5, math.nan
+    (
+        now[0]["metrics"]["cfr"]["mean"],
+        now[0]["paired"]["nominal"]["cfr"]["difference"],
+    ) = 0.5, math.nan
     found = compare_tables(table(), now)
-    assert [entry[0].split(": ")[1] for entry in found.different] == ["cfr.mean", "paired.nominal.cfr.difference"]
-    assert "d s e2 idm 1.0: cfr.mean: 0.25 then, 0.5 now" in found.text() and "8 of 10" in found.text()
-    for one, other, place in ((table(), table(2.0) + table(), 1), (table(2.0) + table(), table(), 2)):
+    assert [entry[0].split(": ")[1] for entry in found.different] == [
+        "cfr.mean",
+        "paired.nominal.cfr.difference",
+    ]
+    assert (
+        "d s e2 idm 1.0: cfr.mean: 0.25 then, 0.5 now" in found.text()
+        and "8 of 10" in found.text()
+    )
+    for one, other, place in (
+        (table(), table(2.0) + table(), 1),
+        (table(2.0) + table(), table(), 2),
+    ):
         found = compare_tables(one, other)
-        assert found.equal == len(found.different) == 10 and {entry[place] for entry in found.different} == {"missing"}
+        assert found.equal == len(found.different) == 10 and {
+            entry[place] for entry in found.different
+        } == {"missing"}
 
 
 @pytest.mark.parametrize(("factor", "close"), [(1 + 1e-9, 1), (1 + 2e-6, 0)])
@@ -69,7 +106,9 @@ def then(world, tmp_path_factory):
     """A run on two logs, in traffic of a prior's file."""
     folder = tmp_path_factory.mktemp("then")
     monkeypatch = pytest.MonkeyPatch()
-    said = SimpleNamespace(readouterr=lambda: SimpleNamespace(out="", err=""))  # capsys is none for a module
+    said = SimpleNamespace(
+        readouterr=lambda: SimpleNamespace(out="", err="")
+    )  # capsys is none for a module
     with monkeypatch.context():
         given = [*arguments(world, folder, "good", *QUICK), "data.build.steps=20"]
         status, _ = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=said)
@@ -78,7 +117,12 @@ def then(world, tmp_path_factory):
 
 
 def again(run, folder, *more):
-    return [f"reproduce={run}", f"hydra.run.dir={folder}", f"data.cache={folder.parent / 'cache'}", *more]
+    return [
+        f"reproduce={run}",
+        f"hydra.run.dir={folder}",
+        f"data.cache={folder.parent / 'cache'}",
+        *more,
+    ]
 
 
 @pytest.fixture
@@ -88,15 +132,26 @@ def sent(then, tmp_path):
     return tmp_path / "sent"
 
 
-def test_one_command_makes_the_same_table_in_a_new_folder(then, tmp_path, monkeypatch, capsys):
+def test_one_command_makes_the_same_table_in_a_new_folder(
+    then, tmp_path, monkeypatch, capsys
+):
     before = {path: path.read_bytes() for path in then.rglob("*") if path.is_file()}
-    status, said = call("evaluate.py", again(then, tmp_path / "now"), monkeypatch=monkeypatch, capsys=capsys)
+    status, said = call(
+        "evaluate.py",
+        again(then, tmp_path / "now"),
+        monkeypatch=monkeypatch,
+        capsys=capsys,
+    )
     assert status == 0, said
     found = json.loads((tmp_path / "now" / "reproduced.json").read_text())
-    assert found["different"] == [] and found["close"] == 0 and found["equal"] > 50, found
+    assert found["different"] == [] and found["close"] == 0 and found["equal"] > 50, (
+        found
+    )
     same_runs(then, tmp_path / "now")
     assert read_list(tmp_path / "now") == read_list(then)
-    assert before == {path: path.read_bytes() for path in then.rglob("*") if path.is_file()}
+    assert before == {
+        path: path.read_bytes() for path in then.rglob("*") if path.is_file()
+    }
 
 
 @pytest.mark.slow
@@ -105,49 +160,114 @@ def test_data_and_weights_may_lie_elsewhere(world, sent, tmp_path, monkeypatch, 
     weights = tmp_path / "weights.safetensors"
     shutil.copy(world / "prior.safetensors", weights)
     for name in (".hydra/config.yaml", "provenance.json"):
-        (sent / name).write_text((sent / name).read_text().replace(str(world), "/nowhere"))
+        (sent / name).write_text(
+            (sent / name).read_text().replace(str(world), "/nowhere")
+        )
     with zipfile.ZipFile(tmp_path / "data.zip", "w") as archive:
         for path in sorted((world / "good").iterdir()):
             archive.write(path, path.name)
     other = again(sent, tmp_path / "a", f"prior.checkpoint={sent / 'provenance.json'}")
     status, said = call("evaluate.py", other, monkeypatch=monkeypatch, capsys=capsys)
-    assert status == 2 and "prior.checkpoint is another file than the run's prior.checkpoint=" in error_line(said)
-    status, said = call("evaluate.py", again(sent, tmp_path / "a"), monkeypatch=monkeypatch, capsys=capsys)
-    assert status == 2 and "not there; say where the file lies that the run used, by prior.checkpoint=FILE" in said
-    here = ["data=scenarionet", f"data.path={tmp_path / 'data.zip'}", f"prior.checkpoint={weights}"]
-    status, said = call("evaluate.py", again(sent, tmp_path / "b", *here), monkeypatch=monkeypatch, capsys=capsys)
+    assert (
+        status == 2
+        and "prior.checkpoint is another file than the run's prior.checkpoint="
+        in error_line(said)
+    )
+    status, said = call(
+        "evaluate.py",
+        again(sent, tmp_path / "a"),
+        monkeypatch=monkeypatch,
+        capsys=capsys,
+    )
+    assert (
+        status == 2
+        and "not there; say where the file lies that the run used, by prior.checkpoint=FILE"
+        in said
+    )
+    here = [
+        "data=scenarionet",
+        f"data.path={tmp_path / 'data.zip'}",
+        f"prior.checkpoint={weights}",
+    ]
+    status, said = call(
+        "evaluate.py",
+        again(sent, tmp_path / "b", *here),
+        monkeypatch=monkeypatch,
+        capsys=capsys,
+    )
     assert status == 0, said
-    assert json.loads((tmp_path / "b" / "reproduced.json").read_text())["different"] == []
+    assert (
+        json.loads((tmp_path / "b" / "reproduced.json").read_text())["different"] == []
+    )
 
 
 @pytest.mark.slow
 def test_other_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, capsys):
     shutil.copytree(world / "good", tmp_path / "good")
-    (tmp_path / "good" / "sd_00.pkl").write_bytes((world / "good" / "sd_01.pkl").read_bytes())
-    given = again(then, tmp_path / "now", "data=scenarionet", f"data.path={tmp_path / 'good'}")
+    (tmp_path / "good" / "sd_00.pkl").write_bytes(
+        (world / "good" / "sd_01.pkl").read_bytes()
+    )
+    given = again(
+        then, tmp_path / "now", "data=scenarionet", f"data.path={tmp_path / 'good'}"
+    )
     status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
-    assert status == 2 and "scenes are not" in error_line(said) and "scene-0" in error_line(said)
+    assert (
+        status == 2
+        and "scenes are not" in error_line(said)
+        and "scene-0" in error_line(said)
+    )
     assert not left_behind(tmp_path / "now")
 
 
 def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, capsys):
-    status, said = call("evaluate.py", again(then, tmp_path / "now", "seeds=[1]"), monkeypatch=monkeypatch, capsys=capsys)
-    assert status == 2 and "leave out seeds (only" in error_line(said) and not left_behind(tmp_path / "now")
+    status, said = call(
+        "evaluate.py",
+        again(then, tmp_path / "now", "seeds=[1]"),
+        monkeypatch=monkeypatch,
+        capsys=capsys,
+    )
+    assert (
+        status == 2
+        and "leave out seeds (only" in error_line(said)
+        and not left_behind(tmp_path / "now")
+    )
 
 
-def test_a_failure_that_the_run_does_not_have_is_refused(then, tmp_path, monkeypatch, capsys):
+def test_a_failure_that_the_run_does_not_have_is_refused(
+    then, tmp_path, monkeypatch, capsys
+):
     for given in (again(then, tmp_path / "now", "failure=none"), ["failure=none"]):
-        status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
-        assert status == 2 and ("none of the 0 failures" in said or "reproduce=RUN_DIR" in said)
+        status, said = call(
+            "evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys
+        )
+        assert status == 2 and (
+            "none of the 0 failures" in said or "reproduce=RUN_DIR" in said
+        )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("more", [["tries=1", "methods=[nominal,e2]", "eta=[1,2]"], ["budget=640", "methods=[search]"]])
-def test_the_command_of_a_failure_drives_the_same_contact(more, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["tries=1", "methods=[nominal,e2]", "eta=[1,2]"],
+        ["budget=640", "methods=[search]"],
+    ],
+)
+def test_the_command_of_a_failure_drives_the_same_contact(
+    more, tmp_path, monkeypatch, capsys
+):
     """In its folder's failures.csv; also that of the run that it makes."""
     (tmp_path / "list.csv").write_text("scene_id,number\nallway_stop_043_0200,7\n")
     given = [f"scenes={tmp_path / 'list.csv'}", "seeds=[0]", "processes=1", *more]
-    assert call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'then'}"], monkeypatch=monkeypatch, capsys=capsys)[0] == 0
+    assert (
+        call(
+            "evaluate.py",
+            [*given, f"hydra.run.dir={tmp_path / 'then'}"],
+            monkeypatch=monkeypatch,
+            capsys=capsys,
+        )[0]
+        == 0
+    )
     rows = {rollout_key(row): row for row in read_rows(tmp_path / "then" / TABLE)}
     lines = list(csv.DictReader((tmp_path / "then" / "failures.csv").open(newline="")))
     assert lines
@@ -155,10 +275,26 @@ def test_the_command_of_a_failure_drives_the_same_contact(more, tmp_path, monkey
         folder = tmp_path / str(number)
         program, command, *options = shlex.split(line["again"])
         assert (program, command) == ("e2rl", "evaluate")
-        assert call("evaluate.py", [*options, f"hydra.run.dir={folder}"], monkeypatch=monkeypatch, capsys=capsys)[0] == 0
+        assert (
+            call(
+                "evaluate.py",
+                [*options, f"hydra.run.dir={folder}"],
+                monkeypatch=monkeypatch,
+                capsys=capsys,
+            )[0]
+            == 0
+        )
         (row,) = read_rows(folder / TABLE)
         known = rows[line["failure"]]
-        for name in ("scene_id", "method", "eta", "seed", "partner", "contact_step", "contact_type"):
+        for name in (
+            "scene_id",
+            "method",
+            "eta",
+            "seed",
+            "partner",
+            "contact_step",
+            "contact_type",
+        ):
             assert row[name] == known[name]
         (twin,) = csv.DictReader((folder / "failures.csv").open(newline=""))
         assert twin["again"] == line["again"]
@@ -170,14 +306,24 @@ def test_a_stranger_s_run_runs_nothing(sent, tmp_path, monkeypatch, capsys):
     for target in ("os.system", "e2rl.planners.external.ExternalEgo"):
         ego = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
         OmegaConf.save(OmegaConf.merge(config, {"ego": ego}), file)
-        status, said = call("evaluate.py", again(sent, tmp_path / "now"), monkeypatch=monkeypatch, capsys=capsys)
-        assert status == 2 and "runs code that is no extension of e2rl" in error_line(said)
+        status, said = call(
+            "evaluate.py",
+            again(sent, tmp_path / "now"),
+            monkeypatch=monkeypatch,
+            capsys=capsys,
+        )
+        assert status == 2 and "runs code that is no extension of e2rl" in error_line(
+            said
+        )
     assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.slow
-def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(world, tmp_path, monkeypatch, capsys):
-    """In its own folder, with its own configuration; what changes its meaning is refused."""
+def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(
+    world, tmp_path, monkeypatch, capsys
+):
+    """In its own folder, with its own configuration; what changes its meaning is
+    refused."""
     score = Setup.score
     left = [3]
 
@@ -187,17 +333,38 @@ def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(world, t
             raise KeyboardInterrupt
         return score(*tasks, **settings)
 
-    small = ["seeds=[0]", "batch=1", "processes=1", "methods=[constant_velocity,replay]", "data.build.steps=20"]
+    small = [
+        "seeds=[0]",
+        "batch=1",
+        "processes=1",
+        "methods=[constant_velocity,replay]",
+        "data.build.steps=20",
+    ]
     given = [*arguments(world, tmp_path, "good", *small), "ego=idm"]
-    status, said = call("evaluate.py", [*given, f"hydra.run.dir={tmp_path / 'whole'}"], monkeypatch=monkeypatch, capsys=capsys)
+    status, said = call(
+        "evaluate.py",
+        [*given, f"hydra.run.dir={tmp_path / 'whole'}"],
+        monkeypatch=monkeypatch,
+        capsys=capsys,
+    )
     assert status == 0, said
     monkeypatch.setattr(Setup, "score", stopped)
     run = tmp_path / "run"
     status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
-    assert status == 130 and f"evaluate.py resume={run}" in said and "interrupted (SIGINT)" in said
+    assert (
+        status == 130
+        and f"evaluate.py resume={run}" in said
+        and "interrupted (SIGINT)" in said
+    )
     left[0], named = 1, shlex.split(said.rpartition("evaluate.py ")[2])
-    status, said = call("evaluate.py", [*named, "seeds=[1]"], monkeypatch=monkeypatch, capsys=capsys)
-    assert status == 2 and "leave out seeds (only processes, launcher, shard can change)" in error_line(said)
+    status, said = call(
+        "evaluate.py", [*named, "seeds=[1]"], monkeypatch=monkeypatch, capsys=capsys
+    )
+    assert (
+        status == 2
+        and "leave out seeds (only processes, launcher, shard can change)"
+        in error_line(said)
+    )
     status, said = call("evaluate.py", named, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0 and left == [0], said
     same_runs(tmp_path / "whole", run)

@@ -1,4 +1,5 @@
-"""The example workflow's commands run as they stand, on fewer scenes, and write what it keeps."""
+"""The example workflow's commands run as they stand, on fewer scenes, and write what it
+keeps."""
 
 import os
 import subprocess
@@ -13,8 +14,16 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.slow
 def test_the_workflow_drives_and_gates(tmp_path):
-    text = (ROOT / "examples" / "ci" / "github-workflow.yml").read_text().replace("runs/gate", str(tmp_path))
-    steps = {step["name"]: step for step in yaml.safe_load(text)["jobs"]["gate"]["steps"] if "name" in step}
+    text = (
+        (ROOT / "examples" / "ci" / "github-workflow.yml")
+        .read_text()
+        .replace("runs/gate", str(tmp_path))
+    )
+    steps = {
+        step["name"]: step
+        for step in yaml.safe_load(text)["jobs"]["gate"]["steps"]
+        if "name" in step
+    }
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     done = [
         subprocess.run(
@@ -27,7 +36,11 @@ def test_the_workflow_drives_and_gates(tmp_path):
         )
         for name, more in (("drive", " num_scenes=3 processes=1"), ("gate", ""))
     ]
-    assert [each.returncode for each in done] == [0, 3], done[-1].stderr + done[0].stderr
+    assert [each.returncode for each in done] == [0, 3], (
+        done[-1].stderr + done[0].stderr
+    )
     assert "an interval needs 10" in done[1].stdout
     kept = steps["keep what was found"]["with"]["path"].split()
-    assert len(kept) == 3 and all(Path(each).is_file() for each in kept if not each.endswith(".html"))
+    assert len(kept) == 3 and all(
+        Path(each).is_file() for each in kept if not each.endswith(".html")
+    )

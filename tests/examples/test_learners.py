@@ -1,4 +1,5 @@
-"""Learners of others train in the project's environment, as the examples show, and their policies drive."""
+"""Learners of others train in the project's environment, as the examples show, and
+their policies drive."""
 
 import importlib.util
 from pathlib import Path
@@ -40,13 +41,18 @@ def test_torchrl_trains_the_actor(settings, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["sb3_ppo", "torchrl_sac"])
 def test_a_policy_of_theirs_is_an_ego(settings, tmp_path, capsys, name):
-    """It is written with the log of its episodes, whose steps are at most those asked for."""
+    """It is written with the log of its episodes, whose steps are at most those asked
+    for."""
     file = tmp_path / "policy.onnx"
     module = example(name)
     module.UPDATES = 1
     module.main("256", str(file), num_envs=8, **settings | {"method": "replay"})
     assert f"ego.file={file}" in capsys.readouterr().out
-    action = e2rl.make_ego("policy_file", file=str(file)).decide(torch.randn(50, OBSERVATION_SIZE))
+    action = e2rl.make_ego("policy_file", file=str(file)).decide(
+        torch.randn(50, OBSERVATION_SIZE)
+    )
     assert action.isfinite().all() and action.std(0).min() > 1e-3
     log = pandas.read_csv(tmp_path / "policy.monitor.csv", comment="#")
-    assert {"r", "l", "contact", "off_road", "progress"} <= set(log) and 0 < log["l"].sum() <= 256
+    assert {"r", "l", "contact", "off_road", "progress"} <= set(log) and 0 < log[
+        "l"
+    ].sum() <= 256

@@ -1,4 +1,5 @@
-"""The examples do what they say, beside the methods of the package, by the commands that a user would run."""
+"""The examples do what they say, beside the methods of the package, by the commands
+that a user would run."""
 
 import csv
 import json
@@ -20,8 +21,15 @@ EXAMPLES = ROOT / "examples"
 
 
 def run(script, folder, *overrides):
-    """A script of the top level with the examples' configuration and modules, from an empty folder."""
-    command = [sys.executable, str(ROOT / script), "--config-dir", str(EXAMPLES / "conf"), f"hydra.run.dir={folder}"]
+    """A script of the top level with the examples' configuration and modules, from an
+    empty folder."""
+    command = [
+        sys.executable,
+        str(ROOT / script),
+        "--config-dir",
+        str(EXAMPLES / "conf"),
+        f"hydra.run.dir={folder}",
+    ]
     path = os.pathsep.join([str(EXAMPLES), str(ROOT)])
     done = subprocess.run(
         [*command, *overrides],
@@ -48,17 +56,37 @@ def test_adversary_ego_source_and_metric_share_a_table_with_e2(tmp_path):
         "seeds=[0]",
         "data.workers=1",
     )
-    rows = {row["method"]: row for row in json.loads((tmp_path / "run" / "metrics.json").read_text())}
-    assert set(rows) == {"replay", "braking_leader", "e2"} and rows["braking_leader"]["ego"] == "cruise"
-    assert rows["braking_leader"]["eta"] == 2 and "hard_braking" in rows["e2"]["metrics"]
+    rows = {
+        row["method"]: row
+        for row in json.loads((tmp_path / "run" / "metrics.json").read_text())
+    }
+    assert (
+        set(rows) == {"replay", "braking_leader", "e2"}
+        and rows["braking_leader"]["ego"] == "cruise"
+    )
+    assert (
+        rows["braking_leader"]["eta"] == 2 and "hard_braking" in rows["e2"]["metrics"]
+    )
     with open(tmp_path / "run" / "rollouts.csv") as file:
-        assert {row["hard_braking"] for row in csv.DictReader(file)} <= {"0.0", "1.0", "0", "1"}
+        assert {row["hard_braking"] for row in csv.DictReader(file)} <= {
+            "0.0",
+            "1.0",
+            "0",
+            "1",
+        }
 
 
 @pytest.mark.slow
 def test_somebody_else_s_optimiser_spends_the_tries(tmp_path):
     pytest.importorskip("cma")
-    asked = ("search=evolution", "methods=[search]", "budget=12", "budget_unit=tries", "num_scenes=2", "seeds=[0]")
+    asked = (
+        "search=evolution",
+        "methods=[search]",
+        "budget=12",
+        "budget_unit=tries",
+        "num_scenes=2",
+        "seeds=[0]",
+    )
     run("evaluate.py", tmp_path / "run", *asked, "report=false", "save_rollouts=false")
     with open(tmp_path / "run" / "tries.csv") as file:
         tries = list(csv.DictReader(file))
@@ -104,10 +132,15 @@ def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leade
     for scene, agent in braked.tolist():
         speed = out.states[scene, :, agent, 3]
         moving = speed[1:] > 0
-        assert torch.allclose((speed.diff() / DT)[moving], torch.tensor(-2.0), atol=0.02) and speed[-1] == 0
+        assert (
+            torch.allclose((speed.diff() / DT)[moving], torch.tensor(-2.0), atol=0.02)
+            and speed[-1] == 0
+        )
         xy = out.states[scene, :, agent, :2]
         path = logged[scene, :, agent, :2]
-        assert torch.cdist(xy, path).amin(1).max() < 0.8, "on its path, between recorded points"
+        assert torch.cdist(xy, path).amin(1).max() < 0.8, (
+            "on its path, between recorded points"
+        )
     others = out.valid & ~out.adversaries[:, None]
     others[:, :, 0] = False
     assert torch.equal(out.states[others], logged[others])
@@ -135,13 +168,24 @@ def test_the_objective_is_least_in_front_of_the_target(monkeypatch):
 @pytest.mark.slow
 def test_an_objective_of_one_s_own_steers_e2_elsewhere(tmp_path):
     """The same coalition and noise, and other paths of its members."""
-    small = ["methods=[e2,cut_in_front]", "num_scenes=2", "data.split=tune", "seeds=[0]", "processes=1"]
+    small = [
+        "methods=[e2,cut_in_front]",
+        "num_scenes=2",
+        "data.split=tune",
+        "seeds=[0]",
+        "processes=1",
+    ]
     run("evaluate.py", tmp_path / "run", *small, "report=false")
     with open(tmp_path / "run" / "rollouts.csv") as file:
         rows = list(csv.DictReader(file))
-    assert {row["method"] for row in rows} == {"e2", "cut_in_front"} and {row["errored"] for row in rows} <= {
+    assert {row["method"] for row in rows} == {"e2", "cut_in_front"} and {
+        row["errored"] for row in rows
+    } <= {
         "0",
         "0.0",
     }
-    by_method = [[row["transport"] for row in rows if row["method"] == name] for name in ("e2", "cut_in_front")]
+    by_method = [
+        [row["transport"] for row in rows if row["method"] == name]
+        for name in ("e2", "cut_in_front")
+    ]
     assert by_method[0] != by_method[1]

@@ -1,4 +1,5 @@
-"""Shards of an evaluation, as jobs of a cluster: joined, they are the run that was not split."""
+"""Shards of an evaluation, as jobs of a cluster: joined, they are the run that was not
+split."""
 
 import os
 import subprocess
@@ -13,17 +14,38 @@ from tests.evaluation.test_protocol import same_runs
 from tests.scripts import SHORT, call
 
 ROOT = Path(__file__).parents[2]
-OPTIONS = [*SHORT, "methods=[constant_velocity,idm]", "seeds=[0,1]", "batch=2", "processes=1"]
+OPTIONS = [
+    *SHORT,
+    "methods=[constant_velocity,idm]",
+    "seeds=[0,1]",
+    "batch=2",
+    "processes=1",
+]
 
 
 @pytest.mark.slow
 def test_jobs_of_submitit_give_the_run_of_one_machine(tmp_path, monkeypatch, capsys):
-    """Two local jobs with two of four batches each. Then the tables, bit for bit; and a shard that another run's is
-    added to is refused."""
+    """Two local jobs with two of four batches each. Then the tables, bit for bit; and a
+    shard that another run's is added to is refused."""
     pytest.importorskip("submitit")
     options = [*OPTIONS, f"data.cache={tmp_path / 'cache'}"]
-    assert call("evaluate.py", [*options, f"hydra.run.dir={tmp_path / 'one'}"], monkeypatch=monkeypatch, capsys=capsys)[0] == 0
-    command = [sys.executable, str(ROOT / "examples" / "slurm.py"), "--cluster", "local", "--jobs", "2"]
+    assert (
+        call(
+            "evaluate.py",
+            [*options, f"hydra.run.dir={tmp_path / 'one'}"],
+            monkeypatch=monkeypatch,
+            capsys=capsys,
+        )[0]
+        == 0
+    )
+    command = [
+        sys.executable,
+        str(ROOT / "examples" / "slurm.py"),
+        "--cluster",
+        "local",
+        "--jobs",
+        "2",
+    ]
     done = subprocess.run(
         [*command, "--into", str(tmp_path / "jobs"), "--", *options],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
@@ -47,4 +69,7 @@ def test_jobs_of_submitit_give_the_run_of_one_machine(tmp_path, monkeypatch, cap
 def test_what_cannot_be_merged_is_named(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main([str(tmp_path), "--into", str(tmp_path / "whole")])
-    assert "provenance.json: not there; give the folder of a run" in capsys.readouterr().err
+    assert (
+        "provenance.json: not there; give the folder of a run"
+        in capsys.readouterr().err
+    )

@@ -14,12 +14,20 @@ from tests.synthetic import make_scenes
 
 
 def small_scenes(num_scenes=4, steps=20, **kwargs):
-    sizes = {"max_vehicles": 4, "max_agents": 5, "num_routes": 1, "num_points": 120, "num_vehicles": 3, "num_vrus": 1}
+    sizes = {
+        "max_vehicles": 4,
+        "max_agents": 5,
+        "num_routes": 1,
+        "num_points": 120,
+        "num_vehicles": 3,
+        "num_vrus": 1,
+    }
     return make_scenes(num_scenes, steps=steps, **(sizes | kwargs))
 
 
 def brake_check(scenes):
-    """A trivial synthesizer: vehicle 1 is put into the ego's lane `40 / (1 + eta)` m ahead, at half the ego's speed."""
+    """A trivial synthesizer: vehicle 1 is put into the ego's lane `40 / (1 + eta)` m
+    ahead, at half the ego's speed."""
 
     def synthesize(ego, index, eta, seed):
         scene = scenes.batch(index)
@@ -28,18 +36,26 @@ def brake_check(scenes):
         time = 0.1 * torch.arange(states.shape[1])
         speed = states[:, :1, 0, 3] / 2
         eta = torch.as_tensor(eta, dtype=torch.float32).expand(len(index))
-        states[:, :, 1, 0] = states[:, :1, 0, 0] + 40 / (1 + eta[:, None]) + speed * time
+        states[:, :, 1, 0] = (
+            states[:, :1, 0, 0] + 40 / (1 + eta[:, None]) + speed * time
+        )
         states[:, :, 1, 1], states[:, :, 1, 3] = 0.0, speed
         adversaries = torch.zeros(len(index), states.shape[2], dtype=torch.bool)
         adversaries[:, 1] = eta > 0
-        return {"scene_index": index, "states": states, "valid": valid, "adversaries": adversaries, "contact": eta > 1}
+        return {
+            "scene_index": index,
+            "states": states,
+            "valid": valid,
+            "adversaries": adversaries,
+            "contact": eta > 1,
+        }
 
     return synthesize
 
 
 class Ambush(Traffic):
-    """A trivial reacting method: where eta is positive, vehicle 1 is put where the ego plans to be in 0.5 s; the others
-    keep their velocity."""
+    """A trivial reacting method: where eta is positive, vehicle 1 is put where the ego
+    plans to be in 0.5 s; the others keep their velocity."""
 
     def reset(self, scenes, seed, eta):
         return eta
@@ -71,8 +87,9 @@ def small_run(
     against="current",
     **ppo,
 ):
-    """live: a method that drives the traffic against the learning policy; expert: settings of what is cloned; folder:
-    of the run, where `memory` rows are remembered."""
+    """live: a method that drives the traffic against the learning policy; expert:
+    settings of what is cloned; folder: of the run, where `memory` rows are remembered.
+    """
     torch.manual_seed(seed)
     scenes = scenes or small_scenes()
     improve = PolicyImprovement(
@@ -87,15 +104,31 @@ def small_run(
         **({"recorded": False, "evasions": False, "react": None} | (expert or {})),
     )
     traffic = "replay" if live is None else "live"
-    given = {"traffic": traffic, "against": against, "memory": memory, "prefetch": prefetch}
+    given = {
+        "traffic": traffic,
+        "against": against,
+        "memory": memory,
+        "prefetch": prefetch,
+    }
     settings = RoundSettings(scenes=3, nominal=nominal, **given)
     curriculum = AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread)
-    return Evolution(curriculum, improve, synthesize=brake_check(scenes), settings=settings, seed=seed, memory=Memory(folder, memory))
+    return Evolution(
+        curriculum,
+        improve,
+        synthesize=brake_check(scenes),
+        settings=settings,
+        seed=seed,
+        memory=Memory(folder, memory),
+    )
 
 
 def steady(metrics):
     """The metrics of a round that do not depend on the machine."""
-    return {name: value for name, value in metrics.items() if "time/" not in name and "seconds" not in name}
+    return {
+        name: value
+        for name, value in metrics.items()
+        if "time/" not in name and "seconds" not in name
+    }
 
 
 def rounds(run, count):

@@ -1,4 +1,5 @@
-"""Every configuration of learner, curriculum and logger builds and runs, a curriculum of one's own among them."""
+"""Every configuration of learner, curriculum and logger builds and runs, a curriculum
+of one's own among them."""
 
 import pytest
 from e2rl.scripts.train import train_round
@@ -10,20 +11,31 @@ from e2rl.learning.build import build_evolution, build_progress, check_training
 from e2rl.learning.policy import PolicyImprovement
 from e2rl.learning.run_checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.scheduler import CurriculumScheduler
-from e2rl.learning.schedules import AdaptiveCurriculum, ConstantCurriculum, LinearCurriculum
+from e2rl.learning.schedules import (
+    AdaptiveCurriculum,
+    ConstantCurriculum,
+    LinearCurriculum,
+)
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from tests.learning.small import Ambush, brake_check, small_scenes
 
-CURRICULA = {"adaptive": AdaptiveCurriculum, "linear": LinearCurriculum, "constant": ConstantCurriculum}
+CURRICULA = {
+    "adaptive": AdaptiveCurriculum,
+    "linear": LinearCurriculum,
+    "constant": ConstantCurriculum,
+}
 CURRICULA |= {"bandit": BanditCurriculum}
 FULL_ONLY = {"bandit": ["curriculum.templates=[full]"]}  # Ambush knows no templates
 POLICY = ["ego.hidden=[16]", "learner.recorded=false", "learner.ppo.cloning=0.1"]
-POLICY += [f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")]
+POLICY += [
+    f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")
+]
 
 
 class Doubling(CurriculumScheduler):
-    """A curriculum of one's own: the intensity doubles after every round that the ego has survived."""
+    """A curriculum of one's own: the intensity doubles after every round that the ego
+    has survived."""
 
     lasting = ("eta",)
 
@@ -44,24 +56,42 @@ def config_of(*overrides):
 
 def built(config, folder=None):
     scenes = small_scenes(3)
-    return build_evolution(config, scenes, ego=build_ego(config), traffic=Ambush(), synthesize=brake_check(scenes), folder=folder)
+    return build_evolution(
+        config,
+        scenes,
+        ego=build_ego(config),
+        traffic=Ambush(),
+        synthesize=brake_check(scenes),
+        folder=folder,
+    )
 
 
 @pytest.mark.parametrize("curriculum", CURRICULA)
 def test_policy_learner(curriculum):
-    run = built(config_of(f"curriculum={curriculum}", *FULL_ONLY.get(curriculum, []), *POLICY))
-    assert isinstance(run.improve, PolicyImprovement) and type(run.curriculum) is CURRICULA[curriculum]
+    run = built(
+        config_of(f"curriculum={curriculum}", *FULL_ONLY.get(curriculum, []), *POLICY)
+    )
+    assert (
+        isinstance(run.improve, PolicyImprovement)
+        and type(run.curriculum) is CURRICULA[curriculum]
+    )
     assert train_round(run)["synthesizer/memory_rows"] > 0
 
 
 def test_the_experiment_of_training_is_of_options_that_exist():
     run = built(config_of("experiment=harden", *FULL_ONLY["bandit"], *POLICY))
-    assert isinstance(run.improve, PolicyImprovement) and run.improve.teacher is not None
+    assert (
+        isinstance(run.improve, PolicyImprovement) and run.improve.teacher is not None
+    )
 
 
 def test_without_a_synthesizer_given_the_traffic_method_attacks():
-    config = config_of("learner.round.nominal=log", "curriculum.solvable_only=false", *POLICY)
-    run = build_evolution(config, small_scenes(3), ego=build_ego(config), traffic=Ambush())
+    config = config_of(
+        "learner.round.nominal=log", "curriculum.solvable_only=false", *POLICY
+    )
+    run = build_evolution(
+        config, small_scenes(3), ego=build_ego(config), traffic=Ambush()
+    )
     metrics = train_round(run)
     assert metrics["synthesizer/attacked"] == metrics["synthesizer/contact"] == 1.0
     assert run.memory.rows == 2
@@ -70,7 +100,11 @@ def test_without_a_synthesizer_given_the_traffic_method_attacks():
 def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
     config = config_of(*POLICY)
     with open_dict(config):
-        config.curriculum = {"_target_": f"{__name__}.Doubling", "first": 0.25, "prioritised": False}
+        config.curriculum = {
+            "_target_": f"{__name__}.Doubling",
+            "first": 0.25,
+            "prioritised": False,
+        }
     run = built(config, tmp_path)
     assert isinstance(run.curriculum, Doubling) and not run.curriculum.prioritised
     assert train_round(run)["curriculum/eta"] == 0.25
@@ -84,7 +118,10 @@ def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
 @pytest.mark.parametrize(
     ("override", "what"),
     [
-        (["curriculum=bandit", "synthesizer=idm"], "curriculum: .*synthesizer=idm has none"),
+        (
+            ["curriculum=bandit", "synthesizer=idm"],
+            "curriculum: .*synthesizer=idm has none",
+        ),
         (["+curriculum.cosine=1"], "curriculum"),
     ],
 )
@@ -98,11 +135,19 @@ def test_the_time_left_is_told_once_each_kind_of_phase_was_measured(monkeypatch)
     left = []
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     progress = build_progress(load_config("train", ["rounds=2"]))
-    for kind, seconds in (("measurement", 600), ("round", 60), ("round", 10), ("measurement", 10)):
+    for kind, seconds in (
+        ("measurement", 600),
+        ("round", 60),
+        ("round", 10),
+        ("measurement", 10),
+    ):
         left.append(progress.left())
         with progress.phase(kind):
             now[0] += seconds
-    assert left == ["", "", "about 11 min left", "about 10 min left"] and progress.left() == ""
+    assert (
+        left == ["", "", "about 11 min left", "about 10 min left"]
+        and progress.left() == ""
+    )
 
 
 def test_a_run_that_goes_on_has_measured_nothing_yet():
@@ -115,8 +160,14 @@ def test_a_run_that_goes_on_has_measured_nothing_yet():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["learner.device=banana"], "learner.device=banana: .*use learner.device=cpu or cuda"),
-        (["learner.device=cpu:0", "learner.round.traffic=live"], "live traffic .*set device=cpu:0"),
+        (
+            ["learner.device=banana"],
+            "learner.device=banana: .*use learner.device=cpu or cuda",
+        ),
+        (
+            ["learner.device=cpu:0", "learner.round.traffic=live"],
+            "live traffic .*set device=cpu:0",
+        ),
     ],
 )
 def test_a_device_for_learning_that_cannot_be_used_is_refused(options, message):

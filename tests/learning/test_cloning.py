@@ -1,4 +1,5 @@
-"""The cloning loss: one label is the hard loss, many are its mean; every kind of expert has its share."""
+"""The cloning loss: one label is the hard loss, many are its mean; every kind of expert
+has its share."""
 
 import pytest
 import torch
@@ -18,10 +19,13 @@ def network():
 
 
 def shown(action, weight):
-    """Demonstrations [5] at random observations with labels action [C, 2] and weight [C]."""
+    """Demonstrations [5] at random observations with labels action [C, 2] and weight
+    [C]."""
     action = torch.tensor(action)
     weight = torch.tensor(weight)
-    observation = torch.randn(5, OBSERVATION_SIZE, generator=torch.Generator().manual_seed(1))
+    observation = torch.randn(
+        5, OBSERVATION_SIZE, generator=torch.Generator().manual_seed(1)
+    )
     labels = {"action": action.expand(5, -1, -1), "weight": weight.expand(5, -1)}
     return TensorDict({"observation": observation, **labels}, [5])
 
@@ -36,7 +40,9 @@ def gradient(actor, given):
 def test_one_label_is_the_hard_loss():
     actor = network()
     given = shown([[-3.0, 0.2]], [1.0])
-    hard = TensorDict({"observation": given["observation"], "action": given["action"][:, 0]}, [5])
+    hard = TensorDict(
+        {"observation": given["observation"], "action": given["action"][:, 0]}, [5]
+    )
     soft = CloningLoss(actor.actor)(given)["loss_cloning"]
     torch.testing.assert_close(soft, BCLoss(actor.actor)(hard)["loss_bc"])
 
@@ -48,7 +54,9 @@ def test_loss_and_gradient_are_the_weighted_means_of_those_of_the_labels():
     soft = gradient(actor, shown(actions, weights))
     single = [gradient(actor, shown([action], [1.0])) for action in actions]
     for found, of_each in zip(soft, zip(*single, strict=True), strict=True):
-        expected = sum(weight * each for weight, each in zip(weights, of_each, strict=True))
+        expected = sum(
+            weight * each for weight, each in zip(weights, of_each, strict=True)
+        )
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -71,12 +79,19 @@ def test_the_teaching_loss_is_that_of_a_mixture_round_the_labels():
     away = given["action"] - policy.deterministic(given["observation"])[:, None]
     away = away / (policy.reach * torch.tensor([0.25, 0.12]))
     likelihood = (torch.tensor(weights) * torch.exp(-away.square().sum(-1) / 2)).sum(1)
-    torch.testing.assert_close(TeachingLoss(policy)(given)["loss_teaching"], -likelihood.log().mean())
+    torch.testing.assert_close(
+        TeachingLoss(policy)(given)["loss_teaching"], -likelihood.log().mean()
+    )
 
 
 def test_teaching_leaves_the_explorations_width_alone():
     policy = network().network
     given = shown([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0])  # a weight of 0 fills up
     loss = TeachingLoss(policy)(given)["loss_teaching"]
-    assert torch.autograd.grad(loss, policy.spread, allow_unused=True, retain_graph=True) == (None,)
-    assert all(part.isfinite().all() for part in torch.autograd.grad(loss, list(policy.trunk.parameters())))
+    assert torch.autograd.grad(
+        loss, policy.spread, allow_unused=True, retain_graph=True
+    ) == (None,)
+    assert all(
+        part.isfinite().all()
+        for part in torch.autograd.grad(loss, list(policy.trunk.parameters()))
+    )

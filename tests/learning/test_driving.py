@@ -1,4 +1,5 @@
-"""One drive per row of a pool, counted to its first failure; finished episodes without the bias towards short ones."""
+"""One drive per row of a pool, counted to its first failure; finished episodes without
+the bias towards short ones."""
 
 import pytest
 import torch
@@ -13,36 +14,63 @@ from tests.learning.small import brake_check, small_scenes
 
 def attacked(scenes, eta=1.0):
     index = torch.arange(len(scenes))
-    return TrafficPool.stored(brake_check(scenes)(None, index, eta, 0), eta) + TrafficPool.recorded(index)
+    return TrafficPool.stored(
+        brake_check(scenes)(None, index, eta, 0), eta
+    ) + TrafficPool.recorded(index)
 
 
 def test_outcomes_do_not_depend_on_the_batch():
     scenes = small_scenes(5, steps=40)
     pool = attacked(scenes)
-    parts = [PoolDriver(scenes, SimSettings(), batch=batch).drive_all(IDMEgo(), pool)[0] for batch in (10, 4, 16)]
-    for name in ("row", "scene_index", "contact", "returns", "progress", "acceleration"):
+    parts = [
+        PoolDriver(scenes, SimSettings(), batch=batch).drive_all(IDMEgo(), pool)[0]
+        for batch in (10, 4, 16)
+    ]
+    for name in (
+        "row",
+        "scene_index",
+        "contact",
+        "returns",
+        "progress",
+        "acceleration",
+    ):
         for part in parts[1:]:
             assert torch.equal(getattr(parts[0], name), getattr(part, name)), name
-    assert parts[0].row.tolist() == list(range(10)) and parts[0].adversarial.tolist() == [True] * 5 + [False] * 5
+    assert (
+        parts[0].row.tolist() == list(range(10))
+        and parts[0].adversarial.tolist() == [True] * 5 + [False] * 5
+    )
 
 
 def test_a_drive_counts_until_its_first_contact():
     scenes = small_scenes(2, steps=40)
     pool = attacked(scenes, eta=7.0)
     rows = torch.tensor([0, 2])
-    frames = PoolDriver(scenes, SimSettings(), batch=2).drive(IDMEgo(hardest_braking=0.1, braking=0.1), pool, rows)
+    frames = PoolDriver(scenes, SimSettings(), batch=2).drive(
+        IDMEgo(hardest_braking=0.1, braking=0.1), pool, rows
+    )
     episodes = episodes_of(frames, pool, rows=rows)
     assert episodes.contact.tolist() == [True, False]
     assert frames["alive"][1].all() and frames["alive"][0].sum() < 40
-    assert frames["contact"][0].sum() == 1 and not frames["reward"][0][~frames["alive"][0]].any()
+    assert (
+        frames["contact"][0].sum() == 1
+        and not frames["reward"][0][~frames["alive"][0]].any()
+    )
 
 
 def test_disturbances_are_executed_but_not_intended():
     scenes = small_scenes(2)
     driver = PoolDriver(scenes, SimSettings(), batch=2)
     pool = TrafficPool.recorded(torch.arange(2))
-    frames = driver.drive(IDMEgo(), pool, torch.arange(2), lambda action, step: action + torch.tensor([1.0, 0.0]))
-    assert torch.allclose(frames["executed"][..., 0], frames["intended"][..., 0] + 1.0, atol=1e-3)
+    frames = driver.drive(
+        IDMEgo(),
+        pool,
+        torch.arange(2),
+        lambda action, step: action + torch.tensor([1.0, 0.0]),
+    )
+    assert torch.allclose(
+        frames["executed"][..., 0], frames["intended"][..., 0] + 1.0, atol=1e-3
+    )
 
 
 def test_mean_acceleration_is_that_of_the_drive():
@@ -51,17 +79,25 @@ def test_mean_acceleration_is_that_of_the_drive():
     pool = TrafficPool.recorded(torch.arange(2))
     episodes, _ = driver.drive_all(IDMEgo(acceleration=1.0), pool)
     gained = driver.env.world().states[:, 0, 3] - 10.0
-    assert episodes.acceleration.tolist() == pytest.approx((gained / 2.0).tolist(), abs=1e-3)
+    assert episodes.acceleration.tolist() == pytest.approx(
+        (gained / 2.0).tolist(), abs=1e-3
+    )
 
 
 # --- episodes of collected frames
 
 
 def frames(lengths, total, fail=()):
-    """One environment: episodes of these lengths in turn, reward 1 a step; those in `fail` end by contact."""
+    """One environment: episodes of these lengths in turn, reward 1 a step; those in
+    `fail` end by contact."""
     timestep = torch.cat([torch.arange(1, n + 1) for n in lengths])[:total]
     number = torch.cat([torch.full((n,), k) for k, n in enumerate(lengths)])[:total]
-    done = torch.tensor([t == lengths[k] for t, k in zip(timestep.tolist(), number.tolist(), strict=True)])
+    done = torch.tensor(
+        [
+            t == lengths[k]
+            for t, k in zip(timestep.tolist(), number.tolist(), strict=True)
+        ]
+    )
     contact = done & torch.tensor([k in fail for k in number.tolist()])
     row = number[None, :, None]
     returns = timestep.float()
@@ -88,30 +124,55 @@ def frames(lengths, total, fail=()):
 
 def test_returns_outcomes_and_scenes_of_episodes_across_batches():
     data = frames([10, 4, 10, 10], 34, fail=(1,))
-    episodes = finished_episodes([data[:, :12], data[:, 12:]], torch.tensor([False, True, True, False]), horizon=10)
-    assert episodes.row.tolist() == [0, 1, 2, 3] and episodes.scene_index.tolist() == [10, 11, 12, 13]
+    episodes = finished_episodes(
+        [data[:, :12], data[:, 12:]],
+        torch.tensor([False, True, True, False]),
+        horizon=10,
+    )
+    assert episodes.row.tolist() == [0, 1, 2, 3] and episodes.scene_index.tolist() == [
+        10,
+        11,
+        12,
+        13,
+    ]
     assert episodes.returns.tolist() == [10.0, 4.0, 10.0, 10.0]
     assert episodes.progress.tolist() == [20.0, 8.0, 20.0, 20.0]
     assert episodes.failed.tolist() == [False, True, False, False]
     summary = episodes.summary()
-    assert summary["contact"] == 0.25 and summary["contact_adversarial"] == 0.5 and summary["contact_nominal"] == 0.0
+    assert (
+        summary["contact"] == 0.25
+        and summary["contact_adversarial"] == 0.5
+        and summary["contact_nominal"] == 0.0
+    )
     assert "acceleration" not in summary, "what was not measured is left out"
 
 
 def test_episodes_that_could_not_have_lasted_do_not_count():
-    """The second begins 5 steps before the end: only a failure could be finished by then."""
+    """The second begins 5 steps before the end: only a failure could be finished by
+    then."""
     data = frames([10, 3, 10], 15, fail=(1,))
-    assert finished_episodes([data], torch.zeros(3, dtype=torch.bool), horizon=10).row.tolist() == [0]
+    assert finished_episodes(
+        [data], torch.zeros(3, dtype=torch.bool), horizon=10
+    ).row.tolist() == [0]
 
 
 def test_decisions_of_several_steps_are_told_from_steps():
-    """Episodes of 5, 3 and 5 steps in decisions of 2 are 3, 2 and 3 frames, the last one of each cut short."""
+    """Episodes of 5, 3 and 5 steps in decisions of 2 are 3, 2 and 3 frames, the last
+    one of each cut short."""
     steps = [2, 4, 5, 2, 3, 2, 4, 5]
     number = [0, 0, 0, 1, 1, 2, 2, 2]
     data = frames([3, 2, 3], 8, fail=(1,))
     assert data["traffic", "row"][0, :, 0].tolist() == number
     data["next", "timestep"] = torch.tensor(steps)[None, :, None]
     adversarial = torch.zeros(3, dtype=torch.bool)
-    assert finished_episodes([data], adversarial, horizon=5, hold=2).row.tolist() == [0, 1, 2]
-    assert finished_episodes([data[:, :7]], adversarial, horizon=5, hold=2).row.tolist() == [0, 1]
-    assert finished_episodes([data[:, :5]], adversarial, horizon=5, hold=2).row.tolist() == [0], "the second might have lasted"
+    assert finished_episodes([data], adversarial, horizon=5, hold=2).row.tolist() == [
+        0,
+        1,
+        2,
+    ]
+    assert finished_episodes(
+        [data[:, :7]], adversarial, horizon=5, hold=2
+    ).row.tolist() == [0, 1]
+    assert finished_episodes(
+        [data[:, :5]], adversarial, horizon=5, hold=2
+    ).row.tolist() == [0], "the second might have lasted"

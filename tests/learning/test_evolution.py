@@ -25,15 +25,24 @@ def test_a_round_improves_moves_on_and_reports():
     run = small_run(nominal="prior")
     attack = run.synthesize
     asked = []
-    run.synthesize = lambda ego, index, eta, seed: asked.append((ego, eta, seed)) or attack(ego, index, eta, seed)
+    run.synthesize = lambda ego, index, eta, seed: (
+        asked.append((ego, eta, seed)) or attack(ego, index, eta, seed)
+    )
     before = {key: value.clone() for key, value in run.ego.network.weights().items()}
     metrics = train_round(run)
     etas = [eta.tolist() for _, eta, _ in asked]
-    assert etas == [[1.0] * 3, [0.0] * 3], "the attack, then the same scenes by the prior alone"
+    assert etas == [[1.0] * 3, [0.0] * 3], (
+        "the attack, then the same scenes by the prior alone"
+    )
     assert asked[0][0] is run.ego and asked[0][2] == asked[1][2]
-    assert any(not torch.equal(value, before[key]) for key, value in run.ego.network.weights().items())
+    assert any(
+        not torch.equal(value, before[key])
+        for key, value in run.ego.network.weights().items()
+    )
     assert run.round == 1 and all(name.split("/")[0] in GROUPS for name in metrics)
-    assert metrics["curriculum/eta"] == 1.0 and run.curriculum.eta == 1.25, "no contact at eta 1: it rises"
+    assert metrics["curriculum/eta"] == 1.0 and run.curriculum.eta == 1.25, (
+        "no contact at eta 1: it rises"
+    )
     assert all(isinstance(value, float) for value in metrics.values())
     train_round(run)
     assert asked[2][2] != asked[0][2], "another round, another seed"
@@ -44,11 +53,20 @@ def test_a_data_set_made_once_meets_the_policy_that_the_run_began_with():
     begun = small_run().ego.network.weights()
     attack = run.synthesize
     met = []
-    run.synthesize = lambda ego, *given: met.append(copy.deepcopy(ego.network.weights())) or attack(ego, *given)
+    run.synthesize = lambda ego, *given: (
+        met.append(copy.deepcopy(ego.network.weights())) or attack(ego, *given)
+    )
     for _ in range(2):
         train_round(run)
-    assert any(not torch.equal(value, begun[key]) for key, value in run.ego.network.weights().items())
-    assert all(torch.equal(value, begun[key]) for weights in met for key, value in weights.items())
+    assert any(
+        not torch.equal(value, begun[key])
+        for key, value in run.ego.network.weights().items()
+    )
+    assert all(
+        torch.equal(value, begun[key])
+        for weights in met
+        for key, value in weights.items()
+    )
     with pytest.raises(InputError, match=r"against=start"):
         RoundSettings(against="start", traffic="live")
 
@@ -57,9 +75,13 @@ def test_templates_are_given_to_the_attack_only_where_one_is_not_full():
     run = small_run(nominal="prior")
     attack = run.synthesize
     asked = []
-    run.synthesize = lambda ego, index, eta, seed, *limits: asked.append(limits) or attack(ego, index, eta, seed)
+    run.synthesize = lambda ego, index, eta, seed, *limits: (
+        asked.append(limits) or attack(ego, index, eta, seed)
+    )
     train_round(run)
-    run.curriculum = BanditCurriculum(4, 4, etas=[0.5, 2.0], templates=["pair", "chain"])
+    run.curriculum = BanditCurriculum(
+        4, 4, etas=[0.5, 2.0], templates=["pair", "chain"]
+    )
     run.curriculum.round = 1
     train_round(run)
     assert asked[:2] == [(), ()] and asked[3] == (), "the nominal traffic has none"
@@ -74,9 +96,16 @@ def test_a_round_s_choices_and_their_outcomes_are_counted(live):
     run = small_run(live=live)
     metrics = train_round(run)
     (row,) = run.choices
-    assert (row["round"], row["eta"], row["template"], row["draws"]) == (0, 1.0, "full", 3)
+    assert (row["round"], row["eta"], row["template"], row["draws"]) == (
+        0,
+        1.0,
+        "full",
+        3,
+    )
     own = run.episodes.adversarial
-    assert row["episodes"] == int(own.sum()) > 0 and row["failures"] == int(run.episodes.failed[own].sum())
+    assert row["episodes"] == int(own.sum()) > 0 and row["failures"] == int(
+        run.episodes.failed[own].sum()
+    )
     assert row["left_out"] == metrics["synthesizer/left_out"] == 0
 
 
@@ -95,7 +124,13 @@ def test_live_traffic_reacts_to_the_learning_policy():
     class Watched(Ambush):
         def replan(self, state, world, ego_plan):
             if not world.step.any():
-                told.append((ego_plan.clone(), run.ego.plan(world), keep_velocity(world.states[:, 0])))
+                told.append(
+                    (
+                        ego_plan.clone(),
+                        run.ego.plan(world),
+                        keep_velocity(world.states[:, 0]),
+                    )
+                )
             return super().replan(state, world, ego_plan)
 
     run = small_run(nominal="prior", live=Watched())
@@ -108,15 +143,30 @@ def test_live_traffic_reacts_to_the_learning_policy():
     assert (given - straight).abs().max() > 0.5, "the plan is the policy's own"
     assert metrics["train/contact_adversarial"] == metrics["synthesizer/contact"] == 1.0
     assert metrics["train/contact_nominal"] == 0.0 and run.curriculum.eta < 1.0
-    assert any(not torch.equal(value, before[key]) for key, value in run.ego.network.weights().items())
+    assert any(
+        not torch.equal(value, before[key])
+        for key, value in run.ego.network.weights().items()
+    )
 
 
 def planner_run(space, live=None):
     scenes = small_scenes(3, steps=40)
     present = {"desired_speed": 10.0, "headway": 1.0, "use_limits": False}
-    given = {"search": {"trials": 3, "startup": 3}, "space": space, "batch": 3, "traffic": live}
-    improve = PlannerImprovement(IDMEgo(**present), present, scenes=scenes, sim=SimSettings(), **given)
-    return Evolution(AdaptiveCurriculum(3, 2), improve, synthesize=brake_check(scenes), settings=RoundSettings(scenes=3, nominal="log"))
+    given = {
+        "search": {"trials": 3, "startup": 3},
+        "space": space,
+        "batch": 3,
+        "traffic": live,
+    }
+    improve = PlannerImprovement(
+        IDMEgo(**present), present, scenes=scenes, sim=SimSettings(), **given
+    )
+    return Evolution(
+        AdaptiveCurriculum(3, 2),
+        improve,
+        synthesize=brake_check(scenes),
+        settings=RoundSettings(scenes=3, nominal="log"),
+    )
 
 
 def test_planners_are_tuned_and_attacked_as_tuned():
@@ -125,7 +175,9 @@ def test_planners_are_tuned_and_attacked_as_tuned():
     assert metrics["train/trials"] == 3 and len(run.improve.trials) == 3
     assert run.ego.desired_speed > 5, "standing still is no improvement"
     assert metrics["train/objective"] <= metrics["train/objective_before"]
-    assert not torch.isnan(run.curriculum.regret()).any(), "its episodes feed the curriculum"
+    assert not torch.isnan(run.curriculum.regret()).any(), (
+        "its episodes feed the curriculum"
+    )
     asked = []
     attack = run.synthesize
     run.synthesize = lambda ego, *rest: asked.append(ego) or attack(ego, *rest)
@@ -145,11 +197,15 @@ def test_unfit_combinations_are_refused():
 
 
 def test_a_copy_on_another_device_learns_what_the_ego_itself_would():
-    """cpu:0 is a device of its own to the code, and the same to arithmetic; attacks meet the ego at home."""
+    """cpu:0 is a device of its own to the code, and the same to arithmetic; attacks
+    meet the ego at home."""
     run = small_run(seed=3)
     expected = rounds(run, 2)
     weights = run.ego.network.weights()
     run = small_run(seed=3, expert={"device": "cpu:0"})
     assert run.improve._learning is not run.ego
     assert rounds(run, 2) == expected
-    assert all(torch.equal(value, weights[name]) for name, value in run.ego.network.weights().items())
+    assert all(
+        torch.equal(value, weights[name])
+        for name, value in run.ego.network.weights().items()
+    )

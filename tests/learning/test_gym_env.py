@@ -24,13 +24,23 @@ SPEED = 0  # of the observation
 @pytest.fixture(scope="module")
 def given():
     """Three scenes with recorded traffic."""
-    return {"scenes": e2rl.load_scenes("bundled", 3), "method": "replay", "eta": 0.0, "compile": False}
+    return {
+        "scenes": e2rl.load_scenes("bundled", 3),
+        "method": "replay",
+        "eta": 0.0,
+        "compile": False,
+    }
 
 
 @pytest.fixture(scope="module")
 def bundled():
     """All bundled test scenes, so that two draws of several are hardly ever alike."""
-    return {"scenes": e2rl.load_scenes("bundled"), "method": "replay", "eta": 0.0, "compile": False}
+    return {
+        "scenes": e2rl.load_scenes("bundled"),
+        "method": "replay",
+        "eta": 0.0,
+        "compile": False,
+    }
 
 
 def actions(batch, seed=0):
@@ -45,7 +55,8 @@ def test_the_checkers_of_gymnasium_and_torchrl_pass(given):
 
 
 def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
-    """Through ends and resets: observations, rewards, flags and what ended, from equal seeds and actions."""
+    """Through ends and resets: observations, rewards, flags and what ended, from equal
+    seeds and actions."""
     env = e2rl.make_env(4, **given)
     batch = e2rl.make_gym_env(4, **given)
     env.set_seed(5)
@@ -53,29 +64,42 @@ def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
     ended = 0
     for step in range(90):
         assert (seen == td["observation"].numpy()).all() and seen.dtype == np.float32
-        assert [given["scenes"].index(scene) for scene in info["scene"]] == td["scene_index"][:, 0].tolist()
+        assert [given["scenes"].index(scene) for scene in info["scene"]] == td[
+            "scene_index"
+        ][:, 0].tolist()
         action = actions(4, step)
         td["action"] = in_units(torch.tensor(action), *batch.bounds)
         done, td = env.step_and_maybe_reset(td)
         seen, *flags, info = batch.step(action)
-        for key, value in zip(("reward", "terminated", "truncated"), flags, strict=True):
+        for key, value in zip(
+            ("reward", "terminated", "truncated"), flags, strict=True
+        ):
             assert (value == done["next", key][:, 0].numpy()).all()
         over = done["next", "done"][:, 0].numpy()
         assert (over == info.get("_final_obs", False)).all()
         for row in over.nonzero()[0]:
-            assert (info["final_obs"][row] == done["next", "observation"][row].numpy()).all()
-            assert info["final_info"]["off_road"][row] == done["next", "metrics", "off_road"][row, 0]
+            assert (
+                info["final_obs"][row] == done["next", "observation"][row].numpy()
+            ).all()
+            assert (
+                info["final_info"]["off_road"][row]
+                == done["next", "metrics", "off_road"][row, 0]
+            )
             assert seen[row, ELAPSED] == 0, "the next episode's first"
             ended += 1
     assert ended > 4
 
 
 def test_a_scene_drives_alone_as_in_a_batch(given):
-    """In a chosen scene, to the end of the episode, whose observation and info are those of the step."""
+    """In a chosen scene, to the end of the episode, whose observation and info are
+    those of the step."""
     one = e2rl.make_gym_env(**given)
     batch = e2rl.make_gym_env(2, **given)
     name = given["scenes"].scene_id[1]
-    (alone, info), (both, _) = one.reset(options={"scene": name}), batch.reset(options={"scene": 1})
+    (alone, info), (both, _) = (
+        one.reset(options={"scene": name}),
+        batch.reset(options={"scene": 1}),
+    )
     assert info["scene"] == name
     for step in range(200):
         assert np.allclose(alone, both, atol=1e-5)
@@ -84,7 +108,10 @@ def test_a_scene_drives_alone_as_in_a_batch(given):
         both, rewards, *_, infos = batch.step(np.stack([action, action]))
         assert reward == pytest.approx(rewards[0], abs=1e-5) and info["scene"] == name
         if terminated or truncated:
-            assert np.allclose(alone, infos["final_obs"][0], atol=1e-5) and alone[ELAPSED] > 0
+            assert (
+                np.allclose(alone, infos["final_obs"][0], atol=1e-5)
+                and alone[ELAPSED] > 0
+            )
             assert terminated == (info["contact"] or info["off_road"])
             return
     pytest.fail("no end")
@@ -95,14 +122,17 @@ def test_a_seed_decides_the_episodes_in_attacked_traffic(given):
 
     def driven(seed):
         first, info = batch.reset(seed=seed)
-        return [first, *(batch.step(np.zeros((3, 2)))[0] for _ in range(12))], info["scene"].tolist()
+        return [first, *(batch.step(np.zeros((3, 2)))[0] for _ in range(12))], info[
+            "scene"
+        ].tolist()
 
     (ours, scenes), (again, same), (_, others) = driven(1), driven(1), driven(3)
     assert all(map(np.array_equal, ours, again)) and scenes == same != others
 
 
 def test_environments_without_a_seed_drive_in_other_scenes(bundled):
-    """As workers of one function, and as one environment that is copied into several processes."""
+    """As workers of one function, and as one environment that is copied into several
+    processes."""
     batches = [e2rl.make_gym_env(8, **bundled) for _ in range(2)]
     first, second = (batch.reset()[1]["scene"].tolist() for batch in batches)
     assert first != second
@@ -131,7 +161,9 @@ def scenes_of(env):
     return env.reset()[1]["scene"].tolist()
 
 
-@pytest.mark.parametrize("kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")])
+@pytest.mark.parametrize(
+    "kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")]
+)
 def test_gymnasium_s_own_batches_drive_in_scenes_of_their_own(bundled, kind):
     """Every environment by a seed of its own, the same again by the same seed."""
     workers = kind([lambda: e2rl.make_gym_env(**bundled)] * 6)
@@ -147,14 +179,17 @@ def test_gymnasium_s_own_batches_drive_in_scenes_of_their_own(bundled, kind):
 
 
 def test_in_the_next_step_an_episode_begins_whatever_is_done(given):
-    """As in gymnasium's own batches: its action is ignored, it has no reward, and nothing is final."""
+    """As in gymnasium's own batches: its action is ignored, it has no reward, and
+    nothing is final."""
     env = e2rl.make_gym_env(4, autoreset="next_step", **given)
     env.reset(seed=5)
     begins = np.zeros(4, dtype=bool)
     episodes = 0
     for step in range(100):
         observation, reward, terminated, truncated, info = env.step(actions(4, step))
-        assert (observation[begins, ELAPSED] == 0).all() and (observation[~begins, ELAPSED] > 0).all()
+        assert (observation[begins, ELAPSED] == 0).all() and (
+            observation[~begins, ELAPSED] > 0
+        ).all()
         assert not (terminated | truncated)[begins].any() and not reward[begins].any()
         assert "final_obs" not in info
         begins = terminated | truncated
@@ -164,7 +199,9 @@ def test_in_the_next_step_an_episode_begins_whatever_is_done(given):
 
 
 def test_gymnasium_normalises_the_observations_of_a_batch(given):
-    env = vector.NormalizeObservation(e2rl.make_gym_env(3, autoreset="next_step", **given))
+    env = vector.NormalizeObservation(
+        e2rl.make_gym_env(3, autoreset="next_step", **given)
+    )
     env.reset(seed=0)
     for step in range(40):
         observation = env.step(actions(3, step))[0]
@@ -183,10 +220,20 @@ def test_torchrl_is_pointed_to_its_own_environment(given):
 def test_actions_are_scaled_about_keeping_speed_and_heading(given):
     low = torch.tensor([-8.0, -1.6])
     high = torch.tensor([5.0, 1.6])
-    found = in_units(torch.tensor([[-2.0, -1.0], [-0.5, 0.0], [0.0, 0.5], [1.0, 3.0]]), low, high=high)
-    assert found.tolist() == [pytest.approx(row) for row in ([-8.0, -1.6], [-4.0, 0.0], [0.0, 0.8], [5.0, 1.6])]
+    found = in_units(
+        torch.tensor([[-2.0, -1.0], [-0.5, 0.0], [0.0, 0.5], [1.0, 3.0]]),
+        low,
+        high=high,
+    )
+    assert found.tolist() == [
+        pytest.approx(row)
+        for row in ([-8.0, -1.6], [-4.0, 0.0], [0.0, 0.8], [5.0, 1.6])
+    ]
     env = e2rl.make_gym_env(**given, max_acceleration=2.0)
-    assert env.bounds.tolist() == [pytest.approx([-8.0, -1.6]), pytest.approx([2.0, 1.6])]
+    assert env.bounds.tolist() == [
+        pytest.approx([-8.0, -1.6]),
+        pytest.approx([2.0, 1.6]),
+    ]
     before = env.reset(options={"scene": 0})[0][SPEED]
     assert env.step(np.zeros(2))[0][SPEED] == pytest.approx(before, abs=1e-5)
 
@@ -196,7 +243,10 @@ def test_what_cannot_be_is_named(given, monkeypatch):
     with pytest.raises(InputError, match="scene=nowhere"):
         env.reset(options={"scene": "nowhere"})
     before = env.reset(seed=1)[1]["scene"]
-    assert len({env.reset(seed=seed)[1]["scene"] for seed in range(8)}) > 1 and env.reset(seed=1)[1]["scene"] == before
+    assert (
+        len({env.reset(seed=seed)[1]["scene"] for seed in range(8)}) > 1
+        and env.reset(seed=1)[1]["scene"] == before
+    )
     with pytest.raises(InputError, match="num_envs=0"):
         e2rl.make_gym_env(0, **given)
     with pytest.raises(InputError, match="max_speed"):

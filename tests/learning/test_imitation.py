@@ -1,11 +1,16 @@
-"""Demonstrations come from the log, cloning fits them, and disturbed ones lead back to the lane."""
+"""Demonstrations come from the log, cloning fits them, and disturbed ones lead back to
+the lane."""
 
 import pytest
 import torch
 
 from e2rl.learning import imitation
 from e2rl.learning.cloning import clip_expert
-from e2rl.learning.imitation import Imitation, ImitationSettings, recorded_demonstrations
+from e2rl.learning.imitation import (
+    Imitation,
+    ImitationSettings,
+    recorded_demonstrations,
+)
 from e2rl.planners.actor import ActorEgo
 from e2rl.sim.env import SimSettings
 from tests.learning.small import small_scenes
@@ -22,15 +27,31 @@ def braking_log(num_scenes=4, steps=20, acceleration=-2.0):
 
 
 def settings(**changes):
-    return ImitationSettings(**({"epochs": 8, "minibatch": 32, "learning_rate": 3e-3, "held_out": 0.25} | changes))
+    return ImitationSettings(
+        **(
+            {"epochs": 8, "minibatch": 32, "learning_rate": 3e-3, "held_out": 0.25}
+            | changes
+        )
+    )
 
 
 def test_replayed_demonstrations_are_the_inverse_dynamics_of_the_log():
     shown = recorded_demonstrations(braking_log(), SimSettings(), seed=0, drives=0)
-    assert len(shown) == 4 * 20 and shown["scene_index"].unique().tolist() == [0, 1, 2, 3]
-    assert torch.allclose(shown["action"], torch.tensor([-2.0, 0.0]).expand(80, 1, 2), atol=2e-3)
-    last = (shown["observation"][:, 1:3] * torch.tensor([4.0, 1.0])).view(4, 20, 2)  # as the observation reports it
-    assert torch.allclose(last[:, 1:], shown["action"].view(4, 20, 2)[:, :-1], atol=2e-3), "in order of time"
+    assert len(shown) == 4 * 20 and shown["scene_index"].unique().tolist() == [
+        0,
+        1,
+        2,
+        3,
+    ]
+    assert torch.allclose(
+        shown["action"], torch.tensor([-2.0, 0.0]).expand(80, 1, 2), atol=2e-3
+    )
+    last = (shown["observation"][:, 1:3] * torch.tensor([4.0, 1.0])).view(
+        4, 20, 2
+    )  # as the observation reports it
+    assert torch.allclose(
+        last[:, 1:], shown["action"].view(4, 20, 2)[:, :-1], atol=2e-3
+    ), "in order of time"
 
 
 def test_disturbed_demonstrations_lead_back(monkeypatch):
@@ -40,7 +61,11 @@ def test_disturbed_demonstrations_lead_back(monkeypatch):
     sideways = 3 * shown["observation"][:, 3]
     turned = shown["observation"][:, 4]
     off = (sideways.abs() > 0.1) & (sideways * turned > 0)
-    assert off.sum() > 20 and (shown["action"][off, 0, 1].sign() == -sideways[off].sign()).float().mean() > 0.9
+    assert (
+        off.sum() > 20
+        and (shown["action"][off, 0, 1].sign() == -sideways[off].sign()).float().mean()
+        > 0.9
+    )
 
 
 def test_clipping_keeps_actions_off_the_bounds():
@@ -57,6 +82,13 @@ def test_cloning_reduces_the_held_out_loss_and_takes_the_best_weights():
     training = Imitation(ego.network, shown, settings=settings())
     before = training.measure(training.held_out)
     best = training.fit("imitation", 8)
-    assert best["held_out_loss"] < before["loss"] - 0.3 and best["held_out_miss"] < before["miss"] / 2
-    assert best["held_out_loss"] == min(row["held_out_loss"] for row in training.history)
-    assert training.measure(training.held_out)["loss"] == pytest.approx(best["held_out_loss"], abs=1e-6)
+    assert (
+        best["held_out_loss"] < before["loss"] - 0.3
+        and best["held_out_miss"] < before["miss"] / 2
+    )
+    assert best["held_out_loss"] == min(
+        row["held_out_loss"] for row in training.history
+    )
+    assert training.measure(training.held_out)["loss"] == pytest.approx(
+        best["held_out_loss"], abs=1e-6
+    )

@@ -1,4 +1,5 @@
-"""Scalars and media land where they belong, in the known groups, and go on after a resume."""
+"""Scalars and media land where they belong, in the known groups, and go on after a
+resume."""
 
 import json
 import math
@@ -36,16 +37,26 @@ def test_what_a_resumed_run_logs_again_is_not_doubled(tmp_path):
 
 
 def test_wandb_has_scalars_and_media_of_a_step_in_one_row(tmp_path, monkeypatch):
-    """Two rounds, each with pictures after its scalars, read back from the file of the offline run."""
+    """Two rounds, each with pictures after its scalars, read back from the file of the
+    offline run."""
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_SILENT", "true")
     picture = tmp_path / "choices.png"
     video = tmp_path / "attack.gif"
     Image.new("RGB", (8, 8)).save(picture)
-    Image.new("RGB", (8, 8)).save(video, save_all=True, append_images=[Image.new("RGB", (8, 8), "red")])
+    Image.new("RGB", (8, 8)).save(
+        video, save_all=True, append_images=[Image.new("RGB", (8, 8), "red")]
+    )
     logger = RunLogger("wandb", tmp_path)
     for number in range(2):
-        logger.log({"train/return": 1.5 + number, "time/improve": 2.0, "train/unknown": math.nan}, number)
+        logger.log(
+            {
+                "train/return": 1.5 + number,
+                "time/improve": 2.0,
+                "train/unknown": math.nan,
+            },
+            number,
+        )
         logger.show("curriculum/choices", picture, number)
         logger.show("synthesizer/video_1", video, number)
     logger.close()
@@ -54,13 +65,18 @@ def test_wandb_has_scalars_and_media_of_a_step_in_one_row(tmp_path, monkeypatch)
     assert [row["_step"] for row in rows] == [0, 1]
     assert [row["train/return"] for row in rows] == [1.5, 2.5]
     assert all("train/unknown" not in row for row in rows)
-    media = [row[f"{name}/path"] for row in rows for name in ("curriculum/choices", "synthesizer/video_1")]
+    media = [
+        row[f"{name}/path"]
+        for row in rows
+        for name in ("curriculum/choices", "synthesizer/video_1")
+    ]
     assert len(set(media)) == 4
     assert all((file.parent / "files" / path).is_file() for path in media)
 
 
 def history(file):
-    """The rows {name: value} of an offline run. Its file is a log of LevelDB, whose records are messages of wandb's."""
+    """The rows {name: value} of an offline run. Its file is a log of LevelDB, whose
+    records are messages of wandb's."""
     from wandb.proto.wandb_internal_pb2 import Record
 
     rows = []
@@ -68,13 +84,19 @@ def history(file):
         record = Record.FromString(content)
         if record.WhichOneof("record_type") == "history":
             items = record.history.item
-            rows.append({"/".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items})
+            rows.append(
+                {
+                    "/".join(item.nested_key) or item.key: json.loads(item.value_json)
+                    for item in items
+                }
+            )
     return rows
 
 
 def leveldb_records(content):
-    """Records of a LevelDB log: fragments of crc, length and kind (1 whole, 2 first, 3 middle, 4 last), none of which
-    crosses a block. The first block has a header of WANDB_HEADER bytes."""
+    """Records of a LevelDB log: fragments of crc, length and kind (1 whole, 2 first, 3
+    middle, 4 last), none of which crosses a block. The first block has a header of
+    WANDB_HEADER bytes."""
     at = 0
     record = b""
     while at + FRAGMENT.size <= len(content):

@@ -1,4 +1,5 @@
-"""The memory of D': bounded, the oldest leave first, mapped from plain arrays, and drawn less than what is fresh."""
+"""The memory of D': bounded, the oldest leave first, mapped from plain arrays, and
+drawn less than what is fresh."""
 
 import pytest
 import torch
@@ -13,7 +14,11 @@ def traffic(number, rows=4, eta=2.0, template=FULL):
     index = torch.arange(rows)
     made = brake_check(small_scenes(rows))(None, index, eta, 0)
     made["states"] = made["states"] + number
-    return {**made, "eta": torch.full((rows,), eta), "template": torch.full((rows,), template)}
+    return {
+        **made,
+        "eta": torch.full((rows,), eta),
+        "template": torch.full((rows,), template),
+    }
 
 
 def filled(folder, bound, rounds=5):
@@ -24,10 +29,15 @@ def filled(folder, bound, rounds=5):
     return memory
 
 
-@pytest.mark.parametrize(("bound", "left"), [(0, [4]), (7, [4]), (8, [3, 4]), (11, [3, 4]), (100, [0, 1, 2, 3, 4])])
+@pytest.mark.parametrize(
+    ("bound", "left"),
+    [(0, [4]), (7, [4]), (8, [3, 4]), (11, [3, 4]), (100, [0, 1, 2, 3, 4])],
+)
 def test_the_oldest_rounds_leave_and_the_newest_stays(tmp_path, bound, left):
     memory = filled(tmp_path, bound)
-    assert [one.number for one in memory.rounds] == left and memory.rows == 4 * len(left)
+    assert [one.number for one in memory.rounds] == left and memory.rows == 4 * len(
+        left
+    )
     assert len(list(memory.folder.iterdir())) == 5, "a checkpoint may still name them"
     memory.prune(left[0])
     assert sorted(memory.folder.iterdir()) == [memory.path(number) for number in left]
@@ -44,7 +54,8 @@ def test_the_pool_holds_every_round_the_newest_first_and_heavier(tmp_path):
 
 
 def test_evasions_make_the_round_trip(tmp_path):
-    """Through make_traffic, the file and the pool; rows that are left out and nominal ones have none."""
+    """Through make_traffic, the file and the pool; rows that are left out and nominal
+    ones have none."""
     scenes = small_scenes(4)
     index = torch.arange(4)
     actions = torch.arange(4 * 20 * 2).reshape(4, 20, 2).float()
@@ -52,13 +63,25 @@ def test_evasions_make_the_round_trip(tmp_path):
     solved = Solved(torch.tensor([True, True, False, True]), actions, span=span)
     memory = Memory(tmp_path, 100)
     for number in range(2):
-        order = Order(number, index, eta=torch.full((4,), 2.0), template=torch.full((4,), FULL), seed=0, ego=None)
-        memory.write(number, *make_traffic(order, brake_check(scenes), solvable=lambda traffic: solved))
+        order = Order(
+            number,
+            index,
+            eta=torch.full((4,), 2.0),
+            template=torch.full((4,), FULL),
+            seed=0,
+            ego=None,
+        )
+        memory.write(
+            number,
+            *make_traffic(order, brake_check(scenes), solvable=lambda traffic: solved),
+        )
         memory.take(number)
     memory.restore(memory.index())
     pool = memory.pool(3.0)
     for number, first in ((0, 0), (1, 7)):
         rows, found, acts = pool.evaded(number)
-        assert rows.tolist() == [first, first + 2] and pool.scene_index[rows].tolist() == [0, 3]
+        assert rows.tolist() == [first, first + 2] and pool.scene_index[
+            rows
+        ].tolist() == [0, 3]
         assert torch.equal(found, actions[[0, 3]]) and torch.equal(acts, span[[0, 3]])
     assert not pool.parts[0].evasion[3:].any() and len(pool) == 14

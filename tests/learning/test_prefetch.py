@@ -1,4 +1,5 @@
-"""The next round made beside learning: the same D' as here, whenever it is ready; a death has one message."""
+"""The next round made beside learning: the same D' as here, whenever it is ready; a
+death has one message."""
 
 import os
 import signal
@@ -22,9 +23,12 @@ def real(run, scenes):
 
 
 def test_the_traffic_is_that_of_the_same_order_here():
-    """Made against the policy before learning, whatever the policy has become meanwhile."""
+    """Made against the policy before learning, whatever the policy has become
+    meanwhile."""
     scenes = small_scenes()
-    run = real(small_run(scenes=scenes, nominal="prior", spread=0.5, prefetch=True), scenes)
+    run = real(
+        small_run(scenes=scenes, nominal="prior", spread=0.5, prefetch=True), scenes
+    )
     train_round(run)
     order = run._next
     kept = {name: value.clone() for name, value in order.ego.network.weights().items()}
@@ -33,10 +37,18 @@ def test_the_traffic_is_that_of_the_same_order_here():
     expected, _ = make_traffic(order, run.synthesize)
     metrics = train_round(run)
     found = run.memory.rounds[-1].traffic
-    assert set(found) == set(expected) and order.number == run.memory.rounds[-1].number == 1
+    assert (
+        set(found) == set(expected)
+        and order.number == run.memory.rounds[-1].number == 1
+    )
     assert all(torch.equal(found[name], expected[name]) for name in expected)
-    assert metrics["time/waiting"] >= 0 and metrics["synthesizer/eta"] == pytest.approx(order.eta.mean().item())
-    assert all(torch.equal(value, order.ego.network.weights()[name]) for name, value in kept.items())
+    assert metrics["time/waiting"] >= 0 and metrics["synthesizer/eta"] == pytest.approx(
+        order.eta.mean().item()
+    )
+    assert all(
+        torch.equal(value, order.ego.network.weights()[name])
+        for name, value in kept.items()
+    )
     against_now = run.synthesize(run.ego, order.scenes, order.eta, order.seed)["states"]
     assert not torch.equal(against_now, found["states"][: len(order.scenes)])
 
@@ -48,7 +60,9 @@ def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tm
     run = begun()
     attack = brake_check(small_scenes())
     run.synthesize = lambda ego, index, eta, seed: (
-        os.kill(os.getpid(), signal.SIGKILL) if seed == 1 else attack(ego, index, eta, seed)
+        os.kill(os.getpid(), signal.SIGKILL)
+        if seed == 1
+        else attack(ego, index, eta, seed)
     )
     train_round(run)
     save_checkpoint(tmp_path, run)

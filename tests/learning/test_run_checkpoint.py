@@ -1,4 +1,5 @@
-"""r rounds and r more after a resume are 2r rounds, bit for bit; nothing half-written, nothing misread."""
+"""r rounds and r more after a resume are 2r rounds, bit for bit; nothing half-written,
+nothing misread."""
 
 import pytest
 import torch
@@ -22,7 +23,13 @@ KINDS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_resumed_rounds_are_those_of_one_run(tmp_path, kind):
-    settings = {"spread": 0.5, "memory": 8, "collect": {"hold": 2}, "final_lr": 1.0, **KINDS[kind]}
+    settings = {
+        "spread": 0.5,
+        "memory": 8,
+        "collect": {"hold": 2},
+        "final_lr": 1.0,
+        **KINDS[kind],
+    }
     whole = small_run(seed=3, folder=tmp_path / "whole", **settings)
     expected = rounds(whole, 4)
     folder, shorter = tmp_path / "run", 2  # a run of two rounds, to which two are added
@@ -35,9 +42,13 @@ def test_resumed_rounds_are_those_of_one_run(tmp_path, kind):
     assert begun + rounds(second, 2) == expected
     for key, value in whole.ego.network.weights().items():
         assert torch.equal(value, second.ego.network.weights()[key]), key
-    assert whole.memory.index() == second.memory.index() and len(whole.memory.rounds) == (0 if kind == "live" else 2)
+    assert whole.memory.index() == second.memory.index() and len(
+        whole.memory.rounds
+    ) == (0 if kind == "live" else 2)
     for one, other in zip(whole.memory.rounds, second.memory.rounds, strict=True):
-        assert all(torch.equal(value, other.traffic[key]) for key, value in one.traffic.items())
+        assert all(
+            torch.equal(value, other.traffic[key]) for key, value in one.traffic.items()
+        )
 
 
 def test_the_memory_keeps_what_the_newest_checkpoints_name(tmp_path):
@@ -45,8 +56,13 @@ def test_the_memory_keeps_what_the_newest_checkpoints_name(tmp_path):
     for _ in range(4):
         rounds(run, 1)
         save_checkpoint(tmp_path, run, keep_last=2)
-    assert [path.name for path in sorted((tmp_path / "checkpoints").iterdir())] == ["round-000003", "round-000004"]
-    assert sorted((tmp_path / "memory").iterdir()) == [run.memory.path(k) for k in (1, 2, 3)], "two rounds of each"
+    assert [path.name for path in sorted((tmp_path / "checkpoints").iterdir())] == [
+        "round-000003",
+        "round-000004",
+    ]
+    assert sorted((tmp_path / "memory").iterdir()) == [
+        run.memory.path(k) for k in (1, 2, 3)
+    ], "two rounds of each"
 
 
 def test_what_is_missing_or_damaged_in_the_memory_is_named(tmp_path):
@@ -70,9 +86,15 @@ def test_what_does_not_fit_is_refused_and_named(tmp_path):
     run = small_run(folder=tmp_path)
     rounds(run, 1)
     folder = save_checkpoint(tmp_path, run)
-    with pytest.raises(InputError, match=r"actor\.safetensors: an actor of another architecture: hidden"):
+    with pytest.raises(
+        InputError,
+        match=r"actor\.safetensors: an actor of another architecture: hidden",
+    ):
         load_checkpoint(tmp_path, small_run(hidden=(8,), folder=tmp_path))
-    for content, what in ((b"half of it", r"state\.pt: damaged"), ({"format": "e2rl-checkpoint/3"}, "another version")):
+    for content, what in (
+        (b"half of it", r"state\.pt: damaged"),
+        ({"format": "e2rl-checkpoint/3"}, "another version"),
+    ):
         torch.save(content, folder / "state.pt")
         seal(folder)
         with pytest.raises(InputError, match=what):
@@ -80,9 +102,17 @@ def test_what_does_not_fit_is_refused_and_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("file", "how"), [("state.pt", "flipped"), ("actor.safetensors", "torn"), ("state.pt", "missing"), (SEAL, "torn")]
+    ("file", "how"),
+    [
+        ("state.pt", "flipped"),
+        ("actor.safetensors", "torn"),
+        ("state.pt", "missing"),
+        (SEAL, "torn"),
+    ],
 )
-def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(tmp_path, capsys, file, how):
+def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(
+    tmp_path, capsys, file, how
+):
     run = small_run(folder=tmp_path)
     for _ in range(2):
         rounds(run, 1)
@@ -101,9 +131,15 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(tmp_path, cap
     saved = ActorEgo(hidden=(16,), checkpoint=str(older)).network.weights()
     found = ActorEgo(hidden=(16,), checkpoint=str(tmp_path)).network.weights()
     assert all(torch.equal(value, saved[key]) for key, value in found.items())
-    assert all(torch.equal(value, saved[key]) for key, value in other.ego.network.weights().items())
+    assert all(
+        torch.equal(value, saved[key])
+        for key, value in other.ego.network.weights().items()
+    )
     for left in older.iterdir():
         left.write_bytes(b"")
-    for load in (lambda: load_checkpoint(tmp_path, other), lambda: ActorEgo(hidden=(16,), checkpoint=str(tmp_path))):
+    for load in (
+        lambda: load_checkpoint(tmp_path, other),
+        lambda: ActorEgo(hidden=(16,), checkpoint=str(tmp_path)),
+    ):
         with pytest.raises(InputError, match="damaged"):
             load()

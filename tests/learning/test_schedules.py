@@ -3,7 +3,11 @@
 import pytest
 import torch
 
-from e2rl.learning.schedules import AdaptiveCurriculum, ConstantCurriculum, LinearCurriculum
+from e2rl.learning.schedules import (
+    AdaptiveCurriculum,
+    ConstantCurriculum,
+    LinearCurriculum,
+)
 from e2rl.run.errors import InputError
 from e2rl.traffic.traffic import FULL
 
@@ -11,7 +15,9 @@ SCENES = torch.zeros(4000, dtype=torch.int64)
 
 
 def test_linear_values_rise_to_the_final_ones_and_stay():
-    curriculum = LinearCurriculum(6, 10, eta=0.5, eta_final=2.5, ramp=0.5, fraction=0.0, fraction_final=0.9)
+    curriculum = LinearCurriculum(
+        6, 10, eta=0.5, eta_final=2.5, ramp=0.5, fraction=0.0, fraction_final=0.9
+    )
     etas = []
     fractions = []
     for _ in range(10):
@@ -22,23 +28,42 @@ def test_linear_values_rise_to_the_final_ones_and_stay():
 
 
 def test_adaptive_intensity_seeks_the_band_within_its_bounds():
-    band = {"eta_step": 0.5, "eta_min": 0.5, "eta_max": 2.0, "target_low": 0.2, "target_high": 0.4}
+    band = {
+        "eta_step": 0.5,
+        "eta_min": 0.5,
+        "eta_max": 2.0,
+        "target_low": 0.2,
+        "target_high": 0.4,
+    }
     curriculum = AdaptiveCurriculum(6, 10, eta=1.0, **band)
     seen = []
     for rate in (0.0, 0.2, 0.4, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9, 0.9):
         curriculum.advance(rate)
         seen.append(curriculum.eta)
-    assert seen == [1.5, 1.5, 1.5, 2.0, 2.0, 1.5, 1.0, 0.5, 0.5, 0.5], "the band's ends belong to it"
+    assert seen == [1.5, 1.5, 1.5, 2.0, 2.0, 1.5, 1.0, 0.5, 0.5, 0.5], (
+        "the band's ends belong to it"
+    )
     curriculum.advance()
-    assert curriculum.eta == 0.5 and curriculum.round == 11, "no collision rate is known: it stays"
+    assert curriculum.eta == 0.5 and curriculum.round == 11, (
+        "no collision rate is known: it stays"
+    )
 
 
 @pytest.mark.parametrize(
     ("eta", "spread", "low", "high"),
-    [(2.0, 1.0, 1.0, 3.0), (0.5, 1.0, 0.25, 1.5), (4.5, 1.0, 3.5, 5.0), (1.0, 0.0, 1.0, 1.0)],
+    [
+        (2.0, 1.0, 1.0, 3.0),
+        (0.5, 1.0, 0.25, 1.5),
+        (4.5, 1.0, 3.5, 5.0),
+        (1.0, 0.0, 1.0, 1.0),
+    ],
 )
-def test_scenes_have_intensities_uniform_around_the_round_s_cut_at_the_bounds(eta, spread, low, high):
-    etas = AdaptiveCurriculum(6, 10, eta=eta, spread=spread, eta_min=0.25, eta_max=5.0).etas(SCENES)
+def test_scenes_have_intensities_uniform_around_the_round_s_cut_at_the_bounds(
+    eta, spread, low, high
+):
+    etas = AdaptiveCurriculum(
+        6, 10, eta=eta, spread=spread, eta_min=0.25, eta_max=5.0
+    ).etas(SCENES)
     assert etas.min() >= low and etas.max() <= high
     assert etas.mean().item() == pytest.approx((low + high) / 2, abs=0.05)
     assert etas.std().item() == pytest.approx((high - low) / 12**0.5, abs=0.05)
@@ -59,12 +84,19 @@ def test_constant_intensities_take_turns():
     assert curriculum.eta == 2.0 and curriculum.fraction == 0.3
 
 
-@pytest.mark.parametrize("kind", [AdaptiveCurriculum, LinearCurriculum, ConstantCurriculum])
-def test_the_template_is_full_and_intensities_are_counted_under_multiples_of_a_half(kind):
+@pytest.mark.parametrize(
+    "kind", [AdaptiveCurriculum, LinearCurriculum, ConstantCurriculum]
+)
+def test_the_template_is_full_and_intensities_are_counted_under_multiples_of_a_half(
+    kind,
+):
     one = kind(6, 10)
     other = kind(6, 10)
     etas, templates = one.choices(torch.arange(6))
-    assert torch.equal(etas, other.etas(torch.arange(6))) and templates.tolist() == [FULL] * 6
+    assert (
+        torch.equal(etas, other.etas(torch.arange(6)))
+        and templates.tolist() == [FULL] * 6
+    )
     assert one.templates == ("full",) and one.values() == {}
     assert one.level(torch.tensor([0.6, 1.2, 3.0])).tolist() == [0.5, 1.0, 3.0]
 

@@ -1,4 +1,5 @@
-"""Concrete cut-ins on a straight road, all of a batch at once: does a driver survive them (docs/verdicts.md)."""
+"""Concrete cut-ins on a straight road, all of a batch at once: does a driver survive
+them (docs/verdicts.md)."""
 
 from typing import NamedTuple
 
@@ -15,7 +16,8 @@ DURATION = 40.0  # s after the lateral speed has been reached
 
 
 class CutIn(NamedTuple):
-    """Concrete cut-ins, each field [B]; gap and the lateral gap of 1.6 m hold when the lateral speed is reached."""
+    """Concrete cut-ins, each field [B]; gap and the lateral gap of 1.6 m hold when the
+    lateral speed is reached."""
 
     speed: Tensor  # m/s, the ego's
     other_speed: Tensor  # m/s
@@ -24,13 +26,20 @@ class CutIn(NamedTuple):
 
 
 def lateral_motion(cut_in: CutIn) -> tuple[Tensor, Tensor, int]:
-    """(lateral speed, gap between the sides) of the other, each [T, B], and the step at which the gap is 1.6 m.
+    """(lateral speed, gap between the sides) of the other, each [T, B], and the step at
+    which the gap is 1.6 m.
 
-    Explicit Euler steps: the speed grows by 1.5 m/s^2, then is constant until the other is centred before the ego.
+    Explicit Euler steps: the speed grows by 1.5 m/s^2, then is constant until the other
+    is centred before the ego.
     """
     target = cut_in.lateral_speed
     start = -int((target.max() / (LATERAL_ACCELERATION * DT)).ceil())
-    time = torch.arange(start, round(DURATION / DT), dtype=target.dtype, device=target.device)[:, None] * DT
+    time = (
+        torch.arange(
+            start, round(DURATION / DT), dtype=target.dtype, device=target.device
+        )[:, None]
+        * DT
+    )
     speed = torch.minimum((target + LATERAL_ACCELERATION * time).clamp(min=0), target)
     way = (speed * DT).cumsum(0) - speed * DT
     gap = LATERAL_GAP + way[-start] - way
@@ -39,9 +48,11 @@ def lateral_motion(cut_in: CutIn) -> tuple[Tensor, Tensor, int]:
 
 
 def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
-    """Whether [B] it crashes with the driver in the ego. Both speeds are constant but for it.
+    """Whether [B] it crashes with the driver in the ego. Both speeds are constant but
+    for it.
 
-    Semi-implicit Euler steps of DT along the road: v' = max(v + a DT, 0), x' = x + v' DT.
+    Semi-implicit Euler steps of DT along the road: v' = max(v + a DT, 0), x' = x + v'
+    DT.
     """
     lateral_speed, lateral_gap, start = lateral_motion(cut_in)
     speed = cut_in.speed
@@ -54,7 +65,17 @@ def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
     for lateral, side in zip(lateral_speed, lateral_gap, strict=True):
         overlaps = side <= 0
         crash |= overlaps & (gap <= 0) & (gap >= -2 * LENGTH)
-        seen = Observation(speed, acceleration, gap=gap, other_speed=other, lateral_gap=side, lateral_speed=lateral, overlaps=overlaps, length=length, other_length=length)
+        seen = Observation(
+            speed,
+            acceleration,
+            gap=gap,
+            other_speed=other,
+            lateral_gap=side,
+            lateral_speed=lateral,
+            overlaps=overlaps,
+            length=length,
+            other_length=length,
+        )
         state, wanted = driver.step(state, seen)
         after = (speed + wanted * DT).clamp(min=0)
         acceleration = (after - speed) / DT

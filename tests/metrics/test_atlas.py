@@ -1,4 +1,5 @@
-"""The atlas: only preventable failures, the least nats of each cell, whatever the order of the rows."""
+"""The atlas: only preventable failures, the least nats of each cell, whatever the order
+of the rows."""
 
 import math
 import random
@@ -13,11 +14,14 @@ DUTIES = ("none", "wrong way")
 
 def found(scene="a", seed=0, **changes):
     """A preventable failure of one and the same cell."""
-    return failure(CROSSING | {"duty": "none", "cfr_preventable": 1.0}, scene, seed=seed, **changes)
+    return failure(
+        CROSSING | {"duty": "none", "cfr_preventable": 1.0}, scene, seed=seed, **changes
+    )
 
 
 def many(number=300):
-    """Failures of all kinds, a third of them not preventable; some have equal or unknown nats and realism."""
+    """Failures of all kinds, a third of them not preventable; some have equal or
+    unknown nats and realism."""
     draw = random.Random(1)
     rows = crowd(number)
     for seed, row in enumerate(rows):
@@ -48,12 +52,18 @@ def test_a_cell_keeps_its_failure_with_the_least_nats_and_counts_all():
     nats = {}
     for row in rows:
         if (cell := cell_of(row)) is not None:
-            nats.setdefault(cell, []).append((math.inf if math.isnan(row["transport"]) else row["transport"], row))
+            nats.setdefault(cell, []).append(
+                (math.inf if math.isnan(row["transport"]) else row["transport"], row)
+            )
     assert set(atlas) == set(nats) and len(atlas) > 20
     for cell, failures in atlas.items():
         least = min(value for value, _ in nats[cell])
-        assert cell_of(failures[0]) == cell and (failures[0]["transport"] == least or least == math.inf)
-        assert len(failures) == len(nats[cell]) and all(row in failures for _, row in nats[cell])
+        assert cell_of(failures[0]) == cell and (
+            failures[0]["transport"] == least or least == math.inf
+        )
+        assert len(failures) == len(nats[cell]) and all(
+            row in failures for _, row in nats[cell]
+        )
     order = [by_likelihood(failures[0]) for failures in atlas.values()]
     assert order == sorted(order)  # the cells, too, by likelihood
 
@@ -83,12 +93,21 @@ def test_ties_go_to_the_realism_then_to_scene_and_seed():
 
 
 @pytest.mark.parametrize(
-    ("speed", "band"), [(0.0, "0 to 5 m/s"), (4.99, "0 to 5 m/s"), (5.0, "5 to 10 m/s"), (31.0, "30 to 35 m/s")]
+    ("speed", "band"),
+    [
+        (0.0, "0 to 5 m/s"),
+        (4.99, "0 to 5 m/s"),
+        (5.0, "5 to 10 m/s"),
+        (31.0, "30 to 35 m/s"),
+    ],
 )
 def test_a_cell_is_five_words(speed, band):
     cell = cell_of(found(ego=speed))
     assert dict(zip(CELL, cell, strict=True)) == {
-        **{name: CROSSING[name] for name in ("approach", "partner_manoeuvre", "contact_type")},
+        **{
+            name: CROSSING[name]
+            for name in ("approach", "partner_manoeuvre", "contact_type")
+        },
         "duty": "none",
         "speed_band": band,
     }
@@ -97,4 +116,9 @@ def test_a_cell_is_five_words(speed, band):
 
 
 def test_what_a_row_does_not_know_is_empty():
-    assert cell_of(found(ego=math.nan, duty="")) == (*cell_of(found())[:2], "", "", "side")
+    assert cell_of(found(ego=math.nan, duty="")) == (
+        *cell_of(found())[:2],
+        "",
+        "",
+        "side",
+    )

@@ -1,4 +1,5 @@
-"""A metric that is registered from outside appears in rows, files and tables, and nothing else changes."""
+"""A metric that is registered from outside appears in rows, files and tables, and
+nothing else changes."""
 
 import pytest
 import torch
@@ -13,16 +14,30 @@ from tests.metrics.random_rollouts import random_rollouts
 
 
 def fast_traffic(batch):
-    """The share of vehicle-steps until the ego's contact above 10 m/s, and the steps it rests on."""
+    """The share of vehicle-steps until the ego's contact above 10 m/s, and the steps it
+    rests on."""
     steps = torch.arange(batch["states"].shape[1])
-    counted = batch["valid"] & batch["traffic"][:, None] & (steps <= batch["stop"][:, None])[..., None]
+    counted = (
+        batch["valid"]
+        & batch["traffic"][:, None]
+        & (steps <= batch["stop"][:, None])[..., None]
+    )
     number = counted.sum((1, 2))
-    return {"fast": ((batch["states"][..., 3] > 10) & counted).sum((1, 2)) / number, "fast_steps": number}
+    return {
+        "fast": ((batch["states"][..., 3] > 10) & counted).sum((1, 2)) / number,
+        "fast_steps": number,
+    }
 
 
 @pytest.fixture
 def fast():
-    metric = Metric("fast", "vehicle-steps above 10 m/s", fraction=True, weight="fast_steps", tables="main speeds")
+    metric = Metric(
+        "fast",
+        "vehicle-steps above 10 m/s",
+        fraction=True,
+        weight="fast_steps",
+        tables="main speeds",
+    )
     register(metric, fast_traffic)
     yield metric
     unregister("fast")
@@ -33,12 +48,31 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
     rows, samples = score_rollouts(rollouts)
     assert all(0 < row["fast"] < 1 and row["fast_steps"] > 0 for row in rows)
     values, weights = metric_table(rows, [fast])
-    assert torch.equal(values / weights, torch.tensor([[row["fast"]] for row in rows], dtype=torch.float64))
-    expected = sum(row["fast"] * row["fast_steps"] for row in rows) / sum(row["fast_steps"] for row in rows)
-    assert summarise(rows, samples, draws=20, realism_draws=2)["fast"]["mean"] == pytest.approx(expected)
-    assert paired_differences(rows, samples, other_rows=rows, other_samples=samples, draws=20, realism_draws=2)["fast"]["difference"] == 0
+    assert torch.equal(
+        values / weights,
+        torch.tensor([[row["fast"]] for row in rows], dtype=torch.float64),
+    )
+    expected = sum(row["fast"] * row["fast_steps"] for row in rows) / sum(
+        row["fast_steps"] for row in rows
+    )
+    assert summarise(rows, samples, draws=20, realism_draws=2)["fast"][
+        "mean"
+    ] == pytest.approx(expected)
+    assert (
+        paired_differences(
+            rows,
+            samples,
+            other_rows=rows,
+            other_samples=samples,
+            draws=20,
+            realism_draws=2,
+        )["fast"]["difference"]
+        == 0
+    )
     write_rows(tmp_path / "rollouts.csv", rows)
-    assert read_rows(tmp_path / "rollouts.csv")[7]["fast"] == pytest.approx(rows[7]["fast"])
+    assert read_rows(tmp_path / "rollouts.csv")[7]["fast"] == pytest.approx(
+        rows[7]["fast"]
+    )
     summaries = metric_rows(rows, samples, draws=20, realism_draws=2)
     (row,) = metric_tables(summaries, table="speeds")[0].rows
     assert row[0] == "fast [%]" and row[1].startswith(f"{100 * expected:.1f} [")
@@ -47,12 +81,19 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
 
 
 def test_taken_names_and_wrong_shapes_are_refused():
-    for name in ("cfr", "seed", "partner", "motion_columns"):  # a metric, columns, the name of a built-in function
+    for name in (
+        "cfr",
+        "seed",
+        "partner",
+        "motion_columns",
+    ):  # a metric, columns, the name of a built-in function
         with pytest.raises(ValueError, match=f"metric {name}: .*taken"):
             register(Metric(name, ""), fast_traffic)
     register(Metric("wrong", ""), lambda batch: batch["valid"])
     try:
-        with pytest.raises(ValueError, match="wrong: a metric is one number per rollout"):
+        with pytest.raises(
+            ValueError, match="wrong: a metric is one number per rollout"
+        ):
             score_rollouts(random_rollouts(2))
     finally:
         unregister("wrong")

@@ -1,4 +1,5 @@
-"""Evasions found are real: DrivingEnv drives them without contact; where there is no way out none is found."""
+"""Evasions found are real: DrivingEnv drives them without contact; where there is no
+way out none is found."""
 
 import pytest
 import torch
@@ -12,9 +13,21 @@ from e2rl.sim.rollouts import Rollouts
 from tests.synthetic import make_scenes
 
 SIZES = {"max_vehicles": 8, "max_agents": 10, "num_routes": 2, "num_points": 150}
-BOXED = [(0, 0, 0.0), (-5, 0, 0.0), (5, 0, 0.0), (-5, 1, 0.0), (0, 1, 0.0), (5, 1, 0.0), (-30, 0, 12.0)]
+BOXED = [
+    (0, 0, 0.0),
+    (-5, 0, 0.0),
+    (5, 0, 0.0),
+    (-5, 1, 0.0),
+    (0, 1, 0.0),
+    (5, 1, 0.0),
+    (-30, 0, 12.0),
+]
 WALL = [(0, 0, 10.0), (40, 0, 0.0), (40, 1, 0.0)]  # both lanes are closed 40 m ahead
-CUT = [(0, 0, 10.0), (12, 0, 0.0), (-40, 1, 0.0)]  # 7.5 m of gap: nobody stops in it at 8 m/s^2 (6.3 m + clearance)
+CUT = [
+    (0, 0, 10.0),
+    (12, 0, 0.0),
+    (-40, 1, 0.0),
+]  # 7.5 m of gap: nobody stops in it at 8 m/s^2 (6.3 m + clearance)
 
 
 @pytest.fixture(autouse=True)
@@ -24,24 +37,38 @@ def quick(monkeypatch):
 
 
 def search(vehicles, moment=None, count=1, sim=None, width=2.0, **options):
-    scene_set = make_scenes(count, vehicles=vehicles, num_vrus=0, steps=60, **(SIZES | options))
+    scene_set = make_scenes(
+        count, vehicles=vehicles, num_vrus=0, steps=60, **(SIZES | options)
+    )
     scene = scene_set.scenes
     scene["size"][:, 1:, 1] = width
-    found = find_evasions(scene, scene["logged"], valid=scene["logged_valid"], sim=sim or SimSettings(), moment=moment)
+    found = find_evasions(
+        scene,
+        scene["logged"],
+        valid=scene["logged_valid"],
+        sim=sim or SimSettings(),
+        moment=moment,
+    )
     return found, scene_set
 
 
 def replay(scene_set, actions):
-    """(contact with anyone, off the road) [B] in DrivingEnv of actions [B, T, 2], and the final states [B, 4]."""
+    """(contact with anyone, off the road) [B] in DrivingEnv of actions [B, T, 2], and
+    the final states [B, 4]."""
     count = len(scene_set)
-    env = DrivingEnv(scene_set, SimSettings(end_on_contact=False, end_off_road=False), count)
+    env = DrivingEnv(
+        scene_set, SimSettings(end_on_contact=False, end_off_road=False), count
+    )
     td = env.reset(TensorDict({"scene_index": torch.arange(count)[:, None]}, [count]))
     touched = torch.zeros(count, dtype=torch.bool)
     for action in actions.unbind(1):
         td["action"] = action
         after = env.step(td)["next"]
         metrics = after["metrics"]
-        touched = touched | (metrics["contact"] | metrics["contact_vru"] | metrics["off_road"])[:, 0]
+        touched = (
+            touched
+            | (metrics["contact"] | metrics["contact_vru"] | metrics["off_road"])[:, 0]
+        )
         td = after.exclude("reward")
     return touched, env.world().states[:, 0]
 
@@ -59,29 +86,49 @@ def test_the_boxed_in_have_no_way_out_and_nothing_is_claimed():
     scene_set = make_scenes(1, vehicles=BOXED, num_vrus=0, steps=60, **SIZES)
     scene = scene_set.scenes
     scene["logged"][:, :, 1, 0] += torch.linspace(0, 6, 61)  # the one behind pushes
-    result = find_evasions(scene, scene["logged"], valid=scene["logged_valid"], sim=SimSettings())
+    result = find_evasions(
+        scene, scene["logged"], valid=scene["logged_valid"], sim=SimSettings()
+    )
     assert not result.found.any()
 
 
 def test_a_wall_is_a_matter_of_braking_distance():
-    far, _ = search(WALL, moment=torch.tensor([20]), width=3.4)  # 20 m on: 15.5 m of gap are left
+    far, _ = search(
+        WALL, moment=torch.tensor([20]), width=3.4
+    )  # 20 m on: 15.5 m of gap are left
     assert far.found.all()
-    weak, _ = search(WALL, moment=torch.tensor([20]), width=3.4, sim=SimSettings(max_braking=2.0))
-    assert not weak.found.any(), "2 m/s^2 stop it after 25 m, and there is no way around"
+    weak, _ = search(
+        WALL, moment=torch.tensor([20]), width=3.4, sim=SimSettings(max_braking=2.0)
+    )
+    assert not weak.found.any(), (
+        "2 m/s^2 stop it after 25 m, and there is no way around"
+    )
 
 
 def test_the_strategy_finds_what_the_grid_does_not(monkeypatch):
-    slalom = [(0, 0, 10.0), (25, 0, 0.0), (50, 1, 0.0), (-8, 0, 10.0), (-14, 1, 10.0)]  # pursued, two lane changes
+    slalom = [
+        (0, 0, 10.0),
+        (25, 0, 0.0),
+        (50, 1, 0.0),
+        (-8, 0, 10.0),
+        (-14, 1, 10.0),
+    ]  # pursued, two lane changes
     fine, scene_set = search(slalom)
     monkeypatch.setattr(evasion, "ROUNDS", 0)
     coarse, _ = search(slalom)
-    assert not coarse.found.any() and fine.found.all() and not replay(scene_set, fine.actions)[0].any()
+    assert (
+        not coarse.found.any()
+        and fine.found.all()
+        and not replay(scene_set, fine.actions)[0].any()
+    )
 
 
 def test_a_rollout_s_result_does_not_depend_on_the_batch():
     together, scene_set = search(CUT, count=3)
     scene = scene_set.scenes[2:]
-    alone = find_evasions(scene, scene["logged"], valid=scene["logged_valid"], sim=SimSettings())
+    alone = find_evasions(
+        scene, scene["logged"], valid=scene["logged_valid"], sim=SimSettings()
+    )
     torch.testing.assert_close(together.states[2], alone.states[0], atol=1e-4, rtol=0)
 
 
@@ -90,10 +137,22 @@ SLOW_AHEAD = [(0, 0, 12.0), (40, 0, 3.0), (-40, 1, 5.0)]
 
 def collided():
     """(scenes, rollouts) of two recordings in which the ego runs into a slow vehicle."""
-    scene_set = make_scenes(2, vehicles=SLOW_AHEAD, num_vrus=0, steps=60, max_vehicles=8, max_agents=10)
+    scene_set = make_scenes(
+        2, vehicles=SLOW_AHEAD, num_vrus=0, steps=60, max_vehicles=8, max_agents=10
+    )
     scene = scene_set.scenes
-    more = {"adversaries": scene["valid"] & False, "seed": torch.arange(2), "eta": torch.zeros(2).double()}
-    return scene, Rollouts.in_scenes(scene_set, torch.arange(2), states=scene["logged"], valid=scene["logged_valid"], **more)
+    more = {
+        "adversaries": scene["valid"] & False,
+        "seed": torch.arange(2),
+        "eta": torch.zeros(2).double(),
+    }
+    return scene, Rollouts.in_scenes(
+        scene_set,
+        torch.arange(2),
+        states=scene["logged"],
+        valid=scene["logged_valid"],
+        **more,
+    )
 
 
 def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_none():
@@ -105,9 +164,19 @@ def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_
     assert evasions.shape == (2, 61, 4) and evasions[1].isnan().all()
     torch.testing.assert_close(evasions[0, 0], scene["logged"][0, 0, 0])
     size = scene["size"][0]
-    gap = separation(evasions[0][:, None], size[:1], second=scene["logged"][0, :, 1:], second_size=size[1:])
+    gap = separation(
+        evasions[0][:, None],
+        size[:1],
+        second=scene["logged"][0, :, 1:],
+        second_size=size[1:],
+    )
     assert (gap[scene["logged_valid"][0, :, 1:]] > 0).all()
-    driven = separation(scene["logged"][0, :, :1], size[:1], second=scene["logged"][0, :, 1:2], second_size=size[1:2])
+    driven = separation(
+        scene["logged"][0, :, :1],
+        size[:1],
+        second=scene["logged"][0, :, 1:2],
+        second_size=size[1:2],
+    )
     assert (driven < 0).any(), "the ego as driven has the collision"
 
 
@@ -116,7 +185,10 @@ def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
     after = torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
     found = spliced(driven, after, moment=torch.tensor([0, 4, 10]))[..., 0]
     assert found[0].tolist() == list(range(1, 11))
-    assert found[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6] and found[2].tolist() == [0] * 10
+    assert (
+        found[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6]
+        and found[2].tolist() == [0] * 10
+    )
 
 
 def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkeypatch):
@@ -127,11 +199,18 @@ def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkey
         found = torch.tensor([moment is not None] * len(states))
         track = torch.full((len(states), 60, 4), 7.0)
         peak = torch.full((len(states),), 3.0)
-        return evasion.Evasions(found, track[..., :2], states=track, peak=peak, batch_size=[len(states)])
+        return evasion.Evasions(
+            found, track[..., :2], states=track, peak=peak, batch_size=[len(states)]
+        )
 
     monkeypatch.setattr(evasion, "find_evasions", late_only)
     rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 1, "contact_step": 4.0}]
     add_avoidable(rows, rollouts, scene=scene, sim=SimSettings())
     assert asked == [None, [30, 0]]
-    assert [(row["avoidable"], row["avoidable_1s"], row["evasion_accel"]) for row in rows] == [(1, 1, 3.0)] * 2
-    assert torch.equal(rollouts.evasion[0, :31], scene["logged"][0, :31, 0]) and (rollouts.evasion[0, 31:] == 7).all()
+    assert [
+        (row["avoidable"], row["avoidable_1s"], row["evasion_accel"]) for row in rows
+    ] == [(1, 1, 3.0)] * 2
+    assert (
+        torch.equal(rollouts.evasion[0, :31], scene["logged"][0, :31, 0])
+        and (rollouts.evasion[0, 31:] == 7).all()
+    )

@@ -6,7 +6,13 @@ import pytest
 import torch
 
 from e2rl.metrics.contact import first_contact
-from e2rl.metrics.failure_features import LATE, MANOEUVRES, WINDOW, last_seconds, manoeuvre
+from e2rl.metrics.failure_features import (
+    LATE,
+    MANOEUVRES,
+    WINDOW,
+    last_seconds,
+    manoeuvre,
+)
 from e2rl.metrics.score import as_doubles, score_rollouts
 from e2rl.sim.dynamics import rollout
 from tests.metrics.test_contact import course, row, scene
@@ -19,8 +25,12 @@ WORDS = ("approach", "ego_manoeuvre", "partner_manoeuvre")
 
 
 def drive(x, y, heading, speed, turn=lambda t: 0.0, accel=lambda t: 0.0, steps=80):
-    """A course [T+1, 4] of the simulator's unicycle under yaw rates [rad/s] and accelerations [m/s^2] of time."""
-    actions = torch.tensor([[accel(0.1 * step), turn(0.1 * step)] for step in range(steps)], dtype=torch.float64)
+    """A course [T+1, 4] of the simulator's unicycle under yaw rates [rad/s] and
+    accelerations [m/s^2] of time."""
+    actions = torch.tensor(
+        [[accel(0.1 * step), turn(0.1 * step)] for step in range(steps)],
+        dtype=torch.float64,
+    )
     start = torch.tensor([x, y, heading, speed], dtype=torch.float64)
     states = torch.cat([start[None], rollout(start[None], actions[None])[0]])
     return states, torch.ones(steps + 1, dtype=torch.bool)
@@ -33,17 +43,43 @@ def words(*courses):
 
 def swerve(sign, begin, seconds=1.0, rate=0.2):
     """Yaw rates of a lane change: out, then back."""
-    return lambda t: sign * rate * ((begin <= t < begin + seconds) - (begin + seconds <= t < begin + 2 * seconds))
+    return lambda t: (
+        sign
+        * rate
+        * (
+            (begin <= t < begin + seconds)
+            - (begin + seconds <= t < begin + 2 * seconds)
+        )
+    )
 
 
 EGO = course(0, 0, heading=EAST, speed=12)
 STRAIGHT = ("keeps speed", "keeps speed")
 CASES = [
     (EGO, course(30.5, 0, heading=EAST, speed=5), ("ahead", *STRAIGHT)),
-    (EGO, drive(20, 0, EAST, 12, accel=lambda t: -5.0 if t > 0.5 else 0.0), ("ahead", "keeps speed", "brakes")),
-    *((EGO, course(40, 0, heading=heading, speed=0), ("ahead", "keeps speed", "stands")) for heading in (EAST, NORTH, WEST, 2.0)),
-    (course(0, 0, heading=EAST, speed=10), course(43.0, -24, heading=NORTH, speed=6), ("crossing from the right", *STRAIGHT)),
-    (course(0, 0, heading=EAST, speed=10), course(43.0, 24, heading=SOUTH, speed=6), ("crossing from the left", *STRAIGHT)),
+    (
+        EGO,
+        drive(20, 0, EAST, 12, accel=lambda t: -5.0 if t > 0.5 else 0.0),
+        ("ahead", "keeps speed", "brakes"),
+    ),
+    *(
+        (
+            EGO,
+            course(40, 0, heading=heading, speed=0),
+            ("ahead", "keeps speed", "stands"),
+        )
+        for heading in (EAST, NORTH, WEST, 2.0)
+    ),
+    (
+        course(0, 0, heading=EAST, speed=10),
+        course(43.0, -24, heading=NORTH, speed=6),
+        ("crossing from the right", *STRAIGHT),
+    ),
+    (
+        course(0, 0, heading=EAST, speed=10),
+        course(43.0, 24, heading=SOUTH, speed=6),
+        ("crossing from the left", *STRAIGHT),
+    ),
     (  # a left turn across oncoming traffic, of the ego and of its partner
         drive(-10, 0, EAST, 6, turn=lambda t: 0.4 if 2 < t < 5 else 0.0),
         course(47, 5, heading=WEST, speed=9),
@@ -59,7 +95,11 @@ CASES = [
         course(-14, 0, heading=EAST, speed=10),
         ("from behind", "brakes", "keeps speed"),
     ),
-    (course(0, 0, heading=EAST, speed=0), course(-30, 0.5, heading=EAST, speed=15), ("from behind", "stands", "keeps speed")),
+    (
+        course(0, 0, heading=EAST, speed=0),
+        course(-30, 0.5, heading=EAST, speed=15),
+        ("from behind", "stands", "keeps speed"),
+    ),
 ]
 
 
@@ -68,19 +108,38 @@ def test_known_cases_have_their_words(ego, partner, expected):
     assert words(ego, partner) == expected
 
 
-@pytest.mark.parametrize(("side", "sign", "other"), [("left", 1, "right"), ("right", -1, "left")])
+@pytest.mark.parametrize(
+    ("side", "sign", "other"), [("left", 1, "right"), ("right", -1, "left")]
+)
 def test_who_comes_over_cuts_in_from_its_side_or_is_beside(side, sign, other):
     cuts_in = drive(18, 3.5 * sign, EAST, 9, turn=swerve(-sign, 1.5))
-    assert words(course(0, 0, heading=EAST, speed=13), cuts_in) == (f"cut-in from the {side}", "keeps speed", f"veers {other}")
+    assert words(course(0, 0, heading=EAST, speed=13), cuts_in) == (
+        f"cut-in from the {side}",
+        "keeps speed",
+        f"veers {other}",
+    )
     beside = drive(0, 3.5 * sign, EAST, 12, turn=swerve(-sign, 2.0))
-    assert words(EGO, beside) == (f"beside on the {side}", "keeps speed", f"veers {other}")
+    assert words(EGO, beside) == (
+        f"beside on the {side}",
+        "keeps speed",
+        f"veers {other}",
+    )
 
 
 def test_a_leader_in_a_sharp_bend_is_ahead_and_the_follower_is_behind():
-    """Both turn right by a quarter; two seconds before the contact they differ by more than 45 degrees."""
+    """Both turn right by a quarter; two seconds before the contact they differ by more
+    than 45 degrees."""
 
     def bend(speed, begin):
-        return drive(0, 0, EAST, speed, turn=lambda t: -speed / 10 if begin <= t * speed < begin + 5 * math.pi else 0.0)
+        return drive(
+            0,
+            0,
+            EAST,
+            speed,
+            turn=lambda t: (
+                -speed / 10 if begin <= t * speed < begin + 5 * math.pi else 0.0
+            ),
+        )
 
     slow = bend(5.0, 20)
     fast = bend(9.0, 20)
@@ -90,33 +149,58 @@ def test_a_leader_in_a_sharp_bend_is_ahead_and_the_follower_is_behind():
 
 
 def test_along_a_bend_of_the_lane_nobody_veers():
-    """A curve of radius 150 m: 20 m of it bend by less than a turn, and lie 1.3 m beside the first heading."""
+    """A curve of radius 150 m: 20 m of it bend by less than a turn, and lie 1.3 m
+    beside the first heading."""
     angle = torch.linspace(-0.5, 1.5, 200, dtype=torch.float64)
     lane = torch.stack([150 * angle.sin(), 150 * (1 - angle.cos())], -1)
     on_lane = drive(0, 0, EAST, 10, turn=lambda t: 10 / 150)
-    ahead = drive(150 * math.sin(0.2), 150 * (1 - math.cos(0.2)), 0.2, 4, turn=lambda t: 4 / 150)
-    given = scene(on_lane, ahead).replace(lane_points=lane[None], lane_index=torch.zeros(1, 200, dtype=torch.int64))
+    ahead = drive(
+        150 * math.sin(0.2), 150 * (1 - math.cos(0.2)), 0.2, 4, turn=lambda t: 4 / 150
+    )
+    given = scene(on_lane, ahead).replace(
+        lane_points=lane[None], lane_index=torch.zeros(1, 200, dtype=torch.int64)
+    )
     found = score_rollouts(given)[0][0]
     assert [found[name] for name in WORDS] == ["ahead", "keeps speed", "keeps speed"]
     straight = score_rollouts(scene(on_lane, ahead))[0][0]
-    assert straight["ego_manoeuvre"] == "veers left", "relative to a straight lane it does"
+    assert straight["ego_manoeuvre"] == "veers left", (
+        "relative to a straight lane it does"
+    )
 
 
 def test_contacts_soon_after_the_start_use_what_is_known():
-    batch = as_doubles(scene(course(0, 0, heading=EAST, speed=10), course(9, 0, heading=EAST, speed=0, appears=2)))
+    batch = as_doubles(
+        scene(
+            course(0, 0, heading=EAST, speed=10),
+            course(9, 0, heading=EAST, speed=0, appears=2),
+        )
+    )
     batch |= first_contact(batch)
     window, known, size = last_seconds(batch)
     assert window.shape == (1, WINDOW + 1, 2, 4) and size.shape == (1, 2, 2)
-    assert known.tolist() == [int(batch["before"]) - 2] and window[0, 0, 0, 0] == pytest.approx(2.0)
+    assert known.tolist() == [int(batch["before"]) - 2] and window[
+        0, 0, 0, 0
+    ] == pytest.approx(2.0)
     late = course(5.5, 0, heading=EAST, speed=5, appears=2)  # a step before the contact
-    assert words(course(0, 0, heading=EAST, speed=8), late)[1:] == ("keeps speed", "keeps speed")
-    assert words(course(0, 0, heading=EAST, speed=8), course(5.5, 0, heading=EAST, speed=5, appears=5))[1:] == ("", "")  # at its birth: none
+    assert words(course(0, 0, heading=EAST, speed=8), late)[1:] == (
+        "keeps speed",
+        "keeps speed",
+    )
+    assert words(
+        course(0, 0, heading=EAST, speed=8),
+        course(5.5, 0, heading=EAST, speed=5, appears=5),
+    )[1:] == ("", "")  # at its birth: none
 
 
 def test_speeds_just_above_and_below_the_thresholds():
     still = torch.zeros(1, WINDOW + 1, 1, 4, dtype=torch.float64)
     steps = torch.arange(WINDOW + 1, dtype=torch.float64)
-    for gain, word in ((1.2, "accelerates"), (0.8, "keeps speed"), (-0.8, "keeps speed"), (-1.2, "brakes")):
+    for gain, word in (
+        (1.2, "accelerates"),
+        (0.8, "keeps speed"),
+        (-0.8, "keeps speed"),
+        (-1.2, "brakes"),
+    ):
         window = still.clone()
         window[0, :, 0, 3] = 10 + gain * 0.1 * (steps - WINDOW + LATE).clamp(min=0)
         found = manoeuvre(window, torch.tensor([WINDOW]), lanes=window[..., 2])

@@ -1,4 +1,5 @@
-"""Failure modes: what belongs together, how it is named, and that the order of the failures does not matter."""
+"""Failure modes: what belongs together, how it is named, and that the order of the
+failures does not matter."""
 
 import random
 
@@ -14,9 +15,19 @@ from e2rl.metrics.failure_modes import (
     mode_name,
     split_side,
 )
-from e2rl.metrics.statistics import bootstrap_draws, metric_table, resampled_labels, row_metrics
+from e2rl.metrics.statistics import (
+    bootstrap_draws,
+    metric_table,
+    resampled_labels,
+    row_metrics,
+)
 
-REAR_END = {"approach": "ahead", "partner_manoeuvre": "brakes", "ego_manoeuvre": "keeps speed", "contact_type": "front"}
+REAR_END = {
+    "approach": "ahead",
+    "partner_manoeuvre": "brakes",
+    "ego_manoeuvre": "keeps speed",
+    "contact_type": "front",
+}
 CROSSING = {
     "approach": "crossing from the right",
     "partner_manoeuvre": "turns left",
@@ -26,18 +37,34 @@ CROSSING = {
 
 
 def failure(kind, scene="a", seed=0, ego=10.0, partner=5.0, **changes):
-    row = {"cfr": 1.0, "scene_id": scene, "seed": seed, "method": "e2", "eta": 2.0, "location": scene}
+    row = {
+        "cfr": 1.0,
+        "scene_id": scene,
+        "seed": seed,
+        "method": "e2",
+        "eta": 2.0,
+        "location": scene,
+    }
     return row | {"ego_speed": ego, "partner_speed": partner} | kind | changes
 
 
 def crowd(number, seed=0):
     """Failures of all kinds with random words and speeds."""
     draw = random.Random(seed)
-    approaches = ("ahead", "oncoming", "from behind", "crossing from the left", "crossing from the right")
+    approaches = (
+        "ahead",
+        "oncoming",
+        "from behind",
+        "crossing from the left",
+        "crossing from the right",
+    )
     moves = ("keeps speed", "brakes", "turns left", "veers right")
     return [
         failure(
-            {"approach": draw.choice(approaches), "contact_type": draw.choice(("front", "side"))},
+            {
+                "approach": draw.choice(approaches),
+                "contact_type": draw.choice(("front", "side")),
+            },
             scene=f"scene {index}",
             ego=draw.uniform(0, 20),
             partner=draw.uniform(0, 20),
@@ -57,18 +84,27 @@ def test_identical_failures_are_one_mode_and_other_approaches_another():
 
 
 def test_one_manoeuvre_or_a_few_metres_per_second_make_no_mode_of_their_own():
-    rows = [failure(CROSSING, scene=str(index), ego=8 + index, partner=4 + index) for index in range(6)]
-    rows += [failure(CROSSING, scene="other", ego_manoeuvre="brakes", contact_type="front")]
+    rows = [
+        failure(CROSSING, scene=str(index), ego=8 + index, partner=4 + index)
+        for index in range(6)
+    ]
+    rows += [
+        failure(CROSSING, scene="other", ego_manoeuvre="brakes", contact_type="front")
+    ]
     assert set(cluster_failures(rows)) == {1}
 
 
 def test_the_order_of_the_failures_does_not_matter():
     rows = crowd(60)
-    found = dict(zip((row["scene_id"] for row in rows), cluster_failures(rows), strict=True))
+    found = dict(
+        zip((row["scene_id"] for row in rows), cluster_failures(rows), strict=True)
+    )
     assert 4 < len(set(found.values())) < 30
     for seed in range(3):
         shuffled = random.Random(seed).sample(rows, len(rows))
-        assert [found[row["scene_id"]] for row in shuffled] == cluster_failures(shuffled)
+        assert [found[row["scene_id"]] for row in shuffled] == cluster_failures(
+            shuffled
+        )
 
 
 def test_distances_are_the_weights_of_what_differs():
@@ -94,42 +130,77 @@ def test_a_duty_splits_modes_where_it_is_known_and_plays_no_part_where_it_is_not
         row["duty"] = "none"
         row["ego_speed"] = 11.0
     assert cluster_failures(rows) == [1, 1, 1, 2, 2, 2]
-    assert mode_name(rows[:3]) == "crossing from the right, partner turns left, ego keeps speed: right of way"
+    assert (
+        mode_name(rows[:3])
+        == "crossing from the right, partner turns left, ego keeps speed: right of way"
+    )
     assert mode_name(rows[3:]).endswith(": no duty broken")
 
 
 def test_names_say_what_two_thirds_agree_on():
     assert mode_name([failure(REAR_END)]) == "ahead, partner brakes, ego keeps speed"
-    two_sides = [failure(CROSSING), failure(CROSSING, approach="crossing from the left")]
+    two_sides = [
+        failure(CROSSING),
+        failure(CROSSING, approach="crossing from the left"),
+    ]
     assert mode_name(two_sides) == "crossing, partner turns left, ego keeps speed"
-    mixed = [failure(CROSSING, ego_manoeuvre=move) for move in ("brakes", "stands", "turns left")]
+    mixed = [
+        failure(CROSSING, ego_manoeuvre=move)
+        for move in ("brakes", "stands", "turns left")
+    ]
     assert mode_name(mixed) == "crossing from the right, partner turns left"
-    assert mode_name([failure({"approach": word}) for word in ("ahead", "oncoming")]) == "various"
-    assert split_side("beside on the left") == ("beside", "left") and split_side("brakes") == ("brakes", "")
+    assert (
+        mode_name([failure({"approach": word}) for word in ("ahead", "oncoming")])
+        == "various"
+    )
+    assert split_side("beside on the left") == ("beside", "left") and split_side(
+        "brakes"
+    ) == ("brakes", "")
 
 
 def test_the_medoid_is_the_middle_one_of_the_members():
-    members = [failure(CROSSING, scene=str(index), ego=float(speed)) for index, speed in enumerate((3, 9, 10, 12, 40))]
+    members = [
+        failure(CROSSING, scene=str(index), ego=float(speed))
+        for index, speed in enumerate((3, 9, 10, 12, 40))
+    ]
     assert members[medoid(members)]["ego_speed"] == 10
     twins = [failure(CROSSING, scene=name) for name in "cab"]
-    assert twins[medoid(twins)]["scene_id"] == "a" == twins[::-1][medoid(twins[::-1])]["scene_id"]
+    assert (
+        twins[medoid(twins)]["scene_id"]
+        == "a"
+        == twins[::-1][medoid(twins[::-1])]["scene_id"]
+    )
 
 
 def test_small_modes_are_those_of_one_or_of_less_than_two_per_cent():
     assert large_modes([1, 1, 2]) == [1, 2], "of few failures each may be one"
     assert large_modes([1] * 8 + [2, 2, 3]) == [1, 2]
-    assert large_modes([1] * 200 + [2, 2, 2] + [3] * 5) == [1, 3] and large_modes([]) == []
+    assert (
+        large_modes([1] * 200 + [2, 2, 2] + [3] * 5) == [1, 3] and large_modes([]) == []
+    )
 
 
 def expected_labels(labels, places, count):
-    """The mean number of different labels, over all ways to pick places and one rollout at each."""
+    """The mean number of different labels, over all ways to pick places and one rollout
+    at each."""
     names = sorted(set(places))
     total = []
     for seed in range(4000):
         draw = random.Random(seed)
         chosen = draw.sample(names, count)
         total.append(
-            len({draw.choice([x for x, place in zip(labels, places, strict=True) if place == one]) for one in chosen})
+            len(
+                {
+                    draw.choice(
+                        [
+                            x
+                            for x, place in zip(labels, places, strict=True)
+                            if place == one
+                        ]
+                    )
+                    for one in chosen
+                }
+            )
         )
     return sum(total) / len(total)
 
@@ -140,10 +211,22 @@ def test_coverage_is_the_expected_number_of_modes_at_so_many_places():
     given = torch.tensor(labels, dtype=torch.float64), torch.tensor(places)
     for count in (1, 2, 4, 6):
         found = resampled_labels(*given, bootstrap_draws(6, 3), count)
-        assert found[0].item() == pytest.approx(expected_labels(labels, places, count=count), abs=0.05)
-    assert resampled_labels(*given, bootstrap_draws(6, 3), 7).isnan().all(), "there are only six places"
-    rows = [failure(CROSSING, scene=str(index), mode=3) | {"counted": float(index % 3 == 0)} for index in range(36)]
+        assert found[0].item() == pytest.approx(
+            expected_labels(labels, places, count=count), abs=0.05
+        )
+    assert resampled_labels(*given, bootstrap_draws(6, 3), 7).isnan().all(), (
+        "there are only six places"
+    )
+    rows = [
+        failure(CROSSING, scene=str(index), mode=3) | {"counted": float(index % 3 == 0)}
+        for index in range(36)
+    ]
     coverage = [metric for metric in row_metrics() if metric.places]
     totals, weights = metric_table(rows, coverage)
-    assert [metric.name for metric in coverage] == ["mode_coverage", "mode_coverage_counted"]
-    assert weights.sum(0).tolist() == [36, 12] and set((totals / weights)[0].tolist()) == {3.0}
+    assert [metric.name for metric in coverage] == [
+        "mode_coverage",
+        "mode_coverage_counted",
+    ]
+    assert weights.sum(0).tolist() == [36, 12] and set(
+        (totals / weights)[0].tolist()
+    ) == {3.0}

@@ -6,15 +6,24 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.metrics.geometry import edge_distances, edge_parts_inside, overlap_area, pair_overlap
+from e2rl.metrics.geometry import (
+    edge_distances,
+    edge_parts_inside,
+    overlap_area,
+    pair_overlap,
+)
 from e2rl.scenes.boxes import corners
 
 shapely = pytest.importorskip("shapely")
 
 
 def random_boxes(count, seed, spread=4.0):
-    draw = torch.rand(count, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    state = torch.stack([draw[:, 0] * spread, draw[:, 1] * spread, draw[:, 2] * 7, draw[:, 3]], -1)
+    draw = torch.rand(
+        count, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
+    state = torch.stack(
+        [draw[:, 0] * spread, draw[:, 1] * spread, draw[:, 2] * 7, draw[:, 3]], -1
+    )
     return state, 0.3 + draw[:, 4:] * torch.tensor([6.0, 3.0], dtype=torch.float64)
 
 
@@ -30,8 +39,14 @@ def test_overlap_area_is_shapely_s():
     assert (expected > 0).mean() > 0.4
     np.testing.assert_allclose(area, expected, atol=1e-9)
     apart = torch.zeros(4000, dtype=torch.bool)
-    assert not pair_overlap(*first, *second, apart).any(), "pairs that are not possible have no overlap"
-    np.testing.assert_allclose(pair_overlap(*first, *second, ~apart), np.where(expected > 1e-6, expected, 0), atol=1e-9)
+    assert not pair_overlap(*first, *second, apart).any(), (
+        "pairs that are not possible have no overlap"
+    )
+    np.testing.assert_allclose(
+        pair_overlap(*first, *second, ~apart),
+        np.where(expected > 1e-6, expected, 0),
+        atol=1e-9,
+    )
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, math.pi / 2, math.pi, 2.5])
@@ -41,8 +56,12 @@ def test_shared_and_collinear_edges_need_no_special_case(turn):
     forward = torch.tensor([math.cos(turn), math.sin(turn), 0, 0], dtype=torch.float64)
     for shift, expected in ((0.0, 8.0), (1.0, 6.0), (4.0, 0.0), (5.0, 0.0)):
         other = state + shift * forward
-        assert overlap_area(state, size, second=other, second_size=size).item() == pytest.approx(expected, abs=1e-9)
-    assert overlap_area(state, size, second=state, second_size=size / 2).item() == pytest.approx(2.0, abs=1e-9)
+        assert overlap_area(
+            state, size, second=other, second_size=size
+        ).item() == pytest.approx(expected, abs=1e-9)
+    assert overlap_area(
+        state, size, second=state, second_size=size / 2
+    ).item() == pytest.approx(2.0, abs=1e-9)
 
 
 def test_edge_parts_are_shapely_s():
@@ -55,5 +74,9 @@ def test_edge_parts_are_shapely_s():
     away = edge_distances(*first, second[0][:, :2])
     for edge in range(4):
         line = shapely.linestrings(corner[:, [edge, (edge + 1) % 4]])
-        np.testing.assert_allclose(parts[:, edge], shapely.length(shapely.intersection(line, other)), atol=1e-9)
-        np.testing.assert_allclose(away[:, edge], shapely.distance(line, point), atol=1e-9)
+        np.testing.assert_allclose(
+            parts[:, edge], shapely.length(shapely.intersection(line, other)), atol=1e-9
+        )
+        np.testing.assert_allclose(
+            away[:, edge], shapely.distance(line, point), atol=1e-9
+        )

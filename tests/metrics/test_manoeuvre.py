@@ -1,4 +1,5 @@
-"""Manoeuvres obey the simulator's limits and follow routes; what counts against them is what DrivingEnv counts."""
+"""Manoeuvres obey the simulator's limits and follow routes; what counts against them is
+what DrivingEnv counts."""
 
 import torch
 
@@ -25,15 +26,20 @@ START = torch.tensor([0.0, 0.0, 0.0, 8.0])
 
 
 def arc(radius):
-    """A route [P, 2] that begins in the origin towards +x and bends left with a radius [m]."""
+    """A route [P, 2] that begins in the origin towards +x and bends left with a radius
+    [m]."""
     angle = SPACING * torch.arange(150) / radius
     return radius * torch.stack([angle.sin(), 1 - angle.cos()], -1)
 
 
 def test_knots_are_interpolated_and_come_back():
     ramp = torch.arange(KNOTS, dtype=torch.float32)
-    torch.testing.assert_close(accelerations(ramp, STEPS), (torch.arange(STEPS) + 0.5) / 5)
-    torch.testing.assert_close(knots_of(torch.full((2, STEPS), 1.5)), torch.full((2, KNOTS), 1.5))
+    torch.testing.assert_close(
+        accelerations(ramp, STEPS), (torch.arange(STEPS) + 0.5) / 5
+    )
+    torch.testing.assert_close(
+        knots_of(torch.full((2, STEPS), 1.5)), torch.full((2, KNOTS), 1.5)
+    )
 
 
 def test_shifts_begin_at_rest_hold_what_is_held_and_have_their_own_rate():
@@ -52,7 +58,9 @@ def test_a_bend_is_followed_at_the_shift_asked_for():
     route = arc(25.0).double()
     ramp = (torch.arange(KNOTS).double() / 4).clamp(max=1)
     for wanted in (0.0, 2.0, -3.0):
-        _, states = execute(start, route, accel=0 * ramp, shift=wanted * ramp, steps=STEPS, sim=LIMITS)
+        _, states = execute(
+            start, route, accel=0 * ramp, shift=wanted * ramp, steps=STEPS, sim=LIMITS
+        )
         offset = project(states[40:, :2], route)[1]
         assert (offset - wanted).abs().max() < 0.4, offset
 
@@ -61,10 +69,18 @@ def test_limits_hold_and_the_actions_give_the_states():
     generator = torch.Generator().manual_seed(1)
     accel, shift = 20 * torch.randn(2, 200, KNOTS, generator=generator)
     start = START.expand(200, 4)
-    actions, states = execute(start, arc(15.0), accel=accel, shift=shift, steps=STEPS, sim=LIMITS)
-    assert actions[..., 0].min() >= -8 and actions[..., 0].max() <= 5 and actions[..., 1].abs().max() <= 1.6
+    actions, states = execute(
+        start, arc(15.0), accel=accel, shift=shift, steps=STEPS, sim=LIMITS
+    )
+    assert (
+        actions[..., 0].min() >= -8
+        and actions[..., 0].max() <= 5
+        and actions[..., 1].abs().max() <= 1.6
+    )
     torch.testing.assert_close(dynamics.rollout(start, actions), states)
-    assert peak_acceleration(start, states).max() < dynamics.MAX_LATERAL + 1e-2, "braking and turning share the grip"
+    assert peak_acceleration(start, states).max() < dynamics.MAX_LATERAL + 1e-2, (
+        "braking and turning share the grip"
+    )
     assert (states[..., 3] >= 0).all()
 
 
@@ -82,11 +98,18 @@ def trajectories(scene, shift=0.0, speed=10.0, steps=40):
 
 def evasion_scene(scene_set, moment=0):
     scene = scene_set.scenes
-    return EvasionScene.after(torch.full((len(scene_set),), moment), scene, states=scene["logged"], valid=scene["logged_valid"])
+    return EvasionScene.after(
+        torch.full((len(scene_set),), moment),
+        scene,
+        states=scene["logged"],
+        valid=scene["logged_valid"],
+    )
 
 
 def test_contact_is_what_the_environment_calls_contact():
-    scene_set = make_scenes(3, vehicles=[(0, 0, 10.0), (18, 0, 4.0)], num_vrus=0, steps=40, **SMALL)
+    scene_set = make_scenes(
+        3, vehicles=[(0, 0, 10.0), (18, 0, 4.0)], num_vrus=0, steps=40, **SMALL
+    )
     env = DrivingEnv(scene_set, SimSettings(end_on_contact=False), 3)
     td = env.reset()
     hit = []
@@ -95,7 +118,12 @@ def test_contact_is_what_the_environment_calls_contact():
         after = env.step(td)["next"]
         hit.append(after["metrics", "contact"][:, 0])
         td = after.exclude("reward")
-    missed = violations(trajectories(scene_set.scenes), evasion_scene(scene_set), clearance=0.0, road_margin=0.0)[:, 0]
+    missed = violations(
+        trajectories(scene_set.scenes),
+        evasion_scene(scene_set),
+        clearance=0.0,
+        road_margin=0.0,
+    )[:, 0]
     assert torch.equal(missed > 0, torch.stack(hit, 1)) and (missed > 0).any()
 
 
@@ -103,20 +131,46 @@ def test_pedestrians_count_and_the_absent_do_not():
     scene_set = make_scenes(1, vehicles=[(0, 0, 10.0)], num_vrus=1, steps=40, **SMALL)
     scene_set.scenes["logged"][:, :, 4, 1] = 0.0
     ego = trajectories(scene_set.scenes)
-    assert (violations(ego, evasion_scene(scene_set), clearance=0.0, road_margin=0.0) > 0).any()
+    assert (
+        violations(ego, evasion_scene(scene_set), clearance=0.0, road_margin=0.0) > 0
+    ).any()
     scene_set.scenes["logged_valid"][:, :, 4] = False
     task = evasion_scene(scene_set)
-    assert (violations(ego, task, clearance=0.0, road_margin=0.0) == 0).all() and (task.others < AWAY).all()
+    assert (violations(ego, task, clearance=0.0, road_margin=0.0) == 0).all() and (
+        task.others < AWAY
+    ).all()
 
 
 def test_clearance_widens_and_the_road_ends_beside():
-    scene_set = make_scenes(1, vehicles=[(0, 0, 10.0), (5, 1, 10.0)], num_vrus=0, steps=40, **SMALL)
+    scene_set = make_scenes(
+        1, vehicles=[(0, 0, 10.0), (5, 1, 10.0)], num_vrus=0, steps=40, **SMALL
+    )
     gap = LANE_WIDTH - 2.0
     task = evasion_scene(scene_set)
-    assert (violations(trajectories(scene_set.scenes), task, clearance=gap - 0.05, road_margin=0.0) == 0).all()
-    assert (violations(trajectories(scene_set.scenes), task, clearance=gap + 0.05, road_margin=0.0) > 0).any()
-    assert (violations(trajectories(scene_set.scenes, shift=-4.5), task, clearance=0.0, road_margin=0.0) > 1).all()
-    edge = trajectories(scene_set.scenes, shift=-LANE_WIDTH / 2 - 0.7)  # 0.3 m inside the border
+    assert (
+        violations(
+            trajectories(scene_set.scenes), task, clearance=gap - 0.05, road_margin=0.0
+        )
+        == 0
+    ).all()
+    assert (
+        violations(
+            trajectories(scene_set.scenes), task, clearance=gap + 0.05, road_margin=0.0
+        )
+        > 0
+    ).any()
+    assert (
+        violations(
+            trajectories(scene_set.scenes, shift=-4.5),
+            task,
+            clearance=0.0,
+            road_margin=0.0,
+        )
+        > 1
+    ).all()
+    edge = trajectories(
+        scene_set.scenes, shift=-LANE_WIDTH / 2 - 0.7
+    )  # 0.3 m inside the border
     assert (violations(edge, task, clearance=0.0, road_margin=0.1) == 0).all()
     assert (violations(edge, task, clearance=0.0, road_margin=0.5) > 0).all()
 
@@ -124,9 +178,24 @@ def test_clearance_widens_and_the_road_ends_beside():
 def test_nothing_counts_behind_the_map_s_end_or_after_the_episode():
     cars = [(0, 0, 10.0), (30, 0, 0.0)]
     for end, misses in ((400.0, True), (20.0, False)):
-        scene_set = make_scenes(1, vehicles=cars, num_vrus=0, steps=40, road=(-60.0, end), **SMALL)
-        assert (violations(trajectories(scene_set.scenes), evasion_scene(scene_set), clearance=0.0, road_margin=0.0) > 0).any() == misses
+        scene_set = make_scenes(
+            1, vehicles=cars, num_vrus=0, steps=40, road=(-60.0, end), **SMALL
+        )
+        assert (
+            violations(
+                trajectories(scene_set.scenes),
+                evasion_scene(scene_set),
+                clearance=0.0,
+                road_margin=0.0,
+            )
+            > 0
+        ).any() == misses
     scene_set = make_scenes(1, vehicles=cars, num_vrus=0, steps=40, **SMALL)
     late = evasion_scene(scene_set, moment=30)
     assert late.inside.sum() == 10
-    assert (violations(trajectories(scene_set.scenes), late, clearance=0.0, road_margin=0.0)[..., 10:] == 0).all()
+    assert (
+        violations(
+            trajectories(scene_set.scenes), late, clearance=0.0, road_margin=0.0
+        )[..., 10:]
+        == 0
+    ).all()

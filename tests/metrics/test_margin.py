@@ -1,4 +1,5 @@
-"""The margin: minus the distance of closest approach without a contact, what the competent driver spares with one."""
+"""The margin: minus the distance of closest approach without a contact, what the
+competent driver spares with one."""
 
 import math
 
@@ -11,25 +12,42 @@ from tests.metrics.test_contact import course, row
 
 def test_without_anybody_or_with_whom_the_ego_follows_nobody_is_near():
     assert row(course(0, 0, heading=0, speed=5))["margin"] == -FARTHEST
-    assert row(course(0, 0, heading=0, speed=5), course(20, 0, heading=0, speed=5))["margin"] == -FARTHEST
+    assert (
+        row(course(0, 0, heading=0, speed=5), course(20, 0, heading=0, speed=5))[
+            "margin"
+        ]
+        == -FARTHEST
+    )
 
 
 @pytest.mark.parametrize("gap", [4.0, 8.0])
 def test_who_passes_at_a_distance_has_it_as_its_margin(gap):
-    """Oncoming in a lane that is `gap` m beside: at the closest approach 0 s ahead and gap minus a width away."""
-    found = row(course(0, 0, heading=0, speed=10), course(60, gap, heading=math.pi, speed=10))
+    """Oncoming in a lane that is `gap` m beside: at the closest approach 0 s ahead and
+    gap minus a width away."""
+    found = row(
+        course(0, 0, heading=0, speed=10), course(60, gap, heading=math.pi, speed=10)
+    )
     assert found["margin"] == pytest.approx(-(gap - 2.0), abs=0.2)
 
 
 def test_the_margin_grows_with_nearness_to_contact_to_verdict():
-    passes = [row(course(0, 0, heading=0, speed=10), course(60, gap, heading=math.pi, speed=10))["margin"] for gap in (8.0, 5.0, 3.0)]
+    passes = [
+        row(
+            course(0, 0, heading=0, speed=10),
+            course(60, gap, heading=math.pi, speed=10),
+        )["margin"]
+        for gap in (8.0, 5.0, 3.0)
+    ]
     assert passes == sorted(passes)
-    stops = row(course(0, 0, heading=0, speed=10), course(60, 0, heading=0, speed=0.0))  # a wreck far ahead: the ego drives into it
+    stops = row(
+        course(0, 0, heading=0, speed=10), course(60, 0, heading=0, speed=0.0)
+    )  # a wreck far ahead: the ego drives into it
     assert stops["cfr_preventable"] == 1 and stops["margin"] == PREVENTED
 
 
 def test_a_contact_has_the_share_of_its_speed_that_the_driver_has_lost_before_it():
-    """An ego at 10 m/s whose driver is down to 6 by then; one that creeps; one without a driver; a preventable one."""
+    """An ego at 10 m/s whose driver is down to 6 by then; one that creeps; one without
+    a driver; a preventable one."""
     states = torch.zeros(4, 5, 2, 4)
     driver = torch.zeros(4, 5, 4)
     states[:, :, 0, 3], driver[:, 3, 3] = 10.0, 6.0

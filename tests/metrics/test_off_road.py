@@ -13,17 +13,25 @@ shapely = pytest.importorskip("shapely")
 
 def doubles(rollouts, seed):
     road = random_map(rollouts, 60.0, generator=torch.Generator().manual_seed(seed))
-    return {key: value.double() if value.is_floating_point() else value for key, value in road.items()}
+    return {
+        key: value.double() if value.is_floating_point() else value
+        for key, value in road.items()
+    }
 
 
 def random_points(count, rollouts, seed):
-    draw = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    draw = torch.rand(
+        count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     return (draw[:, :2] - 0.5) * 200, (draw[:, 2] * rollouts).long()
 
 
 def parts(road, name, rollout, minimum):
     index = road[f"{name}_index"][rollout]
-    lists = [road[f"{name}_points"][rollout][index == line].numpy() for line in index[index >= 0].unique()]
+    lists = [
+        road[f"{name}_points"][rollout][index == line].numpy()
+        for line in index[index >= 0].unique()
+    ]
     return [
         (line, points)
         for line, points in zip(index[index >= 0].unique().tolist(), lists, strict=True)
@@ -33,7 +41,13 @@ def parts(road, name, rollout, minimum):
 
 def test_distance_to_lanes_is_shapely_s():
     road, (points, rollout) = doubles(4, 1), random_points(6000, 4, seed=2)
-    near = near_lane(points, rollout, lane_points=road["lane_points"], lane_index=road["lane_index"], lane_width=road["lane_width"]).numpy()
+    near = near_lane(
+        points,
+        rollout,
+        lane_points=road["lane_points"],
+        lane_index=road["lane_index"],
+        lane_width=road["lane_width"],
+    ).numpy()
     for index in range(4):
         chosen = (rollout == index).numpy()
         expected = np.zeros(chosen.sum(), bool)
@@ -47,7 +61,12 @@ def test_distance_to_lanes_is_shapely_s():
 
 def test_inside_overlapping_polygons_is_shapely_s():
     road, (points, rollout) = doubles(5, 3), random_points(6000, 5, seed=4)
-    inside = inside_polygon(points, rollout, polygon_points=road["drivable_points"], polygon_index=road["drivable_index"]).numpy()
+    inside = inside_polygon(
+        points,
+        rollout,
+        polygon_points=road["drivable_points"],
+        polygon_index=road["drivable_index"],
+    ).numpy()
     for index in range(5):
         chosen = (rollout == index).numpy()
         where = shapely.points(points[chosen].numpy())
@@ -76,14 +95,28 @@ def test_the_ego_leaves_the_road_or_not_and_is_unknown_where_it_starts_beside_it
     leaves = course(0, 0, heading=0.5, speed=10)
     stays = course(0, 0, heading=0, speed=10)
     beside = course(0, 40, heading=0, speed=10)
-    assert (row(leaves, other)["ego_off_road"], row(stays, other)["ego_off_road"]) == (1, 0)
+    assert (row(leaves, other)["ego_off_road"], row(stays, other)["ego_off_road"]) == (
+        1,
+        0,
+    )
     assert np.isnan(row(beside, other)["ego_off_road"])
 
 
-@pytest.mark.parametrize(("gap", "on"), [(0.0, True), (1e-6, True), (0.05, True), (0.3, True), (1.0, False)])
+@pytest.mark.parametrize(
+    ("gap", "on"), [(0.0, True), (1e-6, True), (0.05, True), (0.3, True), (1.0, False)]
+)
 def test_a_seam_between_polygons_is_theirs_and_an_outer_border_is_none(gap, on):
-    square = torch.tensor([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]], dtype=torch.float64)
+    square = torch.tensor(
+        [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]], dtype=torch.float64
+    )
     polygons = torch.cat([square, square + torch.tensor([10.0 + gap, 0.0])])[None]
     index = torch.arange(2).repeat_interleave(4)[None]
-    points = torch.tensor([[10.0 + gap / 2, 5.0], [-0.1, 5.0], [5.0, 10.1]], dtype=torch.float64)
-    assert in_seam(points, torch.zeros(3, dtype=torch.long), polygon_points=polygons, polygon_index=index).tolist() == [on, False, False]
+    points = torch.tensor(
+        [[10.0 + gap / 2, 5.0], [-0.1, 5.0], [5.0, 10.1]], dtype=torch.float64
+    )
+    assert in_seam(
+        points,
+        torch.zeros(3, dtype=torch.long),
+        polygon_points=polygons,
+        polygon_index=index,
+    ).tolist() == [on, False, False]

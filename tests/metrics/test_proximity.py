@@ -1,4 +1,5 @@
-"""Closest approach, gaps, acceleration, progress and standing vehicles against closed forms."""
+"""Closest approach, gaps, acceleration, progress and standing vehicles against closed
+forms."""
 
 import math
 
@@ -21,14 +22,22 @@ from tests.metrics.test_contact import course, row, scene
 
 def test_cost_is_the_mean_over_steps_of_the_worst_adversary():
     cost = torch.tensor([[[0.0, 0.2, 0.9], [0.0, 0.4, 0.1], [0, 1, 1]]])
-    counted = torch.tensor([[[False, True, False], [False, True, True], [False, False, False]]])
+    counted = torch.tensor(
+        [[[False, True, False], [False, True, True], [False, False, False]]]
+    )
     assert mean_worst_cost(cost, counted).item() == pytest.approx(0.3)
-    assert mean_worst_cost(cost, counted & False).isnan().all(), "no adversary: unknown, not 0"
+    assert mean_worst_cost(cost, counted & False).isnan().all(), (
+        "no adversary: unknown, not 0"
+    )
 
 
 def test_gap_is_the_smallest_box_distance():
-    assert row(course(0, 0, heading=0, speed=5), course(0, 5, heading=0, speed=5))["min_dtc"] == pytest.approx(3.0, abs=1e-5)
-    assert math.isnan(row(course(0, 0, heading=0, speed=5))["min_dtc"]), "nobody else: unknown"
+    assert row(course(0, 0, heading=0, speed=5), course(0, 5, heading=0, speed=5))[
+        "min_dtc"
+    ] == pytest.approx(3.0, abs=1e-5)
+    assert math.isnan(row(course(0, 0, heading=0, speed=5))["min_dtc"]), (
+        "nobody else: unknown"
+    )
 
 
 def test_constant_braking_has_its_own_mean_acceleration_and_way():
@@ -47,7 +56,9 @@ def test_short_paths_have_no_acceleration():
 def test_gaps_of_the_ego_s_track_are_closed_before_measuring():
     states, valid = course(0, 0, heading=0, speed=10)
     valid[3:6] = False
-    path, count = ego_path(states[None, :, None], valid[None, :, None], stop=torch.tensor([80]))
+    path, count = ego_path(
+        states[None, :, None], valid[None, :, None], stop=torch.tensor([80])
+    )
     assert count.item() == 78 and progress(path, count).item() == pytest.approx(80)
 
 
@@ -57,39 +68,63 @@ def completion(ego, recorded, *others):
     logged = rollout.logged.clone()
     valid = rollout.logged_valid.clone()
     logged[0, :, 0], valid[0, :, 0] = recorded[0].float(), recorded[1]
-    return score_rollouts(rollout.replace(logged=logged, logged_valid=valid))[0][0]["route_completion"]
+    return score_rollouts(rollout.replace(logged=logged, logged_valid=valid))[0][0][
+        "route_completion"
+    ]
 
 
 def test_the_share_of_the_recorded_way_is_what_lies_behind_the_ego():
-    """On it and beside it alike; more than the recording has drives no more than all of it."""
+    """On it and beside it alike; more than the recording has drives no more than all of
+    it."""
     recorded = course(0, 0, heading=0.3, speed=10)
     assert completion(recorded, recorded) == pytest.approx(1)
-    assert completion(course(0, 0, heading=0.3, speed=4), recorded) == pytest.approx(0.4, abs=1e-4)
-    assert completion(course(-math.sin(0.3), math.cos(0.3), heading=0.3, speed=4), recorded) == pytest.approx(0.4, abs=1e-4)
+    assert completion(course(0, 0, heading=0.3, speed=4), recorded) == pytest.approx(
+        0.4, abs=1e-4
+    )
+    assert completion(
+        course(-math.sin(0.3), math.cos(0.3), heading=0.3, speed=4), recorded
+    ) == pytest.approx(0.4, abs=1e-4)
     assert completion(course(0, 0, heading=0.3, speed=20), recorded) == 1
     assert completion(course(0, 0, heading=0.3 + math.pi, speed=5), recorded) == 0
 
 
 def test_a_bent_way_counts_by_its_length_and_a_standing_ego_has_none():
     angle = torch.linspace(0, math.pi, 81, dtype=torch.float64)
-    bent = torch.stack([20 * angle.sin(), 20 - 20 * angle.cos(), angle, torch.full_like(angle, 8)], -1)
+    bent = torch.stack(
+        [20 * angle.sin(), 20 - 20 * angle.cos(), angle, torch.full_like(angle, 8)], -1
+    )
     everywhere = torch.ones(1, 81, 1, dtype=torch.bool)
     for steps in (20, 40, 80):
-        found = route_completion(bent[None], torch.tensor([steps + 1]), logged=bent[None, :, None], logged_valid=everywhere)
+        found = route_completion(
+            bent[None],
+            torch.tensor([steps + 1]),
+            logged=bent[None, :, None],
+            logged_valid=everywhere,
+        )
         assert found.item() == pytest.approx(steps / 80, abs=1e-6)
     gone = everywhere & (torch.arange(81) <= 40)[:, None]
-    found = route_completion(bent[None], torch.tensor([21]), logged=bent[None, :, None], logged_valid=gone)
+    found = route_completion(
+        bent[None], torch.tensor([21]), logged=bent[None, :, None], logged_valid=gone
+    )
     assert found.item() == pytest.approx(0.5, abs=1e-6), "of the way that is recorded"
-    assert math.isnan(completion(course(0, 0, heading=0, speed=5), course(0, 0, heading=0, speed=0.1)))
+    assert math.isnan(
+        completion(course(0, 0, heading=0, speed=5), course(0, 0, heading=0, speed=0.1))
+    )
 
 
 @pytest.mark.parametrize("steps", [5, 24, 26, 60, 81])
 def test_the_share_of_a_way_that_crosses_itself_is_what_was_driven(steps):
-    """The crossing is passed at the steps 15 and 82; near it, the nearest piece is of the other passage."""
+    """The crossing is passed at the steps 15 and 82; near it, the nearest piece is of
+    the other passage."""
     recorded = track(loop(), 20.0, speed=25.0, steps=90)[None].double()
     ego = recorded + torch.tensor([0.3, -0.3, 0, 0])
     everywhere = torch.ones(1, 91, 1, dtype=torch.bool)
-    found = route_completion(ego, torch.tensor([steps + 1]), logged=recorded[:, :, None], logged_valid=everywhere)
+    found = route_completion(
+        ego,
+        torch.tensor([steps + 1]),
+        logged=recorded[:, :, None],
+        logged_valid=everywhere,
+    )
     assert found.item() == pytest.approx(steps / 90, abs=0.01)
 
 
@@ -112,7 +147,13 @@ def rollouts():
     logged_valid[0, 8:, LATE] = False  # not recorded throughout
     parked = torch.zeros(1, ROWS, dtype=torch.bool)
     parked[0, [PARKED_STAYS, PARKED_MOVES]] = True
-    return {"states": states, "valid": valid, "logged": logged, "logged_valid": logged_valid, "parked": parked}
+    return {
+        "states": states,
+        "valid": valid,
+        "logged": logged,
+        "logged_valid": logged_valid,
+        "parked": parked,
+    }
 
 
 def traffic():
@@ -127,11 +168,24 @@ def values(batch, who=None):
 def test_everybody_is_counted_once_and_where_it_belongs():
     batch = rollouts()
     who = traffic()
-    assert values(batch) == {"parked_moved": 0.5, "parked_vehicles": 2, "starters": 1, "starters_log": 1}
+    assert values(batch) == {
+        "parked_moved": 0.5,
+        "parked_vehicles": 2,
+        "starters": 1,
+        "starters_log": 1,
+    }
     as_logged = values(batch | {"states": batch["logged"]})
-    assert as_logged["parked_moved"] == 0 and as_logged["starters"] == as_logged["starters_log"] == 1
+    assert (
+        as_logged["parked_moved"] == 0
+        and as_logged["starters"] == as_logged["starters_log"] == 1
+    )
     who[0, [PARKED_MOVES, STARTS]] = False
-    assert values(batch, who) == {"parked_moved": 0, "parked_vehicles": 1, "starters": 0, "starters_log": 1}
+    assert values(batch, who) == {
+        "parked_moved": 0,
+        "parked_vehicles": 1,
+        "starters": 0,
+        "starters_log": 1,
+    }
 
 
 def test_moved_means_farther_than_the_limit_at_a_step_where_it_is_there():

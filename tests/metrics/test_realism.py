@@ -1,11 +1,19 @@
-"""Realism: identities of the distance, what is counted, and the pooled figures by an independent route."""
+"""Realism: identities of the distance, what is counted, and the pooled figures by an
+independent route."""
 
 import numpy as np
 import pytest
 import torch
 from scipy.stats import wasserstein_distance
 
-from e2rl.metrics.realism import CLIP, KINEMATICS, kinematic_samples, realism, split_half, wasserstein
+from e2rl.metrics.realism import (
+    CLIP,
+    KINEMATICS,
+    kinematic_samples,
+    realism,
+    split_half,
+    wasserstein,
+)
 from e2rl.metrics.score import score_rollouts
 from tests.metrics.random_rollouts import random_rollouts
 
@@ -20,9 +28,13 @@ def once(clusters):
 
 def test_a_draw_equals_the_distance_of_the_repeated_samples():
     generator = torch.Generator().manual_seed(2)
-    pair = torch.randn(2, 9000, generator=generator, dtype=torch.float64)  # more than one block of columns
+    pair = torch.randn(
+        2, 9000, generator=generator, dtype=torch.float64
+    )  # more than one block of columns
     cluster = torch.randint(5, (9000,), generator=generator)
-    draws = torch.tensor([[1.0, 0, 2, 1, 3], [0, 0, 5, 0, 0], [0, 0, 0, 0, 0]], dtype=torch.float64)
+    draws = torch.tensor(
+        [[1.0, 0, 2, 1, 3], [0, 0, 5, 0, 0], [0, 0, 0, 0, 0]], dtype=torch.float64
+    )
     result = wasserstein(pair, cluster, draws=draws)
     for draw, distance in zip(draws[:2], result[:2], strict=True):
         repeated = pair.repeat_interleave(draw[cluster].long(), dim=1)
@@ -37,7 +49,9 @@ def test_pooled_figures_follow_the_definition():
     distances = []
     scaled = []
     for name in KINEMATICS:
-        simulated, log = np.concatenate([sample[name].numpy() for sample in features], 1)
+        simulated, log = np.concatenate(
+            [sample[name].numpy() for sample in features], 1
+        )
         distances.append(wasserstein_distance(simulated, log))
         scaled.append(distances[-1] / np.subtract(*np.quantile(log, [0.95, 0.05])))
         assert table[f"w1_{name}"].item() == pytest.approx(distances[-1])
@@ -50,51 +64,100 @@ def test_the_ego_the_parked_and_what_happens_after_the_stop_do_not_count():
     rollouts = random_rollouts(4, seed=6)
     before = features_of(rollouts)
     changed = rollouts.clone()
-    changed.logged[:, :, 0] += 5 * torch.rand(changed.logged[:, :, 0].shape)  # the ego's own log
-    assert all(torch.equal(a[name], b[name]) for a, b in zip(before, features_of(changed), strict=True) for name in a)
+    changed.logged[:, :, 0] += 5 * torch.rand(
+        changed.logged[:, :, 0].shape
+    )  # the ego's own log
+    assert all(
+        torch.equal(a[name], b[name])
+        for a, b in zip(before, features_of(changed), strict=True)
+        for name in a
+    )
     states = torch.zeros(1, 81, 3, 4, dtype=torch.float64)
     valid = torch.ones(1, 81, 3, dtype=torch.bool)
     states[:, :, 1, 3] = 5.0
     agents = torch.tensor([[False, True, True]])
     for stop, blocks in ((80, 16), (34, 6), (9, 1)):
-        sample = kinematic_samples(states, valid, logged=states, logged_valid=valid, agents=agents, stop=torch.tensor([stop]))[0]
-        assert [sample[name].shape[1] for name in KINEMATICS] == [blocks - 1, blocks - 1, max(blocks - 2, 0)], stop
+        sample = kinematic_samples(
+            states,
+            valid,
+            logged=states,
+            logged_valid=valid,
+            agents=agents,
+            stop=torch.tensor([stop]),
+        )[0]
+        assert [sample[name].shape[1] for name in KINEMATICS] == [
+            blocks - 1,
+            blocks - 1,
+            max(blocks - 2, 0),
+        ], stop
 
 
 def test_real_adv_is_real_of_a_traffic_of_adversaries_alone():
     rollouts = random_rollouts(6, seed=3)
     alone = rollouts.replace(simulated=rollouts.simulated & rollouts.adversaries)
     draws, cluster = once(6)
-    ours, theirs = (realism(features_of(given), cluster, draws=draws) for given in (rollouts, alone))
-    assert ours["real_adv"] == theirs["real"] == theirs["real_adv"] and ours["real_adv"] != ours["real"]
+    ours, theirs = (
+        realism(features_of(given), cluster, draws=draws) for given in (rollouts, alone)
+    )
+    assert (
+        ours["real_adv"] == theirs["real"] == theirs["real_adv"]
+        and ours["real_adv"] != ours["real"]
+    )
     nobody = rollouts.replace(adversaries=torch.zeros_like(rollouts.adversaries))
     rows, features = score_rollouts(nobody)
     table = realism(features, cluster, draws=draws)
-    assert table["real_adv"].isnan() and table["real"] == ours["real"] and rows[0]["real_adv"] != rows[0]["real_adv"]
+    assert (
+        table["real_adv"].isnan()
+        and table["real"] == ours["real"]
+        and rows[0]["real_adv"] != rows[0]["real_adv"]
+    )
 
 
 def test_a_constant_turn_has_its_lateral_acceleration():
     time = torch.arange(81, dtype=torch.float64) * 0.1
-    states = torch.stack([time, time, 3.0 + 0.2 * time, 4.0 + 0.5 * time], -1)[None, :, None].expand(1, 81, 2, 4)
+    states = torch.stack([time, time, 3.0 + 0.2 * time, 4.0 + 0.5 * time], -1)[
+        None, :, None
+    ].expand(1, 81, 2, 4)
     valid = torch.ones(1, 81, 2, dtype=torch.bool)
     agents = torch.tensor([[False, True]])
-    sample = kinematic_samples(states, valid, logged=states, logged_valid=valid, agents=agents, stop=torch.tensor([80]))[0]
+    sample = kinematic_samples(
+        states,
+        valid,
+        logged=states,
+        logged_valid=valid,
+        agents=agents,
+        stop=torch.tensor([80]),
+    )[0]
     middle = 4.0 + 0.5 * (0.55 + 0.5 * torch.arange(15))
-    torch.testing.assert_close(sample["a_lat"][0], (0.2 * middle).double(), atol=1e-6, rtol=0)
-    torch.testing.assert_close(sample["a_lon"][0], torch.full((15,), 0.5, dtype=torch.float64))
+    torch.testing.assert_close(
+        sample["a_lat"][0], (0.2 * middle).double(), atol=1e-6, rtol=0
+    )
+    torch.testing.assert_close(
+        sample["a_lon"][0], torch.full((15,), 0.5, dtype=torch.float64)
+    )
     assert sample["jerk"].abs().max() < 1e-9
 
 
 def logs(*samples):
-    """Features of rollouts whose logs hold the samples, alike in every feature; the rollouts themselves are far off."""
-    return [{name: torch.stack([sample + 99, sample]) for name in KINEMATICS} for sample in samples]
+    """Features of rollouts whose logs hold the samples, alike in every feature; the
+    rollouts themselves are far off."""
+    return [
+        {name: torch.stack([sample + 99, sample]) for name in KINEMATICS}
+        for sample in samples
+    ]
 
 
 def test_split_halves_are_scipy_s_whichever_half_is_first_and_keep_clusters_together():
     generator = torch.Generator().manual_seed(4)
-    samples = [torch.randn(20 + 9 * k, generator=generator, dtype=torch.float64) * (1 + 0.1 * k) for k in range(6)]
+    samples = [
+        torch.randn(20 + 9 * k, generator=generator, dtype=torch.float64)
+        * (1 + 0.1 * k)
+        for k in range(6)
+    ]
     cluster = torch.tensor([0, 0, 1, 1, 2, 2])
     halves = torch.tensor([[True, False, False], [False, True, True]])
     one, other = split_half(logs(*samples), cluster, halves=halves).tolist()
-    distance = wasserstein_distance(torch.cat(samples[:2]).numpy(), torch.cat(samples[2:]).numpy())
+    distance = wasserstein_distance(
+        torch.cat(samples[:2]).numpy(), torch.cat(samples[2:]).numpy()
+    )
     assert one == pytest.approx(1 - distance) and other == pytest.approx(one)

@@ -1,4 +1,5 @@
-"""Contacts, distances, progress and the road, scored anew from rollout files with numpy and shapely alone."""
+"""Contacts, distances, progress and the road, scored anew from rollout files with numpy
+and shapely alone."""
 
 import numpy as np
 import pytest
@@ -19,11 +20,15 @@ class Blind(Ego):
     """Goes straight on, whoever is there."""
 
     def plan(self, world):
-        return constant_velocity(world.states[:, 0], DT * torch.arange(1, PLAN_STEPS + 1))
+        return constant_velocity(
+            world.states[:, 0], DT * torch.arange(1, PLAN_STEPS + 1)
+        )
 
 
 def bundled(traffic):
-    return e2rl.roll_out(e2rl.load_scenes("bundled", num_scenes=6), Blind(), traffic=traffic)
+    return e2rl.roll_out(
+        e2rl.load_scenes("bundled", num_scenes=6), Blind(), traffic=traffic
+    )
 
 
 SETS = {
@@ -34,11 +39,25 @@ SETS = {
 
 
 def boxes(states, size):
-    """Polygons [...] of boxes size [..., 2] at states [..., 4]; empty ones where the states are none."""
-    ahead = np.stack([np.cos(states[..., 2]), np.sin(states[..., 2])], -1) * size[..., :1] / 2
-    left = np.stack([-np.sin(states[..., 2]), np.cos(states[..., 2])], -1) * size[..., 1:] / 2
+    """Polygons [...] of boxes size [..., 2] at states [..., 4]; empty ones where the
+    states are none."""
+    ahead = (
+        np.stack([np.cos(states[..., 2]), np.sin(states[..., 2])], -1)
+        * size[..., :1]
+        / 2
+    )
+    left = (
+        np.stack([-np.sin(states[..., 2]), np.cos(states[..., 2])], -1)
+        * size[..., 1:]
+        / 2
+    )
     middle = states[..., :2]
-    corners = [middle + ahead + left, middle + ahead - left, middle - ahead - left, middle - ahead + left]
+    corners = [
+        middle + ahead + left,
+        middle + ahead - left,
+        middle - ahead - left,
+        middle - ahead + left,
+    ]
     return shapely.polygons(np.nan_to_num(np.stack(corners, -2)))
 
 
@@ -48,12 +67,16 @@ def on_road(points, file):
     found = np.zeros(len(points), bool)
 
     def lines(name):
-        parts = zip(file[f"{name}_offsets"][:-1], file[f"{name}_offsets"][1:], strict=True)
+        parts = zip(
+            file[f"{name}_offsets"][:-1], file[f"{name}_offsets"][1:], strict=True
+        )
         return [file[f"{name}_points"][begin:end].astype(float) for begin, end in parts]
 
     for line, width in zip(lines("lane"), file["lane_width"], strict=False):
         if len(line) > 1:
-            found[tree.query(shapely.linestrings(line), "dwithin", width / 2 + 1.0)] = True
+            found[tree.query(shapely.linestrings(line), "dwithin", width / 2 + 1.0)] = (
+                True
+            )
     for ring in lines("drivable"):
         if len(ring) > 2:
             found[tree.query(shapely.polygons(ring), "contains")] = True
@@ -75,25 +98,43 @@ def score(file):
     hit = bool(len(after)) and not unknown
     stop = after[0] if hit else len(hits) - 1
     seen = there[1 : stop + 1] & there[1 : stop + 1, :1]
-    gap = np.where(seen, shapely.distance(box[1 : stop + 1, :1], box[1 : stop + 1]), np.inf)[:, 1:]
+    gap = np.where(
+        seen, shapely.distance(box[1 : stop + 1, :1], box[1 : stop + 1]), np.inf
+    )[:, 1:]
     ego = states[: stop + 1, 0][there[: stop + 1, 0]]
     turn = np.diff(ego[:, 2])
     heading = ego[:-1, 2] + np.arctan2(np.sin(turn), np.cos(turn)) / 2
     found = {
         "cfr": np.nan if unknown else float(hit),
-        "cfr_vru": float(((area * np.isin(file["agent_type"], ("pedestrian", "cyclist")))[1 : stop + 1] > 0).any()),
-        "cfr_object": float(((area * (file["agent_type"] == "other"))[1 : stop + 1] > 0).any()),
+        "cfr_vru": float(
+            (
+                (area * np.isin(file["agent_type"], ("pedestrian", "cyclist")))[
+                    1 : stop + 1
+                ]
+                > 0
+            ).any()
+        ),
+        "cfr_object": float(
+            ((area * (file["agent_type"] == "other"))[1 : stop + 1] > 0).any()
+        ),
         "contact_step": float(stop) if hit else np.nan,
         "partner": float((area * vehicle)[stop].argmax()) if hit else -1.0,
         "min_dtc": 0.0 if hit else gap.min() if np.isfinite(gap).any() else np.nan,
-        "progress": (np.diff(ego[:, 0]) * np.cos(heading) + np.diff(ego[:, 1]) * np.sin(heading)).sum(),
+        "progress": (
+            np.diff(ego[:, 0]) * np.cos(heading) + np.diff(ego[:, 1]) * np.sin(heading)
+        ).sum(),
         "bg_pairs": 0.0,
     }
     others = simulated[simulated > 0]
     for number, one in enumerate(others):
         two = others[number + 1 :]
         both = there[: stop + 1, [one]] & there[: stop + 1, two]
-        meet = (shapely.area(shapely.intersection(box[: stop + 1, [one]], box[: stop + 1, two])) > 0) & both
+        meet = (
+            shapely.area(
+                shapely.intersection(box[: stop + 1, [one]], box[: stop + 1, two])
+            )
+            > 0
+        ) & both
         found["bg_pairs"] += (meet[1:].any(0) & ~meet[0]).sum()
     road = on_road(states[: stop + 1, :, :2].reshape(-1, 2), file).reshape(stop + 1, -1)
     counted = there[: stop + 1, others] & there[0, others] & road[0, others]
@@ -116,4 +157,6 @@ def test_rows_are_what_another_reader_of_the_files_scores(name, tmp_path):
     assert len(theirs) == len(rows) and {row["cfr"] for row in rows} >= {0.0, 1.0}
     for row in rows:
         other = theirs[row["scene_id"], row["seed"]]
-        assert {key: float(row[key]) for key in other} == pytest.approx(other, abs=1e-6, nan_ok=True), row["scene_id"]
+        assert {key: float(row[key]) for key in other} == pytest.approx(
+            other, abs=1e-6, nan_ok=True
+        ), row["scene_id"]

@@ -1,4 +1,5 @@
-"""Planners written against nuPlan's interface. They run in a process of their own, as a user's do."""
+"""Planners written against nuPlan's interface. They run in a process of their own, as a
+user's do."""
 
 import json
 import math
@@ -6,20 +7,29 @@ import os
 from pathlib import Path
 
 from nuplan.common.actor_state.ego_state import EgoState
-from nuplan.common.actor_state.state_representation import StateSE2, StateVector2D, TimePoint
+from nuplan.common.actor_state.state_representation import (
+    StateSE2,
+    StateVector2D,
+    TimePoint,
+)
 from nuplan.common.actor_state.vehicle_parameters import VehicleParameters
 from nuplan.common.maps.maps_datatypes import SemanticMapLayer
-from nuplan.planning.simulation.observation.observation_type import DetectionsTracks, Sensors
+from nuplan.planning.simulation.observation.observation_type import (
+    DetectionsTracks,
+    Sensors,
+)
 from nuplan.planning.simulation.planner.abstract_planner import AbstractPlanner
-from nuplan.planning.simulation.trajectory.interpolated_trajectory import InterpolatedTrajectory
+from nuplan.planning.simulation.trajectory.interpolated_trajectory import (
+    InterpolatedTrajectory,
+)
 
 SECOND = 1_000_000  # us
 LANES = [SemanticMapLayer.LANE, SemanticMapLayer.LANE_CONNECTOR]
 
 
 class Straight(AbstractPlanner):
-    """Keeps velocity and heading. It plans for a vehicle of its own, whose rear axle lies elsewhere in its box, as
-    planners do that were tuned for nuPlan's."""
+    """Keeps velocity and heading. It plans for a vehicle of its own, whose rear axle
+    lies elsewhere in its box, as planners do that were tuned for nuPlan's."""
 
     vehicle = VehicleParameters(2.3, 4.0, 1.1, 1.7, 3.1, "mine", "one")
 
@@ -41,16 +51,24 @@ class Straight(AbstractPlanner):
 
     def straight(self, ego, speed, told=None):
         """At a speed; told: the speed that its states tell."""
-        return InterpolatedTrajectory([self.ahead(ego, speed, told, seconds) for seconds in (0.0, self.seconds)])
+        return InterpolatedTrajectory(
+            [self.ahead(ego, speed, told, seconds) for seconds in (0.0, self.seconds)]
+        )
 
     def ahead(self, ego, speed, told, seconds):
         pose = ego.rear_axle
         way = speed * seconds
-        pose = StateSE2(pose.x + way * math.cos(pose.heading), pose.y + way * math.sin(pose.heading), pose.heading)
+        pose = StateSE2(
+            pose.x + way * math.cos(pose.heading),
+            pose.y + way * math.sin(pose.heading),
+            pose.heading,
+        )
         velocity = StateVector2D(speed if told is None else told, 0.0)
         zero = StateVector2D(0.0, 0.0)
         time = TimePoint(ego.time_point.time_us + round(seconds * SECOND))
-        return EgoState.build_from_rear_axle(pose, velocity, zero, 0.0, time, self.vehicle)
+        return EgoState.build_from_rear_axle(
+            pose, velocity, zero, 0.0, time, self.vehicle
+        )
 
 
 class Wrong(Straight):
@@ -76,7 +94,8 @@ class Wrong(Straight):
 
 
 class Centred(Straight):
-    """Plans on the centre of the ego's lane, wherever the ego is, at an acceleration. It tells poses only."""
+    """Plans on the centre of the ego's lane, wherever the ego is, at an acceleration.
+    It tells poses only."""
 
     def __init__(self, acceleration):
         super().__init__()
@@ -86,18 +105,28 @@ class Centred(Straight):
     def compute_planner_trajectory(self, current_input):
         ego, _ = current_input.history.current_state
         if self.path is None:
-            (lane,) = self.initialization.map_api.get_all_map_objects(ego.center, SemanticMapLayer.LANE)
+            (lane,) = self.initialization.map_api.get_all_map_objects(
+                ego.center, SemanticMapLayer.LANE
+            )
             self.path = lane.baseline_path
         nearest = self.path.get_nearest_pose_from_position(ego.rear_axle)
         speed = state_of(ego)[3]
-        return InterpolatedTrajectory([self.later(ego, nearest, speed, step / 10) for step in range(81)])
+        return InterpolatedTrajectory(
+            [self.later(ego, nearest, speed, step / 10) for step in range(81)]
+        )
 
     def later(self, ego, begin, speed, seconds):
         way = speed * seconds + self.acceleration * seconds**2 / 2
         zero = StateVector2D(0.0, 0.0)
-        pose = StateSE2(begin.x + way * math.cos(begin.heading), begin.y + way * math.sin(begin.heading), begin.heading)
+        pose = StateSE2(
+            begin.x + way * math.cos(begin.heading),
+            begin.y + way * math.sin(begin.heading),
+            begin.heading,
+        )
         time = TimePoint(ego.time_point.time_us + round(seconds * SECOND))
-        return EgoState.build_from_rear_axle(pose, zero, zero, 0.0, time, ego.car_footprint.vehicle_parameters)
+        return EgoState.build_from_rear_axle(
+            pose, zero, zero, 0.0, time, ego.car_footprint.vehicle_parameters
+        )
 
 
 class Camera(Straight):
@@ -108,7 +137,8 @@ class Camera(Straight):
 
 
 class Witness(Straight):
-    """Turns at a tenth of a radian a second, and writes what it sees, a line a plan, to the file E2RL_WITNESS."""
+    """Turns at a tenth of a radian a second, and writes what it sees, a line a plan, to
+    the file E2RL_WITNESS."""
 
     def compute_planner_trajectory(self, current_input):
         history = current_input.history
@@ -119,12 +149,22 @@ class Witness(Straight):
             "interval": history.sample_interval,
             "times": [one.time_point.time_us for one in history.ego_states],
             "egos": [state_of(one) for one in history.ego_states],
-            "rear": [*pose_of(ego.rear_axle), ego.dynamic_car_state.rear_axle_velocity_2d.y],
+            "rear": [
+                *pose_of(ego.rear_axle),
+                ego.dynamic_car_state.rear_axle_velocity_2d.y,
+            ],
             "yaw_rate": ego.dynamic_car_state.angular_velocity,
-            "size": [ego.car_footprint.vehicle_parameters.length, ego.car_footprint.vehicle_parameters.width],
-            "agents": {one.track_token: agent_of(one) for one in observation.tracked_objects.tracked_objects},
+            "size": [
+                ego.car_footprint.vehicle_parameters.length,
+                ego.car_footprint.vehicle_parameters.width,
+            ],
+            "agents": {
+                one.track_token: agent_of(one)
+                for one in observation.tracked_objects.tracked_objects
+            },
             "before": [
-                sorted(a.track_token for a in one.tracked_objects.tracked_objects) for one in history.observations
+                sorted(a.track_token for a in one.tracked_objects.tracked_objects)
+                for one in history.observations
             ],
         }
         if current_input.iteration.index == 0:
@@ -132,17 +172,33 @@ class Witness(Straight):
             blocks = []
             for name in self.initialization.route_roadblock_ids:
                 block = api.get_map_object(name, layers.ROADBLOCK)
-                blocks.append(block or api.get_map_object(name, layers.ROADBLOCK_CONNECTOR))
+                blocks.append(
+                    block or api.get_map_object(name, layers.ROADBLOCK_CONNECTOR)
+                )
             around = api.get_proximal_map_objects(ego.center, 1.0, LANES)
-            seen["on"] = [lane.id for layer in LANES for lane in api.get_all_map_objects(ego.center, layer)]
+            seen["on"] = [
+                lane.id
+                for layer in LANES
+                for lane in api.get_all_map_objects(ego.center, layer)
+            ]
             seen["near"] = [lane.id for lanes in around.values() for lane in lanes]
-            seen["route"] = [[lane_of(lane) for lane in block.interior_edges] for block in blocks]
-            seen["linked"] = [after in block.outgoing_edges for block, after in zip(blocks, blocks[1:])]
+            seen["route"] = [
+                [lane_of(lane) for lane in block.interior_edges] for block in blocks
+            ]
+            seen["linked"] = [
+                after in block.outgoing_edges
+                for block, after in zip(blocks, blocks[1:])
+            ]
             seen["drivable"] = api.is_in_layer(ego.center, layers.DRIVABLE_AREA)
-            seen["aside"] = [aside_of(api, ego.center, 0.25 * k) for k in range(-40, 41)]
+            seen["aside"] = [
+                aside_of(api, ego.center, 0.25 * k) for k in range(-40, 41)
+            ]
             seen["goal"] = pose_of(self.initialization.mission_goal)
             seen["lights"] = [
-                [one.status.name, api.get_map_object(one.lane_connector_id, layers.LANE_CONNECTOR).id]
+                [
+                    one.status.name,
+                    api.get_map_object(one.lane_connector_id, layers.LANE_CONNECTOR).id,
+                ]
                 for one in current_input.traffic_light_data
             ]
         with Path(os.environ["E2RL_WITNESS"]).open("a") as file:
@@ -156,7 +212,9 @@ class Witness(Straight):
         speed = ego.dynamic_car_state.center_velocity_2d.x
         for step in range(51):
             turn = rate * step / 10
-            chord = speed * step / 10 * (math.sin(turn / 2) / (turn / 2) if turn else 1.0)
+            chord = (
+                speed * step / 10 * (math.sin(turn / 2) / (turn / 2) if turn else 1.0)
+            )
             heading = ego.center.heading + turn
             x = ego.center.x + chord * math.cos(heading - turn / 2)
             y = ego.center.y + chord * math.sin(heading - turn / 2)
@@ -164,7 +222,11 @@ class Witness(Straight):
             velocity = StateVector2D(speed, 0.0)
             zero = StateVector2D(0.0, 0.0)
             pose = StateSE2(x, y, heading)
-            found.append(EgoState.build_from_center(pose, velocity, zero, 0.0, time, vehicle, angular_vel=rate))
+            found.append(
+                EgoState.build_from_center(
+                    pose, velocity, zero, 0.0, time, vehicle, angular_vel=rate
+                )
+            )
         return InterpolatedTrajectory(found)
 
 
@@ -177,10 +239,18 @@ def state_of(ego):
 
 
 def aside_of(api, pose, aside):
-    """Where a point beside a pose lies: in the drivable area, in lanes and in what is drivable and no lane."""
-    point = StateSE2(pose.x - aside * math.sin(pose.heading), pose.y + aside * math.cos(pose.heading), pose.heading)
+    """Where a point beside a pose lies: in the drivable area, in lanes and in what is
+    drivable and no lane."""
+    point = StateSE2(
+        pose.x - aside * math.sin(pose.heading),
+        pose.y + aside * math.cos(pose.heading),
+        pose.heading,
+    )
     layers = ([SemanticMapLayer.DRIVABLE_AREA], LANES, [SemanticMapLayer.CARPARK_AREA])
-    return [aside, *(any(api.is_in_layer(point, layer) for layer in one) for one in layers)]
+    return [
+        aside,
+        *(any(api.is_in_layer(point, layer) for layer in one) for one in layers),
+    ]
 
 
 def agent_of(agent):
@@ -206,7 +276,10 @@ def lane_of(lane):
         "right": right and right.id,
         "width": lane.polygon.area / lane.baseline_path.length,
         "borders": [
-            lane.oriented_distance(line.discrete_path[0]) for line in (lane.left_boundary, lane.right_boundary)
+            lane.oriented_distance(line.discrete_path[0])
+            for line in (lane.left_boundary, lane.right_boundary)
         ],
-        "turns": lane.baseline_path.get_curvature_at_arc_length(lane.baseline_path.length / 2),
+        "turns": lane.baseline_path.get_curvature_at_arc_length(
+            lane.baseline_path.length / 2
+        ),
     }

@@ -1,4 +1,5 @@
-"""Planners outside of e2rl for the tests: that of examples/, its law as an Ego, and ones that go wrong in one scene."""
+"""Planners outside of e2rl for the tests: that of examples/, its law as an Ego, and
+ones that go wrong in one scene."""
 
 import runpy
 import sys
@@ -55,20 +56,27 @@ def command_of(path: Path = EXAMPLE) -> str:
     return f"{sys.executable} -S {path}"
 
 
-def wrong_planner(folder: Path, bad: float, act: str = "pass", read: str = "pass", reply: str = "pass") -> str:
-    """The command of a planner that does what the statements say where the ego of a scene is at y = bad: when it plans
-    for the scene, when it reads the batch, or instead of its reply. Each of its processes leaves a file, its number, in
+def wrong_planner(
+    folder: Path, bad: float, act: str = "pass", read: str = "pass", reply: str = "pass"
+) -> str:
+    """The command of a planner that does what the statements say where the ego of a
+    scene is at y = bad: when it plans for the scene, when it reads the batch, or
+    instead of its reply. Each of its processes leaves a file, its number, in
     folder/marks."""
     (folder / "marks").mkdir(exist_ok=True)
     fields = {"folder": str(EXAMPLE.parent), "marks": str(folder / "marks"), "bad": bad}
-    (folder / "wrong.py").write_text(WRONG.format(act=act, read=read, reply=reply, **fields))
+    (folder / "wrong.py").write_text(
+        WRONG.format(act=act, read=read, reply=reply, **fields)
+    )
     return command_of(folder / "wrong.py")
 
 
 def worlds(scenes):
     """An environment that begins each of the scenes, and its World."""
     env = DrivingEnv(scenes, SimSettings(), len(scenes), agents=True)
-    env.reset(TensorDict({"scene_index": torch.arange(len(scenes))[:, None]}, [len(scenes)]))
+    env.reset(
+        TensorDict({"scene_index": torch.arange(len(scenes))[:, None]}, [len(scenes)])
+    )
     return env, env.world()
 
 
@@ -85,7 +93,8 @@ def driven(ego, steps=80, **scene):
 
 
 class SameLaw(Ego):
-    """The law of examples/external_planner.py in e2rl, told what the World and the missions hold."""
+    """The law of examples/external_planner.py in e2rl, told what the World and the
+    missions hold."""
 
     def plan(self, world):
         mission = mission_of(world.scene)
@@ -93,13 +102,25 @@ class SameLaw(Ego):
         now = world.states
         actions = []
         for row, there in enumerate(world.valid):
-            route = torch.cat([mission.points[row], mission.limit[row, :, None]], 1).tolist()
-            lines = list(zip(mission.light[row].tolist(), mission.light_s[row].tolist(), strict=True))
-            agents = torch.cat([now[row], scene["size"][row], 0 * now[row]], 1)[there].tolist()
+            route = torch.cat(
+                [mission.points[row], mission.limit[row, :, None]], 1
+            ).tolist()
+            lines = list(
+                zip(
+                    mission.light[row].tolist(),
+                    mission.light_s[row].tolist(),
+                    strict=True,
+                )
+            )
+            agents = torch.cat([now[row], scene["size"][row], 0 * now[row]], 1)[
+                there
+            ].tolist()
             lights = scene["light_state"][row, world.step[row]].tolist()
             known = (*scene["size"][row, 0].tolist(), route, lines)
             actions.append(LAW(known, lights, [(0, 0, *agent[:8]) for agent in agents]))
         steps = self.replan_every
-        held = dynamics.rollout(now[:, 0], torch.tensor(actions)[:, None].expand(-1, steps, -1))
+        held = dynamics.rollout(
+            now[:, 0], torch.tensor(actions)[:, None].expand(-1, steps, -1)
+        )
         plan = torch.cat([held, held.new_zeros(len(held), 50 - steps, 4)], 1)
         return continued(plan, torch.full((len(held),), steps))

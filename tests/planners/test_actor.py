@@ -1,4 +1,5 @@
-"""The learned ego: its observation is the environment's, its plan comes true, its file fits or is refused."""
+"""The learned ego: its observation is the environment's, its plan comes true, its file
+fits or is refused."""
 
 import copy
 
@@ -25,29 +26,43 @@ def wild(ego, scale=0.3):
 
 @pytest.mark.parametrize(("vehicles", "true"), [(8, 1), (1, 15)])
 def test_its_plan_comes_true(vehicles, true):
-    """Planning sees what the environment observes: among others the first step is where the action leads; alone on the
-    road the whole plan is, with the actions held as in it."""
-    env = DrivingEnv(make_scenes(2, num_vehicles=vehicles, num_vrus=2 * (vehicles > 1)), SimSettings(), 2)
+    """Planning sees what the environment observes: among others the first step is where
+    the action leads; alone on the road the whole plan is, with the actions held as in
+    it."""
+    env = DrivingEnv(
+        make_scenes(2, num_vehicles=vehicles, num_vrus=2 * (vehicles > 1)),
+        SimSettings(),
+        2,
+    )
     ego = wild(ActorEgo(hidden=(16,), room=None), 0.1)
     td = env.reset()
     for step in range(15):
         if step % true == 0:
             plan = ego.plan(env.world())
-            assert plan.shape == (2, PLAN_STEPS, 4) and torch.equal(plan, ego.plan(env.world()))
+            assert plan.shape == (2, PLAN_STEPS, 4) and torch.equal(
+                plan, ego.plan(env.world())
+            )
         if step % min(true, 5) == 0:
             action = ego.act(env.world(), td["observation"], plan)
         td = env.step(td.set("action", action))["next"].exclude("reward")
-        assert torch.allclose(env.world().states[:, 0], plan[:, step % true], atol=1e-3), step
+        assert torch.allclose(
+            env.world().states[:, 0], plan[:, step % true], atol=1e-3
+        ), step
 
 
 def test_plans_expect_the_others_plans():
-    """A leader that plans to halt makes the ego plan to halt; by its velocity alone it would go on."""
-    env = DrivingEnv(make_scenes(2, vehicles=[(0.0, 0, 10.0), (25.0, 0, 10.0)]), SimSettings(), 2)
+    """A leader that plans to halt makes the ego plan to halt; by its velocity alone it
+    would go on."""
+    env = DrivingEnv(
+        make_scenes(2, vehicles=[(0.0, 0, 10.0), (25.0, 0, 10.0)]), SimSettings(), 2
+    )
     env.reset()
     ego = ActorEgo(hidden=(8,))
     world = env.world()
     going_on = ego.plan(world)
-    world.plan = world.states[:, : env.scene["route_log"].shape[1], None].repeat(1, 1, PLAN_STEPS, 1)
+    world.plan = world.states[:, : env.scene["route_log"].shape[1], None].repeat(
+        1, 1, PLAN_STEPS, 1
+    )
     world.plan[..., 3] = 0.0
     halting = ego.plan(world)
     assert (going_on[:, -1, 3] > 8).all() and (halting[:, -1, 3] < 3).all()
@@ -57,14 +72,23 @@ def test_the_network_can_override_the_reference():
     ego = ActorEgo(hidden=(8,), slack=None, room=None)
     env = DrivingEnv(make_scenes(2), SimSettings(), 2)
     observation = env.reset()["observation"]
-    assert torch.allclose(ego.network.network.deterministic(observation), follow(observation)[..., :2], atol=1e-4)
+    assert torch.allclose(
+        ego.network.network.deterministic(observation),
+        follow(observation)[..., :2],
+        atol=1e-4,
+    )
     with torch.no_grad():
         ego.network.network.trunk.last.bias[:2] = torch.tensor([8.0, -8.0])
-    assert torch.allclose(ego.network.network.deterministic(observation), torch.tensor([5.0, -1.6]), atol=1e-2)
+    assert torch.allclose(
+        ego.network.network.deterministic(observation),
+        torch.tensor([5.0, -1.6]),
+        atol=1e-2,
+    )
 
 
 def test_nothing_learned_accelerates_into_a_vehicle_that_is_followed_or_a_pedestrian():
-    """It may brake harder than its reference; against oncoming traffic, whose duty it is too, it decides alone."""
+    """It may brake harder than its reference; against oncoming traffic, whose duty it
+    is too, it decides alone."""
     follows = make_scenes(2, vehicles=[(0.0, 0, 10.0), (18.0, 0, 6.0)])
     oncoming = make_scenes(2, vehicles=[(0.0, 0, 10.0), (18.0, 0, 6.0)])
     oncoming.scenes["start"][:, 1, 2] = torch.pi
@@ -83,7 +107,11 @@ def test_nothing_learned_accelerates_into_a_vehicle_that_is_followed_or_a_pedest
 
     for scenes in (follows, walks):
         own, unbound, reference = accelerations(scenes, 8.0)
-        assert (unbound > 4.9).all() and torch.allclose(own, reference[:, 2] + 0.5, atol=1e-3) and (own < -1.0).all()
+        assert (
+            (unbound > 4.9).all()
+            and torch.allclose(own, reference[:, 2] + 0.5, atol=1e-3)
+            and (own < -1.0).all()
+        )
         own, unbound, reference = accelerations(scenes, -8.0)
         assert torch.equal(own, unbound) and (own < reference[:, 0] - 0.5).all()
     own, _, _ = accelerations(oncoming, 8.0)
@@ -97,8 +125,13 @@ def test_with_room_ahead_the_reference_drives_and_without_it_the_network():
     observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
     names = [entry.name for entry in observation_layout()]
     for room, weight in ((2.5, 0.0), (2.0, 0.0), (1.5, 0.5), (1.0, 1.0), (-0.5, 1.0)):
-        observation[:, [names.index(f"manoeuvre.{accel}.+0.gap") for accel in ("-1", "+1")]] = room / 3.0
-        (own, _), (network, _) = ego.network.network(observation), alone.network.network(observation)
+        observation[
+            :, [names.index(f"manoeuvre.{accel}.+0.gap") for accel in ("-1", "+1")]
+        ] = room / 3.0
+        (own, _), (network, _) = (
+            ego.network.network(observation),
+            alone.network.network(observation),
+        )
         usual = ego.network.network.offset(observation)[:, :2]
         torch.testing.assert_close(own, torch.lerp(usual, network, weight))
 
@@ -111,17 +144,23 @@ def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise(
         normaliser(part)
     everything = torch.cat(parts)
     assert torch.allclose(normaliser.mean, everything.mean(0), atol=1e-5)
-    assert torch.allclose(normaliser.variance, everything.var(0, correction=0), rtol=1e-4)
+    assert torch.allclose(
+        normaliser.variance, everything.var(0, correction=0), rtol=1e-4
+    )
 
 
 def test_file_round_trip(tmp_path):
     first = wild(ActorEgo(hidden=(8,), slack=0.3, room=3.0))
-    first.network.normaliser.observe(torch.randn(10, first.network.normaliser.mean.shape[0]))
+    first.network.normaliser.observe(
+        torch.randn(10, first.network.normaliser.mean.shape[0])
+    )
     folder = tmp_path / "checkpoints" / "round-000001"
     folder.mkdir(parents=True)
     first.network.save(folder / "actor.safetensors")
     seal(folder)
-    assert find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
+    assert (
+        find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
+    )
     second = ActorEgo(hidden=(8,), checkpoint=str(tmp_path))
     assert second.network.architecture == first.network.architecture
     seen = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()
@@ -133,7 +172,8 @@ def test_file_round_trip(tmp_path):
 
 
 def test_a_file_without_the_reference_s_weight_drives_as_it_did(tmp_path):
-    """Earlier versions added the network's output to the reference's action, and did not bound it."""
+    """Earlier versions added the network's output to the reference's action, and did
+    not bound it."""
     first = wild(ActorEgo(hidden=(8,), slack=None, room=None))
     network = first.network.network
     file = tmp_path / "actor.safetensors"
@@ -142,10 +182,16 @@ def test_a_file_without_the_reference_s_weight_drives_as_it_did(tmp_path):
             value[2:] = 0.0
     observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
     with torch.no_grad():
-        added = network.trunk(network.normaliser(observation))[:, :2] + network.offset(observation)[:, :2]
+        added = (
+            network.trunk(network.normaliser(observation))[:, :2]
+            + network.offset(observation)[:, :2]
+        )
         expected = network.middle + network.reach * added.tanh()
     of = first.network.weights()
-    shorter = {key: value[:2] if key.startswith("network.trunk.last") else value for key, value in of.items()}
+    shorter = {
+        key: value[:2] if key.startswith("network.trunk.last") else value
+        for key, value in of.items()
+    }
     first.network.weights = lambda: shorter
     first.network.save(file)
     second = ActorEgo(hidden=(8,), checkpoint=str(file))
@@ -158,16 +204,25 @@ def test_the_network_can_let_go_of_the_reference():
     with torch.no_grad():
         network.trunk.last.bias[:] = torch.tensor([0.3, -0.2, -1.0, -1.0])
     expected = network.middle + network.reach * torch.tensor([0.3, -0.2]).tanh()
-    torch.testing.assert_close(network.deterministic(observation), expected.expand(2, 2))
+    torch.testing.assert_close(
+        network.deterministic(observation), expected.expand(2, 2)
+    )
 
 
 def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatch):
     file = tmp_path / "actor.safetensors"
     network = ActorEgo(hidden=(8,)).network
     network.save(file)
-    with pytest.raises(InputError, match=r"bounds .*5\.0, .* not .*2\.0.*set sim\.max_"):
+    with pytest.raises(
+        InputError, match=r"bounds .*5\.0, .* not .*2\.0.*set sim\.max_"
+    ):
         ActorEgo(hidden=(8,), max_acceleration=2.0, checkpoint=str(file))
-    bounds = {"room": 0.0}, {"room": float("nan")}, {"slack": float("nan")}, {"least_scale": -1}
+    bounds = (
+        {"room": 0.0},
+        {"room": float("nan")},
+        {"slack": float("nan")},
+        {"least_scale": -1},
+    )
     for change in ({"observation": 12}, {"hidden": [10**9]}, *bounds):
         monkeypatch.setattr(network, "architecture", network.architecture | change)
         network.save(file)
@@ -187,5 +242,9 @@ def test_noise_is_the_networks_alone_and_ends_with_the_block():
     with network.noisy(0.3, 1.0):
         assert not torch.equal(network.deterministic(observation), clean)
         torch.nn.init.zeros_(network.trunk.last.weight)
-        assert torch.allclose(network.deterministic(observation), follow(observation)[..., :2], atol=1e-4)
-    assert torch.equal(network.deterministic(observation), network.deterministic(observation))
+        assert torch.allclose(
+            network.deterministic(observation), follow(observation)[..., :2], atol=1e-4
+        )
+    assert torch.equal(
+        network.deterministic(observation), network.deterministic(observation)
+    )

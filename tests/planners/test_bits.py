@@ -25,7 +25,8 @@ from tests.synthetic import make_scenes
 
 
 def wild_ego(**changes):
-    """An ego with random weights, whose plans use the whole range of controls and of goals."""
+    """An ego with random weights, whose plans use the whole range of controls and of
+    goals."""
     ego = BitsEgo(checkpoint=None, **changes)
     generator = torch.Generator().manual_seed(0)
     for layer in (ego.network.goal_head[-1], ego.network.policy[-1]):
@@ -34,7 +35,9 @@ def wild_ego(**changes):
 
 
 def test_plans_the_cheapest_candidate():
-    _, world = worlds(make_scenes(3, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0)]))
+    _, world = worlds(
+        make_scenes(3, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0)])
+    )
     ego = wild_ego()
     candidates = ego.candidates(world)
     plan = ego.plan(world)
@@ -42,7 +45,9 @@ def test_plans_the_cheapest_candidate():
     assert candidates.states.shape == (3, 40, PLAN_STEPS, 4) and costs.std(1).min() > 1
     for k in range(3):
         assert torch.equal(plan[k], candidates.states[k, costs[k].argmin()])
-    torch.testing.assert_close(ego.rated(world, plan[:, None])[:, 0], costs.amin(1), atol=8.0, rtol=0)
+    torch.testing.assert_close(
+        ego.rated(world, plan[:, None])[:, 0], costs.amin(1), atol=8.0, rtol=0
+    )
 
 
 def test_a_moved_scene_gets_the_moved_candidates():
@@ -54,10 +59,16 @@ def test_a_moved_scene_gets_the_moved_candidates():
     first = ego.candidates(here)
     second = ego.candidates(there)
     x, y, heading, speed = first.states.unbind(-1)
-    moved = torch.stack([shift[0] - y, shift[1] + x, dynamics.wrap(heading + torch.pi / 2), speed], -1)
-    torch.testing.assert_close(second.states[..., :2], moved[..., :2], atol=2e-2, rtol=0)
+    moved = torch.stack(
+        [shift[0] - y, shift[1] + x, dynamics.wrap(heading + torch.pi / 2), speed], -1
+    )
+    torch.testing.assert_close(
+        second.states[..., :2], moved[..., :2], atol=2e-2, rtol=0
+    )
     torch.testing.assert_close(second.states[..., 3], speed, atol=1e-2, rtol=0)
-    torch.testing.assert_close(ego.costs(there, second), ego.costs(here, first), atol=0.5, rtol=1e-2)
+    torch.testing.assert_close(
+        ego.costs(there, second), ego.costs(here, first), atol=0.5, rtol=1e-2
+    )
 
 
 def test_a_file_gives_the_network_back_and_another_is_refused(tmp_path):
@@ -65,11 +76,18 @@ def test_a_file_gives_the_network_back_and_another_is_refused(tmp_path):
     seen = torch.randn(4, OBSERVATION_SIZE)
     save_bits(network, tmp_path / "bits.safetensors", origin={"data": "made"})
     again = load_bits(str(tmp_path))
-    for one, other in zip(network.goals(network.encode(seen)), again.goals(again.encode(seen)), strict=True):
+    for one, other in zip(
+        network.goals(network.encode(seen)),
+        again.goals(again.encode(seen)),
+        strict=True,
+    ):
         assert torch.equal(one, other) and not other.requires_grad
     network.architecture["cells"] = 9
     save_bits(network, tmp_path / "bits.safetensors", origin={})
-    for where, why in ((tmp_path, "another architecture"), (tmp_path / "no", "no bits.safetensors there")):
+    for where, why in (
+        (tmp_path, "another architecture"),
+        (tmp_path / "no", "no bits.safetensors there"),
+    ):
         with pytest.raises(InputError, match=why):
             BitsEgo(checkpoint=str(where))
 
@@ -84,7 +102,11 @@ def test_cells_and_places_are_inverses():
     torch.testing.assert_close(again[0][:, 0], way, atol=1e-3, rtol=0)
     torch.testing.assert_close(again[1][:, 0], side, atol=1e-4, rtol=0)
     on_grid = (way < reach(speed)) & (side.abs() < SIDES / 2)
-    assert (residual[on_grid].abs() <= 0.5001).all() and cell.min() >= 0 and cell.max() < CELLS
+    assert (
+        (residual[on_grid].abs() <= 0.5001).all()
+        and cell.min() >= 0
+        and cell.max() < CELLS
+    )
 
 
 def test_the_needed_acceleration_drives_the_distance():
@@ -92,5 +114,7 @@ def test_the_needed_acceleration_drives_the_distance():
     way = torch.tensor([50.0, 75.0, 20.0, 5.0])
     accel = needed_acceleration(speed, way)
     torch.testing.assert_close(accel, torch.tensor([0.0, 2.0, -2.5, 0.4]))
-    time = torch.where(accel < 0, speed / -accel, PLAN_SECONDS).clamp(max=PLAN_SECONDS)  # to the halt
+    time = torch.where(accel < 0, speed / -accel, PLAN_SECONDS).clamp(
+        max=PLAN_SECONDS
+    )  # to the halt
     torch.testing.assert_close(speed * time + accel * time**2 / 2, way)

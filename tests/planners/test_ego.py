@@ -1,4 +1,5 @@
-"""Tracking leaves no error on drivable plans, makes good deviations, and a policy restarts with its episodes."""
+"""Tracking leaves no error on drivable plans, makes good deviations, and a policy
+restarts with its episodes."""
 
 from dataclasses import replace
 
@@ -29,13 +30,17 @@ class Cruise(Ego):
     """Holds its speed along its mission."""
 
     def plan(self, world):
-        return MissionPath(world).drive(world.states[:, 0, 3:].expand(-1, PLAN_STEPS + 1))
+        return MissionPath(world).drive(
+            world.states[:, 0, 3:].expand(-1, PLAN_STEPS + 1)
+        )
 
 
 def test_a_drivable_plan_is_followed_without_error():
     generator = torch.Generator().manual_seed(0)
     start = torch.tensor([0.0, 0.0, 0.5, 12.0], dtype=torch.float64)
-    actions = torch.randn(50, 2, generator=generator, dtype=torch.float64) * torch.tensor([2.0, 0.2])
+    actions = torch.randn(
+        50, 2, generator=generator, dtype=torch.float64
+    ) * torch.tensor([2.0, 0.2])
     plan = torch.cat([start[None], dynamics.rollout(start, actions)])
     state = start
     for k in range(50):
@@ -72,20 +77,27 @@ def test_what_a_policy_writes_as_its_plan_is_what_it_then_drives(kind, atol):
         fresh = made[step // 5]
         age = step % 5
         assert torch.equal(told[:, step, : PLAN_STEPS - age], fresh[:, age:])
-        assert torch.equal(told[:, step, PLAN_STEPS - age :], fresh[:, -1:].expand(-1, age, -1)), "its end is held"
+        assert torch.equal(
+            told[:, step, PLAN_STEPS - age :], fresh[:, -1:].expand(-1, age, -1)
+        ), "its end is held"
     assert torch.allclose(driven, told[:, :, 0], atol=atol)
     for step in range(0, 30, 5):
-        assert torch.allclose(driven[:, step : step + 5], told[:, step, :5], atol=atol), "the interval that follows"
+        assert torch.allclose(
+            driven[:, step : step + 5], told[:, step, :5], atol=atol
+        ), "the interval that follows"
 
 
 def test_a_reset_in_between_makes_a_new_plan_there():
-    """Environment 0 hits a wall early and starts anew while 1 drives on: both stay on their lanes' centre."""
+    """Environment 0 hits a wall early and starts anew while 1 drives on: both stay on
+    their lanes' centre."""
     scenes = make_scenes(2, vehicles=[(0.0, 0, 10.0), (23.0, 0, 0.0)])
     scenes.scenes["valid"][1, 1] = False
     scenes.scenes["logged_valid"][1, :, 1] = False
     env = make_env(scenes, 4)
     env.set_seed(1)
-    data = env.rollout(70, EgoPolicy(Cruise(replan_every=5), env), break_when_any_done=False)
+    data = env.rollout(
+        70, EgoPolicy(Cruise(replan_every=5), env), break_when_any_done=False
+    )
     done = data["next", "done"]
     assert done.any() and not done.all(0).any()
     assert data["action"].abs().max() < 1e-3
@@ -115,9 +127,15 @@ def drive(ego, scenes, steps=12):
 @pytest.mark.parametrize(
     ("of", "told"),
     [
-        (lambda plan: plan[:, :30], r"Planned.plan: returns torch.float32 \[2, 30, 4\], .*floats \[2, 50, 4\]"),
+        (
+            lambda plan: plan[:, :30],
+            r"Planned.plan: returns torch.float32 \[2, 30, 4\], .*floats \[2, 50, 4\]",
+        ),
         (lambda plan: plan[0], r"\[50, 4\], expected a tensor of floats \[2, 50, 4\]"),
-        (lambda plan: plan.numpy(), r"returns numpy ndarray of float32 \[2, 50, 4\], .*torch.as_tensor"),
+        (
+            lambda plan: plan.numpy(),
+            r"returns numpy ndarray of float32 \[2, 50, 4\], .*torch.as_tensor",
+        ),
         (lambda plan: plan.long(), "torch.int64"),
         (lambda plan: None, "NoneType"),
     ],
@@ -137,24 +155,41 @@ def test_plans_of_another_shape_or_type_are_told_so(of, told):
     ],
 )
 def test_a_plan_that_begins_elsewhere_ends_its_rollout(of):
-    with pytest.raises(Undrivable, match="begins more than 2 m ahead of, behind, 5 m beside or 1 rad") as refused:
+    with pytest.raises(
+        Undrivable, match="begins more than 2 m ahead of, behind, 5 m beside or 1 rad"
+    ) as refused:
         drive(Planned(of), make_scenes(2, vehicles=[(3.5, 0, 10.0)]))
     assert set(refused.value.rows) == {0, 1}
-    drive(Planned(lambda plan: plan + torch.tensor([0.5, 3.0, 0.1, 0])), make_scenes(2), steps=8)  # on the lane beside
+    drive(
+        Planned(lambda plan: plan + torch.tensor([0.5, 3.0, 0.1, 0])),
+        make_scenes(2),
+        steps=8,
+    )  # on the lane beside
 
 
 def reversing(plan):
     """Back along x at 5 m/s from where the ego is."""
     ahead = 0.1 * torch.arange(1, PLAN_STEPS + 1)
     start = plan[:, :1, 0] - 0.1 * plan[:, :1, 3]
-    return torch.stack([start - 5 * ahead, *plan[..., 1:3].unbind(-1), torch.full_like(start - ahead, -5.0)], -1)
+    return torch.stack(
+        [
+            start - 5 * ahead,
+            *plan[..., 1:3].unbind(-1),
+            torch.full_like(start - ahead, -5.0),
+        ],
+        -1,
+    )
 
 
-@pytest.mark.parametrize(("signed", "speed"), [(True, 20.0), (False, 20.0), (True, 12.0)])
+@pytest.mark.parametrize(
+    ("signed", "speed"), [(True, 20.0), (False, 20.0), (True, 12.0)]
+)
 def test_a_plan_that_goes_backwards_is_told_that_egos_do_not_reverse(signed, speed):
-    """Whether or not it says so by its speeds; at 12 m/s it begins less than 2 m from the ego, and asks for an action
-    beyond all bounds."""
-    planned = Planned(lambda plan: reversing(plan) * torch.tensor([1.0, 1, 1, 1 if signed else -1]))
+    """Whether or not it says so by its speeds; at 12 m/s it begins less than 2 m from
+    the ego, and asks for an action beyond all bounds."""
+    planned = Planned(
+        lambda plan: reversing(plan) * torch.tensor([1.0, 1, 1, 1 if signed else -1])
+    )
     scenes = make_scenes(1, speed=speed)
     with pytest.raises(Undrivable, match="goes backwards: egos do not reverse"):
         drive(planned, scenes)
@@ -170,17 +205,25 @@ class Braking(Ego):
 def test_a_policy_overrides_act_alone():
     """It is announced to hold its velocity, and does what it acts."""
     steps = drive(Braking(), make_scenes(2, speed=10.0), 20)
-    assert torch.allclose(steps["next", "agents", "states"][:, -1, 0, 3], torch.full((2,), 6.0), atol=1e-4)
-    assert torch.allclose(steps["ego", "plan"][:, 0, :, 3], torch.full((2, PLAN_STEPS), 10.0))
+    assert torch.allclose(
+        steps["next", "agents", "states"][:, -1, 0, 3], torch.full((2,), 6.0), atol=1e-4
+    )
+    assert torch.allclose(
+        steps["ego", "plan"][:, 0, :, 3], torch.full((2, PLAN_STEPS), 10.0)
+    )
 
 
 def test_replayed_log_is_tracked():
     env = make_env(make_scenes(1, num_vehicles=2), 1)
     env.rollout(80, EgoPolicy(ReplayEgo(), env))
-    assert torch.allclose(env.world().states[:, 0], env.scene["logged"][:, 80, 0], atol=0.01)
+    assert torch.allclose(
+        env.world().states[:, 0], env.scene["logged"][:, 80, 0], atol=0.01
+    )
 
 
-@pytest.mark.parametrize("name", ["idm", "lane_graph", "lane_graph_tuned", "replay", "sampling", "bits"])
+@pytest.mark.parametrize(
+    "name", ["idm", "lane_graph", "lane_graph_tuned", "replay", "sampling", "bits"]
+)
 def test_a_file_of_the_configuration_builds_its_ego(name):
     ego = built(load_choice("ego", name), "ego", kind=Ego)
     plan = ego.plan(world_of(num_scenes=2)[1])
@@ -193,7 +236,9 @@ class Straight(Ego):
     """Holds its speed and heading; acts itself."""
 
     def plan(self, world):
-        return dynamics.constant_velocity(world.states[:, 0], 0.1 * torch.arange(1, PLAN_STEPS + 1))
+        return dynamics.constant_velocity(
+            world.states[:, 0], 0.1 * torch.arange(1, PLAN_STEPS + 1)
+        )
 
     def act(self, world, observation, plan):
         return super().act(world, observation, plan)
@@ -206,8 +251,16 @@ class Meddler(Straight):
         self.told = []
 
     def plan(self, world):
-        told = {**world.scene, **{name: value for name, value in vars(world).items() if name != "scene"}}
-        self.told.append({key: value if value is None else value.clone() for key, value in told.items()})
+        told = {
+            **world.scene,
+            **{name: value for name, value in vars(world).items() if name != "scene"},
+        }
+        self.told.append(
+            {
+                key: value if value is None else value.clone()
+                for key, value in told.items()
+            }
+        )
         return self.meddle(super().plan(world), *told.values())
 
     def act(self, world, observation, plan):
@@ -216,7 +269,9 @@ class Meddler(Straight):
 
     def meddle(self, made, *told):
         for value in told:
-            if value is not None and not value.dtype.is_floating_point:  # of the scene, the step, who is there
+            if (
+                value is not None and not value.dtype.is_floating_point
+            ):  # of the scene, the step, who is there
                 value.zero_()
             elif value is not None:
                 value.add_(7.0)
@@ -225,26 +280,42 @@ class Meddler(Straight):
 
 def test_code_from_outside_moves_nobody():
     scenes = make_scenes(2, num_vehicles=3, red_light_x=60.0)
-    data = [env.rollout(20, EgoPolicy(ego(), env)) for ego in (Straight, Meddler) for env in [make_env(scenes, 2)]]
+    data = [
+        env.rollout(20, EgoPolicy(ego(), env))
+        for ego in (Straight, Meddler)
+        for env in [make_env(scenes, 2)]
+    ]
     for key in ("observation", "agents", "action", "ego"):
         assert (data[0][key] == data[1][key]).all(), key
 
 
 @pytest.mark.parametrize("traffic", [LogReplay(), ConstantVelocity()])
 def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic):
-    """Everything that a planner is told, in rollouts and by traffic that asks it beforehand, is of the present."""
+    """Everything that a planner is told, in rollouts and by traffic that asks it
+    beforehand, is of the present."""
     first = make_scenes(2, num_vehicles=3, num_vrus=2, red_light_x=60.0, steps=40)
     told = []
     first.scenes["valid"][:, 2] = first.scenes["logged_valid"][:, :, 2] = False
     second = replace(first, scenes=first.scenes.clone())
-    later = {key: second.scenes[key][:, 12:] for key in ("logged", "logged_valid", "light_state")}
+    later = {
+        key: second.scenes[key][:, 12:]
+        for key in ("logged", "logged_valid", "light_state")
+    }
     later["logged"][..., :2] += 9.0
     later["logged_valid"].logical_not_(), later["light_state"].fill_(LIGHT_GREEN)
     second.scenes["route_log"][:, 1:] += 1
     second.scenes["size"][:, 2] = second.scenes["agent_type"][:, 2] = 3
     for scenes in (first, second):
         ego = Meddler()
-        roll_out(scenes, torch.arange(2), seed=torch.arange(2), eta=torch.zeros(2), ego=ego, traffic=traffic, sim=SimSettings())
+        roll_out(
+            scenes,
+            torch.arange(2),
+            seed=torch.arange(2),
+            eta=torch.zeros(2),
+            ego=ego,
+            traffic=traffic,
+            sim=SimSettings(),
+        )
         told.append(ego.told[:3])  # at steps 0, 5 and 10
         ego.told = []
         world = worlds(scenes)[1]
@@ -279,7 +350,10 @@ def test_scenes_of_a_batch_do_not_mix(kind):
     """Planned together, beyond a chunk, or alone, a scene gets the same plan."""
     ego = kind()
     count = 66 if kind is BitsEgo else 10
-    scenes = make_scenes(count, vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0), (-15.0, 0, 11.0)])
+    scenes = make_scenes(
+        count,
+        vehicles=[(0.0, 0, 10.0), (22.0, 0, 6.0), (10.0, 1, 10.0), (-15.0, 0, 11.0)],
+    )
     scenes.scenes["start"][1, 1:4, 0] += 6.0
     scenes.scenes["valid"][2, 1:] = False
     together = ego.plan(worlds(scenes)[1])
@@ -291,7 +365,9 @@ def test_scenes_of_a_batch_do_not_mix(kind):
 
 @pytest.mark.parametrize("kind", [IDMEgo, LaneGraphEgo, SamplingEgo, BitsEgo])
 def test_a_red_light_is_halted_at_and_without_one_it_drives_on(kind):
-    halts_by = 48.3 if kind is IDMEgo else 47.8  # the line is at 50 m, the front 2.25 m ahead of the centre
+    halts_by = (
+        48.3 if kind is IDMEgo else 47.8
+    )  # the line is at 50 m, the front 2.25 m ahead of the centre
     for light, low, high in ((50.0, 35.0, halts_by), (None, 55.0, 1e3)):
         _, state = driven(kind(), num_vehicles=1, num_vrus=0, red_light_x=light)
         assert low < state[0] < high and (state[3] < 2.5) == (light is not None)
@@ -301,14 +377,27 @@ def test_a_red_light_is_halted_at_and_without_one_it_drives_on(kind):
 def test_a_free_road_is_driven_at_the_limit_and_behind_a_wall_it_halts(kind):
     for limit, speed in ((0.0, 20.0), (12.0, 12.0)):
         data, state = driven(kind(), num_vehicles=1, num_vrus=0, limit=limit)
-        assert abs(state[3] - speed) < 0.3 and data["next", "agents", "states"][0, :, 0, 1].abs().max() < 0.05
-    data, state = driven(kind(), vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0), (50.0, 1, 0.0)], num_vrus=0)
-    assert not data["next", "terminated"].any() and state[3] < 2.0 and 20 < state[0] < 46
+        assert (
+            abs(state[3] - speed) < 0.3
+            and data["next", "agents", "states"][0, :, 0, 1].abs().max() < 0.05
+        )
+    data, state = driven(
+        kind(), vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0), (50.0, 1, 0.0)], num_vrus=0
+    )
+    assert (
+        not data["next", "terminated"].any() and state[3] < 2.0 and 20 < state[0] < 46
+    )
 
 
 def test_idm_settles_behind_a_slower_leader_and_returns_to_its_lane():
-    data, state = driven(IDMEgo(), vehicles=[(0.0, 0, 9.0), (30.0, 0, 6.0), (30.0, 1, 0.0)], limit=10.0)
-    assert not data["next", "done"][:, :-1].any() and state[3] < 7.0 and 8 < 30.0 + 8 * 6.0 - state[0] - 4.5 < 20
+    data, state = driven(
+        IDMEgo(), vehicles=[(0.0, 0, 9.0), (30.0, 0, 6.0), (30.0, 1, 0.0)], limit=10.0
+    )
+    assert (
+        not data["next", "done"][:, :-1].any()
+        and state[3] < 7.0
+        and 8 < 30.0 + 8 * 6.0 - state[0] - 4.5 < 20
+    )
     scenes = make_scenes(1, num_vehicles=1)
     scenes.scenes["start"][0, 0, 1:3] = torch.tensor([0.8, -0.1])
     env = worlds(scenes)[0]

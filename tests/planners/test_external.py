@@ -1,4 +1,5 @@
-"""A planner in another process drives as the same law does inside, and what goes wrong in a scene costs that scene."""
+"""A planner in another process drives as the same law does inside, and what goes wrong
+in a scene costs that scene."""
 
 import json
 import multiprocessing
@@ -38,7 +39,8 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
 
 
 def scene_set(count=4, **about):
-    """Scenes with a slow leader; the ego of scene BAD is in the other lane, on its route."""
+    """Scenes with a slow leader; the ego of scene BAD is in the other lane, on its
+    route."""
     found = make_scenes(count, vehicles=ROAD, steps=12, **about)
     found.scenes["start"][BAD : BAD + 1, 0, 1] = 3.5
     found.scenes["logged"][BAD : BAD + 1, :, 0, 1] = 3.5
@@ -48,7 +50,13 @@ def scene_set(count=4, **about):
 
 def run(ego, folder=None, processes=1, batch=4):
     setup = Setup(scene_set(), ego, ego_name="external", sim=SimSettings(), batch=batch)
-    return run_protocol(setup, [Method("replay", LogReplay())], seeds=[0], folder=folder, processes=processes)
+    return run_protocol(
+        setup,
+        [Method("replay", LogReplay())],
+        seeds=[0],
+        folder=folder,
+        processes=processes,
+    )
 
 
 @pytest.mark.parametrize(("replan_every", "red_light_x"), [(1, None), (5, 45.0)])
@@ -56,7 +64,10 @@ def test_it_drives_as_the_same_law_inside(replan_every, red_light_x):
     scenes = scene_set(red_light_x=red_light_x)
     inside, outside = (
         roll_out(scenes, ego, traffic=LogReplay()).states
-        for ego in (SameLaw(replan_every), ExternalEgo(command_of(), replan_every=replan_every))
+        for ego in (
+            SameLaw(replan_every),
+            ExternalEgo(command_of(), replan_every=replan_every),
+        )
     )
     assert torch.allclose(inside, outside, atol=1e-3)
     speed = outside[:, -1, 0, 3]
@@ -75,29 +86,53 @@ def test_one_that_runs_serves_several_connections():
     finally:
         planner.kill()
         planner.wait()
-    assert row["metrics"]["progress"] == pytest.approx(inside["metrics"]["progress"], abs=1e-3, nan_ok=True)
+    assert row["metrics"]["progress"] == pytest.approx(
+        inside["metrics"]["progress"], abs=1e-3, nan_ok=True
+    )
     assert row["n_rollouts"] == 4 and row["errored"] == {}
 
 
 TRAJECTORY = "return reply(self, 4, scene + struct.pack('<I{0}f', {1}, *[{2}] * {0}))"
 WRONGS = {
-    "raises": ({"act": "raise ValueError('no way out')"}, "PlannerFailed", "no way out"),
+    "raises": (
+        {"act": "raise ValueError('no way out')"},
+        "PlannerFailed",
+        "no way out",
+    ),
     "dies": ({"act": "os._exit(3)"}, "PlannerDied", "ended with status 3"),
-    "hangs": ({"act": "time.sleep(100)"}, "PlannerTimedOut", "no reply within 0.3 s a scene"),
+    "hangs": (
+        {"act": "time.sleep(100)"},
+        "PlannerTimedOut",
+        "no reply within 0.3 s a scene",
+    ),
     "NaN": ({"act": "return math.nan, 0"}, "BadReply", "an action that is not finite"),
     "jumps": ({"reply": TRAJECTORY.format(200, 50, 20.0)}, "BadReply", "jumps"),
-    "short": ({"reply": TRAJECTORY.format(4, 1, 0.0)}, "BadReply", "fewer than the 5 steps until the next plan"),
-    "long": ({"reply": "self.wfile.write(struct.pack('<2I', 4, 2**31))"}, "BadReply", "announces 2147483648 bytes"),
+    "short": (
+        {"reply": TRAJECTORY.format(4, 1, 0.0)},
+        "BadReply",
+        "fewer than the 5 steps until the next plan",
+    ),
+    "long": (
+        {"reply": "self.wfile.write(struct.pack('<2I', 4, 2**31))"},
+        "BadReply",
+        "announces 2147483648 bytes",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", WRONGS)
 def test_what_goes_wrong_in_a_scene_costs_that_scene(tmp_path, name):
     wrong, reason, detail = WRONGS[name]
-    ego = ExternalEgo(wrong_planner(tmp_path, 3.5, **wrong), timeout=0.3 if name == "hangs" else 5.0)
+    ego = ExternalEgo(
+        wrong_planner(tmp_path, 3.5, **wrong), timeout=0.3 if name == "hangs" else 5.0
+    )
     (row,) = run(ego, tmp_path)
     (entry,) = json.loads((tmp_path / ERRORED_FILE).read_text())
-    assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 4 and entry["raised_by"] == "ego"
+    assert (
+        row["errored"] == {f"raised {reason}": 1}
+        and row["n_rollouts"] == 4
+        and entry["raised_by"] == "ego"
+    )
     assert row["metrics"]["errored"]["mean"] == 0.25
     assert entry["scene_id"] == scene_set().scene_id[BAD]
     assert re.search(detail, entry["detail"]), entry["detail"]
@@ -106,11 +141,24 @@ def test_what_goes_wrong_in_a_scene_costs_that_scene(tmp_path, name):
 def test_it_is_restarted_as_often_as_allowed(tmp_path):
     command = wrong_planner(tmp_path, 3.5, act="os._exit(3)")
     (row,) = run(ExternalEgo(command, restarts=1))
-    assert row["metrics"]["errored"]["mean"] == 0.25 and len(list((tmp_path / "marks").iterdir())) == 2
+    assert (
+        row["metrics"]["errored"]["mean"] == 0.25
+        and len(list((tmp_path / "marks").iterdir())) == 2
+    )
     (row,) = run(ExternalEgo(command, restarts=0), tmp_path)
-    assert row["errored"] == {"raised PlannerDied": 4} and row["metrics"]["errored"]["mean"] == 1.0
-    details = [entry["detail"] for entry in json.loads((tmp_path / ERRORED_FILE).read_text())]
-    assert sum("it was restarted 0 times; see ego.restarts" in detail for detail in details) == 3
+    assert (
+        row["errored"] == {"raised PlannerDied": 4}
+        and row["metrics"]["errored"]["mean"] == 1.0
+    )
+    details = [
+        entry["detail"] for entry in json.loads((tmp_path / ERRORED_FILE).read_text())
+    ]
+    assert (
+        sum(
+            "it was restarted 0 times; see ego.restarts" in detail for detail in details
+        )
+        == 3
+    )
     assert len(list((tmp_path / "marks").iterdir())) == 3
 
 
@@ -125,7 +173,8 @@ def test_its_process_ends_with_its_ego(tmp_path):
 
 
 def started_command(ego):
-    """The process of a command with two workers, which a terminal's Ctrl-C reaches with all that it starts."""
+    """The process of a command with two workers, which a terminal's Ctrl-C reaches with
+    all that it starts."""
 
     def command():
         os.setsid()
@@ -139,7 +188,8 @@ def started_command(ego):
 
 
 def pids_in(folder, count):
-    """Numbers of the files in a folder, once there are so many; each is a process that lives."""
+    """Numbers of the files in a folder, once there are so many; each is a process that
+    lives."""
     begin = time.monotonic()
     while len(list(folder.iterdir())) < count and time.monotonic() - begin < 30:
         time.sleep(0.02)
@@ -162,7 +212,9 @@ def alive_after(pids, seconds):
 @pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGKILL"])
 def test_no_process_is_left(tmp_path, how):
     """Two workers wait for planners that hang."""
-    ego = ExternalEgo(wrong_planner(tmp_path, 0.0, act="time.sleep(100)"), timeout=100.0)
+    ego = ExternalEgo(
+        wrong_planner(tmp_path, 0.0, act="time.sleep(100)"), timeout=100.0
+    )
     running = started_command(ego)
     planners = pids_in(tmp_path / "marks", 2)
     if how == "SIGINT":
@@ -175,7 +227,8 @@ def test_no_process_is_left(tmp_path, how):
 
 
 def starting(folder):
-    """The statements of a planner that starts two programs, one in a session of its own, and hangs."""
+    """The statements of a planner that starts two programs, one in a session of its
+    own, and hangs."""
     (folder / "children").mkdir()
     return "; ".join(
         [
@@ -203,7 +256,10 @@ class Starter(SameLaw):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "how"),
-    [("external", "SIGKILL"), *product(["external", "inside"], ["SIGINT", "SIGTERM", "a worker is killed"])],
+    [
+        ("external", "SIGKILL"),
+        *product(["external", "inside"], ["SIGINT", "SIGTERM", "a worker is killed"]),
+    ],
 )
 def test_nothing_is_left_of_what_planners_started(tmp_path, how, kind):
     """Two workers wait for planners that hang; SIGKILL ends the command's own process."""
@@ -221,7 +277,9 @@ def test_nothing_is_left_of_what_planners_started(tmp_path, how, kind):
         os.kill(running.pid, getattr(signal, how))
     running.join(20)
     assert not alive_after(started, 30)
-    assert running.exitcode == {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}.get(how, 2)
+    assert running.exitcode == {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}.get(
+        how, 2
+    )
 
 
 def workers_of(process):
@@ -236,7 +294,9 @@ def test_messages_hold_the_world_field_by_field():
     mission = mission_of(scenes)
     scene = scenes[1]
     content = scene_messages(world, [1])
-    kind, length, row, index, points, dots, lanes, lights = struct.unpack_from("<8I", content)
+    kind, length, row, index, points, dots, lanes, lights = struct.unpack_from(
+        "<8I", content
+    )
     assert (kind, length, row, index) == (2, len(content) - 8, 1, 1)
     take = partial(_take, content, [32])
     assert take("3f", 1) == [(*scene["size"][0].tolist(), mission.end[1].item())]
@@ -244,19 +304,40 @@ def test_messages_hold_the_world_field_by_field():
     found = take("i2f", dots)
     assert torch.tensor([dot[1:] for dot in found]).equal(scene["lane_points"])
     assert [dot[0] for dot in found] == scene["lane_index"].tolist()
-    exits = torch.cat([scene["lane_left"][:, None], scene["lane_right"][:, None], scene["lane_exits"]], 1).tolist()
-    assert take("f8i", lanes) == [(3.5, *exits[lane]) for lane in range(lanes)] and lanes == 2
+    exits = torch.cat(
+        [
+            scene["lane_left"][:, None],
+            scene["lane_right"][:, None],
+            scene["lane_exits"],
+        ],
+        1,
+    ).tolist()
+    assert (
+        take("f8i", lanes) == [(3.5, *exits[lane]) for lane in range(lanes)]
+        and lanes == 2
+    )
     assert take("2f", lights) == [(45.0, 0.0)] and take.args[1] == [len(content)]
     content = plan_message(world)
     take = partial(_take, content, [8])
     assert take("I", 1) == [(3,)]
     for row in range(3):
         ((number, step, agents, lights),) = take("4I", 1)
-        assert (number, step, agents, lights) == (row, 0, 4, 1) and take("I", 1) == [(1,)]
+        assert (number, step, agents, lights) == (row, 0, 4, 1) and take("I", 1) == [
+            (1,)
+        ]
         present = scenes["valid"][row].nonzero()[:, 0].tolist()
         for agent, record in zip(present, take("2I8f", agents), strict=True):
-            state, size = (scenes[key][row, agent].tolist() for key in ("start", "size"))
-            assert record == (agent, int(scenes["agent_type"][row, agent]), *state, *size, 0.0, 0.0)
+            state, size = (
+                scenes[key][row, agent].tolist() for key in ("start", "size")
+            )
+            assert record == (
+                agent,
+                int(scenes["agent_type"][row, agent]),
+                *state,
+                *size,
+                0.0,
+                0.0,
+            )
     assert take.args[1] == [len(content)]
 
 
@@ -276,11 +357,14 @@ def test_what_cannot_be_is_named():
         ({"address": "unix:/no"}, "nothing listens"),
     ):
         with pytest.raises(InputError, match=why):
-            ExternalEgo(**given, start_timeout=1.0).plan(World.at_start(scene_set().scenes))
+            ExternalEgo(**given, start_timeout=1.0).plan(
+                World.at_start(scene_set().scenes)
+            )
 
 
 def test_it_is_asked_about_the_present_only():
-    """Traffic that looks ahead would give a planner with a memory moments that never come."""
+    """Traffic that looks ahead would give a planner with a memory moments that never
+    come."""
     ego = ExternalEgo(command_of())
     world = World.at_start(scene_set().scenes)
     ego.plan(world)

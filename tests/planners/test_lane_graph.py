@@ -2,7 +2,13 @@
 
 import torch
 
-from e2rl.planners.lane_graph_planner import LaneGraphEgo, Prediction, circle_gap, circles, collision_hazard
+from e2rl.planners.lane_graph_planner import (
+    LaneGraphEgo,
+    Prediction,
+    circle_gap,
+    circles,
+    collision_hazard,
+)
 
 
 def test_off_its_route_it_prefers_the_shortest():
@@ -19,7 +25,9 @@ def test_without_a_safe_profile_it_takes_the_least_hazardous_or_the_shortest():
     driven = torch.tensor([[0.0, 40.0, 20.0]]).expand(2, 3)
     matched = torch.tensor([True, True])
     assert LaneGraphEgo().choose(hazard, driven, matched).tolist() == [1, 1]
-    assert LaneGraphEgo(brake_if_unsafe=True).choose(hazard, driven, matched).tolist() == [0, 1]
+    assert LaneGraphEgo(brake_if_unsafe=True).choose(
+        hazard, driven, matched
+    ).tolist() == [0, 1]
 
 
 def test_hazard_equals_its_definition():
@@ -29,16 +37,31 @@ def test_hazard_equals_its_definition():
     scene = torch.tensor([0, 1, 1, 0, 1])
     size = torch.tensor([4.0, 2.0]).double().repeat(5, 1)
     ego_size = torch.tensor([4.5, 1.8]).double().repeat(2, 1)
-    found = collision_hazard(ego, ego_size, others=Prediction(poses, size, scene=scene), slope=0.3, growth=0.02)
+    found = collision_hazard(
+        ego,
+        ego_size,
+        others=Prediction(poses, size, scene=scene),
+        slope=0.3,
+        growth=0.02,
+    )
     safe = torch.ones(2, 3).double()
     for j in range(5):
         for t in range(4):
-            gap = circle_gap(ego[scene[j], :, t], ego_size[0], second=poses[j, t], second_size=size[j])
-            safe[scene[j]] *= torch.tanh(gap.clamp(min=0) * (0.3 + 0.02 * t)).clamp(min=1e-6)
+            gap = circle_gap(
+                ego[scene[j], :, t],
+                ego_size[0],
+                second=poses[j, t],
+                second_size=size[j],
+            )
+            safe[scene[j]] *= torch.tanh(gap.clamp(min=0) * (0.3 + 0.02 * t)).clamp(
+                min=1e-6
+            )
     assert torch.allclose(found, -safe.log(), rtol=1e-3)
 
 
 def test_circles_lie_in_their_box():
     x, y, radius = circles(torch.zeros(1, 3), torch.tensor([[4.0, 2.0]]))
-    assert (x.abs() + radius <= 2.0 + 1e-6).all() and (y.abs() + radius <= 1.0 + 1e-6).all()
+    assert (x.abs() + radius <= 2.0 + 1e-6).all() and (
+        y.abs() + radius <= 1.0 + 1e-6
+    ).all()
     assert torch.allclose((x.abs() + radius).max(), torch.tensor(2.0))

@@ -1,6 +1,8 @@
-"""A planner of nuPlan's interface sees the scene as it is and drives where it plans to, by the adapter in examples/.
+"""A planner of nuPlan's interface sees the scene as it is and drives where it plans to,
+by the adapter in examples/.
 
-The devkit is on no package index: a stand-in has what the adapter and the planners of these tests import."""
+The devkit is on no package index: a stand-in has what the adapter and the planners of
+these tests import."""
 
 import json
 import math
@@ -26,7 +28,9 @@ from tests.synthetic import LANE_WIDTH, MARGIN, make_scenes
 
 HERE = Path(__file__).parent
 ADAPTER = HERE.parents[1] / "examples" / "nuplan_planner.py"
-REAR = 0.2823 * 4.5  # m from the rear axle to the centre of the scenes' egos, in proportion to nuPlan's vehicle
+REAR = (
+    0.2823 * 4.5
+)  # m from the rear axle to the centre of the scenes' egos, in proportion to nuPlan's vehicle
 LIGHTS = ("UNKNOWN", "RED", "YELLOW", "GREEN")  # by state
 
 
@@ -38,47 +42,71 @@ def nuplan(monkeypatch, tmp_path):
     monkeypatch.setenv("E2RL_WITNESS", str(tmp_path / "seen"))
 
     def ego(planner, replan_every=1):
-        return ExternalEgo(f"{sys.executable} {ADAPTER} {planner}", replan_every=replan_every, timeout=20.0)
+        return ExternalEgo(
+            f"{sys.executable} {ADAPTER} {planner}",
+            replan_every=replan_every,
+            timeout=20.0,
+        )
 
     return ego
 
 
 @pytest.mark.parametrize("replan_every", [1, 5])
-def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(nuplan, replan_every):
-    """Whatever vehicle it plans for: the rear axle of its plan is that of the scene's ego."""
+def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(
+    nuplan, replan_every
+):
+    """Whatever vehicle it plans for: the rear axle of its plan is that of the scene's
+    ego."""
     scenes = make_scenes(2)
     heading = torch.tensor([0.0, 0.4])
     scenes.scenes["start"][:, 0, 2] = scenes.scenes["logged"][:, 0, 0, 2] = heading
     start = scenes.scenes["start"][:, 0].clone()
-    states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Straight", replan_every), traffic=LogReplay()).states
+    states = e2rl.roll_out(
+        scenes,
+        nuplan("--planner nuplan_planners:Straight", replan_every),
+        traffic=LogReplay(),
+    ).states
     expected = dynamics.constant_velocity(start, torch.tensor([4.0]))[:, 0]
     assert torch.allclose(states[:, 40, 0], expected, atol=2e-3)
 
 
 @pytest.mark.parametrize("replan_every", [1, 5])
 @pytest.mark.parametrize("acceleration", [1.0, -1.0])
-def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_softly_to_its_path(nuplan, replan_every, acceleration):
-    """From e beside the path a cubic of length S begins with curvature 6 e / S^2, which is its largest."""
+def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_softly_to_its_path(
+    nuplan, replan_every, acceleration
+):
+    """From e beside the path a cubic of length S begins with curvature 6 e / S^2, which
+    is its largest."""
     scenes = make_scenes(2)
     beside = torch.tensor([1.0, -0.6])
     seconds = DT * torch.arange(51)
     scenes.scenes["start"][:, 0, 1] = scenes.scenes["logged"][:, 0, 0, 1] = beside
-    ego = nuplan(f"--planner nuplan_planners:Centred acceleration={acceleration}", replan_every)
+    ego = nuplan(
+        f"--planner nuplan_planners:Centred acceleration={acceleration}", replan_every
+    )
     states = e2rl.roll_out(scenes, ego, traffic=LogReplay()).states[:, :51, 0]
     speed = 10.0 + acceleration * seconds
     assert torch.allclose(states[..., 3], speed.expand(2, -1), atol=0.05)
     left = states[..., 1] / beside[:, None]
     assert left.max() < 1.001 and left.min() > -0.05 and left[:, 40:].abs().max() < 0.05
-    sharpest = states[..., 2].diff(dim=1).abs() / (DT * speed[1:]) / beside[:, None].abs()  # 1/m, a metre beside
+    sharpest = (
+        states[..., 2].diff(dim=1).abs() / (DT * speed[1:]) / beside[:, None].abs()
+    )  # 1/m, a metre beside
     assert sharpest.max() < 1.1 * 6 / (1.5 * 10.0) ** 2
 
 
 @pytest.mark.parametrize("replan_every", [1, 5])
-def test_it_sees_the_ego_and_everybody_else_where_they_are(nuplan, tmp_path, replan_every):
+def test_it_sees_the_ego_and_everybody_else_where_they_are(
+    nuplan, tmp_path, replan_every
+):
     scenes = make_scenes(1, num_vrus=1)
     scenes.scenes["start"][:, 1, 2] = 1.0  # one looks along no axis
     scenes.scenes["logged"][:, :, 1, 2] = 1.0
-    rollouts = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), traffic=LogReplay())
+    rollouts = e2rl.roll_out(
+        scenes,
+        nuplan("--planner nuplan_planners:Witness", replan_every),
+        traffic=LogReplay(),
+    )
     seen = written(tmp_path)
     states = rollouts.states[0]
     assert [one["index"] for one in seen] == list(range(0, 80, replan_every))
@@ -86,37 +114,65 @@ def test_it_sees_the_ego_and_everybody_else_where_they_are(nuplan, tmp_path, rep
         step = one["index"]
         x, y, heading, speed = states[step, 0].tolist()
         assert one["egos"][-1] == pytest.approx([x, y, heading, speed], abs=1e-4)
-        back = x - REAR * math.cos(heading), y - REAR * math.sin(heading), heading, -REAR * one["yaw_rate"]
-        assert one["rear"] == pytest.approx(back, abs=2e-3) and one["size"] == [4.5, 2.0]
+        back = (
+            x - REAR * math.cos(heading),
+            y - REAR * math.sin(heading),
+            heading,
+            -REAR * one["yaw_rate"],
+        )
+        assert one["rear"] == pytest.approx(back, abs=2e-3) and one["size"] == [
+            4.5,
+            2.0,
+        ]
         present = (rollouts.valid[0, step].nonzero()[:, 0].tolist())[1:]
         assert set(one["agents"]) == {f"agent-{k}" for k in present}
         for k in present:
             x, y, heading, speed = states[step, k].tolist()
             size = scenes.scenes["size"][0, k].tolist()
             velocity = [speed * math.cos(heading), speed * math.sin(heading)]
-            assert one["agents"][f"agent-{k}"][:7] == pytest.approx([x, y, heading, *velocity, *size], abs=1e-4)
-            assert one["agents"][f"agent-{k}"][7] == ("PEDESTRIAN" if k >= 32 else "VEHICLE")
+            assert one["agents"][f"agent-{k}"][:7] == pytest.approx(
+                [x, y, heading, *velocity, *size], abs=1e-4
+            )
+            assert one["agents"][f"agent-{k}"][7] == (
+                "PEDESTRIAN" if k >= 32 else "VEHICLE"
+            )
     assert seen[-1]["yaw_rate"] == pytest.approx(0.1, abs=0.01)
 
 
 @pytest.mark.parametrize("replan_every", [1, 5])
-def test_its_history_is_what_was_driven_and_before_that_steady(nuplan, tmp_path, replan_every):
+def test_its_history_is_what_was_driven_and_before_that_steady(
+    nuplan, tmp_path, replan_every
+):
     scenes = make_scenes(1)
-    scenes.scenes["start_yaw_rate"][0, 0], scenes.scenes["start_accel"][0, 0] = 0.2, -1.0
-    states = e2rl.roll_out(scenes, nuplan("--planner nuplan_planners:Witness", replan_every), traffic=LogReplay()).states[
-        0, :, 0
-    ]
+    scenes.scenes["start_yaw_rate"][0, 0], scenes.scenes["start_accel"][0, 0] = (
+        0.2,
+        -1.0,
+    )
+    states = e2rl.roll_out(
+        scenes,
+        nuplan("--planner nuplan_planners:Witness", replan_every),
+        traffic=LogReplay(),
+    ).states[0, :, 0]
     first, *_, last = written(tmp_path)
     for one in (first, last):
         assert len(one["egos"]) == len(one["before"]) == 21 and one["interval"] == DT
-        assert {later - earlier for earlier, later in zip(one["times"], one["times"][1:], strict=False)} == {100_000}
+        assert {
+            later - earlier
+            for earlier, later in zip(one["times"], one["times"][1:], strict=False)
+        } == {100_000}
     came = states[last["index"] - 20 : last["index"] + 1]
-    tolerance = 1e-4 if replan_every == 1 else 0.03  # between two plans it is interpolated
+    tolerance = (
+        1e-4 if replan_every == 1 else 0.03
+    )  # between two plans it is interpolated
     assert torch.allclose(torch.tensor(last["egos"]), came, atol=tolerance)
     past = torch.tensor(first["egos"])
     assert torch.allclose(past[-1], states[0], atol=1e-5)
-    steady = torch.tensor([0.0, 0.2]).expand(20, 2)  # from where it was 2 s ago, it arrives
-    assert torch.allclose(dynamics.rollout(past[:1], steady[None])[0], past[1:], atol=2e-2)
+    steady = torch.tensor([0.0, 0.2]).expand(
+        20, 2
+    )  # from where it was 2 s ago, it arrives
+    assert torch.allclose(
+        dynamics.rollout(past[:1], steady[None])[0], past[1:], atol=2e-2
+    )
 
 
 def written(folder):
@@ -139,10 +195,14 @@ def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(nuplan, tmp_path
         assert one["on"] and set(one["on"]) <= set(one["near"]) and one["drivable"]
         route = [lane["id"] for block in one["route"] for lane in block]
         assert set(route) & set(one["near"]) and all(one["linked"]), row
-        assert (torch.tensor(one["goal"][:2]) - mission.points[row]).norm(dim=-1).min() < 1e-3
+        assert (torch.tensor(one["goal"][:2]) - mission.points[row]).norm(
+            dim=-1
+        ).min() < 1e-3
     limits = {lane["limit"] for one in seen for block in one["route"] for lane in block}
     given = mission.limit[mission.limit > 0].unique().tolist()
-    assert limits - {None} and all(min(abs(limit - k) for k in given) < 1e-4 for limit in limits - {None})
+    assert limits - {None} and all(
+        min(abs(limit - k) for k in given) < 1e-4 for limit in limits - {None}
+    )
 
 
 def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(nuplan, tmp_path):
@@ -154,7 +214,12 @@ def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(nuplan, tmp
         begin = scenes["light_points"][row, light].tolist()
         state = int(scenes["light_state"][row, 0, light])
         status = {name: what for what, name in seen[row]["lights"]}
-        lanes = [lane for block in seen[row]["route"] for lane in block if math.dist(lane["begin"][:2], begin) < 0.5]
+        lanes = [
+            lane
+            for block in seen[row]["route"]
+            for lane in block
+            if math.dist(lane["begin"][:2], begin) < 0.5
+        ]
         assert not lanes or LIGHTS[state] in [status.get(lane["id"]) for lane in lanes]
         checked += bool(lanes)
     assert checked >= 9
@@ -165,16 +230,30 @@ def test_lanes_side_by_side_are_a_roadblock(nuplan, tmp_path):
     nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes.scenes))
     (one,) = written(tmp_path)
     (left, right), half = one["route"][0], LANE_WIDTH / 2
-    assert (left["id"], left["index"], left["right"], left["left"]) == ("1", 1, "0", None)
-    assert (right["id"], right["index"], right["left"], right["right"]) == ("0", 2, "1", None)
+    assert (left["id"], left["index"], left["right"], left["left"]) == (
+        "1",
+        1,
+        "0",
+        None,
+    )
+    assert (right["id"], right["index"], right["left"], right["right"]) == (
+        "0",
+        2,
+        "1",
+        None,
+    )
     for lane in (left, right):
-        assert lane["limit"] == 12.0 and lane["width"] == pytest.approx(LANE_WIDTH, rel=0.01)
-        assert lane["borders"] == pytest.approx([half, -half], abs=1e-3) and lane["turns"] == pytest.approx(
-            0.0, abs=1e-6
+        assert lane["limit"] == 12.0 and lane["width"] == pytest.approx(
+            LANE_WIDTH, rel=0.01
         )
+        assert lane["borders"] == pytest.approx([half, -half], abs=1e-3) and lane[
+            "turns"
+        ] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_road_reaches_as_far_beside_the_lanes_as_the_metrics_have_it(nuplan, tmp_path):
+def test_the_road_reaches_as_far_beside_the_lanes_as_the_metrics_have_it(
+    nuplan, tmp_path
+):
     scenes = make_scenes(1)
     nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes.scenes))
     (one,) = written(tmp_path)
@@ -182,12 +261,19 @@ def test_the_road_reaches_as_far_beside_the_lanes_as_the_metrics_have_it(nuplan,
     for aside, drivable, lane, beside in one["aside"]:
         beyond = max(border[0] - aside, aside - border[1])  # m outside of the lanes
         if min(abs(beyond), abs(beyond - MARGIN), abs(aside - LANE_WIDTH / 2)) > 0.1:
-            assert (drivable, lane, beside) == (beyond < MARGIN, beyond < 0, 0 < beyond < MARGIN), aside
+            assert (drivable, lane, beside) == (
+                beyond < MARGIN,
+                beyond < 0,
+                0 < beyond < MARGIN,
+            ), aside
 
 
 WRONG = {
     "raises": ("PlannerFailed", "RuntimeError: no way out (nuplan_planners.py, line"),
-    "velocities": ("PlannerFailed", "the trajectory's poses move 50.0 m, its rear-axle velocities 5.0 m"),
+    "velocities": (
+        "PlannerFailed",
+        "the trajectory's poses move 50.0 m, its rear-axle velocities 5.0 m",
+    ),
     "elsewhere": ("PlannerFailed", "the trajectory begins 20.0 m from the ego"),
     "short": ("BadReply", "fewer than the 5 steps until the next plan"),
 }
@@ -197,7 +283,9 @@ WRONG = {
 def test_what_goes_wrong_in_a_scene_costs_that_scene_and_is_told(nuplan, tmp_path, how):
     ego = nuplan(f"--planner nuplan_planners:Wrong how={how} bad=3.5", replan_every=5)
     setup = Setup(scene_set(), ego, ego_name="nuplan", sim=SimSettings(), batch=4)
-    (row,) = run_protocol(setup, [Method("replay", LogReplay())], seeds=[0], folder=tmp_path)
+    (row,) = run_protocol(
+        setup, [Method("replay", LogReplay())], seeds=[0], folder=tmp_path
+    )
     (entry,) = json.loads((tmp_path / ERRORED_FILE).read_text())
     reason, detail = WRONG[how]
     assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 4
@@ -205,12 +293,18 @@ def test_what_goes_wrong_in_a_scene_costs_that_scene_and_is_told(nuplan, tmp_pat
 
 
 def test_a_planner_of_cameras_is_refused(nuplan):
-    with pytest.raises(Exception, match="Camera observes Sensors; e2rl has DetectionsTracks only"):
-        nuplan("--planner nuplan_planners:Camera").plan(World.at_start(make_scenes(1).scenes))
+    with pytest.raises(
+        Exception, match="Camera observes Sensors; e2rl has DetectionsTracks only"
+    ):
+        nuplan("--planner nuplan_planners:Camera").plan(
+            World.at_start(make_scenes(1).scenes)
+        )
 
 
 def test_a_configuration_of_the_devkit_names_the_planner(nuplan, tmp_path):
-    (tmp_path / "planner.yaml").write_text("mine:\n  _target_: nuplan_planners.Straight\n  seconds: 2.0\n")
+    (tmp_path / "planner.yaml").write_text(
+        "mine:\n  _target_: nuplan_planners.Straight\n  seconds: 2.0\n"
+    )
     ego = nuplan(f"--config {tmp_path / 'planner.yaml'}")
     world = World.at_start(make_scenes(1).scenes)
     plan = ego.plan(world)

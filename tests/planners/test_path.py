@@ -1,4 +1,5 @@
-"""Paths: pass through the pose, end on the route, stay the same when planned anew; caps of curves, limits, lights."""
+"""Paths: pass through the pose, end on the route, stay the same when planned anew; caps
+of curves, limits, lights."""
 
 import math
 
@@ -28,7 +29,9 @@ def test_passes_through_the_pose_and_ends_on_the_route():
     assert torch.allclose(poses[:, 0], STATE[:, :3], atol=2e-2)
     assert torch.allclose(poses[:, 0, :2], STATE[:, :2], atol=1e-5)
     centre = torch.tensor([0.0, 40.0])
-    assert torch.allclose((poses[:, 1, :2] - centre).norm(dim=-1), torch.tensor(40.0), atol=0.05)
+    assert torch.allclose(
+        (poses[:, 1, :2] - centre).norm(dim=-1), torch.tensor(40.0), atol=0.05
+    )
 
 
 def test_planning_anew_on_the_way_keeps_the_path():
@@ -40,7 +43,8 @@ def test_planning_anew_on_the_way_keeps_the_path():
 
 
 def test_drive_is_nearly_unicycle_motion():
-    """The planned positions advance as their speeds and headings say, also off the centreline and in a curve."""
+    """The planned positions advance as their speeds and headings say, also off the
+    centreline and in a curve."""
     path = RoutePath(STATE, arc_route().expand(2, -1, -1))
     plan = path.drive(STATE[:, 3:].expand(2, 51))
     states = torch.cat([STATE[:, None], plan], 1)
@@ -53,10 +57,16 @@ def test_caps_halt_at_red_lights_and_obey_limits():
     path = MissionPath(world_of(num_vehicles=1, red_light_x=60.0, limit=8.0)[1])
     caps = path.speed_caps(20.0)
     stop = 60.0 - 4.5 / 2 - 1.0
-    assert torch.allclose(look_up(caps, torch.tensor([[0.0, 20.0]])), torch.tensor(8.0), atol=0.01)
+    assert torch.allclose(
+        look_up(caps, torch.tensor([[0.0, 20.0]])), torch.tensor(8.0), atol=0.01
+    )
     at = torch.tensor([[stop - 6.0, stop - 1.5, stop, stop + 1.0]])
-    assert torch.allclose(look_up(caps, at), torch.tensor([36.0, 9.0, 0.0, 0.0]).sqrt(), atol=0.02)
-    assert torch.allclose(path.speed_caps(20.0, limits=False, lights=False), torch.tensor(400.0), atol=0.1)
+    assert torch.allclose(
+        look_up(caps, at), torch.tensor([36.0, 9.0, 0.0, 0.0]).sqrt(), atol=0.02
+    )
+    assert torch.allclose(
+        path.speed_caps(20.0, limits=False, lights=False), torch.tensor(400.0), atol=0.1
+    )
 
 
 def stop(colour, speed, light_x=50.0):
@@ -70,22 +80,36 @@ def test_red_binds_unless_halting_is_hopeless_yellow_where_it_is_comfortable():
     assert stop(colour=1, speed=10) == 50.0 and stop(colour=2, speed=10) == 50.0
     assert stop(colour=1, speed=20) == 50.0 and stop(colour=2, speed=20) == float("inf")
     assert stop(colour=1, speed=30) == float("inf")
-    assert stop(colour=3, speed=10) == float("inf") and stop(colour=0, speed=10) == float("inf")
-    assert stop(colour=1, speed=1, light_x=-5.0) == float("inf"), "a line passed binds no longer"
+    assert stop(colour=3, speed=10) == float("inf") and stop(
+        colour=0, speed=10
+    ) == float("inf")
+    assert stop(colour=1, speed=1, light_x=-5.0) == float("inf"), (
+        "a line passed binds no longer"
+    )
 
 
-@pytest.mark.parametrize(("d", "turned", "length"), [(1.5, 0.2, 8.0), (-0.7, -0.4, 1.5)])
+@pytest.mark.parametrize(
+    ("d", "turned", "length"), [(1.5, 0.2, 8.0), (-0.7, -0.4, 1.5)]
+)
 def test_a_deviation_fades_as_a_critically_damped_return(d, turned, length):
-    """l^2 d'' + 2 l d' + d = 0 from (d, tan(turned)); the slope is the derivative of the offset."""
+    """l^2 d'' + 2 l d' + d = 0 from (d, tan(turned)); the slope is the derivative of
+    the offset."""
     ahead = torch.linspace(0, 20, 2001, dtype=torch.float64)
     given = (torch.tensor(value, dtype=torch.float64) for value in (d, turned, length))
     offset, slope = fading(*given, ahead)
-    assert offset[0].item() == pytest.approx(d) and slope[0].item() == pytest.approx(math.tan(turned))
-    (first,), (bend,) = torch.gradient(offset, spacing=0.01), torch.gradient(slope, spacing=0.01)
+    assert offset[0].item() == pytest.approx(d) and slope[0].item() == pytest.approx(
+        math.tan(turned)
+    )
+    (first,), (bend,) = (
+        torch.gradient(offset, spacing=0.01),
+        torch.gradient(slope, spacing=0.01),
+    )
     inner = slice(2, -2)
     torch.testing.assert_close(first[inner], slope[inner], atol=1e-4, rtol=0)
     balance = length**2 * bend + 2 * length * slope + offset
-    torch.testing.assert_close(balance[inner], torch.zeros_like(balance[inner]), atol=2e-2, rtol=0)
+    torch.testing.assert_close(
+        balance[inner], torch.zeros_like(balance[inner]), atol=2e-2, rtol=0
+    )
 
 
 def test_caps_slow_down_for_curves():

@@ -1,4 +1,5 @@
-"""PDM-Closed: it follows, stops, keeps the limit, comes over, brakes; its score is that of its terms."""
+"""PDM-Closed: it follows, stops, keeps the limit, comes over, brakes; its score is that
+of its terms."""
 
 import math
 
@@ -43,9 +44,13 @@ def test_it_follows_a_slower_leader_without_contact():
 
 
 def test_it_stops_behind_whom_stands_and_at_a_red_light():
-    data, last = driven(EGO, steps=100, vehicles=[(0, 0, 10.0), (60, 0, 0.0)], num_vrus=0)
+    data, last = driven(
+        EGO, steps=100, vehicles=[(0, 0, 10.0), (60, 0, 0.0)], num_vrus=0
+    )
     assert not touched(data) and float(last[3]) < 1.5 and float(last[0]) > 45
-    _, last = driven(EGO, steps=100, vehicles=[(0, 0, 10.0)], num_vrus=0, red_light_x=50.0)
+    _, last = driven(
+        EGO, steps=100, vehicles=[(0, 0, 10.0)], num_vrus=0, red_light_x=50.0
+    )
     assert float(last[3]) < 1.5 and 35 < float(last[0]) < 50
 
 
@@ -56,8 +61,13 @@ def test_it_keeps_the_speed_limit(limit):
     assert float(last[3]) > 0.9 * min(limit, 14.0)
 
 
-@pytest.mark.parametrize(("speed", "braking"), [(4.9, EGO.emergency_braking), (5.1, EGO.braking), (14.0, EGO.braking)])
-def test_a_slow_ego_brakes_as_hard_as_it_can_before_a_collision_that_is_near_a_fast_one_as_idm_may(speed, braking):
+@pytest.mark.parametrize(
+    ("speed", "braking"),
+    [(4.9, EGO.emergency_braking), (5.1, EGO.braking), (14.0, EGO.braking)],
+)
+def test_a_slow_ego_brakes_as_hard_as_it_can_before_a_collision_that_is_near_a_fast_one_as_idm_may(
+    speed, braking
+):
     _, world = world_of(vehicles=[(0, 0, speed), (speed, 0, 0.0)], num_vrus=0)
     lost = EGO.plan(world)[0, :5, 3].diff() / DT
     torch.testing.assert_close(lost, torch.full_like(lost, -braking), atol=0.05, rtol=0)
@@ -65,7 +75,8 @@ def test_a_slow_ego_brakes_as_hard_as_it_can_before_a_collision_that_is_near_a_f
 
 @pytest.mark.parametrize("beside", [1.0, -1.0])
 def test_it_comes_over_where_somebody_who_stands_beside_blocks_the_mission(beside):
-    """A parked car reaches 0.2 m into the ego's way; a metre to the other side the ego passes it."""
+    """A parked car reaches 0.2 m into the ego's way; a metre to the other side the ego
+    passes it."""
     scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (40.0, 0, 0.0)], num_vrus=0)
     scenes.scenes["start"][0, 1, 1] = scenes.scenes["logged"][0, :, 1, 1] = 1.8 * beside
     env, world = worlds(scenes)
@@ -79,7 +90,9 @@ def test_proposals_lead_to_their_offsets_and_are_slower_by_their_fraction():
     states = EGO.proposals(world)
     assert states.shape[:2] == (1, COUNT)
     end = states[0, :, -1].view(len(OFFSETS), len(FRACTIONS), 4)
-    torch.testing.assert_close(end[:, -1, 1], end[0, -1, 1] + torch.tensor(OFFSETS), atol=0.2, rtol=0)
+    torch.testing.assert_close(
+        end[:, -1, 1], end[0, -1, 1] + torch.tensor(OFFSETS), atol=0.2, rtol=0
+    )
     assert (end[..., 3].diff(dim=1) > 0).all() and (end[..., 0].diff(dim=1) > 0).all()
 
 
@@ -118,16 +131,22 @@ def test_whom_it_touched_without_fault_it_may_touch_again():
     both = beside._replace(states=torch.cat([beside.states, ahead.states], 2))
     touch = torch.ones(1, 1, 1, 2, dtype=torch.bool)
     loose = torch.zeros(1, 1, 2, dtype=torch.bool)
-    assert not at_fault(states, torch.tensor([[4.8, 2.0]]), others=both, touch=touch, loose=loose).any()
+    assert not at_fault(
+        states, torch.tensor([[4.8, 2.0]]), others=both, touch=touch, loose=loose
+    ).any()
     swapped = both._replace(states=both.states.flip(2))
-    assert at_fault(states, torch.tensor([[4.8, 2.0]]), others=swapped, touch=touch, loose=loose).any()
+    assert at_fault(
+        states, torch.tensor([[4.8, 2.0]]), others=swapped, touch=touch, loose=loose
+    ).any()
 
 
 def others_at(place):
     """One vehicle of 4.8 x 2 m."""
     states = torch.tensor(place)[None, None, None]
     there = torch.ones(1, 1, dtype=torch.bool)
-    return Others(states=states, size=torch.tensor([[[4.8, 2.0]]]), seen=there, objects=~there)
+    return Others(
+        states=states, size=torch.tensor([[[4.8, 2.0]]]), seen=there, objects=~there
+    )
 
 
 def test_an_object_that_it_hits_halves_the_score():
@@ -138,12 +157,17 @@ def test_an_object_that_it_hits_halves_the_score():
     vehicle, time = score(world, go, others=ahead)
     thing, same = score(world, go, others=ahead._replace(objects=ahead.seen))
     assert vehicle.item() == 0 and time.item() == same.item() < 2.0
-    assert thing.item() == pytest.approx(0.5 * (PROGRESS + COMFORT) / (PROGRESS + TIME_TO_COLLISION + COMFORT))
+    assert thing.item() == pytest.approx(
+        0.5 * (PROGRESS + COMFORT) / (PROGRESS + TIME_TO_COLLISION + COMFORT)
+    )
 
 
 @pytest.mark.parametrize(("degrees", "expected"), [(29, 0), (31, 1)])
-def test_the_time_to_collision_looks_30_degrees_to_each_side_in_one_lane(degrees, expected):
-    """At 8 m from the rear axle, across the ego's way in 0.3 s; in several lanes it counts up to 150 degrees."""
+def test_the_time_to_collision_looks_30_degrees_to_each_side_in_one_lane(
+    degrees, expected
+):
+    """At 8 m from the rear axle, across the ego's way in 0.3 s; in several lanes it
+    counts up to 150 degrees."""
     axle = -1.461 / 5.176 * 4.8
     angle = math.radians(degrees)
     x = axle + 8 * math.cos(angle)
@@ -155,18 +179,25 @@ def test_the_time_to_collision_looks_30_degrees_to_each_side_in_one_lane(degrees
     touch = torch.zeros(1, 1, 1, 1, 4, dtype=torch.bool)
     touch[..., 0] = True
     for loose, clear in ((False, expected), (True, 0)):
-        assert runs_into(states, size, others=other, touch=touch, loose=torch.full((1, 1, 1), loose)).item() == (not clear)
+        assert runs_into(
+            states, size, others=other, touch=touch, loose=torch.full((1, 1, 1), loose)
+        ).item() == (not clear)
 
 
 def test_comfort_has_the_published_windows_and_bounds():
-    """Smooth braking at 4 m/s^2 is within −4.05; a step of 1.3 m/s^2 between two halves of 2 s is no jerk of 4.13."""
+    """Smooth braking at 4 m/s^2 is within −4.05; a step of 1.3 m/s^2 between two halves
+    of 2 s is no jerk of 4.13."""
     _, world = world_of(vehicles=[(0, 0, 30.0)], num_vrus=0)
     world.accel[:, 0] = -4.0
 
     def smooth(accelerations):
-        actions = torch.stack([torch.tensor(accelerations), torch.zeros(SCORED_STEPS)], -1)
+        actions = torch.stack(
+            [torch.tensor(accelerations), torch.zeros(SCORED_STEPS)], -1
+        )
         states = dynamics.rollout(world.states[0, 0], actions)[None, None]
-        return comfortable(world, torch.cat([world.states[:, None, :1], states], 2)).item()
+        return comfortable(
+            world, torch.cat([world.states[:, None, :1], states], 2)
+        ).item()
 
     assert smooth([-4.0] * 40)
     assert not smooth([-4.1] * 40)
@@ -174,7 +205,8 @@ def test_comfort_has_the_published_windows_and_bounds():
 
 
 def test_the_limit_of_the_present_lane_holds_for_the_whole_plan():
-    """It does not brake before a lower limit that begins 20 m ahead, as the published one does not."""
+    """It does not brake before a lower limit that begins 20 m ahead, as the published
+    one does not."""
     scenes = make_scenes(1, vehicles=[(0, 0, 10.0)], num_vrus=0, limit=10.0)
     slower = scenes.scenes["route_limit"].clone()
     slower[..., slower.shape[-1] // 2 :] = 2.0
@@ -187,16 +219,23 @@ def test_the_limit_of_the_present_lane_holds_for_the_whole_plan():
 
 
 def test_the_score_is_the_weighted_mean_of_its_terms():
-    """Alone on the road: the fastest has all; the slower lose progress in proportion; a hard brake loses comfort."""
+    """Alone on the road: the fastest has all; the slower lose progress in proportion; a
+    hard brake loses comfort."""
     _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
     start = world.states[:, :1]
     none = EGO._others(world, range(SCORED_STEPS + 1))
-    actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(3, 50, 2)
+    actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(
+        3, 50, 2
+    )
     states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
     distance = states[0, :, SCORED_STEPS - 1, 0] - start[0, 0, 0]
     found = score(world, states, others=none)[0][0]
     whole = PROGRESS + TIME_TO_COLLISION + COMFORT
-    expected = PROGRESS * distance / distance[0] + TIME_TO_COLLISION + COMFORT * torch.tensor([1.0, 1.0, 0.0])
+    expected = (
+        PROGRESS * distance / distance[0]
+        + TIME_TO_COLLISION
+        + COMFORT * torch.tensor([1.0, 1.0, 0.0])
+    )
     torch.testing.assert_close(found, expected / whole, atol=1e-4, rtol=0)
     scored = torch.cat([start.expand(3, -1, -1)[None], states[:, :, :SCORED_STEPS]], 2)
     assert comfortable(world, scored)[0].tolist() == [True, True, False]
@@ -208,38 +247,63 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
     found, collides = score(world, go, others=ahead)
     size = world.scene["size"][0, 0]
-    first = int((separation(go[0, 0], size, second=world.states[0, 1], second_size=world.scene["size"][0, 1]) < 0).nonzero()[0, 0]) + 1
+    first = (
+        int(
+            (
+                separation(
+                    go[0, 0],
+                    size,
+                    second=world.states[0, 1],
+                    second_size=world.scene["size"][0, 1],
+                )
+                < 0
+            ).nonzero()[0, 0]
+        )
+        + 1
+    )
     assert found.item() == 0 and collides.item() == pytest.approx(DT * first)
-    turn = dynamics.rollout(world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2))[:, None]
+    turn = dynamics.rollout(
+        world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2)
+    )[:, None]
     free = ahead._replace(seen=ahead.seen & False)
     assert score(world, turn, others=free)[0].item() == 0
 
 
 def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_collision():
-    """Braking late, the ego halts 0.8 m behind whom stands, whom it would hit within 0.9 s if it let go the brake."""
+    """Braking late, the ego halts 0.8 m behind whom stands, whom it would hit within
+    0.9 s if it let go the brake."""
     _, world = world_of(vehicles=[(0, 0, 10.0), (20.0, 0, 0.0)], num_vrus=0)
     ahead = EGO._others(world, range(SCORED_STEPS + 1))
     actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
     states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
     found, collides = score(world, states, others=ahead)
     late, early = states[0, :, SCORED_STEPS - 1, 0]
-    expected = torch.stack([late / late * PROGRESS + COMFORT, early / late * PROGRESS + TIME_TO_COLLISION])
+    expected = torch.stack(
+        [late / late * PROGRESS + COMFORT, early / late * PROGRESS + TIME_TO_COLLISION]
+    )
     assert collides.isinf().all()
-    torch.testing.assert_close(found[0], expected / (PROGRESS + TIME_TO_COLLISION + COMFORT), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        found[0], expected / (PROGRESS + TIME_TO_COLLISION + COMFORT), atol=1e-4, rtol=0
+    )
 
 
 def test_where_every_proposal_is_excluded_it_drives_the_slowest():
-    """The road ends ahead: no proposal is better than another, and no collision makes it brake."""
+    """The road ends ahead: no proposal is better than another, and no collision makes
+    it brake."""
     scenes = make_scenes(1, vehicles=[(0, 0, 10.0)], num_vrus=0)
     scenes.scenes["field"][:, 86:] = 10.0  # from x = 6 m on
     _, world = worlds(scenes)
     states = EGO.proposals(world)
-    assert (score(world, states, others=EGO._others(world, range(SCORED_STEPS + 1)))[0] == 0).all()
+    assert (
+        score(world, states, others=EGO._others(world, range(SCORED_STEPS + 1)))[0] == 0
+    ).all()
     torch.testing.assert_close(EGO.plan(world)[0], states[0, 0])
 
 
 def test_a_scene_is_planned_alike_alone_and_in_a_batch():
-    scenes = make_scenes(3, vehicles=[(0, 0, 10.0), (22, 0, 9.0), (10, 1, 10.0), (45, 1, 8.0)])
+    scenes = make_scenes(
+        3, vehicles=[(0, 0, 10.0), (22, 0, 9.0), (10, 1, 10.0), (45, 1, 8.0)]
+    )
     _, world = worlds(scenes)
     whole = EGO.plan(world)
     for k in range(3):

@@ -1,4 +1,5 @@
-"""The reference follower: executed actions are read back, it keeps its lane, its distance and red lights."""
+"""The reference follower: executed actions are read back, it keeps its lane, its
+distance and red lights."""
 
 import torch
 
@@ -17,14 +18,21 @@ def drive(scenes, batch=2):
 
 
 def test_an_empty_road_is_driven_at_the_limit():
-    data, world = drive(make_scenes(2, num_vehicles=1, num_vrus=0, speed=10.0, limit=12.0, road=(-60.0, 600.0)))
+    data, world = drive(
+        make_scenes(
+            2, num_vehicles=1, num_vrus=0, speed=10.0, limit=12.0, road=(-60.0, 600.0)
+        )
+    )
     assert ((world.states[:, 0, 3] > 11.0) & (world.states[:, 0, 3] < 12.0)).all()
     assert data["action"][..., 1].abs().max() < 1e-3
 
 
 def test_a_standing_car_and_a_red_light_are_halted_at():
     data, world = drive(make_scenes(2, vehicles=[(0.0, 0, 10.0), (45.0, 0, 0.0)]))
-    assert not data["next", "metrics", "contact"].any() and (world.states[:, 0, 3] < 1.0).all()
+    assert (
+        not data["next", "metrics", "contact"].any()
+        and (world.states[:, 0, 3] < 1.0).all()
+    )
     assert (world.states[:, 0, 0] > 30.0).all()
     _, world = drive(make_scenes(2, num_vehicles=1, num_vrus=0, red_light_x=50.0))
     front = world.states[:, 0, 0] + 2.25
@@ -45,7 +53,9 @@ def test_an_offset_is_steered_back():
 
 
 def test_leading_dims_do_not_matter():
-    env = DrivingEnv(make_scenes(3, num_vehicles=12, red_light_x=60.0), SimSettings(), 3)
+    env = DrivingEnv(
+        make_scenes(3, num_vehicles=12, red_light_x=60.0), SimSettings(), 3
+    )
     observation = env.rollout(10)["observation"]
     one_by_one = torch.stack([follow(row) for row in observation.flatten(0, 1)])
     assert torch.allclose(follow(observation).flatten(0, 1), one_by_one, atol=1e-5)
@@ -62,15 +72,21 @@ def test_the_order_of_the_agents_changes_nothing_and_each_of_them_counts():
     assert out.shape == (5, 2) and torch.allclose(trunk(shuffled), out, atol=1e-6)
     for slot in range(NEAREST):
         moved = seen.clone()
-        moved[:, AGENTS.start + slot * PER_AGENT : AGENTS.start + (slot + 1) * PER_AGENT] += 3.0
+        moved[
+            :, AGENTS.start + slot * PER_AGENT : AGENTS.start + (slot + 1) * PER_AGENT
+        ] += 3.0
         assert (trunk(moved) - out).abs().amax() > 1e-3
 
 
 def test_the_rest_of_the_scene_counts_and_a_last_layer_of_zeros_says_nothing():
     torch.manual_seed(0)
     seen = torch.randn(OBSERVATION_SIZE, requires_grad=True)
-    (gradient,) = torch.autograd.grad(Trunk((32,), 8, out=1, last_gain=1.0)(seen).sum(), seen)
-    assert (gradient[: AGENTS.start] != 0).all() and (gradient[AGENTS.stop :] != 0).all()
+    (gradient,) = torch.autograd.grad(
+        Trunk((32,), 8, out=1, last_gain=1.0)(seen).sum(), seen
+    )
+    assert (gradient[: AGENTS.start] != 0).all() and (
+        gradient[AGENTS.stop :] != 0
+    ).all()
     assert torch.equal(Trunk((32, 16), 8, out=2, last_gain=0.0)(seen), torch.zeros(2))
 
 
@@ -78,6 +94,7 @@ def test_the_gradient_of_the_largest_is_shared_among_equals():
     values = torch.randint(3, (4, 5, 6), dtype=torch.float32).requires_grad_()
     weight = torch.randn(4, 6)
     (own,), (other,) = (
-        torch.autograd.grad((f(values) * weight).sum(), values) for f in (Largest.apply, lambda x: x.amax(1))
+        torch.autograd.grad((f(values) * weight).sum(), values)
+        for f in (Largest.apply, lambda x: x.amax(1))
     )
     torch.testing.assert_close(own, other)

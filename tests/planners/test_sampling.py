@@ -18,13 +18,16 @@ TIMES = torch.arange(1, 21) * 0.2
 
 
 def test_boxed_in_it_is_never_worse_than_hard_braking():
-    """Cars on both sides and one standing ahead, too near to stop: the plan hits no harder than braking would."""
+    """Cars on both sides and one standing ahead, too near to stop: the plan hits no
+    harder than braking would."""
     box = [(0.0, 0, 12.0), (11.0, 0, 0.0), (0.0, 1, 12.0), (-25.0, 0, 12.0)]
     _, world = world_of(vehicles=box, num_vrus=0)
     plan = SamplingEgo().plan(world)[0]
     size = world.scene["size"][0, 0]
     wall = world.states[0, 1]
-    braking = dynamics.rollout(world.states[0, 0], torch.tensor([-8.0, 0.0]).expand(PLAN_STEPS, 2))
+    braking = dynamics.rollout(
+        world.states[0, 0], torch.tensor([-8.0, 0.0]).expand(PLAN_STEPS, 2)
+    )
 
     def impact(states):
         hit = (separation(states, size, second=wall, second_size=size) < 0).nonzero()
@@ -39,15 +42,26 @@ def test_candidates_obey_the_simulator_s_bounds():
     _, world = worlds(scenes)
     candidates = SamplingEgo().candidates(world)
     count = len(PROFILES) * (2 * len(SHIFTS) + 1)
-    assert candidates.states.shape == (2, count, PLAN_STEPS, 4) and torch.isfinite(candidates.states).all()
+    assert (
+        candidates.states.shape == (2, count, PLAN_STEPS, 4)
+        and torch.isfinite(candidates.states).all()
+    )
     start = world.states[:, :1].expand(-1, count, -1)[:, :, None]
     states = torch.cat([start, candidates.states], 2)
     actions = dynamics.inverse(states)
     assert (actions[..., 0] > -8 - 1e-3).all() and (actions[..., 0] < 5 + 1e-3).all()
     mean = (states[..., 1:, 3] + states[..., :-1, 3]) / 2
-    assert (actions[..., 1].abs() <= torch.clamp(dynamics.yaw_rate_bound(mean), max=1.6) + 1e-3).all()
-    assert (torch.hypot(actions[..., 0], actions[..., 1] * mean) < dynamics.MAX_LATERAL + 0.05).all()
-    torch.testing.assert_close(dynamics.rollout(start[:, :, 0], actions), candidates.states, atol=2e-3, rtol=0)
+    assert (
+        actions[..., 1].abs()
+        <= torch.clamp(dynamics.yaw_rate_bound(mean), max=1.6) + 1e-3
+    ).all()
+    assert (
+        torch.hypot(actions[..., 0], actions[..., 1] * mean)
+        < dynamics.MAX_LATERAL + 0.05
+    ).all()
+    torch.testing.assert_close(
+        dynamics.rollout(start[:, :, 0], actions), candidates.states, atol=2e-3, rtol=0
+    )
 
 
 def test_moves_lead_beside_the_mission():
@@ -67,17 +81,29 @@ def test_a_mirrored_scene_gets_the_mirrored_plan(beside):
         start = scenes.scenes["start"]
         start[0, 1, 1:3] = torch.tensor([2.6 * sign, -0.12 * sign])
         scenes.scenes["field"].fill_(-10.0)
-        plans.append(SamplingEgo().plan(worlds(scenes)[1]) * torch.tensor([1.0, sign, sign, 1.0]))
+        plans.append(
+            SamplingEgo().plan(worlds(scenes)[1]) * torch.tensor([1.0, sign, sign, 1.0])
+        )
     torch.testing.assert_close(*plans, atol=1e-3, rtol=0)
     assert plans[0][..., 1].abs().max() > 0.3
 
 
 def test_speed_profiles_keep_the_caps():
     caps = (torch.tensor([[8.0]]).expand(1, 100)) ** 2
-    speed = speed_profiles(torch.tensor([10.0]), torch.tensor([[0.0, 0.0], [5.0, 5.0], [-8.0, -8.0]]), caps=caps, braking=4.0)
+    speed = speed_profiles(
+        torch.tensor([10.0]),
+        torch.tensor([[0.0, 0.0], [5.0, 5.0], [-8.0, -8.0]]),
+        caps=caps,
+        braking=4.0,
+    )
     assert speed.shape == (1, 3, PLAN_STEPS + 1) and (speed[..., 0] == 10).all()
-    assert torch.allclose(speed[0, :2, 10:], torch.tensor(8.0)) and (speed[0, 2, 15:] == 0).all()
-    assert (speed.diff(dim=-1) / DT > -8.001).all() and (speed[0, :2].diff(dim=-1) / DT > -4.001).all()
+    assert (
+        torch.allclose(speed[0, :2, 10:], torch.tensor(8.0))
+        and (speed[0, 2, 15:] == 0).all()
+    )
+    assert (speed.diff(dim=-1) / DT > -8.001).all() and (
+        speed[0, :2].diff(dim=-1) / DT > -4.001
+    ).all()
 
 
 def test_steering_catches_up_with_what_a_bound_withheld():
@@ -89,43 +115,72 @@ def test_steering_catches_up_with_what_a_bound_withheld():
 def test_a_curve_is_driven_along_its_mission():
     scenes = make_scenes(1, num_vehicles=1, num_vrus=0)
     angle = torch.arange(150) * 2.0 / 40
-    scenes.scenes["route_points"][0, 0, 0] = torch.stack([40 * angle.sin() - 20, 40 * (1 - angle.cos())], -1)
+    scenes.scenes["route_points"][0, 0, 0] = torch.stack(
+        [40 * angle.sin() - 20, 40 * (1 - angle.cos())], -1
+    )
     scenes.scenes["start"][0, 0] = torch.tensor([-20.0, 0.0, 0.0, 8.0])
     _, world = worlds(scenes)
     path = MissionPath(world)
     steady = torch.full((1, 1, PLAN_STEPS + 1), 8.0)
-    driven = drive(world.states[:, 0], path, steady, torch.zeros(1, 1), torch.ones(1)).states[0, 0]
+    driven = drive(
+        world.states[:, 0], path, steady, torch.zeros(1, 1), torch.ones(1)
+    ).states[0, 0]
     radius = (driven[:, :2] - torch.tensor([-20.0, 40.0])).norm(dim=-1)
     assert (radius - 40).abs().max() < 0.5 and driven[-1, 2] > 0.9
 
 
 def test_forecasts_of_constant_acceleration_and_turn():
-    scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (20.0, 0, 10.0), (40.0, 1, 10.0)], num_vrus=0)
-    scenes.scenes["start_accel"][0, 1], scenes.scenes["start_yaw_rate"][0, 2] = -8.0, 0.5
+    scenes = make_scenes(
+        1, vehicles=[(0.0, 0, 10.0), (20.0, 0, 10.0), (40.0, 1, 10.0)], num_vrus=0
+    )
+    scenes.scenes["start_accel"][0, 1], scenes.scenes["start_yaw_rate"][0, 2] = (
+        -8.0,
+        0.5,
+    )
     _, world = worlds(scenes)
     agents, seen = nearest(world, 5)
-    assert seen.tolist() == [[True, True, False, False, False]] and agents[0, :2].tolist() == [1, 2]
+    assert seen.tolist() == [[True, True, False, False, False]] and agents[
+        0, :2
+    ].tolist() == [1, 2]
     found = forecast(world, agents, seen=seen, times=TIMES, hold=1.0, turn=2.0)
-    expected = 20 + 10 * TIMES - 4 * TIMES.clamp(max=1) ** 2 - 8 * (TIMES - 1).clamp(min=0)
+    expected = (
+        20 + 10 * TIMES - 4 * TIMES.clamp(max=1) ** 2 - 8 * (TIMES - 1).clamp(min=0)
+    )
     torch.testing.assert_close(found.poses[0, 0, :, 0], expected, atol=1e-3, rtol=0)
     torch.testing.assert_close(found.speed[0, 0], 10 - 8 * TIMES.clamp(max=1))
     early = TIMES < 2
-    torch.testing.assert_close(found.poses[0, 1, early, 0], 40 + 20 * (0.5 * TIMES[early]).sin(), atol=0.02, rtol=0)
     torch.testing.assert_close(
-        found.poses[0, 1, early, 1], LANE_WIDTH + 20 * (1 - (0.5 * TIMES[early]).cos()), atol=0.02, rtol=0
+        found.poses[0, 1, early, 0],
+        40 + 20 * (0.5 * TIMES[early]).sin(),
+        atol=0.02,
+        rtol=0,
+    )
+    torch.testing.assert_close(
+        found.poses[0, 1, early, 1],
+        LANE_WIDTH + 20 * (1 - (0.5 * TIMES[early]).cos()),
+        atol=0.02,
+        rtol=0,
     )
     assert torch.allclose(found.poses[0, 1, -1, 2], torch.tensor(1.0), atol=1e-3)
 
 
 def test_pair_costs_order_situations():
-    """Contact costs more than nearness, faster contact more than slower, behind less than ahead, far nothing."""
+    """Contact costs more than nearness, faster contact more than slower, behind less
+    than ahead, far nothing."""
     weights = SamplingEgo()
     size = torch.tensor([[4.5, 2.0]])
 
     def cost(x, y, speed, ego_speed=10.0):
         ego = torch.tensor([[0.0, 0.0, 0.0, ego_speed]])
         other = torch.tensor([[x, y, 0.0, speed]])
-        return pair_cost(ego, size, other=other, other_size=size, margin=torch.tensor([1.0]), weights=weights)[0].item()
+        return pair_cost(
+            ego,
+            size,
+            other=other,
+            other_size=size,
+            margin=torch.tensor([1.0]),
+            weights=weights,
+        )[0].item()
 
     assert cost(4.0, 0.0, 0.0) > cost(4.0, 0.0, 8.0) > cost(5.0, 0.0, 8.0) > 0
     assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0
@@ -144,10 +199,13 @@ def test_the_ranked_begin_with_the_plan_and_are_driven_differently():
 
 
 def test_a_plan_of_its_own_is_rated_as_it_was_ranked():
-    """But for where the plan ends beside the mission, which counts instead of where it led to."""
+    """But for where the plan ends beside the mission, which counts instead of where it
+    led to."""
     _, world = world_of(num_scenes=2)
     ego = SamplingEgo(lateral_offset=0.0)
     states, costs = ego.ranked(world, 8)
     torch.testing.assert_close(ego.rated(world, states), costs, atol=0.2, rtol=0)
     into = world.states[:, None, 1:2].expand(-1, 1, PLAN_STEPS, -1)
-    assert (ego.rated(world, into) > costs[:, :1] + 50).all(), "one that is where another agent is"
+    assert (ego.rated(world, into) > costs[:, :1] + 50).all(), (
+        "one that is where another agent is"
+    )

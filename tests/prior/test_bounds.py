@@ -1,4 +1,5 @@
-"""Bounds: feasible plans stay as they are; whoever runs into somebody brakes just enough, and nobody else does."""
+"""Bounds: feasible plans stay as they are; whoever runs into somebody brakes just
+enough, and nobody else does."""
 
 import math
 
@@ -28,16 +29,28 @@ CAR = (4.0, 2.0)
 
 
 def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
-    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(rows, cap) at even speed, state, others.
+    """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(rows, cap)
+    at even speed, state, others.
 
     exempt, yields: vehicles of such a duty; patience [m/s^2]: see Duty.
     """
     agents = torch.tensor([cars], dtype=torch.float32)
-    routes = torch.stack([arc(x, y, heading=heading, curvature=turn) for x, y, heading, _ in cars])[None]
+    routes = torch.stack(
+        [arc(x, y, heading=heading, curvature=turn) for x, y, heading, _ in cars]
+    )[None]
     zero = torch.zeros(1, len(cars))
-    state = locate(agents, zero, yaw_rate=zero + turn * agents[..., 3], points=routes, hint=zero + 20.0)
+    state = locate(
+        agents,
+        zero,
+        yaw_rate=zero + turn * agents[..., 3],
+        points=routes,
+        hint=zero + 20.0,
+    )
     size = torch.tensor(CAR).expand(1, len(cars), 2)
-    duty = Duty(*(torch.zeros(1, len(cars), dtype=torch.bool) for _ in range(2)), zero + patience)
+    duty = Duty(
+        *(torch.zeros(1, len(cars), dtype=torch.bool) for _ in range(2)),
+        zero + patience,
+    )
     duty.exempt[0, list(exempt)] = True
     duty.yields[0, list(yields)] = True
 
@@ -46,13 +59,23 @@ def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
         if rows is None:
             return lane_relative.decode(x, state, points=routes)
         x[(*rows, torch.zeros_like(rows[0]))] = cap.clamp(max=0.0)
-        return lane_relative.decode(x, state, points=routes).map(lambda value: value[rows])
+        return lane_relative.decode(x, state, points=routes).map(
+            lambda value: value[rows]
+        )
 
-    return decode, state, Obstacles(agents, size, present=torch.ones(1, len(cars), dtype=torch.bool), duty=duty)
+    return (
+        decode,
+        state,
+        Obstacles(
+            agents, size, present=torch.ones(1, len(cars), dtype=torch.bool), duty=duty
+        ),
+    )
 
 
 def caps(decode, state, obstacles, **settings):
-    return acceleration_caps(BoundSettings(**settings), decode(), state=state, obstacles=obstacles)[0]
+    return acceleration_caps(
+        BoundSettings(**settings), decode(), state=state, obstacles=obstacles
+    )[0]
 
 
 def contact_time(seconds):
@@ -61,7 +84,9 @@ def contact_time(seconds):
 
 
 def test_plans_that_meet_nobody_are_free():
-    decode, state, obstacles = traffic((0, 0, 0, 10), (30, 0, 0, 10), (0, 3.5, 0, 12), (40, -3.5, math.pi, 9))
+    decode, state, obstacles = traffic(
+        (0, 0, 0, 10), (30, 0, 0, 10), (0, 3.5, 0, 12), (40, -3.5, math.pi, 9)
+    )
     assert (caps(decode, state, obstacles=obstacles) == NO_CAP).all()
     motion = bounded(BoundSettings(), decode, state=state, obstacles=obstacles)
     assert torch.equal(motion.states(), decode().states())
@@ -73,7 +98,9 @@ def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
     cap = caps(decode, state, obstacles=obstacles)
     time = contact_time((15 - CAR[0]) / (10 - speed))
     room = 10 * time - GAP - speed * time
-    assert cap.tolist() == pytest.approx([-((10 - speed) ** 2) / (2 * room), NO_CAP], rel=2e-2)
+    assert cap.tolist() == pytest.approx(
+        [-((10 - speed) ** 2) / (2 * room), NO_CAP], rel=2e-2
+    )
 
 
 def test_braking_is_never_harder_than_the_floor_nor_softer_than_gentle():
@@ -97,14 +124,19 @@ def test_only_an_exempt_vehicle_may_meet_the_ego():
 
 
 def test_who_yields_brakes_for_the_ego_even_where_the_ego_would_have_to():
-    crossing = (0, -23, math.pi / 2, 10), (-20, 0, 0, 10)  # the ego is later, so it would brake
+    crossing = (
+        (0, -23, math.pi / 2, 10),
+        (-20, 0, 0, 10),
+    )  # the ego is later, so it would brake
     assert caps(*traffic(*crossing))[1] == NO_CAP
     assert caps(*traffic(*crossing, yields=[1]))[1] < -1
 
 
 def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
     ego = (20.0, 0, 0, 0)
-    eager, patient = (caps(*traffic(ego, (0.0, 0, 0, 8), patience=value))[1] for value in (0.0, 6.0))
+    eager, patient = (
+        caps(*traffic(ego, (0.0, 0, 0, 8), patience=value))[1] for value in (0.0, 6.0)
+    )
     assert -6 < eager < 0 and patient == NO_CAP
     closer = caps(*traffic(ego, (5.0, 0, 0, 8), patience=4.0))[1]
     room = 20 - 5 - CAR[0] - GAP
@@ -114,8 +146,16 @@ def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
 def test_who_drifts_into_the_ego_s_side_falls_behind_it_in_time():
     ego = (0, 0, 0, 10)
     angle = 0.1
-    drifting = (2.0, -3.0, angle, 10 / math.cos(angle))  # keeps level with the ego and comes nearer at 1 m/s
-    time = contact_time((3.0 - CAR[1] - LATERAL_MARGIN - CAR[0] / 2 * math.sin(angle)) / (10 * math.tan(angle)))
+    drifting = (
+        2.0,
+        -3.0,
+        angle,
+        10 / math.cos(angle),
+    )  # keeps level with the ego and comes nearer at 1 m/s
+    time = contact_time(
+        (3.0 - CAR[1] - LATERAL_MARGIN - CAR[0] / 2 * math.sin(angle))
+        / (10 * math.tan(angle))
+    )
     cap = caps(*traffic(ego, drifting, yields=[1]), floor=-50.0)[1]
     assert cap == pytest.approx(-2 * (CAR[0] + GAP + 2.0) / time**2, rel=0.05)
     assert caps(*traffic(ego, drifting, exempt=[1]))[1] == NO_CAP
@@ -148,14 +188,21 @@ def test_a_pedestrian_without_a_plan_keeps_its_velocity():
 def test_a_curve_is_met_at_the_lateral_acceleration_allowed():
     decode, state, obstacles = traffic((0, 0, 0, 12), turn=1 / 20.0)
     cap = caps(decode, state, obstacles=obstacles, lateral=4.0)[0]
-    assert cap == pytest.approx(-(12**2 - 4.0 * 20) / (2 * 12 * STRIDE * DT), rel=0.1) or cap == -7.0
+    assert (
+        cap == pytest.approx(-(12**2 - 4.0 * 20) / (2 * 12 * STRIDE * DT), rel=0.1)
+        or cap == -7.0
+    )
     assert caps(decode, state, obstacles=obstacles, lateral=8.0)[0] == NO_CAP
-    assert caps(decode, state, obstacles=obstacles, lateral=4.0, curve=False)[0] == NO_CAP
+    assert (
+        caps(decode, state, obstacles=obstacles, lateral=4.0, curve=False)[0] == NO_CAP
+    )
 
 
 def test_whoever_follows_a_braking_vehicle_brakes_too():
     decode, state, obstacles = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12))
-    assert caps(decode, state, obstacles=obstacles, look=1.6)[2] == NO_CAP, "its plan meets nobody's as they stand"
+    assert caps(decode, state, obstacles=obstacles, look=1.6)[2] == NO_CAP, (
+        "its plan meets nobody's as they stand"
+    )
     motion = bounded(BoundSettings(look=1.6), decode, state=state, obstacles=obstacles)
     assert (motion.v <= decode().v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2
 
@@ -165,5 +212,9 @@ def test_a_cap_lowers_the_next_knot_and_at_most_by_its_onset_the_present_acceler
     state.a = torch.tensor([[1.0, -1.5, -6.0]])
     x0 = torch.tensor([[[0.5] * SIZE, [-3.0] * SIZE, [0.0] * SIZE]])
     capped, after = apply_cap(torch.tensor([[-4.0, -2.0, -5.0]]), x0, state=state)
-    assert after.a.tolist() == [[1.0 - ONSET, -2.0, -6.0]] and capped[0, :, 0].tolist() == [-4.0, -3.0, -5.0]
-    assert torch.equal(capped[..., 1:], x0[..., 1:]) and apply_cap(None, x0, state=state) == (x0, state)
+    assert after.a.tolist() == [[1.0 - ONSET, -2.0, -6.0]] and capped[
+        0, :, 0
+    ].tolist() == [-4.0, -3.0, -5.0]
+    assert torch.equal(capped[..., 1:], x0[..., 1:]) and apply_cap(
+        None, x0, state=state
+    ) == (x0, state)

@@ -1,4 +1,5 @@
-"""Checkpoints: the same prior comes back, and what does not fit is refused in a sentence."""
+"""Checkpoints: the same prior comes back, and what does not fit is refused in a
+sentence."""
 
 import json
 from pathlib import Path
@@ -24,26 +25,43 @@ def test_a_saved_prior_comes_back(tmp_path):
     assert back.denoiser.settings == prior.denoiser.settings
     for key, value in prior.state_dict().items():
         assert torch.equal(value, back.state_dict()[key])
-    assert not any(parameter.requires_grad for parameter in back.parameters()) and not back.training
+    assert (
+        not any(parameter.requires_grad for parameter in back.parameters())
+        and not back.training
+    )
 
 
-@pytest.mark.parametrize("path", sorted((Path(e2rl.__file__).parent / "assets").rglob("*.safetensors")), ids=str)
-def test_weights_that_come_with_the_package_carry_the_hash_of_what_they_are(tmp_path, path):
+@pytest.mark.parametrize(
+    "path",
+    sorted((Path(e2rl.__file__).parent / "assets").rglob("*.safetensors")),
+    ids=str,
+)
+def test_weights_that_come_with_the_package_carry_the_hash_of_what_they_are(
+    tmp_path, path
+):
     with safe_open(path, "pt") as file:
-        metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        metadata = file.metadata()
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     assert HASH in metadata and read_weights(path)[0].keys() == tensors.keys()
-    next(value for value in tensors.values() if value.is_floating_point()).view(-1)[0] += 1e-3
+    next(value for value in tensors.values() if value.is_floating_point()).view(-1)[
+        0
+    ] += 1e-3
     save_file(tensors, tmp_path / path.name, metadata)
     with pytest.raises(ValueError, match="not what was written"):
         read_weights(tmp_path / path.name)
 
 
 def rewritten(path, change, drop=None):
-    """The checkpoint with its architecture passed through `change`, without tensor `drop` and without its hash."""
+    """The checkpoint with its architecture passed through `change`, without tensor
+    `drop` and without its hash."""
     with safe_open(path, "pt") as file:
         metadata = dict(file.metadata())
         del metadata[HASH]
-        tensors = {key: file.get_tensor(key) for key in file.keys() if key != drop}  # noqa: SIM118
+        tensors = {
+            key: file.get_tensor(key)
+            for key in file.keys()  # noqa: SIM118
+            if key != drop
+        }
     architecture = json.loads(metadata["architecture"])
     change(architecture)
     save_file(tensors, path, metadata | {"architecture": json.dumps(architecture)})
@@ -76,6 +94,10 @@ def test_missing_damaged_foreign_and_incomplete_files_are_refused(tmp_path):
     save_file({"x": torch.zeros(1)}, foreign)
     with pytest.raises(InputError, match="format"):
         load_prior(str(foreign))
-    path = rewritten(save_prior(small_prior(), tmp_path, origin={}), lambda a: None, drop="denoiser.head.1.bias")
+    path = rewritten(
+        save_prior(small_prior(), tmp_path, origin={}),
+        lambda a: None,
+        drop="denoiser.head.1.bias",
+    )
     with pytest.raises(InputError, match="head"):
         load_prior(path)

@@ -1,4 +1,5 @@
-"""The joint denoiser: equivariant under permutations of vehicles, blind to absent ones, a mix of x and network."""
+"""The joint denoiser: equivariant under permutations of vehicles, blind to absent ones,
+a mix of x and network."""
 
 import torch
 
@@ -16,7 +17,13 @@ def inputs(seed=0):
     generator = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.randn(BATCH, VEHICLES, *shape, generator=generator)  # noqa: E731
     present = torch.tensor([[True] * 6, [True, True, False, True, False, False]])
-    return draw(SIZE), torch.rand(BATCH, VEHICLES, generator=generator), draw(NODE), draw(VEHICLES, EDGE), present
+    return (
+        draw(SIZE),
+        torch.rand(BATCH, VEHICLES, generator=generator),
+        draw(NODE),
+        draw(VEHICLES, EDGE),
+        present,
+    )
 
 
 def run(net, x, level, nodes, pairs, present):
@@ -26,8 +33,20 @@ def run(net, x, level, nodes, pairs, present):
 def test_vehicles_may_be_listed_in_any_order():
     net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
     order = torch.tensor([3, 0, 5, 1, 4, 2])
-    there = run(net, x[:, order], level=level[:, order], nodes=nodes[:, order], pairs=pairs[:, order][:, :, order], present=present[:, order])
-    torch.testing.assert_close(there, run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)[:, order], rtol=0, atol=1e-5)
+    there = run(
+        net,
+        x[:, order],
+        level=level[:, order],
+        nodes=nodes[:, order],
+        pairs=pairs[:, order][:, :, order],
+        present=present[:, order],
+    )
+    torch.testing.assert_close(
+        there,
+        run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)[:, order],
+        rtol=0,
+        atol=1e-5,
+    )
 
 
 def test_absent_vehicles_do_not_influence_the_others():
@@ -48,14 +67,27 @@ def test_present_vehicles_influence_each_other():
     here = run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)
     x = x.clone()
     x[:, 1] += 1
-    assert (run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)[0, 3] != here[0, 3]).any()
+    assert (
+        run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)[0, 3]
+        != here[0, 3]
+    ).any()
 
 
 def test_an_untrained_denoiser_scales_x_and_a_clean_one_keeps_it():
     x, level, nodes, pairs, present = inputs()
     net = Denoiser()
-    torch.testing.assert_close(run(net, x, level=level, nodes=nodes, pairs=pairs, present=present), net.schedule.alpha(level)[..., None] * x)
-    clean = run(small_prior().denoiser, x, level=torch.zeros_like(level), nodes=nodes, pairs=pairs, present=present)
+    torch.testing.assert_close(
+        run(net, x, level=level, nodes=nodes, pairs=pairs, present=present),
+        net.schedule.alpha(level)[..., None] * x,
+    )
+    clean = run(
+        small_prior().denoiser,
+        x,
+        level=torch.zeros_like(level),
+        nodes=nodes,
+        pairs=pairs,
+        present=present,
+    )
     torch.testing.assert_close(clean, x)
 
 
@@ -63,11 +95,19 @@ def test_a_repeated_encoding_is_that_of_a_repeated_batch():
     net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
     tiled = net.encode(nodes, pairs, present).repeat(2)
     both = net(torch.cat([x, x + 1]), torch.cat([level, level]), tiled)
-    torch.testing.assert_close(both[BATCH:], run(net, x + 1, level=level, nodes=nodes, pairs=pairs, present=present), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        both[BATCH:],
+        run(net, x + 1, level=level, nodes=nodes, pairs=pairs, present=present),
+        rtol=0,
+        atol=1e-5,
+    )
 
 
 def test_weights_have_gradients_where_functions_are_fused_too():
-    net, (x, level, *scene) = small_prior().denoiser.requires_grad_(True).eval(), inputs()
+    net, (x, level, *scene) = (
+        small_prior().denoiser.requires_grad_(True).eval(),
+        inputs(),
+    )
     switch(True)
     run(net, x, level[:1], *scene).square().sum().backward()
     assert all(weight.grad is not None for weight in net.parameters())

@@ -1,4 +1,5 @@
-"""Plans as they are driven: every step as long as the speed makes it, on the planned line."""
+"""Plans as they are driven: every step as long as the speed makes it, on the planned
+line."""
 
 import math
 
@@ -22,7 +23,12 @@ def generator():
 
 
 def routes(sharpest):
-    return torch.stack([arc(0.0, 0.0, heading=0.3, curvature=curvature) for curvature in torch.linspace(-sharpest, sharpest, COUNT)])
+    return torch.stack(
+        [
+            arc(0.0, 0.0, heading=0.3, curvature=curvature)
+            for curvature in torch.linspace(-sharpest, sharpest, COUNT)
+        ]
+    )
 
 
 def steps_of(state, motion):
@@ -36,15 +42,26 @@ def steps_of(state, motion):
 def turned(state, angle):
     """The vehicles at `angle` to their routes."""
     heading = state.heading - torch.atan(state.d1) + angle
-    return lane_relative.LaneState(**(vars(state) | {"heading": heading, "d1": torch.full_like(state.d1, angle).tan()}))
+    return lane_relative.LaneState(
+        **(
+            vars(state)
+            | {"heading": heading, "d1": torch.full_like(state.d1, angle).tan()}
+        )
+    )
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, -1.0, 1.4])
-def test_every_step_is_as_long_as_the_speed_makes_it_and_along_the_heading(generator, angle):
+def test_every_step_is_as_long_as_the_speed_makes_it_and_along_the_heading(
+    generator, angle
+):
     points = routes(0.05)
     state = turned(random_state(points, generator), angle)
-    plan = lane_relative.decode(torch.randn(COUNT, SIZE, generator=generator), state, points=points)
-    step, speed, heading, change = steps_of(state, as_driven(plan, state, on_lane=ON_LANE))
+    plan = lane_relative.decode(
+        torch.randn(COUNT, SIZE, generator=generator), state, points=points
+    )
+    step, speed, heading, change = steps_of(
+        state, as_driven(plan, state, on_lane=ON_LANE)
+    )
     expected = DT * speed[..., None] * torch.stack([heading.cos(), heading.sin()], -1)
     torch.testing.assert_close(step, expected, rtol=0, atol=1e-4)
     assert (change.abs() <= turn_bound(speed) + 1e-5).all()
@@ -58,17 +75,25 @@ def test_a_plan_along_a_straight_route_is_driven_as_it_is(generator):
     plan = lane_relative.decode(x, state, points=points)
     driven = as_driven(plan, state, on_lane=ON_LANE)
     for name in ("s", "d", "v", "a", "heading"):
-        torch.testing.assert_close(getattr(driven, name), getattr(plan, name), rtol=0, atol=1e-3, msg=name)
+        torch.testing.assert_close(
+            getattr(driven, name), getattr(plan, name), rtol=0, atol=1e-3, msg=name
+        )
 
 
 @pytest.mark.parametrize("side", [-3.0, 3.0])
 def test_who_keeps_beside_a_bend_drives_a_circle_of_its_own_at_its_own_speed(side):
-    """10 m/s at 3 m beside a circle of 40 m: 43 or 37 m, and as much more or less of the route."""
+    """10 m/s at 3 m beside a circle of 40 m: 43 or 37 m, and as much more or less of
+    the route."""
     radius = 40.0
     speed = 10.0
     points = arc(0.0, 0.0, heading=0.0, curvature=1 / radius)[None]
     states = torch.tensor([[[0.0, side, 0.0, speed]]])
-    state = lane_relative.locate(states, torch.zeros(1, 1), yaw_rate=torch.full((1, 1), speed / (radius - side)), points=points[None])
+    state = lane_relative.locate(
+        states,
+        torch.zeros(1, 1),
+        yaw_rate=torch.full((1, 1), speed / (radius - side)),
+        points=points[None],
+    )
     state = state.map(lambda value: value[0])
     state.d2[:] = 0
     x = torch.zeros(1, SIZE)
@@ -77,8 +102,12 @@ def test_who_keeps_beside_a_bend_drives_a_circle_of_its_own_at_its_own_speed(sid
     driven = as_driven(plan, state, on_lane=ON_LANE[:1])
     from_centre = torch.hypot(driven.x, driven.y - radius)
     assert (from_centre - (radius - side)).abs().max() < 0.15
-    assert driven.heading[0, 9].item() == pytest.approx(10.0 / (radius - side), abs=0.01)
-    assert driven.s[0, 9].item() - state.s.item() == pytest.approx(10.0 * radius / (radius - side), abs=0.15)
+    assert driven.heading[0, 9].item() == pytest.approx(
+        10.0 / (radius - side), abs=0.01
+    )
+    assert driven.s[0, 9].item() - state.s.item() == pytest.approx(
+        10.0 * radius / (radius - side), abs=0.15
+    )
 
 
 def test_plans_in_free_space_are_driven_as_they_are(generator):
@@ -91,7 +120,10 @@ def test_plans_in_free_space_are_driven_as_they_are(generator):
 
 
 def test_a_jump_of_the_heading_is_driven_as_a_turn_at_the_steering_s_limit():
-    state = turned(random_state(routes(0.0), torch.Generator().manual_seed(1), speed=(5.0, 5.0)), math.pi / 2 - 0.05)
+    state = turned(
+        random_state(routes(0.0), torch.Generator().manual_seed(1), speed=(5.0, 5.0)),
+        math.pi / 2 - 0.05,
+    )
     plan = lane_relative.decode(torch.zeros(COUNT, SIZE), state, points=routes(0.0))
     plan.heading = plan.heading - 0.8
     _, speed, _, change = steps_of(state, as_driven(plan, state, on_lane=ON_LANE))
@@ -99,10 +131,18 @@ def test_a_jump_of_the_heading_is_driven_as_a_turn_at_the_steering_s_limit():
 
 
 def test_who_reverses_rolls_to_a_halt_and_then_drives_as_planned():
-    state = random_state(routes(0.0), torch.Generator().manual_seed(2), speed=(-2.0, -2.0))
-    driven = as_driven(lane_relative.decode(torch.zeros(COUNT, SIZE), state, points=routes(0.0)), state, on_lane=ON_LANE)
+    state = random_state(
+        routes(0.0), torch.Generator().manual_seed(2), speed=(-2.0, -2.0)
+    )
+    driven = as_driven(
+        lane_relative.decode(torch.zeros(COUNT, SIZE), state, points=routes(0.0)),
+        state,
+        on_lane=ON_LANE,
+    )
     step, speed, heading, _ = steps_of(state, driven)
     expected = DT * speed[..., None] * torch.stack([heading.cos(), heading.sin()], -1)
     torch.testing.assert_close(step, expected, rtol=0, atol=1e-4)
-    torch.testing.assert_close(driven.v[:, :6], -2.0 + 0.3 * torch.arange(1, 7).expand(COUNT, 6))
+    torch.testing.assert_close(
+        driven.v[:, :6], -2.0 + 0.3 * torch.arange(1, 7).expand(COUNT, 6)
+    )
     assert (driven.v[:, 6:] >= 0).all()

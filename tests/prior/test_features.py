@@ -1,11 +1,19 @@
-"""Features: the same wherever the scene lies, and the listed ones (and no others) change sign in a mirror."""
+"""Features: the same wherever the scene lies, and the listed ones (and no others)
+change sign in a mirror."""
 
 import math
 
 import pytest
 import torch
 
-from e2rl.prior.features import SIDED_EDGE, SIDED_NODE, curve_speed, edge_features, leaders_ahead, node_features
+from e2rl.prior.features import (
+    SIDED_EDGE,
+    SIDED_NODE,
+    curve_speed,
+    edge_features,
+    leaders_ahead,
+    node_features,
+)
 from e2rl.prior.lane_relative import locate
 from e2rl.prior.routes import route_scene
 from tests.prior.small import arc, curved_scenes, mirrored, moved
@@ -22,13 +30,19 @@ def features(scene, step=None):
     )
     step = torch.zeros(len(scene), dtype=torch.long) if step is None else step
     nodes = node_features(
-        routed, state, leaders_ahead(routed, state.s, agents=scene["start"], present=scene["valid"]), step, step == 0
+        routed,
+        state,
+        leaders_ahead(routed, state.s, agents=scene["start"], present=scene["valid"]),
+        step,
+        step == 0,
     )
     here = scene["valid"][0, :vehicles]
     return nodes[:, here], edge_features(routed, state)[:, here][:, :, here]
 
 
-@pytest.mark.parametrize(("kind", "sided"), [(0, SIDED_NODE), (1, SIDED_EDGE)], ids=["nodes", "edges"])
+@pytest.mark.parametrize(
+    ("kind", "sided"), [(0, SIDED_NODE), (1, SIDED_EDGE)], ids=["nodes", "edges"]
+)
 def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
     scene = curved_scenes()
     here = features(scene)[kind]
@@ -36,13 +50,19 @@ def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
     sign = torch.ones(here.shape[-1])
     sign[list(sided)] = -1
     torch.testing.assert_close(there, here * sign, rtol=0, atol=2e-3)
-    flipping = ((here - there).abs() > 5e-3).flatten(0, -2).any(0).nonzero()[:, 0].tolist()
-    assert set(flipping) == set(sided), "every listed feature is looked at by this scene"
+    flipping = (
+        ((here - there).abs() > 5e-3).flatten(0, -2).any(0).nonzero()[:, 0].tolist()
+    )
+    assert set(flipping) == set(sided), (
+        "every listed feature is looked at by this scene"
+    )
 
 
 def test_features_do_not_know_where_the_scene_lies():
     scene = curved_scenes()
-    for here, there in zip(features(scene), features(moved(scene, 120.0, y=-40.0, angle=0.7)), strict=True):
+    for here, there in zip(
+        features(scene), features(moved(scene, 120.0, y=-40.0, angle=0.7)), strict=True
+    ):
         torch.testing.assert_close(there, here, rtol=0, atol=5e-3)
 
 
@@ -54,20 +74,42 @@ def test_only_estimates_look_at_the_past():
     now = torch.full((1,), 5)
     assert not torch.equal(features(scene)[0], features(changed)[0])
     assert torch.equal(features(scene, now)[0], features(changed, now)[0])
-    alone = features(scene, first)[0][0, 0, 51:61]  # 8 m/s now, 0.4 m/s^2 less and less before
-    torch.testing.assert_close(alone, -0.2 * (0.2 * torch.arange(10) + 0.1) / 2 * torch.ones(10), rtol=0, atol=1e-4)
+    alone = features(scene, first)[0][
+        0, 0, 51:61
+    ]  # 8 m/s now, 0.4 m/s^2 less and less before
+    torch.testing.assert_close(
+        alone,
+        -0.2 * (0.2 * torch.arange(10) + 0.1) / 2 * torch.ones(10),
+        rtol=0,
+        atol=1e-4,
+    )
 
 
 def test_a_queue_a_light_and_a_limit_are_seen():
     nodes, _ = features(curved_scenes(limit=15.0))
     ego = nodes[0, 0]
-    assert ego[0] == pytest.approx(0.8) and ego[7] == pytest.approx(0.7) and ego[8] == pytest.approx(1.0)
+    assert (
+        ego[0] == pytest.approx(0.8)
+        and ego[7] == pytest.approx(0.7)
+        and ego[8] == pytest.approx(1.0)
+    )
     gap = -20 * math.log(ego[25])
     assert gap == pytest.approx(18 - 4.5, abs=0.2)
-    assert ego[32] == pytest.approx(1 - 30 / 120, abs=0.01) and ego[33:36].tolist() == [1, 0, 0]
+    assert ego[32] == pytest.approx(1 - 30 / 120, abs=0.01) and ego[33:36].tolist() == [
+        1,
+        0,
+        0,
+    ]
 
 
 def test_the_curve_speed_of_a_circle_is_that_of_its_radius():
     points = arc(0, 0, heading=0, curvature=0.02)[None, None]
-    state = locate(torch.tensor([[[0.0, 0.0, 0.0, 8.0]]]), torch.zeros(1, 1), yaw_rate=torch.zeros(1, 1), points=points)
-    assert curve_speed(state, points, lateral=2.5, brake=1.2).item() == pytest.approx(math.sqrt(2.5 / 0.02), rel=1e-2)
+    state = locate(
+        torch.tensor([[[0.0, 0.0, 0.0, 8.0]]]),
+        torch.zeros(1, 1),
+        yaw_rate=torch.zeros(1, 1),
+        points=points,
+    )
+    assert curve_speed(state, points, lateral=2.5, brake=1.2).item() == pytest.approx(
+        math.sqrt(2.5 / 0.02), rel=1e-2
+    )

@@ -10,7 +10,18 @@ COUNT = 32
 
 def start(v, kappa, heading):
     zero = torch.zeros_like(v)
-    return LaneState(zero + 20, zero, d1=zero, d2=zero, v=v, a=zero, x=zero + 3, y=zero - 2, heading=heading, kappa=kappa)
+    return LaneState(
+        zero + 20,
+        zero,
+        d1=zero,
+        d2=zero,
+        v=v,
+        a=zero,
+        x=zero + 3,
+        y=zero - 2,
+        heading=heading,
+        kappa=kappa,
+    )
 
 
 def random_start(seed=0):
@@ -28,15 +39,30 @@ def test_constant_curvature_is_a_circle():
     centre_x = state.x - state.heading.sin() / state.kappa
     centre_y = state.y + state.heading.cos() / state.kappa
     radius = torch.hypot(plan.x - centre_x[:, None], plan.y - centre_y[:, None])
-    torch.testing.assert_close(radius, (1 / state.kappa.abs())[:, None].expand_as(radius), rtol=1e-3, atol=5e-3)
+    torch.testing.assert_close(
+        radius, (1 / state.kappa.abs())[:, None].expand_as(radius), rtol=1e-3, atol=5e-3
+    )
     way = state.v[:, None] * 0.1 * torch.arange(1, HORIZON + 1)
-    torch.testing.assert_close(plan.heading, state.heading[:, None] + state.kappa[:, None] * way, rtol=0, atol=1e-3)
-    torch.testing.assert_close(plan.kappa, state.kappa[:, None].expand_as(plan.kappa), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        plan.heading,
+        state.heading[:, None] + state.kappa[:, None] * way,
+        rtol=0,
+        atol=1e-3,
+    )
+    torch.testing.assert_close(
+        plan.kappa, state.kappa[:, None].expand_as(plan.kappa), rtol=0, atol=1e-5
+    )
 
 
 def test_fitting_a_decoded_plan_gives_it_back():
     state, generator = random_start()
-    x = torch.cat([0.3 * torch.randn(COUNT, KNOTS, generator=generator), torch.randn(COUNT, 2, generator=generator)], 1)
+    x = torch.cat(
+        [
+            0.3 * torch.randn(COUNT, KNOTS, generator=generator),
+            torch.randn(COUNT, 2, generator=generator),
+        ],
+        1,
+    )
     plan = decode(x, state)
     wrapped = torch.remainder(plan.heading + torch.pi, 2 * torch.pi) - torch.pi
     found = fit(wrapped, torch.ones_like(plan.heading), state=state, knots=x[:, :KNOTS])

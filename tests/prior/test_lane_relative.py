@@ -1,4 +1,5 @@
-"""Decoding and fitting along routes: continuity, closed forms, no reversing, and the round trip."""
+"""Decoding and fitting along routes: continuity, closed forms, no reversing, and the
+round trip."""
 
 import pytest
 import torch
@@ -36,7 +37,16 @@ def straight(v, a=0.0, d=0.0, heading=0.0, count=1):
     """Vehicles at 20 m of a route along +x."""
     full = lambda value: torch.full((count,), float(value))  # noqa: E731
     return LaneState(
-        full(20), full(d), d1=full(heading).tan(), d2=full(0), v=full(v), a=full(a), x=full(0), y=full(d), heading=full(heading), kappa=full(0)
+        full(20),
+        full(d),
+        d1=full(heading).tan(),
+        d2=full(0),
+        v=full(v),
+        a=full(a),
+        x=full(0),
+        y=full(d),
+        heading=full(heading),
+        kappa=full(0),
     )
 
 
@@ -46,13 +56,22 @@ def test_plans_begin_where_and_as_the_vehicle_is(generator):
     x = torch.randn(COUNT, SIZE, generator=generator)
     plan = decode(x, state, points=points)
     step = 0.1 * (state.v + plan.v[:, 0]) / 2
-    expected = torch.stack([state.x + step * state.heading.cos(), state.y + step * state.heading.sin()], -1)
+    expected = torch.stack(
+        [state.x + step * state.heading.cos(), state.y + step * state.heading.sin()], -1
+    )
     gap = torch.stack([plan.x[:, 0], plan.y[:, 0]], -1) - expected
-    assert gap.norm(dim=-1).max() < 0.12, "vertices are chords: a few cm on the tightest bend"
-    turn = torch.remainder(plan.heading[:, 0] - state.heading + torch.pi, 2 * torch.pi) - torch.pi
+    assert gap.norm(dim=-1).max() < 0.12, (
+        "vertices are chords: a few cm on the tightest bend"
+    )
+    turn = (
+        torch.remainder(plan.heading[:, 0] - state.heading + torch.pi, 2 * torch.pi)
+        - torch.pi
+    )
     assert turn.abs().max() < 0.08
     assert (plan.v[:, 0] - state.v).abs().max() < 0.1 * 4 + 1e-4
-    torch.testing.assert_close(plan.a[:, 0], 0.9 * state.a + 0.1 * x[:, 0], rtol=0, atol=1e-2, msg="trapezoid")
+    torch.testing.assert_close(
+        plan.a[:, 0], 0.9 * state.a + 0.1 * x[:, 0], rtol=0, atol=1e-2, msg="trapezoid"
+    )
 
 
 def test_the_offset_passes_its_half_way_mark_and_ends_flat_at_its_target(generator):
@@ -65,11 +84,17 @@ def test_the_offset_passes_its_half_way_mark_and_ends_flat_at_its_target(generat
     way = plan.s - state.s
     assert reach == pytest.approx(32.0)
     half = split(x, state)[1].item()
-    assert plan.d[0, (way[0] - reach / 2).abs().argmin()].item() == pytest.approx(half, abs=0.05)
+    assert plan.d[0, (way[0] - reach / 2).abs().argmin()].item() == pytest.approx(
+        half, abs=0.05
+    )
     after = way[0] >= reach
     assert after.any()
-    torch.testing.assert_close(plan.d[0, after], torch.full((int(after.sum()),), end), rtol=0, atol=1e-4)
-    torch.testing.assert_close(plan.heading[0, after], torch.zeros(int(after.sum())), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        plan.d[0, after], torch.full((int(after.sum()),), end), rtol=0, atol=1e-4
+    )
+    torch.testing.assert_close(
+        plan.heading[0, after], torch.zeros(int(after.sum())), rtol=0, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("accel", [-1.0, 0.0, 1.5])
@@ -78,13 +103,17 @@ def test_constant_acceleration_is_the_closed_form(accel):
     x = torch.cat([torch.full((1, KNOTS), accel), torch.zeros(1, 2)], 1)
     plan = decode(x, state, points=arc(0, 0, heading=0, curvature=0)[None])
     torch.testing.assert_close(plan.v[0], 12 + accel * TIME)
-    torch.testing.assert_close(plan.x[0], 12 * TIME + accel * TIME**2 / 2, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(
+        plan.x[0], 12 * TIME + accel * TIME**2 / 2, rtol=1e-4, atol=1e-3
+    )
 
 
 def test_nobody_reverses(generator):
     points = routes()
     state = random_state(points, generator, speed=(0.0, 5.0))
-    plan = decode(-4 * torch.rand(COUNT, SIZE, generator=generator), state, points=points)
+    plan = decode(
+        -4 * torch.rand(COUNT, SIZE, generator=generator), state, points=points
+    )
     assert (plan.v >= 0).all() and (plan.s.diff(dim=-1) >= -1e-5).all()
     assert (plan.v[:, -1] == 0).all()
 
@@ -95,7 +124,9 @@ def test_gradients_are_finite_everywhere(generator):
     x = (3 * torch.randn(COUNT, SIZE, generator=generator)).requires_grad_(True)
     plan = decode(x, state, points=points)
     (gradient,) = torch.autograd.grad(plan.states().square().sum(), x)
-    assert gradient.isfinite().all() and (gradient[:, :KNOTS] != 0).any(1).all(), "a held speed still passes some"
+    assert gradient.isfinite().all() and (gradient[:, :KNOTS] != 0).any(1).all(), (
+        "a held speed still passes some"
+    )
 
 
 def test_a_standing_vehicle_does_not_move_sideways():
@@ -104,22 +135,31 @@ def test_a_standing_vehicle_does_not_move_sideways():
     plan = decode(x, state, points=arc(0, 0, heading=0, curvature=0)[None])
     for name in ("x", "y", "heading"):
         torch.testing.assert_close(
-            getattr(plan, name), getattr(state, name)[:, None].expand(1, HORIZON), rtol=0, atol=1e-4
+            getattr(plan, name),
+            getattr(state, name)[:, None].expand(1, HORIZON),
+            rtol=0,
+            atol=1e-4,
         )
 
 
 def test_fitting_a_decoded_plan_gives_it_back(generator):
-    """Accelerations that change slowly: what changes faster is taken for noise (ROUGHNESS)."""
+    """Accelerations that change slowly: what changes faster is taken for noise
+    (ROUGHNESS)."""
     points = routes()
     state = random_state(points, generator, speed=(10.0, 15.0))
-    knots = state.a[:, None] + (0.05 * torch.randn(COUNT, KNOTS, generator=generator)).cumsum(1)
+    knots = state.a[:, None] + (
+        0.05 * torch.randn(COUNT, KNOTS, generator=generator)
+    ).cumsum(1)
     x = torch.cat([knots.clamp(-1.5, 3), torch.randn(COUNT, 2, generator=generator)], 1)
     plan = decode(x, state, points=points)
     found, error = fit(plan, torch.ones_like(plan.s), state=state)
     assert error.max() < 0.1
     torch.testing.assert_close(found[:, :KNOTS], x[:, :KNOTS], rtol=0, atol=0.15)
-    # The ridge pulls lateral knots towards 0; the offsets they stand for are met within centimetres.
-    torch.testing.assert_close(decode(found, state, points=points).d, plan.d, rtol=0, atol=0.08)
+    # The ridge pulls lateral knots towards 0; the offsets they stand for are met within
+    # centimetres.
+    torch.testing.assert_close(
+        decode(found, state, points=points).d, plan.d, rtol=0, atol=0.08
+    )
 
 
 def test_unknown_steps_do_not_influence_a_fit(generator):
@@ -129,7 +169,9 @@ def test_unknown_steps_do_not_influence_a_fit(generator):
     known = torch.ones_like(plan.s)
     known[:, 20:] = 0
     other = plan.map(lambda value: torch.where(known > 0, value, -77.0))
-    for one, two in zip(fit(plan, known, state=state), fit(other, known, state=state), strict=True):
+    for one, two in zip(
+        fit(plan, known, state=state), fit(other, known, state=state), strict=True
+    ):
         torch.testing.assert_close(one, two)
 
 
@@ -138,12 +180,16 @@ def test_travelled_distance_is_the_integral_of_speed(generator):
     v, way = speeds(state, torch.randn(COUNT, KNOTS, generator=generator))
     before = torch.cat([state.v[:, None], v[:, :-1]], 1)
     torch.testing.assert_close(
-        way.diff(dim=-1, prepend=torch.zeros(COUNT, 1)), (v + before) / 2 * 0.1, rtol=0, atol=1e-5
+        way.diff(dim=-1, prepend=torch.zeros(COUNT, 1)),
+        (v + before) / 2 * 0.1,
+        rtol=0,
+        atol=1e-5,
     )
 
 
 def test_the_polynomial_and_its_gradients():
-    """Value and derivatives are those of the power sum; the gradients in closed form are the numerical ones."""
+    """Value and derivatives are those of the power sum; the gradients in closed form
+    are the numerical ones."""
     draw = torch.Generator().manual_seed(2)
     c = torch.randn(3, 2, 7, generator=draw, dtype=torch.float64, requires_grad=True)
     u = torch.rand(3, 2, 5, generator=draw, dtype=torch.float64, requires_grad=True)
@@ -151,6 +197,11 @@ def test_the_polynomial_and_its_gradients():
     at = u[..., None]
     value, first, second = polynomial(c, u)
     assert torch.allclose(value, (c[..., None, :] * at**power).sum(-1))
-    assert torch.allclose(first, (c[..., None, 1:] * power[1:] * at ** power[:-1]).sum(-1))
-    assert torch.allclose(second, (c[..., None, 2:] * (power * (power - 1))[2:] * at ** power[:-2]).sum(-1))
+    assert torch.allclose(
+        first, (c[..., None, 1:] * power[1:] * at ** power[:-1]).sum(-1)
+    )
+    assert torch.allclose(
+        second,
+        (c[..., None, 2:] * (power * (power - 1))[2:] * at ** power[:-2]).sum(-1),
+    )
     assert torch.autograd.gradcheck(polynomial, (c, u))

@@ -1,4 +1,5 @@
-"""The prior as a whole: nominal reverse SDE, path KL, the ego's row, bounds, ends of routes."""
+"""The prior as a whole: nominal reverse SDE, path KL, the ego's row, bounds, ends of
+routes."""
 
 from dataclasses import replace
 
@@ -38,7 +39,9 @@ def gaussian_prior(**sampler):
     def denoise(x, level, context):
         alpha = prior.schedule.alpha(level)
         sigma = prior.schedule.sigma(level)
-        return MEAN + STD**2 * alpha / (alpha**2 * STD**2 + sigma**2) * (x - alpha * MEAN)
+        return MEAN + STD**2 * alpha / (alpha**2 * STD**2 + sigma**2) * (
+            x - alpha * MEAN
+        )
 
     prior.denoise = denoise
     return prior
@@ -56,9 +59,12 @@ def gaussian_prior(**sampler):
 )
 @pytest.mark.parametrize("temperature", [1.0, 0.8])
 def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
-    """With a linear denoiser the path (x_K .. x_1) is Gaussian: its law is read off unit noises, one per scene."""
+    """With a linear denoiser the path (x_K .. x_1) is Gaussian: its law is read off
+    unit noises, one per scene."""
     prior = gaussian_prior(**sampler)
-    prior.sampler = SamplerSettings(**{**vars(prior.sampler), "temperature": temperature})
+    prior.sampler = SamplerSettings(
+        **{**vars(prior.sampler), "temperature": temperature}
+    )
     steps = prior.sampler.steps
     push = 0.3
     noise = torch.zeros(steps, steps + 1, 1, SIZE)
@@ -81,13 +87,18 @@ def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
     moved = pushed[0] - free[0]
     expected = 0.5 * moved @ torch.linalg.solve(mix @ mix.T, moved) * SIZE
     assert (none == 0).all()
-    torch.testing.assert_close(kl[:, 0].double(), expected.expand(steps + 1), rtol=1e-3, atol=0)
+    torch.testing.assert_close(
+        kl[:, 0].double(), expected.expand(steps + 1), rtol=1e-3, atol=0
+    )
 
 
 def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
-    """Both laws of the path are products of Gaussian steps, whose densities torch knows."""
+    """Both laws of the path are products of Gaussian steps, whose densities torch
+    knows."""
     prior = gaussian_prior(steps=4, sampler="ddim")
-    noise = torch.randn(4, 6, 1, SIZE, generator=torch.Generator().manual_seed(2)).double()
+    noise = torch.randn(
+        4, 6, 1, SIZE, generator=torch.Generator().manual_seed(2)
+    ).double()
     levels = prior.sampler.levels(prior.schedule)
     step = prior.sampler.on(prior.schedule).step
     total = torch.zeros(6, 1).double()
@@ -95,9 +106,17 @@ def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
 
     def control(x, level, k, context, denoise):
         if before:
-            means = [step(*before[-1][:1], x0, *before[-1][2:], x * 0)[0] for x0 in before[-1][1]]
-            std = step(*before[-1][:1], before[-1][1][0], *before[-1][2:], x * 0)[1].sqrt()
-            of_prior, of_control = (torch.distributions.Normal(mean, std).log_prob(x).sum(-1) for mean in means)
+            means = [
+                step(*before[-1][:1], x0, *before[-1][2:], x * 0)[0]
+                for x0 in before[-1][1]
+            ]
+            std = step(*before[-1][:1], before[-1][1][0], *before[-1][2:], x * 0)[
+                1
+            ].sqrt()
+            of_prior, of_control = (
+                torch.distributions.Normal(mean, std).log_prob(x).sum(-1)
+                for mean in means
+            )
             total.add_(of_control - of_prior)
         x0 = denoise(x)
         before.append((x, (x0, x0 + 0.2 * x), level, levels[len(before) + 1]))
@@ -121,7 +140,9 @@ def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
     budget = torch.stack([0.4 * free[0], 2 * free[1]])
     seen.clear()
     sample = prior.sample(None, noise, control, budget)
-    torch.testing.assert_close(sample.kl[:, 0], torch.stack([budget[0], free[1]]), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        sample.kl[:, 0], torch.stack([budget[0], free[1]]), rtol=1e-4, atol=0
+    )
     last = prior.sampler.levels(prior.schedule)[5]
     x = seen[-1][:1]  # the last step is the prior's own where the budget is spent
     torch.testing.assert_close(sample.x0[:1], prior.denoise(x, last, None))
@@ -138,7 +159,9 @@ def test_the_ego_s_row_is_its_plan_in_every_estimate():
     assert torch.equal(prior.sample(context, noise).x0[:, 0], context.ego_x)
     other = noise.clone()
     other[:, :, 0] = 9.0
-    assert torch.equal(prior.sample(context, other).x0, prior.sample(context, noise).x0), "noise of its row is unused"
+    assert torch.equal(
+        prior.sample(context, other).x0, prior.sample(context, noise).x0
+    ), "noise of its row is unused"
 
 
 @pytest.mark.parametrize("on_lane", [False, True])
@@ -156,21 +179,29 @@ def test_the_ego_s_plan_becomes_the_x_that_decodes_to_it(on_lane):
 
 def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     scene = curved_scenes()
-    scene["start"][:, 5] = torch.tensor([-7.0, 0.0, 0.0, 14.0])  # runs into the ego from behind
+    scene["start"][:, 5] = torch.tensor(
+        [-7.0, 0.0, 0.0, 14.0]
+    )  # runs into the ego from behind
     scene["route_points"][:, 5] = arc(-7.0, 0.0, heading=0.0, curvature=0.0)
     x0 = torch.zeros(*scene["route_log"].shape, SIZE)
-    tight, loose = (small_prior(bounds=bounds) for bounds in (BoundSettings(curve=False), FREE))
+    tight, loose = (
+        small_prior(bounds=bounds) for bounds in (BoundSettings(curve=False), FREE)
+    )
     free = loose.plan(x0, context_of(loose, scene)).motion.v
     shy = tight.plan(x0, context_of(tight, scene)).motion.v
     context = context_of(tight, scene)
     nobody = torch.zeros(scene["route_log"].shape, dtype=torch.bool)
     exempt = nobody.clone()
     exempt[:, 5] = True
-    context.obstacles.duty = Duty(exempt, nobody, patience=torch.zeros_like(free[..., 0]))
+    context.obstacles.duty = Duty(
+        exempt, nobody, patience=torch.zeros_like(free[..., 0])
+    )
     bold = tight.plan(x0, context).motion.v
     assert (shy[0, 5, 2:] < free[0, 5, 2:]).all()
     others = torch.arange(shy.shape[1]) != 5
-    assert torch.equal(shy[:, others], free[:, others]) and torch.equal(bold[:, others], free[:, others])
+    assert torch.equal(shy[:, others], free[:, others]) and torch.equal(
+        bold[:, others], free[:, others]
+    )
     assert torch.equal(bold[0, 5], free[0, 5]), "an adversary may meet the ego"
 
 
@@ -184,9 +215,20 @@ def test_parked_absent_and_waiting_vehicles_stay_and_the_ego_is_not_moved():
     states = plan.states()
     still = [1, 4, *range(len(VEHICLES), scene["route_log"].shape[1])]
     start = scene["start"][:, : scene["route_log"].shape[1]]
-    torch.testing.assert_close(states[:, still, :, :3], start[:, still, None, :3].expand(-1, -1, HORIZON, -1))
+    torch.testing.assert_close(
+        states[:, still, :, :3], start[:, still, None, :3].expand(-1, -1, HORIZON, -1)
+    )
     assert (states[:, still, :, 3] == 0).all()
-    assert context.active[0].tolist() == [False, False, True, True, True, True, False, False]
+    assert context.active[0].tolist() == [
+        False,
+        False,
+        True,
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_vehicles_end_where_an_open_route_ends():
@@ -194,9 +236,13 @@ def test_vehicles_end_where_an_open_route_ends():
     prior = small_prior(bounds=FREE)
     scene["route_length"][:, 2] = 30.0  # 10 m ahead, at 7 m/s
     scene["route_length"][:, 3], scene["route_open"][:, 3] = 30.0, False
-    plan = prior.plan(torch.zeros(*scene["route_log"].shape, SIZE), context_of(prior, scene))
+    plan = prior.plan(
+        torch.zeros(*scene["route_log"].shape, SIZE), context_of(prior, scene)
+    )
     last = int(plan.on_map[0, 2].sum())
-    assert 10 <= last <= 18 and plan.on_map[0, 2, :last].all() and plan.on_map[0, 3].all()
+    assert (
+        10 <= last <= 18 and plan.on_map[0, 2, :last].all() and plan.on_map[0, 3].all()
+    )
     assert (plan.motion.s[0, 2, :last] < 30).all() and plan.motion.s[0, 2, last] >= 30
 
 
@@ -212,7 +258,9 @@ def test_samples_do_not_depend_on_the_batch_nor_on_absent_vehicles():
     wild = noise.clone()
     wild[:, :, len(VEHICLES) :] = 5.0
     here = scene["valid"][0, : scene["route_log"].shape[1]]
-    torch.testing.assert_close(prior.sample(context_of(prior, scene), wild).x0[:, here], whole[:, here])
+    torch.testing.assert_close(
+        prior.sample(context_of(prior, scene), wild).x0[:, here], whole[:, here]
+    )
 
 
 def test_temperature_scales_every_noise():
@@ -221,7 +269,9 @@ def test_temperature_scales_every_noise():
     cold = small_prior(sampler=SamplerSettings(temperature=0.5))
     noise = noise_for(hot, scene)
     context = context_of(hot, scene)
-    torch.testing.assert_close(cold.sample(context, 2 * noise).x0, hot.sample(context, noise).x0)
+    torch.testing.assert_close(
+        cold.sample(context, 2 * noise).x0, hot.sample(context, noise).x0
+    )
 
 
 def test_the_same_weights_carry_lane_and_free_space_plans_apart():
@@ -244,7 +294,9 @@ def test_routes_are_drawn_in_proportion_and_never_where_there_is_none():
     uniform[0], uniform[1] = 0.0, 1.0
     chosen = sample_route(logits, 0.5, uniform=uniform)
     share = torch.bincount(chosen, minlength=4) / len(chosen)
-    torch.testing.assert_close(share, torch.softmax(logits[0] / 0.5, -1), rtol=0, atol=0.01)
+    torch.testing.assert_close(
+        share, torch.softmax(logits[0] / 0.5, -1), rtol=0, atol=0.01
+    )
     assert (sample_route(logits, 0.0, uniform=uniform) == 0).all()
 
 
@@ -259,16 +311,27 @@ def test_the_ego_follows_its_mission_whatever_is_drawn():
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_what_is_known_of_the_moment_changes_no_context(moved):
-    """A context of the same moment gives leaders, but not of a vehicle that is elsewhere on its route by now."""
+    """A context of the same moment gives leaders, but not of a vehicle that is
+    elsewhere on its route by now."""
     scene = curved_scenes()
     prior = small_prior()
     before = context_of(prior, scene)
     state = replace(before.state, s=before.state.s + 7.0 * moved)
-    given = before.routed, state, scene["start"], scene["valid"], torch.zeros(len(scene), dtype=torch.long), None
+    given = (
+        before.routed,
+        state,
+        scene["start"],
+        scene["valid"],
+        torch.zeros(len(scene), dtype=torch.long),
+        None,
+    )
     known = prior.encode(*given, known=before)
     anew = prior.encode(*given)
     assert torch.equal(known.encoding.nodes, anew.encoding.nodes)
-    assert all(torch.equal(one, other) for one, other in zip(known.followed, anew.followed, strict=True))
+    assert all(
+        torch.equal(one, other)
+        for one, other in zip(known.followed, anew.followed, strict=True)
+    )
     assert (known.followed is before.followed) == (not moved)
 
 
@@ -277,6 +340,11 @@ def test_without_a_plan_the_ego_is_sampled_like_everybody_else():
     scene = curved_scenes(2)
     known = context_of(prior, scene)
     step = torch.zeros(len(scene), dtype=torch.long)
-    unknown = prior.encode(known.routed, known.state, scene["start"], scene["valid"], step, None)
-    one, two = (prior.sample(unknown, noise_for(prior, scene, seed=seed)).x0[:, 0] for seed in (0, 1))
+    unknown = prior.encode(
+        known.routed, known.state, scene["start"], scene["valid"], step, None
+    )
+    one, two = (
+        prior.sample(unknown, noise_for(prior, scene, seed=seed)).x0[:, 0]
+        for seed in (0, 1)
+    )
     assert (one - two).abs().amin() > 0

@@ -1,4 +1,5 @@
-"""The spread of samples: none without noise, and for a linear denoiser what the sampler's own moments say."""
+"""The spread of samples: none without noise, and for a linear denoiser what the
+sampler's own moments say."""
 
 from dataclasses import replace
 
@@ -18,7 +19,9 @@ def test_without_noise_all_samples_are_one():
     prior = small_prior(sampler=SamplerSettings(steps=3, temperature=0.0))
     found = sample_variances(prior, scenes(2).scenes, samples=3)
     assert found["vehicles"].min() > 0
-    assert all(found[name].abs().max() < 1e-9 for name in ("knots", "lateral", "travel"))
+    assert all(
+        found[name].abs().max() < 1e-9 for name in ("knots", "lateral", "travel")
+    )
 
 
 @pytest.mark.parametrize("sampler", ["ddim", "dpm_solver_pp"])
@@ -27,15 +30,29 @@ def test_gaussian_samples_have_the_variance_of_the_sampler(sampler, monkeypatch)
     exact = denoiser(0.0, STD)
     monkeypatch.setattr(prior, "denoise", lambda x, level, context: exact(x, level))
     found = sample_variances(prior, scenes(4).scenes, samples=200)
-    _, std = moments(exact, sampler, churn=1.0, steps=prior.sampler.steps, spacing=prior.sampler.spacing)
-    assert found["knots"].sum() / found["vehicles"].sum() == pytest.approx(std**2, rel=0.03)
-    assert found["lateral"].sum() / found["vehicles"].sum() == pytest.approx(std**2, rel=0.05)
+    _, std = moments(
+        exact,
+        sampler,
+        churn=1.0,
+        steps=prior.sampler.steps,
+        spacing=prior.sampler.spacing,
+    )
+    assert found["knots"].sum() / found["vehicles"].sum() == pytest.approx(
+        std**2, rel=0.03
+    )
+    assert found["lateral"].sum() / found["vehicles"].sum() == pytest.approx(
+        std**2, rel=0.05
+    )
 
 
 @pytest.mark.parametrize("samples", [3, 16])
 @pytest.mark.parametrize("part", [0.5, 0.9])
-def test_a_value_of_the_samples_own_law_lies_in_their_central_part_that_often(samples, part):
+def test_a_value_of_the_samples_own_law_lies_in_their_central_part_that_often(
+    samples, part
+):
     """Its rank among them takes each of the samples + 1 values alike."""
     ranks = torch.arange(samples + 1)
     assert central(ranks, samples, part=part).mean().item() == pytest.approx(part)
-    assert torch.equal(central(ranks, samples, part=part), central(samples - ranks, samples, part=part))
+    assert torch.equal(
+        central(ranks, samples, part=part), central(samples - ranks, samples, part=part)
+    )

@@ -17,13 +17,16 @@ SCENE = "<img src=x onerror=alert(1)></script>&"  # the name of a stranger's sce
 
 
 def planned(rollouts: Rollouts) -> Rollouts:
-    """The rollouts with straight plans of everybody, adversaries that aim at the ego, and an evasion of the ego."""
+    """The rollouts with straight plans of everybody, adversaries that aim at the ego,
+    and an evasion of the ego."""
     replans = torch.arange(0, rollouts.states.shape[1] - 1, 5)
     now = rollouts.states[:, replans].nan_to_num()
     ahead = torch.stack([now[..., 2:3].cos(), now[..., 2:3].sin()], -1)
     distance = now[..., 3:] * 0.5 * torch.arange(1, 11)
     rollouts.plans = now[..., None, :2] + distance[..., None] * ahead
-    rollouts.targets = torch.where(rollouts.adversaries, 0, -1)[:, None].expand(-1, len(replans), -1)
+    rollouts.targets = torch.where(rollouts.adversaries, 0, -1)[:, None].expand(
+        -1, len(replans), -1
+    )
     rollouts.evasion = rollouts.states[:, :, 0] + torch.tensor([0.0, 3.0, 0.0, 0.0])
     return rollouts
 
@@ -39,22 +42,42 @@ def write_run(folder: Path, rollouts: dict[str, Rollouts]) -> Path:
         driven.to_npz(folder / ROLLOUTS)
         rows += scores
         features += samples
-    record(rows, features, errored=[], folder=folder, summarise=lambda *found: metric_rows(*found, draws=20, realism_draws=2))
+    record(
+        rows,
+        features,
+        errored=[],
+        folder=folder,
+        summarise=lambda *found: metric_rows(*found, draws=20, realism_draws=2),
+    )
     return folder
 
 
 def failed_run(folder: Path) -> Path:
     """A run of two methods with failures; those of `planned` know plans and evasions."""
-    return write_run(folder, {"e2": random_rollouts(12, seed=21), "planned": planned(random_rollouts(12, seed=20))})
+    return write_run(
+        folder,
+        {
+            "e2": random_rollouts(12, seed=21),
+            "planned": planned(random_rollouts(12, seed=20)),
+        },
+    )
 
 
 def preventable_run(folder: Path) -> Path:
-    """The same run, but each failure is preventable, in one of three cells of the atlas; those of the first know no
-    nats."""
+    """The same run, but each failure is preventable, in one of three cells of the
+    atlas; those of the first know no nats."""
     rows = read_rows(failed_run(folder) / TABLE)
-    same = {"cfr_preventable": 1.0, "partner_manoeuvre": "brakes", "contact_type": "front", "ego_speed": 7.0}
+    same = {
+        "cfr_preventable": 1.0,
+        "partner_manoeuvre": "brakes",
+        "contact_type": "front",
+        "ego_speed": 7.0,
+    }
     for number, row in enumerate(filter(is_failure, rows)):
-        row |= same | {"duty": ("none", "none", "light")[number % 3], "approach": ("ahead", "oncoming")[number % 3 > 0]}
+        row |= same | {
+            "duty": ("none", "none", "light")[number % 3],
+            "approach": ("ahead", "oncoming")[number % 3 > 0],
+        }
         row["transport"] = float(97 * number % 31) if number % 3 else float("nan")
     write_rows(folder / TABLE, rows)
     return folder

@@ -1,5 +1,5 @@
-"""Replays of failures: everybody where the rollout has them, the competent driver as its verdict says, small; whole
-numbers come back from their text."""
+"""Replays of failures: everybody where the rollout has them, the competent driver as
+its verdict says, small; whole numbers come back from their text."""
 
 import base64
 import zlib
@@ -18,7 +18,11 @@ from tests.report.failed_run import planned
 
 def decoded(text: str) -> np.ndarray:
     """What decode.js does."""
-    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(4, -1).astype(np.uint32)
+    planes = (
+        np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
+        .reshape(4, -1)
+        .astype(np.uint32)
+    )
     code = sum(plane << 8 * k for k, plane in enumerate(planes))
     return (code >> 1).astype(np.int64) ^ -(code & 1).astype(np.int64)
 
@@ -26,14 +30,28 @@ def decoded(text: str) -> np.ndarray:
 def replays_of(rollouts):
     """[(rollout, its row, its replay)] of the failures among rollouts."""
     rows = score_rollouts(rollouts)[0]
-    found = [Failure(rollouts.rollout(index), row) for index, row in enumerate(rows) if row["cfr"] == 1]
-    return [(failure.rollout, failure.row, failure_replay(failure)) for failure in found]
+    found = [
+        Failure(rollouts.rollout(index), row)
+        for index, row in enumerate(rows)
+        if row["cfr"] == 1
+    ]
+    return [
+        (failure.rollout, failure.row, failure_replay(failure)) for failure in found
+    ]
 
 
 def motion_of(replay) -> dict[str, np.ndarray]:
     """{channel: [tracks, K]} of a replay."""
-    values = decoded(replay["motion"]).reshape(len(CHANNELS), len(replay["tracks"]), -1).cumsum(-1).cumsum(-1)
-    return {name: part * quantum for (name, quantum), part in zip(CHANNELS.items(), values, strict=True)}
+    values = (
+        decoded(replay["motion"])
+        .reshape(len(CHANNELS), len(replay["tracks"]), -1)
+        .cumsum(-1)
+        .cumsum(-1)
+    )
+    return {
+        name: part * quantum
+        for (name, quantum), part in zip(CHANNELS.items(), values, strict=True)
+    }
 
 
 def track_of(replay, role) -> int:
@@ -52,7 +70,9 @@ def test_everybody_is_where_the_rollout_has_them():
         np.testing.assert_array_equal(motion["present"][: len(agents)], present)
         for index, name in enumerate(("x", "y")):
             there = rollout.states[:steps, agents, index].T
-            np.testing.assert_allclose(motion[name][: len(agents)][present], there[present], atol=0.0051)
+            np.testing.assert_allclose(
+                motion[name][: len(agents)][present], there[present], atol=0.0051
+            )
         turn = motion["heading"][: len(agents)] - rollout.states[:steps, agents, 2].T
         assert np.abs(np.sin(turn / 2)[present]).max() < 0.001
         assert agents[replay["partner"]] == row["partner"]
@@ -61,13 +81,22 @@ def test_everybody_is_where_the_rollout_has_them():
 @pytest.mark.parametrize(("gap", "preventable"), [(30.5, 1), (6.0, 0)])
 def test_the_competent_driver_does_what_the_verdict_says(gap, preventable):
     """It brakes for a slower vehicle 30 m ahead; 1 m of gap is too late for it."""
-    ((_, row, replay),) = replays_of(scene(course(0, 0, heading=0, speed=12), course(gap, 0, heading=0, speed=5), adversaries=[1]))
+    ((_, row, replay),) = replays_of(
+        scene(
+            course(0, 0, heading=0, speed=12),
+            course(gap, 0, heading=0, speed=5),
+            adversaries=[1],
+        )
+    )
     motion = motion_of(replay)
     driver = track_of(replay, "driver")
     ego = track_of(replay, "ego")
     assert row["preventable"] == preventable
     assert (motion["gap"][driver].min() > 0) == (preventable == 1)
-    assert motion["gap"][ego, replay["contact"]] == 0 and (motion["gap"][ego, : replay["contact"]] > 0).all()
+    assert (
+        motion["gap"][ego, replay["contact"]] == 0
+        and (motion["gap"][ego, : replay["contact"]] > 0).all()
+    )
     np.testing.assert_allclose(motion["gap"][ego, 0], gap - 4.8, atol=0.01)
 
 
@@ -76,24 +105,45 @@ def test_plans_and_the_evasion_are_those_of_the_file():
     motion = motion_of(replay)
     plans = replay["plans"]
     steps = motion["x"].shape[1]
-    np.testing.assert_allclose(motion["y"][track_of(replay, "evasion")], rollout.evasion[:steps, 1], atol=0.0051)
+    np.testing.assert_allclose(
+        motion["y"][track_of(replay, "evasion")],
+        rollout.evasion[:steps, 1],
+        atol=0.0051,
+    )
     agents = np.flatnonzero(rollout.valid[:steps].any(0))
     known = np.isin(rollout.planners, agents)
     assert agents[plans["agents"]].tolist() == rollout.planners[known].tolist()
-    points = decoded(plans["points"]).reshape(known.sum(), -1, 2, 10).cumsum(-1).cumsum(-1) * CHANNELS["x"]
-    np.testing.assert_allclose(points.transpose(1, 0, 3, 2), rollout.plans[:, known], atol=0.0051)
-    assert (decoded(plans["targets"]).reshape(known.sum(), -1)[1:] == track_of(replay, "ego")).all()
+    points = (
+        decoded(plans["points"]).reshape(known.sum(), -1, 2, 10).cumsum(-1).cumsum(-1)
+        * CHANNELS["x"]
+    )
+    np.testing.assert_allclose(
+        points.transpose(1, 0, 3, 2), rollout.plans[:, known], atol=0.0051
+    )
+    assert (
+        decoded(plans["targets"]).reshape(known.sum(), -1)[1:]
+        == track_of(replay, "ego")
+    ).all()
 
 
 def test_the_map_is_the_rollout_s():
     rollout = random_rollouts(4).rollout(2)
     drawn = encoded_map(rollout)
     for name in ("lane", "drivable"):
-        points = decoded(drawn[f"{name}_points"]).reshape(2, -1).cumsum(-1).cumsum(-1) * 0.05
-        np.testing.assert_allclose(points.T, getattr(rollout, f"{name}_points"), atol=0.0255)
-        np.testing.assert_array_equal(decoded(drawn[f"{name}_counts"]), np.diff(getattr(rollout, f"{name}_offsets")))
+        points = (
+            decoded(drawn[f"{name}_points"]).reshape(2, -1).cumsum(-1).cumsum(-1) * 0.05
+        )
+        np.testing.assert_allclose(
+            points.T, getattr(rollout, f"{name}_points"), atol=0.0255
+        )
+        np.testing.assert_array_equal(
+            decoded(drawn[f"{name}_counts"]),
+            np.diff(getattr(rollout, f"{name}_offsets")),
+        )
 
 
 def test_numbers_of_31_bits_come_back_whatever_their_sign():
-    numbers = np.array([0, -1, 1, 2**30, -(2**30), 2**31 - 1, -(2**31), *range(-300, 300, 7)])
+    numbers = np.array(
+        [0, -1, 1, 2**30, -(2**30), 2**31 - 1, -(2**31), *range(-300, 300, 7)]
+    )
     np.testing.assert_array_equal(decoded(encode(numbers)), numbers)

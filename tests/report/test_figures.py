@@ -1,4 +1,5 @@
-"""Figures: intensity and skeleton, what stands where in pixels of the image; PNG and PDF files."""
+"""Figures: intensity and skeleton, what stands where in pixels of the image; PNG and
+PDF files."""
 
 import math
 
@@ -26,44 +27,69 @@ ASIDE = course(0, 25, heading=1.0, speed=0)
 def replay_of(*courses, eta=2.0):
     rollouts = scene(*courses, adversaries=[1])
     rollouts.eta = torch.tensor([eta])
-    return Replay(rollouts.rollout(0), score_rollouts(rollouts)[0][0], metres=60.0, pixels=SIDE)
+    return Replay(
+        rollouts.rollout(0), score_rollouts(rollouts)[0][0], metres=60.0, pixels=SIDE
+    )
 
 
 def test_panels_stand_by_eta_at_their_contacts_and_without_one_at_the_first_of_the_stronger():
-    replays = [replay_of(EGO, course(x, 0, heading=0, speed=5), eta=eta) for eta, x in ((0.0, 70), (1.0, 35), (3.0, 20))]
-    figure = drawing.image_of(intensity_figure([Failure(each.rollout, each.row) for each in replays]))
+    replays = [
+        replay_of(EGO, course(x, 0, heading=0, speed=5), eta=eta)
+        for eta, x in ((0.0, 70), (1.0, 35), (3.0, 20))
+    ]
+    figure = drawing.image_of(
+        intensity_figure([Failure(each.rollout, each.row) for each in replays])
+    )
     assert replays[0].contact is None and replays[1].contact > replays[2].contact
     times = [replays[1].contact, replays[1].contact, replays[2].contact]
     for index, (time, phase) in enumerate(zip(times, (None, 0.25, 0.25), strict=True)):
         left = (index % 2) * (SIDE + GAP)
         top = (index // 2) * (SIDE + GAP)
         panel = np.asarray(figure.crop((left, top, left + SIDE, top + SIDE)))
-        different = (panel != np.asarray(replays[index].picture(time, phase=phase))).any(-1)
-        assert different.mean() < 1e-4, "where a panel stands changes the rounding of its edges"
+        different = (
+            panel != np.asarray(replays[index].picture(time, phase=phase))
+        ).any(-1)
+        assert different.mean() < 1e-4, (
+            "where a panel stands changes the rounding of its edges"
+        )
 
 
 @pytest.fixture(scope="module")
 def shown():
-    """Vehicle 2 acts on 1, which acts on the ego; 3 stands aside and is a candidate that was not taken."""
+    """Vehicle 2 acts on 1, which acts on the ego; 3 stands aside and is a candidate
+    that was not taken."""
     rollout = replay_of(EGO, AHEAD, FAR, ASIDE).rollout
     settings = TopologySettings()
     reference = torch.as_tensor(rollout.states[:50:5])[None]
     size = torch.as_tensor(rollout.size)[None, None].expand(*reference.shape[:3], 2)
-    weights = pair_weights(reference, torch.ones(reference.shape[:3], dtype=torch.bool), size=size, settings=settings)
-    coalition, candidates = (torch.tensor([[False, True, True, third]]) for third in (False, True))
+    weights = pair_weights(
+        reference,
+        torch.ones(reference.shape[:3], dtype=torch.bool),
+        size=size,
+        settings=settings,
+    )
+    coalition, candidates = (
+        torch.tensor([[False, True, True, third]]) for third in (False, True)
+    )
     zero = torch.tensor([0])
     moments = 0.5 * torch.arange(10.0)[None]
     target = torch.tensor([[-1, 0, 1, -1]])
     who = candidates, coalition, coalition, target
-    return SkeletonPicture(rollout, Selection(zero, zero, reference, moments, weights, *who, settings))
+    return SkeletonPicture(
+        rollout, Selection(zero, zero, reference, moments, weights, *who, settings)
+    )
 
 
-def test_the_moment_is_that_of_the_greatest_risk_of_the_links_and_times_are_those_the_weights_came_from(shown):
+def test_the_moment_is_that_of_the_greatest_risk_of_the_links_and_times_are_those_the_weights_came_from(
+    shown,
+):
     own = shown.selection.weights[0, :, 1, 0] + shown.selection.weights[0, :, 2, 1]
     assert shown.time == pytest.approx(0.5 * int(own.argmax())) and own.max() > own[0]
     assert shown.nodes() == [0, 1, 2]
     for ttc in (0.0, 0.7, 3.0, 7.5):
-        weight = 1 / (1 + math.exp((ttc - shown.settings.tau_max) / shown.settings.beta))
+        weight = 1 / (
+            1 + math.exp((ttc - shown.settings.tau_max) / shown.settings.beta)
+        )
         assert shown.ttc(weight) == pytest.approx(ttc)
 
 
@@ -71,35 +97,62 @@ def test_what_was_driven_takes_the_place_of_the_reference(shown):
     driven = SkeletonPicture.driven(shown.rollout, shown.selection)
     steps = 5 * torch.arange(driven.selection.weights.shape[1])
     torch.testing.assert_close(driven.selection.moments[0].float(), 0.1 * steps)
-    np.testing.assert_array_equal(driven.selection.reference[0], shown.rollout.states[steps])
-    assert driven.risky[0, 0] == pytest.approx(10 * driven.time), "the ego drives 10 m/s along x"
+    np.testing.assert_array_equal(
+        driven.selection.reference[0], shown.rollout.states[steps]
+    )
+    assert driven.risky[0, 0] == pytest.approx(10 * driven.time), (
+        "the ego drives 10 m/s along x"
+    )
 
 
 def test_vehicles_have_the_colour_of_their_part(shown):
-    assert [shown.colour(agent) for agent in (0, 1, 3)] == [drawing.EGO, drawing.ADVERSARY, drawing.VULNERABLE]
+    assert [shown.colour(agent) for agent in (0, 1, 3)] == [
+        drawing.EGO,
+        drawing.ADVERSARY,
+        drawing.VULNERABLE,
+    ]
 
 
-def test_the_same_figure_is_written_as_the_same_pixels_and_vectors_and_no_name_is_a_formula(tmp_path):
+def test_the_same_figure_is_written_as_the_same_pixels_and_vectors_and_no_name_is_a_formula(
+    tmp_path,
+):
     for name in "ab":
         made, axes = new_panels(2, 200, gap=10, head=40, foot=30)
         axes[0].plot([0, 1, 2], [0, 1, 0], linewidth=2)
         axes[0].set_title("$\\frac{")
         save_figure(tmp_path / f"{name}.png", made)
     for suffix in ("png", "pdf"):
-        assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
+        assert (tmp_path / f"a.{suffix}").read_bytes() == (
+            tmp_path / f"b.{suffix}"
+        ).read_bytes()
     content = (tmp_path / "a.pdf").read_bytes()
-    assert b"/MediaBox [ 0 0 410 270 ]" in content and b"/Subtype /Image" not in content, "a point is a point"
+    assert (
+        b"/MediaBox [ 0 0 410 270 ]" in content and b"/Subtype /Image" not in content
+    ), "a point is a point"
 
 
 def test_the_shown_sweep_is_unharmed_at_first_and_then_hit_ever_earlier():
     def sweep(*times, scene="a"):
         same = {"method": "e2", "ego_policy": "idm", "scene_id": scene, "seed": 0}
-        rows = [{"eta": eta, "cfr": time == time, "contact_time": time} for eta, time in enumerate(times)]
+        rows = [
+            {"eta": eta, "cfr": time == time, "contact_time": time}
+            for eta, time in enumerate(times)
+        ]
         return [same | {"min_dtc": 1.0 + row["eta"]} | row for row in rows]
 
     none = math.nan
-    times = [(3.0, 2.0, 1.0), (none, 3.0, none), (none, none, none), (none, none, 2.0), (none, 2.0, 2.5)]
+    times = [
+        (3.0, 2.0, 1.0),
+        (none, 3.0, none),
+        (none, none, none),
+        (none, none, 2.0),
+        (none, 2.0, 2.5),
+    ]
     order = [sweep(*each) for each in (*times, (none, 2.5, 2.4), (none, 3.5, 2.4))]
     assert sorted(order, key=worth) == order
-    rows = [*sweep(none, 4.0, 3.0), *sweep(none, 4.0, 1.0, scene="b"), *sweep(none, 4.0, scene="c")]
+    rows = [
+        *sweep(none, 4.0, 3.0),
+        *sweep(none, 4.0, 1.0, scene="b"),
+        *sweep(none, 4.0, scene="c"),
+    ]
     assert best_sweep(rows[::-1]) == rows[3:6]

@@ -1,4 +1,5 @@
-"""The failure report in Chromium: it loads without a complaint, shows what the files hold, and obeys."""
+"""The failure report in Chromium: it loads without a complaint, shows what the files
+hold, and obeys."""
 
 import shutil
 import threading
@@ -18,14 +19,22 @@ from tests.report.failed_run import SCENE, failed_run, preventable_run
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
 FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"),
+    *(
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-background-networking",
+        "--disable-sync",
+    ),
     *("--no-first-run", "--window-size=1440,900"),
 )
 webdriver = pytest.importorskip("selenium.webdriver", reason="needs the extra browser")
 support = pytest.importorskip("selenium.webdriver.support.ui")
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no chromium and chromedriver on the path"),
+    pytest.mark.skipif(
+        not (CHROMIUM and DRIVER), reason="no chromium and chromedriver on the path"
+    ),
 ]
 DECODE = """const done = arguments[1];
 page.store.replay(arguments[0]).then(({ replay }) => done(replay.tracks.map((track) =>
@@ -69,7 +78,9 @@ def page(run, chromium):
 
 
 def wait_for(browser, condition):
-    support.WebDriverWait(browser, 20, 0.05).until(lambda _: browser.execute_script(condition))
+    support.WebDriverWait(browser, 20, 0.05).until(
+        lambda _: browser.execute_script(condition)
+    )
 
 
 def rows_of(browser) -> list[list[str]]:
@@ -81,7 +92,10 @@ def rows_of(browser) -> list[list[str]]:
 
 
 def heads_of(browser) -> list[str]:
-    return [node.text.split(" ▲")[0].strip() for node in browser.find_elements("css selector", "#index thead th")]
+    return [
+        node.text.split(" ▲")[0].strip()
+        for node in browser.find_elements("css selector", "#index thead th")
+    ]
 
 
 def failures_of(run) -> list[dict]:
@@ -97,18 +111,28 @@ def shown_in(browser, run) -> dict:
 def choose(browser, label: str, starts: str) -> None:
     """Choose, in the select of this label, what begins so."""
     labels = browser.find_elements("css selector", "#scope label, #filters label")
-    node = next(each for each in labels if each.text.splitlines() and each.text.splitlines()[0].strip() == label)
+    node = next(
+        each
+        for each in labels
+        if each.text.splitlines() and each.text.splitlines()[0].strip() == label
+    )
     select = support.Select(node.find_element("tag name", "select"))
-    select.select_by_visible_text(next(each.text for each in select.options if each.text.startswith(starts)))
+    select.select_by_visible_text(
+        next(each.text for each in select.options if each.text.startswith(starts))
+    )
 
 
 def test_it_opens_without_a_complaint(run, page):
     assert page.get_log("browser") == [] and len(rows_of(page)) == len(failures_of(run))
-    assert len(page.find_elements("css selector", "#curves svg polyline")) >= 5  # ego, partner, driver; gaps of two
+    assert (
+        len(page.find_elements("css selector", "#curves svg polyline")) >= 5
+    )  # ego, partner, driver; gaps of two
 
 
 def test_the_browser_decodes_what_the_files_hold(run, page):
-    numbers = page.execute_script("return page.report.failures.map((failure) => failure.replay)")
+    numbers = page.execute_script(
+        "return page.report.failures.map((failure) => failure.replay)"
+    )
     for row, number in zip(failures_of(run), numbers, strict=True):
         rollout = Rollout.read(run / ROLLOUTS / rollout_name(row))
         tracks = page.execute_async_script(DECODE, number)
@@ -117,9 +141,16 @@ def test_the_browser_decodes_what_the_files_hold(run, page):
         for track, agent in zip(tracks, agents, strict=False):
             present = np.array(track["present"]) == 1
             assert (present == rollout.valid[:steps, agent]).all()
-            for name, index, quantum in (("x", 0, 0.01), ("y", 1, 0.01), ("speed", 3, 0.01)):
+            for name, index, quantum in (
+                ("x", 0, 0.01),
+                ("y", 1, 0.01),
+                ("speed", 3, 0.01),
+            ):
                 found = np.array(track[name])[present]
-                assert np.abs(found - rollout.states[:steps, agent, index][present]).max() < 0.51 * quantum + 1e-5
+                assert (
+                    np.abs(found - rollout.states[:steps, agent, index][present]).max()
+                    < 0.51 * quantum + 1e-5
+                )
 
 
 def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
@@ -128,7 +159,10 @@ def test_scrubbing_moves_the_ego_on_the_canvas(run, page):
     for step in (0, 4, 8):
         page.execute_script("page.player.seek(arguments[0])", step)
         x, y, heading, _ = states[step].tolist()
-        assert page.execute_script(COLOUR_AT, x - np.cos(heading), y - np.sin(heading)) == EGO  # 1 m behind its middle
+        assert (
+            page.execute_script(COLOUR_AT, x - np.cos(heading), y - np.sin(heading))
+            == EGO
+        )  # 1 m behind its middle
 
 
 def test_filters_keep_what_they_say_and_names_from_files_are_text(run, page):
@@ -136,15 +170,21 @@ def test_filters_keep_what_they_say_and_names_from_files_are_text(run, page):
     side = [row for row in failures_of(run) if row["contact_type"] == "side"]
     choose(page, "Contact", starts="side")
     shown = rows_of(page)
-    assert 0 < len(shown) == len(side) and {row[heads.index("Contact")] for row in shown} == {"side"}
+    assert 0 < len(shown) == len(side) and {
+        row[heads.index("Contact")] for row in shown
+    } == {"side"}
     page.find_element("css selector", "#filters button").click()  # reset
     assert len(rows_of(page)) == len(failures_of(run))
     scenes = [row[heads.index("Scene")] for row in rows_of(page)]
     assert scenes and all(name.startswith(SCENE) for name in scenes)
-    assert not page.find_elements("tag name", "img") and not page.find_elements("css selector", ".caption b")
+    assert not page.find_elements("tag name", "img") and not page.find_elements(
+        "css selector", ".caption b"
+    )
 
 
-def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(chromium, tmp_path):
+def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(
+    chromium, tmp_path
+):
     run = preventable_run(tmp_path)
     chromium.get_log("browser")  # what earlier tests left
     chromium.get(write_report(run).as_uri())
@@ -157,13 +197,22 @@ def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(chromium, 
         for button in buttons:  # in the order of the grid
             approach = button.find_element("xpath", "./ancestor::tr/th").text
             light = "light" in button.get_attribute("title")
-            failures = atlas[approach, "brakes", "light" if light else "none", "5 to 10 m/s", "front"]
-            nats = "nats unknown" if approach == "ahead" else f"{failures[0]['transport']:.0f} nats"
+            failures = atlas[
+                approach, "brakes", "light" if light else "none", "5 to 10 m/s", "front"
+            ]
+            nats = (
+                "nats unknown"
+                if approach == "ahead"
+                else f"{failures[0]['transport']:.0f} nats"
+            )
             assert f"{len(failures)} failure" in button.text and nats in button.text
             button.send_keys("\n")
             shown = shown_in(chromium, run)
             assert shown["transport"] == failures[0]["transport"] or approach == "ahead"
-            assert (shown["scene_id"], shown["seed"]) == (failures[0]["scene_id"], failures[0]["seed"])
+            assert (shown["scene_id"], shown["seed"]) == (
+                failures[0]["scene_id"],
+                failures[0]["seed"],
+            )
             pressed = [each.get_attribute("aria-pressed") for each in buttons]
             assert pressed == [str(each == button).lower() for each in buttons]
     assert chromium.get_log("browser") == []
@@ -174,17 +223,25 @@ def test_a_link_opens_at_its_failure_from_a_folder_and_from_a_server(run, page):
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         rows = failures_of(run)
-        for base in ((run / PAGE).as_uri(), f"http://127.0.0.1:{server.server_port}/{PAGE}"):
+        for base in (
+            (run / PAGE).as_uri(),
+            f"http://127.0.0.1:{server.server_port}/{PAGE}",
+        ):
             for number, row in enumerate(rows):
                 if number % 2:  # else only the end of the address changes
                     page.get("about:blank")
                 page.get(f"{base}#failure={rollout_key(row)}")
                 wait_for(
-                    page, f"return page.player.failure.key === {rollout_key(row)!r} && page.player.replay !== null"
+                    page,
+                    f"return page.player.failure.key === {rollout_key(row)!r} && page.player.replay !== null",
                 )
-                assert page.current_url == page.find_element("css selector", "#copies input").get_attribute("value")
+                assert page.current_url == page.find_element(
+                    "css selector", "#copies input"
+                ).get_attribute("value")
                 first = page.find_element("css selector", "#summary strong").text
-                assert f"under {row['method']} at η=2: preventable" in first  # the traffic of the failure
+                assert (
+                    f"under {row['method']} at η=2: preventable" in first
+                )  # the traffic of the failure
                 assert not page.find_element("id", "lost").is_displayed()
         page.get(f"{base}#failure=none")
         wait_for(page, "return !document.getElementById('lost').hidden")
@@ -195,10 +252,17 @@ def test_the_first_lines_are_of_one_traffic_and_others_can_be_chosen(run, page):
     for method in (None, "planned", "e2"):
         if method:
             choose(page, "Traffic", starts=method)
-        rows = [row for row in read_rows(run / TABLE) if row["method"] == (method or "e2")]
+        rows = [
+            row for row in read_rows(run / TABLE) if row["method"] == (method or "e2")
+        ]
         known = [row["cfr"] for row in rows if row["cfr"] == row["cfr"]]
-        assert f"hit in {sum(known):.0f} of {len(known)} rollouts" in page.find_element("id", "summary").text
-        assert len(rows_of(page)) == len(failures_of(run))  # the index has those of all traffic
+        assert (
+            f"hit in {sum(known):.0f} of {len(known)} rollouts"
+            in page.find_element("id", "summary").text
+        )
+        assert len(rows_of(page)) == len(
+            failures_of(run)
+        )  # the index has those of all traffic
 
 
 def test_failures_of_a_scene_stand_together_whatever_the_traffic(run, page):
@@ -213,11 +277,17 @@ def test_failures_of_a_scene_stand_together_whatever_the_traffic(run, page):
         else:
             under.setdefault(scenes[-1], []).append(text)
     names = {row["scene_id"] for row in failures_of(run)}
-    assert len(scenes) == len(names) == len(under) and sum(map(len, under.values())) == len(failures_of(run))
+    assert len(scenes) == len(names) == len(under) and sum(
+        map(len, under.values())
+    ) == len(failures_of(run))
     for name in names:
         own = [row for row in failures_of(run) if row["scene_id"] == name]
-        (head,) = [text for text in scenes if text.startswith(f"{name}: {len(own)} failure")]
-        assert len(under[head]) == len(own) and all(row["method"] in head for row in own)
+        (head,) = [
+            text for text in scenes if text.startswith(f"{name}: {len(own)} failure")
+        ]
+        assert len(under[head]) == len(own) and all(
+            row["method"] in head for row in own
+        )
     assert any("e2 η=2, planned η=2" in text for text in scenes)
 
 
@@ -226,13 +296,19 @@ def test_the_speed_that_is_shown_is_the_speed_driven(run, page):
     row = shown_in(page, run)
     states = Rollout.read(run / ROLLOUTS / rollout_name(row)).states[:, 0]
     for rate in ("1", "0.25"):
-        page.execute_script("document.getElementById('rate').value = arguments[0]", rate)
+        page.execute_script(
+            "document.getElementById('rate').value = arguments[0]", rate
+        )
         for step in range(int(row["contact_step"]) + 1):
             page.execute_script("page.player.seek(arguments[0])", step)
             seconds, speed = page.find_element("id", "clock").text.split("\n")
             assert float(seconds.split()[0]) == pytest.approx(0.1 * step, abs=1e-6)
-            assert float(speed.split()[1]) == pytest.approx(states[step, 3], abs=0.0551) and speed.endswith(" m/s")
-    assert page.find_element("css selector", ".controls label").text.startswith("Playback")
+            assert float(speed.split()[1]) == pytest.approx(
+                states[step, 3], abs=0.0551
+            ) and speed.endswith(" m/s")
+    assert page.find_element("css selector", ".controls label").text.startswith(
+        "Playback"
+    )
 
 
 def test_what_is_copied_is_the_whole_field(page):
@@ -240,5 +316,7 @@ def test_what_is_copied_is_the_whole_field(page):
         page.execute_script("arguments[0].scrollIntoView()", line)
         line.find_element("tag name", "button").click()
         field = line.find_element("tag name", "input")
-        ends = page.execute_script("return [arguments[0].selectionStart, arguments[0].selectionEnd]", field)
+        ends = page.execute_script(
+            "return [arguments[0].selectionStart, arguments[0].selectionEnd]", field
+        )
         assert ends == [0, len(field.get_attribute("value"))] and "Copied" in line.text

@@ -14,7 +14,9 @@ from tests.learning.small import small_run, small_scenes
 def attacked():
     scenes = small_scenes()
     run = small_run(scenes=scenes)
-    run.curriculum = AdaptiveCurriculum(len(scenes), 4, eta=4.0, spread=0.0)  # 8 m ahead and half as fast
+    run.curriculum = AdaptiveCurriculum(
+        len(scenes), 4, eta=4.0, spread=0.0
+    )  # 8 m ahead and half as fast
     return scenes, run, train_round(run)
 
 
@@ -24,11 +26,25 @@ def test_videos_are_of_hits_of_different_scenes(attacked):
     rows = hits(traffic, scenes)
     assert len(rows) and len(set(traffic["scene_index"][rows].tolist())) == len(rows)
     assert (traffic["eta"][rows] > 0).all()
-    twice = {name: torch.cat([value, value]) for name, value in traffic.items() if value.dim()}
+    twice = {
+        name: torch.cat([value, value])
+        for name, value in traffic.items()
+        if value.dim()
+    }
     assert hits(twice, scenes).tolist() == rows.tolist(), "a scene is shown once"
 
 
 def test_videos_are_written(attacked, tmp_path):
     scenes, run, _ = attacked
-    (video,) = save_videos(run.memory.rounds[-1].traffic, scenes, number=1, method="brake_check", folder=tmp_path, count=1)
-    assert video == tmp_path / "videos" / "round-001-1.gif" and Image.open(video).n_frames > 10
+    (video,) = save_videos(
+        run.memory.rounds[-1].traffic,
+        scenes,
+        number=1,
+        method="brake_check",
+        folder=tmp_path,
+        count=1,
+    )
+    assert (
+        video == tmp_path / "videos" / "round-001-1.gif"
+        and Image.open(video).n_frames > 10
+    )

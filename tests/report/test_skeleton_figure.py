@@ -10,13 +10,20 @@ from tests.traffic.e2.traffic_scenes import synthesizer
 
 
 def selection(*targets, seed=0, risk=0.5):
-    """Scenes of whose vehicles each acts on its target (-1: on nobody), every pair of the same risk at two moments."""
+    """Scenes of whose vehicles each acts on its target (-1: on nobody), every pair of
+    the same risk at two moments."""
     target = torch.tensor(targets)
     count, vehicles = target.shape
     weights = torch.full((count, 2, vehicles, vehicles), risk)
     moments = torch.tensor([[0.1, 0.6]]).expand(count, 2)
     acts = target >= 0
-    what = torch.arange(count) + seed, torch.zeros(count).long(), torch.zeros(count, 2, vehicles, 4), moments, weights
+    what = (
+        torch.arange(count) + seed,
+        torch.zeros(count).long(),
+        torch.zeros(count, 2, vehicles, 4),
+        moments,
+        weights,
+    )
     return Selection(*what, acts, acts, acts, target, TopologySettings())
 
 
@@ -36,10 +43,16 @@ def test_links_then_members_then_risk_decide_and_the_first_of_equals_stays():
     later = selection([-1, 0, 1, 2], seed=50)
     later.step.fill_(5)
     chain(later)
-    assert (int(chain.longest.seed), int(chain.first.seed)) == (50, 31), "what other methods share is the start"
+    assert (int(chain.longest.seed), int(chain.first.seed)) == (50, 31), (
+        "what other methods share is the start"
+    )
 
 
 def test_the_risk_of_links_is_that_of_each_member_with_its_target():
     given = selection([-1, 0, 1, -1])
-    given.weights[0, 1, 1, 0], given.weights[0, 1, 2, 1], given.weights[0, 1, 2, 0] = 0.7, 0.2, 0.99
+    given.weights[0, 1, 1, 0], given.weights[0, 1, 2, 1], given.weights[0, 1, 2, 0] = (
+        0.7,
+        0.2,
+        0.99,
+    )
     torch.testing.assert_close(link_risk(given), torch.tensor([[1.0, 0.9]]))

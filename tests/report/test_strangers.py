@@ -1,4 +1,5 @@
-"""A stranger's run folder: what is damaged, no file or elsewhere is refused in one line, and nothing is written."""
+"""A stranger's run folder: what is damaged, no file or elsewhere is refused in one
+line, and nothing is written."""
 
 import json
 import os
@@ -28,14 +29,17 @@ def run(tmp_path_factory):
     _, tuned = folders(folder.parent / "other")
     for name in (PROVENANCE, TUNING_FILE):
         shutil.copy(tuned / name, folder)
-    (folder / CHOICES).write_text("round,eta,template,draws,episodes,failures\n0,1.0,pair,3,4,1\n")
+    (folder / CHOICES).write_text(
+        "round,eta,template,draws,episodes,failures\n0,1.0,pair,3,4,1\n"
+    )
     (folder / "parts").mkdir()
     (folder / "parts" / "rollouts-000000.pt").write_bytes(b"a part")
     return folder
 
 
 def json_with(*place):
-    """A change of a JSON file: what lies at a place is the last argument; None: is not there."""
+    """A change of a JSON file: what lies at a place is the last argument; None: is not
+    there."""
     *where, key, value = place
 
     def change(path):
@@ -75,15 +79,27 @@ def swapped(path):
 COMMANDS = {
     "report": lambda run, out: report.main([str(run), "--out", str(out / "x.html")]),
     "replay": lambda run, out: replay.main([str(run), "--modes", "--out", str(out)]),
-    "export": lambda run, out: export.main([str(run), "--to", "npz", "--no-scene", "--out", str(out)]),
+    "export": lambda run, out: export.main(
+        [str(run), "--to", "npz", "--no-scene", "--out", str(out)]
+    ),
     "curves": lambda run, out: curves.main([str(run), "--out", str(out)]),
     "merge": lambda run, out: merge.main([str(run), "--into", str(out)]),
 }
 DAMAGE = [
     ("report", TABLE, instead(b"dataset,split,method,ego_policy,scene_id,seed,eta\n")),
     ("report", TABLE, rows_with(contact_step=1e6)),
-    ("report", TABLE, lambda path: path.write_bytes(path.read_bytes().replace(b"test", b"\x1b[2J"))),
-    ("report", TABLE, lambda path: path.write_bytes(path.read_bytes().replace(b"test", b"\xed\xa0\x80"))),
+    (
+        "report",
+        TABLE,
+        lambda path: path.write_bytes(path.read_bytes().replace(b"test", b"\x1b[2J")),
+    ),
+    (
+        "report",
+        TABLE,
+        lambda path: path.write_bytes(
+            path.read_bytes().replace(b"test", b"\xed\xa0\x80")
+        ),
+    ),
     ("export", TABLE, link("/dev/zero")),
     ("report", METRICS_FILE, json_with(0, "metrics", "cfr", "mean", None)),
     ("report", METRICS_FILE, json_with(0, "paired", "planned", "cfr", "n", None)),
@@ -98,7 +114,11 @@ DAMAGE = [
     ("replay", MODES_FILE, json_with("modes", 0, "typical", "file", "other.npz")),
     ("replay", MODES_FILE, json_with("modes", 0, "name", "\u202egnp.exe")),
     ("export", ROLLOUTS, swapped),
-    ("export", ROLLOUTS, lambda path: [link("/dev/zero")(file) for file in path.iterdir()]),
+    (
+        "export",
+        ROLLOUTS,
+        lambda path: [link("/dev/zero")(file) for file in path.iterdir()],
+    ),
     ("curves", TUNING_FILE, json_with("trials", [])),
     ("curves", TUNING_FILE, json_with("trials", 0, "metrics", "cfr", "x")),
     ("curves", TUNING_FILE, json_with("trials", 1, "parameters", {"other": 1})),
@@ -112,19 +132,27 @@ DAMAGE = [
 
 
 @pytest.mark.parametrize(("command", "name", "damage"), DAMAGE)
-def test_a_damaged_folder_is_refused_in_one_line(run, tmp_path, capsys, command, name, damage):
+def test_a_damaged_folder_is_refused_in_one_line(
+    run, tmp_path, capsys, command, name, damage
+):
     copy = shutil.copytree(run, tmp_path / "run")
     damage(copy / name)
     before = sorted(copy.rglob("*"))
     with pytest.raises(SystemExit) as end:
         COMMANDS[command](copy, tmp_path / "out")
     said = capsys.readouterr().err
-    assert end.value.code == 2 and said.startswith(f"error: {copy}") and said.removesuffix("\n").isprintable()
+    assert (
+        end.value.code == 2
+        and said.startswith(f"error: {copy}")
+        and said.removesuffix("\n").isprintable()
+    )
     assert sorted(copy.rglob("*")) == before and not list(tmp_path.rglob("out/*"))
 
 
 def test_the_folder_itself_is_read_by_all_commands(run, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("e2rl.commands.replay.save_animation", lambda path, frames: None)
+    monkeypatch.setattr(
+        "e2rl.commands.replay.save_animation", lambda path, frames: None
+    )
     monkeypatch.setattr("e2rl.report.picture.Replay.frames", lambda shown: [])
     for name, command in COMMANDS.items():
         command(run, tmp_path / name)
@@ -139,14 +167,21 @@ def test_a_link_out_of_the_folder_is_not_written_to(run, tmp_path, capsys, comma
         (copy / name).symlink_to(tmp_path / "home")
     main = {"replay": replay.main, "export": export.main}[command]
     with pytest.raises(SystemExit) as end:
-        main([str(copy), *(["--to", "npz", "--no-scene"] if command == "export" else [])])
+        main(
+            [str(copy), *(["--to", "npz", "--no-scene"] if command == "export" else [])]
+        )
     assert end.value.code == 2 and "a link out of" in capsys.readouterr().err
     assert not list((tmp_path / "home").iterdir())
 
 
-@pytest.mark.parametrize("line", ["0,1.0,unknown,3,4,1", "0,1.0,pair", "0,1.0,pair,x,4,1", "inf,1.0,pair,3,4,1"])
+@pytest.mark.parametrize(
+    "line",
+    ["0,1.0,unknown,3,4,1", "0,1.0,pair", "0,1.0,pair,x,4,1", "inf,1.0,pair,3,4,1"],
+)
 def test_a_damaged_table_of_choices_is_named(tmp_path, line):
-    (tmp_path / CHOICES).write_text(f"round,eta,template,draws,episodes,failures\n{line}\n")
+    (tmp_path / CHOICES).write_text(
+        f"round,eta,template,draws,episodes,failures\n{line}\n"
+    )
     with pytest.raises(InputError, match=f"{CHOICES}: no table"):
         draw_choices(tmp_path)
     (tmp_path / CHOICES).write_text("round,eta,template,draws,episodes,failures\n")

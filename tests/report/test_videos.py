@@ -1,4 +1,5 @@
-"""Videos: the right failures, the contact where it is, animations that play, one line for bad input."""
+"""Videos: the right failures, the contact where it is, animations that play, one line
+for bad input."""
 
 import sys
 
@@ -28,17 +29,37 @@ def replay_of(*courses, **options):
 
 def row(scene_id, eta=2.0, cfr=1.0, cfr_adv=1.0, kind="front", counted=0.0):
     return {
-        **{"scene_id": scene_id, "eta": eta, "cfr": cfr, "cfr_adv": cfr_adv, "contact_type": kind},
+        **{
+            "scene_id": scene_id,
+            "eta": eta,
+            "cfr": cfr,
+            "cfr_adv": cfr_adv,
+            "contact_type": kind,
+        },
         "counted": counted,
     }
 
 
 def test_failures_are_distinct_found_and_of_different_kinds():
-    rows = [row("a", eta=0.0), row("b"), row("b", kind="rear"), row("c", cfr=0.0), row("d")]
+    rows = [
+        row("a", eta=0.0),
+        row("b"),
+        row("b", kind="rear"),
+        row("c", cfr=0.0),
+        row("d"),
+    ]
     rows += [row("e", kind="side", cfr_adv=0.0), row("f")]
     assert [part["scene_id"] for part in found_failures(rows, 3)] == ["b", "e", "d"]
-    assert [part["scene_id"] for part in found_failures(rows, 9)] == ["b", "e", "d", "f", "a"]
-    assert [part["scene_id"] for part in found_failures([*rows, row("g", counted=1.0)], 1)] == ["g"]
+    assert [part["scene_id"] for part in found_failures(rows, 9)] == [
+        "b",
+        "e",
+        "d",
+        "f",
+        "a",
+    ]
+    assert [
+        part["scene_id"] for part in found_failures([*rows, row("g", counted=1.0)], 1)
+    ] == ["g"]
     assert found_failures([row("c", cfr=0.0), row("n", cfr=float("nan"))], 3) == []
 
 
@@ -47,7 +68,11 @@ def test_the_command_saves_animations_of_a_run_s_failures(tmp_path, capsys):
     main([str(run), "--failures=1", "--pixels", "120", "--out", str(tmp_path)])
     (gif,) = capsys.readouterr().out.splitlines()
     with Image.open(gif) as animation:
-        assert animation.size == (120, 120) and animation.n_frames > picture.FREEZE and animation.info["loop"] == 0
+        assert (
+            animation.size == (120, 120)
+            and animation.n_frames > picture.FREEZE
+            and animation.info["loop"] == 0
+        )
         assert animation.info["duration"] == 100
 
 
@@ -55,18 +80,32 @@ def test_the_contact_is_marked_where_the_boxes_touch():
     shown = replay_of(*CRASH, adversaries=[1])
     assert shown.contact == 37
     middle = 0.5 * (37 * 1.2 + 2.4 + 30.5 + 37 * 0.5 - 2.4)
-    np.testing.assert_allclose(picture.contact_point(shown.rollout, 37, partner=1), [middle, 0], atol=0.3)
+    np.testing.assert_allclose(
+        picture.contact_point(shown.rollout, 37, partner=1), [middle, 0], atol=0.3
+    )
 
 
 def test_the_ego_is_blue_and_the_adversary_red_where_they_are():
-    shown = replay_of(course(0, 0, heading=0, speed=0), course(12, 0, heading=0, speed=0), course(-12, 0, heading=0, speed=0), adversaries=[1])
+    shown = replay_of(
+        course(0, 0, heading=0, speed=0),
+        course(12, 0, heading=0, speed=0),
+        course(-12, 0, heading=0, speed=0),
+        adversaries=[1],
+    )
     image = shown.picture(10)
-    for x, colour in ((0, drawing.EGO), (12, drawing.ADVERSARY), (-12, drawing.BACKGROUND)):
-        assert pixel_at(image, shown.panel.map.axes, point=np.array([x - 0.8, 0.0])) == rgb(colour)
+    for x, colour in (
+        (0, drawing.EGO),
+        (12, drawing.ADVERSARY),
+        (-12, drawing.BACKGROUND),
+    ):
+        assert pixel_at(
+            image, shown.panel.map.axes, point=np.array([x - 0.8, 0.0])
+        ) == rgb(colour)
 
 
 def test_an_mp4_shows_each_picture_when_it_is_due(tmp_path):
-    """Read back by a decoder: the frame at k / 10 s is like picture k, and less like all others that differ."""
+    """Read back by a decoder: the frame at k / 10 s is like picture k, and less like
+    all others that differ."""
     reader = pytest.importorskip("imageio_ffmpeg", reason="needs the extra mp4")
     shown = replay_of(*CRASH, adversaries=[1])
     shown.panel.figure.set_dpi(72 * 121 / picture.SIDE)  # odd: 4:2:0 has no half pixels
@@ -75,11 +114,25 @@ def test_an_mp4_shows_each_picture_when_it_is_due(tmp_path):
     path = tmp_path / "new" / "failure.mp4"
     save_animation(path, drawn)
     facts, *frames = reader.read_frames(path)
-    assert facts["codec"] == "h264" and facts["pix_fmt"].startswith("yuv420p") and facts["size"] == (120, 120)
-    assert facts["fps"] == 10 and len(frames) == len(drawn) and facts["duration"] == pytest.approx(len(drawn) / 10)
-    decoded = np.stack([np.frombuffer(frame, np.uint8) for frame in frames]).astype(float)
-    source = np.stack([np.asarray(frame)[:120, :120].ravel() for frame in drawn]).astype(float)
-    off = cdist(decoded, source, "cityblock") / source.shape[1]  # [frame, picture], of 255
+    assert (
+        facts["codec"] == "h264"
+        and facts["pix_fmt"].startswith("yuv420p")
+        and facts["size"] == (120, 120)
+    )
+    assert (
+        facts["fps"] == 10
+        and len(frames) == len(drawn)
+        and facts["duration"] == pytest.approx(len(drawn) / 10)
+    )
+    decoded = np.stack([np.frombuffer(frame, np.uint8) for frame in frames]).astype(
+        float
+    )
+    source = np.stack(
+        [np.asarray(frame)[:120, :120].ravel() for frame in drawn]
+    ).astype(float)
+    off = (
+        cdist(decoded, source, "cityblock") / source.shape[1]
+    )  # [frame, picture], of 255
     same = cdist(source, source, "chebyshev") == 0
     assert len(np.unique(same, axis=0)) > 37, "it moves"
     assert off.diagonal().max() < 3
@@ -88,13 +141,17 @@ def test_an_mp4_shows_each_picture_when_it_is_due(tmp_path):
 
 def test_an_mp4_keeps_colours(tmp_path):
     reader = pytest.importorskip("imageio_ffmpeg", reason="needs the extra mp4")
-    save_animation(tmp_path / "keys.mp4", [Image.new("RGB", (32, 32), rgb(key)) for key in KEYS])
+    save_animation(
+        tmp_path / "keys.mp4", [Image.new("RGB", (32, 32), rgb(key)) for key in KEYS]
+    )
     _, *frames = reader.read_frames(tmp_path / "keys.mp4")
     found = [np.frombuffer(frame, np.uint8).reshape(-1, 3).mean(0) for frame in frames]
     np.testing.assert_allclose(found, list(map(rgb, KEYS)), atol=8)
 
 
-def test_other_kinds_and_a_missing_library_are_told_before_anything_is_drawn(tmp_path, monkeypatch):
+def test_other_kinds_and_a_missing_library_are_told_before_anything_is_drawn(
+    tmp_path, monkeypatch
+):
     frames = (pytest.fail("drawn for nothing") for _ in range(1))
     with pytest.raises(InputError, match="failure.avi.*gif or .mp4"):
         save_animation(tmp_path / "failure.avi", frames)
@@ -108,8 +165,13 @@ def test_an_ffmpeg_that_fails_is_told_and_leaves_nothing(tmp_path, monkeypatch):
     broken = tmp_path / "ffmpeg"
     broken.write_text("#!/bin/sh\necho one >&2\necho Unknown encoder >&2\nexit 1\n")
     broken.chmod(0o755)
-    for program, reason in ((tmp_path / "nowhere", "nowhere"), (broken, "Unknown encoder")):
+    for program, reason in (
+        (tmp_path / "nowhere", "nowhere"),
+        (broken, "Unknown encoder"),
+    ):
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
         with pytest.raises(InputError, match=f"ffmpeg failed .*{reason}"):
-            save_animation(tmp_path / "out" / "failure.mp4", [Image.new("RGB", (8, 8))] * 2)
+            save_animation(
+                tmp_path / "out" / "failure.mp4", [Image.new("RGB", (8, 8))] * 2
+            )
     assert not list((tmp_path / "out").iterdir())

@@ -23,6 +23,9 @@ def test_a_path_is_read_whatever_letters_it_has(typed):
     assert override.value() == PATHS[typed]
 
 
-@pytest.mark.parametrize("typed", ["seeds=[0,1]", "data=bundled", "+egos={idm:{ego:idm}}", "~data", "-m", "name='ü'"])
+@pytest.mark.parametrize(
+    "typed",
+    ["seeds=[0,1]", "data=bundled", "+egos={idm:{ego:idm}}", "~data", "-m", "name='ü'"],
+)
 def test_anything_else_stays_as_it_is(typed):
     assert with_path(typed) == typed

@@ -1,4 +1,5 @@
-"""A command that is interrupted, killed or out of disk ends soon, leaves no process, and says how to go on."""
+"""A command that is interrupted, killed or out of disk ends soon, leaves no process,
+and says how to go on."""
 
 import os
 import resource
@@ -48,8 +49,16 @@ def test_an_interrupted_command_leaves_no_process(tmp_path, method, how):
     marks = [tmp_path / name for name in "ab"]
     (tmp_path / "script.py").write_text(SCRIPT)
     command = [sys.executable, str(tmp_path / "script.py"), method, *map(str, marks)]
-    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # tests in the background are started deaf to it
-    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heed)
+    heed = partial(
+        signal.signal, signal.SIGINT, signal.SIG_DFL
+    )  # tests in the background are started deaf to it
+    run = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=heed,
+    )
     while not all(mark.exists() and mark.read_text() for mark in marks):
         assert run.poll() is None, run.stderr.read()
         time.sleep(0.05)
@@ -70,26 +79,46 @@ def test_an_interrupted_command_leaves_no_process(tmp_path, method, how):
 
 
 def unconfigured():
-    raise ValueError("Unable to configure handler 'file'") from PermissionError(13, "Permission denied", "runs/log")
+    raise ValueError("Unable to configure handler 'file'") from PermissionError(
+        13, "Permission denied", "runs/log"
+    )
 
 
 @pytest.mark.parametrize(
     ("fail", "told"),
     [
-        (lambda: os.write(os.open("/dev/full", os.O_WRONLY), b"x"), "a file: cannot be written (No space left"),
-        (lambda: Path("/dev/null/x").mkdir(), "/dev/null/x: cannot be written (Not a directory)"),
-        (lambda: Path("/dev/null").mkdir(), "/dev/null: cannot be written (File exists)"),
-        (lambda: Path("/dev").write_bytes(b""), "/dev: cannot be written (Is a directory)"),
+        (
+            lambda: os.write(os.open("/dev/full", os.O_WRONLY), b"x"),
+            "a file: cannot be written (No space left",
+        ),
+        (
+            lambda: Path("/dev/null/x").mkdir(),
+            "/dev/null/x: cannot be written (Not a directory)",
+        ),
+        (
+            lambda: Path("/dev/null").mkdir(),
+            "/dev/null: cannot be written (File exists)",
+        ),
+        (
+            lambda: Path("/dev").write_bytes(b""),
+            "/dev: cannot be written (Is a directory)",
+        ),
         (unconfigured, "runs/log: cannot be written (Permission denied)"),
         (lambda: torch.empty(2**48, dtype=torch.uint8), "out of memory"),
         (lambda: np.empty(2**50, np.uint8), "out of memory"),
     ],
 )
-def test_a_disk_or_memory_that_is_full_ends_in_one_line_with_how_to_go_on(capsys, fail, told):
+def test_a_disk_or_memory_that_is_full_ends_in_one_line_with_how_to_go_on(
+    capsys, fail, told
+):
     with pytest.raises(SystemExit) as stopped, ending(lambda: "run x again"):
         fail()
     said = capsys.readouterr().err.strip()
-    assert stopped.value.code == 1 and said.startswith(f"error: {told}") and "\n" not in said
+    assert (
+        stopped.value.code == 1
+        and said.startswith(f"error: {told}")
+        and "\n" not in said
+    )
     assert said.endswith("go on with: run x again")
 
 
@@ -101,37 +130,81 @@ def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):
     for error in (ValueError("a bug"), FileNotFoundError(2, "none")):
         with pytest.raises(type(error)), ending(lambda: "run x again"):
             raise error
-    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+    assert [
+        signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)
+    ] == before
 
 
 @pytest.mark.parametrize(
     ("code", "redirection", "status", "reason"),
     [
         ("print('good')", ">&-", 0, ""),
-        ("print('x' * 100_000)", "| true", 1, "error: nobody reads the output any more; go on with: again"),
-        ("time.sleep(0.5); print('x')", "| true", 1, "error: nobody reads the output any more; go on with: again"),
-        ("raise BrokenPipeError(32, 'Broken pipe')", "| cat", 1, "BrokenPipeError: [Errno 32] Broken pipe"),
-        ("raise BrokenPipeError(32, 'Broken pipe')", ">&-", 1, "BrokenPipeError: [Errno 32] Broken pipe"),
+        (
+            "print('x' * 100_000)",
+            "| true",
+            1,
+            "error: nobody reads the output any more; go on with: again",
+        ),
+        (
+            "time.sleep(0.5); print('x')",
+            "| true",
+            1,
+            "error: nobody reads the output any more; go on with: again",
+        ),
+        (
+            "raise BrokenPipeError(32, 'Broken pipe')",
+            "| cat",
+            1,
+            "BrokenPipeError: [Errno 32] Broken pipe",
+        ),
+        (
+            "raise BrokenPipeError(32, 'Broken pipe')",
+            ">&-",
+            1,
+            "BrokenPipeError: [Errno 32] Broken pipe",
+        ),
     ],
-    ids=["closed", "unread", "unread at the end", "another pipe", "another pipe, closed"],
+    ids=[
+        "closed",
+        "unread",
+        "unread at the end",
+        "another pipe",
+        "another pipe, closed",
+    ],
 )
-def test_an_output_that_nobody_reads_is_told_from_others(code, redirection, status, reason):
+def test_an_output_that_nobody_reads_is_told_from_others(
+    code, redirection, status, reason
+):
     script = f"import time\nfrom e2rl.run.endings import ending\nwith ending(lambda: 'again'): {code}"
     command = f'set -o pipefail; "$0" -c "$1" {redirection}'
-    done = subprocess.run(["bash", "-c", command, sys.executable, script], stderr=subprocess.PIPE, text=True)
-    assert done.returncode == status and done.stderr.strip().splitlines()[-1:] == ([reason] if reason else [])
+    done = subprocess.run(
+        ["bash", "-c", command, sys.executable, script],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert done.returncode == status and done.stderr.strip().splitlines()[-1:] == (
+        [reason] if reason else []
+    )
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_is_one(capsys, monkeypatch, number, status):
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+)
+def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_is_one(
+    capsys, monkeypatch, number, status
+):
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "a=$(touch x)"])
-    before = signal.signal(number, signal.default_int_handler)  # where the tests run in the background it is ignored
+    before = signal.signal(
+        number, signal.default_int_handler
+    )  # where the tests run in the background it is ignored
     with pytest.raises(SystemExit) as stopped, ending():
         try:
             os.kill(os.getpid(), number)
             time.sleep(5)
         except KeyboardInterrupt as error:
-            raise RuntimeError("Converting a tensordict to boolean value is not permitted") from error
+            raise RuntimeError(
+                "Converting a tensordict to boolean value is not permitted"
+            ) from error
     signal.signal(number, before)
     assert stopped.value.code == status
     told = f"interrupted ({number.name}); go on with: python evaluate.py 'a=$(touch x)'"
@@ -141,7 +214,11 @@ def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_is_one(capsy
 @pytest.mark.parametrize(
     ("code", "status", "told"),
     [
-        ("import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)", 130, "run the same command"),
+        (
+            "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)",
+            130,
+            "run the same command",
+        ),
         ("", 1, "name a writable folder by TMPDIR"),
     ],
 )
@@ -155,5 +232,11 @@ def test_what_ends_a_command_before_it_begins_is_one_line(code, status, told):
             resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
     command = [sys.executable, "-c", f"import e2rl.commands.cli; {code}"]
-    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed, timeout=60)
-    assert done.returncode == status and done.stderr.strip().count("\n") == 0 and told in done.stderr
+    done = subprocess.run(
+        command, stderr=subprocess.PIPE, text=True, preexec_fn=heed, timeout=60
+    )
+    assert (
+        done.returncode == status
+        and done.stderr.strip().count("\n") == 0
+        and told in done.stderr
+    )

@@ -22,19 +22,31 @@ def test_a_checkout_is_installed_from_where_it_is(monkeypatch, tmp_path):
 
 def test_elsewhere_the_libraries_are_named(monkeypatch, tmp_path):
     monkeypatch.setattr(extras, "CHECKOUT", tmp_path)
-    metadata = ["torch>=2.7", 'mcap>=1.2; extra == "mcap"', "x<2,>=1 ; extra == 'mcap'", 'ray>=2.40; extra == "ray"']
+    metadata = [
+        "torch>=2.7",
+        'mcap>=1.2; extra == "mcap"',
+        "x<2,>=1 ; extra == 'mcap'",
+        'ray>=2.40; extra == "ray"',
+    ]
     monkeypatch.setattr(extras, "requires", lambda name: metadata)
     assert how_to_install("mcap").endswith("pip install 'mcap>=1.2' 'x<2,>=1'")
 
 
 def test_a_library_that_is_missing_is_told_with_its_extra(monkeypatch):
     monkeypatch.chdir(ROOT)
-    with pytest.raises(InputError, match=r"--to x: no_such cannot be imported .* pip install -e '\.\[mcap\]'"):
+    with pytest.raises(
+        InputError,
+        match=r"--to x: no_such cannot be imported .* pip install -e '\.\[mcap\]'",
+    ):
         library("no_such", "--to x", extra="mcap")
 
 
 def test_every_extra_that_the_code_names_is_one():
-    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     assert all(how_to_install(extra) for extra in known)
     for path in (ROOT / "e2rl").rglob("*.py"):
-        assert "e2rl[" not in path.read_text(), f"{path}: names an installation that only some have"
+        assert "e2rl[" not in path.read_text(), (
+            f"{path}: names an installation that only some have"
+        )

@@ -1,4 +1,5 @@
-"""A file appears whole or not at all; weights read back are those written, and an altered file is noticed."""
+"""A file appears whole or not at all; weights read back are those written, and an
+altered file is noticed."""
 
 import csv
 import hashlib
@@ -37,7 +38,11 @@ from e2rl.run.files import (
     written_whole,
 )
 
-WEIGHTS = {"a": torch.arange(12.0).view(3, 4), "b": torch.tensor(3), "c": torch.zeros(0, 2, dtype=torch.float64)}
+WEIGHTS = {
+    "a": torch.arange(12.0).view(3, 4),
+    "b": torch.tensor(3),
+    "c": torch.zeros(0, 2, dtype=torch.float64),
+}
 
 
 def test_what_fails_on_the_way_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
@@ -77,12 +82,18 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path, content):
 def test_a_link_to_nothing_yet_makes_what_it_leads_to(tmp_path):
     (tmp_path / "link").symlink_to("new/file")
     write_atomically(tmp_path / "link", "text")
-    assert (tmp_path / "link").is_symlink() and (tmp_path / "new" / "file").read_text() == "text"
+    assert (tmp_path / "link").is_symlink() and (
+        tmp_path / "new" / "file"
+    ).read_text() == "text"
 
 
-@pytest.mark.parametrize(("umask", "mode"), [(0o077, 0o600), (0o022, 0o644), (0o002, 0o664)])
+@pytest.mark.parametrize(
+    ("umask", "mode"), [(0o077, 0o600), (0o022, 0o644), (0o002, 0o664)]
+)
 @pytest.mark.parametrize("content", ["new", by_path("new")])
-def test_new_files_and_folders_have_the_permissions_that_the_user_wants(tmp_path, content, umask, mode):
+def test_new_files_and_folders_have_the_permissions_that_the_user_wants(
+    tmp_path, content, umask, mode
+):
     before = os.umask(umask)
     try:
         write_atomically(tmp_path / "file", content)
@@ -124,7 +135,9 @@ def test_a_device_is_written_through_and_nothing_beside_it(tmp_path, content):
 def test_a_pipe_is_written_through(tmp_path, content):
     os.mkfifo(tmp_path / "pipe")
     read = []
-    reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_text()))
+    reader = threading.Thread(
+        target=lambda: read.append((tmp_path / "pipe").read_text())
+    )
     reader.start()
     write_atomically(tmp_path / "pipe", content)
     reader.join(20)
@@ -141,14 +154,23 @@ print("after")
 """
 
 
-@pytest.mark.parametrize("name", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"])
+@pytest.mark.parametrize(
+    "name", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"]
+)
 @pytest.mark.parametrize("into", ["file", "pipe", "socket"])
 def test_standard_output_is_written_in_turn_whatever_it_is(tmp_path, name, into):
     """An output that is a file is not replaced, or what is printed next would be lost."""
     (tmp_path / "link").symlink_to("/dev/stdout")
-    command = [sys.executable, "-c", PRINTS, str(tmp_path / "link") if name == "link" else name]
+    command = [
+        sys.executable,
+        "-c",
+        PRINTS,
+        str(tmp_path / "link") if name == "link" else name,
+    ]
     if into == "pipe":
-        said = subprocess.run(command, stdout=subprocess.PIPE, check=True, timeout=60).stdout
+        said = subprocess.run(
+            command, stdout=subprocess.PIPE, check=True, timeout=60
+        ).stdout
     elif into == "file":
         with (tmp_path / "out").open("wb") as file:
             subprocess.run(command, stdout=file, check=True, timeout=60)
@@ -161,7 +183,9 @@ def test_standard_output_is_written_in_turn_whatever_it_is(tmp_path, name, into)
     assert said == b"before\ncontent\nafter\n"
 
 
-@pytest.mark.parametrize("kind", ["folder", "socket", "read-only", "loop", "link to a folder"])
+@pytest.mark.parametrize(
+    "kind", ["folder", "socket", "read-only", "loop", "link to a folder"]
+)
 def test_what_is_no_file_is_refused_by_its_name_and_stays(tmp_path, kind):
     path = tmp_path / "target"
     if kind == "folder":
@@ -179,7 +203,9 @@ def test_what_is_no_file_is_refused_by_its_name_and_stays(tmp_path, kind):
     with pytest.raises(OSError) as refused:
         write_atomically(path, "new")
     assert refused.value.filename == str(path)
-    assert path.lstat() == before and [each.name for each in tmp_path.iterdir()] == ["target"]
+    assert path.lstat() == before and [each.name for each in tmp_path.iterdir()] == [
+        "target"
+    ]
 
 
 def test_what_comes_beside_a_file_follows_no_link_out_of_its_folder(tmp_path):
@@ -194,8 +220,26 @@ def test_what_comes_beside_a_file_follows_no_link_out_of_its_folder(tmp_path):
 
 # --- CSV
 
-FORMULAS = ["=1+1", "+1+1", "-1+1", "@SUM(A1)", "\t=1", "\r=1", " =1", "\uff1d1", '=HYPERLINK("http://x","y")', "'=1"]
-NUMBERS = ["-1", "+2.5", "-3e-5", "-.5", "+2.1 [+0.4, +3.9]*", "-2.1 [-4.0, -0.2]* (12)"]
+FORMULAS = [
+    "=1+1",
+    "+1+1",
+    "-1+1",
+    "@SUM(A1)",
+    "\t=1",
+    "\r=1",
+    " =1",
+    "\uff1d1",
+    '=HYPERLINK("http://x","y")',
+    "'=1",
+]
+NUMBERS = [
+    "-1",
+    "+2.5",
+    "-3e-5",
+    "-.5",
+    "+2.1 [+0.4, +3.9]*",
+    "-2.1 [-4.0, -0.2]* (12)",
+]
 
 
 @pytest.mark.parametrize("text", FORMULAS)
@@ -210,9 +254,17 @@ def test_numbers_and_other_words_stay_as_they_are():
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.lists(st.text(st.sampled_from("'=+-@\t\r\n ,\"1e.a\uff1d"), max_size=6), min_size=1, max_size=3))
+@given(
+    st.lists(
+        st.text(st.sampled_from("'=+-@\t\r\n ,\"1e.a\uff1d"), max_size=6),
+        min_size=1,
+        max_size=3,
+    )
+)
 def test_cells_are_read_as_they_were(texts):
-    rows = CsvReader(io.StringIO(csv_text([["=head", *texts], ["x", *texts]]), newline=""))
+    rows = CsvReader(
+        io.StringIO(csv_text([["=head", *texts], ["x", *texts]]), newline="")
+    )
     assert list(rows.fieldnames) == ["=head", *texts]
     assert next(rows) == dict(zip(["=head", *texts], ["x", *texts], strict=True))
 
@@ -225,7 +277,10 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
         (part / "a").write_text("text")
         assert not (tmp_path / "new" / "folder").exists()
     assert (tmp_path / "new" / "folder" / "a").read_text() == "text"
-    with pytest.raises(KeyboardInterrupt), written_whole(tmp_path / "new" / "other") as part:
+    with (
+        pytest.raises(KeyboardInterrupt),
+        written_whole(tmp_path / "new" / "other") as part,
+    ):
         (part / "a").write_text("text")
         raise KeyboardInterrupt
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["folder"]
@@ -242,7 +297,10 @@ def hold(path, log):
 
 def test_one_process_at_a_time_holds_a_lock_and_it_leaves_no_file(tmp_path):
     context = multiprocessing.get_context("fork")
-    workers = [context.Process(target=hold, args=(tmp_path / "x", tmp_path / "log")) for _ in range(8)]
+    workers = [
+        context.Process(target=hold, args=(tmp_path / "x", tmp_path / "log"))
+        for _ in range(8)
+    ]
     for worker in workers:
         worker.start()
     for worker in workers:
@@ -257,14 +315,19 @@ def stay(folder, inside):
         time.sleep(30)
 
 
-def test_one_run_at_a_time_is_at_work_in_a_folder_until_it_is_killed(tmp_path, monkeypatch):
+def test_one_run_at_a_time_is_at_work_in_a_folder_until_it_is_killed(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(files, "WAIT", 1)
     context = multiprocessing.get_context("fork")
     inside = context.Event()
     other = context.Process(target=stay, args=(tmp_path, inside))
     other.start()
     assert inside.wait(20)
-    with pytest.raises(InputError, match="another process is at work"), alone_in(tmp_path):
+    with (
+        pytest.raises(InputError, match="another process is at work"),
+        alone_in(tmp_path),
+    ):
         pass
     other.kill()
     other.join(20)
@@ -274,7 +337,8 @@ def test_one_run_at_a_time_is_at_work_in_a_folder_until_it_is_killed(tmp_path, m
 
 @pytest.mark.parametrize("name", ["/dev/zero", "../outside", "pipe", "link"])
 def test_a_seal_counts_for_files_of_its_folder_only(tmp_path, name):
-    """It is a stranger's, too: no hash of an endless device, of a file elsewhere, or of a pipe that nobody writes."""
+    """It is a stranger's, too: no hash of an endless device, of a file elsewhere, or of
+    a pipe that nobody writes."""
     folder = tmp_path / "sealed"
     folder.mkdir()
     (tmp_path / "outside").write_text("")
@@ -294,12 +358,16 @@ def test_what_is_written_is_read_and_equal_weights_make_equal_bytes(tmp_path):
     path.write_bytes(weight_bytes(WEIGHTS, header))
     weights, read = read_weights(path)
     assert read == header and set(weights) == set(WEIGHTS)
-    assert all(torch.equal(value, WEIGHTS[key]) and value.dtype == WEIGHTS[key].dtype for key, value in weights.items())
+    assert all(
+        torch.equal(value, WEIGHTS[key]) and value.dtype == WEIGHTS[key].dtype
+        for key, value in weights.items()
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_flipped_bit_changes_no_weight_in_silence(tmp_path, seed):
-    """It is noticed wherever it is but in the name of the hash, where it changes nothing else."""
+    """It is noticed wherever it is but in the name of the hash, where it changes
+    nothing else."""
     content = bytearray(weight_bytes(WEIGHTS, {"architecture": "small"}))
     draw = random.Random(seed)
     content[draw.randrange(len(content))] ^= 1 << draw.randrange(8)

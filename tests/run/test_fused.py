@@ -1,4 +1,5 @@
-"""A fused function gives what it gives eagerly, for every size; what it was not declared for runs eagerly."""
+"""A fused function gives what it gives eagerly, for every size; what it was not
+declared for runs eagerly."""
 
 from typing import NamedTuple
 
@@ -23,7 +24,8 @@ calls = []
 
 @fused("B K 2", "B", "3!", "B:bool")
 def across(points: Tensor, line: Line, weight: Tensor, counts: Tensor) -> Line:
-    """Largest distance [B] of points from lines, where they count, and the lines' angles."""
+    """Largest distance [B] of points from lines, where they count, and the lines'
+    angles."""
     calls.append(points.shape[0])
     normal = torch.stack([-line.angle.sin(), line.angle.cos()], -1)
     distance = (points * normal[:, None]).sum(-1) - line.offset[:, None]
@@ -32,7 +34,9 @@ def across(points: Tensor, line: Line, weight: Tensor, counts: Tensor) -> Line:
 
 def given(batch: int, count: int) -> tuple:
     draw = torch.Generator().manual_seed(batch)
-    points, angle = (torch.randn(batch, *shape, generator=draw) for shape in ((count, 2), ()))
+    points, angle = (
+        torch.randn(batch, *shape, generator=draw) for shape in ((count, 2), ())
+    )
     return points, Line(angle / 3, angle), torch.arange(3.0), angle > 0
 
 
@@ -56,13 +60,20 @@ def test_compiled_it_gives_what_it_gives_eagerly_for_every_size(on, batch, count
         assert torch.allclose(one, other, atol=1e-6)
     assert isinstance(found, Line) and across.file.exists()
     views = arguments[0].transpose(0, 1).contiguous().transpose(0, 1), *arguments[1:]
-    assert torch.equal(across(*views).offset, found.offset), "it depends on how a tensor lies in memory"
+    assert torch.equal(across(*views).offset, found.offset), (
+        "it depends on how a tensor lies in memory"
+    )
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        lambda p, line, w, c: (p.double(), Line(*(x.double() for x in line)), w.double(), c),
+        lambda p, line, w, c: (
+            p.double(),
+            Line(*(x.double() for x in line)),
+            w.double(),
+            c,
+        ),
         lambda p, line, w, c: (p[:0], Line(*(x[:0] for x in line)), w, c[:0]),
         lambda p, line, w, c: (p.requires_grad_(), line, w, c),
         lambda p, line, w, c: (p, line, w[:2], c),
@@ -74,7 +85,10 @@ def test_what_is_not_as_declared_runs_as_it_is(on, change):
     calls.clear()
     found = across(*arguments)
     assert calls == [len(arguments[0])]
-    assert all(torch.equal(one, other) for one, other in zip(found, across.function(*arguments), strict=True))
+    assert all(
+        torch.equal(one, other)
+        for one, other in zip(found, across.function(*arguments), strict=True)
+    )
 
 
 def test_fused_functions_run_as_they_are_until_they_are_switched_on():
@@ -106,7 +120,10 @@ def one_sided(points: Tensor) -> Tensor:
 def test_what_cannot_be_compiled_is_named_in_one_line():
     function = Fused(one_sided, ("B",))
     try:
-        with pytest.raises(InputError, match=r"^compile=true: torch .* cannot compile .*one_sided \(.*\); take .*$"):
+        with pytest.raises(
+            InputError,
+            match=r"^compile=true: torch .* cannot compile .*one_sided \(.*\); take .*$",
+        ):
             function.compile()
     finally:
         del FUSED[function.name]

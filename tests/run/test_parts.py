@@ -1,4 +1,5 @@
-"""Parts that are done are read, whole and of what is asked for, or done again; a stranger's file runs nothing."""
+"""Parts that are done are read, whole and of what is asked for, or done again; a
+stranger's file runs nothing."""
 
 import hashlib
 import io
@@ -37,14 +38,19 @@ def file(tmp_path):
 def test_a_part_is_computed_once_and_read_as_it_was(tmp_path, file, monkeypatch):
     assert not computes(Parts(tmp_path))
     rows, samples, errored = Parts(tmp_path).load("a", [1])
-    assert (rows, errored) == (VALUE[0], VALUE[2]) and torch.equal(samples[0]["speed"], VALUE[1][0]["speed"])
+    assert (rows, errored) == (VALUE[0], VALUE[2]) and torch.equal(
+        samples[0]["speed"], VALUE[1][0]["speed"]
+    )
     monkeypatch.chdir(tmp_path / "parts")
-    assert computes(Parts()) and computes(Parts()), "without a folder nothing is written"
+    assert computes(Parts()) and computes(Parts()), (
+        "without a folder nothing is written"
+    )
     assert computes(Parts(tmp_path), valid=lambda found: False)
 
 
 @pytest.mark.parametrize(
-    ("stage", "about", "identity"), [("other", "", [1]), ("", "another round", [1]), ("", "", [2])]
+    ("stage", "about", "identity"),
+    [("other", "", [1]), ("", "another round", [1]), ("", "", [2])],
 )
 def test_a_part_of_something_else_is_none(tmp_path, file, stage, about, identity):
     assert computes(Parts(tmp_path, stage, about=about), identity=identity)
@@ -76,7 +82,12 @@ class Malicious:
 
 
 def test_a_strangers_part_runs_nothing(tmp_path, file):
-    part = {"format": "e2rl-part/1", "about": "", "identity": [1], "value": Malicious(tmp_path / "ran")}
+    part = {
+        "format": "e2rl-part/1",
+        "about": "",
+        "identity": [1],
+        "value": Malicious(tmp_path / "ran"),
+    }
     file.write_bytes(state_bytes(part))
     assert Parts(tmp_path).load("a", [1]) is None and not (tmp_path / "ran").exists()
 
@@ -85,8 +96,19 @@ def packed():
     """A part that grows a thousandfold as it is read."""
     content = io.BytesIO()
     small = io.BytesIO()
-    torch.save({"format": "e2rl-part/1", "about": "", "identity": [1], "value": torch.zeros(10**6)}, content)
-    with zipfile.ZipFile(content) as full, zipfile.ZipFile(small, "w", zipfile.ZIP_DEFLATED) as archive:
+    torch.save(
+        {
+            "format": "e2rl-part/1",
+            "about": "",
+            "identity": [1],
+            "value": torch.zeros(10**6),
+        },
+        content,
+    )
+    with (
+        zipfile.ZipFile(content) as full,
+        zipfile.ZipFile(small, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
         for name in full.namelist():
             archive.writestr(name, full.read(name))
     return HASHED + hashlib.sha256(small.getvalue()).digest() + small.getvalue()
@@ -94,7 +116,10 @@ def packed():
 
 def test_a_part_that_grows_as_it_is_read_is_none(tmp_path, file):
     part = {"format": "e2rl-part/1", "about": "", "identity": [1]}
-    for content in (packed(), state_bytes(part | {"value": torch.zeros(1).expand(2**20, 2**20)})):
+    for content in (
+        packed(),
+        state_bytes(part | {"value": torch.zeros(1).expand(2**20, 2**20)}),
+    ):
         assert len(content) < 10**5
         file.write_bytes(content)
         assert Parts(tmp_path).load("a", [1]) is None

@@ -1,4 +1,5 @@
-"""What a command has started ends with it; helpers of libraries end by themselves; orphans leave no zombies."""
+"""What a command has started ends with it; helpers of libraries end by themselves;
+orphans leave no zombies."""
 
 import os
 import signal
@@ -51,7 +52,11 @@ def test_a_planner_is_ended_whatever_its_paths_and_options_are(words):
         ["gcs_server", *SLEEP],
         ["/home/me/wandb/bin/wandb-core", *SLEEP],
         ["ray::IDLE", *SLEEP],
-        ["python3.11", "-c", "from multiprocessing.resource_tracker import main; import time; time.sleep(60)"],
+        [
+            "python3.11",
+            "-c",
+            "from multiprocessing.resource_tracker import main; import time; time.sleep(60)",
+        ],
     ],
 )
 def test_helpers_of_libraries_end_by_themselves(words):
@@ -67,7 +72,11 @@ def test_scripts_of_ray_end_by_themselves(tmp_path):
 
 def zombies() -> set[int]:
     """Returns the ended children of this process whose status nobody has taken."""
-    found = [(number, state) for number, state, parent in process_tree._processes() if parent == os.getpid()]
+    found = [
+        (number, state)
+        for number, state, parent in process_tree._processes()
+        if parent == os.getpid()
+    ]
     return {number for number, state in found if state == "Z"}
 
 

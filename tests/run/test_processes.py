@@ -16,13 +16,18 @@ def square(job):
 
 def test_results_keep_the_order_of_the_jobs_whoever_does_them():
     found = list(in_processes(square, range(7), processes=3, cost=float))
-    assert [result["value"][0].item() for result in found] == [float(k**2) for k in range(7)]
+    assert [result["value"][0].item() for result in found] == [
+        float(k**2) for k in range(7)
+    ]
     assert os.getpid() not in {result["process"] for result in found}
 
 
 @pytest.mark.parametrize(("jobs", "processes"), [(range(3), 1), ([5], 4)])
 def test_one_process_or_one_job_stays_here(jobs, processes):
-    assert {result["process"] for result in in_processes(square, jobs, processes=processes, cost=float)} == {os.getpid()}
+    assert {
+        result["process"]
+        for result in in_processes(square, jobs, processes=processes, cost=float)
+    } == {os.getpid()}
 
 
 def linger(job):
@@ -34,10 +39,18 @@ def linger(job):
 def test_jobs_are_reported_when_they_end_not_when_their_turn_comes():
     """While the first job lingers in one process, the other does the rest."""
     reported = []
-    results = in_processes(linger, range(6), processes=2, cost=lambda job: -job, ended=reported.append)
+    results = in_processes(
+        linger, range(6), processes=2, cost=lambda job: -job, ended=reported.append
+    )
     assert next(results) == 0 and set(reported) >= {1, 2, 3, 4, 5}
     assert list(results) == [1, 2, 3, 4, 5] and sorted(reported) == list(range(6))
-    assert list(in_processes(linger, [1, 2], processes=1, cost=float, ended=reported.append)) == reported[-2:] == [1, 2]
+    assert (
+        list(
+            in_processes(linger, [1, 2], processes=1, cost=float, ended=reported.append)
+        )
+        == reported[-2:]
+        == [1, 2]
+    )
 
 
 def refuse(job):

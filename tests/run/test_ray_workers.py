@@ -1,4 +1,5 @@
-"""Ray workers (extra `ray`): what processes here give, bit for bit, though a worker is killed; one clear message."""
+"""Ray workers (extra `ray`): what processes here give, bit for bit, though a worker is
+killed; one clear message."""
 
 import os
 import signal
@@ -36,19 +37,26 @@ def workers():
     found = RayWorkers(2)
     before = signal.getsignal(signal.SIGTERM)
     ray = found.connect()
-    assert signal.getsignal(signal.SIGTERM) is before, "a command still ends as e2rl.run.endings says"
+    assert signal.getsignal(signal.SIGTERM) is before, (
+        "a command still ends as e2rl.run.endings says"
+    )
     yield found
     ray.shutdown()
 
 
 class Mortal(Setup):
-    """A setup whose worker is killed once, after it has written the rollouts of a batch; mark: the file of that."""
+    """A setup whose worker is killed once, after it has written the rollouts of a
+    batch; mark: the file of that."""
 
     mark = ""
 
     def score(self, method, tasks, folder=None, begins=False):
         found = super().score(method, tasks, folder, begins)
-        if method.name == "e2" and tasks[0][:2] == (2, 1) and not os.path.exists(self.mark):
+        if (
+            method.name == "e2"
+            and tasks[0][:2] == (2, 1)
+            and not os.path.exists(self.mark)
+        ):
             with open(self.mark, "w") as file:
                 file.write(str(os.getpid()))
             os.kill(os.getpid(), signal.SIGKILL)
@@ -56,7 +64,9 @@ class Mortal(Setup):
 
 
 @needs_ray
-def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path, workers):
+def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(
+    tmp_path, workers
+):
     """Nothing is lost, nothing twice: rollouts, rows and metrics, bit for bit."""
     scene_set = scenes(3, steps=20)
     folders = (tmp_path / "forked", tmp_path / "ray")
@@ -65,11 +75,23 @@ def test_two_workers_one_killed_on_the_way_give_what_two_processes_give(tmp_path
         setup.mark = str(tmp_path / "killed")
         if processes == 2:
             setup.mark = os.devnull  # it is there: nobody is killed
-        methods = [Method("nominal", synthesizer(), eta=0.0), Method("e2", synthesizer(), eta=3.0)]
-        run_protocol(setup, methods, seeds=SEEDS, folder=folder, processes=processes, parts=Parts(folder))
+        methods = [
+            Method("nominal", synthesizer(), eta=0.0),
+            Method("e2", synthesizer(), eta=3.0),
+        ]
+        run_protocol(
+            setup,
+            methods,
+            seeds=SEEDS,
+            folder=folder,
+            processes=processes,
+            parts=Parts(folder),
+        )
     assert int((tmp_path / "killed").read_text()) != os.getpid()
     same_runs(*folders)
-    parts = [sorted(path.name for path in (folder / "parts").iterdir()) for folder in folders]
+    parts = [
+        sorted(path.name for path in (folder / "parts").iterdir()) for folder in folders
+    ]
     assert parts[0] == parts[1] and len(parts[0]) == 2 * 3 * len(SEEDS)
     for path in (folders[0] / ROLLOUTS).iterdir():
         one = np.load(path)
@@ -97,7 +119,10 @@ def test_workers_make_the_traffic_of_a_round_while_it_learns(workers):
     expected, _ = make_traffic(order, run.synthesize, batch=2)
     train_round(run)
     found = run.memory.rounds[-1].traffic
-    assert set(found) == set(expected) and order.number == run.memory.rounds[-1].number == 1
+    assert (
+        set(found) == set(expected)
+        and order.number == run.memory.rounds[-1].number == 1
+    )
     assert all(torch.equal(found[name], expected[name]) for name in expected)
 
 
@@ -110,9 +135,14 @@ def vanish(job):
 
 
 @needs_ray
-def test_errors_of_workers_arrive_and_one_that_always_dies_is_named(workers, monkeypatch):
+def test_errors_of_workers_arrive_and_one_that_always_dies_is_named(
+    workers, monkeypatch
+):
     monkeypatch.setattr(ray_workers, "RETRIES", 1)
-    for fault, message in ((refuse, "^job 0: refused$"), (vanish, "launcher=ray: a job lost its worker 2 times")):
+    for fault, message in (
+        (refuse, "^job 0: refused$"),
+        (vanish, "launcher=ray: a job lost its worker 2 times"),
+    ):
         with pytest.raises(InputError, match=message):
             list(in_processes(fault, range(1), processes=workers, cost=float))
 

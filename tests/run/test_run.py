@@ -1,4 +1,5 @@
-"""A run goes on with what it was begun with: changed scenes, weights and settings are refused, other code is told."""
+"""A run goes on with what it was begun with: changed scenes, weights and settings are
+refused, other code is told."""
 
 import shlex
 import sys
@@ -24,7 +25,12 @@ SCENES = {"scenes": ("scene_id\na\n", "abc")}
 
 def begin(folder, resume=False, scenes=SCENES, free=("processes",), **changes):
     given = {"resume": str(folder) if resume else None}
-    run = Run(OmegaConf.merge(load_config("evaluate"), given, changes), folder, choices={"ego": "lane_graph"}, free=free)
+    run = Run(
+        OmegaConf.merge(load_config("evaluate"), given, changes),
+        folder,
+        choices={"ego": "lane_graph"},
+        free=free,
+    )
     run.begin(scenes)
     return run
 
@@ -39,8 +45,16 @@ def test_the_same_run_goes_on(tmp_path, weights):
     run = begin(tmp_path, prior={"checkpoint": str(weights)})
     run.parts().save("a", [], 1)
     begun = (tmp_path / PROVENANCE).read_bytes()
-    again = begin(tmp_path, resume=True, prior={"checkpoint": str(weights)}, processes=3, plugins=["json"])
-    assert (tmp_path / PROVENANCE).read_bytes() == begun and again.parts().load("a", []) == 1
+    again = begin(
+        tmp_path,
+        resume=True,
+        prior={"checkpoint": str(weights)},
+        processes=3,
+        plugins=["json"],
+    )
+    assert (tmp_path / PROVENANCE).read_bytes() == begun and again.parts().load(
+        "a", []
+    ) == 1
     assert OmegaConf.load(tmp_path / CONFIG) == run.config
     assert (tmp_path / "scenes.csv").read_text() == SCENES["scenes"][0]
     assert read_provenance(tmp_path)["files"] == {"scenes": "abc"}
@@ -59,15 +73,24 @@ def test_changed_settings_and_scenes_are_refused(tmp_path, changes, name):
         begin(tmp_path, resume=True, **changes)
 
 
-def test_changed_weights_and_files_of_methods_are_refused(tmp_path, weights, monkeypatch):
+def test_changed_weights_and_files_of_methods_are_refused(
+    tmp_path, weights, monkeypatch
+):
     prior = {"checkpoint": str(weights)}
     begin(tmp_path, prior=prior)
-    monkeypatch.setattr(runs, "load_choice", lambda group, name: OmegaConf.create({"name": name, "gain": 2}))
+    monkeypatch.setattr(
+        runs,
+        "load_choice",
+        lambda group, name: OmegaConf.create({"name": name, "gain": 2}),
+    )
     with pytest.raises(InputError, match="synthesizer=nominal changed"):
         begin(tmp_path, resume=True, prior=prior)
     monkeypatch.undo()
     save_prior(small_prior(1), tmp_path / "priors", origin={}).rename(weights)
-    with pytest.raises(InputError, match=r"prior\.checkpoint=.*prior\.safetensors changed since the run began"):
+    with pytest.raises(
+        InputError,
+        match=r"prior\.checkpoint=.*prior\.safetensors changed since the run began",
+    ):
         begin(tmp_path, resume=True, prior=prior)
 
 
@@ -78,11 +101,17 @@ def test_of_a_run_s_folder_the_newest_whole_checkpoint_is_hashed(tmp_path):
         (folder / "actor.safetensors").write_text(content)
         if number < 3:
             seal(folder)
-    config = OmegaConf.create({"ego": {"checkpoint": str(tmp_path)}, "egos": {}, "variants": {}})
+    config = OmegaConf.create(
+        {"ego": {"checkpoint": str(tmp_path)}, "egos": {}, "variants": {}}
+    )
     before = dict(inputs(config))
-    (tmp_path / "checkpoints" / "round-000001" / "actor.safetensors").write_text("other")
+    (tmp_path / "checkpoints" / "round-000001" / "actor.safetensors").write_text(
+        "other"
+    )
     assert dict(inputs(config)) == before
-    (tmp_path / "checkpoints" / "round-000002" / "actor.safetensors").write_text("other")
+    (tmp_path / "checkpoints" / "round-000002" / "actor.safetensors").write_text(
+        "other"
+    )
     assert dict(inputs(config)) != before
 
 
@@ -94,7 +123,9 @@ def test_other_code_is_told_and_named_in_the_rows(tmp_path, monkeypatch, capsys)
         begin(tmp_path, resume=True)
     assert "other versions than before (e2rl, git)" in capsys.readouterr().err
     assert len(read_provenance(tmp_path)["versions"]) == 2
-    assert origin_of(tmp_path)["command"] == command and origin_of(tmp_path)["git"].endswith(", abc")
+    assert origin_of(tmp_path)["command"] == command and origin_of(tmp_path)[
+        "git"
+    ].endswith(", abc")
 
 
 @pytest.mark.parametrize("content", ["{", '{"command": 1}', "[" * 5000])
@@ -104,7 +135,9 @@ def test_a_damaged_file_is_named(tmp_path, content):
         begin(tmp_path, resume=True)
 
 
-@pytest.mark.parametrize("name", ["thesis.tex", "metrics.json", "parts/a.pt", PROVENANCE])
+@pytest.mark.parametrize(
+    "name", ["thesis.tex", "metrics.json", "parts/a.pt", PROVENANCE]
+)
 def test_a_new_run_begins_in_an_empty_folder(tmp_path, name):
     """Logs may be there, and what was left where a run was killed as it began."""
     config = load_config("evaluate")
@@ -121,24 +154,45 @@ def test_a_new_run_begins_in_an_empty_folder(tmp_path, name):
         Run(config, tmp_path, choices={}).enter()
 
 
-def test_a_run_that_is_refused_leaves_everything_as_it_was(tmp_path, monkeypatch, capsys):
+def test_a_run_that_is_refused_leaves_everything_as_it_was(
+    tmp_path, monkeypatch, capsys
+):
     begin(tmp_path / "run")
-    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    before = {
+        path: path.read_bytes()
+        for path in (tmp_path / "run").rglob("*")
+        if path.is_file()
+    }
     monkeypatch.chdir(tmp_path)
     for script in ("evaluate.py", "train.py"):
-        status, said = call(script, [f"hydra.run.dir={tmp_path / 'run'}"], monkeypatch=monkeypatch, capsys=capsys)
-        assert status == 2 and f"has a run already; go on with it by resume={tmp_path / 'run'}" in error_line(said)
+        status, said = call(
+            script,
+            [f"hydra.run.dir={tmp_path / 'run'}"],
+            monkeypatch=monkeypatch,
+            capsys=capsys,
+        )
+        assert (
+            status == 2
+            and f"has a run already; go on with it by resume={tmp_path / 'run'}"
+            in error_line(said)
+        )
         assert call(script, ["batch=0"], monkeypatch=monkeypatch, capsys=capsys)[0] == 2
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert {
+        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()
+    } == before
 
 
 def test_runs_that_begin_in_one_second_have_a_folder_each(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with ThreadPoolExecutor(8) as pool:
         made = list(pool.map(new_folder, ["runs/x"] * 40))
-    assert len(set(made)) == 40 and all(not list((tmp_path / name).iterdir()) for name in made)
+    assert len(set(made)) == 40 and all(
+        not list((tmp_path / name).iterdir()) for name in made
+    )
     (tmp_path / "file").touch()
-    assert new_folder("file/x").startswith("file/x/"), "Hydra says that it cannot be made"
+    assert new_folder("file/x").startswith("file/x/"), (
+        "Hydra says that it cannot be made"
+    )
 
 
 def test_options_for_hydra_and_the_shell_are_quoted(tmp_path, monkeypatch):
@@ -157,7 +211,9 @@ def test_shards_are_joined_and_those_of_another_run_are_refused(tmp_path):
         run.parts().save(f"rollouts-{number:06}", [number], number)
     assert merge([tmp_path / "0", tmp_path / "1"], tmp_path / "all") == 2
     whole = begin(tmp_path / "all", resume=True, free=free)
-    assert [whole.parts().load(f"rollouts-{number:06}", [number]) for number in range(2)] == [0, 1]
+    assert [
+        whole.parts().load(f"rollouts-{number:06}", [number]) for number in range(2)
+    ] == [0, 1]
     begin(tmp_path / "other", free=free, shard=[1, 2], eta=1)
     with pytest.raises(InputError, match="began with another eta"):
         merge([tmp_path / "0", tmp_path / "other"], tmp_path / "mixed")
@@ -166,6 +222,7 @@ def test_shards_are_joined_and_those_of_another_run_are_refused(tmp_path):
 
 def test_the_files_of_a_search_s_families_are_inputs_of_a_run_that_searches():
     searched, plain = (
-        {name for name, _ in inputs(load_config("evaluate", [given]))} for given in ("tries=4", "tries=1")
+        {name for name, _ in inputs(load_config("evaluate", [given]))}
+        for given in ("tries=4", "tries=1")
     )
     assert {"synthesizer=ccdiff", "synthesizer=e2_pursuit"} <= searched - plain

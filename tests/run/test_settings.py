@@ -1,4 +1,5 @@
-"""Settings: a default stands in the YAML file only, and every value is checked against its range."""
+"""Settings: a default stands in the YAML file only, and every value is checked against
+its range."""
 
 from dataclasses import dataclass
 
@@ -39,9 +40,15 @@ class Reach:
 
 
 def test_values_that_are_not_given_are_those_of_the_file():
-    assert Reach() == Reach(look=2.5, gap=4, curve=True, kind="wide", times=(1, 2), most=None)
-    assert Reach(1.5).look == settings_of(Reach, {"look": 1.5}, where="reach").look == 1.5
-    assert settings_of(Reach, {"times": [3, 4]}, where="reach") == Reach(times=(3.0, 4.0))
+    assert Reach() == Reach(
+        look=2.5, gap=4, curve=True, kind="wide", times=(1, 2), most=None
+    )
+    assert (
+        Reach(1.5).look == settings_of(Reach, {"look": 1.5}, where="reach").look == 1.5
+    )
+    assert settings_of(Reach, {"times": [3, 4]}, where="reach") == Reach(
+        times=(3.0, 4.0)
+    )
 
 
 def test_constructors_are_filled_by_name_and_never_overruled():
@@ -58,7 +65,14 @@ def test_constructors_are_filled_by_name_and_never_overruled():
 
 @pytest.mark.parametrize(
     "values",
-    [{"gap": -1.0}, {"gap": 10.5}, {"gap": float("nan")}, {"gpa": 1.0}, {"look": "far"}, {"look": None}]
+    [
+        {"gap": -1.0},
+        {"gap": 10.5},
+        {"gap": float("nan")},
+        {"gpa": 1.0},
+        {"look": "far"},
+        {"look": None},
+    ]
     + [{"kind": "round"}, {"times": [2, 0.5]}, {"most": 2}],
 )
 def test_bad_values_name_the_group_and_the_key(values):

@@ -16,7 +16,10 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.parametrize(
     ("key", "value", "mend"),
-    [("seeds", "0,1", "'seeds=[0,1]'"), ("methods", "no anchoring, e2", "'methods=[no anchoring,e2]'")],
+    [
+        ("seeds", "0,1", "'seeds=[0,1]'"),
+        ("methods", "no anchoring, e2", "'methods=[no anchoring,e2]'"),
+    ],
 )
 def test_several_values_are_told_as_a_list(key, value, mend):
     said = f"Ambiguous value for argument '{key}={value}'\n1. To use it as a list, use key=[value1,value2]"
@@ -31,9 +34,13 @@ def test_a_name_with_spaces_is_no_list():
     check_list("seeds", 3)
 
 
-@pytest.mark.parametrize("key", ["methods", "eta", "seeds", "compare", "budget", "shard"])
+@pytest.mark.parametrize(
+    "key", ["methods", "eta", "seeds", "compare", "budget", "shard"]
+)
 def test_a_text_with_commas_is_refused_for_every_list(key):
-    with pytest.raises(InputError, match=rf"{key}=1,2: several values are a list, '{key}=\[1,2\]'"):
+    with pytest.raises(
+        InputError, match=rf"{key}=1,2: several values are a list, '{key}=\[1,2\]'"
+    ):
         evaluation_settings(load_config("evaluate", [f"{key}='1,2'"]))
 
 
@@ -54,8 +61,17 @@ run_command("evaluate", work)
 
 @pytest.mark.parametrize(("values", "status"), [("2,3", 2), ("1,2,3", 2), ("1,3", 0)])
 def test_a_sweep_goes_on_after_a_job_that_is_refused(tmp_path, values, status):
-    command = [sys.executable, "-c", SWEEP, "-m", f"batch={values}", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    command = [
+        sys.executable,
+        "-c",
+        SWEEP,
+        "-m",
+        f"batch={values}",
+        f"hydra.sweep.dir={tmp_path / 'sweep'}",
+    ]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
     names = values.split(",")
     assert done.returncode == status, done.stderr
     did = [line for line in done.stdout.splitlines() if line.startswith("did")]
@@ -66,6 +82,14 @@ def test_a_sweep_goes_on_after_a_job_that_is_refused(tmp_path, values, status):
 
 
 def test_a_job_alone_that_is_refused_says_so_once(tmp_path):
-    command = [sys.executable, "-c", SWEEP, "batch=2", f"hydra.run.dir={tmp_path / 'run'}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    command = [
+        sys.executable,
+        "-c",
+        SWEEP,
+        "batch=2",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    ]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 2 and done.stderr == "error: batch=2: refused\n"

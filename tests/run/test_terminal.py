@@ -1,4 +1,5 @@
-"""A command that writes into a file says now and then how far it is; what it says of the rest is measured."""
+"""A command that writes into a file says now and then how far it is; what it says of
+the rest is measured."""
 
 import io
 import sys
@@ -28,7 +29,10 @@ def test_in_a_file_there_are_lines_at_the_pace_so_far(monkeypatch):
     assert lines[0] == "rollouts: 3 of 40 after 12 s, about 2 min left"
     assert len(lines) == 5 and not any("\r" in line for line in lines)
     counts = [int(line.split()[1]) for line in lines]
-    assert all(4.0 * (after - before) >= terminal.EVERY for before, after in zip(counts, counts[1:], strict=False))
+    assert all(
+        4.0 * (after - before) >= terminal.EVERY
+        for before, after in zip(counts, counts[1:], strict=False)
+    )
 
 
 def test_short_work_says_nothing_in_a_file(monkeypatch):
@@ -46,4 +50,9 @@ def test_a_terminal_has_a_bar(monkeypatch):
 
 
 def test_a_duration_has_its_sensible_units():
-    assert [duration(seconds) for seconds in (0.2, 29, 90, 7300)] == ["1 s", "29 s", "2 min", "2 h 2 min"]
+    assert [duration(seconds) for seconds in (0.2, 29, 90, 7300)] == [
+        "1 s",
+        "29 s",
+        "2 min",
+        "2 h 2 min",
+    ]

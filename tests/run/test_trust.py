@@ -1,5 +1,5 @@
-"""A stranger's run folder runs no code, starts no program, sends no key and writes nowhere that the command line does
-not name, and takes little to read."""
+"""A stranger's run folder runs no code, starts no program, sends no key and writes
+nowhere that the command line does not name, and takes little to read."""
 
 import os
 
@@ -8,7 +8,14 @@ from omegaconf import OmegaConf
 
 from e2rl.run.config import choices, load_choice, load_config
 from e2rl.run.errors import InputError
-from e2rl.run.trust import CONFIG, check_code, check_written, outside_modules, saved_configuration, written_outside
+from e2rl.run.trust import (
+    CONFIG,
+    check_code,
+    check_written,
+    outside_modules,
+    saved_configuration,
+    written_outside,
+)
 
 POLICY_FILE = "e2rl.planners.policy_file.PolicyFileEgo"
 
@@ -17,7 +24,9 @@ def plain(config):
     return OmegaConf.create(OmegaConf.to_container(config))
 
 
-TRAIN, EVALUATE, TUNE = (plain(load_config(name)) for name in ("train", "evaluate", "tune"))
+TRAIN, EVALUATE, TUNE = (
+    plain(load_config(name)) for name in ("train", "evaluate", "tune")
+)
 changed = OmegaConf.merge
 
 
@@ -27,7 +36,9 @@ def with_choice(group, name, **changes):
 
 def written(folder, content):
     (folder / CONFIG).parent.mkdir(parents=True, exist_ok=True)
-    (folder / CONFIG).write_bytes(content if isinstance(content, bytes) else OmegaConf.to_yaml(content).encode())
+    (folder / CONFIG).write_bytes(
+        content if isinstance(content, bytes) else OmegaConf.to_yaml(content).encode()
+    )
     return folder
 
 
@@ -58,7 +69,11 @@ def test_every_file_of_ones_own_goes_on(tmp_path, group):
 
 
 def test_a_policy_that_holds_arithmetic_goes_on():
-    check_code(changed(EVALUATE, {"ego": {"_target_": POLICY_FILE, "file": "x.onnx"}}), [], where="x")
+    check_code(
+        changed(EVALUATE, {"ego": {"_target_": POLICY_FILE, "file": "x.onnx"}}),
+        [],
+        where="x",
+    )
 
 
 @pytest.mark.parametrize(
@@ -68,26 +83,38 @@ def test_a_policy_that_holds_arithmetic_goes_on():
         {"data": {"_target_": "torch.load"}},
         {"synthesizer": {"deep": [{"x": [{"_target_": "pickle.loads"}]}]}},
         {"ego": {"_target_": "e2rl.run.files.write_atomically"}},  # a function of e2rl
-        {"ego": {"_target_": "e2rl.learning.memory.Memory"}},  # a class of e2rl that is no extension
-        {"ego": {"_target_": "e2rl.run.run.subprocess.Popen"}},  # by way of a module that imports it
-        {"ego": {"_target_": "e2rl.evaluation.ego_set.Ego"}},  # an extension, but not where it is defined
+        {
+            "ego": {"_target_": "e2rl.learning.memory.Memory"}
+        },  # a class of e2rl that is no extension
+        {
+            "ego": {"_target_": "e2rl.run.run.subprocess.Popen"}
+        },  # by way of a module that imports it
+        {
+            "ego": {"_target_": "e2rl.evaluation.ego_set.Ego"}
+        },  # an extension, but not where it is defined
         {"ego": {"_target_": "e2rl.scripts.train.run"}},
         {"ego": {"_target_": "e2rl.no.such.Class"}},
         {"ego": {"_target_": "${seed}"}},
         {"plugins": ["this"]},
-        {"variants": {"x": {"synthesizer._target_": "os.system"}}},  # a change's key is a path
+        {
+            "variants": {"x": {"synthesizer._target_": "os.system"}}
+        },  # a change's key is a path
         {"variants": {"x": {"synthesizer[_target_]": "os.system"}}},
         {"egos": {"x": {"ego": "idm", "teacher._target_": ["os.system"]}}},
         with_choice("ego", "external", command="true"),  # a program of the stranger's
         with_choice("ego", "external", command=["true"]),
         with_choice("ego", "external", address="else:1"),
         {"egos": {"x": {"ego": "external", "[address]": "else:1"}}},
-        {"ego": {"_target_": POLICY_FILE, "file": "policy.pt"}},  # a TorchScript file is a program
+        {
+            "ego": {"_target_": POLICY_FILE, "file": "policy.pt"}
+        },  # a TorchScript file is a program
         {"egos": {"x": {"ego": "policy_file", "file": "policy.pt"}}},
     ],
 )
 def test_code_from_elsewhere_needs_the_users_consent(changes):
-    with pytest.raises(InputError, match="runs code that is no extension of e2rl: .*plugins="):
+    with pytest.raises(
+        InputError, match="runs code that is no extension of e2rl: .*plugins="
+    ):
         check_code(changed(EVALUATE, changes), ["my_stack"], where="resume=x")
 
 
@@ -106,7 +133,10 @@ def test_of_hydras_keys_a_saved_configuration_has_targets_only(key, place):
 
 
 def test_modules_that_the_command_line_names_take_part():
-    mine = {"ego": {"_target_": "my_stack.cruise.Cruise"}, "plugins": ["my_stack.hard_braking"]}
+    mine = {
+        "ego": {"_target_": "my_stack.cruise.Cruise"},
+        "plugins": ["my_stack.hard_braking"],
+    }
     config = changed(TRAIN, mine)
     check_code(config, ["my_stack"], where="resume=x")
     check_code(config, ["my_stack.cruise", "my_stack.hard_braking"], where="resume=x")
@@ -117,15 +147,23 @@ def test_modules_that_the_command_line_names_take_part():
     check_code(external, ["e2rl.planners.external"], where="resume=x")
 
 
-@pytest.mark.parametrize("name", ["../../stranger/evil", "/tmp/evil", "a/../b", ".hidden", "nominal,e2", "${x}", ""])
+@pytest.mark.parametrize(
+    "name",
+    ["../../stranger/evil", "/tmp/evil", "a/../b", ".hidden", "nominal,e2", "${x}", ""],
+)
 def test_a_group_s_file_is_in_its_folder(name):
-    """Methods and egos of a stranger's run name files of the user's own configuration only."""
+    """Methods and egos of a stranger's run name files of the user's own configuration
+    only."""
     with pytest.raises(InputError, match="no name of a file in conf/synthesizer"):
         load_choice("synthesizer", name)
 
 
-LINES = "\n".join(f"a{k}: '${{a{k + 1}}}${{a{k + 1}}}'" for k in range(40)) + "\na40: x\n"
-ALIASES = "a0: &a0 [x]\n" + "\n".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]" for k in range(9))
+LINES = (
+    "\n".join(f"a{k}: '${{a{k + 1}}}${{a{k + 1}}}'" for k in range(40)) + "\na40: x\n"
+)
+ALIASES = "a0: &a0 [x]\n" + "\n".join(
+    f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]" for k in range(9)
+)
 RUN = OmegaConf.to_yaml(EVALUATE)
 
 
@@ -140,9 +178,18 @@ RUN = OmegaConf.to_yaml(EVALUATE)
         (b"a: [" + b"x, " * 50_000 + b"]", "damaged .*more than a run's"),
         ((RUN + ALIASES).encode(), "damaged .*aliases"),
         ((RUN + LINES).encode(), "damaged .*refers to what refers to others"),
-        (changed(EVALUATE, {"x": "${oc.decode:'{_target_: os.system}'}"}), "refers to more than a key"),
-        (changed(EVALUATE, {"x": r"\${oc.decode:'{_target_: os.system}'}"}), "refers to more than a key"),
-        (changed(EVALUATE, {"x": "${y}${z}", "y": "$", "z": "{oc.env:HOME}"}), "refers to what"),
+        (
+            changed(EVALUATE, {"x": "${oc.decode:'{_target_: os.system}'}"}),
+            "refers to more than a key",
+        ),
+        (
+            changed(EVALUATE, {"x": r"\${oc.decode:'{_target_: os.system}'}"}),
+            "refers to more than a key",
+        ),
+        (
+            changed(EVALUATE, {"x": "${y}${z}", "y": "$", "z": "{oc.env:HOME}"}),
+            "refers to what",
+        ),
         (changed(EVALUATE, {"methods": ["${hydra:job.name}"]}), "refers to more"),
         (changed(EVALUATE, {"x": "${sim}${sim}"}), "sim, which is no plain"),
         (changed(EVALUATE, {"x": "${nothing}"}), "nothing, which is not there"),
@@ -157,7 +204,9 @@ def test_a_configuration_that_is_none_is_named_before_it_grows(tmp_path, content
         reading(tmp_path, content)
 
 
-@pytest.mark.parametrize("name", [str(CONFIG), "parts", "rollouts", "checkpoints/round-000001", "parts/a.pt"])
+@pytest.mark.parametrize(
+    "name", [str(CONFIG), "parts", "rollouts", "checkpoints/round-000001", "parts/a.pt"]
+)
 @pytest.mark.parametrize("kind", ["link", "pipe", "device"])
 def test_links_out_of_the_folder_pipes_and_devices_are_refused(tmp_path, name, kind):
     folder = written(tmp_path / "run", EVALUATE)
@@ -170,7 +219,9 @@ def test_links_out_of_the_folder_pipes_and_devices_are_refused(tmp_path, name, k
     place = folder / name
     place.parent.mkdir(parents=True, exist_ok=True)
     place.unlink(missing_ok=True)
-    os.mkfifo(place) if kind == "pipe" else place.symlink_to(outside if kind == "link" else "/dev/zero")
+    os.mkfifo(place) if kind == "pipe" else place.symlink_to(
+        outside if kind == "link" else "/dev/zero"
+    )
     with pytest.raises(InputError, match="a link out of|no regular file|no run found"):
         saved_configuration(EVALUATE, folder, where="resume=x")
 
@@ -186,7 +237,9 @@ def test_an_endpoint_gets_no_key_unasked(tmp_path, changes):
     content = changed(EVALUATE, changes)
     with pytest.raises(InputError, match="sends your API key to http://else"):
         reading(tmp_path, content)
-    agreed = changed(EVALUATE, {"synthesizer": {"reasoner": {"base_url": "http://else"}}})
+    agreed = changed(
+        EVALUATE, {"synthesizer": {"reasoner": {"base_url": "http://else"}}}
+    )
     assert reading(tmp_path, content, config=agreed)
 
 
@@ -194,18 +247,31 @@ def test_an_endpoint_gets_no_key_unasked(tmp_path, changes):
     ("changes", "option"),
     [
         ({"data": {"cache": "{}"}}, "data.cache={}"),
-        ({"data": {"cache_gb": 0}}, "data.cache_gb=0"),  # of the user's cache nothing would be left
+        (
+            {"data": {"cache_gb": 0}},
+            "data.cache_gb=0",
+        ),  # of the user's cache nothing would be left
         ({"tuning": {"study": "{}"}}, "tuning.study={}"),
-        ({"synthesizer": {"reasoner": {"cache": "{}"}}}, "synthesizer.reasoner.cache={}"),
-        ({"variants": {"x": {"synthesizer.reasoner.cache": "{}"}}}, "synthesizer.reasoner.cache={}"),
+        (
+            {"synthesizer": {"reasoner": {"cache": "{}"}}},
+            "synthesizer.reasoner.cache={}",
+        ),
+        (
+            {"variants": {"x": {"synthesizer.reasoner.cache": "{}"}}},
+            "synthesizer.reasoner.cache={}",
+        ),
         ({"data": {"cache": "${resume}"}, "resume": "{}"}, "data.cache={}"),
     ],
 )
-def test_paths_to_write_to_are_in_the_folder_or_on_the_command_line(tmp_path, changes, option):
+def test_paths_to_write_to_are_in_the_folder_or_on_the_command_line(
+    tmp_path, changes, option
+):
     """Links count by where they lead; the option that is told is the one that goes on."""
 
     def at(path):
-        return changed(TUNE, OmegaConf.create(OmegaConf.to_yaml(changes).replace("{}", str(path))))
+        return changed(
+            TUNE, OmegaConf.create(OmegaConf.to_yaml(changes).replace("{}", str(path)))
+        )
 
     run = tmp_path / "run"
     outside = tmp_path / "else"

@@ -1,4 +1,5 @@
-"""Small ScenarioDescription dicts with known answers: a road along +x that forks at x = 100 m."""
+"""Small ScenarioDescription dicts with known answers: a road along +x that forks at x =
+100 m."""
 
 import pickle
 import zipfile
@@ -12,10 +13,16 @@ FRAMES = 91
 ALL = np.arange(FRAMES)
 
 
-def track(position, heading, speed, kind: str = "VEHICLE", valid=None, size=(4.5, 1.9)) -> dict:
-    """A track through position [F, 2] m with heading [F] rad and speed [F] m/s (scalars broadcast)."""
+def track(
+    position, heading, speed, kind: str = "VEHICLE", valid=None, size=(4.5, 1.9)
+) -> dict:
+    """A track through position [F, 2] m with heading [F] rad and speed [F] m/s (scalars
+    broadcast)."""
     position = np.broadcast_to(np.asarray(position, float), (FRAMES, 2))
-    heading, speed = (np.broadcast_to(np.asarray(value, float), (FRAMES,)).copy() for value in (heading, speed))
+    heading, speed = (
+        np.broadcast_to(np.asarray(value, float), (FRAMES,)).copy()
+        for value in (heading, speed)
+    )
     velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
     return {
         "type": kind,
@@ -32,7 +39,12 @@ def track(position, heading, speed, kind: str = "VEHICLE", valid=None, size=(4.5
 
 def straight(x: float, y: float, speed: float, **options) -> dict:
     """A track along +x at constant speed, at (x, y) at frame 0."""
-    return track(np.stack([x + 0.1 * speed * ALL, np.full(FRAMES, y)], 1), 0.0, speed=speed, **options)
+    return track(
+        np.stack([x + 0.1 * speed * ALL, np.full(FRAMES, y)], 1),
+        0.0,
+        speed=speed,
+        **options,
+    )
 
 
 def lane(points, exits=(), speed_kmh: float = 50.0, width: float = 3.6, **more) -> dict:
@@ -49,7 +61,8 @@ def lane(points, exits=(), speed_kmh: float = 50.0, width: float = 3.6, **more) 
 
 
 def fork(connected: bool = True) -> dict:
-    """`in` (x = 0..100, y = 0), then `on` straight to x = 400 and `left`, an arc of radius 20 m up to y = 320.
+    """`in` (x = 0..100, y = 0), then `on` straight to x = 400 and `left`, an arc of
+    radius 20 m up to y = 320.
 
     `near` runs beside `in` at y = 3.5 and goes on in nothing.
     """
@@ -66,8 +79,11 @@ def fork(connected: bool = True) -> dict:
     }
 
 
-def description(tracks: dict | None = None, lanes: dict | None = None, **metadata) -> dict:
-    """A scenario of tracks (default: the ego at 8 m/s on `in`, a car ahead on `near`, a pedestrian) on the fork."""
+def description(
+    tracks: dict | None = None, lanes: dict | None = None, **metadata
+) -> dict:
+    """A scenario of tracks (default: the ego at 8 m/s on `in`, a car ahead on `near`, a
+    pedestrian) on the fork."""
     tracks = tracks or {
         "ego": straight(20, 0, speed=8),
         "7": straight(50, 3.5, speed=6),
@@ -124,15 +140,25 @@ class Malicious:
 
 
 def recordings_in(
-    kind: type[LogFiles], content: bytes, log: str = "made.pkl", place: str = "place", **settings
+    kind: type[LogFiles],
+    content: bytes,
+    log: str = "made.pkl",
+    place: str = "place",
+    **settings,
 ) -> list:
     """What a source makes of one log."""
     source = kind("nowhere", **settings)
-    vars(source).update(logs=lambda: [log], content=lambda _: content, locations={Path(log).stem: place})
+    vars(source).update(
+        logs=lambda: [log], content=lambda _: content, locations={Path(log).stem: place}
+    )
     return list(source.recordings())
 
 
 def data_config(path, cache, **options) -> dict:
     """The scenarionet group with small fields."""
-    group = {"_target_": "e2rl.scenes.scenarionet.ScenarioNetSource", "path": str(path), "cache": str(cache)}
+    group = {
+        "_target_": "e2rl.scenes.scenarionet.ScenarioNetSource",
+        "path": str(path),
+        "cache": str(cache),
+    }
     return group | {"workers": 1, "build": {"field_cells": 64}} | options

@@ -13,8 +13,12 @@ def boxes():
     generator = torch.Generator().manual_seed(0)
 
     def draw():
-        pose = torch.rand(10_000, 3, generator=generator, dtype=torch.float64) * torch.tensor([12.0, 12.0, 6.3])
-        return pose, 0.3 + torch.rand(10_000, 2, generator=generator, dtype=torch.float64) * torch.tensor([8.0, 3.0])
+        pose = torch.rand(
+            10_000, 3, generator=generator, dtype=torch.float64
+        ) * torch.tensor([12.0, 12.0, 6.3])
+        return pose, 0.3 + torch.rand(
+            10_000, 2, generator=generator, dtype=torch.float64
+        ) * torch.tensor([8.0, 3.0])
 
     first = draw()
     second = draw()
@@ -38,16 +42,35 @@ def test_distance_agrees_with_shapely(boxes):
 
 
 def test_penetration_is_the_shortest_way_apart(boxes):
-    """Moving one box by the penetration depth along the best axis just ends the overlap."""
+    """Moving one box by the penetration depth along the best axis just ends the
+    overlap."""
     first, second, _ = boxes
     depth = signed_distance(*first, *second)
     inside = depth < -1e-6
     moved = []
     for turn in (0.0, torch.pi / 2, torch.pi, -torch.pi / 2):
         for pose in (first[0], second[0]):
-            way = torch.stack([(pose[:, 2] + turn).cos(), (pose[:, 2] + turn).sin(), torch.zeros(len(pose))], -1)
-            moved.append(separation(first[0], first[1], second=second[0] - way * depth[:, None], second_size=second[1]))
-    assert torch.allclose(torch.stack(moved).amax(0)[inside].clamp(max=0), torch.zeros(()).double(), atol=1e-6)
+            way = torch.stack(
+                [
+                    (pose[:, 2] + turn).cos(),
+                    (pose[:, 2] + turn).sin(),
+                    torch.zeros(len(pose)),
+                ],
+                -1,
+            )
+            moved.append(
+                separation(
+                    first[0],
+                    first[1],
+                    second=second[0] - way * depth[:, None],
+                    second_size=second[1],
+                )
+            )
+    assert torch.allclose(
+        torch.stack(moved).amax(0)[inside].clamp(max=0),
+        torch.zeros(()).double(),
+        atol=1e-6,
+    )
 
 
 def test_rigid_motion_and_order_do_not_matter(boxes):
@@ -60,5 +83,10 @@ def test_rigid_motion_and_order_do_not_matter(boxes):
         turned = pose[:, :2] @ rotation.T + torch.tensor([3.0, -7.0])
         return torch.cat([turned, pose[:, 2:] + torch.atan2(sin, cos)], 1)
 
-    assert torch.allclose(signed_distance(move(first[0]), first[1], second=move(second[0]), second_size=second[1]), before)
+    assert torch.allclose(
+        signed_distance(
+            move(first[0]), first[1], second=move(second[0]), second_size=second[1]
+        ),
+        before,
+    )
     assert torch.allclose(signed_distance(*second, *first), before)

@@ -1,4 +1,5 @@
-"""Placeholders of speed limits: what no road has, and a high one that map and traffic contradict."""
+"""Placeholders of speed limits: what no road has, and a high one that map and traffic
+contradict."""
 
 import numpy as np
 import pytest
@@ -17,9 +18,11 @@ def bend(radius: float) -> np.ndarray:
 STRAIGHT = np.array([[-100.0, 0], [100, 0]])
 
 
-def limits(*lanes: tuple[np.ndarray, float], speed: float) -> tuple[list[float], list[int]]:
-    """What is left of the limits [km/h] of lanes on which a car drives at `speed` m/s, and the numbers of those that
-    are not."""
+def limits(
+    *lanes: tuple[np.ndarray, float], speed: float
+) -> tuple[list[float], list[int]]:
+    """What is left of the limits [km/h] of lanes on which a car drives at `speed` m/s,
+    and the numbers of those that are not."""
     states = np.zeros((91, 1, 4))
     states[:, 0, 0], states[:, 0, 3] = 0.1 * speed * np.arange(91), speed
     recording = Recording(
@@ -31,10 +34,15 @@ def limits(*lanes: tuple[np.ndarray, float], speed: float) -> tuple[list[float],
         size=np.array([[4.5, 1.9]]),
         agent_type=np.array([VEHICLE]),
         ego=0,
-        lanes={str(k): Lane(points, speed_limit=limit / 3.6) for k, (points, limit) in enumerate(lanes)},
+        lanes={
+            str(k): Lane(points, speed_limit=limit / 3.6)
+            for k, (points, limit) in enumerate(lanes)
+        },
     )
     known, repairs = known_limits(recording)
-    return [round(3.6 * lane.speed_limit, 1) for lane in known.values()], list(repairs.values())
+    return [round(3.6 * lane.speed_limit, 1) for lane in known.values()], list(
+        repairs.values()
+    )
 
 
 @pytest.mark.parametrize("value", [255.0, 1000.0])
@@ -43,8 +51,13 @@ def test_a_limit_beyond_any_is_none_and_others_of_the_map_stay(value):
 
 
 def test_the_one_high_limit_of_a_map_that_stands_on_turns_of_an_intersection_is_none():
-    assert limits((STRAIGHT, 0), (bend(10), 100), (STRAIGHT, 100), speed=9) == ([0.0, 0.0, 0.0], [2])
-    assert limits((bend(10), 100), speed=20)[0] == [0.0], "no car takes that bend so fast, whoever drives fast beside"
+    assert limits((STRAIGHT, 0), (bend(10), 100), (STRAIGHT, 100), speed=9) == (
+        [0.0, 0.0, 0.0],
+        [2],
+    )
+    assert limits((bend(10), 100), speed=20)[0] == [0.0], (
+        "no car takes that bend so fast, whoever drives fast beside"
+    )
 
 
 def test_more_than_nearly_all_roads_have_is_none_where_nobody_drives_so_fast():
@@ -54,11 +67,17 @@ def test_more_than_nearly_all_roads_have_is_none_where_nobody_drives_so_fast():
 
 @pytest.mark.parametrize("speed", [0, 3, 28])
 def test_a_motorway_keeps_its_limit_in_a_jam_too(speed):
-    assert limits((STRAIGHT, 100), (bend(400), 100), speed=speed) == ([100.0, 100.0], [])
+    assert limits((STRAIGHT, 100), (bend(400), 100), speed=speed) == (
+        [100.0, 100.0],
+        [],
+    )
 
 
 LONG = np.array([[-300.0, 0], [900, 0]])
-RAMP = 60 * np.stack([np.cos(np.linspace(0, 1.5 * np.pi, 60)), np.sin(np.linspace(0, 1.5 * np.pi, 60))], 1)
+RAMP = 60 * np.stack(
+    [np.cos(np.linspace(0, 1.5 * np.pi, 60)), np.sin(np.linspace(0, 1.5 * np.pi, 60))],
+    1,
+)
 KINKED = np.array([[-300.0, 0], [500, 0], [499, 0.1], [512, 0], [520, 0], [900, 0]])
 
 
@@ -77,5 +96,8 @@ def test_connectors_of_an_intersection_lead_straight_on_too(turns):
 
 def test_a_map_with_several_limits_knows_them():
     """Converters give the turns of an intersection the limit of their road."""
-    assert limits((STRAIGHT, 90), (bend(10), 90), (STRAIGHT, 50), speed=9) == ([90.0, 90.0, 50.0], [])
+    assert limits((STRAIGHT, 90), (bend(10), 90), (STRAIGHT, 50), speed=9) == (
+        [90.0, 90.0, 50.0],
+        [],
+    )
     assert limits((STRAIGHT, 50), (bend(8), 50), speed=5) == ([50.0, 50.0], [])

@@ -7,11 +7,18 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.log_files import bounded_memory
 
 
-@pytest.mark.parametrize("allocate", [np.ones, lambda size: bytearray(8 * size), lambda size: [None] * size])
+@pytest.mark.parametrize(
+    "allocate", [np.ones, lambda size: bytearray(8 * size), lambda size: [None] * size]
+)
 def test_what_asks_for_more_memory_than_a_log_may_take_is_refused(allocate):
     size = 1 << 24
     with bounded_memory(1 << 30):
         allocate(size)
-    with pytest.raises(InputError, match="more than the 67 MB of memory of a log; cut it"), bounded_memory(1 << 26):
+    with (
+        pytest.raises(
+            InputError, match="more than the 67 MB of memory of a log; cut it"
+        ),
+        bounded_memory(1 << 26),
+    ):
         allocate(size)
     allocate(size)

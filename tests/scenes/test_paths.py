@@ -11,4 +11,6 @@ def test_a_circle_shifted_left_is_a_circle():
     circle = 30.0 * np.stack([np.cos(angle), np.sin(angle)], -1)
     moved = shift_left(circle, 2.0)
     assert np.allclose(np.linalg.norm(moved, axis=-1), 28.0, atol=0.02)
-    assert arc_length(moved)[-1] == pytest.approx(arc_length(circle)[-1] * 28 / 30, rel=1e-3)
+    assert arc_length(moved)[-1] == pytest.approx(
+        arc_length(circle)[-1] * 28 / 30, rel=1e-3
+    )

@@ -1,4 +1,5 @@
-"""Pickles of plain data: what `pickle` would read comes out, whatever else a file says is refused, at bounded cost."""
+"""Pickles of plain data: what `pickle` would read comes out, whatever else a file says
+is refused, at bounded cost."""
 
 import collections
 import os
@@ -31,20 +32,39 @@ ARRAYS = arrays.arrays(
         arrays.boolean_dtypes(),
         *(
             kind(endianness="?")
-            for kind in (arrays.integer_dtypes, arrays.floating_dtypes, arrays.unicode_string_dtypes)
+            for kind in (
+                arrays.integer_dtypes,
+                arrays.floating_dtypes,
+                arrays.unicode_string_dtypes,
+            )
         ),
     ),
     arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
 )
 LEAVES = st.one_of(
-    *(st.none(), st.booleans(), st.floats(), st.integers(-(2**63), 2**63), st.text(), st.binary()),
-    *(st.complex_numbers(), st.sets(st.text()), st.frozensets(st.integers(0, 9)), st.binary().map(bytearray), ARRAYS),
+    *(
+        st.none(),
+        st.booleans(),
+        st.floats(),
+        st.integers(-(2**63), 2**63),
+        st.text(),
+        st.binary(),
+    ),
+    *(
+        st.complex_numbers(),
+        st.sets(st.text()),
+        st.frozensets(st.integers(0, 9)),
+        st.binary().map(bytearray),
+        ARRAYS,
+    ),
 )
 PLAIN = st.recursive(
     LEAVES,
     lambda parts: st.one_of(
         *(st.lists(parts), st.tuples(parts, parts), st.dictionaries(st.text(), parts)),
-        st.dictionaries(st.integers(0, 9), parts).map(lambda data: collections.defaultdict(list, data)),
+        st.dictionaries(st.integers(0, 9), parts).map(
+            lambda data: collections.defaultdict(list, data)
+        ),
         st.lists(parts, max_size=3).map(objects),
     ),
     max_leaves=12,
@@ -55,14 +75,23 @@ def same(ours, theirs) -> bool:
     """Whether two pieces of plain data are equal, bit for bit."""
     if isinstance(theirs, np.ndarray):
         theirs = theirs.astype(theirs.dtype.newbyteorder("="))
-        alike = isinstance(ours, np.ndarray) and (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype)
+        alike = isinstance(ours, np.ndarray) and (ours.shape, ours.dtype) == (
+            theirs.shape,
+            theirs.dtype,
+        )
         if theirs.dtype == object:
             return alike and all(map(same, ours.ravel(), theirs.ravel()))
         return alike and ours.tobytes() == theirs.tobytes()
     if isinstance(theirs, list | tuple):
-        return type(ours) is type(theirs) and len(ours) == len(theirs) and all(map(same, ours, theirs))
+        return (
+            type(ours) is type(theirs)
+            and len(ours) == len(theirs)
+            and all(map(same, ours, theirs))
+        )
     if isinstance(theirs, dict):
-        return list(ours) == list(theirs) and all(same(ours[key], theirs[key]) for key in theirs)
+        return list(ours) == list(theirs) and all(
+            same(ours[key], theirs[key]) for key in theirs
+        )
     return ours == theirs or repr(ours) == repr(theirs)  # NaN
 
 
@@ -91,7 +120,10 @@ ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tC\x01bt
 
 
 def array(
-    shape: bytes, dtype: bytes, data: bytes, state: bytes = b"(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00t"
+    shape: bytes,
+    dtype: bytes,
+    data: bytes,
+    state: bytes = b"(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00t",
 ) -> bytes:
     return (
         b"\x80\x03"
@@ -126,14 +158,26 @@ ATTACKS = {
     "ndarray of a shape": b"\x80\x04cnumpy\nndarray\n" + HUGE + b"\x85\x85R.",
     "array of a shape": array(HUGE + b"\x85", b"f8", data=b"C\x08" + bytes(8)) + b".",
     "array of no bytes": array(HUGE + b"K\x00\x86", b"f8", data=b"C\x00") + b".",
-    "array longer than its bytes": array(b"K\x09\x85", b"f8", data=b"C\x08" + bytes(8)) + b".",
+    "array longer than its bytes": array(b"K\x09\x85", b"f8", data=b"C\x08" + bytes(8))
+    + b".",
     "array of pointers": array(b"K\x01\x85", b"O", data=b"C\x08" + b"A" * 8) + b".",
-    "dtype with fields": array(b"K\x01\x85", b"f8", data=b"C\x08" + bytes(8), state=b"(K\x03U\x01<N)}K\x08K\x08K\x00t") + b".",
-    "dtype of structures": array(b"K\x01\x85", b"O,O", data=b"C\x10" + b"A" * 16) + b".",
+    "dtype with fields": array(
+        b"K\x01\x85",
+        b"f8",
+        data=b"C\x08" + bytes(8),
+        state=b"(K\x03U\x01<N)}K\x08K\x08K\x00t",
+    )
+    + b".",
+    "dtype of structures": array(b"K\x01\x85", b"O,O", data=b"C\x10" + b"A" * 16)
+    + b".",
     "dtype of void": array(b"K\x01\x85", b"V8", data=b"C\x08" + bytes(8)) + b".",
-    "text beyond Unicode": array(b"K\x01\x85", b"U1", data=b"C\x04" + b"\xff" * 4) + b".",
+    "text beyond Unicode": array(b"K\x01\x85", b"U1", data=b"C\x04" + b"\xff" * 4)
+    + b".",
     "unbuilt": b"\x80\x03" + ARRAY + b"}" + b"\x94.",
-    "number of a megabyte": b"\x80\x04\x8b" + struct.pack("<I", 10**6) + b"\x7f" * 10**6 + b".",
+    "number of a megabyte": b"\x80\x04\x8b"
+    + struct.pack("<I", 10**6)
+    + b"\x7f" * 10**6
+    + b".",
     "marks": b"(" * 10_000 + b".",
     "persistent": b"\x80\x04}Q.",
     "extension": b"\x80\x04\x82\x01.",
@@ -170,19 +214,45 @@ def test_forbidden_classes_are_refused_by_name_and_never_run(tmp_path):
         (eval, f"open({str(mark)!r}, 'w')"),
         (np.load, str(mark)),
     )
-    calls += (os.mkdir, str(mark)), (np.save, str(mark), 1), (getattr, "a", "upper"), (collections.OrderedDict,)
-    contents = [pickle.dumps({"x": Malicious(*call)}, protocol) for call in calls for protocol in range(6)]
-    names = ["numpy ndarray.tofile", "numpy fromfile", "numpy.core.multiarray fromfile", "numpy.testing dtype"]
-    names += ["builtins eval", "builtins getattr", "collections namedtuple", "numpy.core multiarray", "numpy_core x"]
+    calls += (
+        (os.mkdir, str(mark)),
+        (np.save, str(mark), 1),
+        (getattr, "a", "upper"),
+        (collections.OrderedDict,),
+    )
+    contents = [
+        pickle.dumps({"x": Malicious(*call)}, protocol)
+        for call in calls
+        for protocol in range(6)
+    ]
+    names = [
+        "numpy ndarray.tofile",
+        "numpy fromfile",
+        "numpy.core.multiarray fromfile",
+        "numpy.testing dtype",
+    ]
+    names += [
+        "builtins eval",
+        "builtins getattr",
+        "collections namedtuple",
+        "numpy.core multiarray",
+        "numpy_core x",
+    ]
     for content in contents + [by_name(*name.split()) for name in names]:
-        with pytest.raises(InputError, match=r"made\.pkl: cannot be read: names the forbidden class"):
+        with pytest.raises(
+            InputError, match=r"made\.pkl: cannot be read: names the forbidden class"
+        ):
             safe_load(content, "made.pkl")
     assert not mark.exists()
 
 
 @pytest.mark.parametrize("protocol", [3, 4, 5])
 def test_arrays_of_both_numpys_are_read(protocol):
-    held = {"a": np.arange(6.0).reshape(2, 3), "b": np.float32(2.5), "c": np.array(["x", None], object)}
+    held = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "b": np.float32(2.5),
+        "c": np.array(["x", None], object),
+    }
     old = new = pickle.dumps(held, protocol)
     for name in (b"numpy._core.multiarray", b"numpy._core.numeric"):
         shorter = name.replace(b"_core", b"core")
@@ -190,10 +260,15 @@ def test_arrays_of_both_numpys_are_read(protocol):
             name = bytes([len(name)]) + name
             shorter = bytes([len(shorter)]) + shorter
         old = old.replace(name, shorter)
-    old = old[:2] + old[11:] if old[2:3] == b"\x95" else old  # without the frame, whose length changed
+    old = (
+        old[:2] + old[11:] if old[2:3] == b"\x95" else old
+    )  # without the frame, whose length changed
     assert old != new and b"numpy._core" not in old
     for content in (new, old):
-        assert all(np.array_equal(value, held[key]) for key, value in safe_load(content, "made.pkl").items())
+        assert all(
+            np.array_equal(value, held[key])
+            for key, value in safe_load(content, "made.pkl").items()
+        )
 
 
 def test_limits_stop_long_programs(monkeypatch):
@@ -207,4 +282,8 @@ def test_limits_stop_long_programs(monkeypatch):
 
 def test_bytes_that_are_no_truth_values_count_as_true():
     found = load_plain(array(b"K\x03\x85", b"b1", data=b"C\x03\x00\x01\x07") + b".")
-    assert found.tolist() == [False, True, True] and found.view(np.uint8).tolist() == [0, 1, 1]
+    assert found.tolist() == [False, True, True] and found.view(np.uint8).tolist() == [
+        0,
+        1,
+        1,
+    ]

@@ -12,7 +12,9 @@ from tests.loops import CROSSING, loop, track
 def wavy(seed: int, count: int = 60) -> torch.Tensor:
     """A route [P, 2] of chords SPACING long whose heading wanders slowly."""
     generator = torch.Generator().manual_seed(seed)
-    heading = (0.12 * torch.randn(count, generator=generator, dtype=torch.float64)).cumsum(0)
+    heading = (
+        0.12 * torch.randn(count, generator=generator, dtype=torch.float64)
+    ).cumsum(0)
     step = SPACING * torch.stack([heading.cos(), heading.sin()], -1)
     return torch.cat([torch.zeros(1, 2, dtype=torch.float64), step.cumsum(0)])
 
@@ -21,16 +23,25 @@ def wavy(seed: int, count: int = 60) -> torch.Tensor:
 def test_projection_is_shapelys(seed):
     route = wavy(seed)
     generator = torch.Generator().manual_seed(seed + 9)
-    s = torch.rand(50, generator=generator, dtype=torch.float64) * (SPACING * (len(route) - 2)) + 1
+    s = (
+        torch.rand(50, generator=generator, dtype=torch.float64)
+        * (SPACING * (len(route) - 2))
+        + 1
+    )
     base, heading, _ = interpolate(route, s)
     aside = 6 * torch.rand(50, generator=generator, dtype=torch.float64) - 3
     points = base + aside[:, None] * torch.stack([-heading.sin(), heading.cos()], -1)
     line = LineString(route.tolist())
     along, offset, _ = project(points, route)
     oracle = [Point(*point.tolist()) for point in points]
-    distance = torch.tensor([line.distance(point) for point in oracle], dtype=torch.float64)
+    distance = torch.tensor(
+        [line.distance(point) for point in oracle], dtype=torch.float64
+    )
     assert offset.abs().allclose(distance, atol=1e-6)
-    assert along.allclose(torch.tensor([line.project(point) for point in oracle], dtype=torch.float64), atol=1e-6)
+    assert along.allclose(
+        torch.tensor([line.project(point) for point in oracle], dtype=torch.float64),
+        atol=1e-6,
+    )
     clear = aside.abs() > 0.1
     assert (offset.sign() == aside.sign())[clear].all()
 
@@ -40,17 +51,26 @@ def test_interpolation_lies_on_the_line_and_projects_back():
     s = torch.linspace(0, SPACING * (len(route) - 1), 301, dtype=torch.float64)
     points, heading, _ = interpolate(route, s)
     line = LineString(route.tolist())
-    apart = [line.interpolate(a).distance(Point(*p)) for a, p in zip(s.tolist(), points.tolist(), strict=True)]
+    apart = [
+        line.interpolate(a).distance(Point(*p))
+        for a, p in zip(s.tolist(), points.tolist(), strict=True)
+    ]
     assert max(apart) < 1e-9
     back, offset, chord = project(points, route, hint=s)
     assert back.allclose(s, atol=1e-6) and offset.abs().max() < 1e-6
-    assert (heading - chord).abs().max() < 0.4  # chords and vertex tangents differ by the bend
+    assert (
+        heading - chord
+    ).abs().max() < 0.4  # chords and vertex tangents differ by the bend
 
 
 def test_beyond_the_ends_the_route_goes_on_straight():
     route = torch.tensor([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0]])
     points, heading, curvature = interpolate(route, torch.tensor([-3.0, 7.0]))
-    assert points.tolist() == [[-3.0, 0.0], [7.0, 0.0]] and not heading.any() and not curvature.any()
+    assert (
+        points.tolist() == [[-3.0, 0.0], [7.0, 0.0]]
+        and not heading.any()
+        and not curvature.any()
+    )
     s, d, _ = project(torch.tensor([[-3.0, 1.0], [7.0, -2.0]]), route)
     assert s.tolist() == [-3.0, 7.0] and d.tolist() == [1.0, -2.0]
 
@@ -75,7 +95,14 @@ def test_leading_dims_broadcast_and_a_hint_chooses_the_pass():
     loop = 20.0 * torch.stack([angle.cos(), angle.sin()], -1)
     here = loop[10:11]
     assert abs(project(here, loop, hint=torch.tensor([20.0]))[0].item() - 20.0) < 0.1
-    assert abs(project(here, loop, hint=torch.tensor([145.0]))[0].item() - 20.0 - 40 * torch.pi) < 0.1
+    assert (
+        abs(
+            project(here, loop, hint=torch.tensor([145.0]))[0].item()
+            - 20.0
+            - 40 * torch.pi
+        )
+        < 0.1
+    )
 
 
 def test_interpolation_differentiates():
@@ -93,7 +120,9 @@ def test_a_track_is_followed_across_the_crossing_of_a_loop(begin):
     """The nearest place alone jumps by the length of the loop, in both directions."""
     states = track(loop(), begin, speed=25.0)
     for points in (states[:, :2], states[:, :2] + torch.tensor([0.3, -0.4])):
-        s, d, heading = (value[0] for value in project_track(points[None], loop()[None], start=begin))
+        s, d, heading = (
+            value[0] for value in project_track(points[None], loop()[None], start=begin)
+        )
         assert (s - begin - 2.5 * torch.arange(81)).abs().max() < 0.6
         assert d.abs().max() < 0.6 and wrap(heading - states[:, 2]).abs().max() < 0.1
 
@@ -106,4 +135,6 @@ def test_a_gap_in_a_track_is_no_jump_and_what_does_not_jump_is_projected():
     s = project_track(points, loop()[None], known=known, start=20.0)[0][0]
     assert (s - 20 - 2.5 * torch.arange(81))[known[0]].abs().max() < 0.6
     short = states[None, :8, :2]
-    assert torch.equal(project_track(short, loop()[None])[0], project(short, loop()[None])[0])
+    assert torch.equal(
+        project_track(short, loop()[None])[0], project(short, loop()[None])[0]
+    )

@@ -20,12 +20,26 @@ def build(**options) -> TensorDict:
 def test_the_set_is_sliced():
     several = torch.stack([build(), build()])
     several["scene_index"] = torch.arange(2)
-    whole = SceneSet(several, ["a", "b"], location=["p", "q"], dataset="made", split="test", dropped={"invalid": 1})
-    assert len(whole) == 2 and whole.batch([1, 0, 1])["scene_index"].tolist() == [1, 0, 1] and whole.steps == 80
+    whole = SceneSet(
+        several,
+        ["a", "b"],
+        location=["p", "q"],
+        dataset="made",
+        split="test",
+        dropped={"invalid": 1},
+    )
+    assert (
+        len(whole) == 2
+        and whole.batch([1, 0, 1])["scene_index"].tolist() == [1, 0, 1]
+        and whole.steps == 80
+    )
     assert [part["scene_index"].tolist() for part in whole.parts(1)] == [[0], [1]]
     assert [whole.index(which) for which in (0, 1, "a", "b")] == [0, 1, 0, 1]
     for which in (2, -1, "c"):
-        with pytest.raises(InputError, match=f"scene={which}: expected an index below 2 or the id of a scene"):
+        with pytest.raises(
+            InputError,
+            match=f"scene={which}: expected an index below 2 or the id of a scene",
+        ):
             whole.index(which)
     one, other = whole.hashes()
     several["start"][1, 0, 3] += 1e-3
@@ -35,9 +49,15 @@ def test_the_set_is_sliced():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda scene: scene.set("start_accel", scene["start"]), "start_accel has not 1 dims"),
+        (
+            lambda scene: scene.set("start_accel", scene["start"]),
+            "start_accel has not 1 dims",
+        ),
         (lambda scene: scene["logged"].fill_(float("nan")), "logged .*holds NaN"),
-        (lambda scene: scene["route_log"].fill_(-1), "the ego is absent or has no route"),
+        (
+            lambda scene: scene["route_log"].fill_(-1),
+            "the ego is absent or has no route",
+        ),
     ],
 )
 def test_what_breaks_the_schema_is_named(change, message):

@@ -1,4 +1,5 @@
-"""Kinematics of logs: polynomial tracks come back exactly, and nothing of the future is seen."""
+"""Kinematics of logs: polynomial tracks come back exactly, and nothing of the future is
+seen."""
 
 import numpy as np
 import pytest
@@ -19,10 +20,18 @@ from e2rl.scenes.smoothing import (
 TIME = np.arange(40) * 0.1
 
 
-def accelerating(heading: float = 0.7, speed: float = 4.0, accel: float = 1.5) -> np.ndarray:
-    """States [40, 1, 4] under constant acceleration along a heading, with a false recorded speed."""
+def accelerating(
+    heading: float = 0.7, speed: float = 4.0, accel: float = 1.5
+) -> np.ndarray:
+    """States [40, 1, 4] under constant acceleration along a heading, with a false
+    recorded speed."""
     way = speed * TIME + accel * TIME**2 / 2
-    columns = [way * np.cos(heading) + 9, way * np.sin(heading) - 5, np.full(40, heading), np.full(40, 99.0)]
+    columns = [
+        way * np.cos(heading) + 9,
+        way * np.sin(heading) - 5,
+        np.full(40, heading),
+        np.full(40, 99.0),
+    ]
     return np.stack(columns, -1)[:, None]
 
 
@@ -31,16 +40,23 @@ def test_constant_acceleration_is_estimated_exactly():
     valid = np.ones((40, 1), bool)
     start, accel, yaw_rate = causal_state(states, valid, frame=20)
     assert np.allclose(start[0, :3], states[20, 0, :3], atol=1e-6)
-    assert np.isclose(start[0, 3], 4.0 + 1.5 * 2.0, atol=1e-5) and np.isclose(accel[0], 1.5, atol=1e-4)
+    assert np.isclose(start[0, 3], 4.0 + 1.5 * 2.0, atol=1e-5) and np.isclose(
+        accel[0], 1.5, atol=1e-4
+    )
     assert abs(yaw_rate[0]) < 1e-9
 
 
 def test_a_steady_turn_is_estimated():
     heading = 0.3 * TIME
-    states = np.stack([np.sin(heading) * 20, (1 - np.cos(heading)) * 20, heading, np.full(40, 6.0)], -1)[:, None]
+    states = np.stack(
+        [np.sin(heading) * 20, (1 - np.cos(heading)) * 20, heading, np.full(40, 6.0)],
+        -1,
+    )[:, None]
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
     start, _, yaw_rate = causal_state(states, np.ones((40, 1), bool), frame=20)
-    assert np.isclose(yaw_rate[0], 0.3, atol=1e-4) and np.isclose(start[0, 3], 6.0, atol=0.1)  # the fit is a chord's
+    assert np.isclose(yaw_rate[0], 0.3, atol=1e-4) and np.isclose(
+        start[0, 3], 6.0, atol=0.1
+    )  # the fit is a chord's
 
 
 def test_the_start_state_is_blind_to_the_future_and_to_gaps_before():
@@ -61,23 +77,35 @@ def test_the_past_is_seen_from_the_present_and_blind_to_the_future_and_to_gaps_b
     back = np.arange(1, 11) * 0.1
     past = causal_past(states, valid, frame=20, speed=speed)
     assert past.shape == (1, 10, 3)
-    assert np.allclose(past[0, :, 0], -7.0 * back + 1.5 * back**2 / 2) and np.allclose(past[0, :, 1:], 0)
+    assert np.allclose(past[0, :, 0], -7.0 * back + 1.5 * back**2 / 2) and np.allclose(
+        past[0, :, 1:], 0
+    )
     states[21:], valid[21:], states[:15] = np.nan, False, 1e6
     valid[14] = False
     short = causal_past(states, valid, frame=20, speed=speed)
     assert np.allclose(short[0, :5], past[0, :5])
-    assert np.allclose(np.diff(short[0, 4:, 0]), -0.7) and np.allclose(short[0, :, 1:], 0)
-    assert np.allclose(causal_past(states, valid, frame=0, speed=speed)[0, :, 0], -7.0 * back), "straight on where nothing is known"
+    assert np.allclose(np.diff(short[0, 4:, 0]), -0.7) and np.allclose(
+        short[0, :, 1:], 0
+    )
+    assert np.allclose(
+        causal_past(states, valid, frame=0, speed=speed)[0, :, 0], -7.0 * back
+    ), "straight on where nothing is known"
 
 
 def test_a_turn_shows_in_the_past():
     angle = np.linspace(3.0, 3.5, 20)  # across the cut
-    states = np.stack([10 * np.sin(angle), -10 * np.cos(angle), angle, np.zeros(20)], -1)[:, None]
+    states = np.stack(
+        [10 * np.sin(angle), -10 * np.cos(angle), angle, np.zeros(20)], -1
+    )[:, None]
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
-    past = causal_past(states, np.ones((20, 1), bool), frame=19, speed=np.array([1.0]))[0]
+    past = causal_past(states, np.ones((20, 1), bool), frame=19, speed=np.array([1.0]))[
+        0
+    ]
     turned = -np.arange(1, 11) * 0.5 / 19
     assert np.allclose(past[:, 2], turned)
-    assert np.allclose(past[:, 0], 10 * np.sin(turned)) and np.allclose(past[:, 1], 10 * (1 - np.cos(turned)))
+    assert np.allclose(past[:, 0], 10 * np.sin(turned)) and np.allclose(
+        past[:, 1], 10 * (1 - np.cos(turned))
+    )
 
 
 def test_smoothing_keeps_quadratics_and_takes_speed_along_the_heading():
@@ -93,7 +121,9 @@ def test_smoothing_works_run_by_run_and_removes_noise():
     valid[18:22] = False
     states[20:, :, :2] += 500.0
     out = smooth(states, valid)
-    assert np.allclose(out[:18], smooth(states[:18], valid[:18])) and np.allclose(out[22:, 0, 3], 4 + 1.5 * TIME[22:])
+    assert np.allclose(out[:18], smooth(states[:18], valid[:18])) and np.allclose(
+        out[22:, 0, 3], 4 + 1.5 * TIME[22:]
+    )
     noise = np.random.default_rng(0).normal(0, 0.05, (40, 1, 2))
     noisy = accelerating()
     noisy[..., :2] += noise
@@ -116,7 +146,9 @@ def test_the_longer_side_of_a_lasting_jump_is_kept():
     states[30:, 0, 2] += np.pi
     assert drop_jumps(states, valid).all(), "nobody leaves for a heading"
     states[:15, 0, :2] += 100.0
-    assert np.flatnonzero(drop_jumps(states, valid)[:, 0]).tolist() == list(range(15, 40))
+    assert np.flatnonzero(drop_jumps(states, valid)[:, 0]).tolist() == list(
+        range(15, 40)
+    )
 
 
 def test_speeds_are_signed_along_the_heading():
@@ -124,7 +156,9 @@ def test_speeds_are_signed_along_the_heading():
     valid = np.ones((40, 1), bool)
     assert np.allclose(smooth(back, valid)[:, 0, 3], -3.0 - 0.5 * TIME, atol=1e-9)
     start, accel, _ = causal_state(back, valid, frame=20)
-    assert np.isclose(start[0, 3], -4.0, atol=1e-5) and np.isclose(accel[0], -0.5, atol=1e-4)
+    assert np.isclose(start[0, 3], -4.0, atol=1e-5) and np.isclose(
+        accel[0], -0.5, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("accel", [-8.0, -3.0, 0.0])
@@ -135,7 +169,9 @@ def test_who_brakes_to_a_halt_or_stands_does_not_reverse(accel):
     states[..., :2] += np.random.default_rng(0).normal(0, 0.02, (40, 1, 2))
     valid = np.ones((40, 1), bool)
     assert (smooth(states, valid)[..., 3] >= 0).all()
-    assert all(causal_state(states, valid, frame=frame)[0][0, 3] >= 0 for frame in range(40))
+    assert all(
+        causal_state(states, valid, frame=frame)[0][0, 3] >= 0 for frame in range(40)
+    )
 
 
 def test_gapped_time_stamps_are_resampled_linearly():
@@ -162,33 +198,69 @@ def test_long_gaps_are_not_invented_and_other_rates_are_brought_to_ten_hertz():
     states = accelerating(accel=0.0)
     valid = np.ones((40, 1), bool)
     _, known = resample_uniform(states, valid, ts=stamps)
-    assert len(known) == 50 and not known[20:30].any() and known[:20].all() and known[30:].all()
+    assert (
+        len(known) == 50
+        and not known[20:30].any()
+        and known[:20].all()
+        and known[30:].all()
+    )
     out, known = resample_uniform(states, valid, ts=TIME / 2)
     assert len(out) == 20 and np.allclose(out, states[::2], atol=1e-6) and known.all()
 
 
-RATES = [1.0, 2.0, 5.0, 10.0, 12.5, 20.0, 24.0, 25.0, 29.97, 30.0, 33.0, 50.0, 60.0, 99.0, 100.0, 105.0]
+RATES = [
+    1.0,
+    2.0,
+    5.0,
+    10.0,
+    12.5,
+    20.0,
+    24.0,
+    25.0,
+    29.97,
+    30.0,
+    33.0,
+    50.0,
+    60.0,
+    99.0,
+    100.0,
+    105.0,
+]
 
 
 def circle(seconds: np.ndarray) -> np.ndarray:
-    """States [F, 1, 4] at 6 m/s on a circle of 20 m about (500, -300), across the cut at pi."""
+    """States [F, 1, 4] at 6 m/s on a circle of 20 m about (500, -300), across the cut
+    at pi."""
     angle = 2.5 + 0.3 * seconds
-    columns = [500 + 20 * np.sin(angle), -300 - 20 * np.cos(angle), (angle + np.pi) % (2 * np.pi) - np.pi]
+    columns = [
+        500 + 20 * np.sin(angle),
+        -300 - 20 * np.cos(angle),
+        (angle + np.pi) % (2 * np.pi) - np.pi,
+    ]
     return np.stack([*columns, np.full(len(seconds), 6.0)], -1)[:, None]
 
 
 @settings(max_examples=150, deadline=None)
-@given(rate=st.sampled_from(RATES), jitter=st.floats(0, 0.45), seed=st.integers(0, 2**32 - 1))
+@given(
+    rate=st.sampled_from(RATES),
+    jitter=st.floats(0, 0.45),
+    seed=st.integers(0, 2**32 - 1),
+)
 def test_at_every_rate_a_track_is_what_was_recorded_and_no_more(rate, jitter, seed):
-    """Each valid frame lies on the motion, near recorded frames; each span recorded without a gap is covered."""
+    """Each valid frame lies on the motion, near recorded frames; each span recorded
+    without a gap is covered."""
     rng = np.random.default_rng(seed)
     count = max(int(6 * rate), 8)
     seconds = (np.arange(count) + rng.uniform(-jitter, jitter, count)) / rate
     seconds = seconds[rng.random(count) > 0.05]
     seconds -= seconds[0]
-    valid = np.repeat(rng.random(count) < 0.7, 1 + rng.integers(6))[: len(seconds), None]
+    valid = np.repeat(rng.random(count) < 0.7, 1 + rng.integers(6))[
+        : len(seconds), None
+    ]
     assume(valid.any())
-    out, known = resample_uniform(np.where(valid[..., None], circle(seconds), np.nan), valid, ts=seconds)
+    out, known = resample_uniform(
+        np.where(valid[..., None], circle(seconds), np.nan), valid, ts=seconds
+    )
     time = 0.1 * np.flatnonzero(known[:, 0])
     recorded = seconds[valid[:, 0]]
     error = out[known] - circle(time)[:, 0]
@@ -202,7 +274,9 @@ def test_at_every_rate_a_track_is_what_was_recorded_and_no_more(rate, jitter, se
     assert gap.max(initial=0) < 1.9, "too far from what was recorded"
     bend = 6.0 * 0.3 * gap**2 / 8 + 6.0 * nearest * (nearest <= 0.02)
     assert (np.linalg.norm(error[:, :2], axis=-1) <= bend + 1e-6).all()
-    assert (np.abs(np.sin(error[:, 2])) <= 0.3 * nearest * (nearest <= 0.02) + 1e-6).all()
+    assert (
+        np.abs(np.sin(error[:, 2])) <= 0.3 * nearest * (nearest <= 0.02) + 1e-6
+    ).all()
     grid = 0.1 * np.arange(len(out))[:, None]
     step = np.diff(seconds)
     whole = valid[1:, 0] & valid[:-1, 0] & (step < 0.55)
@@ -217,19 +291,27 @@ def test_who_is_not_recorded_is_nowhere(rate):
     states = np.where(valid[..., None], circle(seconds), 0.0)
     out, known = resample_uniform(states, valid, ts=seconds)
     grid = 0.1 * np.arange(len(out))
-    assert known[:, 0].tolist() == ((grid < 2.04) | (grid > 4.06)).tolist() or rate in (12.5, 24.0, 25.0)
+    assert known[:, 0].tolist() == ((grid < 2.04) | (grid > 4.06)).tolist() or rate in (
+        12.5,
+        24.0,
+        25.0,
+    )
     assert not known[(grid > 2.04) & (grid < 4.06)].any()
     assert np.abs(np.hypot(*(out[known][:, :2] - [500, -300]).T) - 20).max() < 0.02
 
 
 def test_a_track_annotated_at_a_lower_rate_is_interpolated_and_one_lost_from_sight_is_not():
     seconds = np.arange(120) / 20
-    valid = np.stack([np.arange(120) % 10 == 0, np.ones(120, bool), np.ones(120, bool)], 1)
+    valid = np.stack(
+        [np.arange(120) % 10 == 0, np.ones(120, bool), np.ones(120, bool)], 1
+    )
     valid[40:48, 1] = False
     valid[[60, 81], 2] = False
     states = np.where(valid[..., None], np.repeat(circle(seconds), 3, axis=1), 0.0)
     out, known = resample_uniform(states, valid, ts=seconds)
-    assert np.flatnonzero(~known[:, 0]).tolist() == [56, 57, 58, 59], "after its last annotation"
+    assert np.flatnonzero(~known[:, 0]).tolist() == [56, 57, 58, 59], (
+        "after its last annotation"
+    )
     assert np.flatnonzero(~known[:, 1]).tolist() == [20, 21, 22, 23]
     assert known[:, 2].all(), "a flicker between frames that lie 0.1 s apart"
     assert np.abs(np.hypot(*(out[known][:, :2] - [500, -300]).T) - 20).max() < 0.06
@@ -242,7 +324,9 @@ def test_frames_of_one_time_stamp_are_one():
     first = np.flatnonzero(np.diff(seconds) == 0)
     valid[first[::2]], valid[first[1::2] + 1] = False, False
     out, known = resample_uniform(states, valid, ts=seconds)
-    expected, _ = resample_uniform(circle(np.unique(seconds)), np.ones((40, 1), bool), ts=np.unique(seconds))
+    expected, _ = resample_uniform(
+        circle(np.unique(seconds)), np.ones((40, 1), bool), ts=np.unique(seconds)
+    )
     assert known.all() and np.allclose(out, expected)
 
 
@@ -254,11 +338,16 @@ def test_a_frame_beside_the_grid_that_is_alone_is_moved_along_its_speed(speed):
     states = circle(seconds)
     valid = np.zeros((50, 1), bool)
     valid[frames], states[..., 3] = True, speed
-    out, known = resample_uniform(np.where(valid[..., None], states, 0.0), valid, ts=seconds)
+    out, known = resample_uniform(
+        np.where(valid[..., None], states, 0.0), valid, ts=seconds
+    )
     assert np.flatnonzero(known[:, 0]).tolist() == grid
     x, y, heading, _ = states[frames, 0].T
     way = speed * (0.1 * np.array(grid) - seconds[frames])
-    assert np.allclose(out[grid, 0, :3].T, [x + way * np.cos(heading), y + way * np.sin(heading), heading])
+    assert np.allclose(
+        out[grid, 0, :3].T,
+        [x + way * np.cos(heading), y + way * np.sin(heading), heading],
+    )
 
 
 def test_a_height_that_is_unknown_is_the_nearest_of_its_track_and_others_stay():
@@ -270,14 +359,20 @@ def test_a_height_that_is_unknown_is_the_nearest_of_its_track_and_others_stay():
     out = resample_heights(heights, valid, ts=TIME)
     expected = TIME.copy()
     expected[[0, 1, 9, 10]] = TIME[[2, 2, 8, 11]]
-    assert np.allclose(out[:, 0], expected) and (out[:, 1] == 8).all() and np.isnan(out[:, 2]).all()
+    assert (
+        np.allclose(out[:, 0], expected)
+        and (out[:, 1] == 8).all()
+        and np.isnan(out[:, 2]).all()
+    )
     assert resample_heights(np.full((40, 3), np.nan), valid, ts=TIME) is None
     assert resample_heights(np.where(valid, 1.0, heights), valid, ts=TIME) is None
 
 
 def test_a_heading_that_flips_between_frames_is_never_halfway():
     seconds = np.arange(50) / 25
-    states = np.stack([8 * seconds, 0 * seconds, np.where(seconds > 1.0, np.pi, 0.0), 0 * seconds], -1)[:, None]
+    states = np.stack(
+        [8 * seconds, 0 * seconds, np.where(seconds > 1.0, np.pi, 0.0), 0 * seconds], -1
+    )[:, None]
     out, _ = resample_uniform(states, np.ones((50, 1), bool), ts=seconds)
     assert np.allclose(np.sin(out[..., 2]), 0)
 
@@ -290,7 +385,9 @@ def test_a_light_holds_from_its_frame_on(rate):
     assert (late >= -0.02 - 1e-9).all() and (late < 1 / rate + 1e-6).all()
 
 
-@pytest.mark.parametrize("stamps", [TIME[::-1], TIME * 1e6, TIME * 0, np.where(TIME > 2, np.nan, TIME)])
+@pytest.mark.parametrize(
+    "stamps", [TIME[::-1], TIME * 1e6, TIME * 0, np.where(TIME > 2, np.nan, TIME)]
+)
 def test_impossible_time_stamps_are_refused(stamps):
     with pytest.raises(InputError, match="time stamps"):
         resample_uniform(accelerating(), np.ones((40, 1), bool), ts=stamps)

@@ -2,14 +2,29 @@
 
 import torch
 
-from e2rl.search.portfolio import CHANCE_TRIES, FAMILY_TRIES, LEAST, SCENE_TRIES, Portfolio, nearness
+from e2rl.search.portfolio import (
+    CHANCE_TRIES,
+    FAMILY_TRIES,
+    LEAST,
+    SCENE_TRIES,
+    Portfolio,
+    nearness,
+)
 from e2rl.search.tries import Family
 
 SURE = 1000.0  # a chance that draws hardly differ from
 
 
-def portfolio(scenes: int = 2, chance: float = SURE, nfe: tuple[float, ...] = (100.0,)) -> Portfolio:
-    return Portfolio([Family(str(k), "e2", ranges={}, chance=chance, nfe=cost) for k, cost in enumerate(nfe)], scenes)
+def portfolio(
+    scenes: int = 2, chance: float = SURE, nfe: tuple[float, ...] = (100.0,)
+) -> Portfolio:
+    return Portfolio(
+        [
+            Family(str(k), "e2", ranges={}, chance=chance, nfe=cost)
+            for k, cost in enumerate(nfe)
+        ],
+        scenes,
+    )
 
 
 def mean_worth(found: Portfolio, draws: int = 400) -> torch.Tensor:
@@ -23,11 +38,15 @@ def close(found: float, expected: float) -> bool:
 
 def test_a_family_is_worth_its_own_chance_and_less_in_a_scene_where_it_failed():
     found = portfolio()
-    torch.testing.assert_close(mean_worth(found), torch.full((2, 1), SURE).double(), rtol=0.01, atol=0)
+    torch.testing.assert_close(
+        mean_worth(found), torch.full((2, 1), SURE).double(), rtol=0.01, atol=0
+    )
     found.tell(0, 0, 0.0, 0.0, 100.0)
     worth = mean_worth(found)
     family = SURE * CHANCE_TRIES / (CHANCE_TRIES + 1)
-    after = nearness(torch.tensor(0.0)).item() / ((1 + 1 / SCENE_TRIES) * (1 + 1 / FAMILY_TRIES))
+    after = nearness(torch.tensor(0.0)).item() / (
+        (1 + 1 / SCENE_TRIES) * (1 + 1 / FAMILY_TRIES)
+    )
     assert close(worth[1].item(), family) and close(worth[0].item(), family * after)
 
 
@@ -39,9 +58,16 @@ def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
         found.tell(0, 0, 1.0, 2.0, 100.0)
     near = nearness(torch.tensor(2.0))
     tries = torch.arange(1, finds)
-    exposed = CHANCE_TRIES + 1 + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
+    exposed = (
+        CHANCE_TRIES
+        + 1
+        + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
+    )
     worth = mean_worth(found, 4000)[1]
-    assert abs(worth[0].item() / ((CHANCE_TRIES * chance + finds) / exposed) - 1) < 0.05 and worth[0] > 2 * worth[1]
+    assert (
+        abs(worth[0].item() / ((CHANCE_TRIES * chance + finds) / exposed) - 1) < 0.05
+        and worth[0] > 2 * worth[1]
+    )
 
 
 def test_late_tries_where_all_others_failed_tell_less_against_a_family_than_first_ones():
@@ -67,12 +93,19 @@ def test_a_scene_forgets_what_its_tries_told_and_others_do_not():
 def test_a_dear_family_is_worth_less_in_proportion():
     found = portfolio(nfe=(100.0, 400.0))
     worth = mean_worth(found)[0]
-    assert close(worth[0].item() / worth[1].item(), 4.0 * (1 + 1 / SCENE_TRIES))  # it would be the second, besides
+    assert close(
+        worth[0].item() / worth[1].item(), 4.0 * (1 + 1 / SCENE_TRIES)
+    )  # it would be the second, besides
     for _ in range(int(CHANCE_TRIES)):
-        found.tell(1, 1, 0.0, 0.0, 200.0)  # it costs less than it was said to: 300 in the mean
+        found.tell(
+            1, 1, 0.0, 0.0, 200.0
+        )  # it costs less than it was said to: 300 in the mean
     worth = mean_worth(found)[0]
     exposed = found.exposed[1].item()
-    assert close(worth[0].item() / worth[1].item(), 3.0 * (1 + 1 / SCENE_TRIES) * exposed / CHANCE_TRIES)
+    assert close(
+        worth[0].item() / worth[1].item(),
+        3.0 * (1 + 1 / SCENE_TRIES) * exposed / CHANCE_TRIES,
+    )
 
 
 def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
@@ -80,9 +113,19 @@ def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
     found.tell(0, 2, 0.0, 0.0, 120.0)
     share = found.share()[0]
     worth = mean_worth(found)[0]
-    alone = share * (found.found / found.exposed) * 120.0 / torch.tensor([100.0, 110.0, 120.0])
+    alone = (
+        share
+        * (found.found / found.exposed)
+        * 120.0
+        / torch.tensor([100.0, 110.0, 120.0])
+    )
     rank = torch.tensor([0.0, 1.0, 2.0])
-    torch.testing.assert_close(worth, alone * (1 + 1 / SCENE_TRIES) / (1 + (1 + rank) / SCENE_TRIES), rtol=0.02, atol=0)
+    torch.testing.assert_close(
+        worth,
+        alone * (1 + 1 / SCENE_TRIES) / (1 + (1 + rank) / SCENE_TRIES),
+        rtol=0.02,
+        atol=0,
+    )
 
 
 def test_the_nearer_a_scene_came_the_likelier_is_a_find_there():
@@ -95,11 +138,17 @@ def test_the_nearer_a_scene_came_the_likelier_is_a_find_there():
         found.tell(scene, 0, 0.0, nearest, 100.0)
         found.tell(scene, 0, 0.0, -40.0, 100.0)  # the nearest try tells
     worth = mean_worth(found)[:, 0]
-    assert close((worth[1] / worth[0]).item(), (nearness(torch.tensor(0.5)) / LEAST).item())
+    assert close(
+        (worth[1] / worth[0]).item(), (nearness(torch.tensor(0.5)) / LEAST).item()
+    )
 
 
 def test_without_learning_nothing_that_was_told_changes_the_choice():
-    found = Portfolio([Family("a", "e2", ranges={}), Family("b", "e2", ranges={})], 2, learns=False)
+    found = Portfolio(
+        [Family("a", "e2", ranges={}), Family("b", "e2", ranges={})], 2, learns=False
+    )
     for _ in range(50):
         found.tell(0, 0, 1.0, 2.0, 100.0)
-    torch.testing.assert_close(mean_worth(found, 4000), torch.full((2, 2), 0.5).double(), atol=0.03, rtol=0)
+    torch.testing.assert_close(
+        mean_worth(found, 4000), torch.full((2, 2), 0.5).double(), atol=0.03, rtol=0
+    )

@@ -1,4 +1,5 @@
-"""The search: it asks the same of whoever tells the same, and learns where failures are."""
+"""The search: it asks the same of whoever tells the same, and learns where failures
+are."""
 
 from dataclasses import replace
 
@@ -8,7 +9,10 @@ from e2rl.metrics.margin import PREVENTED
 from e2rl.search.search import RAISES, ROUND, Outcome, Search, SearchSettings
 from e2rl.search.tries import Family
 
-FAMILIES = [Family(name, "e2", ranges={"moment": (1.0, 5.0)}) for name in ("good", "poor", "idle")]
+FAMILIES = [
+    Family(name, "e2", ranges={"moment": (1.0, 5.0)})
+    for name in ("good", "poor", "idle")
+]
 CHANCE = {"good": 0.5, "poor": 0.05, "idle": 0.0}
 PLAIN = SearchSettings()
 
@@ -18,15 +22,25 @@ def search_of(scenes=40, seed=0, settings=PLAIN, families=FAMILIES):
 
 
 def told(search, rounds, hopeless=()):
-    """What a planner is like that fails by chance; in `hopeless` scenes nobody ever comes near."""
+    """What a planner is like that fails by chance; in `hopeless` scenes nobody ever
+    comes near."""
     for _ in range(rounds):
         tries = search.ask()
         outcomes = []
         for one in tries:
-            luck = torch.rand((), generator=torch.Generator().manual_seed(hash((one.scene, one.seed)) % 2**31)).item()
+            luck = torch.rand(
+                (),
+                generator=torch.Generator().manual_seed(
+                    hash((one.scene, one.seed)) % 2**31
+                ),
+            ).item()
             fails = luck < CHANCE[one.family] and one.scene not in hopeless
             margin = PREVENTED if fails else -25.0 if one.scene in hopeless else -2.0
-            outcomes.append(Outcome(margin, f"cell {one.scene} {one.number}" if fails else "", nfe=100.0))
+            outcomes.append(
+                Outcome(
+                    margin, f"cell {one.scene} {one.number}" if fails else "", nfe=100.0
+                )
+            )
         search.tell(tries, outcomes)
     return search
 
@@ -50,7 +64,9 @@ def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_
     CHANCE.update({family.name: 0.0 for family in many})
     search = search_of(scenes=5, settings=replace(PLAIN, cover=7), families=many)
     first = search.ask()
-    assert len({(one.scene, one.family) for one in first}) == len(first) == ROUND + 1  # five of each of five scenes
+    assert (
+        len({(one.scene, one.family) for one in first}) == len(first) == ROUND + 1
+    )  # five of each of five scenes
     search.tell(first, [Outcome(-2.0, "", nfe=100.0)] * len(first))
     assert {len(tries) for tries in told(search, 1).tries} == {7}
     assert len(search.ask()) == ROUND
@@ -59,7 +75,9 @@ def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_
 def test_rounds_grow_with_the_tries_so_far():
     many = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
     CHANCE.update({family.name: 0.0 for family in many})
-    search = told(search_of(settings=replace(PLAIN, growth=0.5), families=many), PLAIN.cover + 1)
+    search = told(
+        search_of(settings=replace(PLAIN, growth=0.5), families=many), PLAIN.cover + 1
+    )
     for _ in range(4):
         asked = search.ask()
         assert len(asked) == min(max(40, len(tries_of(search)) // 2), 40 * 12 // 4)
@@ -72,20 +90,34 @@ def test_a_family_that_nearly_finds_is_tried_more_unless_the_margin_does_not_cou
     families = [Family(name, "e2", ranges={}) for name in ("near", "far", "away")]
 
     def share(climb):
-        search = search_of(settings=replace(PLAIN, climb=climb, again=1.0), families=families)
+        search = search_of(
+            settings=replace(PLAIN, climb=climb, again=1.0), families=families
+        )
         for _ in range(15):
             tries = search.ask()
-            search.tell(tries, [Outcome(0.9 if one.family == "near" else -2.0, "", nfe=100.0) for one in tries])
-        return sum(one.family == "near" for one in tries_of(search)) / len(tries_of(search))
+            search.tell(
+                tries,
+                [
+                    Outcome(0.9 if one.family == "near" else -2.0, "", nfe=100.0)
+                    for one in tries
+                ],
+            )
+        return sum(one.family == "near" for one in tries_of(search)) / len(
+            tries_of(search)
+        )
 
     assert share(climb=True) > 1.4 * share(climb=False)
 
 
 def test_tries_go_to_the_family_that_finds_and_not_to_hopeless_scenes():
     search = told(search_of(), 20, hopeless=range(20))
-    counts = {name: sum(one.family == name for one in tries_of(search)) for name in CHANCE}
+    counts = {
+        name: sum(one.family == name for one in tries_of(search)) for name in CHANCE
+    }
     assert counts["good"] > 2 * counts["poor"] and counts["good"] > 2 * counts["idle"]
-    hopeless, others = (sum(map(len, part)) for part in (search.tries[:20], search.tries[20:]))
+    hopeless, others = (
+        sum(map(len, part)) for part in (search.tries[:20], search.tries[20:])
+    )
     assert others > 1.25 * hopeless
 
 
@@ -95,19 +127,27 @@ def test_it_finds_more_scenes_than_chance_at_equal_cost():
 
     def found(bandit, seed):
         settings = replace(PLAIN, bandit=bandit, cover=1)
-        search = told(search_of(seed=seed, settings=settings, families=[FAMILIES[0], *idle]), 5)
+        search = told(
+            search_of(seed=seed, settings=settings, families=[FAMILIES[0], *idle]), 5
+        )
         return sum(any(outcome.cell for outcome in scene) for scene in search.outcomes)
 
-    learnt, blind = (sum(found(bandit, seed) for seed in range(5)) for bandit in (True, False))
+    learnt, blind = (
+        sum(found(bandit, seed) for seed in range(5)) for bandit in (True, False)
+    )
     assert learnt > 1.2 * blind
 
 
 def crashing(scenes, rounds=30):
-    """A search against a planner that always raises in some of 12 scenes and never fails in the others."""
+    """A search against a planner that always raises in some of 12 scenes and never
+    fails in the others."""
     search = search_of(scenes=12)
     for _ in range(rounds):
         tries = search.ask()
-        search.tell(tries, [Outcome(-2.0, "", nfe=100.0, raised=one.scene in scenes) for one in tries])
+        search.tell(
+            tries,
+            [Outcome(-2.0, "", nfe=100.0, raised=one.scene in scenes) for one in tries],
+        )
     return search
 
 

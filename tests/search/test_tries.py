@@ -30,17 +30,24 @@ def test_decisions_lie_in_their_range_and_others_follow_the_rule():
 
 
 def test_a_family_without_ranges_is_the_rule():
-    assert [one.decisions for one in drawn(3, True, family=Family("rule", "e2", ranges={}))] == [RULE] * 3
+    assert [
+        one.decisions for one in drawn(3, True, family=Family("rule", "e2", ranges={}))
+    ] == [RULE] * 3
 
 
 def test_stratified_tries_look_elsewhere_than_those_before_of_whatever_family():
-    """The largest gap between moments of ten tries of a scene, of two families in turn, is below twice its least, and
-    below that of independent draws."""
+    """The largest gap between moments of ten tries of a scene, of two families in turn,
+    is below twice its least, and below that of independent draws."""
     other = replace(TIMED, name="other")
 
     def gap(stratified, seed):
-        each = [drawn(10, stratified, family=family, seed=seed)[at::2] for at, family in enumerate((TIMED, other))]
-        moments = sorted(Decisions(*one.decisions).moment for tries in each for one in tries)
+        each = [
+            drawn(10, stratified, family=family, seed=seed)[at::2]
+            for at, family in enumerate((TIMED, other))
+        ]
+        moments = sorted(
+            Decisions(*one.decisions).moment for tries in each for one in tries
+        )
         return max(b - a for a, b in zip([1.0, *moments], [*moments, 5.0], strict=True))
 
     spread, loose = ([gap(kind, seed) for seed in range(40)] for kind in (True, False))
@@ -48,10 +55,23 @@ def test_stratified_tries_look_elsewhere_than_those_before_of_whatever_family():
 
 
 def test_a_family_is_read_from_its_configuration():
-    given = {"whom": "crossing", "patience": [1, 3], "chance": 0.3, "method": "e2_pursuit", "changes": {"reselect": 1}}
+    given = {
+        "whom": "crossing",
+        "patience": [1, 3],
+        "chance": 0.3,
+        "method": "e2_pursuit",
+        "changes": {"reselect": 1},
+    }
     family = family_of("crossing", given, where="search.families")
-    assert (family.method, family.chance, family.changes) == ("e2_pursuit", 0.3, {"reselect": 1})
-    assert family.ranges == {"whom": float(WHOM.index("crossing")), "patience": (1.0, 3.0)}
+    assert (family.method, family.chance, family.changes) == (
+        "e2_pursuit",
+        0.3,
+        {"reselect": 1},
+    )
+    assert family.ranges == {
+        "whom": float(WHOM.index("crossing")),
+        "patience": (1.0, 3.0),
+    }
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""Unicycle: closed forms, bounds, inverse, agreement of the parallel rollout with the recursion, gradients."""
+"""Unicycle: closed forms, bounds, inverse, agreement of the parallel rollout with the
+recursion, gradients."""
 
 import math
 
@@ -12,8 +13,12 @@ from e2rl.sim.dynamics import Arc, along_arc
 
 def random_case(batch=64, horizon=50, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    start = torch.rand(batch, 4, generator=generator, dtype=torch.float64) * torch.tensor([50.0, 50, 6, 20])
-    action = torch.randn(batch, horizon, 2, generator=generator, dtype=torch.float64) * torch.tensor([6.0, 1.0])
+    start = torch.rand(
+        batch, 4, generator=generator, dtype=torch.float64
+    ) * torch.tensor([50.0, 50, 6, 20])
+    action = torch.randn(
+        batch, horizon, 2, generator=generator, dtype=torch.float64
+    ) * torch.tensor([6.0, 1.0])
     return start, action
 
 
@@ -21,14 +26,18 @@ def test_circle():
     """Constant speed and yaw rate: after a full turn the vehicle is back where it was."""
     steps = 100
     speed = 5.0
-    actions = torch.tensor([0.0, 2 * math.pi / (steps * DT)], dtype=torch.float64).expand(steps, 2)
+    actions = torch.tensor(
+        [0.0, 2 * math.pi / (steps * DT)], dtype=torch.float64
+    ).expand(steps, 2)
     start = torch.tensor([3.0, -2.0, 0.7, speed], dtype=torch.float64)
     end = dynamics.rollout(start, actions)[-1]
     assert torch.allclose(end[:2], start[:2], atol=1e-9)
 
 
 def test_constant_acceleration_is_exact():
-    states = dynamics.rollout(torch.tensor([0.0, 0, 0, 2]), torch.tensor([1.5, 0.0]).expand(40, 2))
+    states = dynamics.rollout(
+        torch.tensor([0.0, 0, 0, 2]), torch.tensor([1.5, 0.0]).expand(40, 2)
+    )
     t = DT * torch.arange(1, 41)
     assert torch.allclose(states[:, 0], 2 * t + 0.75 * t**2, atol=1e-4)
 
@@ -44,12 +53,20 @@ def test_rollout_equals_recursion_with_clipped_speeds():
         speeds.append(expected)
         assert torch.allclose(state, parallel[:, k], atol=1e-9)
     assert torch.allclose(torch.stack(speeds, 1), parallel[..., 3])
-    assert (torch.stack(speeds, 1) == 0).any(), "the case must reach the bound it is about"
+    assert (torch.stack(speeds, 1) == 0).any(), (
+        "the case must reach the bound it is about"
+    )
 
 
-@pytest.mark.parametrize(("acceleration", "distance"), [(0.0, -(2.0**2) / 6), (-5.0, -(2.0**2) / 6), (4.0, -0.5)])
-def test_who_reverses_comes_to_a_halt_however_it_is_told_to_go_on(acceleration, distance):
-    """From 2 m/s in reverse at 3 m/s^2, or as hard as it is told to; then it stands, or drives on."""
+@pytest.mark.parametrize(
+    ("acceleration", "distance"),
+    [(0.0, -(2.0**2) / 6), (-5.0, -(2.0**2) / 6), (4.0, -0.5)],
+)
+def test_who_reverses_comes_to_a_halt_however_it_is_told_to_go_on(
+    acceleration, distance
+):
+    """From 2 m/s in reverse at 3 m/s^2, or as hard as it is told to; then it stands, or
+    drives on."""
     start = torch.tensor([0.0, 0.0, 0.0, -2.0])
     actions = torch.tensor([acceleration, 0.0]).expand(10, 2)
     states = dynamics.rollout(start, actions)
@@ -58,13 +75,19 @@ def test_who_reverses_comes_to_a_halt_however_it_is_told_to_go_on(acceleration, 
         state = dynamics.step(state, actions[0])
         torch.testing.assert_close(state, expected)
     assert states[:, 0].min().item() == pytest.approx(distance, abs=0.03)
-    assert states[-1, 3].item() == pytest.approx(max(0.0, acceleration * 1.0 - 2.0), abs=1e-5)
+    assert states[-1, 3].item() == pytest.approx(
+        max(0.0, acceleration * 1.0 - 2.0), abs=1e-5
+    )
 
 
 def test_who_reverses_and_brakes_harder_goes_on_from_the_speed_that_it_has():
-    """From -4 m/s by 8 m/s^2 to -0.8; then by 3 m/s^2 at least, whatever it is told, to a halt; then as it is told."""
+    """From -4 m/s by 8 m/s^2 to -0.8; then by 3 m/s^2 at least, whatever it is told, to
+    a halt; then as it is told."""
     accelerations = torch.tensor([8.0] * 4 + [-8.0] * 4 + [5.0, -8.0])
-    states = dynamics.rollout(torch.tensor([0.0, 0.0, 0.0, -4.0]), torch.stack([accelerations, torch.zeros(10)], -1))
+    states = dynamics.rollout(
+        torch.tensor([0.0, 0.0, 0.0, -4.0]),
+        torch.stack([accelerations, torch.zeros(10)], -1),
+    )
     speeds = torch.tensor([-3.2, -2.4, -1.6, -0.8, -0.5, -0.2, 0.0, 0.0, 0.5, 0.0])
     torch.testing.assert_close(states[:, 3], speeds, rtol=0, atol=1e-5)
 
@@ -72,7 +95,9 @@ def test_who_reverses_and_brakes_harder_goes_on_from_the_speed_that_it_has():
 def test_a_rollout_is_repeated_steps_forwards_and_backwards():
     start, actions = random_case(256, seed=4)
     start[:, 3] -= 10
-    assert ((start[:, 3] < 0).sum() > 100) and (dynamics.rollout(start, actions)[:, 5, 3] < 0).any()
+    assert ((start[:, 3] < 0).sum() > 100) and (
+        dynamics.rollout(start, actions)[:, 5, 3] < 0
+    ).any()
     state = start
     for moment, expected in enumerate(dynamics.rollout(start, actions).unbind(1)):
         state = dynamics.step(state, actions[:, moment])
@@ -91,9 +116,13 @@ def test_turns_respect_curvature_and_lateral_acceleration():
     rate = dynamics.wrap(states[:, 1:, 2] - states[:, :-1, 2]).abs() / DT
     speed = (states[:, 1:, 3] + states[:, :-1, 3]) / 2
     asked = (10 * actions[..., 1]).abs()
-    allowed = torch.minimum(dynamics.MAX_CURVATURE * speed, dynamics.MAX_LATERAL / speed.clamp(min=1e-3))
+    allowed = torch.minimum(
+        dynamics.MAX_CURVATURE * speed, dynamics.MAX_LATERAL / speed.clamp(min=1e-3)
+    )
     torch.testing.assert_close(rate, torch.minimum(asked, allowed))
-    assert (asked < allowed).any() and (speed > 6).any() and (speed < 4).any(), "by steering lock, grip, or neither"
+    assert (asked < allowed).any() and (speed > 6).any() and (speed < 4).any(), (
+        "by steering lock, grip, or neither"
+    )
 
 
 def test_inverse_returns_the_actions():
@@ -102,7 +131,9 @@ def test_inverse_returns_the_actions():
     start[:, 3] += 5
     states = torch.cat([start[:, None], dynamics.rollout(start, actions)], 1)
     assert torch.allclose(dynamics.inverse(states), actions, atol=1e-9)
-    assert torch.allclose(dynamics.rollout(start, dynamics.inverse(states)), states[:, 1:], atol=1e-8)
+    assert torch.allclose(
+        dynamics.rollout(start, dynamics.inverse(states)), states[:, 1:], atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("horizon", [1, 7])
@@ -117,7 +148,9 @@ def test_the_curvature_that_is_expected_of_a_turn():
     rate = torch.tensor([0.5, -0.3, 0.05, 2.0])
     speed = torch.tensor([10.0, 6.0, 0.2, 5.0])
     found = dynamics.curvature_of(rate, speed)
-    torch.testing.assert_close(found, torch.tensor([0.05, -0.05, 0.05, dynamics.SHARPEST]))
+    torch.testing.assert_close(
+        found, torch.tensor([0.05, -0.05, 0.05, dynamics.SHARPEST])
+    )
 
 
 def test_constant_velocity_is_a_rollout_without_actions():
@@ -136,9 +169,15 @@ def test_an_arc_is_the_unicycle_s_motion_at_constant_acceleration_and_curvature(
     times = DT * torch.arange(1, 51)
     arc, driven = along_arc(states, given, times=times)
     speed = torch.nn.functional.pad(arc[:, 3], (1, 0), value=9.0)
-    actions = torch.stack([torch.full((50,), -3.0), 0.04 * (speed[1:] + speed[:-1]) / 2], -1)
-    torch.testing.assert_close(arc, dynamics.rollout(states, actions), rtol=0, atol=0.02)
-    assert driven[-1].item() == pytest.approx(9.0**2 / 6, abs=1e-4), "to the halt, never backwards"
+    actions = torch.stack(
+        [torch.full((50,), -3.0), 0.04 * (speed[1:] + speed[:-1]) / 2], -1
+    )
+    torch.testing.assert_close(
+        arc, dynamics.rollout(states, actions), rtol=0, atol=0.02
+    )
+    assert driven[-1].item() == pytest.approx(9.0**2 / 6, abs=1e-4), (
+        "to the halt, never backwards"
+    )
     assert (driven.diff() >= 0).all() and (arc[31:, 3] == 0).all()
 
 
@@ -148,21 +187,30 @@ def test_an_arc_in_reverse_is_the_arc_forwards_of_who_looks_the_other_way(accel)
     ways = [dict(hold=1.0, turn=2.0), {}]
     for way in ways:
         back, metres = along_arc(
-            torch.tensor([1.0, 2.0, 0.3, -4.0]), Arc(torch.tensor(-accel), torch.tensor(0.05)), times=times, **way
+            torch.tensor([1.0, 2.0, 0.3, -4.0]),
+            Arc(torch.tensor(-accel), torch.tensor(0.05)),
+            times=times,
+            **way,
         )
         facing = torch.tensor([1.0, 2.0, 0.3 + math.pi, 4.0])
-        ahead, driven = along_arc(facing, Arc(torch.tensor(accel), torch.tensor(-0.05)), times=times, **way)
+        ahead, driven = along_arc(
+            facing, Arc(torch.tensor(accel), torch.tensor(-0.05)), times=times, **way
+        )
         torch.testing.assert_close(back[:, :2], ahead[:, :2], rtol=0, atol=1e-4)
         torch.testing.assert_close(metres, -driven)
         torch.testing.assert_close(back[:, 3], -ahead[:, 3])
         assert dynamics.wrap(back[:, 2] + math.pi - ahead[:, 2]).abs().max() < 1e-5
-    assert dynamics.curvature_of(torch.tensor(-0.2), torch.tensor(-4.0)).item() == pytest.approx(0.05)
+    assert dynamics.curvature_of(
+        torch.tensor(-0.2), torch.tensor(-4.0)
+    ).item() == pytest.approx(0.05)
 
 
 def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():
     given = Arc(torch.tensor(2.0), torch.tensor(0.05))
     times = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    arc, driven = along_arc(torch.tensor([0.0, 0.0, 0.0, 10.0]), given, times=times, hold=1.0, turn=2.0)
+    arc, driven = along_arc(
+        torch.tensor([0.0, 0.0, 0.0, 10.0]), given, times=times, hold=1.0, turn=2.0
+    )
     torch.testing.assert_close(arc[:, 3], torch.full((4,), 12.0))
     torch.testing.assert_close(driven, torch.tensor([11.0, 23.0, 35.0, 47.0]))
     torch.testing.assert_close(arc[1:, 2], torch.full((3,), 1.0))
@@ -180,6 +228,10 @@ def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():
         ((40, 3), (0, 0), 0.0),
     ],
 )
-def test_the_cost_of_the_closest_approach_has_its_published_values(offset, closing, cost):
-    found = dynamics.closest_approach_cost(torch.tensor(offset).double(), torch.tensor(closing).double())
+def test_the_cost_of_the_closest_approach_has_its_published_values(
+    offset, closing, cost
+):
+    found = dynamics.closest_approach_cost(
+        torch.tensor(offset).double(), torch.tensor(closing).double()
+    )
     assert found.item() == pytest.approx(cost, abs=1e-4)

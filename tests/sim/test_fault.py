@@ -1,4 +1,5 @@
-"""A contact is of the ego's own making where it moves and its front, or an agent that has stood, is hit."""
+"""A contact is of the ego's own making where it moves and its front, or an agent that
+has stood, is hit."""
 
 import math
 from types import SimpleNamespace
@@ -13,17 +14,35 @@ SIZE = torch.tensor([[4.0, 2.0]])
 
 
 def judged(ego, others, since=0, vehicle=True, steps=40):
-    """Of egos [B, 4] among agents [B, M, 4], all of one size; the first of them have had their speed since a step."""
+    """Of egos [B, 4] among agents [B, M, 4], all of one size; the first of them have
+    had their speed since a step."""
     count, agents = others.shape[:2]
     half = SIZE.T[None].expand(count, 2, agents) / 2
     still = torch.zeros(count, agents)
-    near = neighbours_of(ego, rotation_into(ego), size=SIZE.expand(count, 2), half_size=half, agents=Agents(others, still == 0, accel=still, turn_rate=still))
+    near = neighbours_of(
+        ego,
+        rotation_into(ego),
+        size=SIZE.expand(count, 2),
+        half_size=half,
+        agents=Agents(others, still == 0, accel=still, turn_rate=still),
+    )
     states = torch.cat([ego[:, None], others], 1)[:, None].repeat(1, steps + 1, 1, 1)
     states[:, :since, 1:2, 3] = 6.0
     tracks = states, torch.ones_like(states[..., 0], dtype=torch.bool)
-    static = SimpleNamespace(size=SIZE.expand(count, 2), half_size=half, vehicle=torch.full((count, agents), vehicle))
+    static = SimpleNamespace(
+        size=SIZE.expand(count, 2),
+        half_size=half,
+        vehicle=torch.full((count, agents), vehicle),
+    )
     static.row = torch.arange(count)[:, None]
-    return own_fault(ego[:, 3], near, hit=near.gap < 0, static=static, tracks=tracks, before=torch.full((count,), steps)).tolist()
+    return own_fault(
+        ego[:, 3],
+        near,
+        hit=near.gap < 0,
+        static=static,
+        tracks=tracks,
+        before=torch.full((count,), steps),
+    ).tolist()
 
 
 @pytest.mark.parametrize(
@@ -45,9 +64,13 @@ def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
     for heading in (0.0, 2.0):  # whichever way the ego looks
         cos = math.cos(heading)
         sin = math.sin(heading)
-        there = torch.tensor([[cos, -sin], [sin, cos]]) @ torch.tensor(place) + torch.tensor([10.0, -5.0])
+        there = torch.tensor([[cos, -sin], [sin, cos]]) @ torch.tensor(
+            place
+        ) + torch.tensor([10.0, -5.0])
         ego = torch.tensor([[10.0, -5.0, heading, speed]])
-        others = torch.tensor([[[*there.tolist(), heading, other_speed], [60.0, 60.0, 0.0, 5.0]]])
+        others = torch.tensor(
+            [[[*there.tolist(), heading, other_speed], [60.0, 60.0, 0.0, 5.0]]]
+        )
         assert judged(ego, others) == [expected]
 
 
@@ -69,7 +92,9 @@ def test_what_the_front_hits_must_have_stood(since, vehicle, expected):
 def test_who_stands_since_the_start_has_stood():
     ego = torch.tensor([[0.0, 0.0, 0.0, 5.0]])
     others = torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
-    assert judged(ego, others, steps=3) == [True] and judged(ego, others, since=1, steps=3) == [False]
+    assert judged(ego, others, steps=3) == [True] and judged(
+        ego, others, since=1, steps=3
+    ) == [False]
 
 
 def test_no_other_agent_no_fault():

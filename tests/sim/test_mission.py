@@ -15,7 +15,9 @@ def test_limits_are_read_at_the_nearest_vertex():
 
 
 def test_end_is_infinite_where_the_route_goes_on():
-    assert mission_of(make_scenes(1, road=(-60.0, 90.0)).scenes).end.item() == 90.0 + BACK
+    assert (
+        mission_of(make_scenes(1, road=(-60.0, 90.0)).scenes).end.item() == 90.0 + BACK
+    )
     assert mission_of(make_scenes(1).scenes).end.isinf().all()
 
 
@@ -26,6 +28,12 @@ def test_a_line_is_run_at_the_step_at_which_the_front_passes_it_at_red():
     light = torch.tensor([[0, -1]])
     line = torch.tensor([[10.0, 9.5]])
     assert ran_red(light_state, light, line=line, front=front).tolist() == [3]
-    assert ran_red(light_state, torch.tensor([[1, -1]]), line=line, front=front).tolist() == [-1], "green"
-    assert ran_red(light_state, light, line=line + 5, front=front).tolist() == [-1], "it halts before the line"
-    assert ran_red(light_state[..., :0], light, line=line, front=front).tolist() == [-1], "no lights"
+    assert ran_red(
+        light_state, torch.tensor([[1, -1]]), line=line, front=front
+    ).tolist() == [-1], "green"
+    assert ran_red(light_state, light, line=line + 5, front=front).tolist() == [-1], (
+        "it halts before the line"
+    )
+    assert ran_red(light_state[..., :0], light, line=line, front=front).tolist() == [
+        -1
+    ], "no lights"

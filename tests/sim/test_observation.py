@@ -1,4 +1,5 @@
-"""Observations: the same under a rigid motion of the scene and in any order of the others; blind to padding."""
+"""Observations: the same under a rigid motion of the scene and in any order of the
+others; blind to padding."""
 
 import pytest
 import torch
@@ -36,7 +37,10 @@ def quarter_turn(scenes: SceneSet, shift: torch.Tensor):
         return torch.stack([-xy[..., 1], xy[..., 0]], -1) + shift
 
     for key in ("start", "logged"):
-        s[key] = torch.cat([turn(s[key][..., :2]), s[key][..., 2:3] + torch.pi / 2, s[key][..., 3:]], -1)
+        s[key] = torch.cat(
+            [turn(s[key][..., :2]), s[key][..., 2:3] + torch.pi / 2, s[key][..., 3:]],
+            -1,
+        )
     for key in ("route_points", "light_points", "lane_points", "drivable_points"):
         s[key] = turn(s[key])
     last = s["field"].shape[-1] - 1
@@ -54,9 +58,21 @@ def test_rigid_motion_changes_nothing():
 def test_order_of_the_others_changes_nothing():
     scenes = scenes_with_everything()
     rows = torch.cat(
-        [torch.tensor([0]), 1 + torch.randperm(31, generator=torch.Generator().manual_seed(0)), torch.arange(32, 48)]
+        [
+            torch.tensor([0]),
+            1 + torch.randperm(31, generator=torch.Generator().manual_seed(0)),
+            torch.arange(32, 48),
+        ]
     )
-    for key in ("start", "start_accel", "start_yaw_rate", "valid", "size", "agent_type", "parked"):
+    for key in (
+        "start",
+        "start_accel",
+        "start_yaw_rate",
+        "valid",
+        "size",
+        "agent_type",
+        "parked",
+    ):
         scenes.scenes[key] = scenes.scenes[key][:, rows]
     for key in ("logged", "logged_valid"):
         scenes.scenes[key] = scenes.scenes[key][:, :, rows]
@@ -71,11 +87,19 @@ def test_absent_agents_leave_no_trace():
     assert torch.equal(observe(scenes), observe(scenes_with_everything()))
 
 
-@pytest.mark.parametrize(("speed", "limit"), [(8.0, UNLIMITED), (15.0, 15.5)])  # m/s; the ego accelerates by half
-def test_a_map_without_limits_looks_like_one_with_the_usual_one_or_that_of_the_ego_s_speed(speed, limit):
-    unknown, known = (observe(make_scenes(2, speed=speed, limit=value)) for value in (0.0, limit))
+@pytest.mark.parametrize(
+    ("speed", "limit"), [(8.0, UNLIMITED), (15.0, 15.5)]
+)  # m/s; the ego accelerates by half
+def test_a_map_without_limits_looks_like_one_with_the_usual_one_or_that_of_the_ego_s_speed(
+    speed, limit
+):
+    unknown, known = (
+        observe(make_scenes(2, speed=speed, limit=value)) for value in (0.0, limit)
+    )
     assert torch.allclose(unknown, known, atol=1e-6)
-    assert not torch.allclose(known, observe(make_scenes(2, speed=speed, limit=limit + 1.0)), atol=1e-3)
+    assert not torch.allclose(
+        known, observe(make_scenes(2, speed=speed, limit=limit + 1.0)), atol=1e-3
+    )
 
 
 def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
@@ -85,7 +109,12 @@ def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
     last = scene["light_state"].shape[1] - 1
     here = torch.full((2,), 20.0)
     at_the_end, beyond = (
-        light_features(observation_config(torch.device("cpu")), static, step=torch.full((2,), step), s=here)
+        light_features(
+            observation_config(torch.device("cpu")),
+            static,
+            step=torch.full((2,), step),
+            s=here,
+        )
         for step in (last, last + 40)
     )
     assert torch.equal(beyond, at_the_end) and beyond[0, 0] == 1 and beyond[1, 2] == 1
@@ -98,19 +127,30 @@ def observations(scenes, actions):
     td = env.reset()
     for action in actions:
         seen.append(td["observation"])
-        td = env.step(td.set("action", action.expand(len(scenes), 2)))["next"].exclude("reward")
+        td = env.step(td.set("action", action.expand(len(scenes), 2)))["next"].exclude(
+            "reward"
+        )
     return torch.stack(seen, 1)
 
 
 def test_driving_in_the_mirror_looks_like_the_mirror_of_driving():
-    """Roads, lights, curves and traffic of the bundled scenes; the ego steers and accelerates at random."""
+    """Roads, lights, curves and traffic of the bundled scenes; the ego steers and
+    accelerates at random."""
     torch.manual_seed(0)
-    scenes = e2rl.load_scenes("bundled", num_scenes=16, versions=["recorded", "mirrored"])
-    first = [k for k, name in enumerate(scenes.scene_id) if f"{name}~mirrored" in scenes.scene_id][:8]
+    scenes = e2rl.load_scenes(
+        "bundled", num_scenes=16, versions=["recorded", "mirrored"]
+    )
+    first = [
+        k
+        for k, name in enumerate(scenes.scene_id)
+        if f"{name}~mirrored" in scenes.scene_id
+    ][:8]
     other = [scenes.scene_id.index(f"{scenes.scene_id[k]}~mirrored") for k in first]
     actions = torch.randn(20, 2) * torch.tensor([1.5, 0.15])
     seen = observations(scenes.chosen(first), actions)
     reflected = observations(scenes.chosen(other), actions * torch.tensor([1.0, -1.0]))
     assert torch.allclose(mirrored(seen), reflected, atol=2e-3)
-    assert not torch.allclose(seen, reflected, atol=0.1), "and these scenes are not symmetric themselves"
+    assert not torch.allclose(seen, reflected, atol=0.1), (
+        "and these scenes are not symmetric themselves"
+    )
     assert torch.equal(mirrored(mirrored(seen)), seen)

@@ -1,4 +1,5 @@
-"""The names of the observation's numbers are those of what stands there, and the page about them says the same."""
+"""The names of the observation's numbers are those of what stands there, and the page
+about them says the same."""
 
 import math
 
@@ -13,56 +14,104 @@ from tests.synthetic import LANE_WIDTH, make_scenes
 
 @pytest.fixture(scope="module")
 def seen():
-    """{name: quantity in its unit} at the second step of a known scene: the ego at 10 m/s accelerates by 1 m/s^2 behind
-    a car 20 m ahead of it at 8 m/s; one stands beside the road; a red light is at x = 70 m."""
-    scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (20.0, 0, 8.0), (-12.0, 1, 9.0)], num_vrus=1, red_light_x=70.0)
+    """{name: quantity in its unit} at the second step of a known scene: the ego at 10
+    m/s accelerates by 1 m/s^2 behind a car 20 m ahead of it at 8 m/s; one stands beside
+    the road; a red light is at x = 70 m."""
+    scenes = make_scenes(
+        1,
+        vehicles=[(0.0, 0, 10.0), (20.0, 0, 8.0), (-12.0, 1, 9.0)],
+        num_vrus=1,
+        red_light_x=70.0,
+    )
     env = DrivingEnv(scenes, SimSettings(), 1)
     td = env.reset().set("action", torch.tensor([[1.0, 0.0]]))
     observation = env.step(td)["next", "observation"][0].tolist()
     entries = observation_layout()
-    return {entry.name: entry.scale * value for entry, value in zip(entries, observation, strict=True)}
+    return {
+        entry.name: entry.scale * value
+        for entry, value in zip(entries, observation, strict=True)
+    }
 
 
 def test_every_number_has_a_name_of_its_own():
     names = [entry.name for entry in observation_layout()]
     assert len(set(names)) == len(names) == OBSERVATION_SIZE
     assert names[ELAPSED] == "ego.elapsed"
-    for block, first in ((reference.ROUTE, "route.0.x"), (reference.LIGHTS, "light.0.red"), (reference.AGENTS, None)):
+    for block, first in (
+        (reference.ROUTE, "route.0.x"),
+        (reference.LIGHTS, "light.0.red"),
+        (reference.AGENTS, None),
+    ):
         assert names[block.start] == (first or "agent.0.present")
 
 
 def test_the_ego_and_its_mission(seen):
     near = {"abs": 1e-4}
-    assert seen["ego.speed"] == pytest.approx(10.1, **near) and seen["ego.acceleration"] == pytest.approx(1, **near)
-    assert seen["ego.yaw_rate"] == seen["ego.offset"] == 0 and seen["ego.heading_cos"] == pytest.approx(1)
-    assert seen["ego.limit"] == pytest.approx(15) and seen["ego.elapsed"] == pytest.approx(1 / 80)
+    assert seen["ego.speed"] == pytest.approx(10.1, **near) and seen[
+        "ego.acceleration"
+    ] == pytest.approx(1, **near)
+    assert seen["ego.yaw_rate"] == seen["ego.offset"] == 0 and seen[
+        "ego.heading_cos"
+    ] == pytest.approx(1)
+    assert seen["ego.limit"] == pytest.approx(15) and seen[
+        "ego.elapsed"
+    ] == pytest.approx(1 / 80)
     assert [seen["ego.length"], seen["ego.width"]] == pytest.approx([4.5, 2.0], abs=0.3)
-    assert [seen[f"route.{k}.x"] for k in range(3)] == pytest.approx([2, 4, 7], abs=1e-3)
-    assert [seen[f"route.3.{name}"] for name in ("y", "heading_sin", "curvature", "limit")] == pytest.approx(
-        [0, 0, 0, 15]
+    assert [seen[f"route.{k}.x"] for k in range(3)] == pytest.approx(
+        [2, 4, 7], abs=1e-3
     )
-    assert (seen["light.0.red"], seen["light.0.green"]) == (1, 0) and 0 < seen["light.0.nearness"] < 0.2
-    assert seen["border.+0.+2.5"] == pytest.approx(2.5 - LANE_WIDTH * 1.5, abs=0.2), "m beyond the border"
+    assert [
+        seen[f"route.3.{name}"] for name in ("y", "heading_sin", "curvature", "limit")
+    ] == pytest.approx([0, 0, 0, 15])
+    assert (seen["light.0.red"], seen["light.0.green"]) == (1, 0) and 0 < seen[
+        "light.0.nearness"
+    ] < 0.2
+    assert seen["border.+0.+2.5"] == pytest.approx(2.5 - LANE_WIDTH * 1.5, abs=0.2), (
+        "m beyond the border"
+    )
 
 
 def test_the_nearest_agents(seen):
-    assert [seen[f"agent.{k}.present"] for k in range(4)] == [1, 1, 1, 0], "two cars and a pedestrian"
+    assert [seen[f"agent.{k}.present"] for k in range(4)] == [1, 1, 1, 0], (
+        "two cars and a pedestrian"
+    )
     assert sum(seen[f"agent.{k}.vehicle"] for k in range(3)) == 2
-    ahead = next(k for k in range(12) if seen[f"agent.{k}.x"] > 15 and seen[f"agent.{k}.vehicle"])
-    agent = {name.split(".")[2]: value for name, value in seen.items() if name.startswith(f"agent.{ahead}.")}
-    assert agent["x"] == pytest.approx(20 + 0.8 - 1.005, abs=0.02) and agent["y"] == pytest.approx(0, abs=1e-4)
-    assert agent["velocity_x"] == pytest.approx(8 - 10.1, abs=1e-3) and agent["speed"] == pytest.approx(8, abs=1e-3)
-    assert agent["heading_cos"] == pytest.approx(1) and agent["half_length"] == pytest.approx(2.25, abs=0.15)
+    ahead = next(
+        k for k in range(12) if seen[f"agent.{k}.x"] > 15 and seen[f"agent.{k}.vehicle"]
+    )
+    agent = {
+        name.split(".")[2]: value
+        for name, value in seen.items()
+        if name.startswith(f"agent.{ahead}.")
+    }
+    assert agent["x"] == pytest.approx(20 + 0.8 - 1.005, abs=0.02) and agent[
+        "y"
+    ] == pytest.approx(0, abs=1e-4)
+    assert agent["velocity_x"] == pytest.approx(8 - 10.1, abs=1e-3) and agent[
+        "speed"
+    ] == pytest.approx(8, abs=1e-3)
+    assert agent["heading_cos"] == pytest.approx(1) and agent[
+        "half_length"
+    ] == pytest.approx(2.25, abs=0.15)
     assert agent["gap"] == pytest.approx(agent["x"] - 2 * agent["half_length"], abs=0.3)
     assert seen["agent.11.present"] == 0
 
 
 def test_the_closest_approach_at_constant_velocities(seen):
-    """Of the car ahead, which the ego catches up with: the time that the gap lasts, and no distance then."""
-    ahead = next(k for k in range(12) if seen[f"agent.{k}.x"] > 15 and seen[f"agent.{k}.vehicle"])
-    agent = {name.split(".")[2]: value for name, value in seen.items() if name.startswith(f"agent.{ahead}.")}
+    """Of the car ahead, which the ego catches up with: the time that the gap lasts, and
+    no distance then."""
+    ahead = next(
+        k for k in range(12) if seen[f"agent.{k}.x"] > 15 and seen[f"agent.{k}.vehicle"]
+    )
+    agent = {
+        name.split(".")[2]: value
+        for name, value in seen.items()
+        if name.startswith(f"agent.{ahead}.")
+    }
     time = agent["x"] / (10.1 - 8)
-    assert agent["approach_time"] == pytest.approx(math.exp(-min(time, 8) / 2), abs=2e-3)
+    assert agent["approach_time"] == pytest.approx(
+        math.exp(-min(time, 8) / 2), abs=2e-3
+    )
     miss = max(agent["x"] - 8 * (10.1 - 8), 0)
     assert agent["approach_distance"] == pytest.approx(math.exp(-miss / 5), abs=2e-2)
 

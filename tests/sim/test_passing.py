@@ -1,4 +1,5 @@
-"""Boxes that pass through each other in a step: the same as a fine look at where they are in between."""
+"""Boxes that pass through each other in a step: the same as a fine look at where they
+are in between."""
 
 import math
 
@@ -17,23 +18,40 @@ def random_steps(count, generator):
     """Offset, change, turn of `count` boxes past a box, and half sizes of both."""
 
     def draw(low, high):
-        return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
+        return low + (high - low) * torch.rand(
+            count, generator=generator, dtype=torch.float64
+        )
 
     offset = torch.stack([draw(-8, 8), draw(-5, 5)])
     change = torch.stack([draw(-9, 9), draw(-6, 6)])
-    return offset, change, draw(-math.pi, math.pi), torch.stack([draw(1, 3), draw(0.4, 1)])
+    return (
+        offset,
+        change,
+        draw(-math.pi, math.pi),
+        torch.stack([draw(1, 3), draw(0.4, 1)]),
+    )
 
 
 def test_the_interval_is_that_of_a_fine_look():
     generator = torch.Generator().manual_seed(0)
     offset, change, turn, other = random_steps(3000, generator)
     own = torch.tensor([[2.3], [0.95]], dtype=torch.float64).expand(2, 3000)
-    begin, end = time_inside(offset, change, direction=torch.stack([turn.cos(), turn.sin()]), own=own, other=other)
+    begin, end = time_inside(
+        offset,
+        change,
+        direction=torch.stack([turn.cos(), turn.sin()]),
+        own=own,
+        other=other,
+    )
     time = torch.linspace(0, 1, FINE + 1, dtype=torch.float64)
     place = offset[..., None] + change[..., None] * time
-    box = torch.stack([*place, turn[:, None].expand(-1, FINE + 1), torch.zeros(3000, FINE + 1)], -1)
+    box = torch.stack(
+        [*place, turn[:, None].expand(-1, FINE + 1), torch.zeros(3000, FINE + 1)], -1
+    )
     still = torch.zeros(4, dtype=torch.float64)
-    gap = separation(still, 2 * own.T[:, None], second=box, second_size=2 * other.T[:, None])
+    gap = separation(
+        still, 2 * own.T[:, None], second=box, second_size=2 * other.T[:, None]
+    )
     inside = (gap < 0).any(1)
     assert torch.equal(inside | ((gap.amin(1) < 0.02) & (begin < end)), begin < end)
     first = time[(gap < 0).int().argmax(1)]
@@ -48,9 +66,13 @@ def test_what_moves_no_farther_than_half_of_the_smallest_extent_is_not_looked_at
     assert is_fast(torch.tensor([[0.3], [0.3]]), own, other=other).all()
 
 
-@pytest.mark.parametrize(("lateral", "known", "hits"), [(0.0, True, True), (0.0, False, False), (2.0, True, False)])
+@pytest.mark.parametrize(
+    ("lateral", "known", "hits"),
+    [(0.0, True, True), (0.0, False, False), (2.0, True, False)],
+)
 def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
-    """Head-on at 78 m/s: from 4.2 m before the ego to 3.6 m behind it. Who was not there did not pass."""
+    """Head-on at 78 m/s: from 4.2 m before the ego to 3.6 m behind it. Who was not
+    there did not pass."""
     ego_before = torch.tensor([[0.0, 0.0, 0.0, 38.0]])
     ego = torch.tensor([[3.8, 0.0, 0.0, 38.0]])
     before = torch.tensor([[[4.2, lateral, math.pi, 40.0]]])
@@ -59,13 +81,25 @@ def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
     still = torch.zeros(1, 1)
     half = torch.tensor([[[1.1], [0.4]]])
     agents = Agents(now, still == 0, accel=still, turn_rate=still)
-    near = neighbours_of(ego, rotation_into(ego), size=size, half_size=half, agents=agents)
+    near = neighbours_of(
+        ego, rotation_into(ego), size=size, half_size=half, agents=agents
+    )
     tracks = torch.stack([torch.cat([ego[:, None], at], 1) for at in (before, now)], 1)
     there = torch.tensor([[[True, known], [True, True]]])
     first = torch.zeros(1, 1, dtype=torch.int64)
-    found = passed(near, (ego_before, ego), tracks=(tracks, there), row=first, step=first[0], size=size, half_size=half)
+    found = passed(
+        near,
+        (ego_before, ego),
+        tracks=(tracks, there),
+        row=first,
+        step=first[0],
+        size=size,
+        half_size=half,
+    )
     assert (near.gap > 0).all() and bool((found.gap < 0).all()) == hits
     if hits:
         assert found.position[0, :, 0].tolist() == pytest.approx([3.1, 0.0], abs=1e-4)
     else:
-        assert torch.equal(found.gap, near.gap) and torch.equal(found.position, near.position)
+        assert torch.equal(found.gap, near.gap) and torch.equal(
+            found.position, near.position
+        )

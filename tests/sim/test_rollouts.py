@@ -1,4 +1,5 @@
-"""Rollouts and their files: exact keys and types, readable without pickle, whole or refused, the same when read."""
+"""Rollouts and their files: exact keys and types, readable without pickle, whole or
+refused, the same when read."""
 
 import io
 import zipfile
@@ -32,34 +33,68 @@ def rollouts():
 
 def test_files_have_the_format_s_keys_types_and_names(tmp_path, rollouts):
     paths = rollouts.to_npz(tmp_path)
-    assert [path.name for path in paths][:2] == ["e2__idm__2__scene_0__0.npz", "e2__idm__2__scene_0__1.npz"]
+    assert [path.name for path in paths][:2] == [
+        "e2__idm__2__scene_0__0.npz",
+        "e2__idm__2__scene_0__1.npz",
+    ]
     assert sorted(tmp_path.iterdir()) == sorted(paths), "no temporary file is left"
     for index, path in enumerate(paths):
         with np.load(path, allow_pickle=False) as archive:
             data = dict(archive)
         assert data.keys() == DTYPES.keys()
         for key, kind in DTYPES.items():
-            assert data[key].dtype.kind == kind[0] and (len(kind) < 2 or data[key].dtype == kind), key
-        assert str(data["format"]) == "e2rl-rollout/1" and float(data["dt"]) == 0.1 and int(data["ego"]) == 0
+            assert data[key].dtype.kind == kind[0] and (
+                len(kind) < 2 or data[key].dtype == kind
+            ), key
+        assert (
+            str(data["format"]) == "e2rl-rollout/1"
+            and float(data["dt"]) == 0.1
+            and int(data["ego"]) == 0
+        )
         for name, least in (("lane", 2), ("drivable", 3)):
             offsets = data[f"{name}_offsets"]
-            assert offsets[0] == 0 and offsets[-1] == len(data[f"{name}_points"]) and (np.diff(offsets) >= least).all()
+            assert (
+                offsets[0] == 0
+                and offsets[-1] == len(data[f"{name}_points"])
+                and (np.diff(offsets) >= least).all()
+            )
         np.testing.assert_array_equal(data["states"], rollouts.states[index].numpy())
 
 
-def test_rollouts_read_back_are_those_written_padded_where_others_are_longer(tmp_path, rollouts):
+def test_rollouts_read_back_are_those_written_padded_where_others_are_longer(
+    tmp_path, rollouts
+):
     read = Rollouts.from_npz(rollouts.to_npz(tmp_path))
-    for key in ("states", "valid", "size", "agent_type", "adversaries", "logged", "eta", "seed"):
-        torch.testing.assert_close(read.get(key), rollouts.get(key), equal_nan=True, rtol=0, atol=0)
+    for key in (
+        "states",
+        "valid",
+        "size",
+        "agent_type",
+        "adversaries",
+        "logged",
+        "eta",
+        "seed",
+    ):
+        torch.testing.assert_close(
+            read.get(key), rollouts.get(key), equal_nan=True, rtol=0, atol=0
+        )
     for key in ("scene_id", "location", "method"):
         assert list(read.get(key)) == list(rollouts.get(key))
     short = random_rollouts(2, seed=2, steps=40, vehicles=6, others=1)
     both = Rollouts.of([rollouts.rollout(0), short.rollout(1)])
     assert both.states.shape[1:3] == rollouts.states.shape[1:3]
     assert not both.valid[1, 41:].any() and not both.valid[1, :, 7:].any()
-    torch.testing.assert_close(both.states[1, :41, :7], short.states[1], equal_nan=True, rtol=0, atol=0)
-    for rows in (read[1:3], torch.cat([read[1:2], read[2:3]]), read[torch.tensor([False, True, True, False])]):
-        assert list(rows.scene_id) == ["scene_0", "scene_1"] and torch.equal(rows.valid, read.valid[1:3])
+    torch.testing.assert_close(
+        both.states[1, :41, :7], short.states[1], equal_nan=True, rtol=0, atol=0
+    )
+    for rows in (
+        read[1:3],
+        torch.cat([read[1:2], read[2:3]]),
+        read[torch.tensor([False, True, True, False])],
+    ):
+        assert list(rows.scene_id) == ["scene_0", "scene_1"] and torch.equal(
+            rows.valid, read.valid[1:3]
+        )
 
 
 def test_rollouts_of_other_maps_and_sizes_are_joined_and_score_as_before():
@@ -68,7 +103,10 @@ def test_rollouts_of_other_maps_and_sizes_are_joined_and_score_as_before():
     large = random_rollouts(3, seed=5, vehicles=7, others=2)
     line = torch.tensor([[-50.0, 0.0], [0.0, 1.0], [50.0, 0.0]]).expand(2, -1, -1)
     small = small.replace(
-        lane_points=line, lane_index=torch.zeros(2, 3, dtype=torch.int64), lane_width=torch.full((2, 1), 4.0), nfe=None
+        lane_points=line,
+        lane_index=torch.zeros(2, 3, dtype=torch.int64),
+        lane_width=torch.full((2, 1), 4.0),
+        nfe=None,
     )
     joined = torch.cat([small, large])
     assert joined.nfe is None
@@ -81,14 +119,18 @@ def test_rollouts_of_other_maps_and_sizes_are_joined_and_score_as_before():
         assert row == pytest.approx(alone, nan_ok=True, abs=1e-9)
 
 
-def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_left_out(tmp_path, rollouts):
+def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_left_out(
+    tmp_path, rollouts
+):
     rows = rollouts.states.shape[2]
     plans = torch.arange(4.0 * 16 * rows * 10 * 2).reshape(4, 16, rows, 10, 2)
     targets = torch.where(rollouts.adversaries, 0, -1)[:, None].expand(-1, 16, -1)
     evasion = rollouts.states[:, :, 0].clone()
     driver = rollouts.states[:, :, 0] + 1
     evasion[1] = driver[2] = torch.nan
-    more = rollouts.replace(plans=plans, targets=targets, evasion=evasion, driver=driver)
+    more = rollouts.replace(
+        plans=plans, targets=targets, evasion=evasion, driver=driver
+    )
     for index, path in enumerate(more.to_npz(tmp_path)):
         data = Rollout.read(path)
         planners = [0, *rollouts.adversaries[index].nonzero()[:, 0].tolist()]
@@ -101,28 +143,71 @@ def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_le
 def test_scenes_tell_who_is_simulated_and_what_was_recorded():
     scenes = make_scenes(2, vehicles=[(0, 0, 5.0), (20, 0, 5.0)], num_vrus=1, steps=10)
     scene = scenes.scenes
-    more = {"adversaries": scene["valid"] & False, "seed": torch.arange(2), "eta": torch.zeros(2).double()}
-    made = Rollouts.in_scenes(scenes, torch.arange(2), states=scene["logged"], valid=scene["logged_valid"], **more)
-    assert torch.equal(made.simulated, scene["valid"] & (scene["agent_type"] == VEHICLE))
-    assert not made.logged_valid[:, :, ~scene["valid"][0]].any() and list(made.scene_id) == scenes.scene_id
-    replayed = Rollouts.in_scenes(scenes, torch.arange(2), states=made.states, valid=made.valid, replays_ego=True, **more)
-    assert not replayed.simulated[:, 0].any() and torch.equal(replayed.simulated[:, 1:], made.simulated[:, 1:])
+    more = {
+        "adversaries": scene["valid"] & False,
+        "seed": torch.arange(2),
+        "eta": torch.zeros(2).double(),
+    }
+    made = Rollouts.in_scenes(
+        scenes,
+        torch.arange(2),
+        states=scene["logged"],
+        valid=scene["logged_valid"],
+        **more,
+    )
+    assert torch.equal(
+        made.simulated, scene["valid"] & (scene["agent_type"] == VEHICLE)
+    )
+    assert (
+        not made.logged_valid[:, :, ~scene["valid"][0]].any()
+        and list(made.scene_id) == scenes.scene_id
+    )
+    replayed = Rollouts.in_scenes(
+        scenes,
+        torch.arange(2),
+        states=made.states,
+        valid=made.valid,
+        replays_ego=True,
+        **more,
+    )
+    assert not replayed.simulated[:, 0].any() and torch.equal(
+        replayed.simulated[:, 1:], made.simulated[:, 1:]
+    )
 
 
-def test_a_failure_has_its_contact_and_a_rollout_without_one_has_none(tmp_path, rollouts):
+def test_a_failure_has_its_contact_and_a_rollout_without_one_has_none(
+    tmp_path, rollouts
+):
     rollouts[:1].to_npz(tmp_path / "rollouts")
-    row = {"method": "e2", "ego_policy": "idm", "eta": 2.0, "scene_id": "scene_0", "seed": 0, "partner": 3}
+    row = {
+        "method": "e2",
+        "ego_policy": "idm",
+        "eta": 2.0,
+        "scene_id": "scene_0",
+        "seed": 0,
+        "partner": 3,
+    }
     failure = Failure.read(tmp_path, row | {"contact_step": 12.0})
-    assert (failure.contact, failure.partner, failure.rollout.name) == (12, 3, "e2__idm__2__scene_0__0.npz")
-    assert Failure(failure.rollout, row | {"contact_step": float("nan")}).contact is None
+    assert (failure.contact, failure.partner, failure.rollout.name) == (
+        12,
+        3,
+        "e2__idm__2__scene_0__0.npz",
+    )
+    assert (
+        Failure(failure.rollout, row | {"contact_step": float("nan")}).contact is None
+    )
 
 
 def test_lines_too_short_to_be_lines_are_left_out():
     points = torch.arange(12.0).reshape(6, 2)
-    kept, offsets, numbers = polylines(points, torch.tensor([0, 0, 3, 4, 4, -1]), minimum=2)
+    kept, offsets, numbers = polylines(
+        points, torch.tensor([0, 0, 3, 4, 4, -1]), minimum=2
+    )
     assert numbers.tolist() == [0, 4] and offsets.tolist() == [0, 2, 4]
     assert kept.tolist() == points[[0, 1, 3, 4]].tolist()
-    empty, offsets, _ = polylines(points[:0], torch.zeros(0, dtype=torch.int64), minimum=3)
+    empty, offsets, _ = polylines(
+        points[:0], torch.zeros(0, dtype=torch.int64), minimum=3
+    )
     assert empty.shape == (0, 2) and offsets.tolist() == [0]
 
 
@@ -132,9 +217,17 @@ def test_names_that_no_path_may_hold_are_mended(tmp_path, rollouts):
     assert Rollout.read(path).scene_id == "a/../b c"
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 @given(
-    st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=6),
+    st.lists(
+        st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)),
+        min_size=1,
+        max_size=6,
+    ),
     st.floats(0.3, 1),
 )
 def test_a_damaged_rollout_is_refused_by_name(tmp_path, rollouts, changes, kept):
@@ -163,15 +256,25 @@ def test_a_damaged_rollout_is_refused_by_name(tmp_path, rollouts, changes, kept)
         ("ego", np.array(48), "ego is out of range"),
         ("size", np.full((48, 2), 1e9, np.float32), "size is not between"),
         ("states", np.full((81, 48, 4), np.nan, np.float32), "a valid state is NaN"),
-        ("logged", np.full((81, 48, 4), -1e6, np.float32), "a valid state of logged is beyond"),
-        ("states", np.full((81, 48, 4), [0, 0, 1e4, 0], np.float32), "beyond 100000 m, 1000 rad"),
+        (
+            "logged",
+            np.full((81, 48, 4), -1e6, np.float32),
+            "a valid state of logged is beyond",
+        ),
+        (
+            "states",
+            np.full((81, 48, 4), [0, 0, 1e4, 0], np.float32),
+            "beyond 100000 m, 1000 rad",
+        ),
         ("lane_width", np.full(3, np.nan, np.float32), "as many lanes as borders"),
         ("plans", np.zeros((16, 1, 10, 2), np.float32), "some are missing"),
         ("agent_type", np.array(["horse"] * 48), "unknown type"),
         ("drivable_offsets", np.array([0, 10**12]), "do not divide"),
     ],
 )
-def test_arrays_that_do_not_fit_together_are_named(tmp_path, rollouts, name, value, what):
+def test_arrays_that_do_not_fit_together_are_named(
+    tmp_path, rollouts, name, value, what
+):
     path = rollouts[:1].to_npz(tmp_path)[0]
     np.savez(path, **(dict(np.load(path)) | {name: value}))
     with pytest.raises(InputError, match=rf"npz: damaged: .*{what}"):
@@ -180,15 +283,21 @@ def test_arrays_that_do_not_fit_together_are_named(tmp_path, rollouts, name, val
 
 def test_an_archive_that_claims_more_than_it_may_is_not_unpacked(tmp_path):
     with (
-        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        zipfile.ZipFile(
+            tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1
+        ) as archive,
         archive.open("states.npy", "w") as one,
     ):
         for _ in range(1025):
             one.write(bytes(1 << 20))
-    with pytest.raises(InputError, match=r"bomb\.npz: no readable rollout .unpacks to 1075 MB"):
+    with pytest.raises(
+        InputError, match=r"bomb\.npz: no readable rollout .unpacks to 1075 MB"
+    ):
         Rollout.read(tmp_path / "bomb.npz")
     claim = io.BytesIO()
-    np.lib.format.write_array_header_1_0(claim, {"descr": "<f8", "fortran_order": False, "shape": (1 << 60,)})
+    np.lib.format.write_array_header_1_0(
+        claim, {"descr": "<f8", "fortran_order": False, "shape": (1 << 60,)}
+    )
     with zipfile.ZipFile(tmp_path / "claim.npz", "w") as archive:
         archive.writestr("states.npy", claim.getvalue())
     with pytest.raises(InputError, match=r"claim\.npz: no readable rollout"):

@@ -1,4 +1,5 @@
-"""Look-ups of a step: the same numbers as the general functions of routes, missions and boxes give."""
+"""Look-ups of a step: the same numbers as the general functions of routes, missions and
+boxes give."""
 
 import torch
 
@@ -22,14 +23,18 @@ def winding(seed=0):
     limit = torch.randint(0, 30, (BATCH, COUNT), generator=draw).float()
     scene = make_scenes(BATCH, num_points=COUNT).scenes
     mission = mission_of(scene)
-    mission = Mission(points, limit, end=mission.end, light=mission.light, light_s=mission.light_s)
+    mission = Mission(
+        points, limit, end=mission.end, light=mission.light, light_s=mission.light_s
+    )
     return static_scene(scene, mission), mission, draw
 
 
 def test_the_pose_is_the_projection_on_the_mission():
     static, mission, draw = winding()
     hint = 150 * torch.rand(BATCH, generator=draw) - 15
-    near = mission.points[torch.arange(BATCH), (hint / SPACING).long().clamp(0, COUNT - 1)]
+    near = mission.points[
+        torch.arange(BATCH), (hint / SPACING).long().clamp(0, COUNT - 1)
+    ]
     xy = near + 3 * torch.randn(BATCH, 2, generator=draw)
     expected = project(xy[:, None], mission.points, hint=hint[:, None])
     for found, value in zip(follow(static, xy, hint=hint), expected, strict=True):
@@ -41,7 +46,9 @@ def test_the_way_ahead_is_interpolated_with_its_limit():
     s = 160 * torch.rand(BATCH, 40, generator=draw) - 20
     x, y, heading, curvature, limit = look_along(static, s)
     xy = torch.stack([x, y], -1)
-    for found, value in zip((xy, heading, curvature), interpolate(mission.points, s), strict=True):
+    for found, value in zip(
+        (xy, heading, curvature), interpolate(mission.points, s), strict=True
+    ):
         assert torch.allclose(found, value, atol=1e-5)
     assert torch.equal(limit, limit_at(mission, s))
 
@@ -56,9 +63,24 @@ def test_others_are_seen_in_the_ego_frame_with_their_gap():
     others = states[:, 1:]
     sizes = (static.size, static.half_size)
     present = scene["valid"][:, 1:]
-    seen = neighbours_of(ego, rotation_into(ego), *sizes, Agents(others, present, accel=others[..., 0], turn_rate=others[..., 1]))
-    assert torch.allclose(seen.position.transpose(1, 2), to_frame(others[..., :2], ego[:, None]), atol=1e-5)
+    seen = neighbours_of(
+        ego,
+        rotation_into(ego),
+        *sizes,
+        Agents(others, present, accel=others[..., 0], turn_rate=others[..., 1]),
+    )
+    assert torch.allclose(
+        seen.position.transpose(1, 2),
+        to_frame(others[..., :2], ego[:, None]),
+        atol=1e-5,
+    )
     turned = others[..., 2] - ego[:, None, 2]
-    assert torch.allclose(seen.direction, torch.stack([turned.cos(), turned.sin()], 1), atol=1e-5)
+    assert torch.allclose(
+        seen.direction, torch.stack([turned.cos(), turned.sin()], 1), atol=1e-5
+    )
     size = scene["size"]
-    assert torch.allclose(seen.gap, separation(ego[:, None], size[:, :1], second=others, second_size=size[:, 1:]), atol=1e-5)
+    assert torch.allclose(
+        seen.gap,
+        separation(ego[:, None], size[:, :1], second=others, second_size=size[:, 1:]),
+        atol=1e-5,
+    )

@@ -1,4 +1,5 @@
-"""The fuzzer reads whole inputs, so that what it counts as refused is refused for the damage, and knows what is bad."""
+"""The fuzzer reads whole inputs, so that what it counts as refused is refused for the
+damage, and knows what is bad."""
 
 import os
 import pickle
@@ -56,14 +57,22 @@ def test_a_command_is_refused_by_one_line_and_no_other_way():
     ended(None, "any warning")
     with pytest.raises(InputError, match="error: of the user"):
         ended(2, "a warning\nerror: of the user")
-    for status, said in ((1, "Traceback\nerror: x"), (2, ""), (-9, ""), (2, "error: x\nerror: y")):
+    for status, said in (
+        (1, "Traceback\nerror: x"),
+        (2, ""),
+        (-9, ""),
+        (2, "error: x\nerror: y"),
+    ):
         with pytest.raises(Garbage):
             ended(status, said)
 
 
 def test_what_an_input_leaves_behind_counts_as_executed(watch, tmp_path):
     (tmp_path / "mark").touch()
-    assert outcome(lambda content: None, b"", watch=watch, mark=tmp_path / "mark")[0] == "executed"
+    assert (
+        outcome(lambda content: None, b"", watch=watch, mark=tmp_path / "mark")[0]
+        == "executed"
+    )
     assert not (tmp_path / "mark").exists()
 
 
@@ -77,7 +86,9 @@ def test_whole_inputs_are_read_and_hostile_ones_run_nothing(tmp_path, watch):
     @settings(max_examples=40, database=None, deadline=None)
     @given(hostile(str(readers.mark)))
     def each(content):
-        found[outcome(readers.pickles()[1], content, watch=watch, mark=readers.mark)[0]] += 1
+        found[
+            outcome(readers.pickles()[1], content, watch=watch, mark=readers.mark)[0]
+        ] += 1
 
     each()
     assert found["refused"] > 20 and not set(found) - set(fuzz.GOOD)

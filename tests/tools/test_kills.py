@@ -10,12 +10,18 @@ from e2rl.run.parts import state_bytes
 from tools import kills
 
 FILES = {
-    "metrics.json": json.dumps([{"metrics": {"cfr": {"mean": 0.5}, "seconds_per_rollout": {"mean": 1.0}}}]),
+    "metrics.json": json.dumps(
+        [{"metrics": {"cfr": {"mean": 0.5}, "seconds_per_rollout": {"mean": 1.0}}}]
+    ),
     "rollouts.csv": "scene_id,cfr,seconds\na,1,0.5\n",
     "logs/scalars/train/loss.csv": "0,0.5\n",
     "rollouts/a.npz": "bytes",
 }
-CHANGED = {"metrics.json": ("0.5", "0.6"), "rollouts.csv": ("a,1", "a,2"), "rollouts/a.npz": ("bytes", "other")}
+CHANGED = {
+    "metrics.json": ("0.5", "0.6"),
+    "rollouts.csv": ("a,1", "a,2"),
+    "rollouts/a.npz": ("bytes", "other"),
+}
 CHANGED |= {"logs/scalars/train/loss.csv": ("0.5", "0.6")}
 
 
@@ -27,7 +33,10 @@ def run_of(folder, **changes):
 
 
 def test_wall_times_and_what_a_run_keeps_for_itself_are_no_difference(tmp_path):
-    one = run_of(tmp_path / "one", **{"parts/a.pt": "1", "logs/scalars/time/improve.csv": "0,1", "tables.md": "1"})
+    one = run_of(
+        tmp_path / "one",
+        **{"parts/a.pt": "1", "logs/scalars/time/improve.csv": "0,1", "tables.md": "1"},
+    )
     times = {
         "metrics.json": FILES["metrics.json"].replace("1.0", "2.0"),
         "rollouts.csv": "scene_id,cfr,seconds\na,1,7\n",
@@ -50,9 +59,13 @@ def test_states_and_weights_are_compared_by_their_tensors(tmp_path):
         path = tmp_path / folder
         about = {"origin": json.dumps({"seconds": len(folder)})}
         path.mkdir()
-        (path / "training.pt").write_bytes(state_bytes({"a": torch.tensor(value), "seconds": len(folder)}))
+        (path / "training.pt").write_bytes(
+            state_bytes({"a": torch.tensor(value), "seconds": len(folder)})
+        )
         torch.save({"a": torch.tensor(value)}, path / "state.pt")
-        (path / "prior.safetensors").write_bytes(weight_bytes({"a": torch.tensor([value])}, about))
+        (path / "prior.safetensors").write_bytes(
+            weight_bytes({"a": torch.tensor([value])}, about)
+        )
     assert kills.differences(tmp_path / "one", tmp_path / "other") == []
     everything = ["prior.safetensors", "state.pt", "training.pt"]
     assert kills.differences(tmp_path / "one", tmp_path / "third") == everything

@@ -19,8 +19,16 @@ def test_the_document_names_every_dependency():
     groups = {"": project["dependencies"], **project["optional-dependencies"]}
     text = (ROOT / "docs" / "licences.md").read_text()
     for group, requirements in groups.items():
-        names = {canonicalize_name(Requirement(each).name) for each in requirements} - {"e2rl"}
-        missing = {name for name in names if not re.search(rf"(?<![\w-]){re.escape(name)}(?![\w-])", text)}
-        assert not missing, f"docs/licences.md lacks {missing} of {group or 'the package'}"
+        names = {canonicalize_name(Requirement(each).name) for each in requirements} - {
+            "e2rl"
+        }
+        missing = {
+            name
+            for name in names
+            if not re.search(rf"(?<![\w-]){re.escape(name)}(?![\w-])", text)
+        }
+        assert not missing, (
+            f"docs/licences.md lacks {missing} of {group or 'the package'}"
+        )
     always = text.split("## Extra")[0]
     assert "not named" not in always and "GPL" not in re.sub("LGPL", "", always)

@@ -21,14 +21,19 @@ def test_states_that_are_not_finite_count_as_ended():
         states[:, :, 2] = torch.nan  # of an agent that is not there
         states[1, 1, 0, 3] = torch.inf
         valid = torch.tensor([True, True, False]).expand(len(tasks), 2, 3)
-        return TensorDict({"states": states, "valid": valid, "task": torch.tensor(tasks)}, [len(tasks)])
+        return TensorDict(
+            {"states": states, "valid": valid, "task": torch.tensor(tasks)},
+            [len(tasks)],
+        )
 
     ((kept, rollouts),), ended = attempt(roll_out, [4, 5, 6])
     assert kept == [4, 6] == rollouts["task"].tolist()
     assert [(task, why["reason"]) for task, why in ended] == [(5, NOT_FINITE)]
 
 
-@pytest.mark.parametrize("error", [InputError("bad"), OSError(28, "No space left on device"), MemoryError()])
+@pytest.mark.parametrize(
+    "error", [InputError("bad"), OSError(28, "No space left on device"), MemoryError()]
+)
 def test_errors_of_the_whole_run_end_it(error):
     def roll_out(tasks):
         raise error
@@ -37,7 +42,10 @@ def test_errors_of_the_whole_run_end_it(error):
         attempt(roll_out, [1, 2])
 
 
-@pytest.mark.parametrize("error", [KeyError(5), ConnectionRefusedError(111, "refused"), FileNotFoundError(2, "x")])
+@pytest.mark.parametrize(
+    "error",
+    [KeyError(5), ConnectionRefusedError(111, "refused"), FileNotFoundError(2, "x")],
+)
 def test_a_batch_is_halved_until_the_one_that_raises_is_alone(error):
     asked = []
 
@@ -49,14 +57,20 @@ def test_a_batch_is_halved_until_the_one_that_raises_is_alone(error):
 
     done, ended = attempt(roll_out, list(range(8)))
     assert [task for tasks, _ in done for task in tasks] == [0, 1, 2, 3, 4, 6, 7]
-    assert [(task, why["reason"]) for task, why in ended] == [(5, f"raised {type(error).__name__}")] and len(asked) == 7
+    assert [(task, why["reason"]) for task, why in ended] == [
+        (5, f"raised {type(error).__name__}")
+    ] and len(asked) == 7
 
 
-@pytest.mark.parametrize(("wrong", "detail"), [(None, "here"), (99, "lost"), (-1, "lost")])
+@pytest.mark.parametrize(
+    ("wrong", "detail"), [(None, "here"), (99, "lost"), (-1, "lost")]
+)
 def test_rows_that_a_planner_names_are_believed_where_the_batch_has_them(wrong, detail):
     def roll_out(tasks):
         if 5 in tasks:
-            raise PlannerError("lost", {tasks.index(5): "here"} if wrong is None else {wrong: "there"})
+            raise PlannerError(
+                "lost", {tasks.index(5): "here"} if wrong is None else {wrong: "there"}
+            )
         return whole(tasks)
 
     done, ended = attempt(roll_out, [4, 5, 6])

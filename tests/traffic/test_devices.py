@@ -18,7 +18,9 @@ def test_tensors_of_two_devices_do_not_meet():
     with pretended_device():
         here = torch.ones(3)
         there = torch.ones(3, device="cuda")
-        assert device_of(there + 1).type == "cuda" and torch.equal((there * 2).cpu(), here * 2)
+        assert device_of(there + 1).type == "cuda" and torch.equal(
+            (there * 2).cpu(), here * 2
+        )
         for wrong in (
             lambda: here + there,
             lambda: here[torch.zeros(1, dtype=torch.int64, device="cuda")],
@@ -44,9 +46,20 @@ def test_a_rollout_keeps_to_its_device_and_is_that_of_the_cpu(method, ego):
         }
         traffic = on[method]()
         traffic.prior.to(device)
-        return roll_out(scene_set, index, seed=index, eta=torch.full((2,), 2.0), ego=ego(), traffic=traffic, sim=SimSettings(), device=device)
+        return roll_out(
+            scene_set,
+            index,
+            seed=index,
+            eta=torch.full((2,), 2.0),
+            ego=ego(),
+            traffic=traffic,
+            sim=SimSettings(),
+            device=device,
+        )
 
     with pretended_device():
         there = driven("cuda")
     here = driven("cpu")
-    assert torch.equal(there.states, here.states) and torch.equal(there.adversaries, here.adversaries)
+    assert torch.equal(there.states, here.states) and torch.equal(
+        there.adversaries, here.adversaries
+    )

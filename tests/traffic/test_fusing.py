@@ -1,4 +1,5 @@
-"""Rollouts with fused functions are those without, to millimetres, and `compile` says which are driven."""
+"""Rollouts with fused functions are those without, to millimetres, and `compile` says
+which are driven."""
 
 import pytest
 import torch
@@ -31,8 +32,13 @@ def prepared(compile, device="cpu"):
 
 def test_whatever_is_fused_is_prepared():
     """Else it would be compiled in the middle of a run."""
-    fused = {each.function.__module__ for each in FUSED.values()} - {"e2rl.prior.denoiser", "e2rl.prior.sde"}
-    assert {name for name in fused if name.startswith("e2rl.")} == {module.__name__ for module in MODULES}
+    fused = {each.function.__module__ for each in FUSED.values()} - {
+        "e2rl.prior.denoiser",
+        "e2rl.prior.sde",
+    }
+    assert {name for name in fused if name.startswith("e2rl.")} == {
+        module.__name__ for module in MODULES
+    }
 
 
 @pytest.mark.slow
@@ -46,40 +52,65 @@ def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
     assert prepared(True) and is_on()
     for each in FUSED.values():
         run = each._run
-        each.__dict__["_run"] = lambda flat, run=run, name=each.name: called.add(name) or run(flat)
+        each.__dict__["_run"] = lambda flat, run=run, name=each.name: (
+            called.add(name) or run(flat)
+        )
     fast = drive(scene_set, on, 2.0, ego=ego)
     torch.manual_seed(0)
     x = torch.rand(1, 2, SIZE)
     points = SPACING * torch.arange(40.0)
     moving = LaneState(*torch.rand(10, 1, 2))
-    given = x, moving, torch.stack([points, 0 * points], -1).expand(1, 2, -1, -1), torch.tensor([[True, False]])
+    given = (
+        x,
+        moving,
+        torch.stack([points, 0 * points], -1).expand(1, 2, -1, -1),
+        torch.tensor([[True, False]]),
+    )
     for one, other in zip(
-        *(vars(decode(*given)).values() for decode in (decode_plans, decode_plans.function)), strict=True
+        *(
+            vars(decode(*given)).values()
+            for decode in (decode_plans, decode_plans.function)
+        ),
+        strict=True,
     ):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
     actor = ActorEgo()
     drive(scene_set, on, 2.0, ego=actor)
     actor.network.network.trunk(torch.zeros(2, OBSERVATION_SIZE)).sum().backward()
-    assert torch.equal(eager.valid, fast.valid) and torch.equal(eager.adversaries, fast.adversaries)
+    assert torch.equal(eager.valid, fast.valid) and torch.equal(
+        eager.adversaries, fast.adversaries
+    )
     assert (eager.states[..., :2] - fast.states[..., :2]).abs().max() < 2e-3
-    torch.testing.assert_close(eager.transport_adversary, fast.transport_adversary, rtol=1e-3, atol=1e-3)
-    missing = {name for name in FUSED if name.startswith("e2rl.") and "<locals>" not in name} - called
+    torch.testing.assert_close(
+        eager.transport_adversary, fast.transport_adversary, rtol=1e-3, atol=1e-3
+    )
+    missing = {
+        name for name in FUSED if name.startswith("e2rl.") and "<locals>" not in name
+    } - called
     assert not missing, "they never ran compiled"
     again = prepared("auto")
     assert again is True and is_on(), "all are there now"
     capsys.readouterr()
 
 
-def test_functions_that_are_not_compiled_are_left_off_unless_they_are_asked_for(monkeypatch, tmp_path, capsys):
+def test_functions_that_are_not_compiled_are_left_off_unless_they_are_asked_for(
+    monkeypatch, tmp_path, capsys
+):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for each in list(FUSED.values()):
         monkeypatch.delitem(each.__dict__, "file", raising=False)
     assert prepared("auto") is False and not is_on()
     told = capsys.readouterr().err
-    assert ("compile=true" in told) == has_compiler() and not list(tmp_path.rglob("*.so"))
-    assert prepared(False) is False and prepared("auto", "cuda") is False and not is_on()
+    assert ("compile=true" in told) == has_compiler() and not list(
+        tmp_path.rglob("*.so")
+    )
+    assert (
+        prepared(False) is False and prepared("auto", "cuda") is False and not is_on()
+    )
     monkeypatch.setattr(Fused, "compile", lambda self: None)
     monkeypatch.setattr(fused.shutil, "which", lambda name: "/usr/bin/c++")
     assert prepared(True) is True and is_on()
-    with pytest.raises(InputError, match="compile=maybe: choose one of auto, true, false"):
+    with pytest.raises(
+        InputError, match="compile=maybe: choose one of auto, true, false"
+    ):
         prepared("maybe")

@@ -29,13 +29,24 @@ def sized(counts, others=0):
     empty = torch.zeros(len(counts), AGENTS)
     route = torch.zeros(len(counts), WIDTH, dtype=torch.long)
     scene = TensorDict({"valid": valid, "route_log": route}, batch_size=[len(counts)])
-    return World(scene, empty[:, 0].long(), states=empty[..., None].expand(-1, -1, 4), valid=valid, accel=empty, turn_rate=empty)
+    return World(
+        scene,
+        empty[:, 0].long(),
+        states=empty[..., None].expand(-1, -1, 4),
+        valid=valid,
+        accel=empty,
+        turn_rate=empty,
+    )
 
 
 def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_than_half():
-    counts = torch.randint(1, WIDTH + 1, (200,), generator=torch.Generator().manual_seed(0)).tolist()
+    counts = torch.randint(
+        1, WIDTH + 1, (200,), generator=torch.Generator().manual_seed(0)
+    ).tolist()
     groups = group_scenes(sized(counts, others=3))
-    assert sorted(torch.cat([group.rows for group in groups]).tolist()) == list(range(200))
+    assert sorted(torch.cat([group.rows for group in groups]).tolist()) == list(
+        range(200)
+    )
     for group in groups:
         here = [counts[row] for row in group.rows.tolist()]
         rows = group.vehicles * len(here)
@@ -54,8 +65,12 @@ def test_what_changes_in_a_crop_arrives_where_it_belongs_and_nothing_else_change
     write_state(whole, part, group=group)
     rows = group.rows.tolist()
     changed = whole.routed.conflict_s != state.routed.conflict_s
-    assert changed.nonzero().tolist() == [[rows[0], 1, 2]] and whole.path_kl.nonzero().tolist() == [[rows[1], 3]]
-    assert group.vehicles < changed.shape[1] and torch.equal(whole.lane.s, state.lane.s), "there is padding to crop"
+    assert changed.nonzero().tolist() == [
+        [rows[0], 1, 2]
+    ] and whole.path_kl.nonzero().tolist() == [[rows[1], 3]]
+    assert group.vehicles < changed.shape[1] and torch.equal(
+        whole.lane.s, state.lane.s
+    ), "there is padding to crop"
 
 
 def test_noise_is_standard_and_depends_on_seed_and_draw_only():
@@ -75,4 +90,9 @@ def test_rows_are_taken_and_put_in_nested_states_without_touching_the_original()
     part = take_rows(state, rows)
     assert part.v.tolist() == [18.0, 16.0]
     back = put_rows(state, rows, new=part.map(lambda value: value + 100))
-    assert back.v.tolist() == [116.0, 17.0, 118.0, 19.0] and state.v.tolist() == [16.0, 17.0, 18.0, 19.0]
+    assert back.v.tolist() == [116.0, 17.0, 118.0, 19.0] and state.v.tolist() == [
+        16.0,
+        17.0,
+        18.0,
+        19.0,
+    ]

@@ -1,4 +1,5 @@
-"""The prior as traffic: its plans are its samples and continue each other; no planner can lie to it."""
+"""The prior as traffic: its plans are its samples and continue each other; no planner
+can lie to it."""
 
 from dataclasses import replace
 
@@ -19,7 +20,15 @@ from e2rl.traffic.nominal import KNOWLEDGE, NominalTraffic
 from e2rl.traffic.traffic import keep_velocity
 from tests.prior.small import curved_scenes, small_prior
 from tests.traffic.e2.crossing import add_route, make_world
-from tests.traffic.e2.traffic_scenes import EGO, ROWS, begin, drive, executed, scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import (
+    EGO,
+    ROWS,
+    begin,
+    drive,
+    executed,
+    scenes,
+    synthesizer,
+)
 
 
 def nominal(knowledge="predicted"):
@@ -39,11 +48,18 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
     routed, lane = on.prior.start(scene, state.routed.route)
     lane = on.lane_now(replace(state, routed=routed, lane=lane), world, plan)
     context = on.prior.encode(routed, lane, world.states, world.valid, world.step, plan)
-    noise = noise_of(state.seed, torch.ones(2, dtype=torch.long), shape=(4, ROWS, SIZE)).transpose(0, 1)
+    noise = noise_of(
+        state.seed, torch.ones(2, dtype=torch.long), shape=(4, ROWS, SIZE)
+    ).transpose(0, 1)
     expected = on.prior.plan(on.prior.sample(context, noise).x0, context)
     here = scene["valid"][:, :ROWS]
-    torch.testing.assert_close(found.states[here], expected.states()[here], rtol=1e-4, atol=1e-4)
-    assert torch.equal(found.present[here], expected.on_map[here]) and not found.present[~here].any()
+    torch.testing.assert_close(
+        found.states[here], expected.states()[here], rtol=1e-4, atol=1e-4
+    )
+    assert (
+        torch.equal(found.present[here], expected.on_map[here])
+        and not found.present[~here].any()
+    )
     assert found.adversary is None and after.replans.tolist() == [1, 1]
 
 
@@ -66,7 +82,9 @@ def test_everybody_is_seen_where_it_drives_and_goes_on_as_planned(free_space):
     on = nominal()
     world = World.at_start(scene)
     turning = scene["logged"][:, 1 : HORIZON + 1, 0].clone()
-    turning[..., 2] = 0.2 * 0.1 * torch.arange(1, HORIZON + 1)  # the ego turns at 0.2 rad/s
+    turning[..., 2] = (
+        0.2 * 0.1 * torch.arange(1, HORIZON + 1)
+    )  # the ego turns at 0.2 rad/s
     state = begin(on, scene)
     state.routed.has_lane[:] = not free_space
     state = replace(state, lane=state.lane.map(lambda value: value + 0.25))
@@ -75,7 +93,9 @@ def test_everybody_is_seen_where_it_drives_and_goes_on_as_planned(free_space):
     start = on.prior.start(scene, state.routed.route)[1]
     torch.testing.assert_close(seen.d[:, 0], start.d[:, 0], rtol=0, atol=1e-3)
     for name in ("s", "d", "d1"):
-        torch.testing.assert_close(getattr(seen, name)[:, 1:6], getattr(start, name)[:, 1:6], rtol=0, atol=1e-3)
+        torch.testing.assert_close(
+            getattr(seen, name)[:, 1:6], getattr(start, name)[:, 1:6], rtol=0, atol=1e-3
+        )
     kept = seen.d2[:, 1:6] - start.d2[:, 1:6]
     if not free_space:
         torch.testing.assert_close(kept, torch.full_like(kept, 0.25), rtol=0, atol=1e-3)
@@ -88,8 +108,12 @@ def test_who_reverses_at_the_start_halts_and_every_step_is_as_long_as_its_speed(
     scene_set.scenes["start"][:, 1, 3] = -3.0
     track = drive(scene_set, nominal(), 0.0).states[:, :, 1]
     step = track[..., :2].diff(dim=1).norm(dim=-1)
-    torch.testing.assert_close(step, 0.1 * (track[:, 1:, 3] + track[:, :-1, 3]).abs() / 2, rtol=0, atol=1e-3)
-    torch.testing.assert_close(track[:, :10, 3], (-3.0 + 0.3 * torch.arange(10)).expand(2, 10))
+    torch.testing.assert_close(
+        step, 0.1 * (track[:, 1:, 3] + track[:, :-1, 3]).abs() / 2, rtol=0, atol=1e-3
+    )
+    torch.testing.assert_close(
+        track[:, :10, 3], (-3.0 + 0.3 * torch.arange(10)).expand(2, 10)
+    )
     assert (track[:, 10:, 3] >= -1e-5).all()
 
 
@@ -112,13 +136,19 @@ class Honest(Liar):
 
 
 def driven(ego, eta=2.0, **settings):
-    method = NominalTraffic(synthesizer().prior, **settings) if eta == 0 else synthesizer(**settings)
+    method = (
+        NominalTraffic(synthesizer().prior, **settings)
+        if eta == 0
+        else synthesizer(**settings)
+    )
     return drive(scenes(3), method, eta, ego=ego).states
 
 
 @pytest.mark.parametrize("eta", [0.0, 2.0])
 @pytest.mark.parametrize("knowledge", KNOWLEDGE)
-def test_nonsense_in_the_announced_plan_is_believed_only_by_whoever_is_told_the_plan(eta, knowledge):
+def test_nonsense_in_the_announced_plan_is_believed_only_by_whoever_is_told_the_plan(
+    eta, knowledge
+):
     honest, lied = (driven(ego(1), eta, knowledge=knowledge) for ego in (Honest, Liar))
     assert torch.equal(honest, lied) == (knowledge == "predicted")
 
@@ -136,14 +166,29 @@ def test_the_prediction_begins_at_the_ego():
 
 
 def fork(copies=3):
-    """Scenes of an ego that may go on or turn, with others beside, behind and across its ways."""
-    others = [(40.0, -40.0, 1.5708, 10.0), (30.0, 3.5, 0.0, 8.0), (-20.0, 0.0, 0.0, 10.0)]
+    """Scenes of an ego that may go on or turn, with others beside, behind and across
+    its ways."""
+    others = [
+        (40.0, -40.0, 1.5708, 10.0),
+        (30.0, 3.5, 0.0, 8.0),
+        (-20.0, 0.0, 0.0, 10.0),
+    ]
     world = make_world([(0.0, 0.0, 0.0, 10.0), *others], copies)
     add_route(world, 0, candidate=1, heading=0.6)
     return world.scene
 
 
-METHODS = ["nominal", "e2", "e2_pursuit", "ccdiff", "ctg_adv", "strive", "safe_sim_opt", "diffscene", "cat"]
+METHODS = [
+    "nominal",
+    "e2",
+    "e2_pursuit",
+    "ccdiff",
+    "ctg_adv",
+    "strive",
+    "safe_sim_opt",
+    "diffscene",
+    "cat",
+]
 
 
 def plans_beside(method, scene, times=2):
@@ -161,14 +206,17 @@ def plans_beside(method, scene, times=2):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_who_is_not_told_the_plan_does_not_know_the_mission(name):
-    """Of two egos that drive alike and mean to go elsewhere traffic makes the same, where one's way is a candidate, and
-    where it is the recorded path, which nobody knows."""
+    """Of two egos that drive alike and mean to go elsewhere traffic makes the same,
+    where one's way is a candidate, and where it is the recorded path, which nobody
+    knows."""
     scene = fork()
     turns = scene.clone()
     recorded = scene.clone()
     turns["route_log"][:, 0] = 1
     recorded["route_log"][:, 0] = 2
-    recorded["route_points"][:, 0, 2] += torch.linspace(0, 30, scene["route_points"].shape[3])[:, None]
+    recorded["route_points"][:, 0, 2] += torch.linspace(
+        0, 30, scene["route_points"].shape[3]
+    )[:, None]
     recorded["route_valid"][:, 0, 2] = recorded["route_recorded"][:, 0, 2] = True
     group = method_config(load_config("evaluate", []), name)
     group.knowledge = "predicted"
@@ -178,7 +226,8 @@ def test_who_is_not_told_the_plan_does_not_know_the_mission(name):
 
 
 def test_the_ego_is_expected_where_it_turns():
-    """Two ways part behind it: it is expected on that on which it drives, whatever its mission is."""
+    """Two ways part behind it: it is expected on that on which it drives, whatever its
+    mission is."""
     method = NominalTraffic(load_prior(), "predicted")
     scene = fork()
     assert scene["route_valid"][:, 0, :2].all()
@@ -187,5 +236,7 @@ def test_the_ego_is_expected_where_it_turns():
         world = World.at_start(scene)
         states = world.states.clone()
         states[:, 0, :2], states[:, 0, 2] = along[0][:, 0], along[1][:, 0]
-        expected = method.as_seen(replace(world, states=states)).scene["route_log"][:, 0]
+        expected = method.as_seen(replace(world, states=states)).scene["route_log"][
+            :, 0
+        ]
         assert (expected == way).all()

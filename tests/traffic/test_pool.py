@@ -1,4 +1,5 @@
-"""Rows of recorded, stored and live traffic: joined pools, row probabilities, and what is refused."""
+"""Rows of recorded, stored and live traffic: joined pools, row probabilities, and what
+is refused."""
 
 from dataclasses import replace
 
@@ -32,18 +33,33 @@ def test_joined_rows_keep_their_traffic():
     twice = attack + attack
     assert both.source.tolist() == [0, 1, 2] + [RECORDED] * 3 + [LIVE] * 3
     assert other_way.source.tolist() == [LIVE] * 3 + [RECORDED] * 3 + [0, 1, 2]
-    assert twice.source.tolist() == list(range(6)) and len(twice.parts) == 2 and len(twice.adversaries) == 6
+    assert (
+        twice.source.tolist() == list(range(6))
+        and len(twice.parts) == 2
+        and len(twice.adversaries) == 6
+    )
     for pool in (both, other_way):
-        assert pool.parts[0] is attack.parts[0] and len(pool) == 9, "the tracks are shared"
+        assert pool.parts[0] is attack.parts[0] and len(pool) == 9, (
+            "the tracks are shared"
+        )
         assert torch.equal(pool.scene_index, INDEX.repeat(3))
-    assert both.seed.tolist() == [0] * 6 + [7, 8, 9] and both.eta.tolist() == [2.0] * 3 + [0.0] * 3 + [1.0] * 3
+    assert (
+        both.seed.tolist() == [0] * 6 + [7, 8, 9]
+        and both.eta.tolist() == [2.0] * 3 + [0.0] * 3 + [1.0] * 3
+    )
 
 
 def test_whether_adversaries_give_way_stays_with_their_rows():
     traffic = brake_check(small_scenes())(None, INDEX, 2.0, 0)
-    some = TrafficPool.stored({**traffic, "owes": torch.tensor([True, False, True])}, 2.0)
+    some = TrafficPool.stored(
+        {**traffic, "owes": torch.tensor([True, False, True])}, 2.0
+    )
     both = (recorded() + some).decisions[:, OWES].tolist()
-    assert both == [1, 1, 1, 1, 0, 1] and stored().decisions[:, OWES].tolist() == [1, 1, 1]
+    assert both == [1, 1, 1, 1, 0, 1] and stored().decisions[:, OWES].tolist() == [
+        1,
+        1,
+        1,
+    ]
 
 
 def test_tracks_are_gathered_from_the_parts_as_from_one():
@@ -55,7 +71,9 @@ def test_tracks_are_gathered_from_the_parts_as_from_one():
     assert torch.equal(states, torch.cat([part.parts[0].states for part in parts])[at])
     assert torch.equal(valid, torch.cat([part.parts[0].valid for part in parts])[at])
     assert torch.equal(pool.tracks(pool.source[7:8])[0], parts[1].parts[0].states[1:2])
-    assert torch.equal(pool.adversaries, torch.cat([part.adversaries for part in parts]))
+    assert torch.equal(
+        pool.adversaries, torch.cat([part.adversaries for part in parts])
+    )
 
 
 def test_weights_multiply_within_a_kind_and_leave_the_share():
@@ -65,9 +83,13 @@ def test_weights_multiply_within_a_kind_and_leave_the_share():
     old = replace(stored(), fresh=torch.zeros(3, dtype=torch.bool))
     pool = replace(fresh, weight=torch.full((3,), 3.0)) + old + recorded()
     probability = pool.probabilities(priority, 0.8)
-    assert probability[:6].tolist() == pytest.approx([0.8 * w / 20 for w in (9, 3, 3, 3, 1, 1)])
+    assert probability[:6].tolist() == pytest.approx(
+        [0.8 * w / 20 for w in (9, 3, 3, 3, 1, 1)]
+    )
     assert probability[6:].sum().item() == pytest.approx(0.2)
-    assert probability[pool.fresh & pool.adversarial].sum().item() == pytest.approx(0.8 * 3 / 4)
+    assert probability[pool.fresh & pool.adversarial].sum().item() == pytest.approx(
+        0.8 * 3 / 4
+    )
 
 
 @pytest.mark.parametrize("missing", ["scene_index", "states", "valid", "adversaries"])

@@ -28,11 +28,18 @@ def test_the_ego_reacts_to_what_the_others_plan():
     look = Lookahead(EGO, world, period=5)
     rows = torch.arange(2)
     halted = onward(world)
-    halted[:, 1] = world.states[:, 1, None]  # the vehicle ahead stands still from now on
+    halted[:, 1] = world.states[
+        :, 1, None
+    ]  # the vehicle ahead stands still from now on
     halted[:, 1, :, 3] = 0.0
-    gone = lambda planned: (look(rows, planned)[:, -1, :2] - world.states[:, 0, :2]).norm(dim=-1)  # noqa: E731
+
+    def gone(planned):
+        return (look(rows, planned)[:, -1, :2] - world.states[:, 0, :2]).norm(dim=-1)  # noqa: E731
+
     assert (gone(halted) < gone(onward(world)) - 5.0).all()
-    assert (gone(halted) < world.states[:, 1, 0] - world.states[:, 0, 0]).all(), "it does not drive through"
+    assert (gone(halted) < world.states[:, 1, 0] - world.states[:, 0, 0]).all(), (
+        "it does not drive through"
+    )
 
 
 def test_scenes_may_be_asked_about_in_any_order():
@@ -40,4 +47,6 @@ def test_scenes_may_be_asked_about_in_any_order():
     look = Lookahead(EGO, world)
     planned = onward(world)
     rows = torch.tensor([2, 0, 1])
-    torch.testing.assert_close(look(rows, planned[rows]), look(torch.arange(3), planned)[rows])
+    torch.testing.assert_close(
+        look(rows, planned[rows]), look(torch.arange(3), planned)[rows]
+    )

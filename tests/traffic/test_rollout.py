@@ -1,4 +1,5 @@
-"""Closed-loop rollouts: seeds decide, what a method plans is driven, figures are of the whole rollout."""
+"""Closed-loop rollouts: seeds decide, what a method plans is driven, figures are of the
+whole rollout."""
 
 import inspect
 import textwrap
@@ -14,13 +15,26 @@ from e2rl.traffic import traffic
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
-from tests.traffic.e2.traffic_scenes import EGO, ROWS, VEHICLES, drive, scenes, synthesizer
+from tests.traffic.e2.traffic_scenes import (
+    EGO,
+    ROWS,
+    VEHICLES,
+    drive,
+    scenes,
+    synthesizer,
+)
 
 
 def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_says():
     """Each vehicle brakes to a halt at 2 m/s^2 from its start, whatever the seed."""
     source = inspect.getdoc(traffic).partition("    class Halt")[1:]
-    names = {"torch": torch, "DT": DT, "HORIZON": HORIZON, "Traffic": Traffic, "TrafficPlan": TrafficPlan}
+    names = {
+        "torch": torch,
+        "DT": DT,
+        "HORIZON": HORIZON,
+        "Traffic": Traffic,
+        "TrafficPlan": TrafficPlan,
+    }
     exec(textwrap.dedent("".join(source)), names)
     scene_set = scenes(2, steps=80)
     out = drive(scene_set, names["Halt"](), 1.0, seeds=[3, 4])
@@ -28,10 +42,18 @@ def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_s
     start = scene_set.scenes["start"][:, None, there]
     time = torch.minimum(DT * torch.arange(81)[:, None], start[..., 3] / 2.0)
     track = out.states[:, :, there]
-    torch.testing.assert_close(track[..., 3], start[..., 3] - 2.0 * time, rtol=0, atol=1e-3)
-    torch.testing.assert_close(track[..., 0], start[..., 0] + start[..., 3] * time - time**2, rtol=0, atol=1e-2)
+    torch.testing.assert_close(
+        track[..., 3], start[..., 3] - 2.0 * time, rtol=0, atol=1e-3
+    )
+    torch.testing.assert_close(
+        track[..., 0], start[..., 0] + start[..., 3] * time - time**2, rtol=0, atol=1e-2
+    )
     assert torch.equal(track[..., 1:3], start[..., 1:3].expand_as(track[..., 1:3]))
-    assert out.valid[:, :, there].all() and not out.adversaries.any() and (out.transport_others == 0).all()
+    assert (
+        out.valid[:, :, there].all()
+        and not out.adversaries.any()
+        and (out.transport_others == 0).all()
+    )
 
 
 def test_zero_intensity_is_the_nominal_rollout_more_of_it_is_not_and_seeds_decide():
@@ -46,7 +68,9 @@ def test_zero_intensity_is_the_nominal_rollout_more_of_it_is_not_and_seeds_decid
     assert not torch.equal(pushed.states[:, :, 1:5], other.states[:, :, 1:5])
     assert torch.equal(nominal.states, zero.states) and not zero.adversaries.any()
     assert (pushed.adversaries.any(1)).all() and not pushed.adversaries[:, 0].any()
-    assert (zero.transport_adversary == 0).all() and (pushed.transport_adversary > 0).all()
+    assert (zero.transport_adversary == 0).all() and (
+        pushed.transport_adversary > 0
+    ).all()
     assert (zero.transport_anchor == 0).all() and (nominal.transport_anchor == 0).all()
 
 
@@ -57,15 +81,21 @@ def test_the_start_is_the_scene_s_and_parked_vehicles_stay():
     torch.testing.assert_close(out.states[:, 0], scene_set.scenes["start"])
     assert torch.equal(out.valid[:, 0], scene_set.scenes["valid"])
     parked = len(VEHICLES) - 1
-    torch.testing.assert_close(out.states[:, :, parked], out.states[:, :1, parked].expand(-1, 21, -1))
-    assert out.simulated[:, : len(VEHICLES)].all() and not out.simulated[:, len(VEHICLES) :].any()
+    torch.testing.assert_close(
+        out.states[:, :, parked], out.states[:, :1, parked].expand(-1, 21, -1)
+    )
+    assert (
+        out.simulated[:, : len(VEHICLES)].all()
+        and not out.simulated[:, len(VEHICLES) :].any()
+    )
     assert out.states.isfinite().all()
 
 
 @pytest.mark.parametrize("replay_ego", [False, True])
 def test_traffic_drives_on_as_planned_after_the_ego_has_left(replay_ego):
-    """The recording would put everybody back by hundreds of metres once a plan of 50 steps is used up. An ego that
-    plans by the log is replayed, also where the simulator's settings do not say so."""
+    """The recording would put everybody back by hundreds of metres once a plan of 50
+    steps is used up. An ego that plans by the log is replayed, also where the
+    simulator's settings do not say so."""
     scene_set = scenes(2, steps=80)
     scene_set.scenes["logged_valid"][:, 4:, 0] = False
     scene_set.scenes["logged"][:, 50:, 1:ROWS, :2] += 500.0
@@ -77,7 +107,8 @@ def test_traffic_drives_on_as_planned_after_the_ego_has_left(replay_ego):
 
 
 class Turns(Traffic):
-    """Vehicle 1 is the adversary of the first half second, vehicle 2 of the rest; each costs a nat in all."""
+    """Vehicle 1 is the adversary of the first half second, vehicle 2 of the rest; each
+    costs a nat in all."""
 
     def reset(self, scenes, seed, eta):
         return torch.zeros_like(eta)
@@ -95,17 +126,33 @@ class Turns(Traffic):
 def test_adversaries_are_whoever_was_one_at_any_time_and_the_transport_is_shared_out():
     out = drive(scenes(2, steps=12), Turns(), 1.0)
     assert out.adversaries.nonzero()[:, 1].tolist() == [1, 2, 1, 2]
-    assert out.transport_adversary.tolist() == [2.0, 2.0] and out.transport_others.tolist() == [0.25, 0.25]
-    assert torch.equal(out.routes, scenes(2).scenes["route_log"].clamp(min=0)), "nobody said otherwise"
+    assert out.transport_adversary.tolist() == [
+        2.0,
+        2.0,
+    ] and out.transport_others.tolist() == [0.25, 0.25]
+    assert torch.equal(out.routes, scenes(2).scenes["route_log"].clamp(min=0)), (
+        "nobody said otherwise"
+    )
 
 
 def test_the_traffic_of_a_round_is_the_rollouts_and_its_seeds_are_the_scenes_own():
     scene_set = scenes(4)
     rows = torch.tensor([3, 1, 0])
-    synthesize = synthesize_traffic(scene_set, synthesizer(), sim=SimSettings(), batch=2)
+    synthesize = synthesize_traffic(
+        scene_set, synthesizer(), sim=SimSettings(), batch=2
+    )
     found = synthesize(EGO, rows, 2.0, 5)
-    assert torch.equal(found["scene_index"], rows) and found["states"].shape[:2] == (3, 21)
-    assert found["adversaries"].any(1).all() and found["contact"].shape == (3,) and found["owes"].all()
+    assert torch.equal(found["scene_index"], rows) and found["states"].shape[:2] == (
+        3,
+        21,
+    )
+    assert (
+        found["adversaries"].any(1).all()
+        and found["contact"].shape == (3,)
+        and found["owes"].all()
+    )
     alone = synthesize(EGO, rows[1:2], 2.0, 5)
-    torch.testing.assert_close(alone["states"][0], found["states"][1], rtol=0, atol=2e-2)
+    torch.testing.assert_close(
+        alone["states"][0], found["states"][1], rtol=0, atol=2e-2
+    )
     assert not torch.equal(synthesize(EGO, rows, 2.0, 6)["states"], found["states"])

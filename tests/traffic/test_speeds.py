@@ -1,4 +1,5 @@
-"""Whatever drives a vehicle: each of its steps is as long as its speed makes it, along its heading."""
+"""Whatever drives a vehicle: each of its steps is as long as its speed makes it, along
+its heading."""
 
 import pytest
 import torch
@@ -8,7 +9,17 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
 METHODS = (
-    *("nominal", "e2", "e2_pursuit", "e2_unbound", "constant_velocity", "idm", "ccdiff", "ctg", "ctg_adv"),
+    *(
+        "nominal",
+        "e2",
+        "e2_pursuit",
+        "e2_unbound",
+        "constant_velocity",
+        "idm",
+        "ccdiff",
+        "ctg",
+        "ctg_adv",
+    ),
     *("diffscene", "safe_sim_opt", "cat", "strive"),
 )  # all that drive; `replay` is the recording
 SLACK = 0.03  # m a step: who stands is held where it is, whatever it says below 0.5 m/s
@@ -20,8 +31,8 @@ def recorded():
 
 
 def deviations(rollouts):
-    """Distance [n] m by which steps of vehicles differ from the mean speed along the mean heading, but of those on
-    their recording, which begins at an estimate of it."""
+    """Distance [n] m by which steps of vehicles differ from the mean speed along the
+    mean heading, but of those on their recording, which begins at an estimate of it."""
     states = rollouts.states.double()
     logged = rollouts.logged.double()
     both = rollouts.valid[:, 1:] & rollouts.valid[:, :-1] & rollouts.simulated[:, None]
@@ -40,7 +51,12 @@ def deviations(rollouts):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_vehicle_moves_as_fast_as_it_says(recorded, method):
     scenes, prior = recorded
-    rollouts = e2rl.roll_out(scenes, e2rl.make_ego("lane_graph"), traffic=e2rl.make_traffic(method, prior), eta=2.0)
+    rollouts = e2rl.roll_out(
+        scenes,
+        e2rl.make_ego("lane_graph"),
+        traffic=e2rl.make_traffic(method, prior),
+        eta=2.0,
+    )
     found = deviations(rollouts)
     assert len(found) > 100
     assert found.max() < SLACK

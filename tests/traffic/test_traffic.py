@@ -16,16 +16,24 @@ def test_the_first_point_of_a_plan_is_where_its_vehicle_is_half_a_second_later()
     out = drive(scenes(steps=40), synthesizer(), 2.0)
     assert out.plans.shape == (3, 40 // REPLAN_STEPS, ROWS, 50 // POINT_STEPS, 2)
     later = out.states[:, REPLAN_STEPS::REPLAN_STEPS, :ROWS, :2]
-    driven = (out.simulated[:, None] & out.valid[:, REPLAN_STEPS::REPLAN_STEPS])[:, :, :ROWS]
+    driven = (out.simulated[:, None] & out.valid[:, REPLAN_STEPS::REPLAN_STEPS])[
+        :, :, :ROWS
+    ]
     driven[:, :, 0] = False
     assert POINT_STEPS == REPLAN_STEPS and driven.sum() > 50
-    torch.testing.assert_close(out.plans[:, :, :, 0][driven], later[driven], rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        out.plans[:, :, :, 0][driven], later[driven], rtol=0, atol=1e-4
+    )
 
 
 def test_the_ego_s_first_plan_is_what_it_plans_at_the_start():
     scene_set = scenes()
-    planned = EGO.plan(World.at_start(scene_set.scenes))[:, POINT_STEPS - 1 :: POINT_STEPS, :2]
-    torch.testing.assert_close(drive(scene_set, synthesizer(), 2.0).plans[:, 0, 0], planned)
+    planned = EGO.plan(World.at_start(scene_set.scenes))[
+        :, POINT_STEPS - 1 :: POINT_STEPS, :2
+    ]
+    torch.testing.assert_close(
+        drive(scene_set, synthesizer(), 2.0).plans[:, 0, 0], planned
+    )
 
 
 def test_whoever_aims_is_an_adversary_and_aims_at_the_ego_or_at_another_one():
@@ -48,7 +56,11 @@ def test_every_denoising_step_is_a_pass_of_each_sample_and_a_gradient_doubles_it
     prior = baseline("ctg_adv").prior
     assert nfe(LogReplay()) == [0]
     assert nfe(NominalTraffic(prior, "plan")) == [REPLANS * STEPS]
-    assert nfe(NominalTraffic(prior, "predicted")) == [REPLANS * (STEPS + 1)]  # and one predicts the ego
-    assert nfe(CTGAdv(prior, samples=3)) == [REPLANS * STEPS * 3]  # its gradients stop at the posterior mean
+    assert nfe(NominalTraffic(prior, "predicted")) == [
+        REPLANS * (STEPS + 1)
+    ]  # and one predicts the ego
+    assert nfe(CTGAdv(prior, samples=3)) == [
+        REPLANS * STEPS * 3
+    ]  # its gradients stop at the posterior mean
     assert nfe(SafeSimOpt(prior, samples=3)) == [REPLANS * STEPS * 3 * 2]
     assert not prior.denoiser._forward_hooks and torch.is_grad_enabled()

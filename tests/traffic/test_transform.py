@@ -1,4 +1,5 @@
-"""The transform: episodes are the rows drawn, live traffic is what its method plans, resets are partial."""
+"""The transform: episodes are the rows drawn, live traffic is what its method plans,
+resets are partial."""
 
 import pytest
 import torch
@@ -25,7 +26,8 @@ SECOND = torch.tensor([[False], [True], [False]])  # environments that are reset
 
 
 class March(Traffic):
-    """Everybody goes straight on at a speed that tells the seed and the replan: seed + replan / 10, in m/s."""
+    """Everybody goes straight on at a speed that tells the seed and the replan: seed +
+    replan / 10, in m/s."""
 
     def __init__(self):
         self.calls = []
@@ -41,7 +43,9 @@ class March(Traffic):
         acting = torch.zeros(states.shape[:2], dtype=torch.bool)
         acting[:, 1] = True
         here = world.valid[:, : acting.shape[1], None].expand(states.shape[:-1])
-        return state + torch.tensor([0.0, 1.0]), TrafficPlan(states, here, adversary=acting)
+        return state + torch.tensor([0.0, 1.0]), TrafficPlan(
+            states, here, adversary=acting
+        )
 
 
 def in_turn(pool):
@@ -57,7 +61,9 @@ def in_turn(pool):
 
 def environment(pool, traffic=None, steps=20, batch=3, scene_set=None, ego=None):
     base = DrivingEnv(scene_set or scenes(3, steps), ON, batch, agents=True)
-    return TransformedEnv(base, AdversarialSynthesizer(pool, in_turn(pool), traffic=traffic, ego=ego))
+    return TransformedEnv(
+        base, AdversarialSynthesizer(pool, in_turn(pool), traffic=traffic, ego=ego)
+    )
 
 
 def live(eta=0.0, count=9):
@@ -69,7 +75,9 @@ def live(eta=0.0, count=9):
 def replayed(scene_set, eta=4.0):
     """Stored rows of all scenes, then recorded ones."""
     index = torch.arange(len(scene_set))
-    return TrafficPool.stored(brake_check(scene_set)(None, index, eta, 0), eta) + TrafficPool.recorded(index)
+    return TrafficPool.stored(
+        brake_check(scene_set)(None, index, eta, 0), eta
+    ) + TrafficPool.recorded(index)
 
 
 def mixed(scene_set, eta=1.0):
@@ -87,7 +95,9 @@ def still(tensordict):
     return tensordict.set("action", torch.zeros(len(tensordict), 2))
 
 
-@pytest.mark.parametrize("traffic", [None, March(), synthesizer()], ids=["none", "march", "e2"])
+@pytest.mark.parametrize(
+    "traffic", [None, March(), synthesizer()], ids=["none", "march", "e2"]
+)
 def test_the_specs_hold(traffic):
     scene_set = scenes(3)
     pool = replayed(scene_set) if traffic is None else mixed(scene_set)
@@ -104,13 +114,24 @@ def random_environment(own=0, traffic=None):
     draw = RowDraw(torch.ones(len(pool)).double(), own)
     reaction = Reaiming(ReactSettings(fraction=1.0, scatter=1.0), own)
     base = DrivingEnv(scene_set, ON, 4, agents=True)
-    return TransformedEnv(base, Compose(AdversarialSynthesizer(pool, draw, traffic=traffic, ego=None, reaction=reaction), RewardSum()))
+    return TransformedEnv(
+        base,
+        Compose(
+            AdversarialSynthesizer(
+                pool, draw, traffic=traffic, ego=None, reaction=reaction
+            ),
+            RewardSum(),
+        ),
+    )
 
 
 def same(first, second):
     """What episodes are, bit for bit."""
     keys = sorted(first.keys(True, True), key=str)
-    assert keys == sorted(second.keys(True, True), key=str) and ("next", "agents", "states") in keys
+    assert (
+        keys == sorted(second.keys(True, True), key=str)
+        and ("next", "agents", "states") in keys
+    )
     return all(torch.equal(first[key], second[key]) for key in keys)
 
 
@@ -131,8 +152,17 @@ def test_a_seed_decides_the_episodes(traffic):
 
 def collected(kind, own, seed):
     """The first batch of a collector, of one environment or of two in `kind`."""
-    env = random_environment(own) if kind is None else kind(2, random_environment, create_env_kwargs={"own": own})
-    collector = Collector(env, frames_per_batch=160, total_frames=-1, auto_register_policy_transforms=False)
+    env = (
+        random_environment(own)
+        if kind is None
+        else kind(2, random_environment, create_env_kwargs={"own": own})
+    )
+    collector = Collector(
+        env,
+        frames_per_batch=160,
+        total_frames=-1,
+        auto_register_policy_transforms=False,
+    )
     torch.manual_seed(0)  # of the random actions
     collector.set_seed(seed)
     collector.reset()  # it has begun episodes when it was made
@@ -145,7 +175,9 @@ def collected(kind, own, seed):
 def test_a_seed_decides_what_a_collector_collects(kind):
     once = collected(kind, 0, seed=3)
     assert same(once, collected(kind, 1, seed=3))
-    assert not torch.equal(once["traffic", "row"], collected(kind, 0, seed=4)["traffic", "row"])
+    assert not torch.equal(
+        once["traffic", "row"], collected(kind, 0, seed=4)["traffic", "row"]
+    )
 
 
 @pytest.mark.slow
@@ -162,12 +194,16 @@ def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
     policy = EgoPolicy(IDMEgo(), env)
     tensordict = advance(env, policy, tensordict=env.reset(), steps=7)
     tensordict = env.reset(tensordict.set("_reset", SECOND))
-    assert tensordict["scene_index"][:, 0].tolist() == [0, 0, 2] and tensordict["timestep"][:, 0].tolist() == [7, 0, 7]
+    assert tensordict["scene_index"][:, 0].tolist() == [0, 0, 2] and tensordict[
+        "timestep"
+    ][:, 0].tolist() == [7, 0, 7]
     assert tensordict["traffic", "row"][:, 0].tolist() == [0, 3, 2]
     tensordict = advance(env, policy, tensordict=tensordict, steps=4)
     assert [steps for steps, _ in on.calls] == [[0, 0, 0], [5, 5, 5], [0], [10, 10]]
     speed = tensordict["agents", "states"][:, 1, 3]
-    torch.testing.assert_close(speed, torch.tensor([0.2, 3.0, 2.2]))  # by seed, and replans of its own
+    torch.testing.assert_close(
+        speed, torch.tensor([0.2, 3.0, 2.2])
+    )  # by seed, and replans of its own
 
 
 def test_a_method_that_asks_the_ego_can_where_there_is_one():
@@ -177,7 +213,12 @@ def test_a_method_that_asks_the_ego_can_where_there_is_one():
         queries_ego = True
 
         def replan(self, state, world, ego_plan, react=None):
-            asked.append(react and react(torch.tensor([1]), keep_velocity(world.states[1:2, :ROWS])).shape)
+            asked.append(
+                react
+                and react(
+                    torch.tensor([1]), keep_velocity(world.states[1:2, :ROWS])
+                ).shape
+            )
             return super().replan(state, world, ego_plan)
 
     for ego in (EGO, None):
@@ -192,15 +233,17 @@ class Picky(Ego):
     def plan(self, world):
         if not bool(world.states.isfinite().all()):
             raise ValueError("NaN")
-        lacking = ((world.states[:, 0, 0] > 100) & (world.step <= 1)).nonzero()[:, 0].tolist()
+        lacking = (
+            ((world.states[:, 0, 0] > 100) & (world.step <= 1)).nonzero()[:, 0].tolist()
+        )
         if lacking:
             raise PlannerError("no plan", dict.fromkeys(lacking, "no plan"))
         return keep_velocity(world.states[:, 0])[:, :50]
 
 
 class Reordering(March):
-    """Asks the ego in groups, in another order than that of the batch; broken: plans NaN where the ego is beyond
-    50 m."""
+    """Asks the ego in groups, in another order than that of the batch; broken: plans
+    NaN where the ego is beyond 50 m."""
 
     queries_ego = True
 
@@ -211,32 +254,49 @@ class Reordering(March):
     def replan(self, state, world, ego_plan, react=None):
         for group in torch.arange(len(world.step)).flip(0).split(2):
             wrong = self.broken & (world.states[group, 0, 0] > 50)
-            react(group, keep_velocity(world.states[group, :ROWS]).masked_fill(wrong[:, None, None, None], torch.nan))
+            react(
+                group,
+                keep_velocity(world.states[group, :ROWS]).masked_fill(
+                    wrong[:, None, None, None], torch.nan
+                ),
+            )
         return super().replan(state, world, ego_plan)
 
 
 @pytest.mark.parametrize("due", [[0, 1, 2, 3, 4], [1, 2, 3, 4]])
 @pytest.mark.parametrize("broken", [False, True])
 def test_who_raises_where_the_traffic_asks_is_named_by_its_own_scene(due, broken):
-    """By the ego, and by the traffic that it is shown; where all are planned anew, and where some are."""
+    """By the ego, and by the traffic that it is shown; where all are planned anew, and
+    where some are."""
     scene_set = scenes(5, 20)
     for name in ("start", "logged"):
         scene_set.scenes[name][3, ..., 0, 0] += 60.0 if broken else 110.0
 
     def driven(tasks):
-        pool = TrafficPool.live(torch.tensor(tasks), torch.zeros(len(tasks)), seed=torch.tensor(tasks))
-        env = environment(pool, Reordering(broken), batch=len(tasks), scene_set=scene_set, ego=Picky())
+        pool = TrafficPool.live(
+            torch.tensor(tasks), torch.zeros(len(tasks)), seed=torch.tensor(tasks)
+        )
+        env = environment(
+            pool, Reordering(broken), batch=len(tasks), scene_set=scene_set, ego=Picky()
+        )
         tensordict = env.reset()
-        env.transform._planned_at = torch.tensor([-5 if task in due else 0 for task in tasks])
+        env.transform._planned_at = torch.tensor(
+            [-5 if task in due else 0 for task in tasks]
+        )
         env.step(still(tensordict))
         world = env.base_env.world()
-        return TensorDict({"states": world.states[:, None], "valid": world.valid[:, None]}, [len(tasks)])
+        return TensorDict(
+            {"states": world.states[:, None], "valid": world.valid[:, None]},
+            [len(tasks)],
+        )
 
     with pytest.raises(TrafficNotFinite if broken else PlannerError) as raised:
         driven([0, 1, 2, 3, 4])
     assert list(raised.value.rows) == [3]
     parts, errored = attempt(driven, [0, 1, 2, 3, 4])
-    assert [task for tasks, _ in parts for task in tasks] == [0, 1, 2, 4] and [task for task, _ in errored] == [3]
+    assert [task for tasks, _ in parts for task in tasks] == [0, 1, 2, 4] and [
+        task for task, _ in errored
+    ] == [3]
     assert errored[0][1]["raised_by"] == ("traffic" if broken else "ego")
 
 
@@ -264,18 +324,26 @@ def test_live_stored_and_recorded_rows_run_side_by_side():
     for step in range(12):
         going_on = tensordict["agents", "states"][6:, 1:ROWS].clone()
         tensordict = policy(tensordict)
-        going_on[..., 3], planned = (torch.arange(3.0) + step // 5 / 10)[:, None], tensordict["ego", "plan"][6:].clone()
+        going_on[..., 3], planned = (
+            (torch.arange(3.0) + step // 5 / 10)[:, None],
+            tensordict["ego", "plan"][6:].clone(),
+        )
         tensordict = env.step(tensordict)["next"]
         states = tensordict["agents", "states"][:, 1:ROWS]
         assert torch.equal(states[:3], pool.parts[0].states[:, step + 1, 1:ROWS])
         assert torch.equal(states[3:6], scene_set.scenes["logged"][:, step + 1, 1:ROWS])
         torch.testing.assert_close(states[6:], keep_velocity(going_on)[:, :, 0])
-        assert step % 5 or torch.equal(on.calls[-1][1], planned), "replanned by what the policy has just written"
-    assert [steps for steps, _ in on.calls] == [[0] * 3, [5] * 3, [10] * 3], "only live rows are replanned"
+        assert step % 5 or torch.equal(on.calls[-1][1], planned), (
+            "replanned by what the policy has just written"
+        )
+    assert [steps for steps, _ in on.calls] == [[0] * 3, [5] * 3, [10] * 3], (
+        "only live rows are replanned"
+    )
 
 
 def test_vehicles_of_replayed_rows_are_expected_to_keep_their_velocity():
-    """Nobody plans there, so that the ego foresees what it does in a pool without a method."""
+    """Nobody plans there, so that the ego foresees what it does in a pool without a
+    method."""
     scene_set = scenes(3)
     scene_set.scenes["logged"][:, 3:, 1, 3] = 1.0
     env = environment(mixed(scene_set), March(), batch=9, scene_set=scene_set)
@@ -293,18 +361,35 @@ def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
             seen.append(tensordict.get(("traffic", "plan"), None))
             return super().forward(tensordict)
 
-    options = {"trust_policy": True, "track_traj_ids": False, "auto_register_policy_transforms": False}
-    collector = Collector(env, Watching(IDMEgo(), env), frames_per_batch=36, total_frames=-1, **options)
+    options = {
+        "trust_policy": True,
+        "track_traj_ids": False,
+        "auto_register_policy_transforms": False,
+    }
+    collector = Collector(
+        env, Watching(IDMEgo(), env), frames_per_batch=36, total_frames=-1, **options
+    )
     data = next(iter(collector))
-    assert ("traffic", "plan") not in data.keys(True) and ("next", "traffic", "plan") not in data.keys(True)
-    torch.testing.assert_close(seen[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS])
+    assert ("traffic", "plan") not in data.keys(True) and (
+        "next",
+        "traffic",
+        "plan",
+    ) not in data.keys(True)
+    torch.testing.assert_close(
+        seen[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS]
+    )
     collector.shutdown()
 
 
 def test_egos_that_drive_differently_meet_plans_of_their_own():
-    """The same attempt twice, but one of the egos brakes: the plan of one is not that of the other."""
+    """The same attempt twice, but one of the egos brakes: the plan of one is not that
+    of the other."""
     on = synthesizer()
-    pool = TrafficPool.live(torch.zeros(2, dtype=torch.int64), torch.full((2,), 2.0), seed=torch.tensor([5, 5]))
+    pool = TrafficPool.live(
+        torch.zeros(2, dtype=torch.int64),
+        torch.full((2,), 2.0),
+        seed=torch.tensor([5, 5]),
+    )
     env = environment(pool, on, steps=20, batch=2, scene_set=scenes(1, 20))
     plans = []
     env.transform.on_plan = lambda plan: plans.append(plan.states)

@@ -1,1 +1,2 @@
-"""Build-time generator of the bundled scenes: parametric layouts -> netconvert -> SUMO -> smooth tracks -> assets."""
+"""Build-time generator of the bundled scenes: parametric layouts -> netconvert -> SUMO
+-> smooth tracks -> assets."""

@@ -1,4 +1,5 @@
-"""Writes the archive of a split that e2rl/scenes/bundled.py reads (format e2rl-scenes/1)."""
+"""Writes the archive of a split that e2rl/scenes/bundled.py reads (format
+e2rl-scenes/1)."""
 
 from dataclasses import dataclass
 
@@ -16,17 +17,32 @@ class Place(SceneMap):
     parked_size: np.ndarray
 
 
-def pack(maps: list[Place], scenes: list[tuple[Recording, int]]) -> dict[str, np.ndarray]:
-    """Arrays of an archive from maps and (recording, first frame on its map's light programme) on them."""
-    lanes = [(scene_map.name, name, lane) for scene_map in maps for name, lane in scene_map.lanes.items()]
-    number = {(scene_map, name): index for index, (scene_map, name, _) in enumerate(lanes)}
+def pack(
+    maps: list[Place], scenes: list[tuple[Recording, int]]
+) -> dict[str, np.ndarray]:
+    """Arrays of an archive from maps and (recording, first frame on its map's light
+    programme) on them."""
+    lanes = [
+        (scene_map.name, name, lane)
+        for scene_map in maps
+        for name, lane in scene_map.lanes.items()
+    ]
+    number = {
+        (scene_map, name): index for index, (scene_map, name, _) in enumerate(lanes)
+    }
     pairs = {
-        kind: [(number[m, n], number[m, other]) for m, n, lane in lanes for other in getattr(lane, kind)]
+        kind: [
+            (number[m, n], number[m, other])
+            for m, n, lane in lanes
+            for other in getattr(lane, kind)
+        ]
         for kind in ("exits", "left", "right")
     }
     points = [lane.points for _, _, lane in lanes]
     polygons = [ring for scene_map in maps for ring in scene_map.drivable]
-    lights = [(number[m.name, name], state) for m in maps for name, state in m.lights.items()]
+    lights = [
+        (number[m.name, name], state) for m in maps for name, state in m.lights.items()
+    ]
     states = [np.moveaxis(_steady(recording), 0, 1) for recording, _ in scenes]
     names = [scene_map.name for scene_map in maps]
     return {
@@ -41,21 +57,34 @@ def pack(maps: list[Place], scenes: list[tuple[Recording, int]]) -> dict[str, np
         "lane_points": _quantise(_join(points, 2), MILLI),
         "lane_width": _quantise([lane.width for _, _, lane in lanes], MILLI),
         "lane_speed": _quantise([lane.speed_limit for _, _, lane in lanes], MILLI),
-        **{kind: np.array(rows, np.int32).reshape(-1, 2) for kind, rows in pairs.items()},
+        **{
+            kind: np.array(rows, np.int32).reshape(-1, 2)
+            for kind, rows in pairs.items()
+        },
         "polygon_counts": _counts(polygons),
         "polygon_points": _quantise(_join(polygons, 2), MILLI),
         "light_lane": np.array([index for index, _ in lights], np.int32),
         "light_states": np.array([state for _, state in lights], np.int8),
-        "parked": _quantise(_join([scene_map.parked for scene_map in maps], 3), UNIT[:3]),
-        "parked_size": _quantise(_join([scene_map.parked_size for scene_map in maps], 2), MILLI),
+        "parked": _quantise(
+            _join([scene_map.parked for scene_map in maps], 3), UNIT[:3]
+        ),
+        "parked_size": _quantise(
+            _join([scene_map.parked_size for scene_map in maps], 2), MILLI
+        ),
         "scene_id": np.array([recording.scene_id for recording, _ in scenes]),
-        "scene_map": np.array([names.index(recording.location) for recording, _ in scenes], np.int32),
+        "scene_map": np.array(
+            [names.index(recording.location) for recording, _ in scenes], np.int32
+        ),
         "scene_first": np.array([first for _, first in scenes], np.int32),
         "scene_ego": np.array([recording.ego for recording, _ in scenes], np.int32),
         "scene_agents": _counts(states),
-        "states": np.concatenate([_second_difference(_quantise(part, UNIT)) for part in states]),
+        "states": np.concatenate(
+            [_second_difference(_quantise(part, UNIT)) for part in states]
+        ),
         "valid": np.concatenate([recording.valid.T for recording, _ in scenes]),
-        "size": _quantise(np.concatenate([recording.size for recording, _ in scenes]), MILLI),
+        "size": _quantise(
+            np.concatenate([recording.size for recording, _ in scenes]), MILLI
+        ),
     }
 
 
@@ -72,7 +101,8 @@ def _join(parts: list[np.ndarray], columns: int) -> np.ndarray:
 
 
 def _steady(recording: Recording) -> np.ndarray:
-    """States with unwrapped headings; frames outside a track repeat a valid one of it, which costs no space."""
+    """States with unwrapped headings; frames outside a track repeat a valid one of it,
+    which costs no space."""
     frames, agents = recording.valid.shape
     index = np.where(recording.valid, np.arange(frames)[:, None], -1)
     last = np.maximum.accumulate(index, 0)

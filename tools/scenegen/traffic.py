@@ -18,8 +18,11 @@ MODELS = [(0.35, "IDM"), (0.45, "EIDM"), (0.20, "Krauss")]
 
 
 def vehicle_type(rng: np.random.Generator, name: str) -> str:
-    """One random vType: IDM, EIDM or Krauss drivers, calm to brisk, who do not all keep to the lane's centre."""
-    _, length, width, kind = BODIES[rng.choice(len(BODIES), p=[body[0] for body in BODIES])]
+    """One random vType: IDM, EIDM or Krauss drivers, calm to brisk, who do not all keep
+    to the lane's centre."""
+    _, length, width, kind = BODIES[
+        rng.choice(len(BODIES), p=[body[0] for body in BODIES])
+    ]
     model = MODELS[rng.choice(len(MODELS), p=[row[0] for row in MODELS])][1]
     truck = kind == "truck"
     values = {
@@ -45,12 +48,17 @@ def vehicle_type(rng: np.random.Generator, name: str) -> str:
     }
     if model == "Krauss":
         values["sigma"] = rng.uniform(0.1, 0.5)
-    text = " ".join(f'{k}="{v if isinstance(v, str) else f"{v:.3f}"}"' for k, v in values.items())
+    text = " ".join(
+        f'{k}="{v if isinstance(v, str) else f"{v:.3f}"}"' for k, v in values.items()
+    )
     return f'  <vType id="{name}" {text}/>'
 
 
-def write_demand(layout: Layout, folder: Path, seconds: float, rng: np.random.Generator) -> Path:
-    """Write Poisson departures of random types on the layout's origin-destination pairs; returns the file."""
+def write_demand(
+    layout: Layout, folder: Path, seconds: float, rng: np.random.Generator
+) -> Path:
+    """Write Poisson departures of random types on the layout's origin-destination
+    pairs; returns the file."""
     types = [f"t{k}" for k in range(TYPES)]
     rows = []
     for start, end, per_hour in layout.demand:

@@ -1,6 +1,8 @@
-"""Docstrings as the API pages show them: plain text in which [B, N] is a shape, and no link of Markdown.
+"""Docstrings as the API pages show them: plain text in which [B, N] is a shape, and no
+link of Markdown.
 
-An extension of griffe, which reads the sources without importing them (mkdocs.yml). Lists and code stay what they are.
+An extension of griffe, which reads the sources without importing them (mkdocs.yml).
+Lists and code stay what they are.
 """
 
 import re
@@ -13,7 +15,8 @@ MARKS = str.maketrans({mark: f"&#{ord(mark)};" for mark in "[]*_<$\\"})
 
 
 class PlainDocstrings(Extension):
-    """Takes from docstrings what Markdown would read into brackets, stars and underscores."""
+    """Takes from docstrings what Markdown would read into brackets, stars and
+    underscores."""
 
     def on_object(self, *, obj: Object, **_: Any) -> None:
         """Called for every module, class, function and attribute."""
@@ -24,4 +27,6 @@ class PlainDocstrings(Extension):
 def plain(text: str) -> str:
     """A docstring without marks of Markdown outside of code."""
     parts = CODE.split(text)
-    return "".join(part if index % 2 else part.translate(MARKS) for index, part in enumerate(parts))
+    return "".join(
+        part if index % 2 else part.translate(MARKS) for index, part in enumerate(parts)
+    )

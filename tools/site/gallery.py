@@ -1,7 +1,8 @@
-"""Hook of the documentation site (mkdocs.yml): the failure report that docs/gallery.md shows.
+"""Hook of the documentation site (mkdocs.yml): the failure report that docs/gallery.md
+shows.
 
-The repository does not hold it. With E2RL_EXECUTE=true in the environment the commands of the page make it, which takes
-a minute or two; otherwise the page says how.
+The repository does not hold it. With E2RL_EXECUTE=true in the environment the commands
+of the page make it, which takes a minute or two; otherwise the page says how.
 """
 
 import os
@@ -34,7 +35,9 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         files.append(File.generated(config, f"assets/{REPORT}", content=report(text)))
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_: object) -> str:
+def on_page_markdown(
+    markdown: str, page: Page, config: MkDocsConfig, **_: object
+) -> str:
     """The page with the report, or with how it is made."""
     if page.file.src_uri != PAGE:
         return markdown
@@ -43,12 +46,17 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_: objec
 
 @cache  # `mkdocs serve` builds after every change of a page
 def report(text: str) -> str:
-    """The report that the commands of a page write; raises PluginError where they do not."""
+    """The report that the commands of a page write; raises PluginError where they do
+    not."""
     folder = str(Path(sys.executable).parent)
     variables = os.environ | {"PATH": os.pathsep.join([folder, os.environ["PATH"]])}
     with tempfile.TemporaryDirectory() as place:
         command = ["bash", "-euo", "pipefail", "-c", COMMANDS.search(text)[1]]
-        done = subprocess.run(command, cwd=place, env=variables, capture_output=True, text=True)
+        done = subprocess.run(
+            command, cwd=place, env=variables, capture_output=True, text=True
+        )
         if done.returncode:
-            raise PluginError(f"{PAGE}: its commands failed\n{done.stdout}{done.stderr}")
+            raise PluginError(
+                f"{PAGE}: its commands failed\n{done.stdout}{done.stderr}"
+            )
         return (Path(place) / REPORT).read_text()

@@ -1,7 +1,9 @@
-"""Hook of the documentation site (mkdocs.yml): docs/tutorial.ipynb as a page, in the site's own style.
+"""Hook of the documentation site (mkdocs.yml): docs/tutorial.ipynb as a page, in the
+site's own style.
 
-The repository holds the notebook without outputs. With E2RL_EXECUTE=true in the environment it is run first, which
-takes some two minutes, and the page shows what its cells print and draw.
+The repository holds the notebook without outputs. With E2RL_EXECUTE=true in the
+environment it is run first, which takes some two minutes, and the page shows what its
+cells print and draw.
 """
 
 import json
@@ -30,7 +32,9 @@ def executed(path: Path) -> dict:
     from nbclient import NotebookClient
 
     node = nbformat.read(path, as_version=4)
-    NotebookClient(node, timeout=600, resources={"metadata": {"path": str(path.parent)}}).execute()
+    NotebookClient(
+        node, timeout=600, resources={"metadata": {"path": str(path.parent)}}
+    ).execute()
     return node
 
 
@@ -39,7 +43,9 @@ def page(notebook: dict) -> str:
     parts = []
     for number, cell in enumerate(notebook["cells"]):
         source = "".join(cell["source"])
-        parts.append(f"```python\n{source}\n```" if cell["cell_type"] == "code" else source)
+        parts.append(
+            f"```python\n{source}\n```" if cell["cell_type"] == "code" else source
+        )
         parts += [shown(output) for output in cell.get("outputs", [])]
         if number == 0:
             parts.append(f"[Download the notebook]({NOTEBOOK})")

@@ -1,4 +1,5 @@
-"""python tools/site/results_curve.py: docs/assets/results.png, the table of docs/intensity.md as a curve."""
+"""python tools/site/results_curve.py: docs/assets/results.png, the table of
+docs/intensity.md as a curve."""
 
 import re
 from pathlib import Path
@@ -14,8 +15,12 @@ ROWS = {"cfr": ("failures", "tab:red"), "cfr_preventable": ("preventable", "tab:
 
 def values(name: str) -> list[tuple[float, float, float]]:
     """(mean, low, high) in % at each intensity of a row of the first table that has it."""
-    row = re.findall(rf"^\| `{name}` \|(.*)\|$", (DOCS / "intensity.md").read_text(), re.MULTILINE)[0]
-    return [tuple(map(float, re.findall(r"[\d.]+", cell))) for cell in row.split("|")[:4]]  # type: ignore[misc]
+    row = re.findall(
+        rf"^\| `{name}` \|(.*)\|$", (DOCS / "intensity.md").read_text(), re.MULTILINE
+    )[0]
+    return [
+        tuple(map(float, re.findall(r"[\d.]+", cell))) for cell in row.split("|")[:4]
+    ]  # type: ignore[misc]
 
 
 def main() -> None:
@@ -23,8 +28,12 @@ def main() -> None:
     for shift, (name, (label, colour)) in zip((-0.02, 0.02), ROWS.items(), strict=True):
         mean, low, high = zip(*values(name), strict=True)
         eta = [step + shift for step in range(len(mean))]
-        below, above = ([abs(a - b) for a, b in zip(mean, end, strict=True)] for end in (low, high))
-        ax.errorbar(eta, mean, [below, above], label=label, color=colour, marker="o", capsize=3)
+        below, above = (
+            [abs(a - b) for a, b in zip(mean, end, strict=True)] for end in (low, high)
+        )
+        ax.errorbar(
+            eta, mean, [below, above], label=label, color=colour, marker="o", capsize=3
+        )
     ax.set(xlabel="intensity η", ylabel="rollouts, %", xticks=range(4), ylim=(0, None))
     ax.set_title("lane_graph under e2, Waymo tune, 166 rollouts a point", fontsize=9)
     ax.legend(frameon=False)

@@ -1,4 +1,5 @@
-"""One training process, or several started by torchrun, of which the leader validates and writes."""
+"""One training process, or several started by torchrun, of which the leader validates
+and writes."""
 
 import contextlib
 import os
@@ -15,14 +16,17 @@ from torch import Tensor
 from e2rl.run.errors import InputError
 
 Value = TypeVar("Value")
-TIMEOUT = timedelta(hours=6)  # the others wait while the leader parses logs or validates
+TIMEOUT = timedelta(
+    hours=6
+)  # the others wait while the leader parses logs or validates
 
 
 @dataclass(frozen=True)
 class Processes:
     """This process, `rank`, among `count` that train together.
 
-    Every method but `leader` is collective: all processes call it in the same order. With count 1 nothing is sent.
+    Every method but `leader` is collective: all processes call it in the same order.
+    With count 1 nothing is sent.
     """
 
     rank: int = 0
@@ -49,7 +53,8 @@ class Processes:
         return values
 
     def from_leader(self, work: Callable[[], Value]) -> Value:
-        """The leader's result of `work()`, in every process; an InputError of the leader is raised in all."""
+        """The leader's result of `work()`, in every process; an InputError of the
+        leader is raised in all."""
         if self.count == 1:
             return work()
         result: list = [None, None]
@@ -64,7 +69,8 @@ class Processes:
         return result[0]
 
     def leader_first(self, work: Callable[[], Value]) -> Value:
-        """`work()` in every process, first in the leader, whose cached files the others then read."""
+        """`work()` in every process, first in the leader, whose cached files the others
+        then read."""
         own: list[Value] = []
         self.from_leader(lambda: own.append(work()))
         return own[0] if self.leader else work()
@@ -75,10 +81,11 @@ ALONE = Processes()
 
 @contextmanager
 def process_group(device: str) -> Iterator[tuple[Processes, str]]:
-    """(processes, this process's device): the processes started by torchrun, or this process alone.
+    """(processes, this process's device): the processes started by torchrun, or this
+    process alone.
 
-    They communicate over gloo on the CPU and NCCL on GPUs, one GPU each. Only the leader prints. Raises InputError for
-    more processes than GPUs.
+    They communicate over gloo on the CPU and NCCL on GPUs, one GPU each. Only the
+    leader prints. Raises InputError for more processes than GPUs.
     """
     if not started_by_torchrun():
         yield ALONE, device
@@ -89,7 +96,9 @@ def process_group(device: str) -> Iterator[tuple[Processes, str]]:
     if on_gpu:
         gpus = torch.cuda.device_count()
         if count > gpus:
-            raise InputError(f"torchrun --nproc_per_node={count}: this machine has {gpus} GPUs; start at most {gpus}")
+            raise InputError(
+                f"torchrun --nproc_per_node={count}: this machine has {gpus} GPUs; start at most {gpus}"
+            )
         device = f"cuda:{local}"
         torch.cuda.set_device(local)
     dist.init_process_group("nccl" if on_gpu else "gloo", timeout=TIMEOUT)
@@ -120,4 +129,8 @@ def follower_overrides() -> list[str]:
     """Hydra overrides for processes other than the leader: no run folder, no log."""
     if not follows():
         return []
-    return ["hydra.run.dir=.", "hydra.output_subdir=null", f"hydra.job_logging.handlers.file.filename={os.devnull}"]
+    return [
+        "hydra.run.dir=.",
+        "hydra.output_subdir=null",
+        f"hydra.job_logging.handlers.file.filename={os.devnull}",
+    ]

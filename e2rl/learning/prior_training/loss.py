@@ -1,4 +1,5 @@
-"""The prior's training loss: denoising of x plus a small trajectory term, on augmented windows."""
+"""The prior's training loss: denoising of x plus a small trajectory term, on augmented
+windows."""
 
 import torch
 import torch.nn.functional as F
@@ -28,11 +29,16 @@ ACCEL_NOISE = 0.35  # m/s^2 on the current acceleration, in half of the windows
 FEATURE_NOISE = 0.1  # on the features, in units of their standard deviations
 MIN_STD = 0.02  # smallest standard deviation that a feature is divided by
 CONSTANT_STD = 1e6  # for constant features, so that they have no effect
-SIDED = {"nodes": SIDED_NODE, "pairs": SIDED_EDGE, "x0": (KNOTS, KNOTS + 1)}  # columns whose sign a mirror flips
+SIDED = {
+    "nodes": SIDED_NODE,
+    "pairs": SIDED_EDGE,
+    "x0": (KNOTS, KNOTS + 1),
+}  # columns whose sign a mirror flips
 
 
 def augment(batch: TensorDictBase, generator: torch.Generator) -> TensorDictBase:
-    """Windows [W] mirrored, with noise on the accelerations and some of the other vehicles hidden."""
+    """Windows [W] mirrored, with noise on the accelerations and some of the other
+    vehicles hidden."""
     batch, size, device = batch.clone(), batch.shape[0], batch["x0"].device
 
     def uniform(*shape: int) -> Tensor:
@@ -59,8 +65,9 @@ def augment(batch: TensorDictBase, generator: torch.Generator) -> TensorDictBase
 def draw(batch: TensorDictBase, generator: torch.Generator) -> TensorDict:
     """The random numbers of the loss of windows [W] at L = LEVELS noise levels each.
 
-    feature [W, R, NODE]: standard normal; level [W, L]: in (0.01, 0.99), stratified; clean [W, L] bool: the ego's row
-    is nearly noise-free (in half); noise [W, L, R, SIZE]: standard normal.
+    feature [W, R, NODE]: standard normal; level [W, L]: in (0.01, 0.99), stratified;
+    clean [W, L] bool: the ego's row is nearly noise-free (in half); noise [W, L, R,
+    SIZE]: standard normal.
     """
     size = len(batch)
     count = LEVELS
@@ -70,40 +77,61 @@ def draw(batch: TensorDictBase, generator: torch.Generator) -> TensorDict:
     level = (torch.arange(count, device=device)[:, None] + u) / count * 0.98 + 0.01
     clean = torch.rand(count, size, generator=generator, device=device) < 0.5
     noise = torch.randn(count, *batch["x0"].shape, generator=generator, device=device)
-    return TensorDict({"feature": feature, "level": level.T, "clean": clean.T, "noise": noise.transpose(0, 1)}, [size])
+    return TensorDict(
+        {
+            "feature": feature,
+            "level": level.T,
+            "clean": clean.T,
+            "noise": noise.transpose(0, 1),
+        },
+        [size],
+    )
 
 
 def loss_weight(batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
     """[L * W, R], level by level: the windows' weights, 0 for a clean ego row."""
-    weight = batch["weight"].expand(drawn["level"].shape[1], *batch["weight"].shape).clone()
+    weight = (
+        batch["weight"].expand(drawn["level"].shape[1], *batch["weight"].shape).clone()
+    )
     weight[..., 0] *= ~drawn["clean"].T
     return weight.flatten(0, 1)
 
 
 class DenoisingLoss(nn.Module):
-    """The denoiser's loss as a module, so that DistributedDataParallel and torch.compile can wrap it."""
+    """The denoiser's loss as a module, so that DistributedDataParallel and
+    torch.compile can wrap it."""
 
     def __init__(self, denoiser: Denoiser, feature_noise: float = FEATURE_NOISE):
         super().__init__()
         self.denoiser = denoiser
         self.feature_noise = feature_noise
 
-    def forward(self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(loss, its action term, its trajectory term) of windows [W] with the random numbers of `draw`.
+    def forward(
+        self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(loss, its action term, its trajectory term) of windows [W] with the random
+        numbers of `draw`.
 
-        total: divisor of the weighted sums, the sum of `loss_weight`, averaged over the processes that share a batch so
-        that the mean of their gradients is the gradient of the whole batch.
+        total: divisor of the weighted sums, the sum of `loss_weight`, averaged over the
+        processes that share a batch so that the mean of their gradients is the gradient
+        of the whole batch.
         """
         net = self.denoiser
         count = drawn["level"].shape[1]
-        scale = self.feature_noise * net.node_std * ((net.node_std > MIN_STD) & (net.node_std < CONSTANT_STD))
+        scale = (
+            self.feature_noise
+            * net.node_std
+            * ((net.node_std > MIN_STD) & (net.node_std < CONSTANT_STD))
+        )
         nodes = batch["nodes"] + scale * drawn["feature"]
         encoding = net.encode(nodes, batch["pairs"], batch["present"]).repeat(count)
         weight = loss_weight(batch, drawn)
         tiled = TensorDict.cat([batch] * count)
         level = drawn["level"].T.reshape(-1, 1).expand(-1, weight.shape[1]).clone()
         level[:, 0] = torch.where(drawn["clean"].T.reshape(-1), EGO_LEVEL, level[:, 0])
-        x = net.schedule.noised(tiled["x0"], level[..., None], drawn["noise"].transpose(0, 1).flatten(0, 1))
+        x = net.schedule.noised(
+            tiled["x0"], level[..., None], drawn["noise"].transpose(0, 1).flatten(0, 1)
+        )
         x0 = net(x, level, encoding).float()
         squared = (x0 - tiled["x0"]) ** 2 * tiled["knot_weight"]
         action = (squared.sum(-1) / SIZE * weight).sum() / total
@@ -112,21 +140,39 @@ class DenoisingLoss(nn.Module):
 
 
 def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
-    """Huber error [W, R] in m of travelled distance and (twice, on lanes) of offset at the knots' times."""
+    """Huber error [W, R] in m of travelled distance and (twice, on lanes) of offset at
+    the knots' times."""
     zero = torch.zeros_like(batch["v"])
-    state = LaneState(zero, batch["d"], d1=batch["d1"], d2=batch["d2"], v=batch["v"], a=batch["a"], x=zero, y=zero, heading=zero, kappa=zero)
+    state = LaneState(
+        zero,
+        batch["d"],
+        d1=batch["d1"],
+        d2=batch["d2"],
+        v=batch["v"],
+        a=batch["a"],
+        x=zero,
+        y=zero,
+        heading=zero,
+        kappa=zero,
+    )
     knots, half, end = split(x0, state)
     travelled = speeds(state, knots)[1][..., KNOT_STEPS - 1 : HORIZON : KNOT_STEPS]
     u = (travelled / lateral_horizon(state.v)[..., None]).clamp(max=1.0)
     d = polynomial(offset_coefficients(state, half, end=end), u)[0]
     ahead = F.huber_loss(travelled, batch["ahead"], reduction="none")
-    aside = F.huber_loss(2 * d, 2 * batch["aside"], reduction="none") * batch["on_lane"][..., None]
+    aside = (
+        F.huber_loss(2 * d, 2 * batch["aside"], reduction="none")
+        * batch["on_lane"][..., None]
+    )
     return ((ahead + aside) * batch["known"].float()).sum(-1) / KNOTS
 
 
 @torch.no_grad()
-def held_out_loss(prior: Prior, windows: TensorDictBase, batch: int, batches: int = 20) -> float:
-    """Denoising loss on at most `batches` batches of windows, with a fixed seed and without augmentation."""
+def held_out_loss(
+    prior: Prior, windows: TensorDictBase, batch: int, batches: int = 20
+) -> float:
+    """Denoising loss on at most `batches` batches of windows, with a fixed seed and
+    without augmentation."""
     device = next(prior.parameters()).device
     generator = torch.Generator(device).manual_seed(1)
     measure = DenoisingLoss(prior.denoiser, feature_noise=0.0)
@@ -134,5 +180,7 @@ def held_out_loss(prior: Prior, windows: TensorDictBase, batch: int, batches: in
     for part in windows[: batches * batch].split(batch):
         part = part.to(device)
         drawn = draw(part, generator)
-        losses.append(measure(part, drawn, loss_weight(part, drawn).sum().clamp(min=1))[0].item())
+        losses.append(
+            measure(part, drawn, loss_weight(part, drawn).sum().clamp(min=1))[0].item()
+        )
     return sum(losses) / len(losses)

@@ -1,4 +1,5 @@
-"""`python train.py stage=prior`: train a prior on the user's data and measure its closed loop on held-out logs."""
+"""`python train.py stage=prior`: train a prior on the user's data and measure its
+closed loop on held-out logs."""
 
 import hashlib
 from pathlib import Path
@@ -7,7 +8,11 @@ from typing import Any
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.prior_training.distributed import process_group
-from e2rl.learning.prior_training.training import TrainingSettings, held_out, train_prior
+from e2rl.learning.prior_training.training import (
+    TrainingSettings,
+    held_out,
+    train_prior,
+)
 from e2rl.learning.supervised import stage_settings
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.bounds import BoundSettings
@@ -24,9 +29,12 @@ from e2rl.sim.env import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
 
 
-def run_prior_stage(run: Run, logger: RunLogger | None) -> tuple[Path, list[dict]] | None:
-    """Train a prior; returns its checkpoint's path and the metrics rows of the nominal closed loop on held-out scenes,
-    the ego replayed. None in processes other than the leader."""
+def run_prior_stage(
+    run: Run, logger: RunLogger | None
+) -> tuple[Path, list[dict]] | None:
+    """Train a prior; returns its checkpoint's path and the metrics rows of the nominal
+    closed loop on held-out scenes, the ego replayed. None in processes other than the
+    leader."""
     config = run.config
     settings = stage_settings(config, TrainingSettings)
     with process_group(config.device) as (processes, device):
@@ -38,27 +46,72 @@ def run_prior_stage(run: Run, logger: RunLogger | None) -> tuple[Path, list[dict
             bounds=settings_of(BoundSettings, own.bounds, where="prior.bounds"),
         ).to(device)
         scenes = processes.leader_first(
-            lambda: load_scenes(config.data, config.num_scenes, split="train", starts=list(settings.starts), scenes=config.scenes)
+            lambda: load_scenes(
+                config.data,
+                config.num_scenes,
+                split="train",
+                starts=list(settings.starts),
+                scenes=config.scenes,
+            )
         )
         processes.from_leader(lambda: run.begin({"scenes": listed(scenes)}))
         data = hashlib.sha256("\n".join(scene_hashes(scenes)).encode()).hexdigest()[:16]
-        about = {"data": f"{scenes.dataset}/{scenes.split}", "scenes": len(scenes), "fingerprint": data}
+        about = {
+            "data": f"{scenes.dataset}/{scenes.split}",
+            "scenes": len(scenes),
+            "fingerprint": data,
+        }
         origin = about | origin_of(folder) | {"settings": vars(settings)}
         parts = Parts(folder, "training", about=data)
-        path = train_prior(prior, scenes, settings=settings, folder=folder, origin=origin, processes=processes, logger=logger, parts=parts)
+        path = train_prior(
+            prior,
+            scenes,
+            settings=settings,
+            folder=folder,
+            origin=origin,
+            processes=processes,
+            logger=logger,
+            parts=parts,
+        )
         if path is None:
             return None
-        fields: dict[str, Any] = {"stage": "prior", "parts": Parts(folder, "prior", about=path.name), **origin_of(folder)}
-        setup = Setup(_first_starts(scenes), ReplayEgo(), ego_name="replay", sim=SimSettings(), device=device)
-        return path, run_protocol(setup, [Method("nominal", NominalTraffic(prior))], seeds=[0], folder=folder, **fields)
+        fields: dict[str, Any] = {
+            "stage": "prior",
+            "parts": Parts(folder, "prior", about=path.name),
+            **origin_of(folder),
+        }
+        setup = Setup(
+            _first_starts(scenes),
+            ReplayEgo(),
+            ego_name="replay",
+            sim=SimSettings(),
+            device=device,
+        )
+        return path, run_protocol(
+            setup,
+            [Method("nominal", NominalTraffic(prior))],
+            seeds=[0],
+            folder=folder,
+            **fields,
+        )
 
 
 def _first_starts(scenes: SceneSet) -> SceneSet:
-    """Of each held-out log the scene with the earliest start frame, i.e. the longest recorded future."""
+    """Of each held-out log the scene with the earliest start frame, i.e. the longest
+    recorded future."""
     first: dict[str, tuple[int, int]] = {}
     for index in held_out(scenes).nonzero()[:, 0].tolist():
         log, _, start = scenes.scene_id[index].rpartition("@")
         first[log] = min(first.get(log, (int(start), index)), (int(start), index))
     keep = [index for _, index in first.values()]
-    names, places = ([values[i] for i in keep] for values in (scenes.scene_id, scenes.location))
-    return SceneSet(scenes.batch(keep), names, location=places, dataset=scenes.dataset, split=f"{scenes.split}-held-out", dropped={})
+    names, places = (
+        [values[i] for i in keep] for values in (scenes.scene_id, scenes.location)
+    )
+    return SceneSet(
+        scenes.batch(keep),
+        names,
+        location=places,
+        dataset=scenes.dataset,
+        split=f"{scenes.split}-held-out",
+        dropped={},
+    )

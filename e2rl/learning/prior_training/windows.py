@@ -1,4 +1,5 @@
-"""Training windows of the prior: the features of vehicles at a frame, and the x that reproduces their next 5 s."""
+"""Training windows of the prior: the features of vehicles at a frame, and the x that
+reproduces their next 5 s."""
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,8 +22,11 @@ STANDING_WEIGHT = 0.25
 
 
 def derivative(values: Tensor, valid: Tensor) -> Tensor:
-    """Central difference over time of values [B, T, V] (one-sided at the ends of a recorded piece), per second."""
-    ahead = torch.cat([values[:, 1:] - values[:, :-1], torch.zeros_like(values[:, :1])], 1)
+    """Central difference over time of values [B, T, V] (one-sided at the ends of a
+    recorded piece), per second."""
+    ahead = torch.cat(
+        [values[:, 1:] - values[:, :-1], torch.zeros_like(values[:, :1])], 1
+    )
     known = torch.cat([valid[:, 1:] & valid[:, :-1], torch.zeros_like(valid[:, :1])], 1)
     ahead = torch.where(known, ahead, 0.0)
     behind = torch.roll(ahead, 1, 1)
@@ -40,24 +44,47 @@ def make_windows(scenes: TensorDictBase, chunk: int = 32) -> TensorDict:
         valid = scene["logged_valid"][:, :, :vehicles]
         accel = derivative(logged[..., 3], valid).clamp(-6.0, 4.0)
         heading = torch.where(valid, logged[..., 2], 0.0)
-        unwrapped = torch.cumsum(torch.cat([heading[:, :1], wrap(heading.diff(dim=1))], 1), 1)
+        unwrapped = torch.cumsum(
+            torch.cat([heading[:, :1], wrap(heading.diff(dim=1))], 1), 1
+        )
         yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
-        exact = [_window(scene, routed, offset=offset, accel=accel[:, offset], yaw_rate=yaw_rate[:, offset], causal=False) for offset in OFFSETS]
-        observed = (scene["start_accel"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles])
+        exact = [
+            _window(
+                scene,
+                routed,
+                offset=offset,
+                accel=accel[:, offset],
+                yaw_rate=yaw_rate[:, offset],
+                causal=False,
+            )
+            for offset in OFFSETS
+        ]
+        observed = (
+            scene["start_accel"][:, :vehicles],
+            scene["start_yaw_rate"][:, :vehicles],
+        )
         parts += [*exact, _window(scene, routed, 0, *observed, True)]
     windows = TensorDict.cat(parts)
     return windows[windows["weight"].sum(-1) > 0]
 
 
 def _window(
-    scene: TensorDictBase, routed: RoutedScene, offset: int, accel: Tensor, yaw_rate: Tensor, causal: bool
+    scene: TensorDictBase,
+    routed: RoutedScene,
+    offset: int,
+    accel: Tensor,
+    yaw_rate: Tensor,
+    causal: bool,
 ) -> TensorDict:
-    """Windows [B] of R rows at frame `offset`, where accelerations and yaw rates [B, V] are given.
+    """Windows [B] of R rows at frame `offset`, where accelerations and yaw rates [B, V]
+    are given.
 
-    nodes [R, NODE], pairs [R, R, EDGE], present [R], x0 [R, SIZE]; weight [R] of a vehicle in the loss, knot_weight
-    [R, SIZE]: knots inside the recorded future; v, a, d, d1, d2 [R]: the start state; ahead, aside [R, KNOTS]: recorded
-    distance and offset at the knots, known [R, KNOTS]: recorded there, on_lane [R]: aside counts (in free space the
-    lateral knots are no offsets); causal []: start states are a causal observer's estimates, otherwise exact.
+    nodes [R, NODE], pairs [R, R, EDGE], present [R], x0 [R, SIZE]; weight [R] of a
+    vehicle in the loss, knot_weight [R, SIZE]: knots inside the recorded future; v, a,
+    d, d1, d2 [R]: the start state; ahead, aside [R, KNOTS]: recorded distance and
+    offset at the knots, known [R, KNOTS]: recorded there, on_lane [R]: aside counts (in
+    free space the lateral knots are no offsets); causal []: start states are a causal
+    observer's estimates, otherwise exact.
     """
     vehicles = routed.route.shape[1]
     logged = scene["logged"][:, offset]
@@ -73,13 +100,27 @@ def _window(
     moving = torch.where(known, tracks[..., 3], 0.0).amax(-1).clamp(min=state.v) > 0.5
     here = valid[:, :vehicles]
     fits = (scene["route_log"] >= 0) | ~routed.has_lane
-    use = here & routed.modelled & fits & (error < MAX_ERROR) & (known.sum(-1) >= KNOT_STEPS)
+    use = (
+        here
+        & routed.modelled
+        & fits
+        & (error < MAX_ERROR)
+        & (known.sum(-1) >= KNOT_STEPS)
+    )
     columns = {name: getattr(state, name) for name in ("v", "a", "d", "d1", "d2")} | {
-        "nodes": node_features(routed, state, leaders_ahead(routed, state.s, agents=agents, present=valid), step, estimated),
+        "nodes": node_features(
+            routed,
+            state,
+            leaders_ahead(routed, state.s, agents=agents, present=valid),
+            step,
+            estimated,
+        ),
         "present": here,
         "x0": x0,
         "weight": use * torch.where(moving, 1.0, STANDING_WEIGHT),
-        "knot_weight": torch.cat([at_knots, known[..., [24]], known[..., [44]]], -1).float(),
+        "knot_weight": torch.cat(
+            [at_knots, known[..., [24]], known[..., [44]]], -1
+        ).float(),
         "on_lane": routed.has_lane,
         "ahead": ahead[..., ends],
         "aside": d[..., ends],
@@ -88,13 +129,19 @@ def _window(
     distance = (logged[:, :vehicles, :2] - logged[:, :1, :2]).norm(dim=-1)
     distance[:, 0] = -1e6  # the ego comes first
     order = (distance + 1e3 * ~use + 1e4 * ~here).argsort(1)[:, :ROWS]
-    pairs = take(take(edge_features(routed, state), order).transpose(1, 2), order).transpose(1, 2)
-    window = {key: take(value, order) for key, value in columns.items()} | {"pairs": pairs, "causal": estimated}
+    pairs = take(
+        take(edge_features(routed, state), order).transpose(1, 2), order
+    ).transpose(1, 2)
+    window = {key: take(value, order) for key, value in columns.items()} | {
+        "pairs": pairs,
+        "causal": estimated,
+    }
     return TensorDict(window, batch_size=[len(logged)])
 
 
 def _future(scene: TensorDictBase, offset: int, vehicles: int) -> tuple[Tensor, Tensor]:
-    """States [B, V, HORIZON, 4] recorded after frame `offset`, and a mask [B, V, HORIZON] of the known ones."""
+    """States [B, V, HORIZON, 4] recorded after frame `offset`, and a mask [B, V,
+    HORIZON] of the known ones."""
     future = slice(offset + 1, offset + 1 + HORIZON)
     tracks = scene["logged"][:, future, :vehicles].transpose(1, 2)
     known = scene["logged_valid"][:, future, :vehicles].transpose(1, 2)
@@ -104,11 +151,18 @@ def _future(scene: TensorDictBase, offset: int, vehicles: int) -> tuple[Tensor, 
     return tracks, known.cumprod(-1).bool()
 
 
-def _targets(routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tensor) -> tuple[Tensor, ...]:
-    """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], recorded distance and offset [B, V, HORIZON]."""
-    hint = state.s[..., None] + (torch.where(known, tracks[..., 3], 0.0) * DT).cumsum(-1)
+def _targets(
+    routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tensor
+) -> tuple[Tensor, ...]:
+    """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], recorded distance
+    and offset [B, V, HORIZON]."""
+    hint = state.s[..., None] + (torch.where(known, tracks[..., 3], 0.0) * DT).cumsum(
+        -1
+    )
     s, d, _ = project(tracks[..., :2], routed.points, hint=hint)
-    x0, error = lane_relative.fit(LaneState.from_states(tracks, s, d=d), known.float(), state=state)
+    x0, error = lane_relative.fit(
+        LaneState.from_states(tracks, s, d=d), known.float(), state=state
+    )
     ahead = s - state.s[..., None]
     lane = routed.has_lane
     if bool(lane.all()):

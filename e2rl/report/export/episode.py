@@ -1,4 +1,5 @@
-"""An episode: one rollout of a run with its map and what is known of its failure, as every exporter takes it."""
+"""An episode: one rollout of a run with its map and what is known of its failure, as
+every exporter takes it."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -18,8 +19,26 @@ from e2rl.scenes.recording import Lane, Recording
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, Rollout
 
 FACTS = (  # columns of rollouts.csv that go along; docs/verdicts.md and docs/modes.md say what they mean
-    *("dataset", "split", "location", "scene_id", "method", "ego_policy", "eta", "seed", "cfr"),
-    *("partner", "contact_step", "contact_type", "approach", "ego_manoeuvre", "partner_manoeuvre", "duty"),
+    *(
+        "dataset",
+        "split",
+        "location",
+        "scene_id",
+        "method",
+        "ego_policy",
+        "eta",
+        "seed",
+        "cfr",
+    ),
+    *(
+        "partner",
+        "contact_step",
+        "contact_type",
+        "approach",
+        "ego_manoeuvre",
+        "partner_manoeuvre",
+        "duty",
+    ),
     *("counted", "at_fault", "preventable", "avoidable"),
 )
 LONG = 7.0  # m: longer vehicles are trucks
@@ -28,12 +47,14 @@ SAME = 0.01  # m: a map or a start that differs by more is another one
 
 @dataclass(frozen=True)
 class Episode:
-    """A rollout, its map and its facts. Positions are relative to the scene's origin, as in the rollout file.
+    """A rollout, its map and its facts. Positions are relative to the scene's origin,
+    as in the rollout file.
 
-    path: the rollout file; rollout: its content; facts: FACTS that are known, and `adversaries`, rows of agents; lanes:
-    by id, with points every 1 m; lights: lane id -> [T + 1] light states. Where the scene is known: `scene`, with
-    `origin` [2] m, its place in the recording's coordinates, and `light_past`: lane id -> states of the frames before
-    the start, the last one 0.1 s before it.
+    path: the rollout file; rollout: its content; facts: FACTS that are known, and
+    `adversaries`, rows of agents; lanes: by id, with points every 1 m; lights: lane id
+    -> [T + 1] light states. Where the scene is known: `scene`, with `origin` [2] m, its
+    place in the recording's coordinates, and `light_past`: lane id -> states of the
+    frames before the start, the last one 0.1 s before it.
     """
 
     path: Path
@@ -57,7 +78,9 @@ class Episode:
 
     def appearances(self, row: int) -> list[tuple[int, int]]:
         """[first, end) steps of each time that an agent is there."""
-        edges = np.flatnonzero(np.diff(self.rollout.valid[:, row], prepend=False, append=False)).tolist()
+        edges = np.flatnonzero(
+            np.diff(self.rollout.valid[:, row], prepend=False, append=False)
+        ).tolist()
         return list(zip(edges[::2], edges[1::2], strict=True))
 
     def size(self, row: int) -> tuple[float, float]:
@@ -78,17 +101,27 @@ class Episode:
         return "; ".join(f"{name}: {value}" for name, value in self.facts.items())
 
 
-def recorded_episode(run: Path, row: Mapping, recording: Recording, build: BuildSettings) -> Episode:
-    """The episode of a row of rollouts.csv in the scene that a recording makes; InputError where it is another one."""
+def recorded_episode(
+    run: Path, row: Mapping, recording: Recording, build: BuildSettings
+) -> Episode:
+    """The episode of a row of rollouts.csv in the scene that a recording makes;
+    InputError where it is another one."""
     bare = rollout_episode(run, row)
     builder = SceneBuilder(recording, build)
     scene = builder.scene(recording)
     graph = builder.graph
     rollout = bare.rollout
-    same = len(graph.points) == len(rollout.lane_points) and len(scene["logged"]) == bare.steps + 1
+    same = (
+        len(graph.points) == len(rollout.lane_points)
+        and len(scene["logged"]) == bare.steps + 1
+    )
     origin = np.round(graph.points[0] - rollout.lane_points[0]) if same else np.zeros(2)
-    same = same and np.allclose(graph.points - origin, rollout.lane_points, rtol=0, atol=SAME)
-    if not same or not np.allclose(scene["start"][0, :2].numpy(), rollout.states[0, 0, :2], rtol=0, atol=SAME):
+    same = same and np.allclose(
+        graph.points - origin, rollout.lane_points, rtol=0, atol=SAME
+    )
+    if not same or not np.allclose(
+        scene["start"][0, :2].numpy(), rollout.states[0, 0, :2], rtol=0, atol=SAME
+    ):
         raise InputError(
             f"{bare.path}: not driven in the scene {row['scene_id']!r} that the data make now; restore the data and "
             "the `data` settings of the run, or pass --no-scene"
@@ -96,10 +129,15 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
     start = recording.current
     assert start is not None
     frames = np.minimum(start + np.arange(bare.steps + 1), len(recording.states) - 1)
-    lights = {name: states for name, states in recording.lights.items() if name in graph.lanes}
+    lights = {
+        name: states for name, states in recording.lights.items() if name in graph.lanes
+    }
     return replace(
         bare,
-        lanes={name: _linked(graph, name, lane=lane) for name, lane in zip(graph.ids, bare.lanes.values(), strict=True)},
+        lanes={
+            name: _linked(graph, name, lane=lane)
+            for name, lane in zip(graph.ids, bare.lanes.values(), strict=True)
+        },
         lights={name: states[frames] for name, states in lights.items()},
         light_past={name: states[:start] for name, states in lights.items()},
         scene=scene,
@@ -108,12 +146,21 @@ def recorded_episode(run: Path, row: Mapping, recording: Recording, build: Build
 
 
 def rollout_episode(run: Path, row: Mapping) -> Episode:
-    """The episode of a row of rollouts.csv as its file alone has it: lanes without links, limits or lights."""
+    """The episode of a row of rollouts.csv as its file alone has it: lanes without
+    links, limits or lights."""
     rollout = Failure.read(run, row).rollout
     pairs = zip(rollout.lanes(), rollout.lane_width.tolist(), strict=True)
-    lanes = {str(index): Lane(points.astype(float), width) for index, (points, width) in enumerate(pairs)}
+    lanes = {
+        str(index): Lane(points.astype(float), width)
+        for index, (points, width) in enumerate(pairs)
+    }
     adversaries = np.flatnonzero(rollout.adversaries).tolist()
-    return Episode(run / ROLLOUTS / rollout.name, rollout, facts=known_facts(row) | {"adversaries": adversaries}, lanes=lanes)
+    return Episode(
+        run / ROLLOUTS / rollout.name,
+        rollout,
+        facts=known_facts(row) | {"adversaries": adversaries},
+        lanes=lanes,
+    )
 
 
 def known_facts(row: Mapping) -> dict[str, Any]:
@@ -122,7 +169,8 @@ def known_facts(row: Mapping) -> dict[str, Any]:
     if known.get("partner", 0) < 0:  # nobody
         del known["partner"]
     return {
-        name: int(value) if isinstance(value, float) and value.is_integer() else value for name, value in known.items()
+        name: int(value) if isinstance(value, float) and value.is_integer() else value
+        for name, value in known.items()
     }
 
 
@@ -132,7 +180,9 @@ def _linked(graph: LaneGraph, name: str, lane: Lane) -> Lane:
     return Lane(
         points=lane.points,
         width=lane.width,
-        speed_limit=recorded.speed_limit if math.isfinite(recorded.speed_limit) else 0.0,
+        speed_limit=recorded.speed_limit
+        if math.isfinite(recorded.speed_limit)
+        else 0.0,
         exits=list(graph.graph.successors(name)),
         left=[other for other in recorded.left if other in graph.lanes],
         right=[other for other in recorded.right if other in graph.lanes],
@@ -140,9 +190,11 @@ def _linked(graph: LaneGraph, name: str, lane: Lane) -> Lane:
 
 
 def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
-    """(row, states [PAST, 4]) of the vehicles before the start, oldest first, as traffic and ego were told them.
+    """(row, states [PAST, 4]) of the vehicles before the start, oldest first, as
+    traffic and ego were told them.
 
-    The speed is that of the displacement to the next frame, negative where that leads backwards.
+    The speed is that of the displacement to the next frame, negative where that leads
+    backwards.
     """
     if episode.scene is None:
         return
@@ -154,8 +206,21 @@ def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
         ahead, left, turned = past.flip(0).T
         cos = heading.cos()
         sin = heading.sin()
-        pose = torch.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turned], -1)
+        pose = torch.stack(
+            [
+                x + cos * ahead - sin * left,
+                y + sin * ahead + cos * left,
+                heading + turned,
+            ],
+            -1,
+        )
         moved = torch.cat([pose[1:], start[row, None, :3]])[:, :2] - pose[:, :2]
-        forwards = (moved * torch.stack([pose[:, 2].cos(), pose[:, 2].sin()], -1)).sum(-1, keepdim=True) >= 0
-        speed = moved.norm(dim=-1, keepdim=True) / episode.rollout.dt * (2.0 * forwards - 1.0)
+        forwards = (moved * torch.stack([pose[:, 2].cos(), pose[:, 2].sin()], -1)).sum(
+            -1, keepdim=True
+        ) >= 0
+        speed = (
+            moved.norm(dim=-1, keepdim=True)
+            / episode.rollout.dt
+            * (2.0 * forwards - 1.0)
+        )
         yield row, torch.cat([pose, speed], -1).numpy()

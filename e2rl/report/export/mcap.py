@@ -1,4 +1,5 @@
-"""MCAP files of Foxglove's scene updates, to watch in Foxglove or Lichtblick (extra `mcap`; docs/export.md).
+"""MCAP files of Foxglove's scene updates, to watch in Foxglove or Lichtblick (extra
+`mcap`; docs/export.md).
 
 | topic | schema | messages |
 | --- | --- | --- |
@@ -7,7 +8,8 @@
 | /plans | foxglove.SceneUpdate | every replan: plans of the ego and the adversaries, where the rollout has them |
 | /tf | foxglove.FrameTransform | every step: the frame `ego` in `map`, to follow it |
 
-Time begins at 0 at the start frame. The facts of the rollout are the metadata record `e2rl`.
+Time begins at 0 at the start frame. The facts of the rollout are the metadata record
+`e2rl`.
 """
 
 import io
@@ -34,15 +36,32 @@ from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.traffic.traffic import REPLAN_STEPS
 
 MAP, EGO = "map", "ego"  # frames
-LIGHTS = {LIGHT_RED: drawing.CONTACT, LIGHT_YELLOW: drawing.VULNERABLE, LIGHT_GREEN: "#2e8b57"}
-COLOURS = {"ego": drawing.EGO, "adversary": drawing.ADVERSARY, "traffic": drawing.BACKGROUND}
-COLOURS |= {"pedestrian": drawing.VULNERABLE, "cyclist": drawing.VULNERABLE, "replayed": drawing.REPLAYED}
-ALL, LINE_LIST = 1, 2  # of foxglove.SceneEntityDeletion.Type and foxglove.LinePrimitive.Type
+LIGHTS = {
+    LIGHT_RED: drawing.CONTACT,
+    LIGHT_YELLOW: drawing.VULNERABLE,
+    LIGHT_GREEN: "#2e8b57",
+}
+COLOURS = {
+    "ego": drawing.EGO,
+    "adversary": drawing.ADVERSARY,
+    "traffic": drawing.BACKGROUND,
+}
+COLOURS |= {
+    "pedestrian": drawing.VULNERABLE,
+    "cyclist": drawing.VULNERABLE,
+    "replayed": drawing.REPLAYED,
+}
+ALL, LINE_LIST = (
+    1,
+    2,
+)  # of foxglove.SceneEntityDeletion.Type and foxglove.LinePrimitive.Type
 SECOND = 1_000_000_000  # ns
 Entity = dict[str, Any]  # of foxglove.SceneEntity
 
 
-def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
+def write(
+    episodes: Iterable[Episode], folder: Path, open_ego: bool = False
+) -> Iterator[tuple[Episode, Path]]:
     """Write NAME.mcap of each episode."""
     for episode in episodes:
         path = folder / f"{episode.path.stem}.mcap"
@@ -55,31 +74,52 @@ def content(episode: Episode) -> bytes:
     buffer = io.BytesIO()
     writer = Writer(buffer, compression=CompressionType.ZSTD)
     writer.start(profile="", library="e2rl")
-    kinds: dict[str, Any] = {"/map": SceneUpdate, "/traffic": SceneUpdate, "/plans": SceneUpdate, "/tf": FrameTransform}
-    schemas = {kind: register_schema(writer, kind) for kind in (SceneUpdate, FrameTransform)}
-    channels = {topic: writer.register_channel(topic, "protobuf", schemas[kind]) for topic, kind in kinds.items()}
+    kinds: dict[str, Any] = {
+        "/map": SceneUpdate,
+        "/traffic": SceneUpdate,
+        "/plans": SceneUpdate,
+        "/tf": FrameTransform,
+    }
+    schemas = {
+        kind: register_schema(writer, kind) for kind in (SceneUpdate, FrameTransform)
+    }
+    channels = {
+        topic: writer.register_channel(topic, "protobuf", schemas[kind])
+        for topic, kind in kinds.items()
+    }
     for step, topic, fields in messages(episode):
         time = round(step * episode.rollout.dt * SECOND)
-        message = kinds[topic](**stamped(fields, time)).SerializeToString(deterministic=True)
+        message = kinds[topic](**stamped(fields, time)).SerializeToString(
+            deterministic=True
+        )
         writer.add_message(channels[topic], time, message, time, sequence=step)
-    writer.add_metadata("e2rl", {name: str(value) for name, value in episode.facts.items()})
+    writer.add_metadata(
+        "e2rl", {name: str(value) for name, value in episode.facts.items()}
+    )
     writer.finish()
     return buffer.getvalue()
 
 
 def stamped(fields: dict[str, Any], time: int) -> dict[str, Any]:
-    """The fields of a message with their time [ns]; a scene update takes the place of the last one of its topic."""
+    """The fields of a message with their time [ns]; a scene update takes the place of
+    the last one of its topic."""
     stamp = {"timestamp": {"seconds": time // SECOND, "nanos": time % SECOND}}
     if "entities" not in fields:
         return fields | stamp
-    return {"deletions": [{"type": ALL} | stamp], "entities": [entity | stamp for entity in fields["entities"]]}
+    return {
+        "deletions": [{"type": ALL} | stamp],
+        "entities": [entity | stamp for entity in fields["entities"]],
+    }
 
 
 def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
     """(step, topic, fields of the message) in the order of time."""
     rollout = episode.rollout
     borders = [np.concatenate([ring, ring[:1]]) for ring in rollout.polygons()]
-    road = [lines("lanes", rollout.lanes(), colour=drawing.BACKGROUND), lines("borders", borders, colour="black")]
+    road = [
+        lines("lanes", rollout.lanes(), colour=drawing.BACKGROUND),
+        lines("borders", borders, colour="black"),
+    ]
     yield 0, "/map", {"entities": road}
     for step in range(episode.steps + 1):
         yield step, "/traffic", {"entities": list(traffic(episode, step))}
@@ -92,12 +132,19 @@ def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 
 def traffic(episode: Episode, step: int) -> Iterator[Entity]:
-    """Everybody who is there at a step, the lights at the beginning of their lanes, and the contact."""
+    """Everybody who is there at a step, the lights at the beginning of their lanes, and
+    the contact."""
     for row in np.flatnonzero(episode.rollout.valid[step]).tolist():
         yield agent(episode, step, row=row)
     if episode.lights:
-        lit = [(episode.lanes[name].points[0], int(states[step])) for name, states in episode.lights.items()]
-        yield spheres("lights", [(place, LIGHTS[state], 1.0) for place, state in lit if state in LIGHTS])
+        lit = [
+            (episode.lanes[name].points[0], int(states[step]))
+            for name, states in episode.lights.items()
+        ]
+        yield spheres(
+            "lights",
+            [(place, LIGHTS[state], 1.0) for place, state in lit if state in LIGHTS],
+        )
     if episode.facts.get("contact_step") == step and "partner" in episode.facts:
         place = contact_point(episode.rollout, step, partner=episode.facts["partner"])
         yield spheres("contact", [(place, drawing.CONTACT, 1.5)])
@@ -111,7 +158,11 @@ def plans(episode: Episode, number: int) -> Iterator[Entity]:
     for row, path in zip(rollout.planners.tolist(), rollout.plans[number], strict=True):
         if rollout.valid[step, row] and np.isfinite(path).all():
             whole = np.concatenate([rollout.states[step, row, :2][None], path])
-            yield lines(f"plan of {row}", [whole], colour=drawing.EGO if row == 0 else drawing.ADVERSARY)
+            yield lines(
+                f"plan of {row}",
+                [whole],
+                colour=drawing.EGO if row == 0 else drawing.ADVERSARY,
+            )
 
 
 def agent(episode: Episode, step: int, row: int) -> Entity:
@@ -122,16 +173,28 @@ def agent(episode: Episode, step: int, row: int) -> Entity:
     role = role_of(rollout, row)
     part = role if role in ("ego", "adversary") else kind
     height = HEIGHT[kind]
-    pose = placed(x, y, heading=heading, where="position", turned="orientation", z=height / 2)
-    cube = {"pose": pose, "size": {"x": length, "y": width, "z": height}, "color": rgba(COLOURS[role])}
-    pairs = [{"key": "part", "value": part}, {"key": "speed", "value": f"{speed:.2f} m/s"}]
+    pose = placed(
+        x, y, heading=heading, where="position", turned="orientation", z=height / 2
+    )
+    cube = {
+        "pose": pose,
+        "size": {"x": length, "y": width, "z": height},
+        "color": rgba(COLOURS[role]),
+    }
+    pairs = [
+        {"key": "part", "value": part},
+        {"key": "speed", "value": f"{speed:.2f} m/s"},
+    ]
     return {"id": f"agent {row}", "frame_id": MAP, "cubes": [cube], "metadata": pairs}
 
 
 def spheres(name: str, parts: Sequence[tuple[np.ndarray, str, float]]) -> Entity:
     """Spheres at (place, colour, size), 2 m above the ground."""
     made = [
-        {"pose": {"position": {"x": float(x), "y": float(y), "z": 2.0}}, "size": dict.fromkeys("xyz", size)}
+        {
+            "pose": {"position": {"x": float(x), "y": float(y), "z": 2.0}},
+            "size": dict.fromkeys("xyz", size),
+        }
         | {"color": rgba(colour)}
         for (x, y), colour, size in parts
     ]
@@ -140,14 +203,33 @@ def spheres(name: str, parts: Sequence[tuple[np.ndarray, str, float]]) -> Entity
 
 def lines(name: str, paths: Sequence[np.ndarray], colour: str) -> Entity:
     """Polylines, piece by piece."""
-    pieces = [{"x": float(x), "y": float(y)} for path in paths for pair in pairwise(path) for x, y in pair]
-    made = {"type": LINE_LIST, "thickness": 0.2, "points": pieces, "color": rgba(colour)}
-    return {"id": name, "frame_id": MAP, "lines": [made | {"pose": {"orientation": {"w": 1}}}]}
+    pieces = [
+        {"x": float(x), "y": float(y)}
+        for path in paths
+        for pair in pairwise(path)
+        for x, y in pair
+    ]
+    made = {
+        "type": LINE_LIST,
+        "thickness": 0.2,
+        "points": pieces,
+        "color": rgba(colour),
+    }
+    return {
+        "id": name,
+        "frame_id": MAP,
+        "lines": [made | {"pose": {"orientation": {"w": 1}}}],
+    }
 
 
-def placed(x: float, y: float, heading: float, where: str, turned: str, z: float = 0.0) -> dict[str, Any]:
+def placed(
+    x: float, y: float, heading: float, where: str, turned: str, z: float = 0.0
+) -> dict[str, Any]:
     """A place and a rotation about the vertical, under these names."""
-    return {where: {"x": x, "y": y, "z": z}, turned: {"z": math.sin(heading / 2), "w": math.cos(heading / 2)}}
+    return {
+        where: {"x": x, "y": y, "z": z},
+        turned: {"z": math.sin(heading / 2), "w": math.cos(heading / 2)},
+    }
 
 
 def rgba(colour: str) -> dict[str, float]:

@@ -1,6 +1,8 @@
-"""ASAM OpenDRIVE 1.7 of an episode's lanes, by scenariogeneration: a road with one lane for each lane.
+"""ASAM OpenDRIVE 1.7 of an episode's lanes, by scenariogeneration: a road with one lane
+for each lane.
 
-A road's reference line is the lane's centreline, fitted by clothoids. Roads and junctions are those of road_plan.py.
+A road's reference line is the lane's centreline, fitted by clothoids. Roads and
+junctions are those of road_plan.py.
 """
 
 from pathlib import Path
@@ -26,8 +28,15 @@ def write_roads(episode: Episode, path: Path) -> None:
     """Write the lanes of an episode; userData of the header tells the scene's origin."""
     root = road_network(episode).get_element()
     header = root.find("header")
-    (west, south), (east, north) = (edge(episode.rollout.lane_points, axis=0) for edge in (np.min, np.max))
-    for name, side in {"north": north, "south": south, "east": east, "west": west}.items():
+    (west, south), (east, north) = (
+        edge(episode.rollout.lane_points, axis=0) for edge in (np.min, np.max)
+    )
+    for name, side in {
+        "north": north,
+        "south": south,
+        "east": east,
+        "west": west,
+    }.items():
         header.set(name, f"{side:.3f}")
     if episode.origin is not None:
         origin = " ".join(f"{part:.0f}" for part in episode.origin)
@@ -40,7 +49,9 @@ def write_roads(episode: Episode, path: Path) -> None:
 
 def road_network(episode: Episode) -> Any:
     """Returns the xodr.OpenDrive of an episode; roads are named after their lanes."""
-    network = xodr.OpenDrive(episode.rollout.location or episode.rollout.scene_id, revMinor="7")
+    network = xodr.OpenDrive(
+        episode.rollout.location or episode.rollout.scene_id, revMinor="7"
+    )
     plan = road_plan(episode.lanes)
     number = {name: index for index, name in enumerate(plan.roads, 1)}
     for name in plan.roads:
@@ -49,15 +60,20 @@ def road_network(episode: Episode) -> Any:
         junction = xodr.Junction(f"junction {index}", index)
         for name in names:
             before, _ = plan.connecting[name]
-            connection = xodr.Connection(number[before], number[name], xodr.ContactPoint.start)
+            connection = xodr.Connection(
+                number[before], number[name], xodr.ContactPoint.start
+            )
             connection.add_lanelink(LANE, LANE)
             junction.add_connection(connection)
         network.add_junction(junction)
     return network
 
 
-def road(lanes: dict[str, Lane], plan: RoadPlan, name: str, number: dict[str, int]) -> Any:
-    """Returns the xodr.Road called `name`, with limits and widths from where each of its lanes begins.
+def road(
+    lanes: dict[str, Lane], plan: RoadPlan, name: str, number: dict[str, int]
+) -> Any:
+    """Returns the xodr.Road called `name`, with limits and widths from where each of
+    its lanes begins.
 
     Args:
         lanes: by id.
@@ -72,13 +88,23 @@ def road(lanes: dict[str, Lane], plan: RoadPlan, name: str, number: dict[str, in
     plan_view = xodr.PlanView()
     for geometry, x, y, heading in pieces:
         plan_view.add_fixed_geometry(geometry, x, y, heading)
-    scale = sum(piece.length for piece, *_ in pieces) / sum(span.end - span.begin for span in spans)
+    scale = sum(piece.length for piece, *_ in pieces) / sum(
+        span.end - span.begin for span in spans
+    )
     starts = scale * np.cumsum([0.0] + [span.end - span.begin for span in spans[:-1]])
     driving = xodr.Lane(a=lanes[spans[0].lane].width)
     section = xodr.LaneSection(0, xodr.Lane()).add_right_lane(driving)
     profile = xodr.Lanes().add_lanesection(section)
-    junction = next((index for index, names in enumerate(plan.junctions, 1) if name in names), -1)
-    element = xodr.Road(number[name], plan_view, profile, road_type=junction, name=", ".join(s.lane for s in spans))
+    junction = next(
+        (index for index, names in enumerate(plan.junctions, 1) if name in names), -1
+    )
+    element = xodr.Road(
+        number[name],
+        plan_view,
+        profile,
+        road_type=junction,
+        name=", ".join(s.lane for s in spans),
+    )
     for start, span in zip(starts.tolist(), spans, strict=True):
         lane = lanes[span.lane]
         profile.add_laneoffset(xodr.LaneOffset(s=start, a=lane.width / 2))
@@ -93,7 +119,9 @@ def road(lanes: dict[str, Lane], plan: RoadPlan, name: str, number: dict[str, in
     return element
 
 
-def add_links(element: Any, driving: Any, plan: RoadPlan, name: str, number: dict[str, int]) -> None:
+def add_links(
+    element: Any, driving: Any, plan: RoadPlan, name: str, number: dict[str, int]
+) -> None:
     """Link a road and its lane with what comes before and after it.
 
     Args:
@@ -107,10 +135,14 @@ def add_links(element: Any, driving: Any, plan: RoadPlan, name: str, number: dic
     before = before or next((a for a, b in plan.plain if b == name), None)
     after = after or next((b for a, b in plan.plain if a == name), None)
     if before is not None:
-        element.add_predecessor(xodr.ElementType.road, number[before], xodr.ContactPoint.end)
+        element.add_predecessor(
+            xodr.ElementType.road, number[before], xodr.ContactPoint.end
+        )
         driving.add_link("predecessor", LANE)
     if after is not None:
-        element.add_successor(xodr.ElementType.road, number[after], xodr.ContactPoint.start)
+        element.add_successor(
+            xodr.ElementType.road, number[after], xodr.ContactPoint.start
+        )
         driving.add_link("successor", LANE)
     for index, names in enumerate(plan.junctions, 1):
         ends = [plan.connecting[other] for other in names]
@@ -121,13 +153,18 @@ def add_links(element: Any, driving: Any, plan: RoadPlan, name: str, number: dic
 
 
 def add_lane_speeds(element: ElementTree.Element) -> None:
-    """Repeat the limits of a road's types in its lane: some tools read the one, some the other."""
+    """Repeat the limits of a road's types in its lane: some tools read the one, some
+    the other."""
     lane = element.find("lanes/laneSection/right/lane")
     assert lane is not None
     for kind in element.iterfind("type"):
         speed = kind.find("speed")
         if speed is not None:
-            limit = {"sOffset": kind.attrib["s"], "max": speed.attrib["max"], "unit": speed.attrib["unit"]}
+            limit = {
+                "sOffset": kind.attrib["s"],
+                "max": speed.attrib["max"],
+                "unit": speed.attrib["unit"],
+            }
             ElementTree.SubElement(lane, "speed", limit)
 
 
@@ -141,7 +178,8 @@ def span_places(lane: Lane, span: Span) -> np.ndarray:
 
 
 def joined_places(parts: list[np.ndarray]) -> list[np.ndarray]:
-    """Returns parts [P, 3] of one line without the points of each that lie at the end of the part before it."""
+    """Returns parts [P, 3] of one line without the points of each that lie at the end
+    of the part before it."""
     joined = parts[:1]
     for part in parts[1:]:
         away = np.linalg.norm(part[:, :2] - joined[-1][-1, :2], axis=1) > SEAM
@@ -150,20 +188,43 @@ def joined_places(parts: list[np.ndarray]) -> list[np.ndarray]:
     return joined
 
 
-def geometries(points: np.ndarray, angle: np.ndarray) -> list[tuple[Any, float, float, float]]:
-    """(geometry, x, y, heading) of clothoids through some of the points [P, 2] of a centreline, in the directions [P]
-    that it has there: one clothoid, or, where that lies more than FIT beside the centreline, those of both halves."""
+def geometries(
+    points: np.ndarray, angle: np.ndarray
+) -> list[tuple[Any, float, float, float]]:
+    """(geometry, x, y, heading) of clothoids through some of the points [P, 2] of a
+    centreline, in the directions [P] that it has there: one clothoid, or, where that
+    lies more than FIT beside the centreline, those of both halves."""
     (x0, y0), (x1, y1) = points[0].tolist(), points[-1].tolist()
     curve = Clothoid.G1Hermite(x0, y0, float(angle[0]), x1, y1, float(angle[-1]))
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     if len(points) > 2 and length > SHORT:
         drawn = np.array(curve.SampleXY(len(points))).T
-        beside = np.linalg.norm(drawn - resample(points, length / (len(points) - 1))[: len(points)], axis=1).max()
+        beside = np.linalg.norm(
+            drawn - resample(points, length / (len(points) - 1))[: len(points)], axis=1
+        ).max()
         if beside > FIT:
             middle = len(points) // 2
-            return geometries(points[: middle + 1], angle[: middle + 1]) + geometries(points[middle:], angle[middle:])
-    if curve.length > 1.5 * length:  # a tangent that is noise bends it back: straight on
-        return [(xodr.Line(float(np.hypot(x1 - x0, y1 - y0))), x0, y0, float(np.arctan2(y1 - y0, x1 - x0)))]
+            return geometries(points[: middle + 1], angle[: middle + 1]) + geometries(
+                points[middle:], angle[middle:]
+            )
+    if (
+        curve.length > 1.5 * length
+    ):  # a tangent that is noise bends it back: straight on
+        return [
+            (
+                xodr.Line(float(np.hypot(x1 - x0, y1 - y0))),
+                x0,
+                y0,
+                float(np.arctan2(y1 - y0, x1 - x0)),
+            )
+        ]
     if max(abs(curve.KappaStart), abs(curve.KappaEnd)) < 1e-6:
         return [(xodr.Line(curve.length), x0, y0, float(angle[0]))]
-    return [(xodr.Spiral(curve.KappaStart, curve.KappaEnd, curve.length), x0, y0, float(angle[0]))]
+    return [
+        (
+            xodr.Spiral(curve.KappaStart, curve.KappaEnd, curve.length),
+            x0,
+            y0,
+            float(angle[0]),
+        )
+    ]

@@ -1,7 +1,8 @@
-"""ScenarioNet: a ScenarioDescription pickle of each episode, and the summary of the folder (docs/export.md).
+"""ScenarioNet: a ScenarioDescription pickle of each episode, and the summary of the
+folder (docs/export.md).
 
-Pickles hold python containers and numpy arrays only. Where the scene is known, the second before the start comes first,
-so the start is frame 10 as in Waymo's files.
+Pickles hold python containers and numpy arrays only. Where the scene is known, the
+second before the start comes first, so the start is frame 10 as in Waymo's files.
 """
 
 import pickle
@@ -22,7 +23,12 @@ SUMMARY = "dataset_summary.pkl"
 MAPPING = "dataset_mapping.pkl"
 MOVES = 1.0  # m that an object moves at least that counts as moving in ScenarioNet
 PROTOCOL = 4  # of pickle, which every Python 3 reads
-HEIGHT = {"vehicle": 1.6, "cyclist": 1.75, "pedestrian": 1.75, "other": 1.0}  # m; rollouts hold none
+HEIGHT = {
+    "vehicle": 1.6,
+    "cyclist": 1.75,
+    "pedestrian": 1.75,
+    "other": 1.0,
+}  # m; rollouts hold none
 LIGHTS = {
     LIGHT_UNKNOWN: "LANE_STATE_UNKNOWN",
     LIGHT_RED: "LANE_STATE_STOP",
@@ -31,8 +37,11 @@ LIGHTS = {
 }
 
 
-def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> Iterator[tuple[Episode, Path]]:
-    """Write sd_NAME.pkl of each episode, then the summary and the mapping that MetaDrive reads a folder by."""
+def write(
+    episodes: Iterable[Episode], folder: Path, open_ego: bool = False
+) -> Iterator[tuple[Episode, Path]]:
+    """Write sd_NAME.pkl of each episode, then the summary and the mapping that
+    MetaDrive reads a folder by."""
     summary = {}
     for episode in episodes:
         path = folder / f"sd_{episode.path.stem}.pkl"
@@ -41,16 +50,22 @@ def write(episodes: Iterable[Episode], folder: Path, open_ego: bool = False) -> 
         summary[path.name] = made["metadata"]
         yield episode, path
     write_atomically(folder / SUMMARY, pickle.dumps(summary, PROTOCOL))
-    write_atomically(folder / MAPPING, pickle.dumps(dict.fromkeys(summary, ""), PROTOCOL))
+    write_atomically(
+        folder / MAPPING, pickle.dumps(dict.fromkeys(summary, ""), PROTOCOL)
+    )
 
 
 def description(episode: Episode) -> dict[str, Any]:
-    """The ScenarioDescription of an episode; track n is the agent of row n, and 0 the ego."""
+    """The ScenarioDescription of an episode; track n is the agent of row n, and 0 the
+    ego."""
     history = 0 if episode.scene is None else PAST
     frames = history + episode.steps + 1
     known = {row: states for row, states in past_of(episode)}
     scene_id = episode.path.stem
-    tracks = {str(row): track(episode, row, history=history, past=known.get(row)) for row in episode.agents}
+    tracks = {
+        str(row): track(episode, row, history=history, past=known.get(row))
+        for row in episode.agents
+    }
     objects = {name: object_summary(name, entry) for name, entry in tracks.items()}
     lights = {name: light(episode, name, history=history) for name in episode.lights}
     metadata: dict[str, Any] = {
@@ -83,8 +98,11 @@ def description(episode: Episode) -> dict[str, Any]:
     }
 
 
-def track(episode: Episode, row: int, history: int, past: np.ndarray | None) -> dict[str, Any]:
-    """The track of an agent, zero where it is absent. past [history, 4]: its states before the start, None for none."""
+def track(
+    episode: Episode, row: int, history: int, past: np.ndarray | None
+) -> dict[str, Any]:
+    """The track of an agent, zero where it is absent. past [history, 4]: its states
+    before the start, None for none."""
     rollout, (length, width) = episode.rollout, episode.size(row)
     frames = history + episode.steps + 1
     kind = str(rollout.agent_type[row])
@@ -100,9 +118,17 @@ def track(episode: Episode, row: int, history: int, past: np.ndarray | None) -> 
         "state": {
             "position": np.concatenate([states[:, :2], np.zeros((frames, 1))], 1),
             "heading": states[:, 2],
-            "velocity": speed * np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], -1),
+            "velocity": speed
+            * np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], -1),
             "valid": valid,
-            **{name: side * valid for name, side in (("length", length), ("width", width), ("height", HEIGHT[kind]))},
+            **{
+                name: side * valid
+                for name, side in (
+                    ("length", length),
+                    ("width", width),
+                    ("height", HEIGHT[kind]),
+                )
+            },
         },
         "metadata": {
             "type": kind.upper(),
@@ -116,9 +142,12 @@ def track(episode: Episode, row: int, history: int, past: np.ndarray | None) -> 
 
 
 def object_summary(name: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """What ScenarioNet's filters know of a track: how long it is there, and how far it moves."""
+    """What ScenarioNet's filters know of a track: how long it is there, and how far it
+    moves."""
     valid = entry["state"]["valid"]
-    distance = np.linalg.norm(np.diff(entry["state"]["position"][valid, :2], axis=0), axis=1).sum()
+    distance = np.linalg.norm(
+        np.diff(entry["state"]["position"][valid, :2], axis=0), axis=1
+    ).sum()
     first = int(valid.argmax())
     return {
         "type": entry["type"],
@@ -130,16 +159,23 @@ def object_summary(name: str, entry: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def number_summary(objects: dict[str, dict], lights: dict[str, dict], lanes: int) -> dict[str, Any]:
-    """Returns what ScenarioNet's filters know of a scenario: how many there are of everything.
+def number_summary(
+    objects: dict[str, dict], lights: dict[str, dict], lanes: int
+) -> dict[str, Any]:
+    """Returns what ScenarioNet's filters know of a scenario: how many there are of
+    everything.
 
     Args:
         objects: the summary of each track.
         lights: dynamic_map_states.
         lanes: number of map features.
     """
-    moving = [entry["type"] for entry in objects.values() if entry["moving_distance"] > MOVES]
-    states = Counter(state for entry in lights.values() for state in entry["state"]["object_state"])
+    moving = [
+        entry["type"] for entry in objects.values() if entry["moving_distance"] > MOVES
+    ]
+    states = Counter(
+        state for entry in lights.values() for state in entry["state"]["object_state"]
+    )
     types = Counter(entry["type"] for entry in objects.values())
     return {
         "num_objects": len(objects),
@@ -158,13 +194,20 @@ def number_summary(objects: dict[str, dict], lights: dict[str, dict], lanes: int
 def light(episode: Episode, name: str, history: int) -> dict[str, Any]:
     """The light that lets into a lane; unknown before the recording begins."""
     past = episode.light_past[name][-history:] if history else np.zeros(0, int)
-    states = np.concatenate([np.full(history - len(past), LIGHT_UNKNOWN), past, episode.lights[name]])
+    states = np.concatenate(
+        [np.full(history - len(past), LIGHT_UNKNOWN), past, episode.lights[name]]
+    )
     return {
         "type": "TRAFFIC_LIGHT",
         "lane": name,
         "stop_point": np.array([*episode.lanes[name].points[0], 0.0]),
         "state": {"object_state": [LIGHTS[int(state)] for state in states]},
-        "metadata": {"type": "TRAFFIC_LIGHT", "object_id": name, "track_length": len(states), "dataset": "e2rl"},
+        "metadata": {
+            "type": "TRAFFIC_LIGHT",
+            "object_id": name,
+            "track_length": len(states),
+            "dataset": "e2rl",
+        },
     }
 
 
@@ -174,13 +217,19 @@ def map_features(episode: Episode) -> dict[str, dict[str, Any]]:
     return {
         name: {
             "type": "LANE_SURFACE_STREET",
-            "polyline": np.pad(lane.points, ((0, 0), (0, 1))),  # z is 0: MetaDrive and ScenarioNet expect [P, 3]
+            "polyline": np.pad(
+                lane.points, ((0, 0), (0, 1))
+            ),  # z is 0: MetaDrive and ScenarioNet expect [P, 3]
             "width": np.full((len(lane.points), 2), lane.width / 2),
             "entry_lanes": entries[name],
             "exit_lanes": list(lane.exits),
             "left_neighbor": [{"feature_id": other} for other in lane.left],
             "right_neighbor": [{"feature_id": other} for other in lane.right],
-            **({"speed_limit_kmh": lane.speed_limit * 3.6} if lane.speed_limit > 0 else {}),
+            **(
+                {"speed_limit_kmh": lane.speed_limit * 3.6}
+                if lane.speed_limit > 0
+                else {}
+            ),
         }
         for name, lane in episode.lanes.items()
     }

@@ -1,1 +1,2 @@
-"""The adversaries of other works behind the traffic interface, on the common prior (docs/baselines.md)."""
+"""The adversaries of other works behind the traffic interface, on the common prior
+(docs/baselines.md)."""

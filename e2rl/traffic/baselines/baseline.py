@@ -1,4 +1,5 @@
-"""What the baselines share: the common prior, an intensity, what they know of the ego and what they owe it."""
+"""What the baselines share: the common prior, an intensity, what they know of the ego
+and what they owe it."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -25,7 +26,8 @@ FURTHER = 1000  # number of the draw that holds the noise of all samples but the
 
 @dataclass
 class BaselineState(PriorState):
-    """B scenes under a baseline: eta [B]; adversary [B, V] bool; path_kl [B, V]: of its control since the start."""
+    """B scenes under a baseline: eta [B]; adversary [B, V] bool; path_kl [B, V]: of its
+    control since the start."""
 
     eta: Tensor = no_vehicles()
     adversary: Tensor
@@ -34,10 +36,11 @@ class BaselineState(PriorState):
 
 @dataclass(eq=False, repr=False)
 class Baseline(NominalTraffic):
-    """The nominal prior, except where `attack` says otherwise: in scenes with gain and intensity above 0.
+    """The nominal prior, except where `attack` says otherwise: in scenes with gain and
+    intensity above 0.
 
-    gain: of the attack per unit of eta, 0: the nominal prior. samples: joint samples a replan; the first has the
-    nominal prior's noise.
+    gain: of the attack per unit of eta, 0: the nominal prior. samples: joint samples a
+    replan; the first has the nominal prior's noise.
     """
 
     responsibility: str = setting(choices=RESPONSIBILITIES)
@@ -51,7 +54,8 @@ class Baseline(NominalTraffic):
         self.yielding = YieldingSettings()
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> BaselineState:
-        """Returns the states of scenes [B] with routes drawn from the prior and no adversary."""
+        """Returns the states of scenes [B] with routes drawn from the prior and no
+        adversary."""
         nominal = super().reset(scenes, seed, eta)
         none = torch.zeros_like(nominal.routed.parked)
         zero = torch.zeros_like(nominal.routed.length)
@@ -79,22 +83,37 @@ class Baseline(NominalTraffic):
 
     def replan_group(self, now: Replan) -> tuple[BaselineState, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
-        context = self.encode(now.state, now.world, ego_plan=now.ego_plan, known=now.before)
+        context = self.encode(
+            now.state, now.world, ego_plan=now.ego_plan, known=now.before
+        )
         if not bool((self.strength(now.state) > 0).any()):
-            return now.state, self.prior.sample(context, now.noise[..., 0, :]).x0, context
+            return (
+                now.state,
+                self.prior.sample(context, now.noise[..., 0, :]).x0,
+                context,
+            )
         state, x0 = self.attack(now, context)
         if self.adversarial:
-            context.obstacles.duty = duty_of(self.responsibility, self.yielding, world=now.world, coalition=state.adversary, eta=state.eta)
+            context.obstacles.duty = duty_of(
+                self.responsibility,
+                self.yielding,
+                world=now.world,
+                coalition=state.adversary,
+                eta=state.eta,
+            )
         return state, x0, context
 
     @abstractmethod
     def attack(self, now: Replan, context: Context) -> tuple[BaselineState, Tensor]:
-        """Returns state and joint sample x0 [G, V, SIZE] of a group of which some scene has strength above 0."""
+        """Returns state and joint sample x0 [G, V, SIZE] of a group of which some scene
+        has strength above 0."""
 
 
-def replay_others(state: Own, plan: TrafficPlan, world: World, driven: Tensor) -> tuple[Own, TrafficPlan]:
-    """Returns state and plan with every vehicle that is not driven [B, V] on its recording, from which the prior sees
-    it."""
+def replay_others(
+    state: Own, plan: TrafficPlan, world: World, driven: Tensor
+) -> tuple[Own, TrafficPlan]:
+    """Returns state and plan with every vehicle that is not driven [B, V] on its
+    recording, from which the prior sees it."""
     logged = RECORDED.replan(None, world, plan.states[:, 0])[1]
     own = driven[..., None]
     states = torch.where(own[..., None], plan.states, logged.states)
@@ -103,5 +122,9 @@ def replay_others(state: Own, plan: TrafficPlan, world: World, driven: Tensor) -
     before = logged.states[:, :, REPLAN_STEPS - 2]
     accel = (now[..., 3] - before[..., 3]) / DT
     yaw_rate = wrap(now[..., 2] - before[..., 2]) / DT
-    lane = select(driven, state.lane, other=locate(now, accel, yaw_rate=yaw_rate, points=state.routed.points))
+    lane = select(
+        driven,
+        state.lane,
+        other=locate(now, accel, yaw_rate=yaw_rate, points=state.routed.points),
+    )
     return replace(state, lane=lane), replace(plan, states=states, present=present)

@@ -1,6 +1,8 @@
-"""CCDiff (Lin et al. 2025): a clique ranker on the recent past, guidance of those that it finds, all others replay.
+"""CCDiff (Lin et al. 2025): a clique ranker on the recent past, guidance of those that
+it finds, all others replay.
 
-The ranker finds the vehicles that stand in the heaviest cliques of the recent past's risk graphs.
+The ranker finds the vehicles that stand in the heaviest cliques of the recent past's
+risk graphs.
 """
 
 from dataclasses import dataclass
@@ -16,7 +18,12 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.baseline import BaselineState, replay_others
 from e2rl.traffic.baselines.guidance import MeanGuided
-from e2rl.traffic.baselines.losses import discounts, disk_overlap, off_road_term, pair_term
+from e2rl.traffic.baselines.losses import (
+    discounts,
+    disk_overlap,
+    off_road_term,
+    pair_term,
+)
 from e2rl.traffic.baselines.view import View
 from e2rl.traffic.e2.motion import direction, smallest
 from e2rl.traffic.e2.topology import cliques_in, weight_of
@@ -32,7 +39,8 @@ NODES = 24  # vehicles nearest to the ego that a graph may have: enumeration is 
 
 
 def recent_states(scene: TensorDictBase) -> Tensor:
-    """States [B, V, T, 4] of the second before the start, the start last; speed from differences of position."""
+    """States [B, V, T, 4] of the second before the start, the start last; speed from
+    differences of position."""
     past = scene["past"].flip(2)  # [B, V, 10, 3] in the start's frame
     start = scene["start"][:, : past.shape[1], None]
     ahead = direction(start[..., 2])
@@ -46,10 +54,11 @@ def recent_states(scene: TensorDictBase) -> Tensor:
 
 
 def risk(states: Tensor, size: Tensor) -> Tensor:
-    """Risk [..., V, V] in [0, 1] of pairs of states [..., V, 4], size [..., V, 2]: (FAR - t) / FAR.
+    """Risk [..., V, V] in [0, 1] of pairs of states [..., V, 4], size [..., V, 2]: (FAR
+    - t) / FAR.
 
-    t is the larger of the times after which the gaps along x and along y are closed: 0 where they overlap on the axis,
-    FAR where they open.
+    t is the larger of the times after which the gaps along x and along y are closed: 0
+    where they overlap on the axis, FAR where they open.
     """
     along = direction(states[..., 2])
     extent = (along.abs() * size[..., :1] + along.flip(-1).abs() * size[..., 1:]) / 2
@@ -57,24 +66,32 @@ def risk(states: Tensor, size: Tensor) -> Tensor:
     offset = states[..., None, :, :2] - states[..., :, None, :2]
     closing = -(velocity[..., None, :, :] - velocity[..., :, None, :]) * offset.sign()
     gap = offset.abs() - extent[..., None, :, :] - extent[..., :, None, :]
-    time = torch.where(closing > 0, gap / closing.clamp(min=1e-6), FAR).where(gap > 0, 0.0)
+    time = torch.where(closing > 0, gap / closing.clamp(min=1e-6), FAR).where(
+        gap > 0, 0.0
+    )
     return (FAR - time.amax(-1).clamp(0, FAR)) / FAR
 
 
 def ranked(scene: TensorDictBase, count: int, draw: Tensor) -> Tensor:
-    """Bool [B, V]: the `count` vehicles, parked ones and the ego apart, that stand in the most of the TOP cliques of
-    each step; draw [B, V] in [0, 1) orders equals and those in none."""
+    """Bool [B, V]: the `count` vehicles, parked ones and the ego apart, that stand in
+    the most of the TOP cliques of each step; draw [B, V] in [0, 1) orders equals and
+    those in none."""
     states = recent_states(scene)
     vehicles = states.shape[1]
     there = scene["valid"][:, :vehicles] & ~scene["parked"][:, :vehicles]
     distance = (states[:, :, -1, :2] - states[:, :1, -1, :2]).norm(dim=-1)
     nodes = smallest(there, distance, count=NODES)
     states = states.transpose(1, 2)
-    weight = risk(states, scene["size"][:, None, :vehicles].expand(*states.shape[:-1], 2))
+    weight = risk(
+        states, scene["size"][:, None, :vehicles].expand(*states.shape[:-1], 2)
+    )
     edges = (weight > EDGE) & nodes[:, None, :, None] & nodes[:, None, None]
     edges = edges & ~torch.eye(vehicles, dtype=torch.bool, device=edges.device)
     host = edges.to(torch.uint8).cpu().numpy(), weight.cpu().numpy()
-    found = [[_top_cliques(*graph) for graph in zip(*steps, strict=True)] for steps in zip(*host, strict=True)]
+    found = [
+        [_top_cliques(*graph) for graph in zip(*steps, strict=True)]
+        for steps in zip(*host, strict=True)
+    ]
     score = torch.zeros(len(states), vehicles)
     for row, steps in zip(score, found, strict=True):
         for clique in (clique for step in steps for clique in step):
@@ -84,9 +101,12 @@ def ranked(scene: TensorDictBase, count: int, draw: Tensor) -> Tensor:
 
 
 def _top_cliques(adjacency: np.ndarray, weight: np.ndarray) -> list[tuple[int, ...]]:
-    """The maximal cliques of SMALLEST or more of greatest total weight; adjacency, weight [V, V]."""
+    """The maximal cliques of SMALLEST or more of greatest total weight; adjacency,
+    weight [V, V]."""
     large = [clique for clique in cliques_in(adjacency) if len(clique) >= SMALLEST]
-    return sorted(large, key=lambda clique: (-round(weight_of(clique, weight), 6), clique))[:TOP]
+    return sorted(
+        large, key=lambda clique: (-round(weight_of(clique, weight), 6), clique)
+    )[:TOP]
 
 
 TIES = 900  # number of the draw that orders vehicles of equal rank
@@ -94,7 +114,8 @@ TIES = 900  # number of the draw that orders vehicles of equal rank
 
 @dataclass
 class CCDiffState(BaselineState):
-    """top [B, V] bool: the vehicles that the ranker found, which the prior drives; all of a scene without strength."""
+    """top [B, V] bool: the vehicles that the ranker found, which the prior drives; all
+    of a scene without strength."""
 
     top: Tensor
 
@@ -102,7 +123,8 @@ class CCDiffState(BaselineState):
 @configured("synthesizer/ccdiff")
 @dataclass(eq=False, repr=False)
 class CCDiff(MeanGuided):
-    """Posterior-mean guidance by attraction to the ego and by the map, of the `controlled` top vehicles only."""
+    """Posterior-mean guidance by attraction to the ego and by the map, of the
+    `controlled` top vehicles only."""
 
     controlled: int = setting(low=1)
     collision: float = setting()
@@ -112,19 +134,37 @@ class CCDiff(MeanGuided):
     tuned = {"gain": (0.1, 40.0, "log"), "step_size": (0.03, 3.0, "log")}
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> CCDiffState:
-        """Returns states of scenes [B] with their top vehicles, whose routes are the prior's; others' are recorded."""
+        """Returns states of scenes [B] with their top vehicles, whose routes are the
+        prior's; others' are recorded."""
         state = super().reset(scenes, seed, eta)
-        draw = noise_of(state.seed, torch.full_like(state.seed, TIES), shape=tuple(state.adversary.shape[1:]), uniform=True)
-        top = ranked(scenes, self.controlled, draw=draw) | (self.strength(state) <= 0)[:, None]
+        draw = noise_of(
+            state.seed,
+            torch.full_like(state.seed, TIES),
+            shape=tuple(state.adversary.shape[1:]),
+            uniform=True,
+        )
+        top = (
+            ranked(scenes, self.controlled, draw=draw)
+            | (self.strength(state) <= 0)[:, None]
+        )
         logged = scenes["route_log"].clone()
         logged[:, 0] = -1  # nobody's but the ego's own business
-        routed, lane = self.prior.start(scenes, torch.where(top | (logged < 0), state.routed.route, logged))
-        return CCDiffState(**(vars(state) | {"routed": routed, "lane": lane, "top": top}))
+        routed, lane = self.prior.start(
+            scenes, torch.where(top | (logged < 0), state.routed.route, logged)
+        )
+        return CCDiffState(
+            **(vars(state) | {"routed": routed, "lane": lane, "top": top})
+        )
 
     def replan(
-        self, state: CCDiffState, world: World, ego_plan: Tensor, react: React | None = None
+        self,
+        state: CCDiffState,
+        world: World,
+        ego_plan: Tensor,
+        react: React | None = None,
     ) -> tuple[CCDiffState, TrafficPlan]:
-        """Returns states and plans of the coming HORIZON steps; who is not among the top replays."""
+        """Returns states and plans of the coming HORIZON steps; who is not among the
+        top replays."""
         state, plan = super().replan(state, world, ego_plan, react)
         return replay_others(state, plan, world=world, driven=state.top)
 
@@ -138,5 +178,15 @@ class CCDiff(MeanGuided):
         others = torch.ones_like(view.routed.conflict)
         others[:, :, 0] = False
         weights = torch.full_like(discounts(states), 1 / states.shape[-2])
-        near = pair_term(states, view, cost=disk_overlap(self.margin), reach=self.margin, weights=weights, left_out=others)
-        return self.off_road * off_road_term(states, view, weights=discounts(states)) - self.collision * near
+        near = pair_term(
+            states,
+            view,
+            cost=disk_overlap(self.margin),
+            reach=self.margin,
+            weights=weights,
+            left_out=others,
+        )
+        return (
+            self.off_road * off_road_term(states, view, weights=discounts(states))
+            - self.collision * near
+        )

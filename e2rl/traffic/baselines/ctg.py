@@ -1,4 +1,5 @@
-"""CTG as published: realistic guidance away from collisions, for every vehicle (Zhong et al. 2023).
+"""CTG as published: realistic guidance away from collisions, for every vehicle (Zhong
+et al. 2023).
 
 Dense adversarial guidance: CTG's machinery turned on the ego, by every vehicle at once.
 """
@@ -25,13 +26,16 @@ from e2rl.traffic.baselines.view import View
 @configured("synthesizer/ctg")
 @dataclass(eq=False, repr=False)
 class CTG(MeanGuided):
-    """Posterior-mean guidance by collision, map and speed; the scene's sample of least loss is driven."""
+    """Posterior-mean guidance by collision, map and speed; the scene's sample of least
+    loss is driven."""
 
     collision: float = setting()
     margin: float = setting(low=0)
     off_road: float = setting()
     speed: float = setting()
-    responsibility: str = field(default="", init=False)  # there is no adversary that owes anything
+    responsibility: str = field(
+        default="", init=False
+    )  # there is no adversary that owes anything
 
     adversarial = False
     guides_everybody = True
@@ -48,7 +52,13 @@ class CTG(MeanGuided):
         """Weighted collision, off-road and speeding terms."""
         states = view.with_ego(motion)
         weights = discounts(states)
-        total = self.collision * pair_term(states, view, cost=disk_overlap(self.margin), reach=self.margin, weights=weights)
+        total = self.collision * pair_term(
+            states,
+            view,
+            cost=disk_overlap(self.margin),
+            reach=self.margin,
+            weights=weights,
+        )
         total = total + self.off_road * off_road_term(states, view, weights=weights)
         return total + self.speed * speeding_term(motion, view)
 
@@ -56,7 +66,8 @@ class CTG(MeanGuided):
 @configured("synthesizer/ctg_adv")
 @dataclass(eq=False, repr=False)
 class CTGAdv(MeanGuided):
-    """Posterior-mean guidance of all vehicles towards the ego, on the road; the scene's sample of least loss."""
+    """Posterior-mean guidance of all vehicles towards the ego, on the road; the scene's
+    sample of least loss."""
 
     approach: float = setting()
     temperature: float = setting(low=1e-3)
@@ -68,8 +79,17 @@ class CTGAdv(MeanGuided):
         """Soft-min distance to the ego, and metres off the road."""
         states = view.with_ego(motion)
         near = approach_term(states, self.temperature)
-        return self.approach * near + self.off_road * off_road_term(states, view, weights=discounts(states))
+        return self.approach * near + self.off_road * off_road_term(
+            states, view, weights=discounts(states)
+        )
 
-    def chosen(self, motion: LaneState, state: BaselineState, view: View, guided: Tensor) -> Tensor:
+    def chosen(
+        self, motion: LaneState, state: BaselineState, view: View, guided: Tensor
+    ) -> Tensor:
         """Sample [B] in which some vehicle comes nearest to the ego."""
-        return self.loss(motion, state, view=view).masked_fill(~guided, float("inf")).amin(-1).argmin(0)
+        return (
+            self.loss(motion, state, view=view)
+            .masked_fill(~guided, float("inf"))
+            .amin(-1)
+            .argmin(0)
+        )

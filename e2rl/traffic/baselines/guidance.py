@@ -1,7 +1,9 @@
-"""The two ways in which baselines guide a diffusion prior by a loss of the decoded plan.
+"""The two ways in which baselines guide a diffusion prior by a loss of the decoded
+plan.
 
-`MeanGuidance` moves the posterior mean of a step (CTG, Zhong et al. 2023), `CleanGuidance` the clean estimate
-(Safe-Sim, Chang et al. 2024). Both are controls of `Prior.sample`, for S samples of B scenes at once.
+`MeanGuidance` moves the posterior mean of a step (CTG, Zhong et al. 2023),
+`CleanGuidance` the clean estimate (Safe-Sim, Chang et al. 2024). Both are controls of
+`Prior.sample`, for S samples of B scenes at once.
 """
 
 from abc import abstractmethod
@@ -22,17 +24,21 @@ from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
 from e2rl.traffic.nominal import Replan
 from e2rl.traffic.traffic import State
 
-Loss = Callable[[LaneState], Tensor]  # motion, fields [S, B, V, T] -> [S, B, V]; each row's own, others detached
+Loss = Callable[
+    [LaneState], Tensor
+]  # motion, fields [S, B, V, T] -> [S, B, V]; each row's own, others detached
 Denoise = Callable[[Tensor], Tensor]
 ROUNDING = 1e-3  # of Adam: its steps are as long for any gradient, so that rounding would decide where there is none
 
 
 @dataclass
 class MeanGuidance:
-    """Adam steps on the posterior mean z of x at the next level, whose decoded plan the loss rates.
+    """Adam steps on the posterior mean z of x at the next level, whose decoded plan the
+    loss rates.
 
-    guided [S * B, V] bool: rows that move; limit [S * B]: largest change of an element, in standard deviations of the
-    step's noise. The last step, which has no noise, is not guided.
+    guided [S * B, V] bool: rows that move; limit [S * B]: largest change of an element,
+    in standard deviations of the step's noise. The last step, which has no noise, is
+    not guided.
     """
 
     prior: Prior
@@ -61,7 +67,9 @@ class MeanGuidance:
         mean, variance = step(x=x, x0=x0, past=past)
         none = None if past is None else (zero, past[1])
         per_x0, _ = step(x=zero, x0=zero + 1, past=none)  # a step is affine in x0
-        shift = self._shift(mean, self.limit[:, None, None] * variance.sqrt(), context=context)
+        shift = self._shift(
+            mean, self.limit[:, None, None] * variance.sqrt(), context=context
+        )
         moved = x0 + shift / per_x0
         self.past = moved, level
         return x, x0, moved
@@ -71,7 +79,9 @@ class MeanGuidance:
             z = mean.detach().clone().requires_grad_(True)
             adam = torch.optim.Adam([z], lr=self.step_size, eps=ROUNDING)
             for _ in range(self.iterations):
-                value = self.loss(motion_of(self.prior, z, context=context, count=self.samples)).sum()
+                value = self.loss(
+                    motion_of(self.prior, z, context=context, count=self.samples)
+                ).sum()
                 (z.grad,) = torch.autograd.grad(value, z)
                 adam.step()
                 z.data = mean + (z.data - mean).clamp(-limit, limit)
@@ -80,9 +90,11 @@ class MeanGuidance:
 
 @dataclass
 class CleanGuidance:
-    """A gradient step on the clean estimate, the gradient taken by the noisy x, through the network.
+    """A gradient step on the clean estimate, the gradient taken by the noisy x, through
+    the network.
 
-    guided [S * B, V] bool: rows that move; clip: largest change of an element at a step, in x.
+    guided [S * B, V] bool: rows that move; clip: largest change of an element at a
+    step, in x.
     """
 
     prior: Prior
@@ -99,7 +111,9 @@ class CleanGuidance:
         with torch.enable_grad():
             variable = x.detach().requires_grad_(True)
             x0 = denoise(variable)
-            value = self.loss(motion_of(self.prior, x0, context=context, count=self.samples)).sum()
+            value = self.loss(
+                motion_of(self.prior, x0, context=context, count=self.samples)
+            ).sum()
             (gradient,) = torch.autograd.grad(value, variable)
         shift = (self.step_size * gradient).clamp(-self.clip, self.clip)
         x0 = x0.detach()
@@ -115,30 +129,46 @@ class Guided(Baseline):
     guides_everybody = False  # or adversaries alone
 
     def attack(self, now: Replan, context: Context) -> tuple[State, Tensor]:
-        """Returns state and chosen joint sample x0 [G, V, SIZE]; scenes without strength keep the nominal one."""
+        """Returns state and chosen joint sample x0 [G, V, SIZE]; scenes without
+        strength keep the nominal one."""
         state = now.state
         count = now.noise.shape[3]
         view = View.of(now.world, context, ego_plan=now.ego_plan)
         acts = self.strength(state) > 0
         adversary = self.attackers(state, view) & acts[:, None]
         state = replace(state, adversary=adversary)
-        guided = (context.active if self.guides_everybody else adversary) & acts[:, None]
+        guided = (context.active if self.guides_everybody else adversary) & acts[
+            :, None
+        ]
         loss = partial(self.loss, state=state, view=view)
         many = tiled(context, count)
-        control = self.guidance(loss, guided.repeat(count, 1), strength=self.strength(state).repeat(count))
+        control = self.guidance(
+            loss, guided.repeat(count, 1), strength=self.strength(state).repeat(count)
+        )
         sample = self.prior.sample(many, folded(now.noise), control)
         motion = motion_of(self.prior, sample.x0, context=many, count=count)
         index = self.chosen(motion, state, view=view, guided=guided)
         index = index * acts if index.ndim == 1 else index * acts[:, None]
-        x0, kl = (pick(value.unflatten(0, (count, -1)), index) for value in (sample.x0, sample.kl))
+        x0, kl = (
+            pick(value.unflatten(0, (count, -1)), index)
+            for value in (sample.x0, sample.kl)
+        )
         return replace(state, path_kl=state.path_kl + kl), x0
 
-    def chosen(self, motion: LaneState, state: State, view: View, guided: Tensor) -> Tensor:
-        """Sample [B] of each scene that is driven: that of least loss over the guided vehicles."""
-        return torch.where(guided, self.loss(motion, state, view=view), 0.0).sum(-1).argmin(0)
+    def chosen(
+        self, motion: LaneState, state: State, view: View, guided: Tensor
+    ) -> Tensor:
+        """Sample [B] of each scene that is driven: that of least loss over the guided
+        vehicles."""
+        return (
+            torch.where(guided, self.loss(motion, state, view=view), 0.0)
+            .sum(-1)
+            .argmin(0)
+        )
 
     def attackers(self, state: State, view: View) -> Tensor:
-        """Bool [B, V]: vehicles under adversarial control, all that the prior moves by default."""
+        """Bool [B, V]: vehicles under adversarial control, all that the prior moves by
+        default."""
         return view.active
 
     @abstractmethod
@@ -152,7 +182,8 @@ class Guided(Baseline):
 
 @dataclass(eq=False, repr=False)
 class MeanGuided(Guided):
-    """Guided by `MeanGuidance`, clipped at the strength in standard deviations of a step's noise."""
+    """Guided by `MeanGuidance`, clipped at the strength in standard deviations of a
+    step's noise."""
 
     step_size: float = setting(low=0)
     iterations: int = setting(low=1)
@@ -169,4 +200,12 @@ class MeanGuided(Guided):
 
     def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> MeanGuidance:
         """The control of `Prior.sample`."""
-        return MeanGuidance(self.prior, loss, guided=guided, limit=strength, samples=self.samples, step_size=self.step_size, iterations=self.iterations)
+        return MeanGuidance(
+            self.prior,
+            loss,
+            guided=guided,
+            limit=strength,
+            samples=self.samples,
+            step_size=self.step_size,
+            iterations=self.iterations,
+        )

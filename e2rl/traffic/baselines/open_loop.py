@@ -1,4 +1,5 @@
-"""Baselines that plan a whole horizon once and then drive it whatever happens: DiffScene, CAT, STRIVE."""
+"""Baselines that plan a whole horizon once and then drive it whatever happens:
+DiffScene, CAT, STRIVE."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -31,8 +32,9 @@ EVERY = HORIZON // REPLAN_STEPS  # replans that a plan lasts
 
 @dataclass
 class OpenLoopState(BaselineState):
-    """held [B, V] bool: vehicles that drive the plan x [B, V, SIZE] whatever happens; released [B, V] bool: those that
-    did before; begun [B, V]: lane states where it begins."""
+    """held [B, V] bool: vehicles that drive the plan x [B, V, SIZE] whatever happens;
+    released [B, V] bool: those that did before; begun [B, V]: lane states where it
+    begins."""
 
     held: Tensor
     released: Tensor
@@ -41,7 +43,8 @@ class OpenLoopState(BaselineState):
 
 
 class Scenario(NamedTuple):
-    """A whole horizon: x [B, V, SIZE] of all vehicles, those held [B, V], adversaries [B, V], path_kl [B, V]."""
+    """A whole horizon: x [B, V, SIZE] of all vehicles, those held [B, V], adversaries
+    [B, V], path_kl [B, V]."""
 
     x: Tensor
     held: Tensor
@@ -51,23 +54,32 @@ class Scenario(NamedTuple):
 
 @dataclass(eq=False, repr=False)
 class OpenLoop(Baseline):
-    """A scenario is generated every EVERY replans, as long as a plan lasts; until then it is driven."""
+    """A scenario is generated every EVERY replans, as long as a plan lasts; until then
+    it is driven."""
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> OpenLoopState:
         """States of scenes [B] in which no vehicle is held."""
         state = super().reset(scenes, seed, eta)
         x = torch.zeros(*state.adversary.shape, SIZE, device=eta.device)
         nobody = torch.zeros_like(state.adversary)
-        return OpenLoopState(**vars(state), held=nobody, released=nobody, x=x, begun=state.lane)
+        return OpenLoopState(
+            **vars(state), held=nobody, released=nobody, x=x, begun=state.lane
+        )
 
     def attack(self, now: Replan, context: Context) -> tuple[OpenLoopState, Tensor]:
-        """Returns state and joint sample [G, V, SIZE]: a new scenario's where one is due; else nominal, but for those
-        held."""
+        """Returns state and joint sample [G, V, SIZE]: a new scenario's where one is
+        due; else nominal, but for those held."""
         state = now.state
         age = state.replans % EVERY
         due = (age == 0) & (self.strength(state) > 0)
         nominal = self.prior.sample(context, now.noise[..., 0, :]).x0
-        rest = later(state.x, state.begun, lane=state.lane, age=age, has_lane=context.routed.has_lane)
+        rest = later(
+            state.x,
+            state.begun,
+            lane=state.lane,
+            age=age,
+            has_lane=context.routed.has_lane,
+        )
         x0 = torch.where(state.held[..., None], rest, nominal)
         if not bool(due.any()):
             return state, x0
@@ -90,18 +102,28 @@ class OpenLoop(Baseline):
         """The scenario of a group; nominal [G, V, SIZE]: its nominal joint sample."""
 
 
-def later(x: Tensor, begun: LaneState, lane: LaneState, age: Tensor, has_lane: Tensor) -> Tensor:
-    """The plan x [B, V, SIZE] that began in lane states `begun` [B, V], as seen age [B] replans later in `lane`.
+def later(
+    x: Tensor, begun: LaneState, lane: LaneState, age: Tensor, has_lane: Tensor
+) -> Tensor:
+    """The plan x [B, V, SIZE] that began in lane states `begun` [B, V], as seen age [B]
+    replans later in `lane`.
 
-    Accelerations go on knot by knot, 0 after the last; the path stays the same. In free space its last curvature does.
+    Accelerations go on knot by knot, 0 after the last; the path stays the same. In free
+    space its last curvature does.
     """
     index = torch.arange(KNOTS, device=x.device) + age[:, None, None]
-    knots = x[..., :KNOTS].gather(-1, index.clamp(max=KNOTS - 1).expand(*x.shape[:-1], -1))
+    knots = x[..., :KNOTS].gather(
+        -1, index.clamp(max=KNOTS - 1).expand(*x.shape[:-1], -1)
+    )
     _, half, end = split(x, begun)
     reach = lateral_horizon(lane.v)[..., None]
     first_reach = lateral_horizon(begun.v)[..., None]
-    ahead = (lane.s - begun.s)[..., None] + reach * torch.tensor([0.5, 1.0], device=x.device)
-    path = polynomial(offset_coefficients(begun, half, end=end), (ahead / first_reach).clamp(0, 1))[0]
+    ahead = (lane.s - begun.s)[..., None] + reach * torch.tensor(
+        [0.5, 1.0], device=x.device
+    )
+    path = polynomial(
+        offset_coefficients(begun, half, end=end), (ahead / first_reach).clamp(0, 1)
+    )[0]
     bend = (path[..., 0] - 0.5 * (lane.d + path[..., 1])) / BEND_SCALE
     lateral = torch.stack([bend, path[..., 1] / OFFSET_SCALE], -1)
     lateral = torch.where(has_lane[..., None], lateral, x[..., KNOTS + 1 :])

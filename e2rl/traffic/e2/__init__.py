@@ -1,1 +1,2 @@
-"""e2, the adversary: topology, feasibility, skeleton, anchoring, potentials, guided control."""
+"""e2, the adversary: topology, feasibility, skeleton, anchoring, potentials, guided
+control."""

@@ -1,7 +1,9 @@
-"""Topological anchoring (Sec. IV-B1): a coarse lane-graph proposal for every link of the skeleton.
+"""Topological anchoring (Sec. IV-B1): a coarse lane-graph proposal for every link of
+the skeleton.
 
-A proposal is a candidate route and a constant acceleration, within limits of speed and curvature, with which a vehicle
-meets its target. The prior's own decoder turns it into motion, so arrival times are those that the prior would plan.
+A proposal is a candidate route and a constant acceleration, within limits of speed and
+curvature, with which a vehicle meets its target. The prior's own decoder turns it into
+motion, so arrival times are those that the prior would plan.
 """
 
 from dataclasses import dataclass, replace
@@ -11,7 +13,14 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState, lateral_horizon, speeds
+from e2rl.prior.lane_relative import (
+    HORIZON,
+    KNOT_STEPS,
+    KNOTS,
+    LaneState,
+    lateral_horizon,
+    speeds,
+)
 from e2rl.prior.routes import take_route
 from e2rl.run.fused import fused
 from e2rl.run.settings import check_range, configured, setting
@@ -33,11 +42,16 @@ from e2rl.traffic.e2.motion import (
 )
 from e2rl.traffic.e2.skeleton import Skeleton
 
-COARSE, FINE = 19, 9  # accelerations tried on each route: over the whole range, then around the best
+COARSE, FINE = (
+    19,
+    9,
+)  # accelerations tried on each route: over the whole range, then around the best
 LATERAL_ACCEL = 4.0  # m/s^2 in bends
 BEND_BRAKING = 3.0  # m/s^2 with which a vehicle slows down for a bend
 EXTRA = 2  # steps beyond the horizon, for the slope of the speed at the last knot
-SWING = 0.2  # peak of the lateral decoder's offset, per unit of slope and lateral horizon
+SWING = (
+    0.2  # peak of the lateral decoder's offset, per unit of slope and lateral horizon
+)
 BEND_VERTICES = 64  # of a route ahead, whose curvature bounds the speed
 ACCEL_COST = 0.2  # s of time gap that 1 m/s^2 weighs
 LATERAL_COST = 0.05  # s that 1 m of present offset from the route weighs
@@ -49,24 +63,28 @@ MAX_SWING = 1.0  # m that it may swing out while it turns in
 @configured("synthesizer/e2", "anchor")
 @dataclass(frozen=True)
 class AnchorSettings:
-    """Settings of the proposals and of the blend; conf/synthesizer/e2.yaml explains each."""
+    """Settings of the proposals and of the blend; conf/synthesizer/e2.yaml explains
+    each."""
 
     strength: float = setting(low=0)
     min_accel: float = setting()
     max_accel: float = setting()
 
     def __post_init__(self) -> None:
-        check_range("synthesizer.anchor.max_accel", self.max_accel, low=self.min_accel + 0.1)
+        check_range(
+            "synthesizer.anchor.max_accel", self.max_accel, low=self.min_accel + 0.1
+        )
 
 
 @dataclass(frozen=True)
 class Anchor:
     """The proposals of a skeleton.
 
-    route [B, V] int64: candidate to follow (the present one where not feasible); knots [B, V, 10]: accelerations
-    [m/s^2] at 0.5 .. 5.0 s; feasible [B, V] bool: members of C* that can meet their target; cost [B, V] in s, inf where
-    not feasible; off_lane [B, V] bool: members that meet it on off_lane_path [B, V, P, 2] (a vertex every SPACING m)
-    instead of a lane.
+    route [B, V] int64: candidate to follow (the present one where not feasible); knots
+    [B, V, 10]: accelerations [m/s^2] at 0.5 .. 5.0 s; feasible [B, V] bool: members of
+    C* that can meet their target; cost [B, V] in s, inf where not feasible; off_lane
+    [B, V] bool: members that meet it on off_lane_path [B, V, P, 2] (a vertex every
+    SPACING m) instead of a lane.
     """
 
     route: Tensor
@@ -78,9 +96,10 @@ class Anchor:
 
 
 class _Candidates(NamedTuple):
-    """Vehicles [B, M] that need a proposal: speed, accel, size [B, M, 2], and their candidate routes [B, M, R]: number
-    in the scene, points [B, M, R, P, 2], usable (bool), end [m], Frenet pose s, d [m], and bend_bound [B, M, R, 64]:
-    squared speed allowed at the vertices ahead.
+    """Vehicles [B, M] that need a proposal: speed, accel, size [B, M, 2], and their
+    candidate routes [B, M, R]: number in the scene, points [B, M, R, P, 2], usable
+    (bool), end [m], Frenet pose s, d [m], and bend_bound [B, M, R, 64]: squared speed
+    allowed at the vertices ahead.
     """
 
     number: Tensor
@@ -96,9 +115,10 @@ class _Candidates(NamedTuple):
 
 
 class _Target(NamedTuple):
-    """A target's path seen along each candidate, [B, M, R, H]: s, d [m]; slack [m] by which boxes that move alike touch
-    before their centres meet; crossing_time [s/m]: until a crossing target is over the centreline; corridor [B, M] m:
-    lateral distance at which the boxes touch.
+    """A target's path seen along each candidate, [B, M, R, H]: s, d [m]; slack [m] by
+    which boxes that move alike touch before their centres meet; crossing_time [s/m]:
+    until a crossing target is over the centreline; corridor [B, M] m: lateral distance
+    at which the boxes touch.
     """
 
     s: Tensor
@@ -109,27 +129,50 @@ class _Target(NamedTuple):
 
 
 def _bend_bound(route: Tensor, s: Tensor) -> Tensor:
-    """Squared speed [..., BEND_VERTICES] allowed at arc lengths s + SPACING k of route [..., P, 2], s [...]: by the
-    curvature there, and by what BEND_BRAKING can still lose before the bends ahead.
+    """Squared speed [..., BEND_VERTICES] allowed at arc lengths s + SPACING k of route
+    [..., P, 2], s [...]: by the curvature there, and by what BEND_BRAKING can still
+    lose before the bends ahead.
     """
     distance = SPACING * torch.arange(BEND_VERTICES, device=s.device)
     curvature = interpolate(route, s[..., None] + distance)[2]
-    bound = LATERAL_ACCEL / curvature.abs().clamp(min=1e-4) + 2 * BEND_BRAKING * distance
+    bound = (
+        LATERAL_ACCEL / curvature.abs().clamp(min=1e-4) + 2 * BEND_BRAKING * distance
+    )
     return bound.flip(-1).cummin(-1).values.flip(-1) - 2 * BEND_BRAKING * distance
 
 
-def _candidates(scene: TensorDictBase, world: World, index: Tensor, keep_route: bool, halt_at_red: bool) -> _Candidates:
-    """The candidate routes of vehicles index [B, M]; keep_route: only the one that each follows; halt_at_red: up to the
-    stop line that binds the vehicle now."""
+def _candidates(
+    scene: TensorDictBase,
+    world: World,
+    index: Tensor,
+    keep_route: bool,
+    halt_at_red: bool,
+) -> _Candidates:
+    """The candidate routes of vehicles index [B, M]; keep_route: only the one that each
+    follows; halt_at_red: up to the stop line that binds the vehicle now."""
     vehicles, count = scene["route_points"].shape[1:3]
     assert world.route is not None
     states = take(world.states[:, :vehicles], index)
     route = take(world.route, index)[..., None]
-    number = route.clamp(min=0) if keep_route else torch.arange(count, device=index.device).expand(*index.shape, -1)
-    at = (torch.arange(len(index), device=index.device)[:, None, None], index[..., None], number)
-    points, end, valid = (scene[key][at] for key in ("route_points", "route_length", "route_valid"))
+    number = (
+        route.clamp(min=0)
+        if keep_route
+        else torch.arange(count, device=index.device).expand(*index.shape, -1)
+    )
+    at = (
+        torch.arange(len(index), device=index.device)[:, None, None],
+        index[..., None],
+        number,
+    )
+    points, end, valid = (
+        scene[key][at] for key in ("route_points", "route_length", "route_valid")
+    )
     s, d, error = frenet_pose(states, points)
-    swing = SWING * error.clamp(-1.0, 1.0).tan().abs() * lateral_horizon(states[..., 3])[..., None]
+    swing = (
+        SWING
+        * error.clamp(-1.0, 1.0).tan().abs()
+        * lateral_horizon(states[..., 3])[..., None]
+    )
     reachable = (d.abs() <= MAX_SHIFT) & (swing <= MAX_SWING)
     usable = valid & (reachable | (number == route))
     if keep_route:
@@ -138,7 +181,18 @@ def _candidates(scene: TensorDictBase, world: World, index: Tensor, keep_route: 
         end = torch.minimum(end, s + distance_to_stop_line(world, index, number=number))
     accel = take(world.accel[:, :vehicles], index)
     size = take(scene["size"], index)
-    return _Candidates(number, points, usable=usable, end=end, s=s, d=d, bend_bound=_bend_bound(points, s), speed=states[..., 3], accel=accel, size=size)
+    return _Candidates(
+        number,
+        points,
+        usable=usable,
+        end=end,
+        s=s,
+        d=d,
+        bend_bound=_bend_bound(points, s),
+        speed=states[..., 3],
+        accel=accel,
+        size=size,
+    )
 
 
 def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
@@ -148,23 +202,32 @@ def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
     touch = (candidates.size + size) / 2
     slack = 0.8 * touch[..., 0, None, None] * cosine.clamp(min=0) ** 2
     crossing_time = (1 - cosine**2) / path[:, :, None, :, 3].clamp(min=1.0)
-    return _Target(s, d, slack=slack, crossing_time=crossing_time, corridor=touch[..., 1])
+    return _Target(
+        s, d, slack=slack, crossing_time=crossing_time, corridor=touch[..., 1]
+    )
 
 
 def _knots(candidates: _Candidates, accel: Tensor, limits: Tensor) -> Tensor:
-    """Knots [B, M, R, A, 10] that hold accelerations accel [B, M, R, A] but for standstill, top speed and bends: the
-    bound depends on the distance, which depends on speed, so three fixed-point steps from the free motion."""
+    """Knots [B, M, R, A, 10] that hold accelerations accel [B, M, R, A] but for
+    standstill, top speed and bends: the bound depends on the distance, which depends on
+    speed, so three fixed-point steps from the free motion."""
     time = DT * torch.arange(HORIZON + EXTRA + 1, device=accel.device)
     v0 = candidates.speed[..., None, None, None]
     free = v0 + accel[..., None] * time
     free = torch.minimum(free.clamp(min=0), v0.clamp(min=TOP_SPEED))
-    braking = (v0 + limits[0] * time).clamp(min=0)  # nobody loses speed faster, bend or not
+    braking = (v0 + limits[0] * time).clamp(
+        min=0
+    )  # nobody loses speed faster, bend or not
     speed = free
     for _ in range(3):
-        travelled = torch.nn.functional.pad(((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0))
+        travelled = torch.nn.functional.pad(
+            ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0)
+        )
         at = (travelled / SPACING).clamp(max=BEND_VERTICES - 1.001)
         low = at.long()
-        table = candidates.bend_bound[..., None, :].expand(*travelled.shape[:-1], BEND_VERTICES)
+        table = candidates.bend_bound[..., None, :].expand(
+            *travelled.shape[:-1], BEND_VERTICES
+        )
         bound = torch.lerp(table.gather(-1, low), table.gather(-1, low + 1), at - low)
         speed = torch.maximum(torch.minimum(free, bound.clamp(min=0).sqrt()), braking)
     knot = KNOT_STEPS * torch.arange(1, KNOTS + 1, device=accel.device)
@@ -173,51 +236,107 @@ def _knots(candidates: _Candidates, accel: Tensor, limits: Tensor) -> Tensor:
 
 
 def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
-    """Speed and travelled distance [B, M, R, A, H] of knots [B, M, R, A, 10], by the prior's decoder."""
+    """Speed and travelled distance [B, M, R, A, H] of knots [B, M, R, A, 10], by the
+    prior's decoder."""
     zero = knots.new_zeros(knots.shape[:-1])
-    v, a = (x[..., None, None].expand(zero.shape) for x in (candidates.speed, candidates.accel))
-    return speeds(LaneState(zero, zero, d1=zero, d2=zero, v=v, a=a, x=zero, y=zero, heading=zero, kappa=zero), knots)
+    v, a = (
+        x[..., None, None].expand(zero.shape)
+        for x in (candidates.speed, candidates.accel)
+    )
+    return speeds(
+        LaneState(
+            zero,
+            zero,
+            d1=zero,
+            d2=zero,
+            v=v,
+            a=a,
+            x=zero,
+            y=zero,
+            heading=zero,
+            kappa=zero,
+        ),
+        knots,
+    )
 
 
 @fused(
-    ("B M R:int64", "B M R P 2!", "B M R:bool", *["B M R"] * 3, f"B M R {BEND_VERTICES}", "B M", "B M", "B M 2"),
+    (
+        "B M R:int64",
+        "B M R P 2!",
+        "B M R:bool",
+        *["B M R"] * 3,
+        f"B M R {BEND_VERTICES}",
+        "B M",
+        "B M",
+        "B M 2",
+    ),
     "B M R A",
     (*[f"B M R {HORIZON}"] * 4, "B M"),
     "2",
 )
-def scored(candidates: _Candidates, accel: Tensor, target: _Target, limits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of accelerations accel [B, M, R, A] within
-    limits [2].
+def scored(
+    candidates: _Candidates, accel: Tensor, target: _Target, limits: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of
+    accelerations accel [B, M, R, A] within limits [2].
 
-    Time gap: distance to the target over speed, least over the steps at which the target is on the candidate.
+    Time gap: distance to the target over speed, least over the steps at which the
+    target is on the candidate.
     """
     knots = _knots(candidates, accel, limits=limits)
     v, travelled = _decode(candidates, knots)
-    offset = candidates.d[..., None, None] * remaining_offset(travelled, candidates.speed[..., None, None, None])
+    offset = candidates.d[..., None, None] * remaining_offset(
+        travelled, candidates.speed[..., None, None, None]
+    )
     lateral = (target.d[..., None, :] - offset).abs()
     ahead = target.s[..., None, :]
-    missing = (ahead - candidates.s[..., None, None] - travelled).abs() - target.slack[..., None, :]
-    time_gap = missing.clamp(min=0) / v.clamp(min=1.0) + lateral * target.crossing_time[..., None, :]
-    met = (lateral <= target.corridor[..., None, None, None]) & (ahead <= candidates.end[..., None, None])
-    time_gap = time_gap.masked_fill(~met, torch.inf).amin(-1).masked_fill(~candidates.usable[..., None], torch.inf)
-    cost = time_gap + ACCEL_COST * accel.abs() + LATERAL_COST * candidates.d.abs()[..., None]
+    missing = (ahead - candidates.s[..., None, None] - travelled).abs() - target.slack[
+        ..., None, :
+    ]
+    time_gap = (
+        missing.clamp(min=0) / v.clamp(min=1.0)
+        + lateral * target.crossing_time[..., None, :]
+    )
+    met = (lateral <= target.corridor[..., None, None, None]) & (
+        ahead <= candidates.end[..., None, None]
+    )
+    time_gap = (
+        time_gap.masked_fill(~met, torch.inf)
+        .amin(-1)
+        .masked_fill(~candidates.usable[..., None], torch.inf)
+    )
+    cost = (
+        time_gap
+        + ACCEL_COST * accel.abs()
+        + LATERAL_COST * candidates.d.abs()[..., None]
+    )
     return cost, time_gap, knots
 
 
 def _on_lane(
     candidates: _Candidates, path: Tensor, size: Tensor, settings: AnchorSettings
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The proposal of least cost on the candidates: candidate [B, M], knots [B, M, 10], cost [B, M] (inf for none)."""
+    """The proposal of least cost on the candidates: candidate [B, M], knots [B, M, 10],
+    cost [B, M] (inf for none)."""
     target = _along(candidates, path, size=size)
     low = settings.min_accel
     high = settings.max_accel
     limits = path.new_tensor((low, high))
-    grid = torch.linspace(low, high, COARSE, device=path.device).expand(*candidates.s.shape, COARSE)
-    best = scored(candidates, grid, target, limits)[0].argmin(-1, keepdim=True)  # per candidate
-    fine = grid.gather(-1, best) + (high - low) / (COARSE - 1) * torch.linspace(-1, 1, FINE, device=path.device)
+    grid = torch.linspace(low, high, COARSE, device=path.device).expand(
+        *candidates.s.shape, COARSE
+    )
+    best = scored(candidates, grid, target, limits)[0].argmin(
+        -1, keepdim=True
+    )  # per candidate
+    fine = grid.gather(-1, best) + (high - low) / (COARSE - 1) * torch.linspace(
+        -1, 1, FINE, device=path.device
+    )
     cost, time_gap, knots = scored(candidates, fine.clamp(low, high), target, limits)
     pick = cost.flatten(2).argmin(-1)
-    cost, time_gap, knots = (take_route(value.flatten(2, 3), pick) for value in (cost, time_gap, knots))
+    cost, time_gap, knots = (
+        take_route(value.flatten(2, 3), pick) for value in (cost, time_gap, knots)
+    )
     return pick // FINE, knots, cost.masked_fill(time_gap > MAX_OFFSET, torch.inf)
 
 
@@ -232,12 +351,14 @@ def propose(
     keep_route: bool = False,
     halt_at_red: bool = False,
 ) -> Anchor:
-    """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H >= 50, 4].
+    """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H
+    >= 50, 4].
 
-    Proposals are made from the ego outwards. Vehicles that act on the ego meet its plan on a lane or, where that costs
-    less, by an interception. The others meet their target's lane proposal; a target without one keeps its speed along
-    its route. keep_route: consider only the routes that vehicles follow now; halt_at_red: nobody passes a stop line
-    that binds it now.
+    Proposals are made from the ego outwards. Vehicles that act on the ego meet its plan
+    on a lane or, where that costs less, by an interception. The others meet their
+    target's lane proposal; a target without one keeps its speed along its route.
+    keep_route: consider only the routes that vehicles follow now; halt_at_red: nobody
+    passes a stop line that binds it now.
     """
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
     expected = constant_speed_states(scene, world, times=times)
@@ -247,36 +368,85 @@ def propose(
     cost = expected.new_full(world.route.shape, torch.inf)
     knots = expected.new_zeros(*world.route.shape, KNOTS)
     path = torch.zeros_like(scene["route_points"][:, :, 0])
-    anchor = Anchor(world.route.clone(), knots, feasible=nobody, cost=cost, off_lane=nobody, off_lane_path=path)
+    anchor = Anchor(
+        world.route.clone(),
+        knots,
+        feasible=nobody,
+        cost=cost,
+        off_lane=nobody,
+        off_lane_path=path,
+    )
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         target = skeleton.target.gather(1, index).clamp(min=0)
-        candidates = _candidates(scene, world, index=index, keep_route=keep_route, halt_at_red=halt_at_red)
-        pick, knots, cost = _on_lane(candidates, take(expected, target), size=take(scene["size"], target), settings=settings)
+        candidates = _candidates(
+            scene, world, index=index, keep_route=keep_route, halt_at_red=halt_at_red
+        )
+        pick, knots, cost = _on_lane(
+            candidates,
+            take(expected, target),
+            size=take(scene["size"], target),
+            settings=settings,
+        )
         cost = cost.masked_fill(~present, torch.inf)
         off_lane = torch.zeros_like(present)
         found = None
         if depth == 1 and interception.reach > 0:
-            found = intercept(world, index, target=target, expected=expected, wish=wish, settings=interception, halt_at_red=halt_at_red)
+            found = intercept(
+                world,
+                index,
+                target=target,
+                expected=expected,
+                wish=wish,
+                settings=interception,
+                halt_at_red=halt_at_red,
+            )
             off_lane = present & (found.cost < cost)
         on_lane = cost.isfinite() & ~off_lane
-        expected = put(expected, index, mask=on_lane, rows=_states(candidates, pick, knots=knots))
+        expected = put(
+            expected, index, mask=on_lane, rows=_states(candidates, pick, knots=knots)
+        )
         route = take_route(candidates.number, pick)
-        anchor = _updated(anchor, index, mask=on_lane, feasible=on_lane, cost=cost, knots=knots, route=route)
+        anchor = _updated(
+            anchor,
+            index,
+            mask=on_lane,
+            feasible=on_lane,
+            cost=cost,
+            knots=knots,
+            route=route,
+        )
         if found is not None:
-            rows = {"feasible": off_lane, "off_lane": off_lane, "cost": found.cost, "knots": found.knots}
-            anchor = _updated(anchor, index, mask=off_lane, off_lane_path=found.path, **rows)
+            rows = {
+                "feasible": off_lane,
+                "off_lane": off_lane,
+                "cost": found.cost,
+                "knots": found.knots,
+            }
+            anchor = _updated(
+                anchor, index, mask=off_lane, off_lane_path=found.path, **rows
+            )
     return anchor
 
 
 def _states(candidates: _Candidates, pick: Tensor, knots: Tensor) -> Tensor:
-    """States [B, M, H, 4] of the vehicles on candidates pick [B, M] with knots [B, M, 10]."""
+    """States [B, M, H, 4] of the vehicles on candidates pick [B, M] with knots [B, M,
+    10]."""
     v, travelled = (x[:, :, 0, 0] for x in _decode(candidates, knots[:, :, None, None]))
-    route, s, d = (take_route(x, pick) for x in (candidates.points, candidates.s, candidates.d))
+    route, s, d = (
+        take_route(x, pick) for x in (candidates.points, candidates.s, candidates.d)
+    )
     offset = d[..., None] * remaining_offset(travelled, candidates.speed[..., None])
     return states_on_route(route, s[..., None] + travelled, d=offset, speed=v)
 
 
 def _updated(anchor: Anchor, index: Tensor, mask: Tensor, **rows: Tensor) -> Anchor:
-    """The Anchor with rows [B, M, ...] of its fields written at vehicles index [B, M] where mask [B, M]."""
-    return replace(anchor, **{name: put(getattr(anchor, name), index, mask=mask, rows=new) for name, new in rows.items()})
+    """The Anchor with rows [B, M, ...] of its fields written at vehicles index [B, M]
+    where mask [B, M]."""
+    return replace(
+        anchor,
+        **{
+            name: put(getattr(anchor, name), index, mask=mask, rows=new)
+            for name, new in rows.items()
+        },
+    )

@@ -1,7 +1,8 @@
 """The yielding rule: what adversaries owe the ego (docs/adversaries.md).
 
-full: an adversary yields to the ego wherever its plan meets the ego's expected motion, late but in time, unless the
-ego follows it; rear: adversaries behind the ego brake for it like any driver; none: no adversary does.
+full: an adversary yields to the ego wherever its plan meets the ego's expected motion,
+late but in time, unless the ego follows it; rear: adversaries behind the ego brake for
+it like any driver; none: no adversary does.
 """
 
 from dataclasses import dataclass
@@ -17,8 +18,12 @@ from e2rl.sim.world import World
 
 RESPONSIBILITIES = ("full", "rear", "none")
 NEAR = 4.0  # m ahead of the ego's centre from which on a vehicle leads it
-CROSSING = torch.pi / 6  # rad between headings above which a vehicle crosses the ego's path
-SAME_DIRECTION = 0.5  # cosine between the headings of vehicles that drive in the same direction
+CROSSING = (
+    torch.pi / 6
+)  # rad between headings above which a vehicle crosses the ego's path
+SAME_DIRECTION = (
+    0.5  # cosine between the headings of vehicles that drive in the same direction
+)
 
 
 @configured("synthesizer/e2", "yielding")
@@ -31,27 +36,34 @@ class YieldingSettings:
 
 
 def place_of(world: World, vehicles: int) -> tuple[Tensor, Tensor]:
-    """Where the ego sees vehicles, m ahead and to the left [B, V, 2]; whether they drive in its direction [B, V]."""
+    """Where the ego sees vehicles, m ahead and to the left [B, V, 2]; whether they
+    drive in its direction [B, V]."""
     states = world.states[:, :vehicles]
     ego = world.states[:, :1]
-    return to_frame(states[..., :2], ego), (states[..., 2] - ego[..., 2]).cos() > SAME_DIRECTION
+    return to_frame(states[..., :2], ego), (
+        states[..., 2] - ego[..., 2]
+    ).cos() > SAME_DIRECTION
 
 
 def followed(world: World, vehicles: int) -> Tensor:
     """Bool [B, V]: the ego drives behind the vehicle, in its track."""
     place, along = place_of(world, vehicles)
     touch = (world.scene["size"][:, :vehicles] + world.scene["size"][:, :1]) / 2
-    return along & (place[..., 0] > touch[..., 0]) & (place[..., 1].abs() < touch[..., 1])
+    return (
+        along & (place[..., 0] > touch[..., 0]) & (place[..., 1].abs() < touch[..., 1])
+    )
 
 
 def leading(world: World, vehicles: int) -> Tensor:
-    """Bool [B, V]: vehicles that drive in the ego's direction ahead of it, in its lane or beside it."""
+    """Bool [B, V]: vehicles that drive in the ego's direction ahead of it, in its lane
+    or beside it."""
     place, along = place_of(world, vehicles)
     return along & (place[..., 0] > NEAR)
 
 
 def yields_at_once(world: World, vehicles: int) -> Tensor:
-    """Bool [B, V]: vehicles that cross the ego's path from its left, and so yield where nothing else decides."""
+    """Bool [B, V]: vehicles that cross the ego's path from its left, and so yield where
+    nothing else decides."""
     angle = wrap(world.states[:, :vehicles, 2] - world.states[:, :1, 2])
     return (angle < -CROSSING) & (angle > CROSSING - torch.pi)
 
@@ -68,7 +80,8 @@ def duty_of(
     """The Duty of a coalition [B, V] at intensities eta [B].
 
     Args:
-        lateness: [B] factor of the patience, and where it is above 1 of its bound (None: 1).
+        lateness: [B] factor of the patience, and where it is above 1 of its bound
+            (None: 1).
         owes: [B] bool, false: it owes the ego nothing (None: it does).
     """
     vehicles = coalition.shape[1]
@@ -82,7 +95,10 @@ def duty_of(
     free = coalition & followed(world, vehicles)
     waits = ahead & ~yields_at_once(world, vehicles)
     lateness = torch.ones_like(eta) if lateness is None else lateness
-    patience = torch.minimum(settings.patience * eta * lateness, settings.max_patience * lateness.clamp(min=1))
+    patience = torch.minimum(
+        settings.patience * eta * lateness,
+        settings.max_patience * lateness.clamp(min=1),
+    )
     if owes is not None:
         free = torch.where(owes[:, None], free, coalition)
     return Duty(free, coalition & ~free, patience=patience[:, None] * waits)

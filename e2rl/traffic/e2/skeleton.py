@@ -1,8 +1,10 @@
-"""Interaction skeleton (Algorithm 2): near agents act on the ego, a distant one acts on them through a causal chain.
+"""Interaction skeleton (Algorithm 2): near agents act on the ego, a distant one acts on
+them through a causal chain.
 
-The arg min / arg max over subsets of a sum of distances are the K nearest / farthest agents. Intermediate members of a
-chain are taken from S and join the coalition C*. The influence of the farthest of all would arrive last, so the far
-agent is sought within MAX_DIST.
+The arg min / arg max over subsets of a sum of distances are the K nearest / farthest
+agents. Intermediate members of a chain are taken from S and join the coalition C*. The
+influence of the farthest of all would arrive last, so the far agent is sought within
+MAX_DIST.
 """
 
 from dataclasses import dataclass
@@ -14,10 +16,22 @@ from torch import Tensor
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import project
 from e2rl.sim.world import World
-from e2rl.traffic.e2.motion import compact, direction, frenet_pose, put, reachable_distance, smallest, take
+from e2rl.traffic.e2.motion import (
+    compact,
+    direction,
+    frenet_pose,
+    put,
+    reachable_distance,
+    smallest,
+    take,
+)
 from e2rl.traffic.e2.topology import TopologySettings
 
-LIMITS = ((1, 0), (2, 0), (1, 1))  # near and far agents of the causal templates single, pair and chain
+LIMITS = (
+    (1, 0),
+    (2, 0),
+    (1, 1),
+)  # near and far agents of the causal templates single, pair and chain
 MAX_DIST = 80.0  # m; farther vehicles start no chain
 STEP = 0.5  # s between the moments that are looked at
 CORRIDOR = 2.5  # m from a route within which a vehicle is on it
@@ -39,9 +53,10 @@ class SkeletonSettings:
 
 @dataclass(frozen=True)
 class Skeleton:
-    """coalition [B, V] bool: C*; target [B, V] int64: the vehicle that each of C* acts on (0 the ego), -1 for all
-    others; depth [B, V] int64: links to the ego (1 acts on it directly, 0 not in C*); near [B, V] bool; far [B, V]
-    bool: far agents with a viable chain.
+    """coalition [B, V] bool: C*; target [B, V] int64: the vehicle that each of C* acts
+    on (0 the ego), -1 for all others; depth [B, V] int64: links to the ego (1 acts on
+    it directly, 0 not in C*); near [B, V] bool; far [B, V] bool: far agents with a
+    viable chain.
     """
 
     coalition: Tensor
@@ -52,44 +67,61 @@ class Skeleton:
 
 
 def limits_of(template: Tensor, settings: SkeletonSettings) -> tuple[Tensor, Tensor]:
-    """The most near and far agents [B] int64 that causal templates [B] allow (e2rl/traffic/traffic.py); those of
-    `full` are the settings'."""
-    near, far = torch.tensor([*LIMITS, (settings.near, settings.far)], device=template.device)[template].unbind(-1)
+    """The most near and far agents [B] int64 that causal templates [B] allow
+    (e2rl/traffic/traffic.py); those of `full` are the settings'."""
+    near, far = torch.tensor(
+        [*LIMITS, (settings.near, settings.far)], device=template.device
+    )[template].unbind(-1)
     return near, far
 
 
 def direct(support: Tensor) -> Skeleton:
     """The skeleton in which all of support [B, V] act on the ego directly."""
-    return Skeleton(support, torch.where(support, 0, -1), depth=support.long(), near=support, far=torch.zeros_like(support))
+    return Skeleton(
+        support,
+        torch.where(support, 0, -1),
+        depth=support.long(),
+        near=support,
+        far=torch.zeros_like(support),
+    )
 
 
 def chain_depth(target: Tensor) -> Tensor:
-    """Links to the ego [B, V] int64 of targets [B, V] (0 the ego, -1 nobody); 0 for vehicles that act on nobody."""
+    """Links to the ego [B, V] int64 of targets [B, V] (0 the ego, -1 nobody); 0 for
+    vehicles that act on nobody."""
     at = target
     depth = (target >= 0).long()
-    while bool((at > 0).any()) and int(depth.max()) < target.shape[1]:  # a chain is never longer than the vehicles
+    while (
+        bool((at > 0).any()) and int(depth.max()) < target.shape[1]
+    ):  # a chain is never longer than the vehicles
         depth = depth + (at > 0)
         at = torch.where(at > 0, target.gather(1, at.clamp(min=0)), at)
     return depth
 
 
 def lane_of(states: Tensor, scene: TensorDictBase) -> Tensor:
-    """Index [B, K] of the lane nearest to states [B, K, 4] and within 60 degrees of their heading; -1 for none."""
+    """Index [B, K] of the lane nearest to states [B, K, 4] and within 60 degrees of
+    their heading; -1 for none."""
     points = scene["lane_points"]
     lane = scene["lane_index"]
     ahead = torch.nn.functional.normalize(torch.diff(points, dim=1), dim=-1)
-    ends = torch.nn.functional.pad(lane[:, 1:] != lane[:, :-1], (0, 1), value=True)  # a lane's last point looks back
+    ends = torch.nn.functional.pad(
+        lane[:, 1:] != lane[:, :-1], (0, 1), value=True
+    )  # a lane's last point looks back
     ahead = torch.cat([ahead, ahead[:, -1:]], 1)
     ahead = torch.where(ends[..., None], ahead.roll(1, 1), ahead)
     along = direction(states[..., 2]) @ ahead.transpose(1, 2)
-    gap = torch.cdist(states[..., :2], points).masked_fill((along < 0.5) | (lane < 0)[:, None], torch.inf)
+    gap = torch.cdist(states[..., :2], points).masked_fill(
+        (along < 0.5) | (lane < 0)[:, None], torch.inf
+    )
     nearest, index = gap.min(-1)
     return torch.where(nearest.isfinite(), lane.gather(1, index), -1)
 
 
 def _on_ego_lanes(states: Tensor, asked: Tensor, scene: TensorDictBase) -> Tensor:
-    """Bool [B, K]: vehicles states[:, 1:] [B, 1 + K, 4] are on the lane of the ego states[:, 0], on a neighbour of it,
-    or on a successor of these (maps cut lanes). Only scenes with any `asked` [B, K] are looked at: maps are large.
+    """Bool [B, K]: vehicles states[:, 1:] [B, 1 + K, 4] are on the lane of the ego
+    states[:, 0], on a neighbour of it, or on a successor of these (maps cut lanes).
+    Only scenes with any `asked` [B, K] are looked at: maps are large.
     """
     rows = asked.any(1).nonzero()[:, 0]
     scene = scene[rows]
@@ -97,20 +129,39 @@ def _on_ego_lanes(states: Tensor, asked: Tensor, scene: TensorDictBase) -> Tenso
     lane = lanes[:, 1:]
     ego_lane = lanes[:, 0]
     known = ego_lane.clamp(min=0)[:, None]
-    across = torch.cat([known, scene["lane_left"].gather(1, known), scene["lane_right"].gather(1, known)], 1)
-    exits = take(scene["lane_exits"], across.clamp(min=0)).masked_fill(across[..., None] < 0, -1).flatten(1)
+    across = torch.cat(
+        [
+            known,
+            scene["lane_left"].gather(1, known),
+            scene["lane_right"].gather(1, known),
+        ],
+        1,
+    )
+    exits = (
+        take(scene["lane_exits"], across.clamp(min=0))
+        .masked_fill(across[..., None] < 0, -1)
+        .flatten(1)
+    )
     shared = (lane[..., None] == torch.cat([across, exits], 1)[:, None]).any(-1)
-    return torch.zeros_like(asked).index_put((rows,), shared & (lane >= 0) & (ego_lane >= 0)[:, None])
+    return torch.zeros_like(asked).index_put(
+        (rows,), shared & (lane >= 0) & (ego_lane >= 0)[:, None]
+    )
 
 
 def influence(
-    scene: TensorDictBase, world: World, slots: tuple[Tensor, Tensor], expected: Tensor, settings: SkeletonSettings
+    scene: TensorDictBase,
+    world: World,
+    slots: tuple[Tensor, Tensor],
+    expected: Tensor,
+    settings: SkeletonSettings,
 ) -> Tensor:
-    """When each slot can act on each other slot and on the ego: bool [B, M, M + 1, K], the last target is the ego.
+    """When each slot can act on each other slot and on the ego: bool [B, M, M + 1, K],
+    the last target is the ego.
 
-    slots: index and presence [B, M] of the vehicles (see `compact`); expected [B, V, K, 4]: states of everybody every
-    STEP s. Slot i can act on j at a time when j is on one of i's candidate routes, i can be there by then, and the
-    longitudinal headway between them would be at most tau_long if i kept its speed.
+    slots: index and presence [B, M] of the vehicles (see `compact`); expected [B, V, K,
+    4]: states of everybody every STEP s. Slot i can act on j at a time when j is on one
+    of i's candidate routes, i can be there by then, and the longitudinal headway
+    between them would be at most tau_long if i kept its speed.
     """
     index, present = slots
     count = expected.shape[2]
@@ -118,16 +169,28 @@ def influence(
     times = STEP * torch.arange(1, count + 1, device=index.device)
     states = take(world.states[:, : expected.shape[1]], index)
     s, _, _ = frenet_pose(states, take(scene["route_points"], index))
-    b, m, r = (take(scene["route_valid"], index) & present[..., None]).nonzero(as_tuple=True)  # most is padding
+    b, m, r = (take(scene["route_valid"], index) & present[..., None]).nonzero(
+        as_tuple=True
+    )  # most is padding
     route = scene["route_points"][b, index[b, m], r]
-    targets = torch.cat([take(expected, index), expected[:, :1]], 1)[..., :2].flatten(1, 2)
-    target_s, target_d, _ = (value.view(-1, width, count) for value in project(targets[b], route))
+    targets = torch.cat([take(expected, index), expected[:, :1]], 1)[..., :2].flatten(
+        1, 2
+    )
+    target_s, target_d, _ = (
+        value.view(-1, width, count) for value in project(targets[b], route)
+    )
     speed = states[b, m, 3, None, None]
     length = scene["size"][b, index[b, m], 0, None, None]
     distance = target_s - s[b, m, r, None, None]
     least, most = reachable_distance(speed, times)
-    can_act = (target_d.abs() <= CORRIDOR) & (distance >= least - length) & (distance <= most + length)
-    can_act &= ((distance - speed * times).abs() <= settings.tau_long) & (distance > -length)
+    can_act = (
+        (target_d.abs() <= CORRIDOR)
+        & (distance >= least - length)
+        & (distance <= most + length)
+    )
+    can_act &= ((distance - speed * times).abs() <= settings.tau_long) & (
+        distance > -length
+    )
     by_slot = torch.zeros(*index.shape, width, count, device=index.device)
     by_slot = by_slot.index_put((b, m), can_act.float(), accumulate=True) > 0
     there = torch.cat([present, torch.ones_like(present[:, :1])], 1)
@@ -136,7 +199,8 @@ def influence(
 
 
 def first_after(flag: Tensor) -> Tensor:
-    """Index [..., K + 1] of the first true of flag [..., K] at or after each index; K for none."""
+    """Index [..., K + 1] of the first true of flag [..., K] at or after each index; K
+    for none."""
     count = flag.shape[-1]
     steps = torch.arange(count, device=flag.device).expand_as(flag)
     when = torch.where(flag, steps, count).flip(-1).cummin(-1).values.flip(-1)
@@ -146,23 +210,33 @@ def first_after(flag: Tensor) -> Tensor:
 def _shortest_chain(
     after: Tensor, start: Tensor, near: Tensor, blocked: Tensor, links: int
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Fewest links [B] (0 none) from slot start [B] to a near slot that can still act on the ego, each no earlier than
-    the last; that slot [B]; each layer's predecessors [B, M]. after: of `first_after`; blocked: slots not to pass.
+    """Fewest links [B] (0 none) from slot start [B] to a near slot that can still act
+    on the ego, each no earlier than the last; that slot [B]; each layer's predecessors
+    [B, M]. after: of `first_after`; blocked: slots not to pass.
 
-    Breadth-first by the earliest arrival at every slot, since departing later never arrives earlier.
+    Breadth-first by the earliest arrival at every slot, since departing later never
+    arrives earlier.
     """
     slots = near.shape[1]
     never = after.shape[-1] - 1
-    arrival = torch.full_like(near, never, dtype=torch.int64).scatter(1, start[:, None], 0)
+    arrival = torch.full_like(near, never, dtype=torch.int64).scatter(
+        1, start[:, None], 0
+    )
     found = torch.zeros_like(start)
     last = start
     parents = []
     for link in range(1, links + 1):
         departure = arrival.masked_fill(near | blocked, never)
-        reached = after[:, :, :slots].gather(-1, departure[:, :, None, None].expand(-1, -1, slots, 1))[..., 0]
+        reached = after[:, :, :slots].gather(
+            -1, departure[:, :, None, None].expand(-1, -1, slots, 1)
+        )[..., 0]
         arrival, parent = reached.min(1)
         parents.append(parent)
-        on_ego = after[:, :, slots].gather(-1, arrival[..., None])[..., 0].masked_fill(~near, never)
+        on_ego = (
+            after[:, :, slots]
+            .gather(-1, arrival[..., None])[..., 0]
+            .masked_fill(~near, never)
+        )
         when, slot = on_ego.min(-1)
         new = (found == 0) & (when < never)
         found = torch.where(new, link, found)
@@ -170,8 +244,11 @@ def _shortest_chain(
     return found, last, parents
 
 
-def _link_chains(after: Tensor, near: Tensor, far: Tensor, max_links: int) -> tuple[Tensor, Tensor]:
-    """Targets [B, M] of slots (M: the ego, -1: none); far slots [B, M] with a chain of up to `max_links` links."""
+def _link_chains(
+    after: Tensor, near: Tensor, far: Tensor, max_links: int
+) -> tuple[Tensor, Tensor]:
+    """Targets [B, M] of slots (M: the ego, -1: none); far slots [B, M] with a chain of
+    up to `max_links` links."""
     target = torch.where(near, near.shape[1], -1)
     viable = torch.zeros_like(far)
     initiators, there = compact(far)
@@ -179,14 +256,24 @@ def _link_chains(after: Tensor, near: Tensor, far: Tensor, max_links: int) -> tu
         start = initiators[:, k]
         taken = target.gather(1, start[:, None])[:, 0] >= 0
         blocked = (target >= 0) & ~near
-        found, current, parents = _shortest_chain(after, start, near=near, blocked=blocked, links=max_links)
+        found, current, parents = _shortest_chain(
+            after, start, near=near, blocked=blocked, links=max_links
+        )
         found = torch.where(there[:, k] & ~taken, found, 0)
         linked = (there[:, k] & (taken | (found > 0)))[:, None]
-        viable = viable.scatter(1, start[:, None], linked | viable.gather(1, start[:, None]))
+        viable = viable.scatter(
+            1, start[:, None], linked | viable.gather(1, start[:, None])
+        )
         for link in range(len(parents), 0, -1):
             active = found >= link
             before = parents[link - 1].gather(1, current[:, None])
-            target = target.scatter(1, before, torch.where(active[:, None], current[:, None], target.gather(1, before)))
+            target = target.scatter(
+                1,
+                before,
+                torch.where(
+                    active[:, None], current[:, None], target.gather(1, before)
+                ),
+            )
             current = torch.where(active, before[:, 0], current)
     return target, viable
 
@@ -203,9 +290,10 @@ def build_skeleton(
 ) -> Skeleton:
     """Algorithm 2 for scenes [B]: support [B, V] = S, feasible [B, V] = F.
 
-    expected [B, V, K, 4]: states of everybody every STEP s from now; cost [B, V]: of meeting the ego, inf for
-    vehicles that cannot; limits: the most near and far agents [B], by default the settings'. The near agents are those
-    of S with the least cost; where S has none, those of F; where F has none either, nobody, or with `pursuit` the
+    expected [B, V, K, 4]: states of everybody every STEP s from now; cost [B, V]: of
+    meeting the ego, inf for vehicles that cannot; limits: the most near and far agents
+    [B], by default the settings'. The near agents are those of S with the least cost;
+    where S has none, those of F; where F has none either, nobody, or with `pursuit` the
     nearest of S, or of F where S is empty.
     """
     most_near, most_far = (settings.near, settings.far) if limits is None else limits
@@ -214,35 +302,61 @@ def build_skeleton(
     expected = expected[:, :, : round(settings.horizon / STEP)].detach()
     distance = (states[..., :2] - states[:, :1, :2]).norm(dim=-1)
     ego = torch.arange(vehicles, device=states.device) == 0
-    support, feasible = (mask & world.valid[:, :vehicles] & ~ego for mask in (support, feasible))
+    support, feasible = (
+        mask & world.valid[:, :vehicles] & ~ego for mask in (support, feasible)
+    )
     first, second = (mask & cost.isfinite() for mask in (support, feasible))
-    near = smallest(torch.where(first.any(1, keepdim=True), first, second), cost, count=most_near)
+    near = smallest(
+        torch.where(first.any(1, keepdim=True), first, second), cost, count=most_near
+    )
     if settings.pursuit:
-        nearest = smallest(torch.where(support.any(1, keepdim=True), support, feasible), distance, count=most_near)
+        nearest = smallest(
+            torch.where(support.any(1, keepdim=True), support, feasible),
+            distance,
+            count=most_near,
+        )
         near = torch.where(near.any(1, keepdim=True), near, nearest)
     index, present = compact(support | near)
     distant = support & ~near & (distance > settings.tau_dist) & (distance <= MAX_DIST)
     distant = present & take(distant, index)
-    distant &= ~_on_ego_lanes(torch.cat([states[:, :1], take(states, index)], 1), distant, scene=scene)
+    distant &= ~_on_ego_lanes(
+        torch.cat([states[:, :1], take(states, index)], 1), distant, scene=scene
+    )
     far = smallest(distant, -take(distance, index), count=most_far)
     linked = present & far.any(1, keepdim=True)  # no far agent, no chain to look for
-    after = first_after(influence(scene, world, slots=(index, linked), expected=expected, settings=settings))
-    slot_target, viable = _link_chains(after, present & take(near, index), far=far, max_links=settings.max_chain - 1)
-    vehicle = torch.cat([index, torch.zeros_like(index[:, :1])], 1)  # of each slot; the last is the ego
+    after = first_after(
+        influence(
+            scene, world, slots=(index, linked), expected=expected, settings=settings
+        )
+    )
+    slot_target, viable = _link_chains(
+        after, present & take(near, index), far=far, max_links=settings.max_chain - 1
+    )
+    vehicle = torch.cat(
+        [index, torch.zeros_like(index[:, :1])], 1
+    )  # of each slot; the last is the ego
     target = torch.full_like(support, -1, dtype=torch.int64)
-    target = put(target, index, mask=slot_target >= 0, rows=vehicle.gather(1, slot_target.clamp(min=0)))
+    target = put(
+        target,
+        index,
+        mask=slot_target >= 0,
+        rows=vehicle.gather(1, slot_target.clamp(min=0)),
+    )
     far = put(torch.zeros_like(support), index, mask=present, rows=viable)
     return Skeleton(target >= 0, target, depth=chain_depth(target), near=near, far=far)
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What a choice of coalitions in B scenes rested on, for whoever listens (`Traffic.on_decision`).
+    """What a choice of coalitions in B scenes rested on, for whoever listens
+    (`Traffic.on_decision`).
 
-    seed [B]: of the scene's noise, which names the rollout; step [B]: of the choice; reference [B, T', V, 4]: states of
-    the reference rollout at the steps looked at, moments [B, T'] s after the choice; weights [B, T', V, V]: pair risks
-    there, eq. (ttc_weight_t); candidates, feasible [B, V] bool: S_top and F; coalition, target [B, V]: C* and whom each
-    of it acts on (0 the ego, -1: in no coalition); settings: of the risk graphs.
+    seed [B]: of the scene's noise, which names the rollout; step [B]: of the choice;
+    reference [B, T', V, 4]: states of the reference rollout at the steps looked at,
+    moments [B, T'] s after the choice; weights [B, T', V, V]: pair risks there, eq.
+    (ttc_weight_t); candidates, feasible [B, V] bool: S_top and F; coalition, target [B,
+    V]: C* and whom each of it acts on (0 the ego, -1: in no coalition); settings: of
+    the risk graphs.
     """
 
     seed: Tensor

@@ -1,8 +1,10 @@
-"""Topological bifurcation (Sec. IV-A1): the vehicles that a reference rollout couples with the ego.
+"""Topological bifurcation (Sec. IV-A1): the vehicles that a reference rollout couples
+with the ego.
 
-Pairs are weighted by their time to collision (eq. ttc_weight), the maximal cliques of each step's risk graph are ranked
-by mean weight, and members of the top cliques score over time (eq. temporal_scoring). Only maximal cliques compete:
-the best pair of a clique never weighs less than the whole, so ranking all cliques would leave pairs only.
+Pairs are weighted by their time to collision (eq. ttc_weight), the maximal cliques of
+each step's risk graph are ranked by mean weight, and members of the top cliques score
+over time (eq. temporal_scoring). Only maximal cliques compete: the best pair of a
+clique never weighs less than the whole, so ranking all cliques would leave pairs only.
 """
 
 from dataclasses import dataclass
@@ -39,9 +41,10 @@ class TopologySettings:
 
 @dataclass(frozen=True)
 class TopologyResult:
-    """score [B, V]: f_i of eq. (temporal_scoring), the ego's own included; candidates [B, V] bool: S_top, never the
-    ego; weights [B, T', V, V]: pair risks at the steps [T'] int64 analysed; cliques[b][t']: the top cliques of a step,
-    each a tuple of vehicle indices.
+    """score [B, V]: f_i of eq. (temporal_scoring), the ego's own included; candidates
+    [B, V] bool: S_top, never the ego; weights [B, T', V, V]: pair risks at the steps
+    [T'] int64 analysed; cliques[b][t']: the top cliques of a step, each a tuple of
+    vehicle indices.
     """
 
     score: Tensor
@@ -51,26 +54,38 @@ class TopologyResult:
     cliques: list[list[list[tuple[int, ...]]]]
 
 
-def _overlap_interval(offset: Tensor, closing: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
+def _overlap_interval(
+    offset: Tensor, closing: Tensor, extent: Tensor
+) -> tuple[Tensor, Tensor]:
     """Times during which |offset + closing t| <= extent; (inf, -inf) for never."""
     still = closing.abs() < 1e-6  # then the projections overlap always or never
     inverse = 1 / torch.where(still, 1.0, closing)
     middle = -offset * inverse
     half = extent * inverse.abs()
-    half = torch.where(still, torch.where(offset.abs() <= extent, torch.inf, -torch.inf), half)
+    half = torch.where(
+        still, torch.where(offset.abs() <= extent, torch.inf, -torch.inf), half
+    )
     return middle - half, middle + half
 
 
-def time_to_collision(states: Tensor, size: Tensor, horizon: float = RISK_SECONDS) -> Tensor:
-    """Time [s] to the first contact of oriented boxes at constant velocity and heading: states [..., N, 4], size
-    [..., N, 2] -> [..., N, N].
+def time_to_collision(
+    states: Tensor, size: Tensor, horizon: float = RISK_SECONDS
+) -> Tensor:
+    """Time [s] to the first contact of oriented boxes at constant velocity and heading:
+    states [..., N, 4], size [..., N, 2] -> [..., N, N].
 
-    Separating axis theorem in closed form: the boxes touch while their projections on all four face normals overlap. 0
-    where they overlap now (and for i = j), inf without contact within `horizon` s. Exactly symmetric.
+    Separating axis theorem in closed form: the boxes touch while their projections on
+    all four face normals overlap. 0 where they overlap now (and for i = j), inf without
+    contact within `horizon` s. Exactly symmetric.
     """
     cos = states[..., 2].cos()
     sin = states[..., 2].sin()
-    moving = (states[..., 0], states[..., 1], cos * states[..., 3], sin * states[..., 3])
+    moving = (
+        states[..., 0],
+        states[..., 1],
+        cos * states[..., 3],
+        sin * states[..., 3],
+    )
     dx, dy, dvx, dvy = (value[..., None, :] - value[..., :, None] for value in moving)
     ci = cos[..., :, None]
     si = sin[..., :, None]
@@ -79,35 +94,64 @@ def time_to_collision(states: Tensor, size: Tensor, horizon: float = RISK_SECOND
     turn_cos = (ci * cj + si * sj).abs()
     turn_sin = (ci * sj - si * cj).abs()
     half = size / 2
-    (li, wi), (lj, wj) = half[..., :, None, :].unbind(-1), half[..., None, :, :].unbind(-1)
-    along = _overlap_interval(ci * dx + si * dy, ci * dvx + si * dvy, extent=li + turn_cos * lj + turn_sin * wj)
-    across = _overlap_interval(ci * dy - si * dx, ci * dvy - si * dvx, extent=wi + turn_sin * lj + turn_cos * wj)
-    begin, end = torch.maximum(along[0], across[0]), torch.minimum(along[1], across[1])  # on the normals of box i
+    (li, wi), (lj, wj) = (
+        half[..., :, None, :].unbind(-1),
+        half[..., None, :, :].unbind(-1),
+    )
+    along = _overlap_interval(
+        ci * dx + si * dy,
+        ci * dvx + si * dvy,
+        extent=li + turn_cos * lj + turn_sin * wj,
+    )
+    across = _overlap_interval(
+        ci * dy - si * dx,
+        ci * dvy - si * dvx,
+        extent=wi + turn_sin * lj + turn_cos * wj,
+    )
+    begin, end = (
+        torch.maximum(along[0], across[0]),
+        torch.minimum(along[1], across[1]),
+    )  # on the normals of box i
     begin = torch.maximum(begin, begin.transpose(-1, -2))
     end = torch.minimum(end, end.transpose(-1, -2))
     first = begin.clamp(min=0)
-    return torch.where((begin <= end) & (end >= 0) & (first <= horizon), first, torch.inf)
+    return torch.where(
+        (begin <= end) & (end >= 0) & (first <= horizon), first, torch.inf
+    )
 
 
-def pair_weights(states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings) -> Tensor:
-    """Risk weights [..., N, N] of eq. (ttc_weight_t), 0 on the diagonal: states [..., N, 4], valid [..., N] bool."""
+def pair_weights(
+    states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings
+) -> Tensor:
+    """Risk weights [..., N, N] of eq. (ttc_weight_t), 0 on the diagonal: states [...,
+    N, 4], valid [..., N] bool."""
     ttc = time_to_collision(states, size + settings.clearance)
     weight = torch.sigmoid((settings.tau_max - ttc) / settings.beta)
     both = valid[..., :, None] & valid[..., None, :]
-    return weight * (both & ~torch.eye(both.shape[-1], dtype=torch.bool, device=both.device))
+    return weight * (
+        both & ~torch.eye(both.shape[-1], dtype=torch.bool, device=both.device)
+    )
 
 
 @lru_cache(maxsize=8192)
 def maximal_cliques(adjacency: bytes, nodes: int) -> tuple[tuple[int, ...], ...]:
-    """Maximal cliques of size >= 2 of the graph whose nodes x nodes matrix of bytes is `adjacency` (rows in order)."""
-    edges = np.argwhere(np.triu(np.frombuffer(adjacency, np.uint8).reshape(nodes, nodes), 1))
-    return tuple(tuple(sorted(clique)) for clique in networkx.find_cliques(networkx.Graph(edges.tolist())))
+    """Maximal cliques of size >= 2 of the graph whose nodes x nodes matrix of bytes is
+    `adjacency` (rows in order)."""
+    edges = np.argwhere(
+        np.triu(np.frombuffer(adjacency, np.uint8).reshape(nodes, nodes), 1)
+    )
+    return tuple(
+        tuple(sorted(clique))
+        for clique in networkx.find_cliques(networkx.Graph(edges.tolist()))
+    )
 
 
 def cliques_in(adjacency: np.ndarray) -> list[tuple[int, ...]]:
     """Maximal cliques of size >= 2 of a graph [V, V] of bytes."""
     nodes = np.flatnonzero(adjacency.any(-1))
-    found = maximal_cliques(np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes))
+    found = maximal_cliques(
+        np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes)
+    )
     return [tuple(int(nodes[i]) for i in clique) for clique in found]
 
 
@@ -125,18 +169,29 @@ def _within_hops(adjacency: Tensor, hops: int) -> Tensor:
     return near
 
 
-def _trim(clique: tuple[int, ...], weight: np.ndarray, distance: np.ndarray, limit: int) -> tuple[int, ...]:
-    """The `limit` members of a clique with the largest total weight inside it; the ego always stays."""
+def _trim(
+    clique: tuple[int, ...], weight: np.ndarray, distance: np.ndarray, limit: int
+) -> tuple[int, ...]:
+    """The `limit` members of a clique with the largest total weight inside it; the ego
+    always stays."""
     if len(clique) <= limit:
         return clique
     total = {i: round(fsum(weight[i, j] for j in clique), 6) for i in clique}
-    return tuple(sorted(sorted(clique, key=lambda i: (i != 0, -total[i], distance[i], i))[:limit]))
+    return tuple(
+        sorted(
+            sorted(clique, key=lambda i: (i != 0, -total[i], distance[i], i))[:limit]
+        )
+    )
 
 
-def _top_cliques(graph: tuple[np.ndarray, ...], settings: TopologySettings) -> list[tuple[int, ...]]:
-    """The cliques of largest mean weight in a graph that have a relevant node; ties by distance, then index.
+def _top_cliques(
+    graph: tuple[np.ndarray, ...], settings: TopologySettings
+) -> list[tuple[int, ...]]:
+    """The cliques of largest mean weight in a graph that have a relevant node; ties by
+    distance, then index.
 
-    graph: adjacency [V, V], relevant nodes [V] bool, weights [V, V], distance [V] of each vehicle to the ego in m.
+    graph: adjacency [V, V], relevant nodes [V] bool, weights [V, V], distance [V] of
+    each vehicle to the ego in m.
     """
     adjacency, relevant, weight, distance = graph
 
@@ -145,40 +200,66 @@ def _top_cliques(graph: tuple[np.ndarray, ...], settings: TopologySettings) -> l
         mean = weight_of(clique, weight) / (size * (size - 1) / 2)
         return -round(mean, 6), fsum(distance[i] for i in clique) / size, clique
 
-    trimmed = {_trim(clique, weight, distance=distance, limit=settings.max_clique) for clique in cliques_in(adjacency)}
-    return sorted((clique for clique in trimmed if relevant[list(clique)].any()), key=rank)[: settings.top_cliques]
+    trimmed = {
+        _trim(clique, weight, distance=distance, limit=settings.max_clique)
+        for clique in cliques_in(adjacency)
+    }
+    return sorted(
+        (clique for clique in trimmed if relevant[list(clique)].any()), key=rank
+    )[: settings.top_cliques]
 
 
-def topological_candidates(states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings) -> TopologyResult:
-    """Candidates S_top of a reference rollout (Sec. IV-A1, eqs. ttc_weight and temporal_scoring).
+def topological_candidates(
+    states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings
+) -> TopologyResult:
+    """Candidates S_top of a reference rollout (Sec. IV-A1, eqs. ttc_weight and
+    temporal_scoring).
 
-    states [B, T, V, 4], valid [B, T, V] bool, size [B, V, 2] m; row 0 is the ego, which is a node of the graphs but
-    never a candidate. Every STRIDE-th step is analysed and counts once.
+    states [B, T, V, 4], valid [B, T, V] bool, size [B, V, 2] m; row 0 is the ego, which
+    is a node of the graphs but never a candidate. Every STRIDE-th step is analysed and
+    counts once.
     """
     steps = torch.arange(0, states.shape[1], STRIDE, device=states.device)
     states = states[:, steps].detach()
     valid = valid[:, steps]
-    weights = pair_weights(states, valid, size=size[:, None].expand(*states.shape[:-1], 2), settings=settings)
+    weights = pair_weights(
+        states,
+        valid,
+        size=size[:, None].expand(*states.shape[:-1], 2),
+        settings=settings,
+    )
     distance = (states[..., :2] - states[..., :1, :2]).norm(dim=-1)
     distance = distance.masked_fill(~valid | ~valid[..., :1], torch.inf)
     nodes = smallest(valid, distance, count=NODES)
-    adjacency = (weights >= settings.edge_threshold) & nodes[..., :, None] & nodes[..., None, :]
-    # Only cliques with a member within HOPS of the ego count; all their members lie within one hop more.
+    adjacency = (
+        (weights >= settings.edge_threshold) & nodes[..., :, None] & nodes[..., None, :]
+    )
+    # Only cliques with a member within HOPS of the ego count; all their members lie
+    # within one hop more.
     relevant = _within_hops(adjacency, HOPS)
     nodes = _within_hops(adjacency, HOPS + 1)
     adjacency = adjacency & nodes[..., :, None] & nodes[..., None, :]
-    host = [x.cpu().numpy() for x in (adjacency.to(torch.uint8), relevant, weights, distance)]
+    host = [
+        x.cpu().numpy()
+        for x in (adjacency.to(torch.uint8), relevant, weights, distance)
+    ]
     score = torch.zeros(states.shape[0], states.shape[2])
     cliques = [
-        [_top_cliques(graph, settings) for graph in zip(*scene, strict=True)] for scene in zip(*host, strict=True)
+        [_top_cliques(graph, settings) for graph in zip(*scene, strict=True)]
+        for scene in zip(*host, strict=True)
     ]
     for row, scene in zip(score, cliques, strict=True):
         for clique in (clique for step in scene for clique in step):
             row[list(clique)] += 1
     score = score.to(states.device)
-    # The vehicles of largest positive score; ties by least distance to the ego, then by index.
+    # The vehicles of largest positive score; ties by least distance to the ego, then by
+    # index.
     scored = valid[:, 0] & (score > 0)
     scored[:, 0] = False
     tie = distance.amin(1).argsort(dim=-1, stable=True).argsort(-1)
-    candidates = smallest(scored, tie - score * score.shape[1], count=settings.candidates)
-    return TopologyResult(score, candidates, weights=weights, steps=steps, cliques=cliques)
+    candidates = smallest(
+        scored, tie - score * score.shape[1], count=settings.candidates
+    )
+    return TopologyResult(
+        score, candidates, weights=weights, steps=steps, cliques=cliques
+    )

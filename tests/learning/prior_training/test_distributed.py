@@ -1,4 +1,5 @@
-"""Several processes train one prior: equal weights everywhere, the whole batch's update, exact resume, and the command.
+"""Several processes train one prior: equal weights everywhere, the whole batch's
+update, exact resume, and the command.
 
 Two processes over gloo run `_work` once; the tests look at what they left behind.
 """
@@ -26,22 +27,37 @@ SETTINGS = TrainingSettings(steps=6, batch=4, bf16=False)
 
 
 def training(windows, processes, seed=0):
-    return PriorTraining(small_prior(seed).requires_grad_(True), windows, test=windows, settings=SETTINGS, processes=processes)
+    return PriorTraining(
+        small_prior(seed).requires_grad_(True),
+        windows,
+        test=windows,
+        settings=SETTINGS,
+        processes=processes,
+    )
 
 
 def prearranged(windows, part=slice(None)):
     """Whole batches with their random numbers, or a part of each."""
     batches = [windows[k : k + 4] for k in (0, 3, 1)]
-    drawn = [draw(batch, torch.Generator().manual_seed(k)) for k, batch in enumerate(batches)]
-    return [(batch[part], numbers[part]) for batch, numbers in zip(batches, drawn, strict=True)]
+    drawn = [
+        draw(batch, torch.Generator().manual_seed(k)) for k, batch in enumerate(batches)
+    ]
+    return [
+        (batch[part], numbers[part])
+        for batch, numbers in zip(batches, drawn, strict=True)
+    ]
 
 
 def updates(run, windows, part=slice(None)):
-    """The gradients after the first of three prearranged updates, and the weights after the last."""
+    """The gradients after the first of three prearranged updates, and the weights after
+    the last."""
     gradients = None
     for batch, numbers in prearranged(windows, part):
         run.update(batch, numbers)
-        gradients = gradients or {key: value.grad.clone() for key, value in run.prior.denoiser.named_parameters()}
+        gradients = gradients or {
+            key: value.grad.clone()
+            for key, value in run.prior.denoiser.named_parameters()
+        }
     return gradients, dict(run.prior.denoiser.state_dict())
 
 
@@ -59,14 +75,18 @@ def _work(rank, folder, port):
     windows = torch.load(folder / "windows.pt", weights_only=False)
     with process_group("cpu") as (processes, device):
         assert (processes.rank, processes.count, device) == (rank, 2, "cpu")
-        whole = training(windows, processes, seed=rank)  # other first weights: the leader's count
+        whole = training(
+            windows, processes, seed=rank
+        )  # other first weights: the leader's count
         half = whole.train(3), whole.state_dict()
         torch.save(half[1], folder / f"half{rank}.pt")
         whole.train(6)
         again = training(windows, processes)
         again.load_state_dict(torch.load(folder / f"half{rank}.pt", weights_only=True))
         again.train(6)
-        shared = updates(training(windows, processes), windows, part=slice(2 * rank, 2 * rank + 2))
+        shared = updates(
+            training(windows, processes), windows, part=slice(2 * rank, 2 * rank + 2)
+        )
         assert processes.mean(torch.tensor([float(rank)])) == 0.5
     torch.save(
         {
@@ -95,7 +115,9 @@ def ranks(windows, tmp_path_factory):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     spawn(_work, (folder, port), nprocs=2)
-    return [torch.load(folder / f"rank{rank}.pt", weights_only=False) for rank in (0, 1)]
+    return [
+        torch.load(folder / f"rank{rank}.pt", weights_only=False) for rank in (0, 1)
+    ]
 
 
 def same(one, two):
@@ -123,14 +145,26 @@ def test_halves_of_a_batch_make_the_update_of_the_whole(ranks, windows):
     gradients, weights = updates(training(windows, ALONE), windows)
     for rank in ranks:
         for key, value in gradients.items():
-            torch.testing.assert_close(rank["shared"][0][key], value, rtol=1e-4, atol=1e-6, msg=key)
+            torch.testing.assert_close(
+                rank["shared"][0][key], value, rtol=1e-4, atol=1e-6, msg=key
+            )
         for key, value in weights.items():
-            torch.testing.assert_close(rank["shared"][1][key], value, rtol=1e-3, atol=1e-5, msg=key)
+            torch.testing.assert_close(
+                rank["shared"][1][key], value, rtol=1e-3, atol=1e-5, msg=key
+            )
 
 
-def test_a_batch_that_cannot_be_shared_and_another_number_of_processes_are_refused(windows):
+def test_a_batch_that_cannot_be_shared_and_another_number_of_processes_are_refused(
+    windows,
+):
     with pytest.raises(InputError, match="batch=4: 3 processes"):
-        PriorTraining(small_prior(), windows, test=windows, settings=SETTINGS, processes=Processes(0, 3))
+        PriorTraining(
+            small_prior(),
+            windows,
+            test=windows,
+            settings=SETTINGS,
+            processes=Processes(0, 3),
+        )
     run = training(windows, ALONE)
     state = run.state_dict()
     with pytest.raises(InputError, match="begun by 2 processes"):
@@ -138,19 +172,44 @@ def test_a_batch_that_cannot_be_shared_and_another_number_of_processes_are_refus
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(torch.cuda.is_available(), reason="one process a GPU: tests the CPU's way")
+@pytest.mark.skipif(
+    torch.cuda.is_available(), reason="one process a GPU: tests the CPU's way"
+)
 def test_torchrun_trains_with_the_real_command(tmp_path):
     data = ["field_cells=64", "vehicles=4", "others=2", "steps=20"]
     stage = ["steps=2", "validate_every=1", "route_steps=5", "batch=4", "starts=[10]"]
-    small = ["num_scenes=4", "data.workers=1", "prior.sampler.steps=2", *(f"data.build.{each}" for each in data)]
+    small = [
+        "num_scenes=4",
+        "data.workers=1",
+        "prior.sampler.steps=2",
+        *(f"data.build.{each}" for each in data),
+    ]
     small += [*(f"stage.{each}" for each in stage), f"data.cache={tmp_path / 'cache'}"]
-    small += [*(f"prior.network.{each}" for each in ("width=16", "heads=2", "blocks=1"))]
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", ROOT / "train.py"]
+    small += [
+        *(f"prior.network.{each}" for each in ("width=16", "heads=2", "blocks=1"))
+    ]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc_per_node=2",
+        ROOT / "train.py",
+    ]
     command += ["stage=prior", f"hydra.run.dir={tmp_path / 'run'}", *small]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("checkpoint: ") == 1 and (tmp_path / "run" / "metrics.json").exists()
+    assert (
+        done.stdout.count("checkpoint: ") == 1
+        and (tmp_path / "run" / "metrics.json").exists()
+    )
     (checkpoint,) = (tmp_path / "run").glob("prior-*.safetensors")
     assert load_prior(str(checkpoint))[1]["processes"] == 2
-    losses = (tmp_path / "run/logs/scalars/train/prior_held_out_loss.csv").read_text().split()
+    losses = (
+        (tmp_path / "run/logs/scalars/train/prior_held_out_loss.csv")
+        .read_text()
+        .split()
+    )
     assert len(losses) == 2, "the leader alone writes"

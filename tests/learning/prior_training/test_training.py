@@ -1,4 +1,5 @@
-"""Training: exact resume, the averaged weights, held-out places, and the whole stage on a few scenes."""
+"""Training: exact resume, the averaged weights, held-out places, and the whole stage on
+a few scenes."""
 
 from dataclasses import replace
 
@@ -24,7 +25,9 @@ from e2rl.run.parts import Parts
 from tests.prior.small import curved_scenes
 from tests.synthetic import make_scenes
 
-SETTINGS = TrainingSettings(steps=20, batch=4, route_steps=5, learning_rate=3e-3, validate_every=10, bf16=False)
+SETTINGS = TrainingSettings(
+    steps=20, batch=4, route_steps=5, learning_rate=3e-3, validate_every=10, bf16=False
+)
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +52,14 @@ def test_training_lowers_the_loss(windows):
     assert held_out_loss(run.prior, windows, batch=8) < 0.8 * before
 
 
-def test_the_average_is_exponential_with_a_decay_that_grows_to_ema(windows, monkeypatch):
+def test_the_average_is_exponential_with_a_decay_that_grows_to_ema(
+    windows, monkeypatch
+):
     monkeypatch.setattr(training, "EMA", 0.2)
     run = of(windows)
-    expected = {key: value.clone() for key, value in run.prior.denoiser.state_dict().items()}
+    expected = {
+        key: value.clone() for key, value in run.prior.denoiser.state_dict().items()
+    }
     for decay in (2 / 11, 0.2, 0.2):
         run.train(run.done + 1)
         for key, value in run.prior.denoiser.state_dict().items():
@@ -66,21 +73,37 @@ def test_the_rate_warms_up_and_ends_at_zero(windows):
     rates = []
     for run.done in (0, 24, 49, 100, 200):
         rates.append(run.learning_rate())
-    cosine = [(1 + torch.tensor(step / 200 * torch.pi).cos().item()) / 2 for step in (0, 24, 49)]
-    assert rates == pytest.approx([cosine[0] / 50, cosine[1] / 2, cosine[2], 0.5, 0.0], abs=1e-6)
+    cosine = [
+        (1 + torch.tensor(step / 200 * torch.pi).cos().item()) / 2
+        for step in (0, 24, 49)
+    ]
+    assert rates == pytest.approx(
+        [cosine[0] / 50, cosine[1] / 2, cosine[2], 0.5, 0.0], abs=1e-6
+    )
 
 
-def test_half_of_the_windows_have_estimated_starts_where_so_many_are_asked_for(windows, monkeypatch):
+def test_half_of_the_windows_have_estimated_starts_where_so_many_are_asked_for(
+    windows, monkeypatch
+):
     monkeypatch.setattr(training, "CAUSAL", 0.25)
     run = of(windows, settings=replace(SETTINGS, batch=4000))
-    assert windows["causal"][run.pick()].float().mean().item() == pytest.approx(0.25, abs=0.03)
+    assert windows["causal"][run.pick()].float().mean().item() == pytest.approx(
+        0.25, abs=0.03
+    )
 
 
 def test_route_choice_learns_the_candidate_that_is_driven():
     scene = curved_scenes(2)
     scene["route_valid"][:, :6, 1] = True
-    scene["route_points"][:, :, 1] = scene["route_points"][:, :, 0] + torch.tensor([0.0, 3.5])
-    assert train_route_choice(untrained(), scene, settings=TrainingSettings(route_steps=60)) == 1.0
+    scene["route_points"][:, :, 1] = scene["route_points"][:, :, 0] + torch.tensor(
+        [0.0, 3.5]
+    )
+    assert (
+        train_route_choice(
+            untrained(), scene, settings=TrainingSettings(route_steps=60)
+        )
+        == 1.0
+    )
 
 
 def test_places_are_held_out_whole():
@@ -99,8 +122,11 @@ def four_places():
     return scenes
 
 
-def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_what_made_it(tmp_path, monkeypatch):
-    """Interrupted in its second validation: the state after the first one is on the disk."""
+def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_what_made_it(
+    tmp_path, monkeypatch
+):
+    """Interrupted in its second validation: the state after the first one is on the
+    disk."""
     calls = []
 
     def stopping(*given):
@@ -112,22 +138,42 @@ def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_w
     def trained(name, seed=0):
         folder = tmp_path / name
         how = {"logger": RunLogger("csv", folder), "parts": Parts(folder)}
-        return train_prior(untrained(seed), four_places(), settings=SETTINGS, folder=folder, origin={"command": "test"}, **how)
+        return train_prior(
+            untrained(seed),
+            four_places(),
+            settings=SETTINGS,
+            folder=folder,
+            origin={"command": "test"},
+            **how,
+        )
 
     one, origin = load_prior(str(trained("whole")))
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(training, "held_out_loss", stopping)
         trained("part")
     two, again = load_prior(str(trained("part", seed=3)))
-    assert all(torch.equal(a, b) for a, b in zip(one.state_dict().values(), two.state_dict().values(), strict=True))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(
+            one.state_dict().values(), two.state_dict().values(), strict=True
+        )
+    )
     assert origin["held_out_loss"] == again["held_out_loss"]
     losses = [
-        (tmp_path / name / "logs/scalars/train/prior_held_out_loss.csv").read_text().split()
+        (tmp_path / name / "logs/scalars/train/prior_held_out_loss.csv")
+        .read_text()
+        .split()
         for name in ("whole", "part")
     ]
     assert losses[0] == losses[1] and len(losses[0]) == 2
-    assert origin["held_out_loss"] == pytest.approx(min(float(line.split(",")[1]) for line in losses[0]))
-    assert origin["windows"] > 0 and origin["command"] == "test" and origin["versions"]["torch"] == torch.__version__
+    assert origin["held_out_loss"] == pytest.approx(
+        min(float(line.split(",")[1]) for line in losses[0])
+    )
+    assert (
+        origin["windows"] > 0
+        and origin["command"] == "test"
+        and origin["versions"]["torch"] == torch.__version__
+    )
 
 
 def test_logs_without_a_moving_vehicle_are_named(tmp_path):

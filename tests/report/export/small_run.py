@@ -1,4 +1,5 @@
-"""A run's folder on two scenes of a fork with lights: in the first a car cuts in on the ego, which hits it."""
+"""A run's folder on two scenes of a fork with lights: in the first a car cuts in on the
+ego, which hits it."""
 
 import csv
 import json
@@ -16,7 +17,15 @@ from e2rl.scenes.source import load_scenes
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 from e2rl.sim.rollouts import Rollouts
 from tests.metrics.random_rollouts import sourced
-from tests.scenes.descriptions import FRAMES, data_config, description, numbered, straight, track, write_folder
+from tests.scenes.descriptions import (
+    FRAMES,
+    data_config,
+    description,
+    numbered,
+    straight,
+    track,
+    write_folder,
+)
 
 PHASES = ["LANE_STATE_STOP"] * 40 + ["LANE_STATE_GO"] * (FRAMES - 40)
 GAPS = ((12, 30), (33, 45), (50, 51))  # steps at which LATE is there
@@ -31,7 +40,9 @@ def turning() -> dict:
     """A truck of 9 m on a circle, so that its heading passes pi."""
     angle = 2.0 + 0.02 * np.arange(FRAMES)
     place = np.stack([60 + 40 * np.sin(angle), 40 - 40 * np.cos(angle)], 1)
-    return track(place, (angle + np.pi) % (2 * np.pi) - np.pi, speed=8.0, size=(9.0, 2.5))
+    return track(
+        place, (angle + np.pi) % (2 * np.pi) - np.pi, speed=8.0, size=(9.0, 2.5)
+    )
 
 
 def scenes() -> list[dict]:
@@ -44,8 +55,16 @@ def scenes() -> list[dict]:
         "rider": straight(30, -4, speed=4, kind="CYCLIST", size=(1.8, 0.7)),
         "box": straight(70, -7, speed=0, kind="TRAFFIC_CONE", size=(0.4, 0.4)),
     }
-    lights = {"on": light("on", PHASES), "left": light("left", ["LANE_STATE_GO"] * FRAMES)}
-    return numbered([description(tracks, map="a place") | {"dynamic_map_states": lights} for _ in range(2)])
+    lights = {
+        "on": light("on", PHASES),
+        "left": light("left", ["LANE_STATE_GO"] * FRAMES),
+    }
+    return numbered(
+        [
+            description(tracks, map="a place") | {"dynamic_map_states": lights}
+            for _ in range(2)
+        ]
+    )
 
 
 def write_run(folder: Path) -> Path:
@@ -75,25 +94,47 @@ def write_run(folder: Path) -> Path:
         eta=torch.full((2,), 2.0, dtype=torch.float64),
     )
     simulated = torch.arange(valid.shape[-1])[None].expand(2, -1) < 3
-    rollouts = sourced(rollouts.replace(simulated=simulated, location=["a place"] * 2), "made", split="data", method="e2", ego="idm")
+    rollouts = sourced(
+        rollouts.replace(simulated=simulated, location=["a place"] * 2),
+        "made",
+        split="data",
+        method="e2",
+        ego="idm",
+    )
     return save_run(folder, data, rollouts=rollouts)
 
 
 def save_run(folder: Path, data: dict, rollouts: Rollouts) -> Path:
-    """Write the run of a command in `folder` that drove `rollouts` in scenes of `data`; return its folder."""
+    """Write the run of a command in `folder` that drove `rollouts` in scenes of `data`;
+    return its folder."""
     run = folder / "run"
     write_rows(run / TABLE, score_rollouts(rollouts)[0])
     rollouts.to_npz(run / ROLLOUTS)
     (run / ".hydra").mkdir()
     OmegaConf.save({"data": data}, run / ".hydra" / "config.yaml")
-    begun = {"command": "", "cwd": str(folder), "choices": {}, "inputs": {}, "settings": {}, "files": {}}
-    (run / "provenance.json").write_text(json.dumps(begun | {"versions": [{"git": ""}]}))
+    begun = {
+        "command": "",
+        "cwd": str(folder),
+        "choices": {},
+        "inputs": {},
+        "settings": {},
+        "files": {},
+    }
+    (run / "provenance.json").write_text(
+        json.dumps(begun | {"versions": [{"git": ""}]})
+    )
     return run
 
 
 def rollout_of(run: Path, scene: int) -> Rollout:
     """The rollout file of a scene."""
-    row = {"method": "e2", "ego_policy": "idm", "eta": 2.0, "scene_id": f"scene-{scene}", "seed": 0}
+    row = {
+        "method": "e2",
+        "ego_policy": "idm",
+        "eta": 2.0,
+        "scene_id": f"scene-{scene}",
+        "seed": 0,
+    }
     return Rollout.read(run / ROLLOUTS / rollout_name(row))
 
 
@@ -105,7 +146,8 @@ def row_of(rollout: Rollout, kind: int) -> int:
 
 
 def exported(run: Path, out: Path, *options: str) -> list[Path]:
-    """The files that `e2rl export` writes of all rollouts into a new folder, in their order."""
+    """The files that `e2rl export` writes of all rollouts into a new folder, in their
+    order."""
     main([str(run), "--all", "--out", str(out), "--to", *options])
     with (out / LIST).open(newline="") as file:
         return [out / line["file"] for line in csv.DictReader(file)]

@@ -1,4 +1,5 @@
-"""The command: which rollouts it takes, from which scenes; a folder is whole or not there."""
+"""The command: which rollouts it takes, from which scenes; a folder is whole or not
+there."""
 
 import csv
 import shutil
@@ -37,16 +38,25 @@ def test_npz_are_the_rollouts_and_their_scenes(run, tmp_path):
     for index, line in enumerate(lines(tmp_path / "all")):
         ours = rollout_of(run, index)
         theirs = Rollout.read(tmp_path / "all" / line["file"])
-        assert all(np.array_equal(value, getattr(theirs, name)) for name, value in vars(ours).items())
+        assert all(
+            np.array_equal(value, getattr(theirs, name))
+            for name, value in vars(ours).items()
+        )
         with np.load(tmp_path / "all" / "scenes" / f"scene-{index}.npz") as scene:
-            np.testing.assert_allclose(scene["origin"] + ours.states[0, 0, :2], [28, 0], atol=1e-3)
+            np.testing.assert_allclose(
+                scene["origin"] + ours.states[0, 0, :2], [28, 0], atol=1e-3
+            )
             np.testing.assert_allclose(scene["logged"], ours.logged)
 
 
 def test_of_a_run_with_a_damaged_rollout_nothing_is_left(copy, tmp_path, capsys):
-    path = sorted((copy / "rollouts").iterdir())[1]  # the second of two, when the first is written
+    path = sorted((copy / "rollouts").iterdir())[
+        1
+    ]  # the second of two, when the first is written
     path.write_bytes(path.read_bytes()[:100])
-    assert path.name in refused(capsys, copy, "--to", "scenarionet", "--all", "--out", tmp_path / "out")
+    assert path.name in refused(
+        capsys, copy, "--to", "scenarionet", "--all", "--out", tmp_path / "out"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -67,18 +77,31 @@ def test_scenes_that_are_not_those_of_the_run_are_refused(copy, tmp_path, capsys
     assert "pass --no-scene" in refused(capsys, *arguments)
     main([str(argument) for argument in (*arguments, "--no-scene")])
     (line,) = lines(tmp_path / "out")
-    assert line["scene_id"] == "scene-0" and line["partner"] == line["adversaries"] == str(CUT_IN)
-    assert line["cfr"] == "1" and line["duty"] and line["contact_step"] and not (tmp_path / "out" / "scenes").exists()
+    assert line["scene_id"] == "scene-0" and line["partner"] == line[
+        "adversaries"
+    ] == str(CUT_IN)
+    assert (
+        line["cfr"] == "1"
+        and line["duty"]
+        and line["contact_step"]
+        and not (tmp_path / "out" / "scenes").exists()
+    )
 
 
-def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(copy, tmp_path, capsys, monkeypatch):
+def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(
+    copy, tmp_path, capsys, monkeypatch
+):
     (tmp_path / "theirs.py").write_text(
         "from dataclasses import dataclass\nfrom e2rl.scenes.scenarionet import ScenarioNetSource\n"
         f"open({str(tmp_path / 'ran')!r}, 'w').close()\n@dataclass\nclass Theirs(ScenarioNetSource):\n    pass\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     edit(copy, _target_="theirs.Theirs")
-    assert "runs code that is no extension" in refused(capsys, copy, "--to", "npz", "--out", tmp_path / "out")
+    assert "runs code that is no extension" in refused(
+        capsys, copy, "--to", "npz", "--out", tmp_path / "out"
+    )
     assert not (tmp_path / "ran").exists()
-    main([str(copy), "--to", "npz", "--out", str(tmp_path / "out"), "--plugin", "theirs"])
+    main(
+        [str(copy), "--to", "npz", "--out", str(tmp_path / "out"), "--plugin", "theirs"]
+    )
     assert (tmp_path / "ran").exists() and len(lines(tmp_path / "out")) == 1

@@ -6,7 +6,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
+pytest.importorskip(
+    "scenariogeneration", reason="--to openscenario needs the extra openscenario"
+)
 from e2rl.report.export import opendrive  # noqa: E402
 from e2rl.report.export.opendrive import FIT, add_lane_speeds  # noqa: E402
 from e2rl.report.export.road_plan import road_plan  # noqa: E402
@@ -18,17 +20,26 @@ from tests.report.export.small_run import exported  # noqa: E402
 @pytest.fixture(scope="module")
 def roads(run, tmp_path_factory):
     """(root of the OpenDRIVE file, its path) of the first rollout."""
-    path = exported(run, tmp_path_factory.mktemp("opendrive") / "out", "openscenario")[0].with_suffix(".xodr")
+    path = exported(run, tmp_path_factory.mktemp("opendrive") / "out", "openscenario")[
+        0
+    ].with_suffix(".xodr")
     return ElementTree.parse(path).getroot(), path
 
 
 def drawn(road) -> np.ndarray:
-    """Points [Q, 2] of a road's reference line: its clothoids and lines, integrated step by step."""
+    """Points [Q, 2] of a road's reference line: its clothoids and lines, integrated
+    step by step."""
     points = []
     for piece in road.iterfind("planView/geometry"):
-        x, y, heading, length = (float(piece.get(name)) for name in ("x", "y", "hdg", "length"))
+        x, y, heading, length = (
+            float(piece.get(name)) for name in ("x", "y", "hdg", "length")
+        )
         spiral = piece.find("spiral")
-        first, last = (0.0, 0.0) if spiral is None else (float(spiral.get(name)) for name in ("curvStart", "curvEnd"))
+        first, last = (
+            (0.0, 0.0)
+            if spiral is None
+            else (float(spiral.get(name)) for name in ("curvStart", "curvEnd"))
+        )
         s = (np.arange(2000) + 0.5) * length / 2000
         angle = heading + first * s + (last - first) / length * s**2 / 2
         steps = np.stack([np.cos(angle), np.sin(angle)], -1) * length / 2000
@@ -41,29 +52,63 @@ def drawn(road) -> np.ndarray:
 def test_reference_lines_are_the_centrelines(roads):
     root, _ = roads
     arc = np.linspace(-np.pi / 2, 0, 16)
-    left = np.concatenate([np.stack([100 + 20 * np.cos(arc), 20 + 20 * np.sin(arc)], 1), [[120.0, 320.0]]])
-    lanes = {"in": [[0, 0], [100, 0]], "on": [[100, 0], [400, 0]], "left": left, "near": [[0, 3.5], [100, 3.5]]}
+    left = np.concatenate(
+        [np.stack([100 + 20 * np.cos(arc), 20 + 20 * np.sin(arc)], 1), [[120.0, 320.0]]]
+    )
+    lanes = {
+        "in": [[0, 0], [100, 0]],
+        "on": [[100, 0], [400, 0]],
+        "left": left,
+        "near": [[0, 3.5], [100, 3.5]],
+    }
     names = [road.get("name") for road in root.iterfind("road")]
-    assert names == ["in", "on", "left", "near", "on", "left"]  # the last two connect `in` with the others
+    assert names == [
+        "in",
+        "on",
+        "left",
+        "near",
+        "on",
+        "left",
+    ]  # the last two connect `in` with the others
     for name, corners in lanes.items():
         points = resample(np.array(corners, float), 1.0) - [28, 0]
-        line = np.concatenate([drawn(road) for road in root.iterfind("road") if road.get("name") == name])
+        line = np.concatenate(
+            [drawn(road) for road in root.iterfind("road") if road.get("name") == name]
+        )
         beside = np.linalg.norm(points[:, None] - line[None], axis=-1).min(1)
         assert beside.max() < 1.5 * FIT
-        lengths = [float(road.get("length")) for road in root.iterfind("road") if road.get("name") == name]
+        lengths = [
+            float(road.get("length"))
+            for road in root.iterfind("road")
+            if road.get("name") == name
+        ]
         assert abs(sum(lengths) - len(points) + 1) < 1
-        whole = next(road for road in reversed(root.findall("road")) if road.get("name") == name)
-        assert abs(float(whole.find("planView/geometry").get("hdg")) - tangent_angle(points)[0]) < 0.05
+        whole = next(
+            road for road in reversed(root.findall("road")) if road.get("name") == name
+        )
+        assert (
+            abs(
+                float(whole.find("planView/geometry").get("hdg"))
+                - tangent_angle(points)[0]
+            )
+            < 0.05
+        )
 
 
 def test_a_road_has_its_lane_s_width_around_the_line_and_its_limit_twice(roads):
     for road in roads[0].iterfind("road"):
         lane = road.find("lanes/laneSection/right/lane")
         width = float(lane.find("width").get("a"))
-        assert width == pytest.approx(3.6, abs=1e-5) == 2 * float(road.find("lanes/laneOffset").get("a"))
+        assert (
+            width
+            == pytest.approx(3.6, abs=1e-5)
+            == 2 * float(road.find("lanes/laneOffset").get("a"))
+        )
         assert lane.find("speed").get("max") == road.find("type/speed").get("max")
         assert lane.find("speed").get("unit") == "m/s"
-    assert {float(road.find("type/speed").get("max")) for road in roads[0].iterfind("road")} == {20, 13.889}
+    assert {
+        float(road.find("type/speed").get("max")) for road in roads[0].iterfind("road")
+    } == {20, 13.889}
 
 
 def test_a_turn_in_two_pieces_changes_width_and_limit_where_the_second_begins():
@@ -71,21 +116,38 @@ def test_a_turn_in_two_pieces_changes_width_and_limit_where_the_second_begins():
     turn = np.stack([50 + 15 * np.sin(arc), 15 - 15 * np.cos(arc)], 1)
     second = turn[9:] + [0.05, 0.0]  # begins a little beside the end of the first
     lanes = {
-        "in": Lane(np.array([[0.0, 0.0], [50.0, 0.0]]), 3.5, speed_limit=10.0, exits=["t", "on"]),
+        "in": Lane(
+            np.array([[0.0, 0.0], [50.0, 0.0]]),
+            3.5,
+            speed_limit=10.0,
+            exits=["t", "on"],
+        ),
         "t": Lane(turn[:10], 3.0, speed_limit=5.0, exits=["u"]),
         "u": Lane(second, 3.2, speed_limit=0.0, exits=["up"]),
         "on": Lane(np.array([[50.0, 0.0], [90.0, 0.0]]), 3.5, speed_limit=10.0),
-        "side": Lane(np.array([[65.0, -20.0], [65.0, 15.0]]), 3.5, speed_limit=10.0, exits=["up"]),
+        "side": Lane(
+            np.array([[65.0, -20.0], [65.0, 15.0]]), 3.5, speed_limit=10.0, exits=["up"]
+        ),
         "up": Lane(np.array([[65.0, 15.0], [65.0, 90.0]]), 3.5, speed_limit=10.0),
     }
     plan = road_plan(lanes)
-    element = opendrive.road(lanes, plan, name="t", number={name: index for index, name in enumerate(plan.roads, 1)}).get_element()
+    element = opendrive.road(
+        lanes,
+        plan,
+        name="t",
+        number={name: index for index, name in enumerate(plan.roads, 1)},
+    ).get_element()
     add_lane_speeds(element)
     line = drawn(element)
-    beside = np.linalg.norm(np.concatenate([turn[:10], second])[:, None] - line[None], axis=-1).min(1)
+    beside = np.linalg.norm(
+        np.concatenate([turn[:10], second])[:, None] - line[None], axis=-1
+    ).min(1)
     assert element.get("name") == "t, u" and beside.max() < 0.1
     lane = element.find("lanes/laneSection/right/lane")
-    widths = [(float(each.get("sOffset")), float(each.get("a"))) for each in lane.iterfind("width")]
+    widths = [
+        (float(each.get("sOffset")), float(each.get("a")))
+        for each in lane.iterfind("width")
+    ]
     (_, first), (start, other) = widths
     assert (first, other) == (3.0, 3.2) and start == pytest.approx(15 * arc[9], abs=0.1)
     offsets = [float(each.get("a")) for each in element.iterfind("lanes/laneOffset")]
@@ -99,7 +161,14 @@ def test_the_file_follows_the_standard_s_schema(roads):
     import scenariogeneration
     from lxml import etree
 
-    schema = Path(scenariogeneration.__file__).parents[1] / "schemas" / "opendrive_17_core.xsd"
+    schema = (
+        Path(scenariogeneration.__file__).parents[1]
+        / "schemas"
+        / "opendrive_17_core.xsd"
+    )
     etree.XMLSchema(etree.parse(str(schema))).assertValid(etree.parse(str(roads[1])))
-    known = {item.get("code"): item.get("value") for item in roads[0].iterfind("header/userData")}
+    known = {
+        item.get("code"): item.get("value")
+        for item in roads[0].iterfind("header/userData")
+    }
     assert known == {"origin": "28 0"}

@@ -1,34 +1,53 @@
-"""OpenSCENARIO: scenariogeneration's parser gets back every state, and the standard's schema holds."""
+"""OpenSCENARIO: scenariogeneration's parser gets back every state, and the standard's
+schema holds."""
 
 import warnings
 
 import numpy as np
 import pytest
 
-pytest.importorskip("scenariogeneration", reason="--to openscenario needs the extra openscenario")
+pytest.importorskip(
+    "scenariogeneration", reason="--to openscenario needs the extra openscenario"
+)
 from scenariogeneration import xosc  # noqa: E402
 
 from e2rl.report.export.openscenario import EGO
 from e2rl.scenes.recording import CYCLIST, PEDESTRIAN
-from tests.report.export.small_run import GAPS, LATE, TRUCK, exported, rollout_of, row_of  # noqa: E402
+from tests.report.export.small_run import (
+    GAPS,
+    LATE,
+    TRUCK,
+    exported,
+    rollout_of,
+    row_of,
+)  # noqa: E402
 
 
 def parsed(paths):
     """The scenarios in files; an invalid one raises."""
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # ParseOpenScenario warns of what breaks the schema
+        warnings.simplefilter(
+            "error"
+        )  # ParseOpenScenario warns of what breaks the schema
         return [xosc.ParseOpenScenario(str(path)) for path in paths]
 
 
 @pytest.fixture(scope="module")
 def scenarios(run, tmp_path_factory):
-    return parsed(exported(run, tmp_path_factory.mktemp("openscenario") / "out", "openscenario"))
+    return parsed(
+        exported(run, tmp_path_factory.mktemp("openscenario") / "out", "openscenario")
+    )
 
 
 def entities_of(scenario):
     """{row: entity object}"""
-    named = {item.name: item.entityobject for item in scenario.entities.scenario_objects}
-    return {0 if name == EGO else int(name.removeprefix("agent_")): found for name, found in named.items()}
+    named = {
+        item.name: item.entityobject for item in scenario.entities.scenario_objects
+    }
+    return {
+        0 if name == EGO else int(name.removeprefix("agent_")): found
+        for name, found in named.items()
+    }
 
 
 def events_of(scenario):
@@ -54,24 +73,44 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
                 if not isinstance(action, xosc.FollowTrajectoryAction):
                     continue
                 shape = action.trajectory.shapes
-                assert shape.time[0] == pytest.approx(start) and action.timeref.scale == 1
+                assert (
+                    shape.time[0] == pytest.approx(start) and action.timeref.scale == 1
+                )
                 for time, place in zip(shape.time, shape.positions, strict=True):
                     step = round(time / 0.1)
-                    middle = [place.x + ahead * np.cos(place.h), place.y + ahead * np.sin(place.h)]
+                    middle = [
+                        place.x + ahead * np.cos(place.h),
+                        place.y + ahead * np.sin(place.h),
+                    ]
                     x, y, heading, _ = rollout.states[step, row]
                     turned = (heading - place.h + np.pi) % (2 * np.pi) - np.pi
-                    assert abs(step * 0.1 - time) < 1e-6 and np.hypot(*(np.array(middle) - [x, y])) < 0.01
+                    assert (
+                        abs(step * 0.1 - time) < 1e-6
+                        and np.hypot(*(np.array(middle) - [x, y])) < 0.01
+                    )
                     assert abs(turned) < 1e-3
                     seen[step, row] = True
-                assert np.abs(np.diff([place.h for place in shape.positions])).max() < 0.5  # headings do not jump
+                assert (
+                    np.abs(np.diff([place.h for place in shape.positions])).max() < 0.5
+                )  # headings do not jump
         seen[GAPS[2][0], LATE] = True  # a single step has no polyline
         assert (seen == rollout.valid).all()
 
 
 def test_who_appears_late_is_added_then_and_deleted_when_gone(scenarios):
-    found = [(type(a), row, start) for row, start, actions in events_of(scenarios[0]) for a in actions]
-    for kind, steps in zip((xosc.AddEntityAction, xosc.DeleteEntityAction), zip(*GAPS, strict=True), strict=True):
-        assert sorted(each[1:] for each in found if each[0] == kind) == [(LATE, step / 10) for step in steps]
+    found = [
+        (type(a), row, start)
+        for row, start, actions in events_of(scenarios[0])
+        for a in actions
+    ]
+    for kind, steps in zip(
+        (xosc.AddEntityAction, xosc.DeleteEntityAction),
+        zip(*GAPS, strict=True),
+        strict=True,
+    ):
+        assert sorted(each[1:] for each in found if each[0] == kind) == [
+            (LATE, step / 10) for step in steps
+        ]
 
 
 def test_boxes_types_and_reference_points(run, scenarios):
@@ -79,9 +118,16 @@ def test_boxes_types_and_reference_points(run, scenarios):
     found = entities_of(scenarios[0])
     for row, entity in found.items():
         sides = entity.boundingbox.boundingbox
-        assert [sides.length, sides.width] == pytest.approx(rollout.size[row].tolist(), abs=1e-5)
-    kinds = [found[row].vehicle_type.get_name() for row in (0, TRUCK, row_of(rollout, CYCLIST))]
+        assert [sides.length, sides.width] == pytest.approx(
+            rollout.size[row].tolist(), abs=1e-5
+        )
+    kinds = [
+        found[row].vehicle_type.get_name()
+        for row in (0, TRUCK, row_of(rollout, CYCLIST))
+    ]
     assert kinds == ["car", "truck", "bicycle"]
     assert isinstance(found[row_of(rollout, PEDESTRIAN)], xosc.Pedestrian)
     axles = found[0].axles
-    assert axles.rearaxle.xpos == 0 and axles.frontaxle.xpos == pytest.approx(2 * found[0].boundingbox.center.x)
+    assert axles.rearaxle.xpos == 0 and axles.frontaxle.xpos == pytest.approx(
+        2 * found[0].boundingbox.center.x
+    )

@@ -31,14 +31,20 @@ ADVERSARIES = [name for name in SMALL if name != "ctg"]
 def baseline(name: str, steps: int = 4, **settings) -> Baseline:
     """A baseline of SMALL with the settings of its file but for those given."""
     kind, few = SMALL[name]
-    return kind(small_prior(0, sampler=SamplerSettings(steps=steps)), **(few | settings))
+    return kind(
+        small_prior(0, sampler=SamplerSettings(steps=steps)), **(few | settings)
+    )
 
 
 def first_replan(on: Baseline, scene, eta: float = 2.0):
-    """The arguments of `attack` at the first replan of scenes [B] (a Replan and its Context), and their View."""
+    """The arguments of `attack` at the first replan of scenes [B] (a Replan and its
+    Context), and their View."""
     world = World.at_start(scene)
     state = begin(on, scene, eta=eta)
     ego_plan = EGO.plan(world)
     state = replace(state, lane=on.lane_now(state, world, ego_plan))
     context = on.encode(state, world, ego_plan)
-    return (Replan(state, world, ego_plan=ego_plan, noise=on.noise(state)), context), View.of(world, context, ego_plan=ego_plan)
+    return (
+        Replan(state, world, ego_plan=ego_plan, noise=on.noise(state)),
+        context,
+    ), View.of(world, context, ego_plan=ego_plan)

@@ -1,4 +1,5 @@
-"""Every baseline: the prior where it has no gain, the same alone and in a batch, on its authors' terms and on ours."""
+"""Every baseline: the prior where it has no gain, the same alone and in a batch, on its
+authors' terms and on ours."""
 
 import pytest
 import torch
@@ -17,12 +18,16 @@ def test_without_gain_it_is_the_prior_bit_for_bit(name, knowledge):
     scene = scenes(2).scenes
     _, plan = replanned(on, scene, eta=2.0, times=3)
     _, nominal = replanned(NominalTraffic(on.prior, knowledge), scene, times=3)
-    assert torch.equal(plan.states, nominal.states) and torch.equal(plan.present, nominal.present)
+    assert torch.equal(plan.states, nominal.states) and torch.equal(
+        plan.present, nominal.present
+    )
     assert not plan.adversary.any() and (plan.path_kl == 0).all()
 
 
 @pytest.mark.parametrize("name", ADVERSARIES)
-def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_one(name):
+def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_one(
+    name,
+):
     on = baseline(name)
     scene = scenes(2).scenes
     world = World.at_start(scene)
@@ -52,7 +57,9 @@ def test_it_attacks_on_the_authors_terms_and_on_ours(name):
         _, plan = replanned(baseline(name, **terms), scene, eta=2.0)
         _, nominal = replanned(baseline(name, **terms), scene, eta=0.0)
         assert plan.adversary.any() and not plan.adversary[:, 0].any()
-        assert not torch.equal(plan.states[plan.adversary], nominal.states[plan.adversary])
+        assert not torch.equal(
+            plan.states[plan.adversary], nominal.states[plan.adversary]
+        )
         assert plan.states.isfinite().all()
 
 
@@ -61,7 +68,10 @@ def test_who_predicts_the_ego_does_not_look_at_its_plan(name):
     on = baseline(name, knowledge="predicted")
     scene = scenes(2).scenes
     world = World.at_start(scene)
-    plans = [on.replan(begin(on, scene, eta=2.0), world, EGO.plan(world) + shift)[1].states for shift in (0.0, 50.0)]
+    plans = [
+        on.replan(begin(on, scene, eta=2.0), world, EGO.plan(world) + shift)[1].states
+        for shift in (0.0, 50.0)
+    ]
     assert torch.equal(*plans)
 
 
@@ -93,5 +103,7 @@ def test_who_is_left_alone_replays_and_the_prior_sees_where_they_are(name):
         assert torch.equal(traffic.present[~driven], logged.present[~driven])
         world = executed(world, traffic, ego_plan=plan)
         here = scene["valid"][:, :8] & ~driven
-        torch.testing.assert_close(state.lane.states()[here][:, :3], logged.states[here][:, 4, :3])
+        torch.testing.assert_close(
+            state.lane.states()[here][:, :3], logged.states[here][:, 4, :3]
+        )
     assert traffic.adversary.any() and not (traffic.adversary & ~driven).any()

@@ -24,11 +24,17 @@ def driving(x, speed):
 
 
 def test_overlap_is_worth_more_the_sooner_and_the_more_often_it_comes():
-    ways = torch.stack([driving(0.0, 10.0), driving(0.0, 5.0)])[:, None]  # two ways of the ego
-    futures = torch.stack([standing(x) for x in (500.0, 40.0, 20.0)])[:, None, None].repeat(1, 1, 2, 1, 1)
+    ways = torch.stack([driving(0.0, 10.0), driving(0.0, 5.0)])[
+        :, None
+    ]  # two ways of the ego
+    futures = torch.stack([standing(x) for x in (500.0, 40.0, 20.0)])[
+        :, None, None
+    ].repeat(1, 1, 2, 1, 1)
     value = overlap_value(futures, ways, size=SIZE)[:, 0, 1]
     assert value[0] == 0
-    assert value[1].item() == pytest.approx(DECAY**38 / 2)  # the faster way alone gets there: beyond 36 m after 3.6 s
+    assert value[1].item() == pytest.approx(
+        DECAY**38 / 2
+    )  # the faster way alone gets there: beyond 36 m after 3.6 s
     assert value[2].item() == pytest.approx((DECAY**18 + DECAY**34) / 2)
 
 
@@ -36,11 +42,17 @@ def test_the_vehicle_and_the_future_of_greatest_value_are_driven(monkeypatch):
     on = baseline("cat", tracks=1, gain=2.0)  # four candidates at eta = 2
     (now, context), _ = first_replan(on, scenes(2).scenes)
     values = torch.zeros(8, 2, 8)
-    values[2, 0, 3], values[1, 0, 1], values[6, 0, 2] = 0.5, 0.4, 0.9  # the seventh is not tried
+    values[2, 0, 3], values[1, 0, 1], values[6, 0, 2] = (
+        0.5,
+        0.4,
+        0.9,
+    )  # the seventh is not tried
     values[1, 1, 5] = 0.9  # a parked vehicle
     monkeypatch.setattr(cat, "overlap_value", lambda *_: values)
     state, x0 = on.attack(now, context)
-    assert state.adversary.nonzero().tolist() == [[0, 3]] and torch.equal(state.held, state.adversary)
+    assert state.adversary.nonzero().tolist() == [[0, 3]] and torch.equal(
+        state.held, state.adversary
+    )
     nominal = on.prior.sample(context, now.noise[..., 0, :].contiguous()).x0
     same = (x0 == nominal).all(-1)
     assert not same[0, 3] and same[1].all() and same[0].sum() == 7

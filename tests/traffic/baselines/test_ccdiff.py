@@ -21,10 +21,18 @@ def pair(*states):
 
 
 def test_risk_is_the_time_until_the_gap_closes_on_both_axes():
-    closing = pair([0.0, 0.0, 0.0, 10.0], [24.0, 0.0, 0.0, 0.0])  # 20 m of gap at 10 m/s, side by side on y
-    assert closing[0, 1].item() == pytest.approx((20 - 2) / 20) and torch.equal(closing, closing.T)
-    assert pair([0.0, 0.0, 0.0, 0.0], [24.0, 0.0, 0.0, 10.0])[0, 1] == 0  # it drives away
-    assert pair([0.0, 0.0, 0.0, 10.0], [24.0, 5.0, 0.0, 0.0])[0, 1] == 0  # a lane that is never left
+    closing = pair(
+        [0.0, 0.0, 0.0, 10.0], [24.0, 0.0, 0.0, 0.0]
+    )  # 20 m of gap at 10 m/s, side by side on y
+    assert closing[0, 1].item() == pytest.approx((20 - 2) / 20) and torch.equal(
+        closing, closing.T
+    )
+    assert (
+        pair([0.0, 0.0, 0.0, 0.0], [24.0, 0.0, 0.0, 10.0])[0, 1] == 0
+    )  # it drives away
+    assert (
+        pair([0.0, 0.0, 0.0, 10.0], [24.0, 5.0, 0.0, 0.0])[0, 1] == 0
+    )  # a lane that is never left
     follower = pair([0.0, 0.0, 0.0, 0.0], [-24.0, 0.0, 0.0, 10.0])
     assert follower[0, 1].item() == pytest.approx(0.9)  # from behind, too
     assert pair([0.0, 0.0, 0.0, 5.0], [3.0, 1.0, 0.0, 5.0])[0, 1] == 1
@@ -34,18 +42,34 @@ def test_the_past_ends_at_the_start():
     scene = scene_of([(0, 0, 0.0, 8.0), (20, 0, 0.7, 5.0)])
     states = recent_states(scene)
     assert states.shape[2] == 11
-    torch.testing.assert_close(states[:, :2, -1], scene["start"][:, :2], rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(
-        states[0, 1, 0, :2], torch.tensor([20.0, 0.0]) - 5.0 * torch.tensor([0.7648, 0.6442]), rtol=0, atol=1e-2
+        states[:, :2, -1], scene["start"][:, :2], rtol=1e-4, atol=1e-3
+    )
+    torch.testing.assert_close(
+        states[0, 1, 0, :2],
+        torch.tensor([20.0, 0.0]) - 5.0 * torch.tensor([0.7648, 0.6442]),
+        rtol=0,
+        atol=1e-2,
     )
 
 
 def test_those_in_cliques_come_first_and_chance_fills_up():
-    """The ego and two vehicles close in on each other; a fourth and a fifth are far and drive away."""
-    vehicles = [(0, 0, 0.0, 10.0), (30, 0, 0.0, 2.0), (60, 0, 3.14159, 8.0), (0, 300, 0.0, 10.0), (0, -300, 3.1, 10.0)]
+    """The ego and two vehicles close in on each other; a fourth and a fifth are far and
+    drive away."""
+    vehicles = [
+        (0, 0, 0.0, 10.0),
+        (30, 0, 0.0, 2.0),
+        (60, 0, 3.14159, 8.0),
+        (0, 300, 0.0, 10.0),
+        (0, -300, 3.1, 10.0),
+    ]
     scene = scene_of(vehicles)
     draw = torch.tensor([[0.0, 0.9, 0.8, 0.7, 0.1, 0.5, 0.5, 0.5]])
     assert ranked(scene, 2, draw=draw)[0].nonzero()[:, 0].tolist() == [1, 2]
-    assert ranked(scene, 3, draw=draw)[0].nonzero()[:, 0].tolist() == [1, 2, 4]  # the least draw
+    assert ranked(scene, 3, draw=draw)[0].nonzero()[:, 0].tolist() == [
+        1,
+        2,
+        4,
+    ]  # the least draw
     scene["parked"][:, 1] = True
     assert not ranked(scene, 8, draw=draw)[0, [0, 1, 5, 6, 7]].any()

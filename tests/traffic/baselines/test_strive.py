@@ -1,4 +1,5 @@
-"""STRIVE: a deterministic decoder, an objective that falls, an attacker that is never behind, a test for a solution."""
+"""STRIVE: a deterministic decoder, an objective that falls, an attacker that is never
+behind, a test for a solution."""
 
 from dataclasses import replace
 
@@ -17,9 +18,14 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, scenes
 def test_latents_are_decoded_as_by_ddim_without_noise():
     on = baseline("strive")
     (now, context), _ = first_replan(on, scenes(2).scenes)
-    prior = small_prior(0, sampler=SamplerSettings(sampler="ddim", spacing="level", steps=4, churn=0.0))
+    prior = small_prior(
+        0, sampler=SamplerSettings(sampler="ddim", spacing="level", steps=4, churn=0.0)
+    )
     expected = prior.sample(context, now.noise[..., 0, :]).x0
-    torch.testing.assert_close(decode_latent(on.prior, now.noise[0, ..., 0, :], context=context, steps=4), expected)
+    torch.testing.assert_close(
+        decode_latent(on.prior, now.noise[0, ..., 0, :], context=context, steps=4),
+        expected,
+    )
 
 
 def test_the_objective_falls_over_the_iterations():
@@ -29,7 +35,12 @@ def test_the_objective_falls_over_the_iterations():
     values = []
 
     def loss(latent):
-        motion = motion_of(on.prior, decode_latent(on.prior, latent, context=context, steps=on.steps), context=context, count=1)
+        motion = motion_of(
+            on.prior,
+            decode_latent(on.prior, latent, context=context, steps=on.steps),
+            context=context,
+            count=1,
+        )
         values.append(on.loss(motion, latent, first, now.state, view).detach())
         return on.loss(motion, latent, first, now.state, view)
 
@@ -54,11 +65,15 @@ def test_nobody_behind_the_ego_is_the_attacker():
     _, view = first_replan(on, scenes(1).scenes)
     states = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
     weight = softmin(states, view)[0].sum(-1)
-    assert weight[3] == 0 and weight.argmax() == 2  # 20 m behind; 10 m ahead in the next lane
+    assert (
+        weight[3] == 0 and weight.argmax() == 2
+    )  # 20 m behind; 10 m ahead in the next lane
     assert abs(weight.sum().item() - 1) < 1e-4
     alone = softmin(states, replace(view, active=view.active & False))
     assert (alone == 0).all()
-    torch.testing.assert_close(blend((1.0, 0.1), torch.tensor([0.0, 0.5, 1.0])), torch.tensor([1.0, 0.55, 0.1]))
+    torch.testing.assert_close(
+        blend((1.0, 0.1), torch.tensor([0.0, 0.5, 1.0])), torch.tensor([1.0, 0.55, 0.1])
+    )
 
 
 def test_an_ego_that_is_boxed_in_has_no_solution():
@@ -68,7 +83,9 @@ def test_an_ego_that_is_boxed_in_has_no_solution():
     far = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
     far[..., 1] += 100.0 * (torch.arange(far.shape[2]) > 0)[:, None]
     walled = far.clone()
-    walled[:, :, 1, :, :2] = torch.tensor([8.0, 0.0])  # stands a box's length ahead, at 10 m/s
+    walled[:, :, 1, :, :2] = torch.tensor(
+        [8.0, 0.0]
+    )  # stands a box's length ahead, at 10 m/s
     found = []
     for states in (far, walled):
         motion = motion_of(on.prior, torch.zeros_like(first), context=context, count=1)

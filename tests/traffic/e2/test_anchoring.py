@@ -8,7 +8,14 @@ from e2rl.traffic.e2 import anchoring
 from e2rl.traffic.e2.anchoring import AnchorSettings, propose
 from e2rl.traffic.e2.interception import InterceptionSettings
 from e2rl.traffic.e2.motion import constant_speed_states
-from tests.traffic.e2.crossing import add_route, decoded, make_world, mask, skeleton_of, wish_of
+from tests.traffic.e2.crossing import (
+    add_route,
+    decoded,
+    make_world,
+    mask,
+    skeleton_of,
+    wish_of,
+)
 
 UP = math.pi / 2
 EGO = (0.0, 0.0, 0.0, 10.0)
@@ -16,22 +23,41 @@ TIMES = DT * torch.arange(1, 51)
 LANES = InterceptionSettings(reach=0.0)
 
 
-def proposed(world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options):
+def proposed(
+    world, skeleton, plan, settings=None, interception=LANES, eta=2.0, **options
+):
     settings = settings or AnchorSettings()
     wish = wish_of(len(plan), eta)
-    return propose(world.scene, world, skeleton=skeleton, ego_plan=plan, settings=settings, interception=interception, wish=wish, **options)
+    return propose(
+        world.scene,
+        world,
+        skeleton=skeleton,
+        ego_plan=plan,
+        settings=settings,
+        interception=interception,
+        wish=wish,
+        **options,
+    )
 
 
 def anchored(world, *vehicles, near=2, **settings):
     support = mask(world, *vehicles)
     skeleton = skeleton_of(world, support, near=near)
     plan = constant_speed_states(world.scene, world, times=TIMES)[:, 0]
-    return proposed(world, skeleton, plan=plan, settings=AnchorSettings(**settings)), skeleton
+    return proposed(
+        world, skeleton, plan=plan, settings=AnchorSettings(**settings)
+    ), skeleton
 
 
 @pytest.mark.parametrize(
     "ahead, way, speed",
-    [(40.0, 30.0, 10.0), (40.0, 45.0, 10.0), (30.0, 20.0, 4.0), (20.0, 25.0, 12.0), (45.0, 16.0, 0.5)],
+    [
+        (40.0, 30.0, 10.0),
+        (40.0, 45.0, 10.0),
+        (30.0, 20.0, 4.0),
+        (20.0, 25.0, 12.0),
+        (45.0, 16.0, 0.5),
+    ],
 )
 def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     world = make_world([EGO, (ahead, -way, UP, speed)])
@@ -40,15 +66,21 @@ def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     gone = decoded(anchor.knots[0, 1], speed)[1]
     arrival = torch.searchsorted(gone, torch.tensor(way)).item() * DT
     assert arrival == pytest.approx(ahead / 10, abs=0.25)
-    assert anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max() and not anchor.off_lane.any()
+    assert (
+        anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max()
+        and not anchor.off_lane.any()
+    )
 
 
 @pytest.mark.parametrize(("late", "finite"), [(4.0, True), (9.0, True), (14.0, False)])
 def test_a_crossing_that_is_missed_costs_the_time_gap(late, finite):
-    """Without acceleration both keep 10 m/s: `late` m behind the crossing it misses by late / 10 s, 1 s at most."""
+    """Without acceleration both keep 10 m/s: `late` m behind the crossing it misses by
+    late / 10 s, 1 s at most."""
     world = make_world([EGO, (30.0, -30.0 - late, UP, 10.0)])
     still, _ = anchored(world, 1, min_accel=-0.05, max_accel=0.05)
-    assert still.cost[0, 1].item() == (pytest.approx(late / 10, abs=0.2) if finite else math.inf)
+    assert still.cost[0, 1].item() == (
+        pytest.approx(late / 10, abs=0.2) if finite else math.inf
+    )
     assert still.feasible[0, 1] == finite
 
 
@@ -63,18 +95,24 @@ def test_the_candidate_that_meets_the_target_is_chosen():
     world = make_world([EGO, (40.0, -30.0, UP, 8.0)])
     world.scene["route_points"][:, 1, 2] = world.scene["route_points"][:, 1, 0]
     world.scene["route_valid"][:, 1, 2] = True
-    add_route(world, 1, candidate=0, heading=0.0)  # the one it follows leads away from the ego's
+    add_route(
+        world, 1, candidate=0, heading=0.0
+    )  # the one it follows leads away from the ego's
     assert anchored(world, 1)[0].route[0, 1] == 2
 
 
-def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken(monkeypatch):
+def test_a_route_that_a_vehicle_would_swing_off_or_cannot_shift_to_is_not_taken(
+    monkeypatch,
+):
     world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
     add_route(world, 1, candidate=2, heading=UP)
     assert not anchored(world, 1)[0].feasible.any()
     monkeypatch.setattr(anchoring, "MAX_SWING", 100.0)
     assert anchored(world, 1)[0].route[0, 1] == 2
     beside = make_world([EGO, (30.0, -6.0, 0.0, 8.0)])
-    beside.scene["route_points"][:, 1, 2] = beside.scene["route_points"][:, 1, 0] + torch.tensor([0.0, 6.0])
+    beside.scene["route_points"][:, 1, 2] = beside.scene["route_points"][
+        :, 1, 0
+    ] + torch.tensor([0.0, 6.0])
     beside.scene["route_valid"][:, 1, 2] = True
     assert not anchored(beside, 1)[0].feasible.any()
     monkeypatch.setattr(anchoring, "MAX_SHIFT", 7.0)
@@ -96,7 +134,11 @@ def test_a_kept_route_is_the_only_one_looked_at():
 def test_who_cannot_meet_the_target_has_no_anchor_and_keeps_its_route():
     world = make_world([EGO, (40.0, 30.0, UP, 8.0), (10.0, -90.0, UP, 5.0)])
     anchor, skeleton = anchored(world, 1, 2)
-    assert skeleton.coalition[0, 1:3].all() and not anchor.feasible.any() and not anchor.knots.any()
+    assert (
+        skeleton.coalition[0, 1:3].all()
+        and not anchor.feasible.any()
+        and not anchor.knots.any()
+    )
     assert torch.equal(anchor.route, world.route) and anchor.cost.isinf().all()
 
 
@@ -104,7 +146,11 @@ def test_a_chain_s_first_link_meets_its_target_not_the_ego():
     world = make_world([EGO, (30.0, -20.0, UP, 8.0), (30.0, -38.0, UP, 8.0)])
     anchor, skeleton = anchored(world, 1, 2, near=1)
     assert skeleton.target[0, 1:3].tolist() == [0, 1] and anchor.feasible[0, 1:3].all()
-    gap = (18 + decoded(anchor.knots[0, 1], 8.0)[1] - decoded(anchor.knots[0, 2], 8.0)[1]).abs().min()
+    gap = (
+        (18 + decoded(anchor.knots[0, 1], 8.0)[1] - decoded(anchor.knots[0, 2], 8.0)[1])
+        .abs()
+        .min()
+    )
     assert gap < 4.5  # the boxes would touch
 
 
@@ -112,7 +158,9 @@ def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
     world = make_world([EGO, (60.0, -30.0, UP, 12.0)])
     arc = 2.0 * torch.arange(150) - 20
     radius = 15.0
-    bend = (arc - 15).clamp(0, radius * math.pi / 2)  # straight up, then left on to the ego's lane, against it
+    bend = (arc - 15).clamp(
+        0, radius * math.pi / 2
+    )  # straight up, then left on to the ego's lane, against it
     rest = (arc - 15 - radius * math.pi / 2).clamp(min=0)
     x = 60 - radius * (1 - (bend / radius).cos()) - rest
     y = -15 + radius * (bend / radius).sin() + (arc - 15).clamp(max=0)
@@ -126,25 +174,47 @@ def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
     assert inside.any() and (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
 
 
-@pytest.mark.parametrize(("beside", "crossing", "slack"), [(1.0, 0.2, 0.0), (-1.5, 0.1, 0.0), (0.0, 0.3, 3.0)])
+@pytest.mark.parametrize(
+    ("beside", "crossing", "slack"),
+    [(1.0, 0.2, 0.0), (-1.5, 0.1, 0.0), (0.0, 0.3, 3.0)],
+)
 def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_still_has_to_cross(
     beside, crossing, slack
 ):
-    """At 10 m/s to a target that stays 30.5 m ahead: the nearest steps are half a metre off it. Acceleration and offset
-    from the route have prices of their own."""
+    """At 10 m/s to a target that stays 30.5 m ahead: the nearest steps are half a metre
+    off it. Acceleration and offset from the route have prices of their own."""
     one = torch.ones(1, 1, 1)
     speed = torch.full((1, 1), 10.0)
     ample = torch.full((1, 1, 1, anchoring.BEND_VERTICES), 1e4)
     size = torch.tensor([[[4.0, 2.0]]])
     candidates = anchoring._Candidates(
-        one.long(), one, usable=one.bool(), end=200 * one, s=0 * one, d=0 * one, bend_bound=ample, speed=speed, accel=0 * speed, size=size
+        one.long(),
+        one,
+        usable=one.bool(),
+        end=200 * one,
+        s=0 * one,
+        d=0 * one,
+        bend_bound=ample,
+        speed=speed,
+        accel=0 * speed,
+        size=size,
     )
     steps = torch.ones(1, 1, 1, 50)
     limits = torch.tensor((-3.0, 2.0))
-    target = anchoring._Target(30.5 * steps, beside * steps, slack=slack * steps, crossing_time=crossing * steps, corridor=torch.full((1, 1), 2.0))
+    target = anchoring._Target(
+        30.5 * steps,
+        beside * steps,
+        slack=slack * steps,
+        crossing_time=crossing * steps,
+        corridor=torch.full((1, 1), 2.0),
+    )
     cost, gap, _ = anchoring.scored(candidates, torch.zeros(1, 1, 1, 1), target, limits)
     expected = max(0.5 - slack, 0.0) / 10 + abs(beside) * crossing
-    assert gap.item() == pytest.approx(expected, abs=1e-4) and cost.item() == pytest.approx(expected, abs=1e-4)
+    assert gap.item() == pytest.approx(
+        expected, abs=1e-4
+    ) and cost.item() == pytest.approx(expected, abs=1e-4)
     shifted = candidates._replace(d=-0.4 * one)
-    cost, gap, _ = anchoring.scored(shifted, torch.full((1, 1, 1, 1), -1.5), target, limits)
+    cost, gap, _ = anchoring.scored(
+        shifted, torch.full((1, 1, 1, 1), -1.5), target, limits
+    )
     assert (cost - gap).item() == pytest.approx(0.2 * 1.5 + 0.05 * 0.4, abs=1e-5)

@@ -1,4 +1,5 @@
-"""Coalitions: who is chosen, who acts through whom, on which routes, and within which templates."""
+"""Coalitions: who is chosen, who acts through whom, on which routes, and within which
+templates."""
 
 from dataclasses import replace
 
@@ -23,7 +24,9 @@ def test_a_coalition_acts_on_the_ego_directly_or_through_members():
     assert torch.equal(plan.adversary, state.coalition | state.drawn)
     members = state.coalition.clone()
     members[:, 0] = True
-    assert members.gather(1, state.target.clamp(min=0)).all(), "no chain leads over somebody who is not controlled"
+    assert members.gather(1, state.target.clamp(min=0)).all(), (
+        "no chain leads over somebody who is not controlled"
+    )
     assert (plan.path_kl[plan.adversary] > 0).all()
 
 
@@ -37,31 +40,45 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
     propose = coalition.propose
 
     def chained(*arguments):
-        return replace(build(*arguments), coalition=acts, target=target, depth=torch.tensor([[0, 1, 2, 1, 3, 0]]))
+        return replace(
+            build(*arguments),
+            coalition=acts,
+            target=target,
+            depth=torch.tensor([[0, 1, 2, 1, 3, 0]]),
+        )
 
     def without_one(scene, world, skeleton, *arguments, **options):
         feasible = skeleton.coalition.clone()
         feasible[:, 1] = False
-        return replace(propose(scene, world, skeleton, *arguments, **options), feasible=feasible)
+        return replace(
+            propose(scene, world, skeleton, *arguments, **options), feasible=feasible
+        )
 
     monkeypatch.setattr(coalition, "build_skeleton", chained)
     monkeypatch.setattr(coalition, "propose", without_one)
     state, _ = replanned(on, scene, eta=1.0)
-    assert state.coalition.nonzero()[:, 1].tolist() == [3] and state.target[0].max() == 0
+    assert (
+        state.coalition.nonzero()[:, 1].tolist() == [3] and state.target[0].max() == 0
+    )
 
 
 def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
-    """Without it nobody takes part then, and the plans are the prior's; with it V_adv alone moves the coalition."""
+    """Without it nobody takes part then, and the plans are the prior's; with it V_adv
+    alone moves the coalition."""
     scene = scenes(3).scenes
     propose = coalition.propose
 
     def nothing(*arguments, **options):
         anchor = propose(*arguments, **options)
-        return replace(anchor, feasible=anchor.feasible & False, cost=anchor.cost + torch.inf)
+        return replace(
+            anchor, feasible=anchor.feasible & False, cost=anchor.cost + torch.inf
+        )
 
     monkeypatch.setattr(coalition, "propose", nothing)
     for pursuit in (False, True):
-        on = synthesizer(skeleton={"pursuit": pursuit}, control={"adversarial_clip": 2.0})
+        on = synthesizer(
+            skeleton={"pursuit": pursuit}, control={"adversarial_clip": 2.0}
+        )
         state, plan = replanned(on, scene, eta=2.0)
         assert state.coalition.any(1).tolist() == [pursuit] * 3
         assert (plan.path_kl[state.coalition] > 0).all() and not state.anchor_jump.any()
@@ -76,20 +93,37 @@ def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
     assert state.off_lane.any() and not (state.off_lane & ~state.coalition).any()
     moved = (state.routed.points != lanes.routed.points).flatten(2).any(-1)
     assert torch.equal(moved, state.off_lane)
-    nobody = replace(state, coalition=state.coalition & False, target=state.target * 0 - 1)
+    nobody = replace(
+        state, coalition=state.coalition & False, target=state.target * 0 - 1
+    )
     calm, _ = on.replan(nobody, world, EGO.plan(world))
-    assert not calm.off_lane.any() and torch.equal(calm.routed.points, lanes.routed.points)
+    assert not calm.off_lane.any() and torch.equal(
+        calm.routed.points, lanes.routed.points
+    )
 
 
 @pytest.mark.parametrize("support", ["topology", "random"])
 def test_the_other_supports_choose_a_coalition_too(support):
-    """The ablations: whoever topology finds, or anybody who is there and not parked, drawn by the scene's seed."""
+    """The ablations: whoever topology finds, or anybody who is there and not parked,
+    drawn by the scene's seed."""
     scene = scenes(3).scenes
-    _, plan = replanned(synthesizer(support=support, responsibility="none"), scene, eta=2.0, seeds=[5, 6, 7])
-    _, again = replanned(synthesizer(support=support, responsibility="none"), scene, eta=2.0, seeds=[5, 6, 7])
+    _, plan = replanned(
+        synthesizer(support=support, responsibility="none"),
+        scene,
+        eta=2.0,
+        seeds=[5, 6, 7],
+    )
+    _, again = replanned(
+        synthesizer(support=support, responsibility="none"),
+        scene,
+        eta=2.0,
+        seeds=[5, 6, 7],
+    )
     assert plan.adversary.any() and torch.equal(plan.adversary, again.adversary)
     vehicles = plan.adversary.shape[1]
-    assert not (plan.adversary & (scene["parked"] | ~scene["valid"])[:, :vehicles]).any()
+    assert not (
+        plan.adversary & (scene["parked"] | ~scene["valid"])[:, :vehicles]
+    ).any()
 
 
 # --- causal templates limit the coalitions, scene by scene; `full` changes nothing
@@ -107,5 +141,7 @@ def test_templates_reach_the_rows_of_synthesized_traffic():
         return synthesize(IDMEgo(), index, eta, 0, *template)["adversaries"].sum(1)
 
     one, two, most = (acting(torch.full((4,), code)) for code in (SINGLE, PAIR, FULL))
-    assert (one <= 1).all() and (two <= 2).all() and (one <= two).all() and two.max() == 2
+    assert (
+        (one <= 1).all() and (two <= 2).all() and (one <= two).all() and two.max() == 2
+    )
     assert torch.equal(most, acting())

@@ -3,7 +3,11 @@ import math
 import pytest
 import torch
 
-from e2rl.traffic.e2.feasibility import EGO_ACCELERATION, FeasibilitySettings, feasible_vehicles
+from e2rl.traffic.e2.feasibility import (
+    EGO_ACCELERATION,
+    FeasibilitySettings,
+    feasible_vehicles,
+)
 from e2rl.traffic.e2.motion import MAX_BRAKING, arrival_window, reachable_distance
 from tests.traffic.e2.crossing import add_route, make_world
 
@@ -25,7 +29,10 @@ def test_routes_that_cross_meet_where_the_lines_do():
     table = result.conflicts
     assert result.mask[0].tolist() == [False, True] + [False] * 6
     assert table.s[0, 1, 0] == pytest.approx(20 + 41.7, abs=0.05)
-    assert table.exists[0, 1].tolist() == [True] + [False] * 5 and not table.exists[0, 2].any()
+    assert (
+        table.exists[0, 1].tolist() == [True] + [False] * 5
+        and not table.exists[0, 2].any()
+    )
 
 
 def test_windows_hold_what_both_can_reach():
@@ -33,7 +40,9 @@ def test_windows_hold_what_both_can_reach():
     earliest = table.earliest[0, 1, 0]
     latest = table.latest[0, 1, 0]
     push = EGO_ACCELERATION
-    alone = (math.sqrt(100 + 2 * push * (50 - 4.5 / 2)) - 10) / push  # the ego flat out, to its front bumper
+    alone = (
+        math.sqrt(100 + 2 * push * (50 - 4.5 / 2)) - 10
+    ) / push  # the ego flat out, to its front bumper
     assert earliest == pytest.approx(alone, abs=0.15) and latest == SETTINGS.horizon
 
 
@@ -72,13 +81,17 @@ def test_only_the_candidate_that_crosses_is_listed():
         (0.0, 0.0, 0.5, False),
     ],
 )
-def test_whoever_is_on_the_road_near_a_centreline_and_along_it_is_associated(aside, turn, depth, associated):
+def test_whoever_is_on_the_road_near_a_centreline_and_along_it_is_associated(
+    aside, turn, depth, associated
+):
     world = make_world([EGO, (30.0, -20.0, UP, 5.0)])
     world.states[:, 1, 0] += aside
     world.states[:, 1, 2] += turn
     world.scene["field"].fill_(depth)
     result = feasible_vehicles(world.scene, world, settings=SETTINGS)
-    assert result.associated[0, 1] == associated and (associated or not result.mask.any())
+    assert result.associated[0, 1] == associated and (
+        associated or not result.mask.any()
+    )
 
 
 @pytest.mark.parametrize(
@@ -99,7 +112,10 @@ def test_whoever_moves_or_stands_closely_ahead_is_relevant(gap, aside, speed, re
     length, width = (world.scene["size"][0, :2].sum(0) / 2).tolist()
     world.states[:, 1, 0] = gap + math.copysign(length, gap)
     world.states[:, 1, 1] = width + aside if aside else 0.0
-    assert feasible_vehicles(world.scene, world, settings=SETTINGS).relevant[0, 1] == relevant
+    assert (
+        feasible_vehicles(world.scene, world, settings=SETTINGS).relevant[0, 1]
+        == relevant
+    )
     world.scene["parked"][:, 1] = True
     assert not feasible_vehicles(world.scene, world, settings=SETTINGS).relevant[0, 1]
 
@@ -109,7 +125,10 @@ def test_absent_vehicles_and_the_ego_are_never_feasible_and_scenes_do_not_mix():
     world = make_world([EGO, (50.0, -40.0, UP, 10.0)], copies=3)
     world.valid[1, 1] = False
     result = feasible_vehicles(world.scene, world, settings=SETTINGS)
-    assert result.mask[:, 1].tolist() == [True, False, True] and not result.mask[:, 0].any()
+    assert (
+        result.mask[:, 1].tolist() == [True, False, True]
+        and not result.mask[:, 0].any()
+    )
     torch.testing.assert_close(result.conflicts.s[2], alone.conflicts.s[0])
 
 
@@ -121,5 +140,7 @@ def test_arrival_windows_solve_the_equations_of_motion():
         most = reachable_distance(torch.tensor(v), torch.tensor(e))[1]
         assert most == pytest.approx(way, abs=1e-3)
     assert latest.tolist()[:2] == [torch.inf, torch.inf]
-    assert 10 * latest[2] - MAX_BRAKING / 2 * latest[2] ** 2 == pytest.approx(9.0, abs=1e-4)
+    assert 10 * latest[2] - MAX_BRAKING / 2 * latest[2] ** 2 == pytest.approx(
+        9.0, abs=1e-4
+    )
     assert arrival_window(torch.tensor(-3.0), torch.tensor(7.0))[1] == 0

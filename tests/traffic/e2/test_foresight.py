@@ -1,4 +1,5 @@
-"""The predicted verdict: worth something is what worse drivers run into and the competent one does not."""
+"""The predicted verdict: worth something is what worse drivers run into and the
+competent one does not."""
 
 import pytest
 import torch
@@ -14,13 +15,19 @@ SIZE = torch.tensor([[4.0, 2.0]])
 
 
 def standing(gap, aside=0.0):
-    """Foresight of a vehicle that stands from now on `gap` m ahead of the ego's front; the ego keeps 10 m/s."""
+    """Foresight of a vehicle that stands from now on `gap` m ahead of the ego's front;
+    the ego keeps 10 m/s."""
     path = torch.zeros(1, STEPS, 4)
     path[0, :, 0], path[..., 3] = SPEED * 0.1 * torch.arange(STEPS), SPEED
     tracks = torch.zeros(1, 1, STEPS, 4)
     tracks[..., 0], tracks[..., 1] = gap + 4.0, aside
     return lambda since=-1.0, settled=False: foresee(
-        path, SIZE, tracks=tracks, sizes=SIZE, since=torch.tensor([since]), settled=torch.tensor([settled])
+        path,
+        SIZE,
+        tracks=tracks,
+        sizes=SIZE,
+        since=torch.tensor([since]),
+        settled=torch.tensor([settled]),
     )
 
 
@@ -32,7 +39,9 @@ def test_the_competent_driver_prevents_what_is_farther_than_its_stopping_gap():
 
 def test_worth_is_highest_just_beyond_what_the_competent_driver_needs():
     need = float(HumanDriver().stopping_gap(torch.tensor(SPEED)))
-    near, middle, far = (float(standing(gap)().worth) for gap in (1.1 * need, 1.5 * need, 40.0))
+    near, middle, far = (
+        float(standing(gap)().worth) for gap in (1.1 * need, 1.5 * need, 40.0)
+    )
     assert 0.5 < near < 1 and near > middle > far > 0
     assert float(standing(0.8 * need)().worth) == 0, "nobody could prevent it"
     assert float(standing(40.0, aside=4.0)().worth) == 0, "nobody is in the way"
@@ -42,7 +51,9 @@ def test_what_has_begun_need_not_be_prevented_again():
     need = float(HumanDriver().stopping_gap(torch.tensor(SPEED)))
     plan = standing(0.8 * need)
     assert float(plan(settled=True).worth) > 0.5
-    assert bool(plan(since=0.7).prevented), "a driver that has begun to react 0.7 s ago still stops"
+    assert bool(plan(since=0.7).prevented), (
+        "a driver that has begun to react 0.7 s ago still stops"
+    )
 
 
 def mirrored(states):
@@ -61,7 +72,14 @@ def test_who_reverses_is_foreseen_as_the_same_motion_forwards():
     tracks = torch.zeros(1, 1, STEPS, 4)
     tracks[..., 0] = 24.0
     ways = [
-        foresee(each, SIZE, tracks=tracks, sizes=SIZE, since=torch.tensor([-1.0]), settled=torch.tensor([False]))
+        foresee(
+            each,
+            SIZE,
+            tracks=tracks,
+            sizes=SIZE,
+            since=torch.tensor([-1.0]),
+            settled=torch.tensor([False]),
+        )
         for each in (path, mirrored(path))
     ]
     assert float(ways[0].worth) > 0.2 and float(ways[0].time) < 3
@@ -70,22 +88,32 @@ def test_who_reverses_is_foreseen_as_the_same_motion_forwards():
 
 
 def test_the_clock_starts_where_the_ego_reverses_into_the_risk():
-    scene = make_scenes(1, vehicles=[(0, 0, 10.0), (18.0, 0, 1.0), (18.0, 1, 1.0)], steps=20).scenes
+    scene = make_scenes(
+        1, vehicles=[(0, 0, 10.0), (18.0, 0, 1.0), (18.0, 1, 1.0)], steps=20
+    ).scenes
     world = World.at_start(scene)
     plan = world.states[:, :1] + torch.zeros(1, 50, 4)
     plan[..., 0] += torch.arange(1, 51)
     world.states[:, :1] = mirrored(world.states[:, :1])
-    since = time_before(world, mirrored(plan), since=torch.full((1, scene["route_log"].shape[1]), -1.0))
+    since = time_before(
+        world, mirrored(plan), since=torch.full((1, scene["route_log"].shape[1]), -1.0)
+    )
     assert since[0, 1:3].tolist() == [0.0, -1.0]
 
 
 @pytest.mark.parametrize(("ahead", "before"), [(18.0, -1.0), (18.0, 0.5), (80.0, 0.5)])
-def test_the_clock_starts_at_the_competent_driver_s_risk_and_runs_while_it_lasts(ahead, before):
-    scene = make_scenes(1, vehicles=[(0, 0, 10.0), (ahead, 0, 1.0), (ahead, 1, 1.0)], steps=20).scenes
+def test_the_clock_starts_at_the_competent_driver_s_risk_and_runs_while_it_lasts(
+    ahead, before
+):
+    scene = make_scenes(
+        1, vehicles=[(0, 0, 10.0), (ahead, 0, 1.0), (ahead, 1, 1.0)], steps=20
+    ).scenes
     world = World.at_start(scene)
     plan = world.states[:, :1] + torch.zeros(1, 50, 4)
     plan[..., 0] += torch.arange(1, 51)
-    since = time_before(world, plan, since=torch.full((1, scene["route_log"].shape[1]), before))
+    since = time_before(
+        world, plan, since=torch.full((1, scene["route_log"].shape[1]), before)
+    )
     begins = 0.0 if ahead < 30 else -1.0
     assert float(since[0, 1]) == (before + 0.5 if before >= 0 else begins)
     assert float(since[0, 2]) == -1.0, "it is in the next lane"

@@ -19,14 +19,29 @@ TIMES = DT * torch.arange(1, 51)
 FREE = replace(InterceptionSettings(), push=2.0, brake=2.0, lateral=2.0)
 
 
-def met(vehicles, eta=2.0, settings=FREE, world=None, halt_at_red=False, moment=-1.0, wrong_way=0.0):
-    """Vehicle 1's interception of the ego among the others, all of which keep their speed."""
+def met(
+    vehicles,
+    eta=2.0,
+    settings=FREE,
+    world=None,
+    halt_at_red=False,
+    moment=-1.0,
+    wrong_way=0.0,
+):
+    """Vehicle 1's interception of the ego among the others, all of which keep their
+    speed."""
     world = world or make_world(vehicles)
     scene = world.scene
     expected = constant_speed_states(world.scene, world, times=TIMES)
     index, target = (torch.full((len(scene), 1), vehicle) for vehicle in (1, 0))
     found = intercept(
-        world, index, target=target, expected=expected, wish=wish_of(len(scene), eta, moment=moment, wrong_way=wrong_way), settings=settings, halt_at_red=halt_at_red
+        world,
+        index,
+        target=target,
+        expected=expected,
+        wish=wish_of(len(scene), eta, moment=moment, wrong_way=wrong_way),
+        settings=settings,
+        halt_at_red=halt_at_red,
     )
     return found, expected, scene["size"][:, :8]
 
@@ -39,13 +54,24 @@ def driven(found, speed):
 
 
 @pytest.mark.parametrize(
-    "vehicle", [BESIDE, (25.0, -20.0, UP, 9.0), (60.0, 3.5, math.pi, 8.0), (-15.0, 0.0, 0.0, 11.0)]
+    "vehicle",
+    [
+        BESIDE,
+        (25.0, -20.0, UP, 9.0),
+        (60.0, 3.5, math.pi, 8.0),
+        (-15.0, 0.0, 0.0, 11.0),
+    ],
 )
 def test_the_boxes_touch_if_everybody_drives_as_expected(vehicle):
     found, expected, size = met([EGO, vehicle])
     assert found.cost.isfinite().all()
     track = driven(found, vehicle[3])
-    assert overlap(track, size[0, 1].expand(50, 2), second=expected[0, 0], second_size=size[0, 0].expand(50, 2)).any()
+    assert overlap(
+        track,
+        size[0, 1].expand(50, 2),
+        second=expected[0, 0],
+        second_size=size[0, 0].expand(50, 2),
+    ).any()
 
 
 def test_a_way_begins_at_the_vehicle_in_its_direction_with_a_vertex_every_two_metres():
@@ -61,14 +87,23 @@ def test_a_way_begins_at_the_vehicle_in_its_direction_with_a_vertex_every_two_me
 def test_the_cubic_between_two_poses_of_a_circle_is_its_arc(angle):
     radius = 12.0
     end = torch.tensor([radius * math.sin(angle), radius * (1 - math.cos(angle))])
-    points, _ = cubic(torch.zeros(2), torch.tensor(0.0), end=end, end_heading=torch.tensor(angle), u=torch.linspace(0, 1, 21))
+    points, _ = cubic(
+        torch.zeros(2),
+        torch.tensor(0.0),
+        end=end,
+        end_heading=torch.tensor(angle),
+        u=torch.linspace(0, 1, 21),
+    )
     gap = (points - torch.tensor([0.0, radius])).norm(dim=-1) - radius
     assert gap.abs().max() < 3e-3 * radius
 
 
-@pytest.mark.parametrize(("x", "heading", "ego"), [(-12.0, 0.0, 10.0), (60.0, math.pi, -10.0)])
+@pytest.mark.parametrize(
+    ("x", "heading", "ego"), [(-12.0, 0.0, 10.0), (60.0, math.pi, -10.0)]
+)
 def test_straight_on_it_costs_what_its_acceleration_and_time_weigh(x, heading, ego):
-    """Behind the ego, or head-on: one constant acceleration until the boxes touch; the cheapest of ten moments."""
+    """Behind the ego, or head-on: one constant acceleration until the boxes touch; the
+    cheapest of ten moments."""
     found, _, size = met([EGO, (x, 0.0, heading, 10.0)])
     touch = 0.4 * (size[0, 0, 0] + size[0, 1, 0]).item() * (heading == 0.0)
     costs = []
@@ -77,7 +112,13 @@ def test_straight_on_it_costs_what_its_acceleration_and_time_weigh(x, heading, e
         way = abs(x - 10.0 * time) - touch
         accel = 2 * (way - 10.0 * time) / time**2
         within = -2 * FREE.brake <= accel <= 2 * FREE.push and 10.0 + accel * time >= 0
-        costs.append((0.2 * abs(accel) + 0.1 * time - FREE.preference if within else math.inf, accel, step))
+        costs.append(
+            (
+                0.2 * abs(accel) + 0.1 * time - FREE.preference if within else math.inf,
+                accel,
+                step,
+            )
+        )
     cost, accel, step = min(costs)
     assert found.cost.item() == pytest.approx(cost, abs=1e-3)
     assert found.knots[0, 0, :step].tolist() == pytest.approx([accel] * step, abs=1e-3)
@@ -95,11 +136,17 @@ def test_what_is_proposed_keeps_the_limits(eta):
     some = found.cost[:, 0].isfinite()
     assert some.any()
     knots = found.knots[some, 0]
-    assert (knots <= settings.push * eta + 1e-5).all() and (knots >= -settings.brake * eta - 1e-5).all()
+    assert (knots <= settings.push * eta + 1e-5).all() and (
+        knots >= -settings.brake * eta - 1e-5
+    ).all()
     v = world.states[some, 1, 3]
-    _, _, curvature = interpolate(found.path[some, 0], torch.arange(2.0, 20.0, 2.0).expand(int(some.sum()), -1))
+    _, _, curvature = interpolate(
+        found.path[some, 0], torch.arange(2.0, 20.0, 2.0).expand(int(some.sum()), -1)
+    )
     slow = v[:, None] ** 2 - 2 * settings.brake * eta * torch.arange(2.0, 20.0, 2.0)
-    assert ((slow.clamp(min=0) * curvature.abs()).amax(-1) < 1.3 * settings.lateral * eta).all()
+    assert (
+        (slow.clamp(min=0) * curvature.abs()).amax(-1) < 1.3 * settings.lateral * eta
+    ).all()
 
 
 def test_no_way_leads_off_the_road_or_through_another_vehicle():
@@ -119,10 +166,17 @@ def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
     one = met([EGO, BESIDE])[0]
     turn = 0.7
     shift = torch.tensor([30.0, -12.0])
-    spin = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    moved = [(*(spin @ torch.tensor(v[:2]) + shift).tolist(), v[2] + turn, v[3]) for v in (EGO, BESIDE)]
+    spin = torch.tensor(
+        [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+    )
+    moved = [
+        (*(spin @ torch.tensor(v[:2]) + shift).tolist(), v[2] + turn, v[3])
+        for v in (EGO, BESIDE)
+    ]
     other = met(moved)[0]
-    torch.testing.assert_close(other.path[0, 0], one.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4)
+    torch.testing.assert_close(
+        other.path[0, 0], one.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4
+    )
     torch.testing.assert_close(other.cost, one.cost, atol=1e-3, rtol=1e-4)
 
 
@@ -133,16 +187,25 @@ def oncoming_world():
 
 def test_a_path_that_ends_against_every_lane_costs_what_is_set_and_is_not_made_at_infinity():
     free = met(None, world=oncoming_world())[0].cost
-    dear = met(None, settings=replace(FREE, wrong_way=1.5), world=oncoming_world())[0].cost
+    dear = met(None, settings=replace(FREE, wrong_way=1.5), world=oncoming_world())[
+        0
+    ].cost
     assert dear.item() == pytest.approx(free.item() + 1.5, abs=1e-5)
-    assert met(None, settings=replace(FREE, wrong_way=math.inf), world=oncoming_world())[0].cost.isinf()
+    assert met(
+        None, settings=replace(FREE, wrong_way=math.inf), world=oncoming_world()
+    )[0].cost.isinf()
 
 
 @pytest.mark.parametrize("line, finite", [(40.0, False), (200.0, True)])
 def test_nobody_is_sent_past_its_own_red_light(line, finite):
     world = make_world([EGO, BESIDE])
-    world.scene["light_state"] = torch.full((1, world.scene["logged"].shape[1], 1), LIGHT_RED)
-    world.scene["route_light"][:, 1, 0, 0], world.scene["route_light_s"][:, 1, 0, 0] = 0, line
+    world.scene["light_state"] = torch.full(
+        (1, world.scene["logged"].shape[1], 1), LIGHT_RED
+    )
+    world.scene["route_light"][:, 1, 0, 0], world.scene["route_light_s"][:, 1, 0, 0] = (
+        0,
+        line,
+    )
     assert bool(met(None, world=world, halt_at_red=True)[0].cost.isfinite()) == finite
     assert met(None, world=world)[0].cost.isfinite().all()
     world.scene["light_state"][:] = LIGHT_GREEN

@@ -1,4 +1,5 @@
-"""The language-model reasoner against a real HTTP server: answers count, failures leave it to the rules, audibly."""
+"""The language-model reasoner against a real HTTP server: answers count, failures leave
+it to the rules, audibly."""
 
 import json
 import math
@@ -12,7 +13,12 @@ import pytest
 import torch
 
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
-from e2rl.traffic.e2.reasoner import CRITERIA, LanguageReasoner, ReasonerSettings, read_answer
+from e2rl.traffic.e2.reasoner import (
+    CRITERIA,
+    LanguageReasoner,
+    ReasonerSettings,
+    read_answer,
+)
 from tests.traffic.e2.crossing import make_world
 
 pytest.importorskip("openai")
@@ -22,17 +28,30 @@ UP = math.pi / 2
 
 def asked(request: dict) -> list[int]:
     """Numbers of the vehicles that a request asks about."""
-    return [int(number) for number in re.findall(r"\d+", request["messages"][-1]["content"].rsplit("Judge", 1)[1])]
+    return [
+        int(number)
+        for number in re.findall(
+            r"\d+", request["messages"][-1]["content"].rsplit("Judge", 1)[1]
+        )
+    ]
 
 
 def verdicts(request: dict, value=True) -> str:
     """The answer that gives all vehicles the same verdict."""
-    return json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, value) for number in asked(request)]})
+    return json.dumps(
+        {
+            "vehicles": [
+                {"id": number} | dict.fromkeys(CRITERIA, value)
+                for number in asked(request)
+            ]
+        }
+    )
 
 
 @contextmanager
 def chat_server(answer):
-    """(base URL, requests received) of a server whose answer(request) -> the message's text, or (status, text)."""
+    """(base URL, requests received) of a server whose answer(request) -> the message's
+    text, or (status, text)."""
     requests = []
 
     class Handler(BaseHTTPRequestHandler):
@@ -41,8 +60,17 @@ def chat_server(answer):
             requests.append(request | {"path": self.path})
             given = answer(request)
             status, text = given if isinstance(given, tuple) else (200, given)
-            choice = {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": text}}
-            named = {"id": "1", "object": "chat.completion", "created": int(time.time()), "model": "small"}
+            choice = {
+                "index": 0,
+                "finish_reason": "stop",
+                "message": {"role": "assistant", "content": text},
+            }
+            named = {
+                "id": "1",
+                "object": "chat.completion",
+                "created": int(time.time()),
+                "model": "small",
+            }
             body = json.dumps(named | {"choices": [choice]}).encode()
             self.send_response(status)
             self.send_header("Content-Type", "application/json")
@@ -55,7 +83,9 @@ def chat_server(answer):
             pass
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread = threading.Thread(
+        target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True
+    )
     thread.start()
     try:
         yield f"http://127.0.0.1:{server.server_address[1]}/v1", requests
@@ -72,7 +102,10 @@ def key(monkeypatch):
 
 def world(copies=1):
     """The ego and two vehicles: the first crosses its way, the second never meets it."""
-    made = make_world([(0.0, 0.0, 0.0, 10.0), (50.0, -40.0, UP, 10.0), (0.0, 12.0, 0.0, 10.0)], copies=copies)
+    made = make_world(
+        [(0.0, 0.0, 0.0, 10.0), (50.0, -40.0, UP, 10.0), (0.0, 12.0, 0.0, 10.0)],
+        copies=copies,
+    )
     made.states[:, 1, 3] += torch.arange(copies)  # scenes that differ
     return made
 
@@ -80,7 +113,16 @@ def world(copies=1):
 def ask(url, tmp_path, made, **settings):
     reasoner = LanguageReasoner(
         ReasonerSettings(
-            **({"kind": "lm", "model": "small", "base_url": url, "retries": 0, "cache": str(tmp_path)} | settings)
+            **(
+                {
+                    "kind": "lm",
+                    "model": "small",
+                    "base_url": url,
+                    "retries": 0,
+                    "cache": str(tmp_path),
+                }
+                | settings
+            )
         )
     )
     return reasoner(made.scene, made, RULES), reasoner.statistics
@@ -89,14 +131,29 @@ def ask(url, tmp_path, made, **settings):
 def test_the_model_decides_and_is_asked_by_schema_at_temperature_zero(tmp_path):
     with chat_server(verdicts) as (url, requests):
         result, counts = ask(url, tmp_path, made=world())
-    assert result.mask[0].tolist() == [False, True, True] + [False] * 5, "the rules would take the first only"
+    assert result.mask[0].tolist() == [False, True, True] + [False] * 5, (
+        "the rules would take the first only"
+    )
     request = requests[0]
-    assert request["path"] == "/v1/chat/completions" and request["temperature"] == 0 and request["model"] == "small"
+    assert (
+        request["path"] == "/v1/chat/completions"
+        and request["temperature"] == 0
+        and request["model"] == "small"
+    )
     schema = request["response_format"]["json_schema"]
-    assert schema["strict"] and schema["schema"]["properties"]["vehicles"]["items"]["required"] == ["id", *CRITERIA]
+    assert schema["strict"] and schema["schema"]["properties"]["vehicles"]["items"][
+        "required"
+    ] == ["id", *CRITERIA]
     text = request["messages"][-1]["content"]
-    assert "50 m ahead of it and 40 m to its right" in text and "Feasible" not in text, "the rules' verdict is not told"
-    assert counts == {"lm_scenes": 1, "lm_requests": 1, "lm_cached": 0, "lm_fallbacks": 0}
+    assert (
+        "50 m ahead of it and 40 m to its right" in text and "Feasible" not in text
+    ), "the rules' verdict is not told"
+    assert counts == {
+        "lm_scenes": 1,
+        "lm_requests": 1,
+        "lm_cached": 0,
+        "lm_fallbacks": 0,
+    }
 
 
 def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_path):
@@ -106,7 +163,10 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
         result, _ = ask(url, tmp_path, made=made)
     assert result.mask[0].tolist() == [False, True] + [False] * 6
     assert "Vehicle 2" not in requests[0]["messages"][-1]["content"]
-    torch.testing.assert_close(result.conflicts.s, feasible_vehicles(made.scene, made, settings=RULES).conflicts.s)
+    torch.testing.assert_close(
+        result.conflicts.s,
+        feasible_vehicles(made.scene, made, settings=RULES).conflicts.s,
+    )
 
 
 @pytest.mark.parametrize(
@@ -116,9 +176,21 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
         "[]",
         "[" * 100_000,
         '{"vehicles": [{"id": 1}]}',
-        json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, True) for number in (1, 7)]}),
+        json.dumps(
+            {
+                "vehicles": [
+                    {"id": number} | dict.fromkeys(CRITERIA, True) for number in (1, 7)
+                ]
+            }
+        ),
         json.dumps({"vehicles": [{"id": 1} | dict.fromkeys(CRITERIA, True)]}),
-        json.dumps({"vehicles": [{"id": number} | dict.fromkeys(CRITERIA, "yes") for number in (1, 2)]}),
+        json.dumps(
+            {
+                "vehicles": [
+                    {"id": number} | dict.fromkeys(CRITERIA, "yes") for number in (1, 2)
+                ]
+            }
+        ),
         (500, "out of order"),
         (404, "no such model"),
         "",
@@ -126,9 +198,14 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
 )
 def test_the_rules_decide_where_the_model_fails(tmp_path, answer):
     made = world(2)
-    with chat_server(lambda request: answer) as (url, _), pytest.warns(UserWarning, match="rules decided for 1 of"):
+    with (
+        chat_server(lambda request: answer) as (url, _),
+        pytest.warns(UserWarning, match="rules decided for 1 of"),
+    ):
         result, counts = ask(url, tmp_path, made=made)
-    assert torch.equal(result.mask, feasible_vehicles(made.scene, made, settings=RULES).mask)
+    assert torch.equal(
+        result.mask, feasible_vehicles(made.scene, made, settings=RULES).mask
+    )
     assert counts["lm_fallbacks"] == counts["lm_requests"] == 2
     assert not list(tmp_path.iterdir()), "failures are not kept"
 
@@ -137,7 +214,11 @@ def test_answers_are_kept_by_content(tmp_path):
     with chat_server(verdicts) as (url, requests):
         first, _ = ask(url, tmp_path, made=world())
         again, counts = ask(url, tmp_path, made=world())
-        assert len(requests) == 1 and counts["lm_cached"] == 1 and torch.equal(first.mask, again.mask)
+        assert (
+            len(requests) == 1
+            and counts["lm_cached"] == 1
+            and torch.equal(first.mask, again.mask)
+        )
         ask(url, tmp_path, made=world(), model="other")
         assert len(requests) == 2, "another model is asked anew"
         moved = world()
@@ -152,6 +233,8 @@ def test_answers_are_kept_by_content(tmp_path):
 
 def test_answers_must_be_about_whom_was_asked():
     entry = {"id": 3} | dict.fromkeys(CRITERIA, False)
-    assert read_answer(json.dumps({"vehicles": [entry]}), [3]) == {3: (False, False, False)}
+    assert read_answer(json.dumps({"vehicles": [entry]}), [3]) == {
+        3: (False, False, False)
+    }
     with pytest.raises(ValueError, match="asked was about"):
         read_answer(json.dumps({"vehicles": [entry, entry]}), [3])

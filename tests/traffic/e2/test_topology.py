@@ -1,4 +1,5 @@
-"""Time to collision against stepped polygons; cliques, scores, candidates against the definitions in plain Python."""
+"""Time to collision against stepped polygons; cliques, scores, candidates against the
+definitions in plain Python."""
 
 import math
 from itertools import combinations
@@ -24,7 +25,9 @@ from e2rl.traffic.e2.topology import (
 def random_boxes(count, n, spread, seed):
     generator = torch.Generator().manual_seed(seed)
     states = torch.rand(count, n, 4, generator=generator, dtype=torch.float64)
-    states = (states - torch.tensor([0.5, 0.5, 0.5, 0.0])) * torch.tensor([2 * spread, 2 * spread, 6.28, 15.0])
+    states = (states - torch.tensor([0.5, 0.5, 0.5, 0.0])) * torch.tensor(
+        [2 * spread, 2 * spread, 6.28, 15.0]
+    )
     size = 1.5 + 4 * torch.rand(count, n, 2, generator=generator, dtype=torch.float64)
     return states, size
 
@@ -43,7 +46,9 @@ def test_first_contact_is_that_of_stepped_polygons():
     closed = time_to_collision(states, size)
     assert torch.equal(closed, closed.transpose(-1, -2))
     time = torch.arange(0, 8.0, 0.01, dtype=torch.float64)
-    velocity = states[..., 3:] * torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
+    velocity = states[..., 3:] * torch.stack(
+        [states[..., 2].cos(), states[..., 2].sin()], -1
+    )
     kinds = []
     for pair in range(len(states)):
 
@@ -57,7 +62,9 @@ def test_first_contact_is_that_of_stepped_polygons():
         kinds.append("now" if hit[0] else "later" if hit.any() else "never")
         if hit.any():
             assert abs(ttc - time[np.argmax(hit)]) <= 0.0101
-        elif ttc.isfinite():  # shorter than a step: the outlines must touch at that moment
+        elif (
+            ttc.isfinite()
+        ):  # shorter than a step: the outlines must touch at that moment
             assert shapely.distance(*at(ttc[None]))[0] < 1e-9
     assert set(kinds) == {"now", "later", "never"}
 
@@ -74,18 +81,38 @@ def test_weights_are_the_sigmoid_of_the_ttc_and_nothing_for_the_absent():
     """Boxes grown by the clearance: a gap of 34 - 4 - 1 m closes at 10 m/s."""
     settings = TopologySettings(clearance=1.0, tau_max=2.5, beta=0.5)
     states = torch.tensor([[0.0, 0, 0, 10], [34, 0, 0, 0], [30, 0, 0, 0]])
-    weight = pair_weights(states, torch.tensor([True, True, False]), size=torch.tensor([4.0, 2.0]).expand(3, 2), settings=settings)
+    weight = pair_weights(
+        states,
+        torch.tensor([True, True, False]),
+        size=torch.tensor([4.0, 2.0]).expand(3, 2),
+        settings=settings,
+    )
     assert weight[0, 1].item() == pytest.approx(1 / (1 + math.exp((2.9 - 2.5) / 0.5)))
-    assert weight[1, 0] == weight[0, 1] and weight[2].sum() == 0 and weight.diagonal().sum() == 0
+    assert (
+        weight[1, 0] == weight[0, 1]
+        and weight[2].sum() == 0
+        and weight.diagonal().sum() == 0
+    )
 
 
 def cliques_by_definition(weight, distance, valid, settings):
     """The top cliques of one graph, by Sec. IV-A1: brute force over all subsets."""
-    present = sorted((i for i in range(len(weight)) if valid[i]), key=lambda i: (distance[i], i))[: topology.NODES]
-    edges = {(i, j) for i in present for j in present if i != j and weight[i, j] >= settings.edge_threshold}
+    present = sorted(
+        (i for i in range(len(weight)) if valid[i]), key=lambda i: (distance[i], i)
+    )[: topology.NODES]
+    edges = {
+        (i, j)
+        for i in present
+        for j in present
+        if i != j and weight[i, j] >= settings.edge_threshold
+    }
     hops = {0: 0}
     for hop in range(1, HOPS + 2):
-        hops |= {j: hop for i, j in edges if i in hops and j not in hops and hops[i] == hop - 1}
+        hops |= {
+            j: hop
+            for i, j in edges
+            if i in hops and j not in hops and hops[i] == hop - 1
+        }
     graph = {(i, j) for i, j in edges if i in hops and j in hops}
     nodes = sorted({i for i, _ in graph})
     complete = [
@@ -95,22 +122,32 @@ def cliques_by_definition(weight, distance, valid, settings):
         if all((i, j) in graph for i, j in combinations(some, 2))
     ]
     found = set()
-    for clique in (some for some in complete if not any(some < other for other in complete)):
-        total = {i: round(math.fsum(weight[i, j] for j in clique if j != i), 6) for i in clique}
+    for clique in (
+        some for some in complete if not any(some < other for other in complete)
+    ):
+        total = {
+            i: round(math.fsum(weight[i, j] for j in clique if j != i), 6)
+            for i in clique
+        }
         order = sorted(clique, key=lambda i: (i != 0, -total[i], distance[i], i))
         found.add(tuple(sorted(order[: settings.max_clique])))
     found = [clique for clique in found if min(hops[i] for i in clique) <= HOPS]
 
     def rank(clique):
         pairs = [weight[i, j] for i, j in combinations(clique, 2)]
-        return -round(math.fsum(pairs) / len(pairs), 6), math.fsum(distance[i] for i in clique) / len(clique), clique
+        return (
+            -round(math.fsum(pairs) / len(pairs), 6),
+            math.fsum(distance[i] for i in clique) / len(clique),
+            clique,
+        )
 
     return sorted(found, key=rank)[: settings.top_cliques]
 
 
 @pytest.mark.parametrize(("seed", "nodes"), [(3, 24), (5, 24), (8, 24), (9, 7)])
 def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypatch):
-    """Eqs. (ttc_weight_t) and (temporal_scoring): a point for each top clique of each analysed step."""
+    """Eqs. (ttc_weight_t) and (temporal_scoring): a point for each top clique of each
+    analysed step."""
     monkeypatch.setattr(topology, "NODES", nodes)
     states, size = random_boxes(1, 11, spread=20.0, seed=seed)
     states[:, 0, :2] *= 0.3
@@ -127,10 +164,17 @@ def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypa
         distance = distance.masked_fill(~valid[0, step], math.inf).tolist()
         nearest = [min(pair) for pair in zip(nearest, distance, strict=True)]
         weight = result.weights[0, number].numpy()
-        expected = cliques_by_definition(weight, distance, valid=valid[0, step].tolist(), settings=settings)
+        expected = cliques_by_definition(
+            weight, distance, valid=valid[0, step].tolist(), settings=settings
+        )
         assert result.cliques[0][number] == expected
         for i in (i for clique in expected for i in clique):
             score[i] += 1
     assert result.score[0].tolist() == score
-    order = sorted((i for i in range(1, 11) if score[i] > 0), key=lambda i: (-score[i], nearest[i], i))
-    assert len(order) > 3 and result.candidates[0].nonzero()[:, 0].tolist() == sorted(order[:3])
+    order = sorted(
+        (i for i in range(1, 11) if score[i] > 0),
+        key=lambda i: (-score[i], nearest[i], i),
+    )
+    assert len(order) > 3 and result.candidates[0].nonzero()[:, 0].tolist() == sorted(
+        order[:3]
+    )

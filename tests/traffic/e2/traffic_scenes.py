@@ -1,4 +1,5 @@
-"""Short episodes on the synthetic road whose ego has somebody to meet, and everything needed to run them."""
+"""Short episodes on the synthetic road whose ego has somebody to meet, and everything
+needed to run them."""
 
 from dataclasses import replace
 
@@ -18,27 +19,62 @@ from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan
 from tests.prior.small import small_prior
 from tests.synthetic import make_scenes
 
-VEHICLES = [(0, 0, 10.0), (22, 0, 9.0), (10, 1, 10.0), (-20, 0, 11.0), (45, 1, 8.0), (70, 0, 0.0)]
+VEHICLES = [
+    (0, 0, 10.0),
+    (22, 0, 9.0),
+    (10, 1, 10.0),
+    (-20, 0, 11.0),
+    (45, 1, 8.0),
+    (70, 0, 0.0),
+]
 ROWS = 8
 EGO = IDMEgo()
 
 
 def scenes(count: int = 3, steps: int = 20, **options) -> SceneSet:
-    """The ego between others in two lanes; vehicle 1 is ahead of it, vehicle 5 is parked far ahead."""
-    return make_scenes(count, vehicles=VEHICLES, steps=steps, max_vehicles=ROWS, max_agents=ROWS + 2, **options)
+    """The ego between others in two lanes; vehicle 1 is ahead of it, vehicle 5 is
+    parked far ahead."""
+    return make_scenes(
+        count,
+        vehicles=VEHICLES,
+        steps=steps,
+        max_vehicles=ROWS,
+        max_agents=ROWS + 2,
+        **options,
+    )
 
 
 def synthesizer(seed: int = 0, steps: int = 4, sampler: str = "ddim", **settings) -> E2:
     """e2 on a small random prior of `steps` denoising steps."""
-    return E2(small_prior(seed, sampler=SamplerSettings(sampler=sampler, steps=steps, spacing="level")), **settings)
+    return E2(
+        small_prior(
+            seed, sampler=SamplerSettings(sampler=sampler, steps=steps, spacing="level")
+        ),
+        **settings,
+    )
 
 
-def drive(scene_set: SceneSet, on: Traffic, eta: float, seeds=None, ego: Ego | None = None, **sim) -> Rollouts:
+def drive(
+    scene_set: SceneSet,
+    on: Traffic,
+    eta: float,
+    seeds=None,
+    ego: Ego | None = None,
+    **sim,
+) -> Rollouts:
     """Rollouts of every scene once."""
     index = torch.arange(len(scene_set))
     seeds = index if seeds is None else torch.tensor(seeds)
     etas = torch.full((len(index),), eta)
-    return roll_out(scene_set, index, seed=seeds, eta=etas, ego=ego or EGO, traffic=on, sim=SimSettings(**sim))
+    return roll_out(
+        scene_set,
+        index,
+        seed=seeds,
+        eta=etas,
+        ego=ego or EGO,
+        traffic=on,
+        sim=SimSettings(**sim),
+    )
 
 
 def begin(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None) -> State:
@@ -48,8 +84,11 @@ def begin(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None) -> S
     return on.reset(scene, seeds, torch.full((count,), eta))
 
 
-def replanned(on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None, times: int = 1):
-    """State and plan after `times` replans, half a second of perfect execution between two of them."""
+def replanned(
+    on: Traffic, scene: TensorDictBase, eta: float = 0.0, seeds=None, times: int = 1
+):
+    """State and plan after `times` replans, half a second of perfect execution between
+    two of them."""
     state = begin(on, scene, eta=eta, seeds=seeds)
     world = World.at_start(scene)
     for _ in range(times):

@@ -1,5 +1,6 @@
-"""A stand-in for nuplan-devkit, which no package index has: as much of its published interface as the adapter and the
-planners of the tests use, under the devkit's module names. Written from the interface; it holds none of its code."""
+"""A stand-in for nuplan-devkit, which no package index has: as much of its published
+interface as the adapter and the planners of the tests use, under the devkit's module
+names. Written from the interface; it holds none of its code."""
 
 import math
 import sys
@@ -110,9 +111,22 @@ class EgoState:
         angular_accel=0.0,
     ):
         back = vehicle_parameters.rear_axle_to_center
-        rear = StateVector2D(center_velocity_2d.x, center_velocity_2d.y - back * angular_vel)
-        dynamic = DynamicCarState(rear, center_velocity_2d, center_acceleration_2d=center_acceleration_2d, angular_velocity=angular_vel)
-        return cls(center, moved(center, -back), dynamic, time_point, CarFootprint(vehicle_parameters))
+        rear = StateVector2D(
+            center_velocity_2d.x, center_velocity_2d.y - back * angular_vel
+        )
+        dynamic = DynamicCarState(
+            rear,
+            center_velocity_2d,
+            center_acceleration_2d=center_acceleration_2d,
+            angular_velocity=angular_vel,
+        )
+        return cls(
+            center,
+            moved(center, -back),
+            dynamic,
+            time_point,
+            CarFootprint(vehicle_parameters),
+        )
 
     @classmethod
     def build_from_rear_axle(
@@ -129,16 +143,32 @@ class EgoState:
         ahead = vehicle_parameters.rear_axle_to_center
         rear = rear_axle_velocity_2d
         velocity = StateVector2D(rear.x, rear.y + ahead * angular_vel)
-        dynamic = DynamicCarState(rear, velocity, center_acceleration_2d=rear_axle_acceleration_2d, angular_velocity=angular_vel)
-        return cls(moved(rear_axle_pose, ahead), rear_axle_pose, dynamic, time_point, CarFootprint(vehicle_parameters))
+        dynamic = DynamicCarState(
+            rear,
+            velocity,
+            center_acceleration_2d=rear_axle_acceleration_2d,
+            angular_velocity=angular_vel,
+        )
+        return cls(
+            moved(rear_axle_pose, ahead),
+            rear_axle_pose,
+            dynamic,
+            time_point,
+            CarFootprint(vehicle_parameters),
+        )
 
 
 def moved(pose, ahead):
-    return StateSE2(pose.x + ahead * math.cos(pose.heading), pose.y + ahead * math.sin(pose.heading), heading=pose.heading)
+    return StateSE2(
+        pose.x + ahead * math.cos(pose.heading),
+        pose.y + ahead * math.sin(pose.heading),
+        heading=pose.heading,
+    )
 
 
 TrackedObjectType = Enum(
-    "TrackedObjectType", "VEHICLE PEDESTRIAN BICYCLE TRAFFIC_CONE BARRIER CZONE_SIGN GENERIC_OBJECT EGO"
+    "TrackedObjectType",
+    "VEHICLE PEDESTRIAN BICYCLE TRAFFIC_CONE BARRIER CZONE_SIGN GENERIC_OBJECT EGO",
 )
 
 
@@ -151,7 +181,14 @@ class SceneObjectMetadata:
 
 
 class Agent:
-    def __init__(self, tracked_object_type, oriented_box, velocity, metadata, angular_velocity=None):
+    def __init__(
+        self,
+        tracked_object_type,
+        oriented_box,
+        velocity,
+        metadata,
+        angular_velocity=None,
+    ):
         self.tracked_object_type = tracked_object_type
         self.box = oriented_box
         self.velocity = velocity
@@ -186,8 +223,14 @@ class SimulationHistoryBuffer:
         self.sample_interval = sample_interval
 
     @classmethod
-    def initialize_from_list(cls, buffer_size, ego_states, observations, sample_interval=None):
-        return cls(deque(ego_states, buffer_size), deque(observations, buffer_size), sample_interval)
+    def initialize_from_list(
+        cls, buffer_size, ego_states, observations, sample_interval=None
+    ):
+        return cls(
+            deque(ego_states, buffer_size),
+            deque(observations, buffer_size),
+            sample_interval,
+        )
 
     ego_states = property(lambda self: list(self._egos))
     observations = property(lambda self: list(self._observations))
@@ -217,8 +260,12 @@ class SemanticMapLayer(IntEnum):
     ROADBLOCK_CONNECTOR = 18
 
 
-LaneConnectorType = IntEnum("LaneConnectorType", "STRAIGHT LEFT RIGHT UTURN UNKNOWN", start=0)
-TrafficLightStatusType = IntEnum("TrafficLightStatusType", "GREEN YELLOW RED UNKNOWN", start=0)
+LaneConnectorType = IntEnum(
+    "LaneConnectorType", "STRAIGHT LEFT RIGHT UTURN UNKNOWN", start=0
+)
+TrafficLightStatusType = IntEnum(
+    "TrafficLightStatusType", "GREEN YELLOW RED UNKNOWN", start=0
+)
 
 
 @dataclass
@@ -230,7 +277,11 @@ class TrafficLightStatusData:
 
 def interface(name, members, *bases):
     """An abstract class of the given members."""
-    return ABCMeta(name, bases, {member: abstractmethod(lambda self: None) for member in members.split()})
+    return ABCMeta(
+        name,
+        bases,
+        {member: abstractmethod(lambda self: None) for member in members.split()},
+    )
 
 
 class AbstractMapObject:
@@ -243,14 +294,20 @@ class PolygonMapObject(interface("Polygonal", "polygon", AbstractMapObject)):
         return self.polygon.contains(Point(point.x, point.y))
 
 
-GraphEdgeMapObject = interface("GraphEdgeMapObject", "incoming_edges outgoing_edges parallel_edges", PolygonMapObject)
+GraphEdgeMapObject = interface(
+    "GraphEdgeMapObject",
+    "incoming_edges outgoing_edges parallel_edges",
+    PolygonMapObject,
+)
 LANE = """baseline_path left_boundary right_boundary speed_limit_mps get_roadblock_id parent has_traffic_lights
 stop_lines is_left_of is_right_of adjacent_edges get_width_left_right oriented_distance"""
 LaneGraphEdgeMapObject = interface("LaneGraphEdgeMapObject", LANE, GraphEdgeMapObject)
 Lane = interface("Lane", "index", LaneGraphEdgeMapObject)
 LaneConnector = interface("LaneConnector", "turn_type", LaneGraphEdgeMapObject)
 BLOCK = "interior_edges children_stop_lines"
-RoadBlockGraphEdgeMapObject = interface("RoadBlockGraphEdgeMapObject", BLOCK, GraphEdgeMapObject)
+RoadBlockGraphEdgeMapObject = interface(
+    "RoadBlockGraphEdgeMapObject", BLOCK, GraphEdgeMapObject
+)
 LINE = """linestring length discrete_path get_nearest_arc_length_from_position get_nearest_pose_from_position
 get_curvature_at_arc_length"""
 PolylineMapObject = interface("PolylineMapObject", LINE, AbstractMapObject)
@@ -275,7 +332,9 @@ class PlannerInput:
     traffic_light_data: list
 
 
-AbstractPlanner = interface("AbstractPlanner", "name initialize observation_type compute_planner_trajectory")
+AbstractPlanner = interface(
+    "AbstractPlanner", "name initialize observation_type compute_planner_trajectory"
+)
 
 
 class InterpolatedTrajectory:
@@ -289,5 +348,8 @@ class InterpolatedTrajectory:
 for module in MODULES.split():
     parts = module.split(".")
     sys.modules.update(
-        {".".join([__name__, *parts[:depth]]): sys.modules[__name__] for depth in range(1, 1 + len(parts))}
+        {
+            ".".join([__name__, *parts[:depth]]): sys.modules[__name__]
+            for depth in range(1, 1 + len(parts))
+        }
     )

@@ -1,4 +1,5 @@
-"""Exports for the clients: of a small run with a contact and lights, and of the bundled places."""
+"""Exports for the clients: of a small run with a contact and lights, and of the bundled
+places."""
 
 import os
 import subprocess
@@ -17,13 +18,18 @@ from tests.report.export.small_run import save_run
 
 @pytest.fixture(scope="session")
 def places(tmp_path_factory):
-    """The folder of a run that replays the first scene of each place of the bundled test scenes."""
+    """The folder of a run that replays the first scene of each place of the bundled
+    test scenes."""
     folder = tmp_path_factory.mktemp("places")
     recordings = reversed(list(BundledSource(split="test").recordings()))
     first = {recording.location: recording.scene_id for recording in recordings}
     listed = folder / "scenes.csv"
     listed.write_text("\n".join(["scene_id", *sorted(first.values())]) + "\n")
-    data = {"_target_": "e2rl.scenes.bundled.BundledSource", "split": "test", "cache": str(folder / "cache")}
+    data = {
+        "_target_": "e2rl.scenes.bundled.BundledSource",
+        "split": "test",
+        "cache": str(folder / "cache"),
+    }
     data |= {"build": {"field_cells": 64}}
     scenes = load_scenes(data, scenes=listed)
     batch = {key: scenes.scenes[key] for key in ("start", "logged", "logged_valid")}
@@ -40,18 +46,30 @@ def places(tmp_path_factory):
         seed=torch.zeros(count, dtype=torch.int64),
         eta=torch.zeros(count, dtype=torch.float64),
     )
-    return save_run(folder, data, rollouts=sourced(rollouts, "bundled", split="test", method="replay", ego="log"))
+    return save_run(
+        folder,
+        data,
+        rollouts=sourced(rollouts, "bundled", split="test", method="replay", ego="log"),
+    )
 
 
 @pytest.fixture(scope="session")
 def commonroad_files(tmp_path_factory):
-    """Exports a run to CommonRoad: its files, in the order of scenes. Its library's pins do not fit the project's."""
-    library = environment("commonroad-io", "commonroad-io==2026.1", "iso3166==2.1.1", options=("--no-deps",))
+    """Exports a run to CommonRoad: its files, in the order of scenes. Its library's
+    pins do not fit the project's."""
+    library = environment(
+        "commonroad-io",
+        "commonroad-io==2026.1",
+        "iso3166==2.1.1",
+        options=("--no-deps",),
+    )
     (packages,) = library.glob("lib/python*/site-packages")
 
     def files(run, name):
         out = tmp_path_factory.mktemp(name) / "out"
-        variables = os.environ | {"PYTHONPATH": os.pathsep.join([os.getcwd(), str(packages)])}
+        variables = os.environ | {
+            "PYTHONPATH": os.pathsep.join([os.getcwd(), str(packages)])
+        }
         command = [
             sys.executable,
             "-m",
@@ -64,8 +82,16 @@ def commonroad_files(tmp_path_factory):
             "--to",
             "commonroad",
         ]
-        done = subprocess.run([str(part) for part in command], env=variables, capture_output=True, text=True)
+        done = subprocess.run(
+            [str(part) for part in command],
+            env=variables,
+            capture_output=True,
+            text=True,
+        )
         assert done.returncode == 0, done.stderr[-3000:]
-        return sorted(out.glob("*.xml"), key=lambda path: int(path.stem.split("-")[1].split("_")[0]))
+        return sorted(
+            out.glob("*.xml"),
+            key=lambda path: int(path.stem.split("-")[1].split("_")[0]),
+        )
 
     return files

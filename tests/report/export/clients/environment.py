@@ -1,6 +1,8 @@
-"""Virtual environments of the programs that read exports, each with its own pinned packages.
+"""Virtual environments of the programs that read exports, each with its own pinned
+packages.
 
-They are kept in the folder E2RL_CLIENTS (default: ~/.cache/e2rl-clients), so a second run does not install again.
+They are kept in the folder E2RL_CLIENTS (default: ~/.cache/e2rl-clients), so a second
+run does not install again.
 """
 
 import hashlib
@@ -20,20 +22,37 @@ PROGRAMS = Path(__file__).parent / "programs"
 
 
 def environment(name: str, *packages: str, options: tuple[str, ...] = ()) -> Path:
-    """Returns the folder of an environment with `packages`; skips the test where they cannot be installed."""
-    root = Path(os.environ.get("E2RL_CLIENTS") or Path.home() / ".cache" / "e2rl-clients")
-    digest = hashlib.sha256(" ".join((sys.version, *packages, *options)).encode()).hexdigest()[:8]
+    """Returns the folder of an environment with `packages`; skips the test where they
+    cannot be installed."""
+    root = Path(
+        os.environ.get("E2RL_CLIENTS") or Path.home() / ".cache" / "e2rl-clients"
+    )
+    digest = hashlib.sha256(
+        " ".join((sys.version, *packages, *options)).encode()
+    ).hexdigest()[:8]
     folder = root / f"{name}-{digest}"
     complete = folder / "complete"
     if complete.exists():
         return folder
     shutil.rmtree(folder, ignore_errors=True)
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    command = [folder / "bin" / "pip", "install", "-q", "--no-compile", *options, *packages]
+    command = [
+        folder / "bin" / "pip",
+        "install",
+        "-q",
+        "--no-compile",
+        *options,
+        *packages,
+    ]
     try:
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=SECONDS)
+        subprocess.run(
+            command, check=True, capture_output=True, text=True, timeout=SECONDS
+        )
     except subprocess.CalledProcessError as error:
-        line = next((line for line in reversed(error.stderr.splitlines()) if "ERROR" in line), "pip failed")
+        line = next(
+            (line for line in reversed(error.stderr.splitlines()) if "ERROR" in line),
+            "pip failed",
+        )
         pytest.skip(f"{' '.join(packages)} cannot be installed: {line}")
     except subprocess.TimeoutExpired:
         pytest.skip(f"{' '.join(packages)} cannot be installed within {SECONDS} s")
@@ -41,8 +60,11 @@ def environment(name: str, *packages: str, options: tuple[str, ...] = ()) -> Pat
     return folder
 
 
-def answer(folder: Path, program: str, *arguments: Any, path: Path | None = None) -> list[Any]:
-    """Returns what a program prints with the Python of an environment: one JSON value per line.
+def answer(
+    folder: Path, program: str, *arguments: Any, path: Path | None = None
+) -> list[Any]:
+    """Returns what a program prints with the Python of an environment: one JSON value
+    per line.
 
     Args:
         folder: the environment.
@@ -54,9 +76,17 @@ def answer(folder: Path, program: str, *arguments: Any, path: Path | None = None
     variables.pop("PYTHONPATH", None)
     if path is not None:
         variables["PATH"] = f"{path}{os.pathsep}{variables['PATH']}"
-    command = [folder / "bin" / "python", PROGRAMS / f"{program}.py", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=variables)
+    command = [
+        folder / "bin" / "python",
+        PROGRAMS / f"{program}.py",
+        *map(str, arguments),
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env=variables
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     return [
-        json.loads(line.removeprefix("answer: ")) for line in done.stdout.splitlines() if line.startswith("answer: ")
+        json.loads(line.removeprefix("answer: "))
+        for line in done.stdout.splitlines()
+        if line.startswith("answer: ")
     ]

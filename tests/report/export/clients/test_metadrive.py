@@ -1,4 +1,5 @@
-"""MetaDrive replays ScenarioNet exports: contacts at the same steps; its summaries are the exported ones."""
+"""MetaDrive replays ScenarioNet exports: contacts at the same steps; its summaries are
+the exported ones."""
 
 import csv
 
@@ -21,10 +22,17 @@ def test_contacts_are_at_the_same_step_and_summaries_the_same(run, metadrive, tm
     exported(run, tmp_path / "out", "scenarionet")
     read = answer(metadrive, "metadrive_replay", tmp_path / "out")
     with (run / TABLE).open(newline="") as file:
-        steps = [int(float(row["contact_step"])) if row["contact_step"] else None for row in csv.DictReader(file)]
+        steps = [
+            int(float(row["contact_step"])) if row["contact_step"] else None
+            for row in csv.DictReader(file)
+        ]
     assert len(read) == len(steps)
     for found, step in zip(read, steps, strict=True):
         assert (found["contact"] is None) == (step is None)
         if step is not None:
-            assert found["contact"] == pytest.approx(step + HISTORY, abs=1)  # boxes have a margin there
-        assert found["differing"] == ["map_height_diff"]  # which is -inf there, of maps without lines
+            assert found["contact"] == pytest.approx(
+                step + HISTORY, abs=1
+            )  # boxes have a margin there
+        assert found["differing"] == [
+            "map_height_diff"
+        ]  # which is -inf there, of maps without lines

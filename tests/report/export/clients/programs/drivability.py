@@ -1,4 +1,5 @@
-"""CommonRoad's drivability checker: the first step at which the ego, obstacle 1, collides, in each file."""
+"""CommonRoad's drivability checker: the first step at which the ego, obstacle 1,
+collides, in each file."""
 
 import json
 import sys
@@ -16,5 +17,10 @@ for file in sys.argv[1:]:
     checker = create_collision_checker(scenario)
     driven = create_collision_object(ego)
     steps = range(ego.prediction.final_time_step + 1)
-    hit = (k for k in steps if driven.obstacle_at_time(k) and checker.time_slice(k).collide(driven.obstacle_at_time(k)))
+    hit = (
+        k
+        for k in steps
+        if driven.obstacle_at_time(k)
+        and checker.time_slice(k).collide(driven.obstacle_at_time(k))
+    )
     print("answer:", json.dumps(next(hit, None)))

@@ -1,4 +1,5 @@
-"""commonroad-sumo converts CommonRoad files: the lights of each, and the connections that they hold."""
+"""commonroad-sumo converts CommonRoad files: the lights of each, and the connections
+that they hold."""
 
 import json
 import logging
@@ -17,7 +18,11 @@ for file in sys.argv[1:]:
         CR2SumoMapConverter(scenario).create_sumo_files(Path(folder))
         (path,) = Path(folder).rglob("*.net.xml")
         root = ElementTree.parse(path).getroot()
-    connections = [each for each in root.iterfind("connection") if not each.get("from").startswith(":")]
+    connections = [
+        each
+        for each in root.iterfind("connection")
+        if not each.get("from").startswith(":")
+    ]
     found = {
         "connections": len(connections),
         "signalled": sum(each.get("tl") is not None for each in connections),

@@ -1,6 +1,8 @@
-"""MetaDrive replays a folder of scenarios without rendering: what its reader says of each, and the first contact.
+"""MetaDrive replays a folder of scenarios without rendering: what its reader says of
+each, and the first contact.
 
-MetaDrive loads its textures from outside of the package; without rendering it asks only whether they are there.
+MetaDrive loads its textures from outside of the package; without rendering it asks only
+whether they are there.
 """
 
 import json
@@ -24,7 +26,11 @@ from metadrive.scenario.utils import read_dataset_summary, read_scenario_data  #
 def plain(summary: dict) -> dict:
     """Sets as sorted lists, dictionaries with defaults as plain ones."""
     return {
-        key: sorted(value) if isinstance(value, (set, list)) else dict(value) if isinstance(value, dict) else value
+        key: sorted(value)
+        if isinstance(value, (set, list))
+        else dict(value)
+        if isinstance(value, dict)
+        else value
         for key, value in summary.items()
     }
 
@@ -57,5 +63,14 @@ for index, name in enumerate(names):
         if info["crash_vehicle"]:
             contacts.append(step)
         over = terminated or truncated
-    print("answer:", json.dumps({"contact": next(iter(contacts), None), "steps": step, "differing": differing}))
+    print(
+        "answer:",
+        json.dumps(
+            {
+                "contact": next(iter(contacts), None),
+                "steps": step,
+                "differing": differing,
+            }
+        ),
+    )
 env.close()
