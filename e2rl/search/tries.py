@@ -10,7 +10,7 @@ from torch import Tensor
 
 from e2rl.run.errors import InputError
 from e2rl.run.settings import check_choice
-from e2rl.traffic.e2.decisions import RULE, WHOM, Decisions
+from e2rl.traffic.decisions import RULE, WHOM, Decisions
 
 TRIES = 10_000  # of a scene that have seeds of their own
 DRAWN = Decisions._fields

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from e2rl.run.errors import InputError
-from e2rl.traffic.e2.decisions import OWES, RULE
+from e2rl.traffic.decisions import OWES, RULE
 from e2rl.traffic.traffic import FULL
 
 RECORDED, LIVE = (
@@ -44,7 +44,7 @@ class TrafficPool:
     the log is replayed, LIVE: a traffic method replans it against the ego; eta [R]:
     adversarial intensity, 0: none; template [R] int64: causal template of the attack
     (e2rl/traffic/traffic.py); seed [R] int64: of the noise of LIVE rows; decisions [R,
-    D]: of the attack (e2rl/traffic/e2/decisions.py); weight [R]: in draws; fresh [R]
+    D]: of the attack (e2rl/traffic/decisions.py); weight [R]: in draws; fresh [R]
     bool: made for this round, not remembered from an earlier one. parts: the stored
     traffic, of equal T and N; positions count through all parts. Joined pools share the
     tracks.

@@ -79,7 +79,7 @@ class Traffic(Extension, ABC):
 
     stochastic: seeds matter; adversarial: the intensity eta matters; follows_template:
     `reset` takes causal templates, template [B] int64 (None: full for all);
-    follows_decisions: and decisions [B, D] (e2rl/traffic/e2/decisions.py; None: by
+    follows_decisions: and decisions [B, D] (e2rl/traffic/decisions.py; None: by
     rule); predicts: plans can be compared with the log in open loop; replays_log: it is
     the recording itself; queries_ego: `replan` takes `react`, which returns the ego's
     states against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) ->

@@ -25,7 +25,7 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import constant_velocity
 from e2rl.sim.env import DrivingEnv
 from e2rl.sim.world import World
-from e2rl.traffic.e2.decisions import OWES
+from e2rl.traffic.decisions import OWES
 from e2rl.traffic.e2.reaiming import Reaiming
 from e2rl.traffic.grouping import put_rows, take_rows
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool

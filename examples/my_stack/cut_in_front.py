@@ -7,7 +7,7 @@ import torch
 
 from e2rl.run.settings import setting
 from e2rl.scenes.boxes import to_frame
-from e2rl.traffic.e2.potentials import LENGTH, PotentialSettings, with_ego
+from e2rl.traffic.potentials import LENGTH, PotentialSettings, with_ego
 
 
 @dataclass(frozen=True)

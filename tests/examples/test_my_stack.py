@@ -13,7 +13,7 @@ import torch
 
 import e2rl
 from e2rl.scenes.recording import DT
-from e2rl.traffic.e2.potentials import SAMPLED_STEPS, PotentialSettings
+from e2rl.traffic.potentials import SAMPLED_STEPS, PotentialSettings
 from tests.traffic.e2.test_potentials import situation
 
 ROOT = Path(__file__).parents[2]

@@ -6,7 +6,7 @@ import pytest
 
 from e2rl.run.errors import InputError
 from e2rl.search.tries import Family, family_of
-from e2rl.traffic.e2.decisions import RULE, WHOM, Decisions
+from e2rl.traffic.decisions import RULE, WHOM, Decisions
 
 TIMED = Family("timed", "e2", ranges={"moment": (1.0, 5.0), "strength": (0.5, 1.5)})
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.traffic.e2.decisions import OWES
+from e2rl.traffic.decisions import OWES
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
 from tests.learning.small import brake_check, small_scenes
 

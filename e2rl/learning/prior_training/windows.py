@@ -13,7 +13,7 @@ from e2rl.run.terminal import Bar
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.sim.dynamics import wrap
-from e2rl.traffic.e2.motion import take
+from e2rl.traffic.motion import take
 
 OFFSETS = (0, 5, 10, 15)  # frames after a scene's start frame at which a window begins
 ROWS = 16  # vehicles of a window: the modelled ones nearest to the ego

@@ -14,9 +14,9 @@ from e2rl.run.settings import setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
-from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of
 from e2rl.traffic.grouping import no_vehicles, noise_of
 from e2rl.traffic.nominal import NominalTraffic, Own, PriorState, React, Replan
+from e2rl.traffic.responsibility import RESPONSIBILITIES, YieldingSettings, duty_of
 from e2rl.traffic.rule_based import LogReplay
 from e2rl.traffic.traffic import REPLAN_STEPS, State, TrafficPlan
 

@@ -25,9 +25,9 @@ from e2rl.traffic.baselines.losses import (
     pair_term,
 )
 from e2rl.traffic.baselines.view import View
-from e2rl.traffic.e2.motion import direction, smallest
-from e2rl.traffic.e2.topology import cliques_in, weight_of
+from e2rl.traffic.cliques import cliques_in, weight_of
 from e2rl.traffic.grouping import noise_of
+from e2rl.traffic.motion import direction, smallest
 from e2rl.traffic.nominal import React
 from e2rl.traffic.traffic import TrafficPlan
 

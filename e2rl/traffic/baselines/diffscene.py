@@ -21,7 +21,7 @@ from e2rl.traffic.baselines.losses import (
 )
 from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
 from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
-from e2rl.traffic.e2.motion import smallest
+from e2rl.traffic.motion import smallest
 from e2rl.traffic.nominal import Replan
 
 LOW, HIGH, JERK = -3.5, 2.0, 2.0  # m/s^2, m/s^2, m/s^3: what the constraint lets pass

@@ -18,8 +18,8 @@ from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import closest_approach_cost
 from e2rl.traffic.baselines.view import View
-from e2rl.traffic.e2.motion import direction
-from e2rl.traffic.e2.potentials import STRIDE
+from e2rl.traffic.motion import direction
+from e2rl.traffic.potentials import STRIDE
 
 DISCOUNT = 0.9  # CTG's, a step of DT
 DISKS = 2  # CTG's, a vehicle

@@ -18,8 +18,8 @@ from e2rl.traffic.baselines.losses import (
     ttc_term,
 )
 from e2rl.traffic.baselines.view import View
-from e2rl.traffic.e2.motion import smallest
-from e2rl.traffic.e2.potentials import STRIDE
+from e2rl.traffic.motion import smallest
+from e2rl.traffic.potentials import STRIDE
 
 GAUSSIAN_REACH = 3.0  # m beyond which the Gaussian of 1 m is below 0.4
 GAUSSIAN_TIME = 2.0  # s of the plan in which collisions cost

@@ -26,9 +26,9 @@ from e2rl.traffic.baselines.losses import (
 )
 from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
 from e2rl.traffic.baselines.view import View, motion_of
-from e2rl.traffic.e2.potentials import SAMPLED_STEPS, STRIDE
 from e2rl.traffic.grouping import of_scenes, take_rows
 from e2rl.traffic.nominal import Replan
+from e2rl.traffic.potentials import SAMPLED_STEPS, STRIDE
 
 
 def decode_latent(prior: Prior, latent: Tensor, context: Context, steps: int) -> Tensor:

@@ -15,8 +15,8 @@ from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routes import RoutedScene
 from e2rl.sim.world import World
-from e2rl.traffic.e2.potentials import SAMPLED_STEPS
 from e2rl.traffic.grouping import mapped
+from e2rl.traffic.potentials import SAMPLED_STEPS
 
 
 @dataclass(frozen=True)

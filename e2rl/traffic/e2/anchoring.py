@@ -29,7 +29,8 @@ from e2rl.scenes.route import SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World
 from e2rl.traffic.e2.interception import InterceptionSettings, Wish, intercept
-from e2rl.traffic.e2.motion import (
+from e2rl.traffic.e2.skeleton import Skeleton
+from e2rl.traffic.motion import (
     TOP_SPEED,
     compact,
     constant_speed_states,
@@ -40,7 +41,6 @@ from e2rl.traffic.e2.motion import (
     states_on_route,
     take,
 )
-from e2rl.traffic.e2.skeleton import Skeleton
 
 COARSE, FINE = (
     19,

@@ -14,13 +14,12 @@ from e2rl.prior.routes import take_route
 from e2rl.run.settings import setting, settings_of
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
+from e2rl.traffic.decisions import LEADER, RULE, Decisions, eligible
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
 from e2rl.traffic.e2.control import ControlSettings
-from e2rl.traffic.e2.decisions import LEADER, RULE, Decisions, eligible
 from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
 from e2rl.traffic.e2.interception import InterceptionSettings, Wish
 from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
-from e2rl.traffic.e2.responsibility import RESPONSIBILITIES, leading, place_of
 from e2rl.traffic.e2.skeleton import (
     STEP,
     Selection,
@@ -34,6 +33,7 @@ from e2rl.traffic.e2.skeleton import (
 from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
 from e2rl.traffic.grouping import no_vehicles, noise_of, put_rows, take_rows
 from e2rl.traffic.nominal import NominalTraffic, PriorState, onto
+from e2rl.traffic.responsibility import RESPONSIBILITIES, leading, place_of
 from e2rl.traffic.traffic import FULL
 
 SUPPORT, SCATTER = (

@@ -25,7 +25,7 @@ from e2rl.run.fused import fused
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.kernels import pulled
-from e2rl.traffic.e2.potentials import (
+from e2rl.traffic.potentials import (
     SAMPLED_STEPS,
     PotentialContext,
     PotentialSettings,

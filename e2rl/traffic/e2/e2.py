@@ -18,10 +18,10 @@ from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.prior import Context
 from e2rl.run.settings import configured
 from e2rl.sim.world import World
+from e2rl.traffic.decisions import ANY, eligible
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.coalition import Coalitions, E2State
 from e2rl.traffic.e2.control import Pull, SparseControl
-from e2rl.traffic.e2.decisions import ANY, eligible
 from e2rl.traffic.e2.foresight import time_before
 from e2rl.traffic.e2.kernels import (
     DRAWN,
@@ -34,10 +34,10 @@ from e2rl.traffic.e2.kernels import (
     sideways,
     tries,
 )
-from e2rl.traffic.e2.potentials import PotentialContext, PotentialSettings
-from e2rl.traffic.e2.responsibility import YieldingSettings, duty_of
 from e2rl.traffic.grouping import noise_of, of_scenes, take_rows
 from e2rl.traffic.nominal import React, Replan
+from e2rl.traffic.potentials import PotentialContext, PotentialSettings
+from e2rl.traffic.responsibility import YieldingSettings, duty_of
 from e2rl.traffic.traffic import TrafficPlan
 
 LITERAL = 500  # number of the draw of the literal blend's noise

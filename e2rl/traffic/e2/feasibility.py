@@ -13,7 +13,7 @@ from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.route import interpolate, project
 from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World
-from e2rl.traffic.e2.motion import (
+from e2rl.traffic.motion import (
     MAX_ACCELERATION,
     arrival_window,
     direction,

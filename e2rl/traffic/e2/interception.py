@@ -27,7 +27,7 @@ from e2rl.scenes.route import SPACING
 from e2rl.sim.dynamics import SHARPEST, wrap
 from e2rl.sim.world import World
 from e2rl.traffic.e2.foresight import foresee
-from e2rl.traffic.e2.motion import direction, distance_to_stop_line, take
+from e2rl.traffic.motion import direction, distance_to_stop_line, take
 
 ENDS = 3  # directions tried at the end of a path
 SAMPLES = 17  # points of a path that are checked

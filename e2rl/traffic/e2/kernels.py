@@ -35,7 +35,7 @@ from e2rl.scenes.route import interpolate, project
 from e2rl.sim.world import World
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.foresight import Foresight, foresee
-from e2rl.traffic.e2.motion import smallest
+from e2rl.traffic.motion import smallest
 
 # Standard deviations of x over 12 samples of a Waymo prior (48 scenes, DPM-Solver++),
 # and the correlation of knots that are neighbours. They set how a pull is spread over x

@@ -40,8 +40,8 @@ from e2rl.traffic.e2.interception import (
     TIME_COST,
     InterceptionSettings,
 )
-from e2rl.traffic.e2.motion import TOP_SPEED
-from e2rl.traffic.e2.responsibility import (
+from e2rl.traffic.motion import TOP_SPEED
+from e2rl.traffic.responsibility import (
     RESPONSIBILITIES,
     YieldingSettings,
     duty_of,

@@ -36,7 +36,7 @@ from e2rl.traffic.e2.feasibility import (
     FeasibilitySettings,
     feasible_vehicles,
 )
-from e2rl.traffic.e2.motion import frenet_pose
+from e2rl.traffic.motion import frenet_pose
 
 INSTRUCTIONS = """\
 You judge which vehicles in a traffic scene could come into conflict with the ego vehicle within the next five seconds.

@@ -16,7 +16,8 @@ from torch import Tensor
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import project
 from e2rl.sim.world import World
-from e2rl.traffic.e2.motion import (
+from e2rl.traffic.e2.topology import TopologySettings
+from e2rl.traffic.motion import (
     compact,
     direction,
     frenet_pose,
@@ -25,7 +26,6 @@ from e2rl.traffic.e2.motion import (
     smallest,
     take,
 )
-from e2rl.traffic.e2.topology import TopologySettings
 
 LIMITS = (
     (1, 0),

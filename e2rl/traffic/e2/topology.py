@@ -8,16 +8,15 @@ clique never weighs less than the whole, so ranking all cliques would leave pair
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from math import fsum
 
-import networkx
 import numpy as np
 import torch
 from torch import Tensor
 
 from e2rl.run.settings import configured, setting
-from e2rl.traffic.e2.motion import smallest
+from e2rl.traffic.cliques import cliques_in, weight_of
+from e2rl.traffic.motion import smallest
 
 STRIDE = 5  # steps between the graphs (0.5 s)
 RISK_SECONDS = 8.0  # s; no contact within it at constant velocity is no risk
@@ -131,33 +130,6 @@ def pair_weights(
     return weight * (
         both & ~torch.eye(both.shape[-1], dtype=torch.bool, device=both.device)
     )
-
-
-@lru_cache(maxsize=8192)
-def maximal_cliques(adjacency: bytes, nodes: int) -> tuple[tuple[int, ...], ...]:
-    """Maximal cliques of size >= 2 of the graph whose nodes x nodes matrix of bytes is
-    `adjacency` (rows in order)."""
-    edges = np.argwhere(
-        np.triu(np.frombuffer(adjacency, np.uint8).reshape(nodes, nodes), 1)
-    )
-    return tuple(
-        tuple(sorted(clique))
-        for clique in networkx.find_cliques(networkx.Graph(edges.tolist()))
-    )
-
-
-def cliques_in(adjacency: np.ndarray) -> list[tuple[int, ...]]:
-    """Maximal cliques of size >= 2 of a graph [V, V] of bytes."""
-    nodes = np.flatnonzero(adjacency.any(-1))
-    found = maximal_cliques(
-        np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes)
-    )
-    return [tuple(int(nodes[i]) for i in clique) for clique in found]
-
-
-def weight_of(clique: tuple[int, ...], weight: np.ndarray) -> float:
-    """Total weight [V, V] of a clique's pairs."""
-    return fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :])
 
 
 def _within_hops(adjacency: Tensor, hops: int) -> Tensor:

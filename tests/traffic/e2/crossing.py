@@ -10,8 +10,8 @@ from e2rl.prior.lane_relative import LaneState, speeds
 from e2rl.scenes.route import SPACING
 from e2rl.sim.world import World
 from e2rl.traffic.e2.interception import Wish
-from e2rl.traffic.e2.motion import constant_speed_states
 from e2rl.traffic.e2.skeleton import STEP, Skeleton, SkeletonSettings, build_skeleton
+from e2rl.traffic.motion import constant_speed_states
 from tests.synthetic import BACK, make_scenes
 
 

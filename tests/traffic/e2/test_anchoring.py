@@ -7,7 +7,7 @@ from e2rl.scenes.recording import DT
 from e2rl.traffic.e2 import anchoring
 from e2rl.traffic.e2.anchoring import AnchorSettings, propose
 from e2rl.traffic.e2.interception import InterceptionSettings
-from e2rl.traffic.e2.motion import constant_speed_states
+from e2rl.traffic.motion import constant_speed_states
 from tests.traffic.e2.crossing import (
     add_route,
     decoded,

@@ -9,7 +9,7 @@ from e2rl.run.errors import InputError
 from e2rl.traffic.e2 import control as control_module
 from e2rl.traffic.e2.anchoring import Anchor
 from e2rl.traffic.e2.control import ControlSettings, SparseControl, clip_rows
-from e2rl.traffic.e2.potentials import (
+from e2rl.traffic.potentials import (
     SAMPLED_STEPS,
     PotentialContext,
     PotentialSettings,

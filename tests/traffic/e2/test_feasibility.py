@@ -8,7 +8,7 @@ from e2rl.traffic.e2.feasibility import (
     FeasibilitySettings,
     feasible_vehicles,
 )
-from e2rl.traffic.e2.motion import MAX_BRAKING, arrival_window, reachable_distance
+from e2rl.traffic.motion import MAX_BRAKING, arrival_window, reachable_distance
 from tests.traffic.e2.crossing import add_route, make_world
 
 UP = math.pi / 2

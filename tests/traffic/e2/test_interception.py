@@ -9,7 +9,7 @@ from e2rl.scenes.drivable_area import CELL
 from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.route import SPACING, interpolate
 from e2rl.traffic.e2.interception import InterceptionSettings, cubic, intercept
-from e2rl.traffic.e2.motion import constant_speed_states
+from e2rl.traffic.motion import constant_speed_states
 from tests.traffic.e2.crossing import decoded, make_world, wish_of
 
 UP = math.pi / 2

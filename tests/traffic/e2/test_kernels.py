@@ -27,7 +27,7 @@ from e2rl.traffic.e2.kernels import (
     shifts,
     tries,
 )
-from e2rl.traffic.e2.motion import smallest
+from e2rl.traffic.motion import smallest
 from tests.prior.test_prior import MEAN, STD, gaussian_prior
 from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synthesizer
 

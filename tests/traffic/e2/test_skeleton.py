@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from e2rl.traffic.e2 import skeleton
-from e2rl.traffic.e2.motion import constant_speed_states
 from e2rl.traffic.e2.skeleton import (
     STEP,
     SkeletonSettings,
@@ -16,6 +15,7 @@ from e2rl.traffic.e2.skeleton import (
     lane_of,
     limits_of,
 )
+from e2rl.traffic.motion import constant_speed_states
 from e2rl.traffic.traffic import CHAIN, FULL, PAIR, SINGLE
 from tests.traffic.e2.crossing import add_route, make_world, mask, skeleton_of
 

@@ -7,8 +7,8 @@ import torch
 
 from e2rl.scenes.boxes import corners
 from e2rl.traffic.e2 import potentials
-from e2rl.traffic.e2.motion import constant_speed_states
-from e2rl.traffic.e2.potentials import (
+from e2rl.traffic.motion import constant_speed_states
+from e2rl.traffic.potentials import (
     SAMPLED_STEPS,
     PotentialContext,
     PotentialSettings,

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from e2rl.sim.env import SimSettings
-from e2rl.traffic.e2.decisions import BESIDE, LEADER, ONCOMING, RULE, WHOM, eligible
+from e2rl.traffic.decisions import BESIDE, LEADER, ONCOMING, RULE, WHOM, eligible
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rollout import roll_out
 from tests.traffic.e2.crossing import make_world

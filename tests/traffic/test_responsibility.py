@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from e2rl.traffic.e2.responsibility import YieldingSettings, duty_of, followed, leading
+from e2rl.traffic.responsibility import YieldingSettings, duty_of, followed, leading
 from tests.traffic.e2.crossing import make_world
 
 EGO = (0.0, 0.0, 0.0, 12.0)

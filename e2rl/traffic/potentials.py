@@ -23,7 +23,7 @@ from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate, project
 from e2rl.sim.dynamics import closest_approach_cost, wrap
-from e2rl.traffic.e2.motion import direction
+from e2rl.traffic.motion import direction
 
 STRIDE = 5  # steps between the states of a plan that the potentials look at
 SAMPLED_STEPS = slice(STRIDE - 1, None, STRIDE)

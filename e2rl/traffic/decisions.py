@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from e2rl.sim.world import World
-from e2rl.traffic.e2.responsibility import SAME_DIRECTION, leading, place_of
+from e2rl.traffic.responsibility import SAME_DIRECTION, leading, place_of
 
 WHOM = (
     "any",
