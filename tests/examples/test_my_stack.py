@@ -14,7 +14,7 @@ import torch
 import e2rl
 from e2rl.scenes.recording import DT
 from e2rl.traffic.potentials import SAMPLED_STEPS, PotentialSettings
-from tests.traffic.e2.test_potentials import situation
+from tests.traffic.test_potentials import situation
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"

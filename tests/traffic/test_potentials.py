@@ -6,7 +6,7 @@ import shapely
 import torch
 
 from e2rl.scenes.boxes import corners
-from e2rl.traffic.e2 import potentials
+from e2rl.traffic import potentials
 from e2rl.traffic.motion import constant_speed_states
 from e2rl.traffic.potentials import (
     SAMPLED_STEPS,
