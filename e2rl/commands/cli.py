@@ -52,7 +52,7 @@ COMMANDS = {  # module, and what the command does
     ),
     "prior-tables": (
         "e2rl.commands.prior_tables",
-        "the prior as traffic: open loop, closed loop, meta-metric",
+        "the prior as traffic: closed loop, spread of its samples",
     ),
     "skeleton": (
         "e2rl.report.skeleton_figure",

@@ -1,22 +1,17 @@
 """`e2rl prior-tables`: the prior as traffic beside log replay, constant velocity and
-IDM, in four tables.
-
-Open-loop accuracy (minADE), the spread of samples, the closed loop, and the realism
-meta-metric over many rollouts of each scene.
-"""
+IDM, in closed loop, and how far its samples lie apart."""
 
 from typing import Any
 
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from e2rl.evaluation.meta_table import meta_rows
 from e2rl.evaluation.methods import processes_of
-from e2rl.evaluation.open_loop import open_loop_rows, spread_rows
 from e2rl.evaluation.plan import begin
 from e2rl.evaluation.protocol import Work, drive_all, record
+from e2rl.evaluation.spread_table import spread_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.report.results import write_results
 from e2rl.report.tables import metric_tables, print_tables
@@ -31,56 +26,35 @@ MAY_CHANGE = ("processes", "launcher")  # when a run is resumed
 class TableSettings:
     """Keys of conf/prior_tables.yaml, checked."""
 
-    open_loop_samples: int = setting(low=0)
     spread_samples: int = setting(low=0)
-    meta_rollouts: int = setting(low=0)
 
 
 def prior_tables(run: Run) -> None:
     """Make the rows of the tables; write and print them."""
     config = run.config
-    folder = run.folder
-    asked = settings_of(
-        TableSettings, {each.name: config[each.name] for each in fields(TableSettings)}
-    )
+    settings = settings_of(TableSettings, {"spread_samples": config.spread_samples})
     plan = begin(run)
-    methods = plan.methods
-    setup = plan.setup
     parts = run.parts()
-    before = []
-    after = []
-    if asked.open_loop_samples:
-        before = open_loop_rows(
+    spread = []
+    if settings.spread_samples:
+        spread = spread_rows(
             plan.scenes,
-            methods,
-            samples=asked.open_loop_samples,
-            device=config.device,
-            parts=parts,
-        )
-    if asked.spread_samples:
-        before += spread_rows(
-            plan.scenes,
-            methods,
-            samples=asked.spread_samples,
+            plan.methods,
+            samples=settings.spread_samples,
             device=config.device,
             parts=parts,
         )
     work = Work(
-        plan.rollouts(folder), processes_of(config), only=plan.only, parts=parts
+        plan.rollouts(run.folder), processes_of(config), only=plan.only, parts=parts
     )
-    scored = drive_all([setup], methods, seeds=plan.asked.seeds, work=work)
-    if asked.meta_rollouts:
-        after = meta_rows(setup, methods, rollouts=asked.meta_rollouts, parts=parts)
+    scored = drive_all([plan.setup], plan.methods, seeds=plan.asked.seeds, work=work)
 
-    def summarise(*found: Any) -> list[dict]:
-        return [
-            row | origin_of(run.folder)
-            for row in (*before, *metric_rows(*found), *after)
-        ]
+    def summarise(*scores: Any) -> list[dict]:
+        return [row | origin_of(run.folder) for row in (*spread, *metric_rows(*scores))]
 
-    rows = record(*scored, folder, summarise)
+    rows = record(*scored, run.folder, summarise)
     answer = write_results(run, plan, rows=rows)
-    print_tables(metric_tables([*before, *after]))
+    print_tables(metric_tables(spread))
     print("", *answer, sep="\n")
 
 

@@ -110,8 +110,6 @@ LATER: dict[
     "cfr_object": math.nan,
     "left_out": math.nan,  # vehicles that come near in the recording and are neither driven nor replayed
 }
-OPEN_LOOP_STAGE = "open loop"
-META_STAGE = "meta-metric"
 SPREAD_STAGE = "spread"
 STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own
 

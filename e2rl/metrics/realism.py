@@ -218,33 +218,6 @@ def _pooled(
     return table | dict(zip(W1, distances, strict=True))
 
 
-def split_half(samples: list[Samples], cluster: Tensor, halves: Tensor) -> Tensor:
-    """`real` [S] of one half of the logs against the other: the ceiling that sampling
-    and the scenes' variety set.
-
-    halves [S, C] bool: the clusters of rollouts (cluster [R]) in the first half of each
-    split; NaN where a half is empty.
-    """
-    distances = []
-    for name in KINEMATICS:
-        log = torch.cat([sample[name][1] for sample in samples])
-        owner = cluster.repeat_interleave(
-            torch.tensor([sample[name].shape[1] for sample in samples])
-        )
-        values, order = log.sort()
-        first = halves[:, owner[order]].to(log)
-        fraction = [
-            side.cumsum(1) / side.sum(1, keepdim=True) for side in (first, 1 - first)
-        ]
-        known = (first > 0).any(1) & (first < 1).any(1)
-        distances.append(
-            ((fraction[0] - fraction[1]).abs()[:, :-1] @ values.diff()).where(
-                known, torch.nan
-            )
-        )
-    return 1 - torch.stack(distances).clamp(max=1).mean(0)
-
-
 def quantile_of_sorted(values: Tensor, fraction: float) -> Tensor:
     """Linear quantile of sorted values [n]; torch.quantile refuses more than 16 million
     of them."""

@@ -183,12 +183,6 @@ def _offset_basis(device: torch.device) -> Tensor:
     return torch.linalg.inv(torch.stack(rows)).float().to(device)
 
 
-def distance_weights(device: torch.device | None = None) -> Tensor:
-    """[KNOTS]: metres that a unit of each acceleration knot adds to the travelled
-    distance, mean over the horizon."""
-    return _distance_basis(device or torch.device("cpu")).mean(0)[1:]
-
-
 def lateral_horizon(v: Tensor) -> Tensor:
     """Distance over which the offset settles, m."""
     return (4.0 * v).clamp(10.0, 80.0)

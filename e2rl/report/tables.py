@@ -14,9 +14,7 @@ from pathlib import Path
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from e2rl.metrics.catalogue import (
-    META_STAGE,
     METRICS,
-    OPEN_LOOP_STAGE,
     SPREAD_STAGE,
     STAGES,
     Metric,
@@ -29,10 +27,6 @@ from e2rl.run.terminal import column_groups, terminal_width
 
 UNKNOWN = "–"
 COUNTED = {  # what the count (n) of a stage's cells counts, and how its metrics are computed
-    OPEN_LOOP_STAGE: "(n) vehicles: others than the ego, faster than 0.5 m/s in the log at the start, recorded "
-    "throughout the horizon; causal start states, a route drawn per sample; samples without acceleration bounds.",
-    META_STAGE: "(n) scenes. Likelihood of the log under each vehicle's histogram over all rollouts and steps; "
-    "vehicles recorded throughout. A deterministic method's rollout stands for all.",
     SPREAD_STAGE: "(n) vehicles: others than the ego, faster than 1 m/s at the start; samples on one route each.",
 }
 MEANS = "Mean [95% interval, by location or scene]; (n) rollouts where fewer count."
@@ -129,8 +123,8 @@ def metric_tables(
     means of each method, and their differences where there are several.
 
     Args:
-        rows: of metrics.json; those of the stages `open loop` and `meta-metric` have
-            their own tables and metrics.
+        rows: of metrics.json; those of the stage `spread` have their own table and
+            metrics.
         settings: text for every caption, such as the prior and its sampler.
         table: of the catalogue, whose metrics the closed-loop tables show; a caption
             names those that no row knows.

@@ -19,11 +19,6 @@ from torch import Tensor
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate, select
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routes import Moment, RoutedScene, reroute
-from e2rl.prior.stratified_sampling import (
-    main_direction,
-    stratified_noise,
-    stratified_uniform,
-)
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
@@ -247,40 +242,6 @@ class NominalTraffic(Traffic):
             )
 
         return LaneState(*(merged(field.name) for field in fields(LaneState)))
-
-    @torch.no_grad()
-    def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
-        """Returns joint samples [B, S, V, HORIZON, 4] beside an ego whose plan is
-        unknown, stratified over S samples, without acceleration bounds: those hold for
-        0.5 s; applied over 5 s they cost a tenth of the accuracy."""
-        prior, (count, batch), vehicles = (
-            self.prior,
-            seed.shape,
-            scene["route_log"].shape[1],
-        )
-
-        def draw(number: int, *shape: int, uniform: bool = False) -> Tensor:
-            numbers = torch.full((count * batch,), number)
-            return noise_of(
-                seed.flatten(), numbers, shape=shape, uniform=uniform
-            ).unflatten(0, (count, batch))
-
-        order = draw(0, 2, vehicles, uniform=True).unbind(2)
-        position = draw(2, 2, vehicles, uniform=True)[0].unbind(1)
-        noise = draw(1, prior.sampler.steps, vehicles, SIZE).transpose(1, 2)
-        direction = main_direction(prior.schedule, prior.sampler, device=noise.device)
-        noise = stratified_noise(noise, direction, order=order[1], position=position[1])
-        step = torch.zeros(batch, dtype=torch.long, device=seed.device)
-        plans = []
-        for uniform, one in zip(
-            stratified_uniform(order[0], position[0]), noise, strict=True
-        ):
-            routed, lane = prior.start(scene, prior.choose_routes(scene, uniform))
-            context = prior.encode(
-                routed, lane, scene["start"], scene["valid"], step, None
-            )
-            plans.append(prior.decode(prior.sample(context, one).x0, context).states())
-        return torch.stack(plans, 1)
 
 
 def onto(

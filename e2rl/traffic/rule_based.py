@@ -48,8 +48,6 @@ class LogReplay(Traffic):
     """The smoothed recording; a vehicle is absent in gaps of its track and after its
     end."""
 
-    stochastic, predicts, replays_log = False, False, True
-
     def replan(
         self, state: State, world: World, ego_plan: Tensor
     ) -> tuple[State, TrafficPlan]:
@@ -69,8 +67,6 @@ class LogReplay(Traffic):
 class ConstantVelocity(Traffic):
     """Start heading and start speed are kept, in reverse too; parked vehicles stay
     parked, and no vehicle leaves."""
-
-    stochastic = False
 
     def replan(
         self, state: State, world: World, ego_plan: Tensor
@@ -108,8 +104,6 @@ class IDM(Traffic):
     braking: float = setting()
     exponent: float = setting()
     speed: float = setting()
-
-    stochastic = False
 
     def __post_init__(self) -> None:
         self.bounds = self.prior.bounds

@@ -6,8 +6,6 @@ its `_target_`, a `name` and its settings. A complete example, in which every ve
 brakes to a halt:
 
     class Halt(Traffic):
-        stochastic = False
-
         def __init__(self, prior=None, braking: float = 2.0):
             self.braking = braking
 
@@ -77,24 +75,20 @@ class Traffic(Extension, ABC):
     """Drives all vehicles but the ego of B scenes at once. Built as
     `_target_(prior=prior, **settings)`.
 
-    stochastic: seeds matter; adversarial: the intensity eta matters; follows_template:
+    adversarial: the intensity eta matters; follows_template:
     `reset` takes causal templates, template [B] int64 (None: full for all);
     follows_decisions: and decisions [B, D] (e2rl/traffic/decisions.py; None: by
-    rule); predicts: plans can be compared with the log in open loop; replays_log: it is
-    the recording itself; queries_ego: `replan` takes `react`, which returns the ego's
-    states against a plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) ->
-    [G, HORIZON, 4]; knowledge, responsibility: what it knows of the ego and owes it, in
+    rule); queries_ego: `replan` takes `react`, which returns the ego's states against a
+    plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
+    knowledge, responsibility: what it knows of the ego and owes it, in
     words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the
     settings that a tuning varies, by dotted name, the gain first; on_decision: called
     with what the method decides, if it tells (e2: a `Selection` of adversaries).
     """
 
-    stochastic = True
     adversarial = False
     follows_template = False
     follows_decisions = False
-    predicts = True
-    replays_log = False
     queries_ego = False
     knowledge = ""
     responsibility = ""
@@ -124,23 +118,6 @@ class Traffic(Extension, ABC):
             ego_plan: [B, >= HORIZON, 4], states that the ego announces, for a method
                 whose knowledge is its plan.
         """
-
-    def open_loop_plans(self, scene: TensorDictBase, seed: Tensor) -> Tensor:
-        """Returns joint plans [B, S, V, HORIZON, 4] of scenes [B] from their start
-        frames; seed [S, B] int64.
-
-        By default those of the first replan, given an ego that keeps its velocity.
-        """
-        world = World.at_start(scene)
-        ego_plan = keep_velocity(world.states[:, 0])
-        eta = torch.zeros(len(world.step), device=seed.device)
-        plans = [
-            self.replan(self.reset(scene, one, eta=eta), world, ego_plan=ego_plan)[
-                1
-            ].states
-            for one in seed
-        ]
-        return torch.stack(plans, 1)
 
 
 def keep_velocity(states: Tensor, steps: Tensor | None = None) -> Tensor:

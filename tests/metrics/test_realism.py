@@ -11,7 +11,6 @@ from e2rl.metrics.realism import (
     KINEMATICS,
     kinematic_samples,
     realism,
-    split_half,
     wasserstein,
 )
 from e2rl.metrics.score import score_rollouts
@@ -136,28 +135,3 @@ def test_a_constant_turn_has_its_lateral_acceleration():
         sample["a_lon"][0], torch.full((15,), 0.5, dtype=torch.float64)
     )
     assert sample["jerk"].abs().max() < 1e-9
-
-
-def logs(*samples):
-    """Features of rollouts whose logs hold the samples, alike in every feature; the
-    rollouts themselves are far off."""
-    return [
-        {name: torch.stack([sample + 99, sample]) for name in KINEMATICS}
-        for sample in samples
-    ]
-
-
-def test_split_halves_are_scipy_s_whichever_half_is_first_and_keep_clusters_together():
-    generator = torch.Generator().manual_seed(4)
-    samples = [
-        torch.randn(20 + 9 * k, generator=generator, dtype=torch.float64)
-        * (1 + 0.1 * k)
-        for k in range(6)
-    ]
-    cluster = torch.tensor([0, 0, 1, 1, 2, 2])
-    halves = torch.tensor([[True, False, False], [False, True, True]])
-    one, other = split_half(logs(*samples), cluster, halves=halves).tolist()
-    distance = wasserstein_distance(
-        torch.cat(samples[:2]).numpy(), torch.cat(samples[2:]).numpy()
-    )
-    assert one == pytest.approx(1 - distance) and other == pytest.approx(one)
