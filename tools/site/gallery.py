@@ -1,8 +1,7 @@
-"""Hook of the documentation site (mkdocs.yml): the failure report that docs/gallery.md
-shows.
+"""Hook of the documentation site (mkdocs.yml): the failure report that docs/guide/report.md shows.
 
-The repository does not hold it. With E2RL_EXECUTE=true in the environment the commands
-of the page make it, which takes a minute or two; otherwise the page says how.
+The repository does not hold it. With E2RL_EXECUTE=true in the environment the commands of the page make it, which takes
+a minute or two; otherwise the page says how.
 """
 
 import os
@@ -18,14 +17,13 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-PAGE = "gallery.md"
-REPORT = "gallery.html"
+PAGE, REPORT = "guide/report.md", "gallery.html"
 PLACE = "<!-- the report -->"  # of the report in the page
-SHOWN = """[**Open the report**](assets/gallery.html){target=_blank} in a tab of its own.
+SHOWN = """[**Open the report**](../assets/gallery.html){target=_blank} in a tab of its own.
 
-<iframe src="assets/gallery.html" title="A failure report" class="report"></iframe>"""
+<iframe src="../assets/gallery.html" title="A failure report" class="report"></iframe>"""
 LEFT_OUT = "This copy of the documentation was built without it; `E2RL_EXECUTE=true mkdocs build` includes it."
-COMMANDS = re.compile(r"^```bash\n(.+?)^```$", re.MULTILINE | re.DOTALL)
+COMMANDS = re.compile(r"```bash\n(.+?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
@@ -46,12 +44,17 @@ def on_page_markdown(
 
 @cache  # `mkdocs serve` builds after every change of a page
 def report(text: str) -> str:
-    """The report that the commands of a page write; raises PluginError where they do
-    not."""
+    """The report that the commands of a page write; raises PluginError where they do not."""
     folder = str(Path(sys.executable).parent)
     variables = os.environ | {"PATH": os.pathsep.join([folder, os.environ["PATH"]])}
     with tempfile.TemporaryDirectory() as place:
-        command = ["bash", "-euo", "pipefail", "-c", COMMANDS.search(text)[1]]
+        command = [
+            "bash",
+            "-euo",
+            "pipefail",
+            "-c",
+            COMMANDS.search(text, text.index(PLACE))[1],
+        ]
         done = subprocess.run(
             command, cwd=place, env=variables, capture_output=True, text=True
         )

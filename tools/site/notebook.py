@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 NOTEBOOK = "tutorial.ipynb"
 PAGE = "tutorial.md"
@@ -24,6 +25,13 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
     if config.extra["execute"]:
         notebook = executed(path)
     files.append(File.generated(config, PAGE, content=page(notebook)))
+
+
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
+    """Links to the notebook lead to its page here; on a code host they open the notebook."""
+    if page.file.src_uri == PAGE:
+        return markdown
+    return markdown.replace(f"{NOTEBOOK})", f"{PAGE})")
 
 
 def executed(path: Path) -> dict:
