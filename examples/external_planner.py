@@ -3,7 +3,7 @@ whoever drives ahead of it.
 
     python evaluate.py ego=external 'ego.command=python examples/external_planner.py'
 
-It needs nothing but Python, and speaks the protocol of docs/how-to/planner.md. Given
+It needs nothing but Python, and speaks the protocol of docs/guide/planner.md. Given
 HOST:PORT instead of unix:PATH, it serves any number of connections until it is stopped.
 """
 

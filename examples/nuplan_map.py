@@ -1,5 +1,5 @@
 """The map of a scene as a planner written for nuPlan asks for it; goes with
-nuplan_planner.py (docs/how-to/nuplan.md).
+nuplan_planner.py (docs/guide/nuplan.md).
 
 Lanes are e2rl's centrelines with their widths. Lanes side by side make a roadblock. A
 roadblock with a light, behind a split or before a merge is a connector, as are its

@@ -1,10 +1,10 @@
-"""Serves a planner written for nuPlan to e2rl: `ego=nuplan` (docs/how-to/nuplan.md).
+"""Serves a planner written for nuPlan to e2rl: `ego=nuplan` (docs/guide/nuplan.md).
 
     python nuplan_planner.py --planner MODULE:CLASS [NAME=VALUE ...] ADDRESS python
     nuplan_planner.py --config PLANNER.yaml ADDRESS
 
 Runs in the Python in which nuplan-devkit is installed, with nuplan_map.py beside it; of
-e2rl it needs nothing. It speaks the protocol of docs/how-to/planner.md, and makes one
+e2rl it needs nothing. It speaks the protocol of docs/guide/planner.md, and makes one
 planner a scene.
 """
 

@@ -13,7 +13,7 @@ from e2rl.scenes.scene import SceneSet
 LANE_WIDTH = (
     3.5  # m; lane 0 at y = 0, lane 1 (its left neighbour) at y = 3.5, both towards +x
 )
-MARGIN = 1.0  # m beyond a lane's half width that still counts as on the road (docs/method.md, section 1)
+MARGIN = 1.0  # m beyond a lane's half width that still counts as on the road (docs/reference/scenes.md)
 BACK = 20.0  # m of route behind each vehicle
 
 
@@ -146,7 +146,7 @@ def _lights(num_scenes, steps, red_light_x):
 
 def _map(road):
     """Two lanes, the rectangle they cover, and its exact distance field of
-    docs/method.md, section 1."""
+    docs/reference/scenes.md."""
     x = torch.arange(road[0], road[1] + 1e-6, SPACING)
     y = torch.tensor([0.0, LANE_WIDTH])
     lane = torch.stack([x.repeat(2), y.repeat_interleave(len(x))], -1)

@@ -1,7 +1,9 @@
-"""What documents and docstrings name is there: paths, other documents, sections of
-docs/method.md, options."""
+"""What documents and docstrings name is there: paths, pages, anchors, commands and
+their options. Documents keep within their limits."""
 
 import ast
+import importlib
+import json
 import re
 import shlex
 from collections.abc import Iterator
@@ -10,26 +12,44 @@ from pathlib import Path
 
 import pytest
 
+from e2rl.commands.cli import COMMANDS as CLI_COMMANDS
 from e2rl.run.config import load_config
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 FOLDERS = "benchmarks|conf|docs|e2rl|examples|tests|tools"
 PATH = re.compile(rf"(?<![\w./<>-])(?:{FOLDERS})/[\w./<>*{{}}\[\]-]*")
-PLACEHOLDER = re.compile(
-    r"[<>*{}\[\]]|\.\.\.|(?<![a-zA-Z])[A-Z]{3,}(?![a-zA-Z])"
-)  # <name>, *, {a,b}, ..., NAME
+# <name>, *, {a,b}, ..., NAME
+PLACEHOLDER = re.compile(r"[<>*{}\[\]]|\.\.\.|(?<![a-zA-Z])[A-Z]{3,}(?![a-zA-Z])")
 DOCUMENT = re.compile(r"(?<![\w/-])[\w-]+\.md\b")
-SECTION = re.compile(r"docs/method\.md, sections? (\d+)(?: to (\d+))?")
-WRITTEN = {
-    "tables.md",
-    "methods.md",
-    "egos.md",
-    "budget.md",
-    "tutorial.md",
-}  # documents that a run writes, or the site's build
-COMMANDS = r"(?:python|torchrun[^`\n]*?) (?:evaluate|train)\.py|e2rl (?:evaluate|train|tune|prior-tables|skeleton)"
-COMMAND = re.compile(rf"({COMMANDS})(?![\w-])((?:\\\n|[^`\n])*)")
+WRITTEN = {"tables.md", "methods.md", "egos.md", "budget.md"}  # by a run
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
+HYDRA = "evaluate|train|tune|skeleton"  # commands of e2rl with a configuration
+COMMAND = re.compile(
+    rf"((?:python|torchrun[^`\n]*?) (?:evaluate|train)\.py|e2rl (?:{HYDRA}))(?![\w-])"
+    r"((?:\\\n|[^`\n])*)"
+)
+CODE = re.compile(r"^```.*?^```$|`[^`\n]+`|^ {4}.+$", re.MULTILINE | re.DOTALL)
+SUBCOMMAND = re.compile(r"^(?:`| *)e2rl ([a-z][\w-]*)", re.MULTILINE)
 EXTENDED = "--config-dir"
+
+
+def pages() -> list[Path]:
+    """The pages of the site: Markdown and the notebook."""
+    return sorted([*DOCS.rglob("*.md"), *DOCS.rglob("*.ipynb")])
+
+
+def documents() -> list[Path]:
+    """The repository's texts: README and the like, and the pages."""
+    return [*sorted(ROOT.glob("*.md")), ROOT / "examples" / "README.md", *pages()]
+
+
+def markdown() -> list[Path]:
+    """The documents in Markdown."""
+    return [path for path in documents() if path.suffix == ".md"]
 
 
 def docstrings(path: Path) -> Iterator[str]:
@@ -44,12 +64,7 @@ def docstrings(path: Path) -> Iterator[str]:
 @cache
 def texts() -> dict[str, str]:
     """Documents, docstrings and configuration files, by path."""
-    documents = [
-        ROOT / "README.md",
-        ROOT / "CONTRIBUTING.md",
-        *(ROOT / "docs").rglob("*.md"),
-    ]
-    found = {path: path.read_text() for path in documents if path.exists()}
+    found = {path: path.read_text() for path in documents()}
     found |= {path: path.read_text() for path in (ROOT / "conf").rglob("*.yaml")}
     found |= {
         path: "\n".join(docstrings(path)) for path in (ROOT / "e2rl").rglob("*.py")
@@ -64,39 +79,112 @@ def named_paths(text: str) -> set[str]:
     return {path for path in found if not PLACEHOLDER.search(path)}
 
 
+# Pages by their names in docstrings of e2rl/.
+FORMER = re.compile(
+    r"docs/(?:how-to/|notes/)?(?:adversaries|baselines|cluster|compare|data|export|gym|"
+    r"learning|method|modes|nuplan|nuplan-scores|observation|planner|planners|"
+    r"reproduce|search|torchrl|training|verdicts)\.md"
+)
+
+
+def anchors(path: Path) -> set[str]:
+    """The anchors of a document's headings, as code hosts and the site make them."""
+    text = FENCE.sub("", path.read_text())
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+        for heading in HEADING.findall(text)
+    }
+
+
 def test_placeholders_are_no_paths_and_full_stops_end_sentences():
-    text = "See docs/a.md. Or (conf/ego/NAME.yaml; e2rl/x_y.py), conf/<group>/<name>.yaml, conf/data/*.yaml, `tests/b`."
-    assert named_paths(text) == {"docs/a.md", "e2rl/x_y.py", "tests/b"}
-    assert (
-        named_paths("e2rl-rollout/1, runs/evaluate/docs/a, https://x.org/docs/a.md")
-        == set()
+    text = (
+        "See docs/a.md. Or (conf/ego/NAME.yaml; e2rl/x_y.py), "
+        "conf/<group>/<name>.yaml, conf/data/*.yaml, `tests/b`."
     )
+    assert named_paths(text) == {"docs/a.md", "e2rl/x_y.py", "tests/b"}
+    elsewhere = "e2rl-rollout/1, runs/evaluate/docs/a, https://x.org/docs/a.md"
+    assert named_paths(elsewhere) == set()
+
+
+def test_there_are_at_most_35_pages():
+    assert len(pages()) <= 35
+
+
+def test_the_pages_have_at_most_200_kilobytes():
+    assert sum(path.stat().st_size for path in pages()) <= 200_000
+
+
+def test_the_pages_lie_in_three_folders():
+    folders = {path.parent.name for path in pages() if path.parent != DOCS}
+    assert folders == {"guide", "results", "reference"}
+
+
+def test_beside_the_folders_lie_the_first_page_and_the_notebook():
+    beside = {path.name for path in pages() if path.parent == DOCS}
+    assert beside == {"index.md", "tutorial.ipynb"}
+
+
+def test_the_readme_has_at_most_120_lines():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
+def test_the_readme_has_at_most_120_columns():
+    assert max(map(len, (ROOT / "README.md").read_text().splitlines())) <= 120
+
+
+def test_the_changelog_has_at_most_40_lines():
+    assert len((ROOT / "CHANGELOG.md").read_text().splitlines()) <= 40
+
+
+def test_notes_of_what_did_not_help_have_at_most_12_kilobytes():
+    assert (DOCS / "results" / "did-not-help.md").stat().st_size <= 12_000
+
+
+@pytest.mark.parametrize("path", markdown(), ids=lambda path: path.name)
+def test_relative_links_lead_to_a_file_and_a_heading(path):
+    broken = []
+    for link in LINK.findall(FENCE.sub("", path.read_text())):
+        if "://" in link:
+            continue
+        name, _, anchor = link.partition("#")
+        target = (path.parent / name).resolve() if name else path
+        if not target.exists() or anchor and anchor not in anchors(target):
+            broken.append(link)
+    assert not broken, f"{path.relative_to(ROOT)}: {', '.join(broken)}"
 
 
 @pytest.mark.parametrize("name", sorted(texts()))
 def test_what_is_named_exists(name):
     text = texts()[name]
     missing = {path for path in named_paths(text) if not (ROOT / path).exists()}
-    known = {
-        path.name for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))
-    } | WRITTEN
+    known = {path.name for path in documents()} | WRITTEN
     missing |= set(DOCUMENT.findall(text)) - known
+    if name.startswith("e2rl/"):
+        missing = {each for each in missing if not FORMER.search(f"docs/{each}"[-60:])}
     assert not missing, f"{name} names what is not there: {', '.join(sorted(missing))}"
 
 
-def test_sections_of_the_method_are_numbered_and_those_cited_exist():
-    headings = re.findall(
-        r"^## (\d+)\. ", (ROOT / "docs" / "method.md").read_text(), re.MULTILINE
-    )
-    assert headings == [str(number + 1) for number in range(len(headings))]
-    cited = {
-        number
-        for text in texts().values()
-        for pair in SECTION.findall(text)
-        for number in pair
-        if number
-    }
-    assert cited and cited <= set(headings)
+@pytest.mark.parametrize("path", markdown(), ids=lambda path: path.name)
+def test_python_of_a_document_imports_what_exists(path):
+    for block in PYTHON.findall(path.read_text()):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("e2rl"):
+                module = importlib.import_module(node.module)
+                absent = [
+                    each.name for each in node.names if not hasattr(module, each.name)
+                ]
+                assert not absent, f"{node.module} has no {absent}"
+
+
+@pytest.mark.parametrize("path", markdown(), ids=lambda path: path.name)
+def test_commands_of_a_document_exist(path):
+    assert subcommands(path.read_text()) <= set(CLI_COMMANDS)
+
+
+def subcommands(text: str) -> set[str]:
+    """The commands of e2rl in a text's code."""
+    code = [match.group() for match in CODE.finditer(text)]
+    return {name for piece in code for name in SUBCOMMAND.findall(piece)}
 
 
 def is_choice(override: str) -> bool:
@@ -108,8 +196,8 @@ def commands() -> list[tuple[str, tuple[str, ...]]]:
     """The commands of the documents, each a configuration and its overrides; of those
     that differ in values, one."""
     found = {}
-    for text in (text for name, text in texts().items() if name.endswith(".md")):
-        for command, rest in COMMAND.findall(text):
+    for path in markdown():
+        for command, rest in COMMAND.findall(path.read_text()):
             name = command.split()[-1].removesuffix(".py").replace("-", "_")
             parts = shlex.split(rest.replace("\\\n", " "), comments=True)
             if any(is_choice(part) and part.endswith("=NAME") for part in parts):
@@ -126,10 +214,15 @@ def commands() -> list[tuple[str, tuple[str, ...]]]:
 def test_the_options_of_a_command_exist(name, overrides):
     """Hydra composes them: groups, files and keys are there, in conf/ or where
     --config-dir says."""
-    given = list(overrides)
-    if EXTENDED in given:
-        folder = given.pop(given.index(EXTENDED) + 1)
-        given.append(f"hydra.searchpath=[file://{ROOT / folder}]")
-    assert load_config(
-        name, [part for part in given if not part.startswith("--")]
-    ).synthesizer._target_
+    options = list(overrides)
+    if EXTENDED in options:
+        folder = options.pop(options.index(EXTENDED) + 1)
+        options.append(f"hydra.searchpath=[file://{ROOT / folder}]")
+    options = [option for option in options if not option.startswith("-")]
+    assert load_config(name, options).synthesizer._target_
+
+
+def test_the_notebook_names_commands_that_exist():
+    cells = json.loads((DOCS / "tutorial.ipynb").read_text())["cells"]
+    text = "\n".join("".join(cell["source"]) for cell in cells)
+    assert subcommands(text) <= set(CLI_COMMANDS)

@@ -83,120 +83,124 @@ def built(source, folder, execute):
     }, folder
 
 
-def test_every_link_leads_to_a_file_and_an_anchor(site):
-    pages, folder = site
+def broken_links(pages, folder):
+    """Links and loads of all pages that lead to no file, or to no anchor of it."""
     broken = []
     for name, page in pages.items():
         for link in page.links + page.loads:
             where = urlsplit(link)
             if where.scheme in ("http", "https", "mailto", "data"):
                 continue
-            here = (
-                folder if where.path.startswith("/") else (folder / name).parent
-            )  # 404.html links from the root
-            target = (
-                here / unquote(where.path).lstrip("/") if where.path else folder / name
-            )
+            # 404.html links from the root.
+            here = folder if where.path.startswith("/") else (folder / name).parent
+            path = unquote(where.path).lstrip("/")
+            target = here / path if path else folder / name
             if not target.is_file():
                 broken.append(f"{name}: {link}")
             elif where.fragment and target.suffix == ".html":
-                anchors = pages[
-                    target.resolve().relative_to(folder.resolve()).as_posix()
-                ].anchors
-                if unquote(where.fragment) not in anchors | {"__skip"}:
+                key = target.resolve().relative_to(folder.resolve()).as_posix()
+                if unquote(where.fragment) not in pages[key].anchors | {"__skip"}:
                     broken.append(f"{name}: {link}")
-    assert sum(len(page.links) for page in pages.values()) > 1000 and not broken, (
-        "\n".join(broken)
-    )
+    return broken
+
+
+def test_the_site_has_the_pages_of_the_folder(site):
+    pages, _ = site
+    sources = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.ipynb")]
+    expected = {
+        path.relative_to(ROOT / "docs").with_suffix(".html").as_posix()
+        for path in sources
+    }
+    assert set(pages) - {"404.html"} == expected
+
+
+def test_every_link_leads_to_a_file_and_an_anchor(site):
+    assert broken_links(*site) == []
+
+
+def test_the_pages_have_links(site):
+    pages, _ = site
+    assert sum(len(page.links) for page in pages.values()) > 1000
 
 
 def test_pages_load_nothing_from_elsewhere(site):
-    pages, folder = site
-    assert not [
-        (name, address)
-        for name, page in pages.items()
-        for address in page.loads
-        if "//" in address
-    ]
-    styles = [path.read_text() for path in folder.rglob("*.css")]
-    assert styles and not any(
-        re.search(r"(@import|url\()\s*[\"']?(https?:)?//", style) for style in styles
-    )
+    pages, _ = site
+    loads = [load for page in pages.values() for load in page.loads]
+    assert [load for load in loads if "//" in load] == []
+
+
+def test_styles_load_nothing_from_elsewhere(site):
+    _, folder = site
+    styles = "\n".join(path.read_text() for path in folder.rglob("*.css"))
+    assert styles
+    assert not re.search(r"(@import|url\()\s*[\"']?(https?:)?//", styles)
+
+
+@pytest.mark.parametrize("page", ["scenes", "prior", "attack", "learning", "metrics"])
+def test_the_method_has_formulas(site, page):
+    pages, _ = site
+    assert "math" in pages[f"reference/{page}.html"].tags
 
 
 def test_formulas_are_shown_without_a_script(site):
     pages, folder = site
-    with_formulas = {name for name, page in pages.items() if "math" in page.tags}
-    assert {
-        "concepts/prior.html",
-        "concepts/synthesizer.html",
-        "concepts/learning.html",
-    } <= with_formulas
-    assert not [
-        name
-        for name in pages
-        if re.search(r"arithmatex|<merror|\\\(", (folder / name).read_text())
-    ]
+    for name in pages:
+        text = (folder / name).read_text()
+        assert not re.search(r"arithmatex|<merror|\\\(", text), name
 
 
-def test_every_section_of_the_method_stands_on_one_page(site):
-    _, folder = site
-    text = "\n".join(path.read_text() for path in (folder / "concepts").glob("*.html"))
-    headings = re.findall(
-        r"^## (.+)$", (ROOT / "docs" / "method.md").read_text(), re.MULTILINE
-    )
-    found = re.findall(r"<h2 [^>]*>(.*?)<a ", text)
-    assert headings and {
-        heading: found.count(heading) for heading in headings
-    } == dict.fromkeys(headings, 1)
-
-
-def test_the_search_finds_pages_docstrings_and_the_notebook(site):
-    entries = json.loads((site[1] / "search" / "search_index.json").read_text())["docs"]
-    for page, words in (
-        ("concepts/synthesizer.html", "maximal cliques"),
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        ("reference/attack.html", "maximal cliques"),
         ("tutorial.html", "which duty did the other vehicle break"),
-    ):
-        assert any(
-            entry["location"].startswith(page) and words in entry["text"].lower()
-            for entry in entries
-        ), page
+    ],
+)
+def test_the_search_finds_pages_and_the_notebook(site, page, words):
+    entries = json.loads((site[1] / "search" / "search_index.json").read_text())["docs"]
+    found = [entry for entry in entries if words in entry["text"].lower()]
+    assert any(entry["location"].startswith(page) for entry in found)
 
 
-def test_the_gallery_is_made_by_the_commands_on_its_page(site, tmp_path):
-    """Of six scenes, once each, in a site of this page alone; without E2RL_EXECUTE the
-    page says how it is made."""
+@pytest.mark.parametrize(
+    ("page", "name"), [("api", "e2rl.api.find_failures"), ("api-rooms", "e2rl.metrics")]
+)
+def test_the_api_pages_have_docstrings(site, page, name):
+    pages, _ = site
+    assert name in pages[f"reference/{page}.html"].anchors
+
+
+def test_a_link_to_the_notebook_leads_to_its_page(site):
+    pages, _ = site
+    assert "tutorial.html" in pages["index.html"].links
+
+
+def test_without_execution_the_report_s_page_says_how_it_is_made(site):
     pages, folder = site
-    assert "E2RL_EXECUTE=true mkdocs build" in (folder / "gallery.html").read_text()
-    assert (
-        "iframe" not in pages["gallery.html"].tags
-        and not (folder / "assets" / "gallery.html").exists()
-    )
-    text = (ROOT / "docs" / "gallery.md").read_text()
-    small = text.split("[Watch the failures]")[0].replace(
-        "num_scenes=16", "num_scenes=6 tries=1"
-    )
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "gallery.md").write_text(small)
+    text = (folder / "guide" / "report.html").read_text()
+    assert "E2RL_EXECUTE=true mkdocs build" in text
+    assert "iframe" not in pages["guide/report.html"].tags
+    assert not (folder / "assets" / "gallery.html").exists()
+
+
+def test_the_report_is_made_by_the_commands_on_its_page(tmp_path):
+    """Of six scenes, once each, in a site of this section alone."""
+    text = (ROOT / "docs" / "guide" / "report.md").read_text()
+    section = text[text.index("## A report to look at") :]
+    small = section.replace("num_scenes=16", "num_scenes=6 tries=1")
+    (tmp_path / "docs" / "guide").mkdir(parents=True)
+    (tmp_path / "docs" / "guide" / "report.md").write_text(small)
+    (tmp_path / "docs" / "index.md").write_text("# Home")
     lines = (ROOT / "mkdocs.yml").read_text().splitlines()
     execute = next(line for line in lines if line.startswith("  execute:"))
     hooks = f"hooks: [{ROOT / 'tools' / 'site' / 'gallery.py'}]"
     (tmp_path / "mkdocs.yml").write_text(
-        f"site_name: gallery\nuse_directory_urls: false\n{hooks}\nextra:\n{execute}\n"
+        f"site_name: report\nuse_directory_urls: false\n{hooks}\nextra:\n{execute}\n"
     )
     pages, folder = built(tmp_path, tmp_path / "site", execute="true")
-    shown = [
-        address
-        for address in pages["gallery.html"].loads
-        if address.endswith("gallery.html")
-    ]
-    assert (
-        shown == ["assets/gallery.html"]
-        and "assets/gallery.html" in pages["gallery.html"].links
-    )
+    assert "../assets/gallery.html" in pages["guide/report.html"].links
+    assert "../assets/gallery.html" in pages["guide/report.html"].loads
     report = (folder / "assets" / "gallery.html").read_text()
-    assert (
-        '"n_scenes":6' in report
-        and '"replay":0' in report
-        and tempfile.gettempdir() not in report
-    )
+    assert '"n_scenes":6' in report
+    assert '"replay":0' in report
+    assert tempfile.gettempdir() not in report

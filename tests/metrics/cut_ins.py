@@ -1,5 +1,5 @@
 """Concrete cut-ins on a straight road, all of a batch at once: does a driver survive
-them (docs/verdicts.md)."""
+them (docs/reference/verdicts.md)."""
 
 from typing import NamedTuple
 

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 def test_the_document_names_every_dependency():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     groups = {"": project["dependencies"], **project["optional-dependencies"]}
-    text = (ROOT / "docs" / "licences.md").read_text()
+    text = (ROOT / "docs" / "reference" / "licences.md").read_text()
     for group, requirements in groups.items():
         names = {canonicalize_name(Requirement(each).name) for each in requirements} - {
             "e2rl"
@@ -28,7 +28,7 @@ def test_the_document_names_every_dependency():
             if not re.search(rf"(?<![\w-]){re.escape(name)}(?![\w-])", text)
         }
         assert not missing, (
-            f"docs/licences.md lacks {missing} of {group or 'the package'}"
+            f"docs/reference/licences.md lacks {missing} of {group or 'the package'}"
         )
     always = text.split("## Extra")[0]
     assert "not named" not in always and "GPL" not in re.sub("LGPL", "", always)
