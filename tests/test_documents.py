@@ -27,7 +27,8 @@ LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
-HYDRA = "evaluate|train|tune|prior-tables|skeleton"  # commands of e2rl with a configuration
+# The commands of e2rl that have a configuration.
+HYDRA = "evaluate|train|tune|prior-tables|skeleton"
 COMMAND = re.compile(
     rf"((?:python|torchrun[^`\n]*?) (?:evaluate|train)\.py|e2rl (?:{HYDRA}))(?![\w-])"
     r"((?:\\\n|[^`\n])*)"
