@@ -4,6 +4,7 @@ loads nothing from elsewhere."""
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,6 +19,9 @@ for module in ("mkdocs", "material", "mkdocstrings_handlers.python", "latex2math
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
 LOADED = {
     "script": "src",
     "img": "src",
@@ -204,3 +208,30 @@ def test_the_report_is_made_by_the_commands_on_its_page(tmp_path):
     assert '"n_scenes":6' in report
     assert '"replay":0' in report
     assert tempfile.gettempdir() not in report
+
+
+@pytest.fixture(scope="module")
+def phone():
+    """Chromium with a phone's screen, 390 px wide."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="needs browser")
+    if not (CHROMIUM and DRIVER):
+        pytest.skip("no chromium and chromedriver on the path")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"):
+        options.add_argument(flag)
+    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
+    yield driver
+    driver.quit()
+
+
+def test_no_page_scrolls_sideways_on_a_phone(site, phone):
+    """Tables, code and formulas scroll within themselves."""
+    pages, folder = site
+    width = "return document.scrollingElement.scrollWidth"
+    widths = {}
+    for name in pages:
+        phone.get((folder / name).as_uri())
+        widths[name] = phone.execute_script(width)
+    assert {name for name in widths if widths[name] > PHONE["width"]} == set()
