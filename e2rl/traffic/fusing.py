@@ -17,19 +17,18 @@ from e2rl.run.processes import cores, in_processes
 from e2rl.run.terminal import Bar
 from e2rl.scenes import drivable_area, route
 from e2rl.sim import leaders, observation, step
-from e2rl.traffic.e2 import anchoring, control, foresight, interception, kernels
+from e2rl.traffic.e2 import anchoring, foresight, interception, pull
 
 MODULES = (
     *(
         anchoring,
         bounds,
-        control,
         drivable_area,
         features,
         foresight,
         free_space,
         interception,
-        kernels,
+        pull,
     ),
     *(
         lane_graph_planner,

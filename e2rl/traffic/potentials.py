@@ -44,11 +44,11 @@ MIN_ACCEL, MAX_ACCEL, MAX_LATERAL_ACCEL = (
 MAX_JERK = 2.0  # m/s^3
 
 
-@configured("synthesizer/e2", "potentials")
+@configured("synthesizer/e2_paper", "potentials")
 @dataclass(frozen=True)
 class PotentialSettings:
     """The potentials, with weights of their terms and temperatures [m];
-    conf/synthesizer/e2.yaml explains each.
+    conf/synthesizer/e2_paper.yaml explains each.
 
     A subclass may have another objective, `adversarial`, or other bounds,
     `feasibility`: named by `potentials._target_` of a synthesizer.

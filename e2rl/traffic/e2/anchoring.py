@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.prior.lane_relative import (
@@ -42,21 +41,21 @@ from e2rl.traffic.motion import (
     take,
 )
 
-COARSE, FINE = (
-    19,
-    9,
-)  # accelerations tried on each route: over the whole range, then around the best
+# Accelerations tried on each route: over the whole range, then around the best.
+COARSE = 19
+FINE = 9
 LATERAL_ACCEL = 4.0  # m/s^2 in bends
 BEND_BRAKING = 3.0  # m/s^2 with which a vehicle slows down for a bend
 EXTRA = 2  # steps beyond the horizon, for the slope of the speed at the last knot
-SWING = (
-    0.2  # peak of the lateral decoder's offset, per unit of slope and lateral horizon
-)
+# Peak of the lateral decoder's offset, per unit of slope and lateral horizon.
+SWING = 0.2
 BEND_VERTICES = 64  # of a route ahead, whose curvature bounds the speed
 ACCEL_COST = 0.2  # s of time gap that 1 m/s^2 weighs
 LATERAL_COST = 0.05  # s that 1 m of present offset from the route weighs
 MAX_OFFSET = 1.0  # s of time gap at most; links that cannot meet better have no anchor
-MAX_SHIFT = 4.5  # m of present offset from a route that a vehicle may take instead of its own: a lane change
+# m of present offset from a route that a vehicle may take instead of its own: a lane
+# change.
+MAX_SHIFT = 4.5
 MAX_SWING = 1.0  # m that it may swing out while it turns in
 
 
@@ -142,56 +141,43 @@ def _bend_bound(route: Tensor, s: Tensor) -> Tensor:
 
 
 def _candidates(
-    scene: TensorDictBase,
-    world: World,
-    index: Tensor,
-    keep_route: bool,
-    halt_at_red: bool,
+    world: World, index: Tensor, keep_route: bool, halt_at_red: bool
 ) -> _Candidates:
-    """The candidate routes of vehicles index [B, M]; keep_route: only the one that each
-    follows; halt_at_red: up to the stop line that binds the vehicle now."""
-    vehicles, count = scene["route_points"].shape[1:3]
+    """The candidate routes of vehicles index [B, M]; arguments of `propose`."""
+    scene = world.scene
     assert world.route is not None
+    vehicles, count = scene["route_points"].shape[1:3]
+    device = index.device
     states = take(world.states[:, :vehicles], index)
-    route = take(world.route, index)[..., None]
-    number = (
-        route.clamp(min=0)
-        if keep_route
-        else torch.arange(count, device=index.device).expand(*index.shape, -1)
-    )
-    at = (
-        torch.arange(len(index), device=index.device)[:, None, None],
-        index[..., None],
-        number,
-    )
-    points, end, valid = (
-        scene[key][at] for key in ("route_points", "route_length", "route_valid")
-    )
-    s, d, error = frenet_pose(states, points)
-    swing = (
-        SWING
-        * error.clamp(-1.0, 1.0).tan().abs()
-        * lateral_horizon(states[..., 3])[..., None]
-    )
-    reachable = (d.abs() <= MAX_SHIFT) & (swing <= MAX_SWING)
-    usable = valid & (reachable | (number == route))
+    followed = take(world.route, index)[..., None]
     if keep_route:
-        usable = usable & (route >= 0)
+        number = followed.clamp(min=0)
+    else:
+        number = torch.arange(count, device=device).expand(*index.shape, -1)
+    row = torch.arange(len(index), device=device)[:, None, None]
+    place = (row, index[..., None], number)
+    points = scene["route_points"][place]
+    s, d, error = frenet_pose(states, points)
+    slope = error.clamp(-1.0, 1.0).tan().abs()
+    swing = SWING * slope * lateral_horizon(states[..., 3])[..., None]
+    reachable = (d.abs() <= MAX_SHIFT) & (swing <= MAX_SWING)
+    usable = scene["route_valid"][place] & (reachable | (number == followed))
+    if keep_route:
+        usable = usable & (followed >= 0)
+    end = scene["route_length"][place]
     if halt_at_red:
         end = torch.minimum(end, s + distance_to_stop_line(world, index, number=number))
-    accel = take(world.accel[:, :vehicles], index)
-    size = take(scene["size"], index)
     return _Candidates(
-        number,
-        points,
+        number=number,
+        points=points,
         usable=usable,
         end=end,
         s=s,
         d=d,
         bend_bound=_bend_bound(points, s),
         speed=states[..., 3],
-        accel=accel,
-        size=size,
+        accel=take(world.accel[:, :vehicles], index),
+        size=take(scene["size"], index),
     )
 
 
@@ -215,20 +201,18 @@ def _knots(candidates: _Candidates, accel: Tensor, limits: Tensor) -> Tensor:
     v0 = candidates.speed[..., None, None, None]
     free = v0 + accel[..., None] * time
     free = torch.minimum(free.clamp(min=0), v0.clamp(min=TOP_SPEED))
-    braking = (v0 + limits[0] * time).clamp(
-        min=0
-    )  # nobody loses speed faster, bend or not
+    braking = (v0 + limits[0] * time).clamp(min=0)  # nobody loses speed faster
     speed = free
     for _ in range(3):
-        travelled = torch.nn.functional.pad(
-            ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1), (1, 0)
+        distance = ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1)
+        travelled = torch.nn.functional.pad(distance, (1, 0))
+        vertex = (travelled / SPACING).clamp(max=BEND_VERTICES - 1.001)
+        low = vertex.long()
+        shape = (*travelled.shape[:-1], BEND_VERTICES)
+        table = candidates.bend_bound[..., None, :].expand(shape)
+        bound = torch.lerp(
+            table.gather(-1, low), table.gather(-1, low + 1), vertex - low
         )
-        at = (travelled / SPACING).clamp(max=BEND_VERTICES - 1.001)
-        low = at.long()
-        table = candidates.bend_bound[..., None, :].expand(
-            *travelled.shape[:-1], BEND_VERTICES
-        )
-        bound = torch.lerp(table.gather(-1, low), table.gather(-1, low + 1), at - low)
         speed = torch.maximum(torch.minimum(free, bound.clamp(min=0).sqrt()), braking)
     knot = KNOT_STEPS * torch.arange(1, KNOTS + 1, device=accel.device)
     slope = (speed[..., knot + EXTRA] - speed[..., knot - EXTRA]) / (2 * EXTRA * DT)
@@ -314,36 +298,42 @@ def scored(
     return cost, time_gap, knots
 
 
+class _OnLane(NamedTuple):
+    """The proposals of least cost of vehicles [B, M]: candidate, knots [B, M, 10],
+    cost in s, inf for none."""
+
+    candidate: Tensor
+    knots: Tensor
+    cost: Tensor
+
+
 def _on_lane(
     candidates: _Candidates, path: Tensor, size: Tensor, settings: AnchorSettings
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The proposal of least cost on the candidates: candidate [B, M], knots [B, M, 10],
-    cost [B, M] (inf for none)."""
+) -> _OnLane:
+    """How vehicles best meet targets on their candidates; path [B, M, H, 4] and size
+    [B, M, 2]: the targets'."""
     target = _along(candidates, path, size=size)
     low = settings.min_accel
     high = settings.max_accel
     limits = path.new_tensor((low, high))
-    grid = torch.linspace(low, high, COARSE, device=path.device).expand(
-        *candidates.s.shape, COARSE
-    )
-    best = scored(candidates, grid, target, limits)[0].argmin(
-        -1, keepdim=True
-    )  # per candidate
-    fine = grid.gather(-1, best) + (high - low) / (COARSE - 1) * torch.linspace(
-        -1, 1, FINE, device=path.device
-    )
+    grid = torch.linspace(low, high, COARSE, device=path.device)
+    grid = grid.expand(*candidates.s.shape, COARSE)
+    best = scored(candidates, grid, target, limits)[0].argmin(-1, keepdim=True)
+    around = torch.linspace(-1, 1, FINE, device=path.device)
+    fine = grid.gather(-1, best) + (high - low) / (COARSE - 1) * around
     cost, time_gap, knots = scored(candidates, fine.clamp(low, high), target, limits)
     pick = cost.flatten(2).argmin(-1)
     cost, time_gap, knots = (
         take_route(value.flatten(2, 3), pick) for value in (cost, time_gap, knots)
     )
-    return pick // FINE, knots, cost.masked_fill(time_gap > MAX_OFFSET, torch.inf)
+    cost = cost.masked_fill(time_gap > MAX_OFFSET, torch.inf)
+    return _OnLane(pick // FINE, knots, cost=cost)
 
 
 def propose(
-    scene: TensorDictBase,
     world: World,
     skeleton: Skeleton,
+    *,
     ego_plan: Tensor,
     settings: AnchorSettings,
     interception: InterceptionSettings,
@@ -351,48 +341,52 @@ def propose(
     keep_route: bool = False,
     halt_at_red: bool = False,
 ) -> Anchor:
-    """The skeleton-consistent clean state of Sec. IV-A3 for scenes [B]; ego_plan [B, H
-    >= 50, 4].
+    """Returns the skeleton-consistent clean state of Sec. IV-B1.
 
     Proposals are made from the ego outwards. Vehicles that act on the ego meet its plan
     on a lane or, where that costs less, by an interception. The others meet their
     target's lane proposal; a target without one keeps its speed along its route.
-    keep_route: consider only the routes that vehicles follow now; halt_at_red: nobody
-    passes a stop line that binds it now.
+
+    Args:
+        world: B scenes, with the routes that vehicles follow.
+        skeleton: who acts on whom.
+        ego_plan: [B, H >= 50, 4], the ego's expected states.
+        settings: of the proposals on lanes.
+        interception: limits of those off the lanes.
+        wish: what is asked of those.
+        keep_route: consider only the routes that vehicles follow now.
+        halt_at_red: nobody passes a stop line that binds it now.
     """
+    scene = world.scene
+    assert world.route is not None
     times = DT * torch.arange(1, HORIZON + 1, device=ego_plan.device)
     expected = constant_speed_states(scene, world, times=times)
     expected[:, 0] = ego_plan[:, :HORIZON].detach()
-    assert world.route is not None
     nobody = torch.zeros_like(skeleton.coalition)
-    cost = expected.new_full(world.route.shape, torch.inf)
-    knots = expected.new_zeros(*world.route.shape, KNOTS)
-    path = torch.zeros_like(scene["route_points"][:, :, 0])
     anchor = Anchor(
-        world.route.clone(),
-        knots,
+        route=world.route.clone(),
+        knots=expected.new_zeros(*world.route.shape, KNOTS),
         feasible=nobody,
-        cost=cost,
+        cost=expected.new_full(world.route.shape, torch.inf),
         off_lane=nobody,
-        off_lane_path=path,
+        off_lane_path=torch.zeros_like(scene["route_points"][:, :, 0]),
     )
     for depth in range(1, int(skeleton.depth.max()) + 1):
         index, present = compact(skeleton.depth == depth)
         target = skeleton.target.gather(1, index).clamp(min=0)
         candidates = _candidates(
-            scene, world, index=index, keep_route=keep_route, halt_at_red=halt_at_red
+            world, index, keep_route=keep_route, halt_at_red=halt_at_red
         )
-        pick, knots, cost = _on_lane(
+        best = _on_lane(
             candidates,
             take(expected, target),
             size=take(scene["size"], target),
             settings=settings,
         )
-        cost = cost.masked_fill(~present, torch.inf)
-        off_lane = torch.zeros_like(present)
-        found = None
+        cost = best.cost.masked_fill(~present, torch.inf)
+        on_lane = cost.isfinite()
         if depth == 1 and interception.reach > 0:
-            found = intercept(
+            off = intercept(
                 world,
                 index,
                 target=target,
@@ -401,52 +395,48 @@ def propose(
                 settings=interception,
                 halt_at_red=halt_at_red,
             )
-            off_lane = present & (found.cost < cost)
-        on_lane = cost.isfinite() & ~off_lane
-        expected = put(
-            expected, index, mask=on_lane, rows=_states(candidates, pick, knots=knots)
-        )
-        route = take_route(candidates.number, pick)
+            off_lane = present & (off.cost < cost)
+            on_lane = on_lane & ~off_lane
+            anchor = _updated(
+                anchor,
+                index,
+                off_lane,
+                feasible=off_lane,
+                off_lane=off_lane,
+                cost=off.cost,
+                knots=off.knots,
+                off_lane_path=off.path,
+            )
         anchor = _updated(
             anchor,
             index,
-            mask=on_lane,
+            on_lane,
             feasible=on_lane,
             cost=cost,
-            knots=knots,
-            route=route,
+            knots=best.knots,
+            route=take_route(candidates.number, best.candidate),
         )
-        if found is not None:
-            rows = {
-                "feasible": off_lane,
-                "off_lane": off_lane,
-                "cost": found.cost,
-                "knots": found.knots,
-            }
-            anchor = _updated(
-                anchor, index, mask=off_lane, off_lane_path=found.path, **rows
-            )
+        expected = put(expected, index, mask=on_lane, rows=_states(candidates, best))
     return anchor
 
 
-def _states(candidates: _Candidates, pick: Tensor, knots: Tensor) -> Tensor:
-    """States [B, M, H, 4] of the vehicles on candidates pick [B, M] with knots [B, M,
-    10]."""
-    v, travelled = (x[:, :, 0, 0] for x in _decode(candidates, knots[:, :, None, None]))
-    route, s, d = (
-        take_route(x, pick) for x in (candidates.points, candidates.s, candidates.d)
-    )
-    offset = d[..., None] * remaining_offset(travelled, candidates.speed[..., None])
-    return states_on_route(route, s[..., None] + travelled, d=offset, speed=v)
+def _states(candidates: _Candidates, best: _OnLane) -> Tensor:
+    """States [B, M, H, 4] of the vehicles that drive their proposals."""
+    speed, travelled = _decode(candidates, best.knots[:, :, None, None])
+    speed = speed[:, :, 0, 0]
+    travelled = travelled[:, :, 0, 0]
+    route = take_route(candidates.points, best.candidate)
+    s = take_route(candidates.s, best.candidate)[..., None]
+    d = take_route(candidates.d, best.candidate)[..., None]
+    offset = d * remaining_offset(travelled, candidates.speed[..., None])
+    return states_on_route(route, s + travelled, d=offset, speed=speed)
 
 
 def _updated(anchor: Anchor, index: Tensor, mask: Tensor, **rows: Tensor) -> Anchor:
     """The Anchor with rows [B, M, ...] of its fields written at vehicles index [B, M]
     where mask [B, M]."""
-    return replace(
-        anchor,
-        **{
-            name: put(getattr(anchor, name), index, mask=mask, rows=new)
-            for name, new in rows.items()
-        },
-    )
+    fields = {
+        name: put(getattr(anchor, name), index, mask=mask, rows=new)
+        for name, new in rows.items()
+    }
+    return replace(anchor, **fields)

@@ -1,25 +1,25 @@
-"""Whom the attack controls, and what they aim at: coalitions in scenes (docs/method.md,
-sections 5 to 8)."""
+"""Select and propose: whom the attack controls, whom each acts on, and how it would get
+there (Sec. IV-A; docs/reference).
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, cast
+topology -> feasibility -> skeleton -> proposals. A coalition is kept while one of its
+members can still meet its target, and chosen anew where none can.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.prior.lane_relative import KNOTS
+from e2rl.prior.prior import Plan, Prior
 from e2rl.prior.routes import take_route
-from e2rl.run.settings import setting, settings_of
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
-from e2rl.traffic.decisions import LEADER, RULE, Decisions, eligible
+from e2rl.traffic.decisions import LEADER, eligible
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings, propose
-from e2rl.traffic.e2.control import ControlSettings
-from e2rl.traffic.e2.feasibility import FeasibilitySettings, feasible_vehicles
+from e2rl.traffic.e2.feasibility import Feasibility, FeasibilitySettings
 from e2rl.traffic.e2.interception import InterceptionSettings, Wish
-from e2rl.traffic.e2.reasoner import LanguageReasoner, ReasonerSettings
 from e2rl.traffic.e2.skeleton import (
     STEP,
     Selection,
@@ -28,205 +28,114 @@ from e2rl.traffic.e2.skeleton import (
     build_skeleton,
     chain_depth,
     direct,
-    limits_of,
 )
+from e2rl.traffic.e2.state import E2State
 from e2rl.traffic.e2.topology import TopologySettings, topological_candidates
-from e2rl.traffic.grouping import no_vehicles, noise_of, put_rows, take_rows
-from e2rl.traffic.nominal import NominalTraffic, PriorState, onto
-from e2rl.traffic.responsibility import RESPONSIBILITIES, leading, place_of
-from e2rl.traffic.traffic import FULL
+from e2rl.traffic.grouping import noise_of, put_rows, take_rows
+from e2rl.traffic.nominal import onto
+from e2rl.traffic.responsibility import leading, place_of
 
-SUPPORT, SCATTER = (
-    750,
-    850,
-)  # numbers of the draws of a random support, and of the noise on costs
-MIN_TEMPERATURE, MAX_ROUTE_NATS = (
-    0.05,
-    50.0,
-)  # of the prior's choice of routes, where a new route is booked
+# Numbers of the draws of a random support, and of the noise on costs.
+SUPPORT_DRAW = 750
+SCATTER_DRAW = 850
+# Of the prior's choice of routes, where the nats of a new route are booked.
+MIN_TEMPERATURE = 0.05
+MAX_ROUTE_NATS = 50.0
 SUPPORTS = ("feasible", "topology", "random")
+Reference = Callable[[E2State, World, Tensor], Plan]  # state, world, ego_plan
 
 
 @dataclass
-class E2State(PriorState):
-    """B attacked scenes.
+class Selector:
+    """Chooses coalitions and makes their proposals.
 
-    eta [B]: intensity; decided [B, D]: the decisions; near, far [B] int64: the most
-    near and far agents of a coalition; coalition [B, V]: C*; target [B, V] int64: whom
-    each member acts on (0 the ego, -1 none); off_lane [B, V]: on an interception
-    instead of its lane; committed [B, V]: with a proposal, knots [B, V, KNOTS]: its
-    accelerations [m/s^2]; drawn [B, V]: by a kernel; since [B, V] s: see `foresee`;
-    settled [B, V]: once drawn to what the competent driver prevents; path_kl,
-    anchor_jump [B, V]: path KL of the control and energy of the literal blend since the
-    start.
+    lawful: members owe the ego full duty; support: whom a coalition is chosen from:
+    feasible (S = S_top and F), topology (S_top alone) or random (as many as there are
+    near agents), the ablations of table 2; reselect: replans between two choices, 0:
+    one choice; feasible_vehicles: the rules of feasibility.py or a language model;
+    budget: nats a rollout, None: any; on_decision: called with every `Selection`.
     """
 
-    eta: Tensor = no_vehicles()
-    decided: Tensor = no_vehicles()
-    near: Tensor = no_vehicles()
-    far: Tensor = no_vehicles()
-    coalition: Tensor
-    target: Tensor
-    off_lane: Tensor
-    committed: Tensor
-    knots: Tensor
-    drawn: Tensor
-    since: Tensor
-    settled: Tensor
-    path_kl: Tensor
-    anchor_jump: Tensor
-
-    @property
-    def now(self) -> Decisions:
-        """The decisions."""
-        return Decisions(*self.decided.unbind(-1))
-
-
-@dataclass(eq=False, repr=False)
-class Coalitions(NominalTraffic):
-    """The nominal prior with a coalition of adversaries and their proposals; `E2`
-    drives them.
-
-    support: whom the coalition is chosen from: feasible (S = S_top and F), topology
-    (S_top alone) or random (as many as there are near agents), the ablations of table
-    2. The groups of settings may be given as mappings.
-    """
-
-    responsibility: str = setting(choices=RESPONSIBILITIES)
-    support: str = setting(choices=SUPPORTS)
-    reselect: int = setting(low=0)
+    prior: Prior
+    lawful: bool
+    support: str
+    reselect: int
     topology: TopologySettings
     feasibility: FeasibilitySettings
-    reasoner: ReasonerSettings
+    feasible_vehicles: Callable[
+        [TensorDictBase, World, FeasibilitySettings], Feasibility
+    ]
     skeleton: SkeletonSettings
     anchor: AnchorSettings
     interception: InterceptionSettings
-    control: ControlSettings
+    budget: float | None
 
-    adversarial = True
-    follows_template = follows_decisions = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for part in fields(self):
-            given = getattr(self, part.name)
-            if isinstance(given, Mapping):
-                setattr(
-                    self,
-                    part.name,
-                    settings_of(
-                        cast(type, part.type), given, where=f"synthesizer.{part.name}"
-                    ),
-                )
-        rules = self.reasoner.kind == "rules"
-        self.feasible_vehicles = (
-            feasible_vehicles if rules else LanguageReasoner(self.reasoner)
-        )
-
-    def reset(
+    def select(
         self,
-        scenes: TensorDictBase,
-        seed: Tensor,
-        eta: Tensor,
-        template: Tensor | None = None,
-        decisions: Tensor | None = None,
-    ) -> E2State:
-        """Returns states of scenes [B] with routes drawn from the prior and no vehicle
-        under control.
+        state: E2State,
+        world: World,
+        ego_plan: Tensor,
+        reference: Reference,
+        on_decision: Callable[[Selection], None] | None = None,
+    ) -> tuple[E2State, Anchor]:
+        """Returns states and proposals, with a new coalition in scenes whose choice is
+        due and in which no member of the present one can meet its target any more.
 
         Args:
-            template: [B] causal templates that limit the coalitions (None: full for
-                all).
-            decisions: [B, D] (None: by rule).
+            state: of B scenes.
+            world: the scenes now.
+            ego_plan: [B, >= HORIZON, 4], the ego's expected states.
+            reference: the prior's plan without control.
+            on_decision: is called with what the choice rested on.
         """
-        nominal = super().reset(scenes, seed, eta)
-        near, far = limits_of(
-            torch.full_like(nominal.seed, FULL) if template is None else template,
-            self.skeleton,
-        )
-        decided = (
-            eta.new_tensor(RULE).expand(len(eta), -1)
-            if decisions is None
-            else decisions
-        )
-        none = torch.zeros_like(nominal.routed.parked)
-        zero = torch.zeros_like(nominal.routed.length)
-        nobody = {
-            name: none
-            for name in ("coalition", "off_lane", "committed", "drawn", "settled")
-        }
-        nobody |= {"target": none.long() - 1, "since": zero - 1}
-        costs = {"path_kl": zero, "anchor_jump": zero}
-        knots = zero[..., None].repeat(1, 1, KNOTS)
-        begun: dict[str, Any] = {**vars(nominal), **nobody, **costs}
-        return E2State(
-            **begun,
-            eta=eta * decided[:, 0],
-            decided=decided,
-            near=near,
-            far=far,
-            knots=knots,
-        )
-
-    def _budget(self, state: E2State) -> Tensor | None:
-        """Nats [B] that control may still add; None: any."""
-        limit = self.control.transport_budget
-        return None if limit is None else (limit - state.path_kl.sum(-1)).clamp(min=0)
-
-    def _reselected(
-        self, state: E2State, world: World, ego_plan: Tensor
-    ) -> tuple[E2State, Anchor]:
-        """States and anchors, with a new coalition in scenes whose choice is due and in
-        which no member of the present coalition can meet its target any more."""
         due = state.replans == 0
         if self.reselect > 0:
             due = due | (state.replans % self.reselect == 0)
-        anchor = self._anchor(state, world, ego_plan=ego_plan)
-        rows = (due & (state.eta > 0) & ~anchor.feasible.any(1)).nonzero().squeeze(-1)
+        anchor = self._anchor(state, world, ego_plan)
+        lost = due & state.attacked & ~anchor.feasible.any(1)
+        rows = lost.nonzero()[:, 0]
         if not len(rows):
             return state, anchor
-        there = take_rows(world, rows)
-        chosen = self._select(take_rows(state, rows), there, ego_plan=ego_plan[rows])
-        found = self._anchor(
-            chosen, replace(there, route=chosen.routed.route), ego_plan=ego_plan[rows]
+        world = take_rows(world, rows)
+        ego_plan = ego_plan[rows]
+        chosen, selection = self._choose(
+            take_rows(state, rows), world, ego_plan, reference
         )
-        return put_rows(state, rows, new=chosen), put_rows(anchor, rows, new=found)
+        if on_decision is not None:
+            on_decision(selection)
+        world = replace(world, route=chosen.routed.route)
+        proposals = self._anchor(chosen, world, ego_plan)
+        return put_rows(state, rows, chosen), put_rows(anchor, rows, proposals)
 
     def _anchor(self, state: E2State, world: World, ego_plan: Tensor) -> Anchor:
-        """Proposals for the present coalition on its present routes; whom the ego
-        follows keeps its last one."""
+        """Proposals of the present coalition on its present routes."""
         depth = chain_depth(state.target)
-        if self.responsibility == "full":
-            depth = depth.masked_fill(
-                leading(world, depth.shape[1]) & (state.now.whom != LEADER)[:, None], 0
-            )
+        if self.lawful:  # whom the ego follows keeps its last proposal
+            followed = leading(world, depth.shape[1])
+            by_rule = (state.decisions.whom != LEADER)[:, None]
+            depth = depth.masked_fill(followed & by_rule, 0)
         skeleton = Skeleton(
             state.coalition, state.target, depth=depth, near=depth == 1, far=depth > 1
         )
-        anchor = self._propose(
-            skeleton, state, world=world, ego_plan=ego_plan, keep_route=True
-        )
-        return (
-            self._held(anchor, state, world=world)
-            if self.responsibility == "full"
-            else anchor
-        )
+        anchor = self._propose(skeleton, state, world, ego_plan, keep_route=True)
+        return self._held(anchor, state, world) if self.lawful else anchor
 
     def _held(self, anchor: Anchor, state: E2State, world: World) -> Anchor:
         """The anchor in which members that can no longer meet the ego go on with their
         last proposal while they are ahead of it: they have come into its path by then.
         """
         ahead = place_of(world, state.coalition.shape[1])[0][..., 0] > 0
-        hold = state.coalition & ~anchor.feasible & state.committed & ahead
+        held = state.coalition & ~anchor.feasible & state.committed & ahead
         later = torch.cat([state.knots[..., 1:], state.knots[..., -1:]], -1)
+        present = state.routed
         return replace(
             anchor,
-            feasible=anchor.feasible | hold,
-            knots=torch.where(hold[..., None], later, anchor.knots),
-            route=torch.where(hold, state.routed.route, anchor.route),
-            off_lane=torch.where(hold, state.off_lane, anchor.off_lane),
+            feasible=anchor.feasible | held,
+            knots=torch.where(held[..., None], later, anchor.knots),
+            route=torch.where(held, present.route, anchor.route),
+            off_lane=torch.where(held, state.off_lane, anchor.off_lane),
             off_lane_path=torch.where(
-                hold[..., None, None], state.routed.points, anchor.off_lane_path
+                held[..., None, None], present.points, anchor.off_lane_path
             ),
         )
 
@@ -238,103 +147,141 @@ class Coalitions(NominalTraffic):
         ego_plan: Tensor,
         keep_route: bool = False,
     ) -> Anchor:
-        settings = (self.anchor, self.interception)
-        lawful = self.responsibility == "full"
-        now = state.now
-        wish = Wish(state.eta, now.moment, wrong_way=now.wrong_way)
+        decisions = state.decisions
         return propose(
-            world.scene, world, skeleton, ego_plan, *settings, wish, keep_route, lawful
+            world,
+            skeleton,
+            ego_plan=ego_plan,
+            settings=self.anchor,
+            interception=self.interception,
+            wish=Wish(state.eta, decisions.moment, wrong_way=decisions.wrong_way),
+            keep_route=keep_route,
+            halt_at_red=self.lawful,
         )
 
-    def _select(self, state: E2State, world: World, ego_plan: Tensor) -> E2State:
-        """Topology on a reference rollout, feasibility, skeleton; the coalition takes
-        the routes that meet targets."""
+    def _choose(
+        self, state: E2State, world: World, ego_plan: Tensor, reference: Reference
+    ) -> tuple[E2State, Selection]:
+        """States with new coalitions, and what they rest on: topology on a reference
+        rollout, feasibility, skeleton; members take the routes that meet their
+        targets."""
         scene = world.scene
         vehicles = state.routed.route.shape[1]
-        context = self.encode(state, world, ego_plan=ego_plan)
-        nominal = self.prior.plan(self.prior.estimate(context), context)
-        reference = torch.cat(
-            [ego_plan[:, None], nominal.states()[:, 1:]], 1
-        ).transpose(1, 2)
+        nominal = reference(state, world, ego_plan)
+        expected = torch.cat([ego_plan[:, None], nominal.states()[:, 1:]], 1)
         valid = world.valid[:, None, :vehicles] & nominal.on_map.transpose(1, 2)
-        found = topological_candidates(
-            reference, valid, size=scene["size"][:, :vehicles], settings=self.topology
+        topology = topological_candidates(
+            expected.transpose(1, 2),
+            valid,
+            size=scene["size"][:, :vehicles],
+            settings=self.topology,
         )
         feasible = self.feasible_vehicles(scene, world, self.feasibility).mask
-        steps = round(STEP / DT)
-        expected = reference[:, steps - 1 :: steps].transpose(1, 2)
         support, fallback = self._support(
-            state, world, candidates=found.candidates, feasible=feasible
+            state, world, candidates=topology.candidates, feasible=feasible
         )
-        may = eligible(world, state.now.whom, lawful=self.responsibility == "full")
-        support = support & may
-        fallback = fallback & may
-        anchor = self._propose(
-            direct(support | fallback), state, world=world, ego_plan=ego_plan
-        )  # its cost chooses the near agents
-        cost = anchor.cost + state.now.scatter[:, None] * noise_of(
-            state.seed, SCATTER + state.replans, shape=(vehicles,)
+        may_act = eligible(world, state.decisions.whom, lawful=self.lawful)
+        skeleton, anchor = self._skeleton(
+            state, world, ego_plan, expected, support & may_act, fallback & may_act
         )
-        limits = state.near, state.far
+        members, nats = self._members(state, scene, skeleton, anchor)
+        state = replace(
+            state,
+            coalition=members,
+            target=torch.where(members, skeleton.target, -1),
+            path_kl=state.path_kl + nats * members,
+        )
+        selection = Selection(
+            seed=state.seed,
+            step=world.step,
+            reference=expected.transpose(1, 2)[:, topology.steps],
+            moments=(DT * (topology.steps + 1)).expand(len(expected), -1),
+            weights=topology.weights,
+            candidates=topology.candidates,
+            feasible=feasible,
+            coalition=state.coalition,
+            target=state.target,
+            settings=self.topology,
+        )
+        route = torch.where(members, anchor.route, state.routed.route)
+        nobody = torch.zeros_like(members)
+        state = on_paths(
+            state, world, route=route, off_lane=nobody, paths=anchor.off_lane_path
+        )
+        return state, selection
+
+    def _support(
+        self, state: E2State, world: World, candidates: Tensor, feasible: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """S [B, V] and who may take its place where it is empty, by `support` (Sec.
+        IV-A2)."""
+        if self.support == "topology":
+            return candidates, candidates
+        if self.support == "feasible":
+            return candidates & feasible, feasible
+        vehicles = feasible.shape[1]
+        present = world.valid[:, :vehicles] & ~state.routed.parked
+        present = present & (torch.arange(vehicles, device=present.device) > 0)
+        number = SUPPORT_DRAW + state.replans
+        draw = noise_of(state.seed, number, shape=(vehicles,), uniform=True)
+        rank = draw.masked_fill(~present, torch.inf).argsort(-1).argsort(-1)
+        random = present & (rank < self.skeleton.near)
+        return random, random
+
+    def _skeleton(
+        self,
+        state: E2State,
+        world: World,
+        ego_plan: Tensor,
+        expected: Tensor,
+        support: Tensor,
+        fallback: Tensor,
+    ) -> tuple[Skeleton, Anchor]:
+        """The skeleton of a support [B, V], and its proposals. What it costs each
+        vehicle to meet the ego chooses the near agents."""
+        vehicles = support.shape[1]
+        anchor = self._propose(direct(support | fallback), state, world, ego_plan)
+        number = SCATTER_DRAW + state.replans
+        noise = noise_of(state.seed, number, shape=(vehicles,))
+        steps = round(STEP / DT)
         skeleton = build_skeleton(
-            scene,
             world,
             support=support,
             feasible=fallback,
             settings=self.skeleton,
-            expected=expected,
-            cost=cost,
-            limits=limits,
+            expected=expected[:, :, steps - 1 :: steps],
+            cost=anchor.cost + state.decisions.scatter[:, None] * noise,
         )
-        if bool(
-            skeleton.far.any()
-        ):  # otherwise everybody meets the ego, as just proposed
-            anchor = self._propose(skeleton, state, world=world, ego_plan=ego_plan)
-        # Infeasible configurations are pruned (Sec. IV-A3): members without a proposal,
-        # and whoever acts through them.
-        members = skeleton.coalition & (state.eta > 0)[:, None]
-        acts = members & anchor.feasible
-        if (
-            self.skeleton.pursuit
-        ):  # where nobody can meet its target yet, V_adv alone brings them nearer
-            acts = torch.where(acts.any(1, keepdim=True), acts, members)
-        change = self._route_nats(scene, anchor.route) * (
-            acts & (anchor.route != state.routed.route)
-        )
-        budget = self._budget(state)
-        if (
-            budget is not None
-        ):  # who cannot afford its new route stays on the old one, and out of the coalition
-            held = (change.sum(-1) <= budget)[:, None] | (change == 0)
-            acts = acts & held
-            change = change * held
+        # Without a far agent everybody meets the ego, as was just proposed.
+        if bool(skeleton.far.any()):
+            anchor = self._propose(skeleton, state, world, ego_plan)
+        return skeleton, anchor
+
+    def _members(
+        self, state: E2State, scene: TensorDictBase, skeleton: Skeleton, anchor: Anchor
+    ) -> tuple[Tensor, Tensor]:
+        """Who of C* takes part [B, V], and the nats [B, V] of their new routes.
+
+        Infeasible configurations are pruned (Sec. IV-A3): members without a proposal,
+        members that cannot afford their new route, and whoever acts through them.
+        """
+        candidates = skeleton.coalition & state.attacked[:, None]
+        members = candidates & anchor.feasible
+        if self.skeleton.pursuit:
+            # Where nobody can meet its target yet, V_adv alone brings them nearer.
+            members = torch.where(members.any(1, keepdim=True), members, candidates)
+        changed = members & (anchor.route != state.routed.route)
+        nats = self._route_nats(scene, anchor.route) * changed
+        left = state.nats_left(self.budget)
+        if left is not None:
+            affordable = (nats.sum(-1) <= left)[:, None] | (nats == 0)
+            members = members & affordable
+            nats = nats * affordable
+        target = skeleton.target
         for _ in range(self.skeleton.max_chain - 1):
-            acts = acts & (
-                (skeleton.target <= 0) | acts.gather(1, skeleton.target.clamp(min=0))
-            )
-        target = torch.where(acts, skeleton.target, -1)
-        state = replace(
-            state, coalition=acts, target=target, path_kl=state.path_kl + change * acts
-        )
-        if self.on_decision:
-            moments = (DT * (found.steps + 1)).expand(len(reference), -1)
-            chosen = (found.candidates, feasible, state.coalition, state.target)
-            at = reference[:, found.steps]
-            self.on_decision(
-                Selection(
-                    state.seed,
-                    world.step,
-                    at,
-                    moments,
-                    found.weights,
-                    *chosen,
-                    self.topology,
-                )
-            )
-        route = torch.where(acts, anchor.route, state.routed.route)
-        return self._onto(
-            state, world, route=route, off_lane=acts & False, paths=anchor.off_lane_path
-        )
+            on_ego = target <= 0
+            members = members & (on_ego | members.gather(1, target.clamp(min=0)))
+        return members, nats
 
     def _route_nats(self, scene: TensorDictBase, route: Tensor) -> Tensor:
         """-log p of candidates route [B, V] under the prior's own choice of routes."""
@@ -343,46 +290,17 @@ class Coalitions(NominalTraffic):
             log_p = torch.log_softmax(self.prior.route_choice(scene) / temperature, -1)
         return -take_route(log_p, route.clamp(min=0)).clamp(min=-MAX_ROUTE_NATS)
 
-    def _support(
-        self, state: E2State, world: World, candidates: Tensor, feasible: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """S [B, V] and who may take its place where it is empty, by `support` (Sec.
-        IV-A2)."""
-        if self.support == "random":
-            there = world.valid[:, : feasible.shape[1]] & ~state.routed.parked
-            there = there & (torch.arange(feasible.shape[1], device=there.device) > 0)
-            draw = noise_of(
-                state.seed,
-                SUPPORT + state.replans,
-                shape=tuple(feasible.shape[1:]),
-                uniform=True,
-            )
-            rank = draw.masked_fill(~there, torch.inf).argsort(-1).argsort(-1)
-            chosen = there & (rank < state.near[:, None])
-            return chosen, chosen
-        return (
-            (candidates, candidates)
-            if self.support == "topology"
-            else (candidates & feasible, feasible)
-        )
 
-    def _onto(
-        self,
-        state: E2State,
-        world: World,
-        route: Tensor,
-        off_lane: Tensor,
-        paths: Tensor,
-    ) -> E2State:
-        """States with vehicles moved to candidates route [B, V], or, off_lane [B, V],
-        to paths [B, V, P, 2], with their poses on them; a vehicle that was off its lane
-        and no longer is returns to its route."""
-        changed = (route != state.routed.route) | off_lane | state.off_lane
-        if not bool(changed.any()):
-            return state
-        return replace(
-            onto(
-                state, world, route=route, moved=changed, off_lane=off_lane, paths=paths
-            ),
-            off_lane=off_lane,
-        )
+def on_paths(
+    state: E2State, world: World, route: Tensor, off_lane: Tensor, paths: Tensor
+) -> E2State:
+    """Returns states with vehicles on candidates route [B, V], or, where off_lane
+    [B, V], on paths [B, V, P, 2], and with their poses there.
+
+    A vehicle that was off its lane and no longer is returns to its route.
+    """
+    moved = (route != state.routed.route) | off_lane | state.off_lane
+    if not bool(moved.any()):
+        return state
+    state = onto(state, world, route, moved=moved, off_lane=off_lane, paths=paths)
+    return replace(state, off_lane=off_lane)

@@ -25,8 +25,11 @@ from e2rl.traffic.traffic import REPLAN_STEPS
 DELAYS = (0.75, 0.85, 1.0, 1.25, 1.6, 99.0)  # s
 BRAKING = (7.59, 6.5, 5.5, 5.0, 4.0, 1.0)  # m/s^2
 WEIGHTS = (0.4, 0.3, 0.15, 0.1, 0.05)  # of the failures of all but the first
-FRONT_GAP = 0.8  # m before the ego's front, a step before the contact, at least which makes it the ego's front
+# m before the ego's front, a step before the contact, at least which makes it the
+# ego's front.
+FRONT_GAP = 0.8
 MOVING = 1.0  # m/s: slower drivers do not run into anybody
+REACTION = -1.0  # m/s^2 asked for by a driver who has begun to react
 STEPS = 5  # of DT in one fused function
 SOON = 0.1  # share of the worth that a failure at the end of the horizon loses
 
@@ -40,6 +43,41 @@ class Foresight(NamedTuple):
     time: Tensor
 
 
+class Population(NamedTuple):
+    """D drivers: delay s and braking m/s^2, [D] each."""
+
+    delay: Tensor
+    braking: Tensor
+
+
+class Encounter(NamedTuple):
+    """D drivers who each meet C plans, [D, C] each.
+
+    speed m/s; travelled m; since s (see `foresee`) and braking m/s^2, the driver's
+    memory; hit, front (by its front), reacts: 0 or 1, which compiled code loads faster
+    than truth values; time s of the contact, inf for none.
+    """
+
+    speed: Tensor
+    travelled: Tensor
+    since: Tensor
+    braking: Tensor
+    hit: Tensor
+    front: Tensor
+    reacts: Tensor
+    time: Tensor
+
+
+class Approach(NamedTuple):
+    """C plans along the ego's way at T moments, [T, C] each: rear m, speed m/s, lateral
+    gap m and length m of what is met."""
+
+    rear: Tensor
+    speed: Tensor
+    lateral_gap: Tensor
+    length: Tensor
+
+
 def foresee(
     path: Tensor,
     size: Tensor,
@@ -48,173 +86,158 @@ def foresee(
     since: Tensor,
     settled: Tensor,
 ) -> Foresight:
-    """The Foresight of O plans of each of G vehicles, tracks [G, O, T + 1, 4] from now
-    on, each alone with an ego.
+    """Returns the Foresight of O plans of each of G vehicles, each alone with an ego.
 
-    path [G, T + 1, 4]: the ego's expected states, whose way has no backwards; size,
-    sizes [G, 2] of ego and vehicle; since [G]: s for which the ego has had the vehicle
-    before it (-1: not yet), when a competent driver would have begun to react; settled
-    [G] bool: that driver would have prevented what has begun, so that it need not
-    prevent what is left of it.
+    Args:
+        path: [G, T + 1, 4], the ego's expected states, whose way has no backwards.
+        size: [G, 2] m, of the egos.
+        tracks: [G, O, T + 1, 4], from now on.
+        sizes: [G, 2] m, of the vehicles.
+        since: [G] s for which the ego has had the vehicle before it (-1: not yet), when
+            a competent driver would have begun to react.
+        settled: [G] bool, that driver would have prevented what has begun, so that it
+            need not prevent what is left of it.
     """
     plans = tracks.transpose(1, 2)
     box = sizes[:, None].expand(*tracks.shape[:2], 2)
-    along = along_way(
-        path,
-        size[:, 1],
-        others=Tracks(
-            plans, box, present=torch.ones_like(plans[..., 0], dtype=torch.bool)
-        ),
-    )
+    present = torch.ones_like(plans[..., 0], dtype=torch.bool)
+    along = along_way(path, size[:, 1], Tracks(plans, box, present))
     hit, time = _contacts(path, size[:, 0], along=along, since=since)
     prevented = ~hit[0]
     horizon = DT * tracks.shape[2]
-    worth = (hit[1:] * path.new_tensor(WEIGHTS)[:, None, None]).sum(0)
-    worth = (
-        worth
-        * (prevented | settled[:, None])
-        * (1 - SOON * time.clamp(max=horizon) / horizon)
-    )
+    weights = path.new_tensor(WEIGHTS)[:, None, None]
+    worth = (hit[1:] * weights).sum(0) * (prevented | settled[:, None])
+    worth = worth * (1 - SOON * time.clamp(max=horizon) / horizon)
     return Foresight(worth, prevented, time=time)
 
 
 def _contacts(
     path: Tensor, length: Tensor, along: Along, since: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Whether drivers [D, G, O] run their front into the plans seen `along` path [G, T
-    + 1, 4] ([T + 1, G, O] each), and when [G, O] s the one who does not react does;
-    length [G] m of the ego, since [G].
+    """Whether drivers [D, G, O] run their front into the plans, and when [G, O] s the
+    one who does not react does. The competent driver counts any contact as its own.
 
-    The competent driver counts any contact as its own.
+    path [G, T + 1, 4]; length [G] m of the ego; along: the plans on it, [T + 1, G, O]
+    each; since [G] s.
     """
     plans = along.rear.shape[1:]
     steps = path.shape[1] - 1
-    delay, braking = (path.new_tensor(values) for values in (DELAYS, BRAKING))
+    population = Population(path.new_tensor(DELAYS), path.new_tensor(BRAKING))
     pace = path[..., 3].abs()
-    own = (pace.diff(dim=1) / DT).T[..., None].expand(steps, *plans).flatten(1)
+    planned = (pace.diff(dim=1) / DT).T[..., None].expand(steps, *plans).flatten(1)
     length, speed, since = (
         value[:, None].expand(plans).flatten() for value in (length, pace[:, 0], since)
     )
-    way = path.new_zeros(len(DELAYS), plans.numel())
-    met = (
-        speed.expand_as(way),
-        way,
-        since.expand_as(way),
-        way,
-        way,
-        way,
-        way,
-        torch.full_like(way, torch.inf),
+    zero = path.new_zeros(len(DELAYS), plans.numel())
+    encounter = Encounter(
+        speed=speed.expand_as(zero),
+        travelled=zero,
+        since=since.expand_as(zero),
+        braking=zero,
+        hit=zero,
+        front=zero,
+        reacts=zero,
+        time=torch.full_like(zero, torch.inf),
     )
-    seen = [
-        value.flatten(1)
-        for value in (along.rear, along.speed, along.lateral_gap, along.length)
-    ]
-    for t in range(0, steps, STEPS):
-        moments = path.new_tensor(
-            [DT * (k + 1) for k in range(t, min(t + STEPS, steps))]
+    approach = (along.rear, along.speed, along.lateral_gap, along.length)
+    approach = Approach(*(value.flatten(1) for value in approach))
+    for step in range(0, steps, STEPS):
+        last = min(step + STEPS, steps)
+        moments = path.new_tensor([DT * (k + 1) for k in range(step, last)])
+        ahead = Approach(*(value[step : step + STEPS + 1] for value in approach))
+        encounter = meet(
+            population, moments, length, planned[step:last], encounter, ahead
         )
-        part = [value[t : t + STEPS + 1] for value in seen]
-        met = meet(delay, braking, moments, length, own[t : t + STEPS], *met, *part)
-    hit, front = (value.unflatten(1, plans) > 0 for value in met[4:6])
-    return torch.cat([hit[:1], front[1:]]), met[7][-1].view(plans)
+    hit = encounter.hit.unflatten(1, plans) > 0
+    front = encounter.front.unflatten(1, plans) > 0
+    return torch.cat([hit[:1], front[1:]]), encounter.time[-1].view(plans)
 
 
-@fused("D", "D", f"{STEPS}", "C", f"{STEPS} C", *["D C"] * 8, *[f"{STEPS + 1} C"] * 4)
+@fused("D", f"{STEPS}", "C", f"{STEPS} C", "D C", f"{STEPS + 1} C")
 def meet(
-    delay: Tensor,
-    braking: Tensor,
+    population: Population,
     moments: Tensor,
     length: Tensor,
-    own: Tensor,
-    speed: Tensor,
-    way: Tensor,
-    since: Tensor,
-    brakes: Tensor,
-    hit: Tensor,
-    front: Tensor,
-    reacts: Tensor,
-    time: Tensor,
-    rear: Tensor,
-    other: Tensor,
-    aside: Tensor,
-    extent: Tensor,
-) -> tuple[Tensor, ...]:
-    """Some steps, which end at `moments`, of drivers [D] who meet plans [C].
+    planned: Tensor,
+    encounter: Encounter,
+    ahead: Approach,
+) -> Encounter:
+    """The encounter after some steps of DT.
 
-    Returns, each [D, C], their speed, way, since and braking; whether they have been
-    hit, by their front, and react, as 0 or 1, which compiled code loads faster than
-    truth values; and when they are hit. length [C] and own [STEPS, C]: the ego's, and
-    its planned acceleration; rear, other (speed), aside and extent [STEPS + 1, C]: of
-    what it meets.
+    Args:
+        population: the D drivers.
+        moments: [STEPS] s at which the steps end.
+        length: [C] m, of the egos.
+        planned: [STEPS, C] m/s^2, the egos' expected acceleration.
+        encounter: of the drivers with C plans.
+        ahead: the plans at the STEPS + 1 moments.
     """
-    drivers = HumanDriver(delay=delay[:, None], braking=braking[:, None], release=0.0)  # type: ignore
+    delay = population.delay[:, None]
+    braking = population.braking[:, None]
+    drivers = HumanDriver(delay=delay, braking=braking, release=0.0)  # type: ignore
+    speed = encounter.speed
+    travelled = encounter.travelled
     length = length.expand_as(speed)
-    hit = hit > 0
-    front = front > 0
-    reacts = reacts > 0
-    memory = DriverState(since, brakes, decided=hit)
-    for t in range(own.shape[0]):
-        gap = rear[t] - way - length / 2
-        met, lateral, long = (
-            value[t].expand_as(gap) for value in (other, aside, extent)
-        )
-        seen = Observation(
-            speed,
-            way,
+    hit = encounter.hit > 0
+    front = encounter.front > 0
+    reacts = encounter.reacts > 0
+    time = encounter.time
+    memory = DriverState(encounter.since, encounter.braking, hit)
+    unseen = torch.zeros_like(speed)  # a HumanDriver does not look at it
+    for step in range(planned.shape[0]):
+        gap = ahead.rear[step] - travelled - length / 2
+        lateral_gap = ahead.lateral_gap[step].expand_as(gap)
+        observation = Observation(
+            speed=speed,
+            acceleration=unseen,
             gap=gap,
-            other_speed=met,
-            lateral_gap=lateral,
-            lateral_speed=way,
-            overlaps=lateral <= 0,
+            other_speed=ahead.speed[step].expand_as(gap),
+            lateral_gap=lateral_gap,
+            lateral_speed=unseen,
+            overlaps=lateral_gap <= 0,
             length=length,
-            other_length=long,
+            other_length=ahead.length[step].expand_as(gap),
         )
-        memory, asked = drivers.step(memory, seen)
-        reacts = reacts | (asked < -1.0)
-        planned = own[t].expand_as(speed)
-        after = (
-            speed + DT * torch.where(reacts, torch.minimum(asked, planned), planned)
-        ).clamp(min=0)
-        way = way + (speed + after) / 2 * DT
+        memory, asked = drivers.step(memory, observation)
+        reacts = reacts | (asked < REACTION)
+        accel = planned[step].expand_as(speed)
+        accel = torch.where(reacts, torch.minimum(asked, accel), accel)
+        after = (speed + DT * accel).clamp(min=0)
+        travelled = travelled + (speed + after) / 2 * DT
         speed = after
-        now = rear[t + 1] - way - length / 2
-        touch = (
-            (now < 0) & (now > -(length + extent[t + 1])) & (aside[t + 1] < 0) & ~hit
-        )
+        gap_after = ahead.rear[step + 1] - travelled - length / 2
+        overlap = gap_after > -(length + ahead.length[step + 1])
+        touch = (gap_after < 0) & overlap & (ahead.lateral_gap[step + 1] < 0) & ~hit
         front = front | (touch & (gap > -FRONT_GAP) & (speed > MOVING))
-        time = torch.where(touch, moments[t], time)
+        time = torch.where(touch, moments[step], time)
         hit = hit | touch
-    return (
+    return Encounter(
         speed,
-        way,
-        *memory[:2],
-        *(torch.where(value, 1.0, 0.0) for value in (hit, front, reacts)),
-        time,
+        travelled,
+        since=memory[0],
+        braking=memory[1],
+        hit=torch.where(hit, 1.0, 0.0),
+        front=torch.where(front, 1.0, 0.0),
+        reacts=torch.where(reacts, 1.0, 0.0),
+        time=time,
     )
 
 
 def time_before(world: World, ego_plan: Tensor, since: Tensor) -> Tensor:
-    """`since` [B, V] of the present moment, one replan after `since` was right."""
+    """`since` [B, V] s of the present moment, one replan after `since` was right."""
     vehicles = since.shape[1]
     size = world.scene["size"]
     path = torch.cat([world.states[:, :1], ego_plan[:, :HORIZON]], 1)
     present = world.valid[:, None, :vehicles]
-    seen = along_way(
-        path,
-        size[:, 0, 1],
-        others=Tracks(
-            world.states[:, None, :vehicles], size[:, :vehicles], present=present
-        ),
-    )
-    gap = seen.rear[0] - size[:, :1, 0] / 2
-    closing = world.states[:, :1, 3].abs() - seen.speed[0]
+    tracks = Tracks(world.states[:, None, :vehicles], size[:, :vehicles], present)
+    along = along_way(path, size[:, 0, 1], tracks)
+    gap = along.rear[0] - size[:, :1, 0] / 2
+    closing = world.states[:, :1, 3].abs() - along.speed[0]
     driver = HumanDriver()
-    before = (seen.lateral_gap[0] <= 0) & (closing > 0) & (gap > 0)
+    in_front = (along.lateral_gap[0] <= 0) & (closing > 0) & (gap > 0)
     needed = torch.maximum(
         closing * driver.time_to_collision, driver.stopping_gap(closing)
     )
     begun = torch.where(gap <= needed, 0.0, -1.0)
-    return torch.where(
-        before, torch.where(since >= 0, since + REPLAN_STEPS * DT, begun), -1.0
-    )
+    later = torch.where(since >= 0, since + REPLAN_STEPS * DT, begun)
+    return torch.where(in_front, later, -1.0)

@@ -27,11 +27,6 @@ from e2rl.traffic.motion import (
     take,
 )
 
-LIMITS = (
-    (1, 0),
-    (2, 0),
-    (1, 1),
-)  # near and far agents of the causal templates single, pair and chain
 MAX_DIST = 80.0  # m; farther vehicles start no chain
 STEP = 0.5  # s between the moments that are looked at
 CORRIDOR = 2.5  # m from a route within which a vehicle is on it
@@ -64,15 +59,6 @@ class Skeleton:
     depth: Tensor
     near: Tensor
     far: Tensor
-
-
-def limits_of(template: Tensor, settings: SkeletonSettings) -> tuple[Tensor, Tensor]:
-    """The most near and far agents [B] int64 that causal templates [B] allow
-    (e2rl/traffic/traffic.py); those of `full` are the settings'."""
-    near, far = torch.tensor(
-        [*LIMITS, (settings.near, settings.far)], device=template.device
-    )[template].unbind(-1)
-    return near, far
 
 
 def direct(support: Tensor) -> Skeleton:
@@ -279,24 +265,29 @@ def _link_chains(
 
 
 def build_skeleton(
-    scene: TensorDictBase,
     world: World,
+    *,
     support: Tensor,
     feasible: Tensor,
     settings: SkeletonSettings,
     expected: Tensor,
     cost: Tensor,
-    limits: tuple[Tensor, Tensor] | None = None,
 ) -> Skeleton:
-    """Algorithm 2 for scenes [B]: support [B, V] = S, feasible [B, V] = F.
+    """Returns the skeletons of Algorithm 2.
 
-    expected [B, V, K, 4]: states of everybody every STEP s from now; cost [B, V]: of
-    meeting the ego, inf for vehicles that cannot; limits: the most near and far agents
-    [B], by default the settings'. The near agents are those of S with the least cost;
-    where S has none, those of F; where F has none either, nobody, or with `pursuit` the
-    nearest of S, or of F where S is empty.
+    The near agents are those of S with the least cost; where S has none, those of F;
+    where F has none either, nobody, or with `pursuit` the nearest of S, or of F where S
+    is empty.
+
+    Args:
+        world: B scenes.
+        support: [B, V] bool, S.
+        feasible: [B, V] bool, F.
+        settings: of Algorithm 2.
+        expected: [B, V, K, 4], states of everybody every STEP s from now.
+        cost: [B, V] s, of meeting the ego, inf for vehicles that cannot.
     """
-    most_near, most_far = (settings.near, settings.far) if limits is None else limits
+    scene = world.scene
     vehicles = support.shape[1]
     states = world.states[:, :vehicles].detach()
     expected = expected[:, :, : round(settings.horizon / STEP)].detach()
@@ -307,13 +298,15 @@ def build_skeleton(
     )
     first, second = (mask & cost.isfinite() for mask in (support, feasible))
     near = smallest(
-        torch.where(first.any(1, keepdim=True), first, second), cost, count=most_near
+        torch.where(first.any(1, keepdim=True), first, second),
+        cost,
+        count=settings.near,
     )
     if settings.pursuit:
         nearest = smallest(
             torch.where(support.any(1, keepdim=True), support, feasible),
             distance,
-            count=most_near,
+            count=settings.near,
         )
         near = torch.where(near.any(1, keepdim=True), near, nearest)
     index, present = compact(support | near)
@@ -322,7 +315,7 @@ def build_skeleton(
     distant &= ~_on_ego_lanes(
         torch.cat([states[:, :1], take(states, index)], 1), distant, scene=scene
     )
-    far = smallest(distant, -take(distance, index), count=most_far)
+    far = smallest(distant, -take(distance, index), count=settings.far)
     linked = present & far.any(1, keepdim=True)  # no far agent, no chain to look for
     after = first_after(
         influence(
