@@ -78,7 +78,6 @@ def skeleton_of(
     world: World,
     support: torch.Tensor,
     feasible: torch.Tensor | None = None,
-    limits=None,
     cost=None,
     **settings,
 ) -> Skeleton:
@@ -92,14 +91,12 @@ def skeleton_of(
     expected = constant_speed_states(world.scene, world, times=times)
     feasible = support if feasible is None else feasible
     return build_skeleton(
-        world.scene,
         world,
         support=support,
         feasible=feasible,
         settings=chosen,
         expected=expected,
         cost=distance if cost is None else cost,
-        limits=limits,
     )
 
 

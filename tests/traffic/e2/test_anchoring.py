@@ -29,9 +29,8 @@ def proposed(
     settings = settings or AnchorSettings()
     wish = wish_of(len(plan), eta)
     return propose(
-        world.scene,
         world,
-        skeleton=skeleton,
+        skeleton,
         ego_plan=plan,
         settings=settings,
         interception=interception,

@@ -1,17 +1,12 @@
-"""Coalitions: who is chosen, who acts through whom, on which routes, and within which
-templates."""
+"""Coalitions: who is chosen, who acts through whom, and on which routes."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from e2rl.planners.idm_planner import IDMEgo
-from e2rl.sim.env import SimSettings
 from e2rl.sim.world import World
 from e2rl.traffic.e2 import coalition
-from e2rl.traffic.rollout import synthesize_traffic
-from e2rl.traffic.traffic import FULL, PAIR, SINGLE
 from tests.traffic.e2.traffic_scenes import EGO, begin, replanned, scenes, synthesizer
 
 
@@ -39,20 +34,18 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
     build = coalition.build_skeleton
     propose = coalition.propose
 
-    def chained(*arguments):
+    def chained(world, **arguments):
         return replace(
-            build(*arguments),
+            build(world, **arguments),
             coalition=acts,
             target=target,
             depth=torch.tensor([[0, 1, 2, 1, 3, 0]]),
         )
 
-    def without_one(scene, world, skeleton, *arguments, **options):
+    def without_one(world, skeleton, **options):
         feasible = skeleton.coalition.clone()
         feasible[:, 1] = False
-        return replace(
-            propose(scene, world, skeleton, *arguments, **options), feasible=feasible
-        )
+        return replace(propose(world, skeleton, **options), feasible=feasible)
 
     monkeypatch.setattr(coalition, "build_skeleton", chained)
     monkeypatch.setattr(coalition, "propose", without_one)
@@ -77,7 +70,9 @@ def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
     monkeypatch.setattr(coalition, "propose", nothing)
     for pursuit in (False, True):
         on = synthesizer(
-            skeleton={"pursuit": pursuit}, control={"adversarial_clip": 2.0}
+            skeleton={"pursuit": pursuit},
+            guidance={"adversarial_clip": 2.0, "scaling": "sigma", "feasibility": 0.0},
+            kernels={"samples": 1},
         )
         state, plan = replanned(on, scene, eta=2.0)
         assert state.coalition.any(1).tolist() == [pursuit] * 3
@@ -124,24 +119,3 @@ def test_the_other_supports_choose_a_coalition_too(support):
     assert not (
         plan.adversary & (scene["parked"] | ~scene["valid"])[:, :vehicles]
     ).any()
-
-
-# --- causal templates limit the coalitions, scene by scene; `full` changes nothing
-
-
-def test_templates_reach_the_rows_of_synthesized_traffic():
-    """Equal scenes of equal noise: a vehicle more acts where the template allows it."""
-    scene_set = scenes(4)
-    on = synthesizer(reselect=0, responsibility="none")
-    synthesize = synthesize_traffic(scene_set, on, sim=SimSettings(), batch=3)
-    index = torch.arange(4)
-    eta = torch.full((4,), 3.0)
-
-    def acting(*template):
-        return synthesize(IDMEgo(), index, eta, 0, *template)["adversaries"].sum(1)
-
-    one, two, most = (acting(torch.full((4,), code)) for code in (SINGLE, PAIR, FULL))
-    assert (
-        (one <= 1).all() and (two <= 2).all() and (one <= two).all() and two.max() == 2
-    )
-    assert torch.equal(most, acting())

@@ -13,22 +13,8 @@ def test_a_scene_is_planned_alike_alone_and_in_a_batch():
         _, whole = replanned(on, scene, eta=eta, seeds=[5, 6, 7])
         _, alone = replanned(on, scene[1:2], eta=eta, seeds=[6])
         torch.testing.assert_close(alone.states, whole.states[1:2], rtol=0, atol=5e-3)
-        assert torch.equal(alone.route, whole.route[1:2]) and torch.equal(
-            alone.adversary, whole.adversary[1:2]
-        )
-
-
-def test_without_feasibility_guidance_only_adversaries_leave_the_prior():
-    _, plan = replanned(
-        synthesizer(control={"feasibility": 0.0, "adversarial_clip": 0.5}),
-        scenes(3).scenes,
-        eta=2.0,
-    )
-    traffic, adversary = (
-        plan.path_kl[:, 1:],
-        plan.adversary[:, 1:],
-    )  # row 0 holds the price of choices
-    assert (traffic[~adversary] == 0).all() and (traffic[adversary] > 0).all()
+        assert torch.equal(alone.route, whole.route[1:2])
+        assert torch.equal(alone.adversary, whole.adversary[1:2])
 
 
 @pytest.mark.parametrize("samples", [1, 6])
@@ -50,8 +36,7 @@ def test_the_transport_budget_of_a_rollout_holds_and_is_used(sampler, samples):
     limit = float(free.min()) / 3
     assert limit > 0
     capped = spent(limit)
-    assert (capped <= 1.001 * limit).all() and (
-        capped > (0.99 if samples == 1 else 0.4) * limit
-    ).all()
+    assert (capped <= 1.001 * limit).all()
+    assert (capped > (0.99 if samples == 1 else 0.4) * limit).all()
     assert (spent(0.0) == 0).all()
     torch.testing.assert_close(spent(2 * float(free.max())), free, rtol=1e-3, atol=1e-4)

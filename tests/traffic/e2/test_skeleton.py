@@ -13,10 +13,8 @@ from e2rl.traffic.e2.skeleton import (
     SkeletonSettings,
     influence,
     lane_of,
-    limits_of,
 )
 from e2rl.traffic.motion import constant_speed_states
-from e2rl.traffic.traffic import CHAIN, FULL, PAIR, SINGLE
 from tests.traffic.e2.crossing import add_route, make_world, mask, skeleton_of
 
 UP = math.pi / 2
@@ -281,29 +279,3 @@ def test_any_candidate_route_may_lead_to_the_target():
         world, 2, candidate=3, heading=math.atan2(32.0, 20.0)
     )  # towards where the first will be
     assert skeleton_of(world, mask(world, 1, 2), near=1, tau_long=60.0).far.any()
-
-
-def test_causal_templates_limit_each_scene_by_itself():
-    """A scene for each template, all alike: three vehicles in a column and one beside
-    the ego."""
-    world = make_world([EGO, *COLUMN, (12.0, 3.5, 0.0, 10.0)], copies=4)
-    support = mask(world, 1, 2, 3, 4)
-    settings = SkeletonSettings(near=3)
-    limits = limits_of(torch.tensor([SINGLE, PAIR, CHAIN, FULL]), settings)
-    assert limits[0].tolist() == [1, 2, 1, 3] and limits[1].tolist() == [
-        0,
-        0,
-        1,
-        settings.far,
-    ]
-    result = skeleton_of(world, support, near=3, limits=limits)
-    assert result.near.sum(1).tolist() == [1, 2, 1, 3]
-    assert not result.far[:2].any() and (result.far.sum(1) <= 1).all()
-    assert torch.equal(result.coalition[:2], result.near[:2]) and (
-        result.target[:3] == 0
-    ).sum(1).tolist() == [1, 2, 1]
-    alone = skeleton_of(world, support, near=3)
-    assert all(
-        torch.equal(getattr(result, name)[3], getattr(alone, name)[3])
-        for name in vars(alone)
-    )
