@@ -18,7 +18,7 @@ from e2rl.prior import prior
 from e2rl.run import fused
 from e2rl.sim.env import DrivingEnv
 from e2rl.traffic import nominal
-from e2rl.traffic.e2 import coalition, control, e2, interception
+from e2rl.traffic.e2 import coalition, e2, feasibility, interception, paper
 from e2rl.traffic.e2 import kernels as importance
 from e2rl.traffic.rollout import roll_out
 
@@ -26,7 +26,7 @@ PARTS = {  # each without the others that it calls
     "encoding": [(prior.Prior, "encode")],
     "denoising": [(prior.Prior, "denoise")],
     "decoding": [(prior.Prior, "decode")],
-    "V_feas": [(control.SparseControl, "_gradients")],
+    "V_adv and V_feas": [(paper.MaskedGuidance, "_gradients")],
     "control, and steps of the SDE": [(prior.Prior, "sample")],
     "bounds": [(prior, "bounded")],
     "foresight": [(importance, "foresee"), (interception, "foresee")],
@@ -34,7 +34,7 @@ PARTS = {  # each without the others that it calls
     "proposals and interceptions": [(coalition, "propose")],
     "topology and feasibility": [
         (coalition, "topological_candidates"),
-        (coalition, "feasible_vehicles"),
+        (feasibility, "find_conflicts"),
     ],
     "skeleton": [(coalition, "build_skeleton")],
     "groups of scenes": [
