@@ -6,7 +6,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import e2rl
-from e2rl.planners.ego import EgoPolicy
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.sim.env import DrivingEnv, SimSettings
 from tests.synthetic import make_scenes

@@ -18,9 +18,11 @@ from omegaconf import OmegaConf
 from e2rl.evaluation.modes import read_modes
 from e2rl.evaluation.rollout_files import read_metrics, read_rows
 from e2rl.metrics.score import score_rollouts
-from e2rl.planners.ego import PlannerError
-from e2rl.planners.external import ExternalEgo, drivable, plans_of
-from e2rl.planners.planner_link import ACTION, FAILED, TRAJECTORY, PlannerLink, message
+from e2rl.planners.ego_errors import PlannerError
+from e2rl.planners.external import ExternalEgo, plans_of
+from e2rl.planners.planner_link import PlannerLink
+from e2rl.planners.planner_messages import ACTION, FAILED, TRAJECTORY, message
+from e2rl.planners.plausibility import drivable
 from e2rl.report.tables import metric_tables
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
@@ -237,7 +239,7 @@ class Readers:
         def read(content: bytes) -> None:
             ours, theirs = socket.socketpair()
             link = PlannerLink.__new__(PlannerLink)
-            link._buffer = bytearray()
+            link.buffer = bytearray()
             link._socket = ours
             link._process = None
             link._name = "input"
@@ -248,7 +250,7 @@ class Readers:
                 theirs.sendall(content)
                 theirs.shutdown(socket.SHUT_WR)
                 try:
-                    plans = plans_of(now, ego._ask(b"x", len(now)), 5)
+                    plans = plans_of(now, ego._ask(b"x", len(now)), steps=5)
                 except PlannerError as error:
                     require(
                         all(0 <= row < len(now) for row in error.rows),
@@ -257,7 +259,8 @@ class Readers:
                     raise InputError(str(error)) from error
             whole = torch.full((len(now),), plans.shape[1])
             require(
-                bool(drivable(now, plans, whole).all()), "a plan that no vehicle drives"
+                bool(drivable(now, plans, length=whole).all()),
+                "a plan that no vehicle drives",
             )
 
         return replies | replies.flatmap(damaged), read

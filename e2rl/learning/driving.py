@@ -8,7 +8,9 @@ from tensordict import TensorDict, TensorDictBase, tensorclass
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from e2rl.planners.ego import Ego, EgoPolicy, renumbered
+from e2rl.planners.ego import Ego
+from e2rl.planners.ego_errors import renumbered
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.dynamics import wrap

@@ -25,7 +25,8 @@ from e2rl.learning.scheduler import CurriculumScheduler
 from e2rl.learning.teaching import Teacher
 from e2rl.learning.update import Learner, UpdateSettings
 from e2rl.planners.actor import ActorEgo
-from e2rl.planners.ego import Ego, EgoPlanner
+from e2rl.planners.ego import Ego
+from e2rl.planners.ego_policy import EgoPlanner
 from e2rl.run.config import built
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting, settings_of

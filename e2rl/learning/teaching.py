@@ -16,7 +16,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from e2rl.learning.cloning import clip_expert
-from e2rl.planners.ego import Ego, ask
+from e2rl.planners.ego import Ego
+from e2rl.planners.ego_policy import ask
 from e2rl.planners.sampling import ScoringEgo, ranked_actions
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting, settings_of

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor, nn
 
 from e2rl.planners.actor import ObservingEgo
-from e2rl.planners.ego import finite
 from e2rl.planners.onnx_policy import OnnxPolicy
+from e2rl.planners.plausibility import finite
 from e2rl.run.config import library
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_regular, write_atomically

@@ -11,7 +11,7 @@ from typing import TypeVar
 import torch
 from tensordict import TensorDictBase
 
-from e2rl.planners.ego import (
+from e2rl.planners.ego_errors import (
     BY_EGO,
     NotFinite,
     PlannerError,

@@ -12,7 +12,8 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from e2rl.planners.ego import Ego, EgoPolicy
+from e2rl.planners.ego import Ego
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.prior.routes import take_route
 from e2rl.scenes.route import BEHIND, SPACING, project_track
 from e2rl.scenes.scene import SceneSet

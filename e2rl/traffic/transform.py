@@ -10,15 +10,10 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from e2rl.planners.ego import (
-    PLAN_STEPS,
-    Ego,
-    answering,
-    ask,
-    checked,
-    from_outside,
-    renumbered,
-)
+from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.planners.ego_errors import renumbered
+from e2rl.planners.ego_policy import answering, ask, from_outside
+from e2rl.planners.plausibility import checked_answer
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
@@ -343,11 +338,11 @@ class Lookahead:
         for number, after in enumerate(ends.tolist()):
             with renumbered(rows), answering(now):
                 answer = ask(self.ego, "plan", world=now, scene=world.scene)
-                plan = checked(
+                plan = checked_answer(
                     answer,
-                    (len(now.step), PLAN_STEPS, 4),
-                    ego=self.ego,
+                    self.ego,
                     method="plan",
+                    shape=(len(now.step), PLAN_STEPS, 4),
                     begins=False,
                 )
             pieces.append(plan[:, : self.period])

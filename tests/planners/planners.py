@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from e2rl.planners.ego import Ego, EgoPolicy
+from e2rl.planners.ego import Ego
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.external import continued
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings

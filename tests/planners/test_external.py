@@ -22,7 +22,7 @@ from e2rl import roll_out
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.planners.external import ExternalEgo
-from e2rl.planners.planner_link import plan_message, scene_messages
+from e2rl.planners.planner_messages import plan_message, scene_messages
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.sim.env import SimSettings

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from e2rl.planners.ego import EgoPolicy
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.pdm_closed import (
     COMFORT,
     FRACTIONS,

@@ -14,7 +14,8 @@ from torch import nn
 from e2rl.commands.export_policy import export_actor
 from e2rl.planners import policy_file
 from e2rl.planners.actor import ActorEgo
-from e2rl.planners.ego import EgoPolicy, NotFinite
+from e2rl.planners.ego_errors import NotFinite
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.onnx_policy import check_arithmetic
 from e2rl.planners.policy_file import MAX_FILE, PolicyFileEgo, within_time
 from e2rl.run.errors import InputError

@@ -4,7 +4,7 @@ distance and red lights."""
 import torch
 
 from e2rl.planners.actor import ActorEgo
-from e2rl.planners.ego import EgoPolicy
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.reference import AGENTS, Largest, Trunk, follow
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import NEAREST, OBSERVATION_SIZE, PER_AGENT

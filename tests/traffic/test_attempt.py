@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from e2rl.planners.ego import PlannerError
+from e2rl.planners.ego_errors import PlannerError
 from e2rl.run.errors import InputError
 from e2rl.traffic.attempt import NOT_FINITE, attempt
 

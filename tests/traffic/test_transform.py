@@ -9,7 +9,9 @@ from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, Transformed
 from torchrl.envs.utils import check_env_specs
 
 from e2rl.learning.policy import RowDraw
-from e2rl.planners.ego import Ego, EgoPolicy, PlannerError, TrafficNotFinite
+from e2rl.planners.ego import Ego
+from e2rl.planners.ego_errors import PlannerError, TrafficNotFinite
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
-from e2rl.planners.ego import EgoPolicy
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.recording import DT
