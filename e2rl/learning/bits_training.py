@@ -247,7 +247,11 @@ def losses(
     logits, residuals = network.goals(code)
     guessed = residuals.gather(1, cell[:, None, None].expand(-1, 1, 2))[:, 0]
     controls = network.controls(
-        code, start[:, 3], path.d, distance[:, None], offset[:, None]
+        code,
+        speed=start[:, 3],
+        offset=path.d,
+        distance=distance[:, None],
+        side=offset[:, None],
     )
     states = drive_controls(controls, start, path=path).states[:, 0]
     gap = (states[..., :2] - batch["future"][..., :2]).square().sum(-1)

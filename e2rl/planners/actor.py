@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
-from e2rl.planners.network import ActorCritic, find_weights, read_actor
+from e2rl.planners.network import ActorCritic, Architecture, find_weights, read_actor
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
@@ -18,9 +18,7 @@ from e2rl.sim.observation import features, placed_ego
 from e2rl.sim.static import static_scene
 from e2rl.sim.world import Agents, World
 
-HOLD = (
-    5  # steps for which a planned action is held: 10 evaluations of the policy per plan
-)
+HOLD = 5  # steps for which a planned action is held: 10 evaluations of the policy
 
 
 class ObservingEgo(Ego):
@@ -49,15 +47,15 @@ class ObservingEgo(Ego):
         static = static_scene(world.scene, mission_of(world.scene))
         expected = expected_states(world)
         horizon = world.scene["logged"].shape[1] - 1
-        state = world.states[:, 0]
         present = world.valid[:, 0]
+        state = world.states[:, 0]
         action = world.ego_action()
-        pieces = []
         place = world.mission_s
-        for done in range(0, PLAN_STEPS, HOLD):
+        parts = []
+        for step in range(0, PLAN_STEPS, HOLD):
             ego = placed_ego(
                 static.mission,
-                world.step + done,
+                world.step + step,
                 state=state,
                 action=action,
                 present=present,
@@ -65,17 +63,15 @@ class ObservingEgo(Ego):
                 place=place,
                 agents=static.vehicle,
             )
-            seen = features(
-                static, ego, others_at(world, expected, step=done), ego.step / horizon
-            )
-            action = self.decide(seen)
+            others = others_at(world, expected, step=step)
+            action = self.decide(features(static, ego, others, ego.step / horizon))
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
-            state = driven[:, -1]
             action = dynamics.inverse(last_two)[:, 0]
+            state = driven[:, -1]
             place = ego.pose.s + DT * driven[..., 3].sum(1)
-            pieces.append(driven)
-        return torch.cat(pieces, 1)
+            parts.append(driven)
+        return torch.cat(parts, 1)
 
 
 def others_at(world: World, expected: Tensor, step: int) -> Agents:
@@ -96,13 +92,14 @@ def others_at(world: World, expected: Tensor, step: int) -> Agents:
 def expected_states(world: World) -> Tensor:
     """States [B, N, PLAN_STEPS + 1, 4] of all agents at steps 0.. from now: as planned,
     else at constant velocity."""
-    now = world.states[:, :, None]
-    time = DT * torch.arange(PLAN_STEPS + 1, device=now.device, dtype=now.dtype)
-    expected = dynamics.constant_velocity(world.states, time)
+    states = world.states
+    times = DT * torch.arange(PLAN_STEPS + 1, device=states.device, dtype=states.dtype)
+    expected = dynamics.constant_velocity(states, times)
     if world.plan is None:
         return expected
     vehicles = world.plan.shape[1]
-    planned = torch.cat([now[:, :vehicles], world.plan[:, :, :PLAN_STEPS]], 2)
+    start = states[:, :vehicles, None]
+    planned = torch.cat([start, world.plan[:, :, :PLAN_STEPS]], 2)
     return torch.cat([planned, expected[:, vehicles:]], 1)
 
 
@@ -129,27 +126,26 @@ class ActorEgo(ObservingEgo):
         other bounds."""
         if not self.hidden:
             raise InputError("ego.hidden=[]: give the units of one layer at least")
-        low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
-        high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
-        sizes = (
-            self.hidden,
-            self.agent_units,
-            self.reference,
-            self.slack,
-            self.room,
-            self.initial_std,
+        low = (-float(self.max_braking), -float(self.max_yaw_rate))
+        high = (float(self.max_acceleration), float(self.max_yaw_rate))
+        architecture = Architecture(
+            low,
+            high,
+            hidden=tuple(self.hidden),
+            agent_units=self.agent_units,
+            reference=self.reference,
+            slack=self.slack,
+            room=self.room,
         )
-        self.network = ActorCritic(low, high, *sizes, self.device)
+        self.network = ActorCritic(architecture, self.initial_std, self.device)
         if self.checkpoint is not None:
-            asked = self.network.architecture
             path = find_weights(self.checkpoint)
             self.network = read_actor(path, self.device)
-            own, wanted = (
-                (of["low"], of["high"]) for of in (self.network.architecture, asked)
-            )
-            if own != wanted:
+            saved = self.network.architecture
+            if (saved.low, saved.high) != (low, high):
                 raise InputError(
-                    f"{path}: its actions have the bounds {own}, not {wanted}; set sim.max_* as in its run"
+                    f"{path}: its actions have the bounds {saved.low}, {saved.high}, not "
+                    f"{low}, {high}; set sim.max_* as in its run"
                 )
 
     def decide(self, observation: Tensor) -> Tensor:

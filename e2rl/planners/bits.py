@@ -19,13 +19,16 @@ from e2rl.planners.bits_network import (
     place,
 )
 from e2rl.planners.candidates import Candidates
+from e2rl.planners.chunks import PLANNER_KEYS
 from e2rl.planners.path import MissionPath
-from e2rl.planners.sampling import SCENE_KEYS, ScoringEgo
+from e2rl.planners.sampling import ScoringEgo
 from e2rl.run.settings import configured, setting
 from e2rl.sim.mission import mission_of
 from e2rl.sim.observation import ELAPSED, features, placed_ego
 from e2rl.sim.static import static_scene
 from e2rl.sim.world import World
+
+LOG_KEYS = ("logged", "logged_valid")  # for `static_scene`; no feature shows them
 
 
 @configured("ego/bits")
@@ -34,13 +37,7 @@ class BitsEgo(ScoringEgo):
     """Drives by the cheapest of the plans to goals that recorded drivers might have
     had."""
 
-    READS = (
-        *SCENE_KEYS,
-        "agent_type",
-        "logged",
-        "logged_valid",
-    )  # `static_scene` wants the log; no feature shows it
-
+    READS = (*PLANNER_KEYS, *LOG_KEYS)
     tuned = {"goals": (10, 80), "temperature": (0.3, 2.0)} | ScoringEgo.tuned
 
     checkpoint: str | None = setting()
@@ -49,11 +46,10 @@ class BitsEgo(ScoringEgo):
 
     def __post_init__(self) -> None:
         """Raises InputError for a checkpoint that is missing or does not fit."""
-        self.network = (
-            BitsNetwork().eval()
-            if self.checkpoint is None
-            else load_bits(self.checkpoint)
-        )
+        if self.checkpoint is None:
+            self.network = BitsNetwork().eval()
+        else:
+            self.network = load_bits(self.checkpoint)
         uniform = torch.rand(CELLS, generator=torch.Generator().manual_seed(0))
         self.noise = -(-uniform.clamp(1e-6, 1 - 1e-6).log()).log()  # Gumbel's
 
@@ -62,15 +58,19 @@ class BitsEgo(ScoringEgo):
         """Plans to `goals` goals of each scene."""
         path = MissionPath(world)
         start = world.states[:, 0]
+        speed = start[:, 3]
         network = self.network.to(start.device)
         code = network.encode(observed(world))
-        distance, side = self.drawn(*network.goals(code), start[:, 3])
-        distance = torch.minimum(distance, path.stop_distance().clamp(min=0)[:, None])
-        return drive_controls(
-            network.controls(code, start[:, 3], path.d, distance, side),
-            start,
-            path=path,
+        distance, side = self.drawn(*network.goals(code), speed)
+        stop = path.stop_distance().clamp(min=0)
+        controls = network.controls(
+            code,
+            speed=speed,
+            offset=path.d,
+            distance=torch.minimum(distance, stop[:, None]),
+            side=side,
         )
+        return drive_controls(controls, start, path=path)
 
     def drawn(
         self, logits: Tensor, residual: Tensor, speed: Tensor
@@ -81,14 +81,10 @@ class BitsEgo(ScoringEgo):
         The noise is the same in every scene and replan, so a plan depends on nothing
         but its World.
         """
-        cell = (
-            (logits / self.temperature + self.noise.to(logits.device))
-            .topk(self.goals, 1)
-            .indices
-        )
-        return place(
-            speed, cell, residual=residual.gather(1, cell[..., None].expand(-1, -1, 2))
-        )
+        noisy = logits / self.temperature + self.noise.to(logits.device)
+        cell = noisy.topk(self.goals, 1).indices
+        inside = residual.gather(1, cell[..., None].expand(-1, -1, 2))
+        return place(speed, cell, residual=inside)
 
 
 def observed(world: World) -> Tensor:
@@ -107,5 +103,6 @@ def observed(world: World) -> Tensor:
         place=world.mission_s,
         agents=static.vehicle,
     )
-    seen = features(static, ego, world.others(), world.step.to(state.dtype))
-    return seen.index_fill(1, torch.tensor([ELAPSED], device=state.device), 0.0)
+    observation = features(static, ego, world.others(), world.step.to(state.dtype))
+    elapsed = torch.tensor([ELAPSED], device=state.device)
+    return observation.index_fill(1, elapsed, 0.0)

@@ -11,6 +11,7 @@ cells whose length grows with the vehicle's speed.
 
 import json
 import math
+from collections.abc import Sequence
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -21,8 +22,8 @@ from torch import Tensor, nn
 
 from e2rl.planners.candidates import Candidates, drive
 from e2rl.planners.ego import PLAN_STEPS
-from e2rl.planners.network import Normaliser, perceptron
 from e2rl.planners.path import RoutePath
+from e2rl.planners.trunk import Normaliser, linear
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_weights, unlike, weight_bytes, write_atomically
 from e2rl.scenes.recording import DT
@@ -30,10 +31,20 @@ from e2rl.sim import dynamics
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 PLAN_SECONDS = PLAN_STEPS * DT  # s
-DISTANCES, SIDES = 32, 7  # cells along the mission and beside it
+DISTANCES = 32  # cells along the mission
+SIDES = 7  # cells beside it
 CELLS = DISTANCES * SIDES  # G: cell w * SIDES + s
 SIDE = 1.0  # m, width of a cell
 FASTEST = 2.5  # m/s^2: acceleration over the horizon that leads to the grid's end
+FORMAT = "e2rl-bits/1"
+WEIGHTS = "bits.safetensors"  # file name in a run's folder
+LARGEST = 1 << 12  # units of a layer
+KNOTS = 10  # accelerations of a plan, each held PLAN_STEPS / KNOTS steps
+GOAL_FEATURES = 6
+ACCELERATION = (-8.0, 5.0)  # m/s^2, the simulator's bounds
+TIME = (0.5, 4.0)  # s that a lateral move takes (`candidates.drive`)
+START_TIME = 1.4  # s that it takes before training
+AROUND = SIDE  # m: the move leads at most so far beside the goal
 
 
 def reach(speed: Tensor) -> Tensor:
@@ -54,9 +65,10 @@ def cell_of(speed: Tensor, distance: Tensor, side: Tensor) -> tuple[Tensor, Tens
     inverse of `place`. A goal off the grid counts to the nearest cell."""
     along = distance / reach(speed) * DISTANCES - 0.5
     across = side / SIDE + (SIDES - 1) / 2
-    w = along.round().clamp(0, DISTANCES - 1)
-    s = across.round().clamp(0, SIDES - 1)
-    return (w * SIDES + s).long(), torch.stack([along - w, across - s], -1)
+    row = along.round().clamp(0, DISTANCES - 1)
+    column = across.round().clamp(0, SIDES - 1)
+    residual = torch.stack([along - row, across - column], -1)
+    return (row * SIDES + column).long(), residual
 
 
 def needed_acceleration(speed: Tensor, distance: Tensor) -> Tensor:
@@ -65,16 +77,6 @@ def needed_acceleration(speed: Tensor, distance: Tensor) -> Tensor:
     going = 2 * (distance - PLAN_SECONDS * speed) / PLAN_SECONDS**2
     halting = -speed.square() / (2 * distance.clamp(min=0.1))
     return torch.where(distance < PLAN_SECONDS * speed / 2, halting, going)
-
-
-FORMAT = "e2rl-bits/1"
-WEIGHTS = "bits.safetensors"  # file name in a run's folder
-LARGEST = 1 << 12  # units of a layer
-KNOTS = 10  # accelerations of a plan, each held PLAN_STEPS / KNOTS steps
-GOAL_FEATURES = 6
-ACCELERATION = (-8.0, 5.0)  # m/s^2, the simulator's bounds
-TIME = (0.5, 4.0)  # s that a lateral move takes (`candidates.drive`)
-AROUND = SIDE  # m: the move leads at most so far beside the goal
 
 
 class Controls(NamedTuple):
@@ -104,20 +106,17 @@ class BitsNetwork(nn.Module):
             "knots": KNOTS,
         }
         self.normaliser = Normaliser(OBSERVATION_SIZE)
-        layers = perceptron(
-            OBSERVATION_SIZE, [2 * hidden], out=hidden, last_gain=2**0.5
-        )
+        layers = perceptron([OBSERVATION_SIZE, 2 * hidden, hidden], last_gain=2**0.5)
         self.encoder = nn.Sequential(layers, nn.SiLU(), nn.Dropout(dropout))
-        self.goal_head = perceptron(hidden, [hidden], out=3 * CELLS, last_gain=0.0)
-        self.policy = perceptron(
-            hidden + GOAL_FEATURES, [hidden, hidden], out=KNOTS + 2, last_gain=0.0
-        )
+        self.goal_head = perceptron([hidden, hidden, 3 * CELLS], last_gain=0.0)
+        inputs = hidden + GOAL_FEATURES
+        self.policy = perceptron([inputs, hidden, hidden, KNOTS + 2], last_gain=0.0)
 
     def encode(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
         """Codes [B, hidden] of observations [B, D]; noise [B, D] is added to the
         normalised ones, in training."""
-        seen = self.normaliser(observation)
-        return self.encoder(seen if noise is None else seen + noise)
+        normalised = self.normaliser(observation)
+        return self.encoder(normalised if noise is None else normalised + noise)
 
     def goals(self, code: Tensor) -> tuple[Tensor, Tensor]:
         """Of every goal's cell the logit [B, CELLS], and the place in it: residual [B,
@@ -128,29 +127,36 @@ class BitsNetwork(nn.Module):
     def controls(
         self,
         code: Tensor,
+        *,
         speed: Tensor,
         offset: Tensor,
         distance: Tensor,
         side: Tensor,
     ) -> Controls:
-        """The policy's Controls of plans to the goals distance, side [B, K] m, from
-        codes [B, hidden], speeds [B] m/s and offsets [B] m beside the mission."""
+        """Returns the policy's Controls of plans to K goals.
+
+        Args:
+            code: [B, hidden], of `encode`.
+            speed: [B] m/s.
+            offset: [B] m beside the mission.
+            distance: [B, K] m along the mission to the goals.
+            side: [B, K] m of the goals beside it.
+        """
         speed = speed[:, None].expand_as(distance)
-        offset = offset[:, None]
         features = [
             distance / reach(speed),
             distance / 50,
             needed_acceleration(speed, distance) / 4,
             side / 3,
+            (side - offset[:, None]) / 3,
+            speed / 15,
         ]
-        features += [(side - offset) / 3, speed / 15]
         code = code[:, None].expand(-1, distance.shape[1], -1)
         out = self.policy(torch.cat([code, torch.stack(features, -1)], -1))
-        shift = side + AROUND * out[..., KNOTS].tanh()
         return Controls(
-            between(out[..., :KNOTS], *ACCELERATION, 0.0),
-            shift,
-            time=between(out[..., -1], *TIME, 1.4),
+            between(out[..., :KNOTS], ACCELERATION, start=0.0),
+            side + AROUND * out[..., KNOTS].tanh(),
+            time=between(out[..., -1], TIME, start=START_TIME),
         )
 
     @property
@@ -159,8 +165,18 @@ class BitsNetwork(nn.Module):
         return self.normaliser.mean.device
 
 
-def between(value: Tensor, low: float, high: float, start: float) -> Tensor:
-    """Values squashed into (low, high) by a sigmoid; 0 becomes `start`."""
+def perceptron(sizes: Sequence[int], last_gain: float) -> nn.Sequential:
+    """Layers of these sizes with SiLU between; orthogonal weights, the last layer's
+    scaled by last_gain."""
+    layers: list[nn.Module] = []
+    for fan_in, fan_out in zip(sizes[:-2], sizes[1:-1], strict=True):
+        layers += [linear(fan_in, fan_out, gain=2**0.5), nn.SiLU()]
+    return nn.Sequential(*layers, linear(sizes[-2], sizes[-1], gain=last_gain))
+
+
+def between(value: Tensor, bounds: tuple[float, float], start: float) -> Tensor:
+    """Values squashed into the bounds by a sigmoid; 0 becomes `start`."""
+    low, high = bounds
     fraction = (start - low) / (high - low)
     return low + (high - low) * (value + math.log(fraction / (1 - fraction))).sigmoid()
 
@@ -169,10 +185,14 @@ def drive_controls(controls: Controls, start: Tensor, path: RoutePath) -> Candid
     """The Candidates [B, K] that Controls make of states start [B, 4] on their paths,
     by the unicycle."""
     held = controls.acceleration.repeat_interleave(PLAN_STEPS // KNOTS, -1)
-    now = start[:, None, 3:].expand(*held.shape[:2], 1)
-    speed = torch.cat([now, dynamics.bounded_speed(now, held * DT)], -1)
+    first = start[:, None, 3:].expand(*held.shape[:2], 1)
+    speed = torch.cat([first, dynamics.bounded_speed(first, held * DT)], -1)
     return drive(
-        start, path, speed, controls.shift[..., None], controls.time[..., None]
+        start,
+        path,
+        speed=speed,
+        shift=controls.shift[..., None],
+        time=controls.time[..., None],
     )
 
 
@@ -191,29 +211,23 @@ def load_bits(checkpoint: str) -> BitsNetwork:
     """The network in a file of `save_bits`, in a folder with one, or with "bundled" the
     package's own, trained on the bundled scenes. Raises InputError, naming the file,
     where it is missing, damaged or of another architecture."""
-    path = (
-        Path(str(files("e2rl") / "assets" / "bits"))
-        if checkpoint == "bundled"
-        else Path(checkpoint)
-    )
+    path = Path(checkpoint)
+    if checkpoint == "bundled":
+        path = Path(str(files("e2rl") / "assets" / "bits"))
     path = path / WEIGHTS if path.is_dir() else path
     if not path.is_file():
         raise InputError(
-            f"ego.checkpoint={checkpoint}: no {WEIGHTS} there; train one with `python train.py stage=bits`, or use "
-            "ego.checkpoint=bundled"
+            f"ego.checkpoint={checkpoint}: no {WEIGHTS} there; train one with `python "
+            "train.py stage=bits`, or use ego.checkpoint=bundled"
         )
     try:
         weights, header = read_weights(path)
         saved = json.loads(header["architecture"])
         hidden = saved["hidden"]
-        if (
-            header.get("format") != FORMAT
-            or type(hidden) is not int
-            or not 0 < hidden <= LARGEST
-        ):
-            raise ValueError(
-                f"format {header.get('format')!r} instead of {FORMAT!r}, or {hidden} hidden units"
-            )
+        if header.get("format") != FORMAT or type(hidden) is not int:
+            raise ValueError(f"format {header.get('format')!r} instead of {FORMAT!r}")
+        if not 0 < hidden <= LARGEST:
+            raise ValueError(f"{hidden} hidden units")
         if wrong := unlike(partial(BitsNetwork, hidden), weights):
             raise ValueError(wrong)
         network = BitsNetwork(hidden)

@@ -11,10 +11,9 @@ from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import MAX_SPEED, bounded_speed
 from e2rl.sim.leaders import IDMParameters, idm_acceleration, leaders
-from e2rl.sim.mission import limit_at
 from e2rl.sim.world import World
 
-REACTION = 0.5  # s ahead at which the speed caps are met
+REACTION = 0.5  # s ahead at which the speed caps are kept
 
 
 @configured("ego/idm")
@@ -37,46 +36,42 @@ class IDMEgo(Ego):
         caps."""
         path = MissionPath(world)
         speed = world.states[:, 0, 3]
-        caps = path.speed_caps(
-            self.desired_speed, self.braking, self.use_limits, lights=False
-        )
-        now = world.states[:, :, None]
-        size = world.scene["size"]
-        found = leaders(
+        leader = leaders(
             path.s[:, None],
             path.route[:, None],
-            agents=now,
-            size=size,
+            agents=world.states[:, :, None],
+            size=world.scene["size"],
             present=world.valid,
             free_gap=torch.inf,
         )
-        gap = found.gap[:, 0, 0]
-        leading = found.speed[:, 0, 0].clamp(min=0)
+        gap = leader.gap[:, 0, 0]
+        leading = leader.speed[:, 0, 0].clamp(min=0)
         light = path.stop_distance(self.braking) + self.standstill_gap
-        gap, leading = torch.minimum(gap, light), torch.where(light < gap, 0.0, leading)
-        desired = torch.full_like(path.s, self.desired_speed)
-        if self.use_limits:
-            limit = limit_at(path.mission, path.s)
-            desired = torch.where(limit > 0, limit, desired)
-        driver = IDMParameters(
-            self.headway,
-            self.standstill_gap,
-            acceleration=self.acceleration,
-            braking=self.braking,
-        )
+        leading = torch.where(light < gap, 0.0, leading)
+        desired = path.desired_speed(self.desired_speed, path.s, limits=self.use_limits)
         accel = idm_acceleration(
-            speed, desired, gap=gap, leader_speed=leading, driver=driver, improved=True
+            speed,
+            desired,
+            gap=torch.minimum(gap, light),
+            leader_speed=leading,
+            driver=IDMParameters(
+                self.headway,
+                self.standstill_gap,
+                acceleration=self.acceleration,
+                braking=self.braking,
+            ),
+            improved=True,
+        )
+        caps = path.speed_caps(
+            self.desired_speed,
+            braking=self.braking,
+            limits=self.use_limits,
+            lights=False,
         )
         allowed = look_up(caps, (REACTION * speed)[:, None])[:, 0]
-        accel = torch.minimum(
-            accel, ((allowed - speed) / REACTION).clamp(max=self.acceleration)
-        )
+        accel = torch.minimum(accel, (allowed - speed) / REACTION)
         accel = accel.clamp(-self.hardest_braking, self.acceleration)
-        future = bounded_speed(
-            speed[:, None],
-            (accel * DT)[:, None].expand(-1, PLAN_STEPS),
-            low=0.0,
-            high=MAX_SPEED,
-        )
+        change = (accel * DT)[:, None].expand(-1, PLAN_STEPS)
+        future = bounded_speed(speed[:, None], change, low=0.0, high=MAX_SPEED)
         future = torch.minimum(future, torch.maximum(desired, speed)[:, None])
         return path.drive(torch.cat([speed[:, None], future], 1))

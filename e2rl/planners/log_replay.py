@@ -27,15 +27,14 @@ class ReplayEgo(Ego):
     def plan(self, world: World) -> Tensor:
         """Recorded states [B, PLAN_STEPS, 4] of the coming steps."""
         track = world.scene["logged"][:, :, 0]
-        known = world.scene["logged_valid"][:, :, 0]
-        steps = torch.arange(track.shape[1], device=track.device)
-        last = torch.where(known, steps, 0).amax(1)
-        want = world.step[:, None] + torch.arange(
-            1, PLAN_STEPS + 1, device=track.device
-        )
-        at = want.minimum(last[:, None])
-        row = torch.arange(len(track), device=track.device)[:, None]
-        state = track[row, at]
-        over = (want - at)[..., None] * DT * state[..., 3:]
+        recorded = world.scene["logged_valid"][:, :, 0]
+        device = track.device
+        steps = torch.arange(track.shape[1], device=device)
+        last = torch.where(recorded, steps, 0).amax(1, keepdim=True)
+        step = world.step[:, None] + torch.arange(1, PLAN_STEPS + 1, device=device)
+        index = step.minimum(last)
+        state = track[torch.arange(len(track), device=device)[:, None], index]
+        distance = (step - index)[..., None] * DT * state[..., 3:]
         direction = torch.stack([state[..., 2].cos(), state[..., 2].sin()], -1)
-        return torch.cat([state[..., :2] + over * direction, state[..., 2:]], -1)
+        xy = state[..., :2] + distance * direction
+        return torch.cat([xy, state[..., 2:]], -1)

@@ -4,6 +4,7 @@ route, and speed caps by curves, limits and lights.
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool1d
 
 from e2rl.planners.ego import return_length
 from e2rl.scenes.recording import DT
@@ -12,13 +13,12 @@ from e2rl.sim.dynamics import wrap
 from e2rl.sim.mission import light_state_at, limit_at, mission_of, stop_line_distance
 from e2rl.sim.world import World
 
-MAX_SLOPE = (
-    1.0  # rad, bound of the angle between vehicle and route at the start of a path
-)
+MAX_SLOPE = 1.0  # rad between vehicle and route at the start of a path, at most
 CAPPED_AHEAD = 200.0  # m of speed caps
 LATERAL_ACCELERATION = 3.0  # m/s^2 that curves are taken with
 BRAKING = 3.0  # m/s^2 ahead of curves, limits and lights
 STOP_GAP = 1.0  # m kept to a stop line
+LEAST_STRETCH = 0.2  # of a curve's inside, which far beside a tight one would turn over
 
 
 class RoutePath:
@@ -37,19 +37,16 @@ class RoutePath:
     ) -> None:
         """state [..., 4], route [..., P, 2]; place [...]: arc length [m] near which the
         vehicles are, where known."""
-        self.route = route
         hint = None if place is None else place[..., None]
-        s, d, heading = (
-            value[..., 0] for value in project(state[..., None, :2], route, hint=hint)
-        )
-        self.s = s
-        self.d = d
-        self.turned = wrap(state[..., 2] - heading)
+        s, d, heading = project(state[..., None, :2], route, hint=hint)
+        self.route = route
+        self.s = s[..., 0]
+        self.d = d[..., 0]
+        self.turned = wrap(state[..., 2] - heading[..., 0])
         self.length = return_length(state[..., 3])
         self.residual = torch.zeros_like(state[..., :2])
-        self.residual = (
-            state[..., :2] - self.at(torch.zeros_like(s)[..., None])[..., 0, :2]
-        )
+        here = self.at(torch.zeros_like(s))[..., 0, :2]
+        self.residual = state[..., :2] - here
 
     def offset(self, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """Lateral offset and its slope at `ahead` [..., K] metres along the route."""
@@ -65,24 +62,20 @@ class RoutePath:
         xy, heading, curvature = interpolate(self.route, self.s[..., None] + ahead)
         offset, slope = self.offset(ahead)
         normal = torch.stack([-heading.sin(), heading.cos()], -1)
-        fading = (
-            torch.exp(-ahead.clamp(min=0) / self.length[..., None])[..., None]
-            * self.residual[..., None, :]
-        )
-        turn = torch.atan2(slope, (1 - curvature * offset).clamp(min=0.2))
-        return torch.cat(
-            [xy + offset[..., None] * normal + fading, wrap(heading + turn)[..., None]],
-            -1,
-        )
+        decay = torch.exp(-ahead.clamp(min=0) / self.length[..., None])
+        residual = decay[..., None] * self.residual[..., None, :]
+        xy = xy + offset[..., None] * normal + residual
+        turn = torch.atan2(slope, (1 - curvature * offset).clamp(min=LEAST_STRETCH))
+        return torch.cat([xy, wrap(heading + turn)[..., None]], -1)
 
     def ahead(self, distance: Tensor) -> Tensor:
         """Metres along the route [..., K] after driving `distance` [..., K] (growing,
         from 0) along the path."""
-        _, _, curvature = interpolate(self.route, self.s[..., None] + distance)
+        curvature = interpolate(self.route, self.s[..., None] + distance)[2]
         offset, slope = self.offset(distance)
-        stretch = torch.hypot((1 - curvature * offset).clamp(min=0.2), slope)
+        inner = (1 - curvature * offset).clamp(min=LEAST_STRETCH)
         step = distance.diff(dim=-1, prepend=torch.zeros_like(distance[..., :1]))
-        return (step / stretch).cumsum(-1)
+        return (step / torch.hypot(inner, slope)).cumsum(-1)
 
     def drive(self, speed: Tensor) -> Tensor:
         """States [..., H, 4] at steps 1..H of DT for speeds [..., H + 1] at steps 0..H
@@ -92,11 +85,17 @@ class RoutePath:
 
 
 def fading(
-    d: Tensor, turned: Tensor, length: Tensor, ahead: Tensor
+    d: Tensor, turned: Tensor, *, length: Tensor, ahead: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Offset [m] and its slope, both of the shape that the arguments broadcast to,
-    `ahead` m after an offset d m and a heading `turned` rad off the route: the
-    critically damped return over `length` m (`RoutePath`)."""
+    """Returns the offset [m] and its slope of the critically damped return
+    (`RoutePath`), both of the shape that the arguments broadcast to.
+
+    Args:
+        d: m beside the route at the start.
+        turned: rad off the route at the start.
+        length: m over which the return leads.
+        ahead: m after the start.
+    """
     slope = torch.tan(turned.clamp(-MAX_SLOPE, MAX_SLOPE))
     rate = slope + d / length
     decay = torch.exp(-ahead.clamp(min=0) / length)
@@ -114,35 +113,45 @@ class MissionPath(RoutePath):
     def speed_caps(
         self,
         desired: float,
+        *,
         braking: float = BRAKING,
         limits: bool = True,
         lights: bool = True,
     ) -> Tensor:
-        """Squares [B, CAPPED_AHEAD / SPACING] of the highest speeds every SPACING
-        metres ahead; read them by `look_up`.
+        """Returns squares [B, CAPPED_AHEAD / SPACING] of the highest speeds every
+        SPACING metres ahead, from which braking keeps all limits; read them by
+        `look_up`.
 
-        From these speeds, braking at `braking` m/s^2 meets all limits: `desired` m/s,
-        or the speed limit where it is known and `limits`; LATERAL_ACCELERATION in
-        curves; with `lights` a halt before a light that binds (negative beyond it).
         c(a)^2 = min over b >= a of v(b)^2 + 2 braking (b - a), which is piecewise
-        linear in a.
+        linear in a. Curves are taken with LATERAL_ACCELERATION.
+
+        Args:
+            desired: m/s where no limit is known.
+            braking: m/s^2.
+            limits: a known speed limit replaces `desired`.
+            lights: the caps halt before a light that binds (negative beyond it).
         """
         count = int(CAPPED_AHEAD / SPACING)
         grid = SPACING * torch.arange(count, device=self.s.device, dtype=self.s.dtype)
-        at = self.s[:, None] + grid
-        curvature = torch.nn.functional.avg_pool1d(
-            interpolate(self.mission.points, at)[2], 3, 1, 1
-        )
-        speed = torch.sqrt(
-            LATERAL_ACCELERATION / curvature.abs().clamp(min=1e-4)
-        ).clamp(max=1e3)
-        limit = limit_at(self.mission, at) if limits else torch.zeros_like(at)
-        squared = torch.minimum(speed, torch.where(limit > 0, limit, desired)) ** 2
+        place = self.s[:, None] + grid
+        curvature = interpolate(self.mission.points, place)[2]
+        bend = avg_pool1d(curvature, 3, stride=1, padding=1).abs().clamp(min=1e-4)
+        speed = torch.sqrt(LATERAL_ACCELERATION / bend).clamp(max=1e3)
+        limit = self.desired_speed(desired, place, limits=limits)
+        squared = torch.minimum(speed, limit) ** 2
         potential = (squared + 2 * braking * grid).flip(-1).cummin(-1).values.flip(-1)
         if lights:
             halt = self.stop_distance(braking)[:, None]
             potential = torch.minimum(potential, 2 * braking * halt)
         return potential - 2 * braking * grid
+
+    def desired_speed(
+        self, desired: float, place: Tensor, limits: bool = True
+    ) -> Tensor:
+        """Speed limits [B, ...] m/s at places [B, ...] m; `desired` m/s where none is
+        known."""
+        limit = limit_at(self.mission, place) if limits else torch.zeros_like(place)
+        return torch.where(limit > 0, limit, desired)
 
     def stop_distance(self, braking: float = BRAKING) -> Tensor:
         """Metres [B] until the ego's front is STOP_GAP m before the next stop line that
@@ -150,16 +159,13 @@ class MissionPath(RoutePath):
         `braking` m/s^2 halts before it, a red one if twice as much does.
         """
         scene = self.world.scene
-        mission = self.mission
         lights = light_state_at(
-            scene["light_state"], mission.light, step=self.world.step
+            scene["light_state"], self.mission.light, step=self.world.step
         )
-        ahead = mission.light_s
-        speed = self.world.states[:, 0, 3]
         line = stop_line_distance(
             lights,
-            ahead - self.s[:, None],
-            speed=speed,
+            self.mission.light_s - self.s[:, None],
+            speed=self.world.states[:, 0, 3],
             red_braking=2 * braking,
             yellow_braking=braking,
         )
@@ -173,12 +179,13 @@ def look_up(caps: Tensor, ahead: Tensor) -> Tensor:
     return (low + fraction * (high - low)).clamp(min=0).sqrt()
 
 
-def between_entries(table: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The entries of a table [B, K] before and after places `at` [B, ...], in entries,
-    and the fraction of the distance between them; outside of the table, its first and
+def between_entries(table: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The entries of a table [B, K] before and after places [B, ...], in entries, and
+    the fraction of the distance between them; outside of the table, its first and
     last."""
-    at = at.clamp(0, table.shape[-1] - 1.001)
-    index = at.long()
+    place = place.clamp(0, table.shape[-1] - 1.001)
+    index = place.long()
     flat = index.flatten(1)
-    low, high = (table.gather(1, flat + shift).view(at.shape) for shift in (0, 1))
-    return low, high, at - index
+    low = table.gather(1, flat).view(place.shape)
+    high = table.gather(1, flat + 1).view(place.shape)
+    return low, high, place - index

@@ -6,7 +6,7 @@ import sys
 from omegaconf import DictConfig
 
 from e2rl.metrics import preventable
-from e2rl.planners import lane_graph_planner, reference
+from e2rl.planners import hazard, reference, trunk
 from e2rl.prior import bounds, features, free_space, lane_relative, prior, routes
 from e2rl.prior.denoiser import DenoiserSettings, fused_encoding, fused_estimate
 from e2rl.prior.lane_relative import SIZE
@@ -31,7 +31,7 @@ MODULES = (
         pull,
     ),
     *(
-        lane_graph_planner,
+        hazard,
         lane_relative,
         leaders,
         observation,
@@ -41,6 +41,7 @@ MODULES = (
         route,
         routes,
         step,
+        trunk,
     ),
 )
 

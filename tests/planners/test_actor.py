@@ -2,14 +2,16 @@
 fits or is refused."""
 
 import copy
+import json
 
 import pytest
 import torch
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import PLAN_STEPS
-from e2rl.planners.network import Normaliser, find_weights
+from e2rl.planners.network import Architecture, find_weights
 from e2rl.planners.reference import follow
+from e2rl.planners.trunk import Normaliser
 from e2rl.run.errors import InputError
 from e2rl.run.files import seal
 from e2rl.sim.env import DrivingEnv, SimSettings
@@ -171,33 +173,6 @@ def test_file_round_trip(tmp_path):
         assert torch.equal(ask(first), ask(second))
 
 
-def test_a_file_without_the_reference_s_weight_drives_as_it_did(tmp_path):
-    """Earlier versions added the network's output to the reference's action, and did
-    not bound it."""
-    first = wild(ActorEgo(hidden=(8,), slack=None, room=None))
-    network = first.network.network
-    file = tmp_path / "actor.safetensors"
-    with torch.no_grad():
-        for value in network.trunk.last.parameters():
-            value[2:] = 0.0
-    observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
-    with torch.no_grad():
-        added = (
-            network.trunk(network.normaliser(observation))[:, :2]
-            + network.offset(observation)[:, :2]
-        )
-        expected = network.middle + network.reach * added.tanh()
-    of = first.network.weights()
-    shorter = {
-        key: value[:2] if key.startswith("network.trunk.last") else value
-        for key, value in of.items()
-    }
-    first.network.weights = lambda: shorter
-    first.network.save(file)
-    second = ActorEgo(hidden=(8,), checkpoint=str(file))
-    torch.testing.assert_close(second.decide(observation), expected)
-
-
 def test_the_network_can_let_go_of_the_reference():
     network = ActorEgo(hidden=(8,), room=None).network.network
     observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
@@ -221,10 +196,19 @@ def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatc
         {"room": 0.0},
         {"room": float("nan")},
         {"slack": float("nan")},
-        {"least_scale": -1},
+        {"slack": -0.1},
+        {"low": [1.0]},
     )
-    for change in ({"observation": 12}, {"hidden": [10**9]}, *bounds):
-        monkeypatch.setattr(network, "architecture", network.architecture | change)
+    header = json.loads(network.architecture.header())
+    for change in (
+        {"observation": 12},
+        {"least_scale": 0.05},
+        {"hidden": [10**9]},
+        {"hidden": []},
+        *bounds,
+    ):
+        changed = json.dumps(header | change)
+        monkeypatch.setattr(Architecture, "header", lambda self, text=changed: text)
         network.save(file)
         with pytest.raises(InputError, match="another version"):
             ActorEgo(hidden=(8,), checkpoint=str(file))

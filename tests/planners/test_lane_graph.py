@@ -2,13 +2,8 @@
 
 import torch
 
-from e2rl.planners.lane_graph_planner import (
-    LaneGraphEgo,
-    Prediction,
-    circle_gap,
-    circles,
-    collision_hazard,
-)
+from e2rl.planners.hazard import Prediction, circle_gap, circles, collision_hazard
+from e2rl.planners.lane_graph_planner import LaneGraphEgo
 
 
 def test_off_its_route_it_prefers_the_shortest():

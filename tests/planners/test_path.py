@@ -95,8 +95,12 @@ def test_a_deviation_fades_as_a_critically_damped_return(d, turned, length):
     """l^2 d'' + 2 l d' + d = 0 from (d, tan(turned)); the slope is the derivative of
     the offset."""
     ahead = torch.linspace(0, 20, 2001, dtype=torch.float64)
-    given = (torch.tensor(value, dtype=torch.float64) for value in (d, turned, length))
-    offset, slope = fading(*given, ahead)
+    offset, slope = fading(
+        torch.tensor(d).double(),
+        torch.tensor(turned).double(),
+        length=torch.tensor(length).double(),
+        ahead=ahead,
+    )
     assert offset[0].item() == pytest.approx(d) and slope[0].item() == pytest.approx(
         math.tan(turned)
     )

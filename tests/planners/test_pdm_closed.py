@@ -6,23 +6,21 @@ import math
 import pytest
 import torch
 
+from e2rl.planners.chunks import take
 from e2rl.planners.ego_policy import EgoPolicy
-from e2rl.planners.pdm_closed import (
+from e2rl.planners.pdm_closed import FRACTIONS, OFFSETS, PDMClosedEgo, others_of
+from e2rl.planners.pdm_score import (
     COMFORT,
-    FRACTIONS,
-    KEYS,
-    OFFSETS,
     PROGRESS,
     SCORED_STEPS,
     TIME_TO_COLLISION,
+    Drives,
     Others,
-    PDMClosedEgo,
     at_fault,
     comfortable,
     runs_into,
     score,
 )
-from e2rl.planners.sampling import take
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
@@ -30,7 +28,12 @@ from tests.planners.planners import driven, world_of, worlds
 from tests.synthetic import make_scenes
 
 EGO = PDMClosedEgo()
+SIZE = torch.tensor([[4.8, 2.0]])  # m, of the ego
 COUNT = len(FRACTIONS) * len(OFFSETS)
+
+
+def scored_others(world):
+    return others_of(world, EGO.agents, SCORED_STEPS + 1)
 
 
 def touched(data):
@@ -114,11 +117,9 @@ def test_whose_fault_a_collision_is(name):
     ego = torch.tensor([0.0, 0.0, 0.0, speed])[None, None, None]
     for loose, expected in ((False, alone), (True, between)):
         fault = at_fault(
-            states=ego,
-            size=torch.tensor([[4.8, 2.0]]),
-            others=others_at(place),
+            Drives(ego, SIZE, loose=torch.full((1, 1, 1), loose)),
+            others_at(place),
             touch=torch.ones(1, 1, 1, 1, dtype=torch.bool),
-            loose=torch.full((1, 1, 1), loose),
         )
         assert bool(fault.any()) == expected
 
@@ -131,13 +132,10 @@ def test_whom_it_touched_without_fault_it_may_touch_again():
     both = beside._replace(states=torch.cat([beside.states, ahead.states], 2))
     touch = torch.ones(1, 1, 1, 2, dtype=torch.bool)
     loose = torch.zeros(1, 1, 2, dtype=torch.bool)
-    assert not at_fault(
-        states, torch.tensor([[4.8, 2.0]]), others=both, touch=touch, loose=loose
-    ).any()
+    ego = Drives(states, SIZE, loose=loose)
+    assert not at_fault(ego, both, touch=touch).any()
     swapped = both._replace(states=both.states.flip(2))
-    assert at_fault(
-        states, torch.tensor([[4.8, 2.0]]), others=swapped, touch=touch, loose=loose
-    ).any()
+    assert at_fault(ego, swapped, touch=touch).any()
 
 
 def others_at(place):
@@ -145,17 +143,17 @@ def others_at(place):
     states = torch.tensor(place)[None, None, None]
     there = torch.ones(1, 1, dtype=torch.bool)
     return Others(
-        states=states, size=torch.tensor([[[4.8, 2.0]]]), seen=there, objects=~there
+        states=states, size=torch.tensor([[[4.8, 2.0]]]), present=there, objects=~there
     )
 
 
 def test_an_object_that_it_hits_halves_the_score():
     """A vehicle that it hits leaves nothing; both make it brake alike."""
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(SCORED_STEPS + 1))
+    ahead = scored_others(world)
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
     vehicle, time = score(world, go, others=ahead)
-    thing, same = score(world, go, others=ahead._replace(objects=ahead.seen))
+    thing, same = score(world, go, others=ahead._replace(objects=ahead.present))
     assert vehicle.item() == 0 and time.item() == same.item() < 2.0
     assert thing.item() == pytest.approx(
         0.5 * (PROGRESS + COMFORT) / (PROGRESS + TIME_TO_COLLISION + COMFORT)
@@ -175,13 +173,11 @@ def test_the_time_to_collision_looks_30_degrees_to_each_side_in_one_lane(
     heading = math.atan2(-y, 2.0 - x)
     other = others_at((x, y, heading, math.hypot(y, 2.0 - x) / 0.3))
     states = torch.tensor([0.0, 0.0, 0.0, 0.01])[None, None, None]
-    size = torch.tensor([[4.8, 2.0]])
     touch = torch.zeros(1, 1, 1, 1, 4, dtype=torch.bool)
     touch[..., 0] = True
     for loose, clear in ((False, expected), (True, 0)):
-        assert runs_into(
-            states, size, others=other, touch=touch, loose=torch.full((1, 1, 1), loose)
-        ).item() == (not clear)
+        ego = Drives(states, SIZE, loose=torch.full((1, 1, 1), loose))
+        assert runs_into(ego, other, touch=touch).item() == (not clear)
 
 
 def test_comfort_has_the_published_windows_and_bounds():
@@ -223,7 +219,7 @@ def test_the_score_is_the_weighted_mean_of_its_terms():
     hard brake loses comfort."""
     _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
     start = world.states[:, :1]
-    none = EGO._others(world, range(SCORED_STEPS + 1))
+    none = scored_others(world)
     actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(
         3, 50, 2
     )
@@ -243,7 +239,7 @@ def test_the_score_is_the_weighted_mean_of_its_terms():
 
 def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(SCORED_STEPS + 1))
+    ahead = scored_others(world)
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
     found, collides = score(world, go, others=ahead)
     size = world.scene["size"][0, 0]
@@ -265,7 +261,7 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     turn = dynamics.rollout(
         world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2)
     )[:, None]
-    free = ahead._replace(seen=ahead.seen & False)
+    free = ahead._replace(present=ahead.present & False)
     assert score(world, turn, others=free)[0].item() == 0
 
 
@@ -273,7 +269,7 @@ def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_col
     """Braking late, the ego halts 0.8 m behind whom stands, whom it would hit within
     0.9 s if it let go the brake."""
     _, world = world_of(vehicles=[(0, 0, 10.0), (20.0, 0, 0.0)], num_vrus=0)
-    ahead = EGO._others(world, range(SCORED_STEPS + 1))
+    ahead = scored_others(world)
     actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
     states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
     found, collides = score(world, states, others=ahead)
@@ -294,9 +290,7 @@ def test_where_every_proposal_is_excluded_it_drives_the_slowest():
     scenes.scenes["field"][:, 86:] = 10.0  # from x = 6 m on
     _, world = worlds(scenes)
     states = EGO.proposals(world)
-    assert (
-        score(world, states, others=EGO._others(world, range(SCORED_STEPS + 1)))[0] == 0
-    ).all()
+    assert (score(world, states, others=scored_others(world))[0] == 0).all()
     torch.testing.assert_close(EGO.plan(world)[0], states[0, 0])
 
 
@@ -307,5 +301,5 @@ def test_a_scene_is_planned_alike_alone_and_in_a_batch():
     _, world = worlds(scenes)
     whole = EGO.plan(world)
     for k in range(3):
-        alone = EGO.plan(take(world, torch.tensor([k]), keys=KEYS))[0]
+        alone = EGO.plan(take(world, torch.tensor([k])))[0]
         torch.testing.assert_close(alone, whole[k], atol=1e-3, rtol=0)

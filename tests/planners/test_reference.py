@@ -5,7 +5,8 @@ import torch
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego_policy import EgoPolicy
-from e2rl.planners.reference import AGENTS, Largest, Trunk, follow
+from e2rl.planners.reference import AGENTS, follow
+from e2rl.planners.trunk import Largest, Trunk
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import NEAREST, OBSERVATION_SIZE, PER_AGENT
 from tests.synthetic import make_scenes

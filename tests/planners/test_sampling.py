@@ -7,7 +7,7 @@ from e2rl.planners.candidates import drive, speed_profiles, steer
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import PROFILES, SHIFTS, SamplingEgo
-from e2rl.planners.scoring import forecast, nearest, pair_cost
+from e2rl.planners.scoring import Pairs, forecast, nearest, pair_cost
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
@@ -122,9 +122,14 @@ def test_a_curve_is_driven_along_its_mission():
     _, world = worlds(scenes)
     path = MissionPath(world)
     steady = torch.full((1, 1, PLAN_STEPS + 1), 8.0)
-    driven = drive(
-        world.states[:, 0], path, steady, torch.zeros(1, 1), torch.ones(1)
-    ).states[0, 0]
+    candidates = drive(
+        world.states[:, 0],
+        path,
+        speed=steady,
+        shift=torch.zeros(1, 1),
+        time=torch.ones(1),
+    )
+    driven = candidates.states[0, 0]
     radius = (driven[:, :2] - torch.tensor([-20.0, 40.0])).norm(dim=-1)
     assert (radius - 40).abs().max() < 0.5 and driven[-1, 2] > 0.9
 
@@ -138,30 +143,31 @@ def test_forecasts_of_constant_acceleration_and_turn():
         0.5,
     )
     _, world = worlds(scenes)
-    agents, seen = nearest(world, 5)
-    assert seen.tolist() == [[True, True, False, False, False]] and agents[
-        0, :2
-    ].tolist() == [1, 2]
-    found = forecast(world, agents, seen=seen, times=TIMES, hold=1.0, turn=2.0)
+    agents, present = nearest(world, 5)
+    assert present.tolist() == [[True, True, False, False, False]]
+    assert agents[0, :2].tolist() == [1, 2]
+    states = forecast(world, (agents, present), times=TIMES, hold=1.0, turn=2.0).states[
+        0
+    ]
     expected = (
         20 + 10 * TIMES - 4 * TIMES.clamp(max=1) ** 2 - 8 * (TIMES - 1).clamp(min=0)
     )
-    torch.testing.assert_close(found.poses[0, 0, :, 0], expected, atol=1e-3, rtol=0)
-    torch.testing.assert_close(found.speed[0, 0], 10 - 8 * TIMES.clamp(max=1))
+    torch.testing.assert_close(states[0, :, 0], expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(states[0, :, 3], 10 - 8 * TIMES.clamp(max=1))
     early = TIMES < 2
     torch.testing.assert_close(
-        found.poses[0, 1, early, 0],
+        states[1, early, 0],
         40 + 20 * (0.5 * TIMES[early]).sin(),
         atol=0.02,
         rtol=0,
     )
     torch.testing.assert_close(
-        found.poses[0, 1, early, 1],
+        states[1, early, 1],
         LANE_WIDTH + 20 * (1 - (0.5 * TIMES[early]).cos()),
         atol=0.02,
         rtol=0,
     )
-    assert torch.allclose(found.poses[0, 1, -1, 2], torch.tensor(1.0), atol=1e-3)
+    assert torch.allclose(states[1, -1, 2], torch.tensor(1.0), atol=1e-3)
 
 
 def test_pair_costs_order_situations():
@@ -173,14 +179,14 @@ def test_pair_costs_order_situations():
     def cost(x, y, speed, ego_speed=10.0):
         ego = torch.tensor([[0.0, 0.0, 0.0, ego_speed]])
         other = torch.tensor([[x, y, 0.0, speed]])
-        return pair_cost(
+        pairs = Pairs(
             ego,
-            size,
+            ego_size=size,
             other=other,
             other_size=size,
             margin=torch.tensor([1.0]),
-            weights=weights,
-        )[0].item()
+        )
+        return pair_cost(pairs, weights)[0].item()
 
     assert cost(4.0, 0.0, 0.0) > cost(4.0, 0.0, 8.0) > cost(5.0, 0.0, 8.0) > 0
     assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0
