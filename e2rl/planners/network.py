@@ -34,8 +34,8 @@ class Architecture:
     """What the file of an actor says of its network: bounds of (acceleration, yaw
     rate), and fields of conf/ego/actor.yaml."""
 
-    low: tuple[float, float]
-    high: tuple[float, float]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
     hidden: tuple[int, ...]
     agent_units: int
     reference: bool

@@ -120,10 +120,10 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
     code = network.encode(start["observation"])
     controls = network.controls(
         code,
-        start["start"][:, 3],
-        path.d,
-        start["distance"][:, None],
-        start["offset"][:, None],
+        speed=start["start"][:, 3],
+        offset=path.d,
+        distance=start["distance"][:, None],
+        side=start["offset"][:, None],
     )
     driven = drive_controls(controls, start["start"], path=path)
     assert driven.states[0, 0, -1, 3] < 1.0 and abs(driven.distance.item() - 10.0) < 1.5
