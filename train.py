@@ -8,6 +8,7 @@ driver bits.
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
+import math
 import sys
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_traffic, caption
@@ -22,6 +23,7 @@ from e2rl.learning.build import (
 )
 from e2rl.learning.evolution import Evolution
 from e2rl.learning.imitation import run_imitation_stage
+from e2rl.learning.logging import RunLogger
 from e2rl.learning.prior_training.distributed import (
     follower_overrides,
     follows,
@@ -30,13 +32,13 @@ from e2rl.learning.prior_training.distributed import (
 from e2rl.learning.prior_training.stage import run_prior_stage
 from e2rl.learning.run_checkpoint import load_checkpoint, rounds_done, save_checkpoint
 from e2rl.report.answer import compared_answer
-from e2rl.report.curriculum_figure import draw_choices
 from e2rl.report.rounds import round_line, save_videos
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.run.command import run_command
 from e2rl.run.config import set_up
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
+from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 from e2rl.traffic.fusing import prepare_fused
@@ -46,48 +48,45 @@ MAY_CHANGE = ("rounds", "device", "threads", "launcher")  # when a run is resume
 
 def train_round(run: Evolution) -> dict[str, float]:
     """One round of Algorithm 1; returns its metrics."""
-    order = (
-        run.draw()
-    )  # scenes, and for each an intensity and a causal template, by the curriculum
-    attack = run.roll_out(
-        order
-    )  # the attack on the current policy; what no driver avoids does not enter D'
+    order = run.draw()  # scenes and their intensities, by the curriculum
+    attack = run.roll_out(order)  # on the current policy; D' has what is avoidable
     run.prefetch()  # the next round's attack, in another process meanwhile
-    learned = run.learn(
-        attack
-    )  # episodes in D', by TorchRL's collector, and updates of the policy, in turn
-    return run.move_on(
-        order, attack, learned
-    )  # the curriculum, by what the policy failed in
+    learned = run.learn(attack)  # episodes in D' and updates of the policy, in turn
+    return run.move_on(order, attack, learned)  # the curriculum, by the failures
 
 
 def evolve(task: Run) -> None:
     """Harden an ego: measure it, train it for `rounds` rounds, measure it again."""
     config = task.config
     folder = task.folder
-    done = rounds_done(task.config.resume)
+    done = rounds_done(config.resume)
     progress = build_progress(config, done)
-    prior, origin = build_prior(
-        config, config.device
-    )  # before the scenes, which take longer than a wrong path
+    prior, origin = build_prior(config, config.device)  # a wrong path fails early
     traffic = build_traffic(config.synthesizer, prior)
     ego = build_ego(config)
     scenes = load_scenes(
         config.data, config.num_scenes, split="train", scenes=config.scenes
     )
-    run = build_evolution(config, scenes, ego, traffic, folder=folder)
+    run = build_evolution(config, scenes, ego=ego, traffic=traffic, folder=folder)
     logger = build_logger(config, folder)
-    measure = build_measure(config, ego, task.choices["ego"], traffic, prior, folder)
-    task.begin(
-        {"scenes": listed(scenes), "measured scenes": listed(measure.setup.scenes)}
+    measure = build_measure(
+        config,
+        ego,
+        ego_name=task.choices["ego"],
+        traffic=traffic,
+        prior=prior,
+        folder=folder,
     )
+    measured = measure.setup.scenes
+    task.begin({"scenes": listed(scenes), "measured scenes": listed(measured)})
     logger.forget(load_checkpoint(config.resume, run) if done else 0)
     progress.say(
-        f"{len(scenes)} scenes to train on, {len(measure.setup.scenes)} to measure on, in {folder}"
+        f"{len(scenes)} scenes to train on, {len(measured)} to measure on, in {folder}"
     )
     if (task.choices["data"], task.choices["experiment"]) == ("bundled", "harden"):
         progress.say(
-            "these are the bundled scenes: experiment=harden is for logs of your own (data=, data.path=)"
+            "these are the bundled scenes: experiment=harden is for logs of your own "
+            "(data=, data.path=)"
         )
     if not done:
         with progress.phase("measurement"):
@@ -100,36 +99,43 @@ def evolve(task: Run) -> None:
             logger.log(metrics, number, run.choices)
             add_errored(folder / ERRORED_FILE, number, run.errored)
             save_checkpoint(folder, run, config.keep_last)
-            if picture := draw_choices(folder):
-                logger.show("curriculum/choices", picture, number)
-            if config.logger.videos and run.memory.rounds:
-                attacks = (
-                    run.memory.rounds[-1].traffic,
-                    scenes,
-                    number + 1,
-                    config.synthesizer.name,
-                )
-                for k, video in enumerate(
-                    save_videos(*attacks, folder, config.logger.videos)
-                ):
-                    logger.show(f"synthesizer/video_{k + 1}", video, number)
+            if config.logger.videos:
+                show_videos(run, scenes, task=task, logger=logger)
         progress.say(round_line(metrics, number + 1, config.rounds))
     logger.close()
     with progress.phase("measurement"):
         rows = measure("after", run.ego, run.round)
     save_tables(folder / "tables.md", metric_tables(rows, caption(config, origin)))
-    before, after = (
-        [row for row in rows if row["stage"] == stage] for stage in ("before", "after")
+    answer = compared_answer(
+        [row for row in rows if row["stage"] == "before"],
+        [row for row in rows if row["stage"] == "after"],
+        measure.atlases(),
+        folder,
     )
-    answer = compared_answer(before, after, measure.atlases(), folder)
     print("", *answer, run.improve.outcome(folder), sep="\n")
+
+
+def show_videos(
+    run: Evolution, scenes: SceneSet, *, task: Run, logger: RunLogger
+) -> None:
+    """Write and log `logger.videos` videos of attacks of the last round."""
+    videos = save_videos(
+        run.memory.rounds[-1].traffic,
+        scenes,
+        number=run.round,
+        method=task.config.synthesizer.name,
+        folder=task.folder,
+        count=task.config.logger.videos,
+    )
+    for place, video in enumerate(videos, start=1):
+        logger.show(f"synthesizer/video_{place}", video, run.round - 1)
 
 
 def train_prior(task: Run) -> None:
     """Train a prior and print its nominal closed loop on held-out logs."""
-    logger = (
-        None if follows() else build_logger(task.config, task.folder)
-    )  # the leader alone writes
+    logger = None  # the leader alone writes
+    if not follows():
+        logger = build_logger(task.config, task.folder)
     outcome = run_prior_stage(task, logger)
     if outcome is None:
         return  # another process of torchrun is the leader and reports
@@ -159,8 +165,10 @@ def train_bits(task: Run) -> None:
 def losses_line(row: dict[str, float]) -> str:
     """The losses of a training's chosen turn."""
     return ", ".join(
-        f"{name} {value:.4f}" for name, value in row.items() if value == value
-    )  # NaN: none held out
+        f"{name} {value:.4f}"
+        for name, value in row.items()
+        if not math.isnan(value)  # NaN: none held out
+    )
 
 
 def purpose(task: Run) -> str:
@@ -170,8 +178,9 @@ def purpose(task: Run) -> str:
     if config.stage.name != "evolution":
         return f"Trains {config.stage.name} on {data} logs, into {task.folder}."
     return (
-        f"Hardens {task.choices['ego']} against {config.synthesizer.name} in {data} scenes: measures it, trains it for "
-        f"{config.rounds} rounds, and measures it again, into {task.folder}."
+        f"Hardens {task.choices['ego']} against {config.synthesizer.name} in {data} "
+        f"scenes: measures it, trains it for {config.rounds} rounds, and measures it "
+        f"again, into {task.folder}."
     )
 
 
@@ -188,7 +197,8 @@ def train(task: Run) -> None:
     config = task.config
     if started_by_torchrun() and config.stage.name != "prior":
         raise InputError(
-            f"torchrun: stage={config.stage.name} runs in one process, started with python"
+            f"torchrun: stage={config.stage.name} runs in one process, "
+            "started with python"
         )
     set_up(config)
     check_training(config)

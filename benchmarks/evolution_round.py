@@ -22,7 +22,9 @@ def evolution_round(bench: Bench) -> Iterator[Row]:
         config = bench.configured("train")
         config.learner.round.prefetch = prefetch
         torch.manual_seed(0)
-        run = build_evolution(config, bench.scenes, build_ego(config), bench.traffic)
+        run = build_evolution(
+            config, bench.scenes, ego=build_ego(config), traffic=bench.traffic
+        )
         if prefetch:
             train_round(run)
         begin = time.perf_counter()

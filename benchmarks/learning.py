@@ -48,7 +48,6 @@ def rates(bench: Bench) -> tuple[float, float]:
         build_sim(config),
         collect=collect,
         ppo=ppo,
-        react=None,
         rounds=config.rounds,
     )
     collected = []

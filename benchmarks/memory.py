@@ -78,7 +78,6 @@ def _learn(bench: Bench, batch: int) -> None:
         build_sim(config),
         collect=collect,
         ppo=ppo,
-        react=None,
     )
     for _ in range(2):
         improve.learner.update(improve.collected())

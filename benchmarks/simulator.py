@@ -3,28 +3,21 @@
 step and observation: what DrivingEnv does: the ego's dynamics, its contact with
 everybody, off-road, reward and observation; the others are looked up. everybody driven:
 the work that simulators of many egos report: dynamics of all agents, contact of all
-pairs, off-road of all, no observation. vehicles re-aim: an episode with them by one
-without.
+pairs, off-road of all, no observation.
 """
 
-import time
 from collections.abc import Iterator
-from dataclasses import replace
 
 import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from e2rl.run import fused
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.drivable_area import off_road
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv
-from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
-from e2rl.traffic.pool import TrafficPool
-from e2rl.traffic.transform import AdversarialSynthesizer
 
 STEPS = 80  # an episode, its reset included
 AGENTS = 32  # a scene, where the data have scenes of so many
@@ -66,7 +59,6 @@ def simulator(bench: Bench) -> Iterator[Row]:
             strict=True,
         ):
             yield bench.row("simulator", "everybody driven", index, value, unit)
-    yield from reacting(bench)
 
 
 def run(env: DrivingEnv, index: Tensor) -> None:
@@ -75,43 +67,6 @@ def run(env: DrivingEnv, index: Tensor) -> None:
     env.reset(TensorDict({"scene_index": index[:, None]}, batch_size=[len(index)]))
     for _ in range(STEPS):
         env._step(action)
-
-
-def reacting(bench: Bench) -> Iterator[Row]:
-    """Time of an episode in which vehicles re-aim in 70% of the environments, by that
-    of its replay."""
-    (batch,) = bench.batches(256)
-    index = bench.pick(batch)
-    scene = bench.scenes.batch(index)
-    rows = torch.arange(batch)
-    adversaries = scene["valid"] & (torch.arange(scene["valid"].shape[1]) < 4)
-    traffic = {
-        "scene_index": index,
-        "states": scene["logged"],
-        "valid": scene["logged_valid"],
-    }
-    pool = TrafficPool.stored(traffic | {"adversaries": adversaries}, 2.0)
-    sim = replace(
-        bench.sim, end_on_contact=False, end_off_road=False, end_when_gone=False
-    )
-    action = TensorDict({"action": torch.zeros(batch, 2)}, batch_size=[batch])
-
-    def episode(reaction: Reaiming | None) -> None:
-        transform = AdversarialSynthesizer(pool, lambda _: rows, reaction=reaction)
-        env = TransformedEnv(DrivingEnv(bench.scenes, sim, batch), transform)
-        now = env.reset()
-        begin = time.process_time()
-        for _ in range(STEPS):
-            now = env.step(now.update(action))["next"]
-        times[reaction is not None].append(time.process_time() - begin)
-
-    times: dict[bool, list[float]] = {False: [], True: []}
-    for seed in range(bench.repeats):  # in turn, since the machine's load changes
-        episode(None), episode(Reaiming(ReactSettings(fraction=0.7), seed))
-    ratio = min(times[True]) / min(times[False])
-    yield bench.row(
-        "simulator", "vehicles re-aim, CPU time", index, ratio, "of the replay's"
-    )
 
 
 def everybody(

@@ -15,13 +15,11 @@ from e2rl.evaluation.budget import methods_at, portfolio_plan
 from e2rl.evaluation.methods import (
     SEARCH,
     as_list,
-    build_prior,
     build_sim,
-    build_traffic,
     processes_of,
 )
 from e2rl.evaluation.protocol import Method, Setup
-from e2rl.learning.attack import Synthesize, mixture, solvable
+from e2rl.learning.attack import Synthesize, solvable
 from e2rl.learning.before_after import BeforeAfter
 from e2rl.learning.evolution import Evolution, RoundSettings
 from e2rl.learning.improvement import Improvement
@@ -46,95 +44,82 @@ from e2rl.traffic.traffic import Traffic
 def build_evolution(
     config: DictConfig,
     scenes: SceneSet,
+    *,
     ego: Ego,
     traffic: Traffic,
     synthesize: Synthesize | None = None,
     folder: Path | None = None,
 ) -> Evolution:
-    """An Evolution of `ego` against `traffic` by config.learner and config.curriculum
-    over config.rounds rounds.
+    """Returns an evolution by config.learner and config.curriculum over config.rounds
+    rounds.
 
-    synthesize: makes D'; default: closed-loop rollouts with `traffic`. folder: of the
-    run, where D' is remembered; default: a temporary one.
+    Args:
+        config: of train.py.
+        scenes: to train on.
+        ego: that is hardened.
+        traffic: that attacks it.
+        synthesize: makes D'; None: closed-loop rollouts with `traffic`.
+        folder: of the run, where D' is remembered; None: a temporary one.
+
+    Returns:
+        The run before its first round.
+
+    Raises:
+        InputError: parts of the configuration that do not fit each other.
     """
     sim = build_sim(config)
-    seed = config.seed
-    made_by = partial(
-        synthesize_traffic, scenes, sim=sim, batch=config.batch, device=config.device
-    )
-    synthesize = synthesize or made_by(traffic)
-    given = {"num_scenes": len(scenes), "rounds": config.rounds, "seed": seed}
     curriculum = built(
-        config.curriculum, "curriculum", kind=CurriculumScheduler, **given
+        config.curriculum,
+        "curriculum",
+        kind=CurriculumScheduler,
+        num_scenes=len(scenes),
+        rounds=config.rounds,
+        seed=config.seed,
     )
-    check_templates(curriculum, config.synthesizer.name, traffic=traffic)
     settings = settings_of(
         RoundSettings, _with_prefetch(config, ego), where="learner.round"
     )
-    if settings.second:
-        second = build_traffic(
-            load_choice("synthesizer", settings.second),
-            build_prior(config, config.device)[0],
-        )
-        check_templates(curriculum, settings.second, traffic=second)
-        synthesize = mixture(
-            synthesize, made_by(second), fraction=settings.second_fraction
-        )
     learner = OmegaConf.create(
         {key: value for key, value in config.learner.items() if key != "round"}
     )
-    parameters = {
-        key: value for key, value in resolved(config.ego).items() if key != "_target_"
-    }
-    live = traffic if settings.traffic == "live" else None
-    given = {
-        "ego": ego,
-        "parameters": parameters,
-        "scenes": scenes,
-        "sim": sim,
-        "traffic": live,
-        "seed": seed,
-    }
-    given["device"] = device = learner.pop("device", config.device)
-    if live is not None and device != config.device:
-        raise InputError(
-            f"learner.device={device}: live traffic is made where the policy drives; set device={device}"
-        )
-    improve = built(learner, "learner", kind=Improvement, **given)
-    keep = (
-        partial(solvable, scenes=scenes, sim=sim) if curriculum.solvable_only else None
+    improve = built(
+        learner,
+        "learner",
+        kind=Improvement,
+        ego=ego,
+        scenes=scenes,
+        sim=sim,
+        seed=config.seed,
+        device=learner.pop("device", config.device),
     )
     workers = processes_of(config)
-    how = (
-        keep,
-        Memory(folder, settings.memory),
-        config.batch,
-        workers if isinstance(workers, RayWorkers) else None,
+    return Evolution(
+        curriculum,
+        improve,
+        synthesize
+        or synthesize_traffic(
+            scenes, traffic, sim=sim, batch=config.batch, device=config.device
+        ),
+        settings,
+        config.seed,
+        solvable=(
+            partial(solvable, scenes=scenes, sim=sim)
+            if curriculum.solvable_only
+            else None
+        ),
+        memory=Memory(folder, settings.memory),
+        batch=config.batch,
+        workers=workers if isinstance(workers, RayWorkers) else None,
     )
-    return Evolution(curriculum, improve, synthesize, settings, seed, *how)
-
-
-def check_templates(
-    curriculum: CurriculumScheduler, name: str, traffic: Traffic
-) -> None:
-    """InputError for a curriculum that chooses causal templates for a traffic method
-    that has none."""
-    if curriculum.templates != ("full",) and not traffic.follows_template:
-        raise InputError(
-            f"curriculum: it chooses causal templates ({', '.join(curriculum.templates)}), but "
-            f"synthesizer={name} has none; set synthesizer=e2 or curriculum.templates=[full]"
-        )
 
 
 def _with_prefetch(config: DictConfig, ego: Ego) -> dict:
     """`config.learner.round`, with a `prefetch` that is left open decided by what is
     possible."""
-    options = {"traffic": "replay", "prefetch": None} | resolved(config.learner.round)
+    options = {"prefetch": None} | resolved(config.learner.round)
     learns = config.learner.get("device", "cpu")
     device = str(learns if config.device == "cpu" else config.device)
-    reason = why_no_prefetch(
-        device, config.threads, ego=ego, traffic=options["traffic"]
-    )
+    reason = why_no_prefetch(device, config.threads, ego=ego)
     if options["prefetch"] and reason:
         raise InputError(
             f"learner.round.prefetch=true: {reason}; set it to null or false"

@@ -1,7 +1,7 @@
-"""Drives an ego through one episode per pool row, for planner tuning and
-demonstrations; outcomes of episodes."""
+"""Drives an ego through one episode per pool row, for demonstrations; outcomes of
+episodes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from tensordict import TensorDict, TensorDictBase, tensorclass
@@ -9,13 +9,11 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from e2rl.planners.ego import Ego
-from e2rl.planners.ego_errors import renumbered
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.env import METRICS, DrivingEnv, SimSettings, touches
-from e2rl.traffic.attempt import attempt
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
 
@@ -30,9 +28,9 @@ OUTCOME_KEYS = (
 @tensorclass
 class Episodes:
     """E finished episodes, each field [E]: pool row and scene (int64), adversarial
-    traffic, contact with any agent, off the road (bool), return, progress [m] and mean
-    |acceleration| [m/s^2] (NaN if not measured); survivable: the fraction of the row's
-    critical moments that a teacher would survive (NaN: unknown)."""
+    traffic, contact with any agent, off the road (bool), return, progress [m];
+    survivable: the fraction of the row's critical moments that a teacher would survive
+    (NaN: unknown)."""
 
     row: Tensor
     scene_index: Tensor
@@ -41,7 +39,6 @@ class Episodes:
     off_road: Tensor
     returns: Tensor
     progress: Tensor
-    acceleration: Tensor
     survivable: Tensor
 
     @property
@@ -56,8 +53,8 @@ class Episodes:
             "contact": self.contact.float(),
             "off_road": self.off_road.float(),
             "return": self.returns,
+            "progress": self.progress,
         }
-        values |= {"progress": self.progress, "acceleration": self.acceleration}
         kinds = {
             "": torch.ones_like(self.adversarial),
             "_adversarial": self.adversarial,
@@ -66,9 +63,8 @@ class Episodes:
         result = {"episodes": float(len(self))}
         for suffix, rows in kinds.items():
             for name, value in values.items():
-                known = value[rows & ~value.isnan()]
-                if len(known):
-                    result[name + suffix] = known.mean().item()
+                if rows.any():
+                    result[name + suffix] = value[rows].mean().item()
         return result
 
 
@@ -98,7 +94,6 @@ def finished_episodes(
     ended = after["done"][..., 0] & (begin + decisions(horizon, hold) <= data.shape[1])
     row = data["traffic", "row"][ended][:, 0]
     contact = touches(metrics)
-    unknown = torch.full((len(row),), torch.nan)
     return Episodes(
         row,
         data["scene_index"][ended][:, 0],
@@ -107,8 +102,7 @@ def finished_episodes(
         off_road=metrics["off_road"][ended][:, 0],
         returns=after["episode_reward"][ended][:, 0],
         progress=metrics["progress"][ended][:, 0],
-        acceleration=unknown,
-        survivable=unknown.clone(),
+        survivable=torch.full((len(row),), torch.nan),
         batch_size=[len(row)],
     )
 
@@ -177,43 +171,6 @@ class PoolDriver:
         }
         return TensorDict(frames, batch_size=steps.batch_size, device=alive.device)
 
-    def drive_all(self, ego: Ego, pool: TrafficPool) -> tuple[Episodes, list[dict]]:
-        """Outcomes of one episode in every row of the pool, in their order, but for
-        those in which the ego raises or becomes NaN; and these, each with its row and
-        reason."""
-        none = torch.zeros(0, dtype=torch.int64)
-        never = torch.zeros(0, dtype=torch.bool)
-        parts = [
-            Episodes(
-                none, none, never, never, never, *[torch.zeros(0)] * 4, batch_size=[0]
-            )
-        ]
-        errored: list[dict] = []
-        for rows in torch.arange(len(pool)).split(self.env.batch_size[0]):
-            begins = len(parts) == 1 and not errored
-            found, failed = attempt(
-                lambda tasks: self._frames(ego, pool, rows=tasks),
-                rows.tolist(),
-                begins=begins,
-            )
-            parts += [
-                episodes_of(frames, pool, rows=torch.tensor(done))
-                for done, frames in found
-            ]
-            errored += [{"row": row, **why} for row, why in failed]
-        every = torch.cat(parts)
-        return every[every.row.argsort()], errored
-
-    def _frames(self, ego: Ego, pool: TrafficPool, rows: Sequence[int]) -> TensorDict:
-        """Frames of `drive` of at most as many rows as there are environments, as
-        `attempt` looks at them."""
-        every = torch.arange(self.env.batch_size[0]) % len(
-            rows
-        )  # the other environments drive them once more
-        with renumbered(every):
-            frames = self.drive(ego, pool, torch.tensor(rows)[every])[: len(rows)]
-        return frames.update({"states": frames["executed"], "valid": frames["alive"]})
-
 
 def executed(steps: TensorDictBase) -> Tensor:
     """Mean accelerations and yaw rates [B, T, 2] (m/s^2, rad/s) of the ego over each
@@ -236,19 +193,3 @@ def filled_batches(count: int, batch: int) -> list[Tensor]:
         if count
         else []
     )
-
-
-def episodes_of(frames: TensorDictBase, pool: TrafficPool, rows: Tensor) -> Episodes:
-    """Outcomes [B] of a `PoolDriver.drive`."""
-    frames, count = frames.to("cpu"), frames["alive"].sum(1).cpu()
-    progress = frames["progress"].gather(1, (count - 1)[:, None])[:, 0]
-    effort = (frames["executed"][..., 0].abs() * frames["alive"]).sum(1) / count
-    ended = frames["contact"].any(1), frames["off_road"].any(1)
-    of_rows = pool.scene_index[rows], pool.adversarial[rows]
-    driven = (
-        frames["reward"].sum(1),
-        progress,
-        effort,
-        torch.full_like(effort, torch.nan),
-    )
-    return Episodes(rows, *of_rows, *ended, *driven, batch_size=[len(rows)])

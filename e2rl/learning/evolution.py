@@ -3,9 +3,8 @@ a run between them."""
 
 import copy
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from e2rl.learning.attack import (
@@ -23,12 +22,9 @@ from e2rl.learning.prefetch import Prefetch
 from e2rl.learning.scheduler import Choice, CurriculumScheduler, outcomes_of, tally
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
-from e2rl.run.errors import InputError
 from e2rl.run.ray_workers import RayWorkers
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.pool import TrafficPool
-
-NOISES = 16  # rows per scene in live traffic, each with its own noise
 
 
 @configured("learner/ppo_bc", "round")
@@ -38,38 +34,23 @@ class RoundSettings:
 
     scenes: int = setting(low=1)
     nominal: str = setting(choices=("prior", "log", "none"))
-    traffic: str = setting(choices=("replay", "live"))
-    against: str = setting(choices=("current", "start"))
     memory: int = setting(low=0)
-    fresh: float = setting(low=1)
     prefetch: bool | None = setting(optional=True)
-    second: str | None = setting(optional=True)
-    second_fraction: float = setting(low=0, high=1)
-
-    def __post_init__(self) -> None:
-        if self.second and self.traffic == "live":
-            raise InputError(
-                "learner.round.second: live traffic is of one method; set learner.round.traffic=replay"
-            )
-        if self.against == "start" and self.traffic == "live":
-            raise InputError(
-                "learner.round.against=start: live traffic meets the learning policy; set it to current"
-            )
 
 
 @dataclass
 class RoundTraffic:
     """The traffic of a round: the pool, which of the ordered attacks its first K rows
-    are (drawn [K] int64; the others were left out), and metrics; contact: the attacked
-    ego's contact rate, None if unknown before the episodes are driven; spent: seconds;
-    errored: rows that could not be made."""
+    are (drawn [K] int64; the others were left out); attacked, contact: fractions of the
+    attacks with an adversary, and that hit the ego; spent: seconds; errored: rows that
+    could not be made."""
 
     pool: TrafficPool
     drawn: Tensor
-    metrics: dict[str, float]
+    attacked: float
+    contact: float
     spent: dict[str, float]
-    contact: float | None = None
-    errored: list[dict] = field(default_factory=list)
+    errored: list[dict]
 
 
 class Evolution:
@@ -83,12 +64,10 @@ class Evolution:
     Args:
         synthesize: (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states
             [S, T+1, N, 4], valid [S, T+1, N],
-            adversaries [S, N] bool, contact [S] bool, owes [S] bool}: closed-loop traffic against that ego; contact: it
-            was hit; owes: adversaries give way to it (left out: they do). Rows that cannot be made are left out, and
-            `errored` {position in S: why} names them. A curriculum that chooses causal templates gives template [S],
-            too.
-        solvable: traffic -> Solved: the rows that enter D', and evasions; None: all,
-            and none.
+            adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that
+            ego; contact: it was hit. Rows that cannot be made are left out, and
+            `errored` {position in S: why} names them.
+        solvable: traffic -> bool [S]: the rows that enter D'; None: all.
         memory: None: in a temporary folder.
         batch: scenes that are synthesized at once.
         workers: that do it; None: a process here.
@@ -115,9 +94,6 @@ class Evolution:
         self.memory = memory or Memory(None, settings.memory)
         self.batch = batch
         self.workers = workers
-        self._start = (
-            copy.deepcopy(improve.ego) if settings.against == "start" else None
-        )
         self.episodes: Episodes | None = None
         self.choices: list[Choice] = []
         self.errored: list[dict] = []
@@ -137,20 +113,37 @@ class Evolution:
     # --- the steps of a round, in their order
 
     def draw(self) -> Order:
-        """Returns what is attacked: scenes, intensities and causal templates by the
-        curriculum, and the current ego."""
+        """Returns what is attacked: scenes and intensities by the curriculum, and the
+        current ego."""
         order = self._next or self._order(self.round)
         self._next = None
         return order
 
     def roll_out(self, order: Order) -> RoundTraffic:
         """Returns the attacks on the ordered ego, without those that no driver avoids,
-        with remembered attacks and nominal traffic; of live traffic the rows alone,
-        whose attacks are rolled out while the policy drives."""
-        return (
-            self._live(order)
-            if self.settings.traffic == "live"
-            else self._stored(order)
+        with remembered attacks and nominal traffic."""
+        begin = time.perf_counter()
+        if self.settings.prefetch:
+            work = self._prefetch or self._begin(order)
+            self._prefetch = None
+            spent = {
+                "synthesize": work.wait(),
+                "waiting": time.perf_counter() - begin,
+            }
+        else:
+            self._make(order)
+            spent = {"synthesize": time.perf_counter() - begin}
+        newest = self.memory.take(order.number)
+        pool = self.memory.pool()
+        if self.settings.nominal == "log" or not len(pool):
+            pool = pool + TrafficPool.recorded(order.scenes)  # the pool is never empty
+        return RoundTraffic(
+            pool,
+            newest.traffic["entered"].nonzero()[:, 0],
+            attacked=newest.traffic["attacked"].item(),
+            contact=newest.traffic["contact"].item(),
+            spent=spent,
+            errored=newest.errored,
         )
 
     def prefetch(self) -> None:
@@ -169,7 +162,7 @@ class Evolution:
         begin = time.perf_counter()
         learned, self.episodes = self.improve(attack.pool, self.curriculum)
         attack.spent["improve"] = time.perf_counter() - begin
-        timed = ("collect", "demonstrations", "steps_per_second")
+        timed = ("collect", "steps_per_second")
         attack.spent |= {name: learned.pop(name) for name in timed if name in learned}
         return learned
 
@@ -182,12 +175,8 @@ class Evolution:
         episodes = self.episodes
         state = self.curriculum.summary()
         assert episodes is not None
-        told = episodes.row, episodes.failed, episodes.survivable
-        outcomes = outcomes_of(order.eta, order.template, attack.drawn, *told)
-        contact = (
-            learned.get("contact_adversarial")
-            if attack.contact is None
-            else attack.contact
+        outcomes = outcomes_of(
+            order.eta, drawn=attack.drawn, row=episodes.row, failed=episodes.failed
         )
         curriculum.update(
             episodes.scene_index,
@@ -195,15 +184,9 @@ class Evolution:
             episodes.adversarial,
             episodes.survivable,
         )
-        curriculum.observe(outcomes)
         curriculum.leave_out(order.scenes[outcomes.left_out])
-        self.choices = tally(
-            order.number,
-            curriculum.level(order.eta),
-            outcomes=outcomes,
-            value=curriculum.values(),
-        )
-        curriculum.advance(contact)
+        self.choices = tally(order.number, outcomes)
+        curriculum.advance(attack.contact)
         not_made = sum(entry["during"] == ATTACK for entry in attack.errored)
         attacked = {
             "scenes": float(len(order.scenes)),
@@ -211,14 +194,10 @@ class Evolution:
             "left_out": float(outcomes.left_out.sum() - not_made),
             "memory_rows": float(self.memory.rows),
             **counted(attack.errored),
-            "fresh_draws": attack.pool.fresh[episodes.row].float().mean().item(),
-            **attack.metrics,
+            "attacked": attack.attacked,
+            "contact": attack.contact,
         }
-        attacked |= {} if contact is None else {"contact": contact}
-        self.errored = [
-            *attack.errored,
-            *({"round": order.number, **entry} for entry in self.improve.errored),
-        ]
+        self.errored = attack.errored
         groups = {
             "curriculum": state,
             "train": learned,
@@ -236,16 +215,15 @@ class Evolution:
     def _order(self, number: int) -> Order:
         """What is to be synthesized for a round, as the curriculum and the ego are now."""
         scenes = self.curriculum.draw(self.settings.scenes)
-        ego = self._start or self.ego
-        ego = (
-            copy.deepcopy(ego) if self.settings.prefetch else ego
-        )  # learning changes weights in place
+        ego = self.ego
+        if self.settings.prefetch:  # learning changes weights in place
+            ego = copy.deepcopy(ego)
         return Order(
             number,
             scenes,
-            *self.curriculum.choices(scenes),
-            self.seed * 1_000_003 + number,
-            ego,
+            eta=self.curriculum.etas(scenes),
+            seed=self.seed * 1_000_003 + number,
+            ego=ego,
         )
 
     def _begin(self, order: Order) -> Prefetch:
@@ -256,66 +234,15 @@ class Evolution:
 
     def _make(self, order: Order) -> None:
         """Write the traffic of an order into the memory's folder."""
-        how = (self.settings.nominal == "prior", self.batch, self.workers or 1)
-        self.memory.write(
-            order.number, *make_traffic(order, self.synthesize, self.solvable, *how)
+        traffic, errored = make_traffic(
+            order,
+            self.synthesize,
+            solvable=self.solvable,
+            nominal=self.settings.nominal == "prior",
+            batch=self.batch,
+            processes=self.workers or 1,
         )
-
-    def _stored(self, order: Order) -> RoundTraffic:
-        """D' of an order joined with the memory, and nominal traffic."""
-        begin = time.perf_counter()
-        if self.settings.prefetch:
-            at_work = self._prefetch or self._begin(order)
-            self._prefetch = None
-            spent = {
-                "synthesize": at_work.wait(),
-                "waiting": time.perf_counter() - begin,
-            }
-        else:
-            self._make(order)
-            spent = {"synthesize": time.perf_counter() - begin}
-        made = self.memory.take(order.number)
-        pool = self.memory.pool(self.settings.fresh)
-        if self.settings.nominal == "log" or not len(
-            pool
-        ):  # without nominal traffic the pool may be empty
-            pool = pool + TrafficPool.recorded(order.scenes)
-        metrics = {"attacked": made.traffic["attacked"].item()}
-        drawn = made.traffic["entered"].nonzero()[:, 0]
-        return RoundTraffic(
-            pool,
-            drawn,
-            metrics=metrics,
-            spent=spent,
-            contact=made.traffic["contact"].item(),
-            errored=made.errored,
-        )
-
-    def _live(self, order: Order) -> RoundTraffic:
-        """Rows whose traffic is replanned against the learning ego, attacked and
-        nominal."""
-        index, eta, template = (
-            each.repeat(NOISES) for each in (order.scenes, order.eta, order.template)
-        )
-        noise = (
-            index
-            + (
-                order.seed * NOISES
-                + torch.arange(NOISES).repeat_interleave(len(order.scenes))
-            )
-            * 1_000_003
-        )
-        pool = TrafficPool.live(index, eta, seed=noise, template=template)
-        if self.settings.nominal == "prior":
-            pool = pool + TrafficPool.live(index, torch.zeros_like(eta), seed=noise)
-        elif self.settings.nominal == "log":
-            pool = pool + TrafficPool.recorded(order.scenes)
-        return RoundTraffic(
-            pool,
-            torch.arange(len(order.scenes)).repeat(NOISES),
-            metrics={},
-            spent={"synthesize": 0.0},
-        )
+        self.memory.write(order.number, traffic, errored)
 
     def state_dict(self) -> dict:
         """Curriculum, improvement and the order of the coming round; the checkpoint
@@ -335,7 +262,7 @@ class Evolution:
             }
             given = {
                 name: getattr(order, name)
-                for name in ("number", "scenes", "eta", "template", "seed")
+                for name in ("number", "scenes", "eta", "seed")
             }
             state["next"] = given | {"weights": weights}
         return state

@@ -19,7 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from e2rl.evaluation.methods import build_ego, build_sim
-from e2rl.learning.cloning import NOISE, CloningLoss, demonstrations_of
+from e2rl.learning.cloning import NOISE, clip_expert, cloning_loss
 from e2rl.learning.driving import Disturbance, PoolDriver, filled_batches
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.supervised import Epochs, stage_settings
@@ -61,8 +61,8 @@ class ImitationSettings:
 def recorded_demonstrations(
     scenes: SceneSet, sim: SimSettings, seed: int, drives: int = DRIVES
 ) -> TensorDict:
-    """Returns demonstrations [M] with C = 1 (e2rl.learning.cloning) of the recorded
-    egos.
+    """Returns demonstrations [M] (e2rl.learning.cloning) of the recorded egos, on the
+    CPU, with their scene_index [M].
 
     Every recording is replayed once, and driven `drives` times under disturbances. A
     disturbed episode counts until contact or off the road; actions are clipped to 0.99
@@ -88,14 +88,20 @@ def recorded_demonstrations(
         frames = driver.drive(
             ReplayEgo(), pool, rows, _bursts(len(rows), generator) if number else None
         )
-        action = frames[label][:, :, None]
+        alive = frames["alive"]
+        bounds = driver.env.action_spec.space
         parts.append(
-            demonstrations_of(
-                frames,
-                frames["alive"],
-                scene_index=pool.scene_index[rows],
-                env=driver.env,
-                action=action,
+            TensorDict(
+                {
+                    "observation": frames["observation"][alive],
+                    "action": clip_expert(
+                        frames[label][alive], bounds.low[0], high=bounds.high[0]
+                    ),
+                    "scene_index": pool.scene_index[rows][:, None].expand_as(alive)[
+                        alive
+                    ],
+                },
+                batch_size=[int(alive.sum())],
             )
         )
     return torch.cat(parts)
@@ -125,14 +131,12 @@ class Imitation(Epochs):
     def __init__(
         self, network: ActorCritic, shown: TensorDictBase, settings: ImitationSettings
     ) -> None:
-        shown = shown.select("observation", "action", "weight", "scene_index")
         super().__init__(network, shown, settings, network.network, WEIGHT_DECAY)
-        self.cloning = CloningLoss(network.actor)
 
     def loss(self, batch: TensorDictBase) -> Tensor:
         """The cloning loss [] under noise on the input."""
         with self.network.network.noisy(*NOISE):
-            return self.cloning(batch)["loss_cloning"]
+            return cloning_loss(self.network.actor, batch)
 
     @torch.no_grad()
     def measure(self, data: TensorDictBase) -> dict[str, float]:
@@ -140,9 +144,9 @@ class Imitation(Epochs):
         from the labels in halves of the action's range."""
         reach = (self.network.high - self.network.low) / 2
         central = self.network.network.deterministic(data["observation"])
-        miss = ((central[:, None] - data["action"]).abs() / reach).mean(-1)
-        loss = self.cloning(data)["loss_cloning"].item()
-        return {"loss": loss, "miss": (miss * data["weight"]).sum(1).mean().item()}
+        miss = ((central - data["action"]).abs() / reach).mean(-1)
+        loss = cloning_loss(self.network.actor, data).item()
+        return {"loss": loss, "miss": miss.mean().item()}
 
     def turn(self) -> dict[str, float]:
         """One pass; training losses are measured after it, without noise."""

@@ -1,7 +1,6 @@
 """The extension point for learners: the update of the ego in a round."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from pathlib import Path
 
 from e2rl.learning.driving import Episodes
@@ -13,14 +12,9 @@ from e2rl.traffic.pool import TrafficPool
 
 class Improvement(Extension, ABC):
     """Improves `ego` in the round's pool. A subclass is built as `_target_(ego=,
-    parameters=, scenes=, sim=, traffic=, seed=, device=, **settings)`; parameters:
-    those that the ego was built with; traffic: the method that drives live rows, None
-    without live rows."""
+    scenes=, sim=, seed=, device=, **settings)`."""
 
     ego: Ego
-    errored: Sequence[
-        dict
-    ] = ()  # episodes of the last round that errored, each with its reason
 
     @abstractmethod
     def __call__(

@@ -9,10 +9,9 @@ import json
 import tempfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor
@@ -84,18 +83,13 @@ class Memory:
             del self.rounds[0]
         return self.rounds[-1]
 
-    def pool(self, fresh: float) -> TrafficPool:
-        """Rows of all rounds, the newest first, whose rows weigh `fresh` times as much
-        as the others'. The tracks stay in their files."""
-        made = [one.traffic for one in self.rounds]
-        *older, newest = (
-            TrafficPool.stored(each, each["eta"], template=each["template"])
-            for each in made
+    def pool(self) -> TrafficPool:
+        """Rows of all rounds, the newest first. The tracks stay in their files."""
+        newest, *older = (
+            TrafficPool.stored(each.traffic, each.traffic["eta"])
+            for each in reversed(self.rounds)
         )
-        joined = replace(newest, weight=newest.weight * fresh)
-        for pool in reversed(older):
-            joined = joined + replace(pool, fresh=torch.zeros_like(pool.fresh))
-        return joined
+        return sum(older, newest)
 
     def index(self) -> list[dict[str, int]]:
         """The rounds in memory by number and checksum, the oldest first, for a

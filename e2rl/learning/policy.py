@@ -11,14 +11,13 @@ from typing import Any
 
 import torch
 from omegaconf import OmegaConf
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from e2rl.learning.driving import OUTCOME_KEYS, Episodes, finished_episodes
-from e2rl.learning.experts import Experts
 from e2rl.learning.imitation import recorded_demonstrations
 from e2rl.learning.improvement import Improvement
 from e2rl.learning.scheduler import CurriculumScheduler
@@ -26,16 +25,13 @@ from e2rl.learning.teaching import Teacher
 from e2rl.learning.update import Learner, UpdateSettings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
-from e2rl.planners.ego_policy import EgoPlanner
 from e2rl.run.config import built
 from e2rl.run.errors import InputError
 from e2rl.run.settings import configured, setting, settings_of
 from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
-from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer
 
 
@@ -104,35 +100,27 @@ class PolicyImprovement(Improvement):
         ego: Ego,
         scenes: SceneSet,
         sim: SimSettings,
-        traffic: Traffic | None = None,
-        seed: int = 0,
-        parameters: Mapping[str, Any] | None = None,
         *,
+        seed: int = 0,
         device: str,
         collect: Mapping[str, Any],
         ppo: Mapping[str, Any],
-        recorded: bool,
-        evasions: bool,
         teacher: Ego | Mapping[str, Any],
         teaching: Mapping[str, Any],
-        react: Mapping[str, Any] | None,
         rounds: int,
     ) -> None:
         """Settings: conf/learner/ppo_bc.yaml. Raises InputError if the ego is no actor,
         the teacher no ScoringEgo, or a round shorter than an episode.
 
         Args:
-            recorded, evasions: with ppo.cloning > 0, clone the recorded egos, and the
-                evasions in the pool's traffic.
             teacher: with ppo.teaching > 0, a ScoringEgo that labels states of the
                 collected episodes, as `teaching`
                 says.
-            react: vehicles that leave the replayed traffic; None: nobody.
             rounds: of the run, over which the learning rate falls.
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(
-                f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; use learner=planner_tuning"
+                f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; tune a planner with `e2rl tune`"
             )
         self.settings = settings_of(CollectSettings, collect, where="learner.collect")
         update = settings_of(UpdateSettings, ppo, where="learner.ppo")
@@ -152,15 +140,10 @@ class PolicyImprovement(Improvement):
         )
         self.frames = 0
         placed = scenes.to(device)
-        self.experts: Experts | None = None
+        self.demonstrations: TensorDict | None = None
         self.teacher: Teacher | None = None
         if update.cloning > 0:
-            known = (
-                recorded_demonstrations(scenes, sim, seed=seed) if recorded else None
-            )
-            self.experts = Experts(
-                scenes, sim, hold=hold, device=device, recorded=known, evasions=evasions
-            )
+            self.demonstrations = recorded_demonstrations(scenes, sim, seed=seed)
         if update.teaching > 0:
             planner = (
                 teacher
@@ -175,25 +158,19 @@ class PolicyImprovement(Improvement):
         self.draw = RowDraw(
             torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed
         )
-        self.reaction = None
-        if react is not None:
-            self.reaction = Reaiming(
-                settings_of(ReactSettings, react, where="learner.react"), seed
-            )
-        pool = TrafficPool.recorded(every)
         self.synthesizer = AdversarialSynthesizer(
-            pool, self.draw, traffic=traffic, ego=self._learning, reaction=self.reaction
+            TrafficPool.recorded(every), self.draw
         )
-        agents = traffic is not None or self.teacher is not None
-        base = DrivingEnv(placed, sim, batch, device, agents=agents, hold=hold)
+        base = DrivingEnv(
+            placed,
+            sim,
+            batch,
+            device,
+            agents=self.teacher is not None,
+            hold=hold,
+        )
         self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
-        actor = self._learning.network.actor
-        planning = (
-            actor
-            if traffic is None
-            else TensorDictSequential(EgoPlanner(self._learning, base), actor)
-        )
-        self._collect_by(planning, device)
+        self._collect_by(self._learning.network.actor, device)
 
     def _collect_by(self, policy: TensorDictModuleBase, device: str) -> None:
         """Collect batches [B, steps] of decisions of a policy from here on."""
@@ -214,16 +191,9 @@ class PolicyImprovement(Improvement):
     ) -> tuple[dict[str, float], Episodes]:
         """Reset every environment; `iterations` times: collect [B, steps] decisions,
         update. `frames` are steps of 0.1 s."""
-        begin = time.perf_counter()
         self._learning.network.set_weights(
             self.ego.network.weights()
         )  # those of a checkpoint, in a resumed run
-        experts = {} if self.experts is None else self.experts.demonstrations(pool)
-        counts = {
-            f"{kind}_demonstrations": float(len(found))
-            for kind, found in experts.items()
-        }
-        counts["demonstrations"] = time.perf_counter() - begin
         self.synthesizer.pool = pool
         self.draw.probability = pool.probabilities(
             curriculum.priority(), curriculum.fraction
@@ -246,7 +216,7 @@ class PolicyImprovement(Improvement):
             self.frames += steps_of(data)
             outcomes.append(data.select(*OUTCOME_KEYS).cpu().clone())
             labels, made = self._labels(data, pool.adversarial)
-            rows.append(self.learner.update(data, [*experts.values()], labels) | made)
+            rows.append(self.learner.update(data, self.demonstrations, labels) | made)
             bar.set_postfix(
                 reward=f"{data['next', 'reward'].mean().item():.3f}",
                 kl=f"{rows[-1]['kl']:.4f}",
@@ -257,7 +227,7 @@ class PolicyImprovement(Improvement):
         )
         if self.teacher is not None:
             episodes.survivable = self.teacher.survivable(len(pool))[episodes.row]
-        counts |= {"frames": float(self.frames), "collect": collecting}
+        counts = {"frames": float(self.frames), "collect": collecting}
         counts["steps_per_second"] = (self.frames - begun) / collecting
         return _means(rows) | episodes.summary() | counts, episodes
 
@@ -291,18 +261,13 @@ class PolicyImprovement(Improvement):
             "frames": self.frames,
             "draws": self.draw.generator.get_state(),
         }
-        state |= {} if self.teacher is None else {"labels": self.teacher.state_dict()}
         return state | (
-            {}
-            if self.reaction is None
-            else {"reaction": self.reaction.generator.get_state()}
+            {} if self.teacher is None else {"labels": self.teacher.state_dict()}
         )
 
     def load_state_dict(self, state: dict) -> None:
         self.learner.load_state_dict(state["learner"])
         self.draw.generator.set_state(state["draws"].cpu())
-        if self.reaction is not None:
-            self.reaction.generator.set_state(state["reaction"].cpu())
         if self.teacher is not None:
             self.teacher.load_state_dict(state["labels"])
         self.frames = state["frames"]

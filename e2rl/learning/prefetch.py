@@ -75,10 +75,8 @@ def _run(work: Callable[[], None], sender: Connection, parent: int | None) -> No
     sender.close()
 
 
-def why_no_prefetch(device: str, threads: int, ego: Ego, traffic: str) -> str:
+def why_no_prefetch(device: str, threads: int, ego: Ego) -> str:
     """Returns why the next round cannot be made beside learning, or nothing."""
-    if traffic == "live":
-        return "learner.round.traffic=live is not made beforehand"
     if not isinstance(ego, ActorEgo):
         return f"it hands over the weights of ego=actor, which {type(ego).__name__} has not"
     if (

@@ -1,5 +1,5 @@
-"""The extension point for curricula: intensity, causal template, fraction of
-adversarial episodes, scene priorities.
+"""The extension point for curricula: intensity, fraction of adversarial episodes, scene
+priorities.
 
 Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay
 (Jiang et al. 2021). What is ranked is the regret p s: p is the recent failure rate of
@@ -9,7 +9,7 @@ p: that is the learnability of Rutherford et al. ("No Regrets", 2024). It is 0 f
 scene that is solved and for one that is hopeless.
 """
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass
 
 import torch
@@ -18,19 +18,16 @@ from torch import Tensor
 from e2rl.run.config import Extension
 from e2rl.run.errors import InputError
 from e2rl.run.settings import check_range, configured
-from e2rl.traffic.traffic import FULL, TEMPLATES
 
-Choice = dict[str, int | float | str]  # a row of the table, by COLUMNS
+Choice = dict[str, int | float]  # a row of the table, by COLUMNS
 COLUMNS = (
     "round",
     "eta",
-    "template",
     "draws",
     "left_out",
     "episodes",
     "failures",
     "failure_rate",
-    "value",
 )
 TEMPERATURE = 2.0  # of the ranks of regret: at 2 the first tenth of the scenes has a quarter of the draws
 STALENESS = (
@@ -44,108 +41,73 @@ BIN = 0.5  # intensities are counted under multiples of it
 class Outcomes:
     """What became of the S attacks of a round.
 
-    eta [S]; template [S] int64; left_out [S] bool: no driver avoids it, so it did not
-    enter D'; episodes [S] int64: how many the learning policy drove in it; failures [S]
-    int64: how many of these ended by contact or off the road; survivable [S]: the share
-    of its critical moments that the teacher would survive, NaN where none tells.
+    eta [S]; left_out [S] bool: no driver avoids it, so it did not enter D'; episodes
+    [S] int64: how many the learning policy drove in it; failures [S] int64: how many of
+    these ended by contact or off the road.
     """
 
     eta: Tensor
-    template: Tensor
     left_out: Tensor
     episodes: Tensor
     failures: Tensor
-    survivable: Tensor
 
 
-def outcomes_of(
-    eta: Tensor,
-    template: Tensor,
-    drawn: Tensor,
-    row: Tensor,
-    failed: Tensor,
-    survivable: Tensor,
-) -> Outcomes:
-    """Returns the Outcomes of attacks [S], of episodes [E] in rows `row` of the pool
-    that failed or not, and were survivable [E] in part.
+def outcomes_of(eta: Tensor, *, drawn: Tensor, row: Tensor, failed: Tensor) -> Outcomes:
+    """Returns what became of attacks [S].
 
-    drawn [K] int64: the attack of each of the pool's first K rows; episodes in other
-    rows do not count.
+    Args:
+        eta: intensities of the attacks [S].
+        drawn: the attack of each of the pool's first K rows, [K] int64.
+        row: the pool's row of each episode, [E] int64; those beyond K do not count.
+        failed: episodes that failed, [E] bool.
+
+    Returns:
+        The outcomes of all S attacks.
     """
     count = len(eta)
-    known = row < len(drawn)
-    attack = drawn[row[known]]
-    failed = failed[known]
-    told = survivable[known]
-    left_out = torch.ones(count, dtype=torch.bool).index_fill(0, drawn, False)
-    episodes, failures = (
-        torch.bincount(each, minlength=count) for each in (attack, attack[failed])
-    )
-    share = torch.full((count,), torch.nan).index_copy(
-        0, attack, told
-    )  # the same in all episodes of a row
+    counts = row < len(drawn)
+    attack = drawn[row[counts]]
     return Outcomes(
         eta,
-        template,
-        left_out=left_out,
-        episodes=episodes,
-        failures=failures,
-        survivable=share,
+        torch.ones(count, dtype=torch.bool).index_fill(0, drawn, False),
+        episodes=torch.bincount(attack, minlength=count),
+        failures=torch.bincount(attack[failed[counts]], minlength=count),
     )
 
 
-def tally(
-    number: int,
-    level: Tensor,
-    outcomes: Outcomes,
-    value: Mapping[tuple[float, str], float],
-) -> list[Choice]:
-    """The table of round `number`: a row for each intensity and causal template that
-    was drawn or has a value.
-
-    level [S]: the intensity under which each attack is counted; value: what the
-    curriculum expects to learn from each (eta, template), {} where it does not estimate
-    this. Unknown numbers are NaN.
-    """
-    arms = [
-        (round(eta, 4), TEMPLATES[code])
-        for eta, code in zip(level.tolist(), outcomes.template.tolist(), strict=True)
-    ]
-    value = {(round(eta, 4), name): number for (eta, name), number in value.items()}
+def tally(number: int, outcomes: Outcomes) -> list[Choice]:
+    """The table of round `number`: a row for each multiple of BIN to which intensities
+    of its attacks are rounded. Unknown numbers are NaN."""
+    level = (outcomes.eta / BIN).round() * BIN
     rows: list[Choice] = []
-    for arm in sorted(
-        {*arms, *value}, key=lambda each: (TEMPLATES.index(each[1]), each[0])
-    ):
-        of_arm = torch.tensor([each == arm for each in arms], dtype=torch.bool)
-        draws = int(of_arm.sum())
-        left_out = int(outcomes.left_out[of_arm].sum())
-        episodes, failures = (
-            int(each[of_arm].sum()) for each in (outcomes.episodes, outcomes.failures)
+    for eta in level.unique().tolist():
+        attacks = level == eta
+        episodes = int(outcomes.episodes[attacks].sum())
+        failures = int(outcomes.failures[attacks].sum())
+        rows.append(
+            {
+                "round": number,
+                "eta": round(eta, 4),
+                "draws": int(attacks.sum()),
+                "left_out": int(outcomes.left_out[attacks].sum()),
+                "episodes": episodes,
+                "failures": failures,
+                "failure_rate": failures / episodes if episodes else math.nan,
+            }
         )
-        rate = failures / episodes if episodes else float("nan")
-        numbers = (
-            draws,
-            left_out,
-            episodes,
-            failures,
-            rate,
-            value.get(arm, float("nan")),
-        )
-        rows.append(dict(zip(COLUMNS, (number, *arm, *numbers), strict=True)))
     return rows
 
 
 @configured("curriculum/adaptive")
 class CurriculumScheduler(Extension):
-    """State over S scenes. Per round: `draw` scenes and `choices` for them, read
-    `fraction`, then `learn` from the outcomes and `advance`.
+    """State over S scenes. Per round: `draw` scenes and `etas` for them, read
+    `fraction`, then `update` from the episodes and `advance`.
 
     A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and
     a YAML file in conf/curriculum with its `_target_` and settings. It overrides `etas`
-    where the scenes of a round differ in intensity, `choices` and `templates` where
-    they differ in causal template as well. Its constructor takes its own settings by
-    name and hands on the others, `def __init__(self, *run, stairs, **scenes):
-    super().__init__(*run, **scenes)`.
+    where the scenes of a round differ in intensity. Its constructor takes its own
+    settings by name and hands on the others, `def __init__(self, *run, stairs,
+    **scenes): super().__init__(*run, **scenes)`.
 
     Args:
         rounds: of the whole run.
@@ -154,7 +116,6 @@ class CurriculumScheduler(Extension):
 
     eta: float  # adversarial intensity of this round
     fraction: float  # of this round's episodes that are in adversarial traffic
-    templates: tuple[str, ...] = (TEMPLATES[FULL],)
     lasting: tuple[
         str, ...
     ] = ()  # names of a subclass's attributes (numbers and tensors) that checkpoints hold
@@ -184,11 +145,6 @@ class CurriculumScheduler(Extension):
     def etas(self, scenes: Tensor) -> Tensor:
         """Intensities [S] for this round's scenes [S]; by default `eta` for all."""
         return torch.full((len(scenes),), float(self.eta))
-
-    def choices(self, scenes: Tensor) -> tuple[Tensor, Tensor]:
-        """Intensities [S] and causal templates [S] int64 for this round's scenes [S];
-        by default `etas`, full for all."""
-        return self.etas(scenes), torch.full((len(scenes),), FULL)
 
     def around(
         self, count: int, spread: float, low: float = 0.0, high: float = float("inf")
@@ -259,19 +215,6 @@ class CurriculumScheduler(Extension):
             known[scenes] = torch.where(
                 before.isnan(), mean, before + SMOOTHING * (mean - before)
             )
-
-    def observe(self, outcomes: Outcomes) -> None:
-        """Learn from what became of the round's attacks; by default nothing."""
-
-    def level(self, eta: Tensor) -> Tensor:
-        """The intensities [S] under which those of attacks [S] are counted in
-        curriculum.csv: multiples of BIN."""
-        return (eta / BIN).round() * BIN
-
-    def values(self) -> dict[tuple[float, str], float]:
-        """What is expected to be learned from attacks by (eta, template), where the
-        curriculum estimates it."""
-        return {}
 
     def leave_out(self, scene_index: Tensor) -> None:
         """Mark scenes whose adversarial traffic was left out because no driver survives

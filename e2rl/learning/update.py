@@ -2,7 +2,6 @@
 labels, by one optimiser."""
 
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,10 +14,10 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from e2rl.learning.cloning import (
     NOISE,
-    CloningLoss,
-    TeachingLoss,
-    drawn,
-    mirrored_demonstrations,
+    cloning_loss,
+    mirrored_labels,
+    sampled,
+    teaching_loss,
 )
 from e2rl.learning.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
@@ -30,7 +29,7 @@ PRICED_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is m
 PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
 CRITIC = 0.5  # weight of the critic's loss
 MAX_GRAD_NORM = 0.5
-CLONED = 256  # demonstrations of an optimiser step, as many of each kind; also labels of a teacher
+CLONED = 256  # demonstrations, and labels of a teacher, of an optimiser step
 
 
 @configured("learner/ppo_bc", "ppo")
@@ -84,14 +83,12 @@ class Learner:
             normalize_advantage=False,
             functional=False,
         )
-        self.cloning = CloningLoss(network.actor)
-        self.teaching = TeachingLoss(network.network)
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
 
     def update(
         self,
         data: TensorDictBase,
-        experts: Sequence[TensorDictBase] = (),
+        demonstrations: TensorDictBase | None = None,
         labels: TensorDictBase | None = None,
     ) -> dict[str, float]:
         """One PPO iteration on a Collector's batch [B, T]; returns means of the losses
@@ -102,9 +99,7 @@ class Learner:
         updated at the end, so they are equal in collection and update.
 
         Args:
-            experts: kinds of demonstrations, each [M] with M >= 1
-                (e2rl.learning.cloning), that are cloned; a minibatch
-                has as many of each.
+            demonstrations: [M] (e2rl.learning.cloning) that are cloned.
             labels: a teacher's labels [M].
         """
         settings = self.settings
@@ -131,7 +126,9 @@ class Learner:
         for _ in range(settings.epochs):
             moved = []
             for minibatch in minibatches:  # every frame once
-                losses = self._step(minibatch, experts, labels=labels, warming=warming)
+                losses = self._step(
+                    minibatch, demonstrations, labels=labels, warming=warming
+                )
                 moved.append(losses["kl"])
                 for name, value in losses.items():
                     sums[name].append(value)
@@ -218,7 +215,7 @@ class Learner:
     def _step(
         self,
         minibatch: TensorDictBase,
-        experts: Sequence[TensorDictBase],
+        demonstrations: TensorDictBase | None,
         labels: TensorDictBase | None,
         warming: bool,
     ) -> dict[str, Tensor]:
@@ -241,17 +238,15 @@ class Learner:
                 self.network.network, minibatch[:PRICED_FRAMES]
             )
             total = total + settings.action_penalty * losses["action_penalty"]
-        if experts and settings.cloning > 0 and not warming:
-            shown = drawn(experts, CLONED).to(self.network.device)
+        if demonstrations is not None and settings.cloning > 0 and not warming:
+            shown = sampled(demonstrations, CLONED).to(self.network.device)
             with self.network.network.noisy(*NOISE):
-                losses |= self.cloning(shown).items()
+                losses["loss_cloning"] = cloning_loss(self.network.actor, shown)
             total = total + settings.cloning * losses["loss_cloning"]
         if labels is not None and settings.teaching > 0 and not warming:
-            shown = drawn([labels], CLONED).to(self.network.device)
-            shown = torch.cat(
-                [mirrored_demonstrations(shown[::2]), shown[1::2]]
-            )  # it holds for both sides
-            losses |= self.teaching(shown).items()
+            drawn = sampled(labels, CLONED).to(self.network.device)
+            both = torch.cat([mirrored_labels(drawn[::2]), drawn[1::2]])
+            losses["loss_teaching"] = teaching_loss(self.network.network, both)
             total = total + settings.teaching * losses["loss_teaching"]
         take_step(self.optimiser, total, max_grad_norm=MAX_GRAD_NORM)
         return {name: value.detach().mean() for name, value in losses.items()}

@@ -117,8 +117,6 @@ class DrivingEnv(EnvBase):
         self._config = StepConfig(
             torch.tensor(ends, device=device), weights, low=low, high=high
         )
-        self.clock = 0
-        """Steps simulated so far, resets or not."""
         self._trajectories = Trajectories(self.scene)
         mission = mission_of(self.scene)
         start = self.scene["start"][:, 0]
@@ -199,12 +197,6 @@ class DrivingEnv(EnvBase):
         states [b, V, H, 4], valid [b, V, H].
         """
         self._trajectories.write(rows, self._ego.step[rows], states, valid)
-
-    def write_agents(self, rows: Tensor, agents: Tensor, states: Tensor) -> None:
-        """Overwrite the traffic of vehicles agents [K] of environments rows [K] at the
-        coming steps; steps beyond T are dropped. states [K, H, 4]; the others' traffic
-        stays."""
-        self._trajectories.write_agents(rows, agents, self._ego.step[rows], states)
 
     def world(self) -> World:
         """The current World. Its `scene` is the environment's own storage, which the
@@ -308,7 +300,6 @@ class DrivingEnv(EnvBase):
 
     @torch.no_grad()  # the stored state must not accumulate an autograd graph
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        self.clock += 1
         tracks = self._trajectories.states, self._trajectories.valid
         recording = self.scene["logged"], self.scene["logged_valid"]
         given = recording if self.settings.replay_ego else tensordict["action"]

@@ -204,20 +204,6 @@ class Trajectories:
         )
         self.valid[row, at, : self.vehicles] = valid.transpose(1, 2)[inside]
 
-    def write_agents(
-        self, rows: Tensor, agents: Tensor, step: Tensor, states: Tensor
-    ) -> None:
-        """See `DrivingEnv.write_agents`; from step [K] + 1 on."""
-        at = step[:, None] + torch.arange(1, states.shape[1] + 1, device=step.device)
-        inside = at < self.states.shape[1]
-        where = (
-            rows[:, None].expand_as(at)[inside],
-            at[inside],
-            agents[:, None].expand_as(at)[inside],
-        )
-        self.states[where] = states[inside].to(self.states.dtype)
-        self.valid[where] = True
-
 
 def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> Agents:
     """The agents of trajectories [B, T+1, N, 4], [B, T+1, N] at step [B].

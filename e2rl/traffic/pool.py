@@ -10,30 +10,17 @@ import torch
 from torch import Tensor
 
 from e2rl.run.errors import InputError
-from e2rl.traffic.decisions import OWES, RULE
-from e2rl.traffic.traffic import FULL
+from e2rl.traffic.decisions import RULE
 
-RECORDED, LIVE = (
-    -1,
-    -2,
-)  # sources of a row's traffic that is not a position in the stored traffic
+RECORDED = -1  # sources of a row's traffic that are no position in the stored traffic
+LIVE = -2
 
 
 class StoredTraffic(NamedTuple):
-    """Tracks in memory or mapped from a file: states [D, T+1, N, 4], valid [D, T+1, N],
-    adversaries [D, N] bool; and where an evasion of the ego's contact is known, its
-    actions evasion [D, T, 2] and the steps span [D, 2] int64 from .. up to which it
-    acts, (0, 0) where none is."""
+    """Tracks in memory or mapped from a file: states [D, T+1, N, 4], valid [D, T+1, N]."""
 
     states: Tensor
     valid: Tensor
-    adversaries: Tensor
-    evasion: Tensor
-    span: Tensor
-
-
-TRACKS = StoredTraffic._fields[:3]
-EVASIONS = StoredTraffic._fields[3:]
 
 
 @dataclass
@@ -42,22 +29,16 @@ class TrafficPool:
 
     scene_index [R] int64; source [R] int64: position in the stored traffic, RECORDED:
     the log is replayed, LIVE: a traffic method replans it against the ego; eta [R]:
-    adversarial intensity, 0: none; template [R] int64: causal template of the attack
-    (e2rl/traffic/traffic.py); seed [R] int64: of the noise of LIVE rows; decisions [R,
-    D]: of the attack (e2rl/traffic/decisions.py); weight [R]: in draws; fresh [R]
-    bool: made for this round, not remembered from an earlier one. parts: the stored
-    traffic, of equal T and N; positions count through all parts. Joined pools share the
-    tracks.
+    adversarial intensity, 0: none; seed [R] int64: of the noise of LIVE rows; decisions
+    [R, D]: of the attack (e2rl/traffic/decisions.py). parts: the stored traffic, of
+    equal T and N; positions count through all parts. Joined pools share the tracks.
     """
 
     scene_index: Tensor
     source: Tensor
     eta: Tensor
-    template: Tensor
     seed: Tensor
     decisions: Tensor
-    weight: Tensor
-    fresh: Tensor
     parts: list[StoredTraffic] = field(default_factory=list)
 
     def __len__(self) -> int:
@@ -67,12 +48,6 @@ class TrafficPool:
     def adversarial(self) -> Tensor:
         """Bool [R]: rows with an adversary."""
         return self.eta > 0
-
-    @cached_property
-    def adversaries(self) -> Tensor:
-        """Bool [D, N] of all stored traffic; unlike the tracks they are small, and
-        every step reads them."""
-        return torch.cat([part.adversaries for part in self.parts])
 
     @cached_property
     def _ends(self) -> Tensor:
@@ -92,17 +67,6 @@ class TrafficPool:
             states[rows], valid[rows] = part.states[inside], part.valid[inside]
         return states, valid
 
-    def evaded(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows [b] whose traffic is of parts[number] and has an evasion, its actions
-        [b, T, 2] and its span [b, 2]."""
-        part = self.parts[number]
-        at = self.source - (self._ends[number] - len(part.states))
-        rows = ((at >= 0) & (at < len(part.states)) & (self.source >= 0)).nonzero()[
-            :, 0
-        ]
-        rows = rows[part.span[at[rows], 1] > 0]
-        return rows, part.evasion[at[rows]], part.span[at[rows]]
-
     @staticmethod
     def recorded(scene_index: Tensor) -> "TrafficPool":
         """Rows that replay the recordings of scenes [R]."""
@@ -112,74 +76,50 @@ class TrafficPool:
     def live(
         scene_index: Tensor,
         eta: Tensor,
+        *,
         seed: Tensor,
-        template: Tensor | None = None,
         decisions: Tensor | None = None,
     ) -> "TrafficPool":
-        """Rows of scenes [R] that are replanned against the ego; eta [R], seed [R],
-        template [R] (None: full), decisions [R, D] (None: by rule)."""
-        return _rows(
-            scene_index,
-            LIVE,
-            eta=eta,
-            seed=seed,
-            template=template,
-            decisions=decisions,
-        )
+        """Returns rows that are replanned against the ego.
+
+        Args:
+            scene_index: scenes [R] int64.
+            eta: intensities [R].
+            seed: of the noise, [R] int64.
+            decisions: of the attack, [R, D]; None: by rule.
+
+        Returns:
+            A pool of R rows.
+        """
+        return _rows(scene_index, LIVE, eta=eta, seed=seed, decisions=decisions)
 
     @staticmethod
-    def stored(
-        traffic: Mapping[str, Tensor],
-        eta: Tensor | float,
-        template: Tensor | None = None,
-    ) -> "TrafficPool":
-        """Rows of a synthesizer's traffic at intensities eta [S], or one for all, and
-        templates [S] (None: full for all): scene_index [S], states [S, T+1, N, 4],
-        valid [S, T+1, N] and adversaries [S, N] bool, and if known evasion [S, T, 2]
-        with span [S, 2], and owes [S] bool (True for all): adversaries yield. Raises
-        InputError for a missing key."""
-        missing = {"scene_index", *TRACKS} - set(traffic)
+    def stored(traffic: Mapping[str, Tensor], eta: Tensor | float) -> "TrafficPool":
+        """Rows of a synthesizer's traffic at intensities eta [S], or one for all:
+        scene_index [S], states [S, T+1, N, 4], valid [S, T+1, N]. Raises InputError for
+        a missing key."""
+        missing = {"scene_index", *StoredTraffic._fields} - set(traffic)
         if missing:
             raise InputError(
-                f"synthesized traffic lacks {', '.join(sorted(missing))}; return them from synthesize()"
+                f"synthesized traffic lacks {', '.join(sorted(missing))}; "
+                "return them from synthesize()"
             )
-        states = traffic["states"]
         index = traffic["scene_index"].cpu()
-        none = (
-            torch.zeros(1, 1, 2).expand(len(states), states.shape[1] - 1, 2),
-            torch.zeros(len(states), 2).long(),
-        )
-        given = dict(zip(EVASIONS, none, strict=True)) | dict(traffic)
-        part = StoredTraffic(*(given[name].cpu() for name in StoredTraffic._fields))
         eta = torch.as_tensor(eta, dtype=torch.float32).cpu().expand(len(index))
-        owes = given.get("owes", torch.ones(len(index))).cpu()
-        pool = _rows(
-            index,
-            RECORDED,
-            eta=eta,
-            template=None if template is None else template.cpu(),
-        )
-        pool.decisions[:, OWES] = owes.to(pool.decisions)
+        pool = _rows(index, RECORDED, eta=eta)
         pool.source = torch.arange(len(index))
-        pool.parts = [part]
+        pool.parts = [
+            StoredTraffic(traffic["states"].cpu(), traffic["valid"].cpu()),
+        ]
         return pool
 
     def __add__(self, other: "TrafficPool") -> "TrafficPool":
         """Both pools' rows, this one's first."""
         count = sum(len(part.states) for part in self.parts)
         moved = torch.where(other.source >= 0, other.source + count, other.source)
-        names = (
-            "scene_index",
-            "eta",
-            "template",
-            "seed",
-            "decisions",
-            "weight",
-            "fresh",
-        )
         joined = {
             name: torch.cat([getattr(self, name), getattr(other, name)])
-            for name in names
+            for name in ("scene_index", "eta", "seed", "decisions")
         }
         return TrafficPool(
             source=torch.cat([self.source, moved]),
@@ -189,11 +129,8 @@ class TrafficPool:
 
     def probabilities(self, priority: Tensor, fraction: float) -> Tensor:
         """Draw probability [R]: `fraction` for all adversarial rows (1 or 0 where there
-        is one kind), within a kind in proportion to the row's weight times the priority
-        [S] of its scene."""
-        weight = self.weight * priority.cpu().double()[self.scene_index].clamp(
-            min=1e-12
-        )
+        is one kind), within a kind in proportion to the priority [S] of its scene."""
+        weight = priority.cpu().double()[self.scene_index].clamp(min=1e-12)
         result = torch.zeros(len(self), dtype=torch.float64)
         for kind, part in ((True, fraction), (False, 1 - fraction)):
             rows = self.adversarial == kind
@@ -207,28 +144,19 @@ class TrafficPool:
 def _rows(
     scene_index: Tensor,
     source: int,
+    *,
     eta: Tensor,
     seed: Tensor | None = None,
-    template: Tensor | None = None,
     decisions: Tensor | None = None,
 ) -> TrafficPool:
-    """Fresh rows of weight 1 from one source; by default of seed 0 and template full,
-    by rule."""
-    like = torch.zeros(len(scene_index), dtype=torch.int64)
-    seed = like if seed is None else seed
-    template = like + FULL if template is None else template
-    decisions = (
-        torch.tensor(RULE).repeat(len(like), 1) if decisions is None else decisions
-    )
-    fresh = torch.ones_like(like).bool()
-    weight = torch.ones(len(like))
+    """Rows from one source; by default of seed 0, by rule."""
+    zero = torch.zeros(len(scene_index), dtype=torch.int64)
     return TrafficPool(
         scene_index,
-        like + source,
+        zero + source,
         eta=eta,
-        template=template,
-        seed=seed,
-        decisions=decisions,
-        weight=weight,
-        fresh=fresh,
+        seed=zero if seed is None else seed,
+        decisions=(
+            torch.tensor(RULE).repeat(len(zero), 1) if decisions is None else decisions
+        ),
     )

@@ -22,7 +22,7 @@ from e2rl.sim.mission import Mission, mission_of, ran_red
 from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.pool import TrafficPool
-from e2rl.traffic.traffic import FULL, PlanLog, Traffic, counted_nfe
+from e2rl.traffic.traffic import PlanLog, Traffic, counted_nfe
 from e2rl.traffic.transform import AdversarialSynthesizer
 
 MADE = ("states", "valid", "adversaries", "contact")  # what D' has of its rollouts
@@ -38,7 +38,6 @@ def roll_out(
     traffic: Traffic,
     sim: SimSettings,
     device: str = "cpu",
-    template: Tensor | None = None,
     decisions: Tensor | None = None,
 ) -> Rollouts:
     """Rollouts of scenes `index` [B] int64 to their last step, on through contacts and
@@ -47,7 +46,6 @@ def roll_out(
     Args:
         seed: [B] int64, of the noise.
         eta: [B], intensities.
-        template: [B] int64, causal templates (None: full for all).
         decisions: [B, D], of the attack (None: by rule).
     """
     begin = time.perf_counter()
@@ -55,8 +53,12 @@ def roll_out(
         sim, end_on_contact=False, end_off_road=False, end_when_gone=False
     )
     settings.replay_ego = sim.replay_ego or ego.replays_log
-    given = (None if x is None else x.cpu() for x in (template, decisions))
-    pool = TrafficPool.live(index.cpu(), eta.cpu().float(), seed.cpu(), *given)
+    pool = TrafficPool.live(
+        index.cpu(),
+        eta.cpu().float(),
+        seed=seed.cpu(),
+        decisions=None if decisions is None else decisions.cpu(),
+    )
     looks = type(ego).act is not Ego.act
     base = DrivingEnv(scenes, settings, len(index), device, agents=True, observed=looks)
     synthesizer = AdversarialSynthesizer(pool, torch.arange, traffic=traffic, ego=ego)
@@ -153,15 +155,13 @@ def synthesize_traffic(
     batch: int = 64,
     device: str = "cpu",
 ):
-    """A function (ego, scene_index [S], eta [S] or one for all, seed, template [S], by
-    default full for all) -> the D' of Algorithm 1 against that ego.
+    """A function (ego, scene_index [S], eta [S] or one for all, seed) -> the D' of
+    Algorithm 1 against that ego.
 
     D': scene_index [K], states [K, T+1, N, 4], valid [K, T+1, N], adversaries [K, N],
-    contact [K] (the ego touched a vehicle), owes [K] bool (the method's adversaries
-    give way to the ego), and errored {position in S: why} of the S - K rows in which
-    the ego or the traffic raised or became NaN.
+    contact [K] (the ego touched a vehicle), and errored {position in S: why} of the
+    S - K rows in which the ego or the traffic raised or became NaN.
     """
-
     scene = scenes.batch([0])[:0]
     valid = scene["logged_valid"]
     nothing = dict(
@@ -169,14 +169,9 @@ def synthesize_traffic(
     )
 
     def synthesize(
-        ego: Ego,
-        scene_index: Tensor,
-        eta: Tensor | float,
-        seed: int,
-        template: Tensor | None = None,
+        ego: Ego, scene_index: Tensor, eta: Tensor | float, seed: int
     ) -> dict[str, Any]:
         etas = torch.as_tensor(eta, dtype=torch.float32).expand(len(scene_index))
-        template = torch.full_like(scene_index, FULL) if template is None else template
 
         def roll_out_rows(rows: Sequence[int]) -> Rollouts:
             index = scene_index[list(rows)]
@@ -191,7 +186,6 @@ def synthesize_traffic(
                 traffic=traffic,
                 sim=sim,
                 device=device,
-                template=template[at],
             )
 
         done: list[int] = []
@@ -210,11 +204,6 @@ def synthesize_traffic(
             name: torch.cat([nothing[name], *(part.get(name) for part in parts)])[order]
             for name in MADE
         }
-        owes = torch.full((len(at),), traffic.responsibility == "full")
-        return made | {
-            "scene_index": scene_index[at[order]],
-            "owes": owes,
-            "errored": errored,
-        }
+        return made | {"scene_index": scene_index[at[order]], "errored": errored}
 
     return synthesize

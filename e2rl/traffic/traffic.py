@@ -36,12 +36,6 @@ from e2rl.run.config import Extension
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 
-# Causal templates of an attack, codes in tensors. single: one vehicle acts on the ego;
-# pair: two do; chain: one does, and one more acts on it from afar, through others if
-# necessary; full: as many as the method is set to.
-TEMPLATES = ("single", "pair", "chain", "full")
-SINGLE, PAIR, CHAIN, FULL = range(len(TEMPLATES))
-
 REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, for every method
 POINT_STEPS = (
     5  # steps between two points of a plan that are kept in a rollout's file: 0.5 s
@@ -75,19 +69,17 @@ class Traffic(Extension, ABC):
     """Drives all vehicles but the ego of B scenes at once. Built as
     `_target_(prior=prior, **settings)`.
 
-    adversarial: the intensity eta matters; follows_template:
-    `reset` takes causal templates, template [B] int64 (None: full for all);
-    follows_decisions: and decisions [B, D] (e2rl/traffic/decisions.py; None: by
-    rule); queries_ego: `replan` takes `react`, which returns the ego's states against a
-    plan: react(rows [G] of the batch, states [G, V, HORIZON, 4]) -> [G, HORIZON, 4];
-    knowledge, responsibility: what it knows of the ego and owes it, in
+    adversarial: the intensity eta matters; follows_decisions: `reset` takes decisions
+    [B, D] (e2rl/traffic/decisions.py; None: by rule); queries_ego: `replan` takes
+    `react`, which returns the ego's states against a plan: react(rows [G] of the batch,
+    states [G, V, HORIZON, 4]) -> [G, HORIZON, 4]; knowledge, responsibility: what it
+    knows of the ego and owes it, in
     words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the
     settings that a tuning varies, by dotted name, the gain first; on_decision: called
     with what the method decides, if it tells (e2: a `Selection` of adversaries).
     """
 
     adversarial = False
-    follows_template = False
     follows_decisions = False
     queries_ego = False
     knowledge = ""

@@ -20,10 +20,8 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import constant_velocity
 from e2rl.sim.env import DrivingEnv
 from e2rl.sim.world import World
-from e2rl.traffic.decisions import OWES
-from e2rl.traffic.e2.reaiming import Reaiming
 from e2rl.traffic.grouping import put_rows, take_rows
-from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
+from e2rl.traffic.pool import LIVE, TrafficPool
 from e2rl.traffic.traffic import (
     REPLAN_STEPS,
     State,
@@ -39,11 +37,10 @@ class AdversarialSynthesizer(Transform):
     """Draws a pool row for every new episode, injects its scene, and drives its
     traffic.
 
-    Rows with recorded or stored traffic replay it; with a reaction, vehicles of those
-    with an intensity may leave their trajectories every REPLAN_STEPS simulated steps.
-    LIVE rows are replanned by the traffic method every REPLAN_STEPS steps. It is given
-    ("ego", "plan") [B, H, 4], which the policy has just written (without this key,
-    constant velocity), and may not look at it (`Traffic.knowledge`).
+    Rows with recorded or stored traffic replay it. LIVE rows are replanned by the
+    traffic method every REPLAN_STEPS steps. It is given ("ego", "plan") [B, H, 4],
+    which the policy has just written (without this key, constant velocity), and may not
+    look at it (`Traffic.knowledge`).
 
     Writes ("traffic", ...): row [B, 1] int64 and, with a traffic method, plan [B, V, H,
     4]: states planned for the coming steps, only for the policy, not stacked over time.
@@ -56,21 +53,17 @@ class AdversarialSynthesizer(Transform):
         draw: Draw,
         traffic: Traffic | None = None,
         ego: Ego | None = None,
-        reaction: Reaiming | None = None,
     ) -> None:
         """draw: `env.set_seed` seeds its `generator`, if it has one; traffic: drives
-        LIVE rows; ego: the ego that a method with `queries_ego` queries; reaction:
-        None, nobody leaves replayed traffic."""
+        LIVE rows; ego: the ego that a method with `queries_ego` queries."""
         super().__init__()
         self.pool = pool
         self.draw = draw
         self.traffic = traffic
         self.ego = ego
-        self.reaction = reaction
         self.on_plan: Callable[[TrafficPlan], None] | None = (
             None  # called with every new plan
         )
-        self._next_reaction = 0  # the environment's clock at which vehicles react next
         nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
         self._drawn = nothing  # [B] pool row of each episode
         self._state: State = None
@@ -78,14 +71,11 @@ class AdversarialSynthesizer(Transform):
         self._planned_at = nothing  # [B] step of the last replan, per environment
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Let the environment's `set_seed`, which skips transforms, reach the draws and
-        the reaction."""
+        """Let the environment's `set_seed`, which skips transforms, reach the draws."""
         super().set_container(container)
-        if self.parent is not None:  # a Compose may have no environment yet
-            found = (
-                getattr(part, "generator", None) for part in (self.draw, self.reaction)
-            )
-            self._env.generators.update(each for each in found if each is not None)
+        generator = getattr(self.draw, "generator", None)
+        if self.parent is not None and generator is not None:
+            self._env.generators.add(generator)  # a Compose may have no environment yet
 
     @property
     def _env(self) -> DrivingEnv:
@@ -113,8 +103,6 @@ class AdversarialSynthesizer(Transform):
             self._drawn = torch.zeros(env.batch_size, dtype=torch.int64)
         self._drawn[rows] = self.draw(len(rows)).cpu()
         self._inject(rows)
-        if self.reaction is not None:
-            self._begin_reaction(self.reaction, rows)
         tensordict["scene_index"] = self.pool.scene_index[self._drawn][:, None].to(
             env.device
         )
@@ -128,22 +116,6 @@ class AdversarialSynthesizer(Transform):
             self._env.set_traffic(
                 rows[stored].to(self._env.device), *self.pool.tracks(source[stored])
             )
-
-    def _begin_reaction(self, reaction: Reaiming, rows: Tensor) -> None:
-        """Who reacts in the new episodes of environments rows [b]."""
-        env = self._env
-        drawn = self._drawn[rows]
-        eta = self.pool.eta[drawn] * (self.pool.source[drawn] != LIVE)
-        owes = self.pool.decisions[drawn, OWES] >= 0.5
-        attack = (
-            eta.to(env.device),
-            self.pool.template[drawn].to(env.device),
-            owes.to(env.device),
-        )
-        if len(rows) == len(self._drawn):
-            self._next_reaction = env.clock
-        rows = rows.to(env.device)
-        reaction.begin(rows, *attack, self._stored_adversaries()[rows], env.horizon)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -172,17 +144,13 @@ class AdversarialSynthesizer(Transform):
         )
         begins = not len(self._planned_at)
         whole = begins or len(rows) == len(first)
-        names = {
-            "template": self._method.follows_template,
-            "decisions": self._method.follows_decisions,
-        }
-        given = {
-            name: getattr(self.pool, name)[drawn].to(env.device)
-            for name, follows in names.items()
-            if follows
-        }
+        decided = (
+            {"decisions": self.pool.decisions[drawn].to(env.device)}
+            if self._method.follows_decisions
+            else {}
+        )
         fresh = self._method.reset(
-            world.scene if whole else world.scene[rows], seed, eta, **given
+            world.scene if whole else world.scene[rows], seed, eta, **decided
         )
         self._state = fresh if whole else put_rows(self._state, rows, new=fresh)
         if begins:
@@ -194,19 +162,13 @@ class AdversarialSynthesizer(Transform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Before a step: replan the live traffic of environments in which a replan is
-        due; let vehicles react."""
+        due."""
         if self.traffic is not None:
             step = tensordict["timestep"][:, 0]
             live = (self.pool.source[self._drawn] == LIVE).to(step.device)
             rows = (live & (step - self._planned_at >= REPLAN_STEPS)).nonzero()[:, 0]
             if len(rows):
                 self._replan(rows, tensordict.get(("ego", "plan"), None))
-        env = self._env
-        if self.reaction is not None and env.clock >= self._next_reaction:
-            self._next_reaction = env.clock + REPLAN_STEPS
-            motion = self.reaction.react(env.world())
-            if motion is not None:
-                env.write_agents(*motion)
         return tensordict
 
     @torch.no_grad()
@@ -275,17 +237,6 @@ class AdversarialSynthesizer(Transform):
             return self._plan.index_select(2, ahead[0])
         row = torch.arange(len(age), device=age.device)[:, None]
         return self._plan.transpose(1, 2)[row, ahead].transpose(1, 2)
-
-    def _stored_adversaries(self) -> Tensor:
-        """Bool [B, V]: adversaries of stored traffic; false in recorded and live rows."""
-        env = self._env
-        source = self.pool.source[self._drawn]
-        vehicles = env.scene["route_log"].shape[1]
-        adversaries = torch.zeros(len(source), vehicles, dtype=torch.bool)
-        if bool((source > RECORDED).any()):
-            stored = self.pool.adversaries[source.clamp(min=0), :vehicles]
-            adversaries = torch.where((source > RECORDED)[:, None], stored, adversaries)
-        return adversaries.to(env.device)
 
     def _post_step_mdp_hooks(
         self, tensordict: TensorDictBase, tensordict_: TensorDictBase

@@ -78,45 +78,37 @@ def small_run(
     rounds=4,
     scenes=None,
     collect=None,
-    live=None,
     expert=None,
     spread=0.0,
     folder=None,
     memory=4096,
     prefetch=False,
-    against="current",
     **ppo,
 ):
-    """live: a method that drives the traffic against the learning policy; expert:
-    settings of what is cloned; folder: of the run, where `memory` rows are remembered.
-    """
+    """expert: settings of the teacher; folder: of the run, where `memory` rows are
+    remembered."""
     torch.manual_seed(seed)
     scenes = scenes or small_scenes()
     improve = PolicyImprovement(
         ActorEgo(hidden=hidden, room=None),
         scenes,
         sim=SimSettings(),
-        traffic=live,
         seed=seed,
         collect={"batch": 4, "steps": 20, "hold": 1, "iterations": 2} | (collect or {}),
         ppo={"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | ppo,
         rounds=rounds,
-        **({"recorded": False, "evasions": False, "react": None} | (expert or {})),
+        **(expert or {}),
     )
-    traffic = "replay" if live is None else "live"
-    given = {
-        "traffic": traffic,
-        "against": against,
-        "memory": memory,
-        "prefetch": prefetch,
-    }
-    settings = RoundSettings(scenes=3, nominal=nominal, **given)
-    curriculum = AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread)
     return Evolution(
-        curriculum,
+        AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread),
         improve,
         synthesize=brake_check(scenes),
-        settings=settings,
+        settings=RoundSettings(
+            scenes=3,
+            nominal=nominal,
+            memory=memory,
+            prefetch=prefetch,
+        ),
         seed=seed,
         memory=Memory(folder, memory),
     )

@@ -44,7 +44,7 @@ def test_replayed_demonstrations_are_the_inverse_dynamics_of_the_log():
         3,
     ]
     assert torch.allclose(
-        shown["action"], torch.tensor([-2.0, 0.0]).expand(80, 1, 2), atol=2e-3
+        shown["action"], torch.tensor([-2.0, 0.0]).expand(80, 2), atol=2e-3
     )
     last = (shown["observation"][:, 1:3] * torch.tensor([4.0, 1.0])).view(
         4, 20, 2
@@ -63,7 +63,7 @@ def test_disturbed_demonstrations_lead_back(monkeypatch):
     off = (sideways.abs() > 0.1) & (sideways * turned > 0)
     assert (
         off.sum() > 20
-        and (shown["action"][off, 0, 1].sign() == -sideways[off].sign()).float().mean()
+        and (shown["action"][off, 1].sign() == -sideways[off].sign()).float().mean()
         > 0.9
     )
 

@@ -8,7 +8,8 @@ import struct
 import pytest
 from PIL import Image
 
-from e2rl.learning.logging import RunLogger
+from e2rl.learning.logging import CHOICES, RunLogger
+from e2rl.learning.scheduler import COLUMNS
 from e2rl.run.errors import InputError
 
 WANDB_HEADER, LEVELDB_BLOCK = 7, 1 << 15  # bytes
@@ -34,6 +35,15 @@ def test_what_a_resumed_run_logs_again_is_not_doubled(tmp_path):
     scalars = tmp_path / "logs" / "scalars"
     assert (scalars / "train" / "loss.csv").read_text().split() == ["0,0.5", "1,0.25"]
     assert (scalars / "time" / "improve.csv").read_text().split() == ["0,2.0", "1,3.0"]
+
+
+def test_the_table_of_choices_goes_on_where_a_round_is_logged_again(tmp_path):
+    logger = RunLogger("csv", tmp_path)
+    for number in (0, 1, 1):
+        logger.log({}, number, [dict.fromkeys(COLUMNS, math.nan) | {"round": number}])
+    header, *rows = (tmp_path / CHOICES).read_text().splitlines()
+    assert header == ",".join(COLUMNS)
+    assert rows == ["0,,,,,,", "1,,,,,,"], "NaN is empty"
 
 
 def test_wandb_has_scalars_and_media_of_a_step_in_one_row(tmp_path, monkeypatch):

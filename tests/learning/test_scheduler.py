@@ -1,6 +1,8 @@
 """Learnability, priorities and draws of scenes as defined; what counts for which
 attack; exact resume."""
 
+import math
+
 import pytest
 import torch
 
@@ -8,7 +10,6 @@ from e2rl.learning import scheduler
 from e2rl.learning.scheduler import Outcomes, outcomes_of, ranks, tally
 from e2rl.learning.schedules import AdaptiveCurriculum
 from e2rl.run.errors import InputError
-from e2rl.traffic.traffic import PAIR, SINGLE
 
 
 def curriculum_of(num_scenes=6, **settings):
@@ -146,48 +147,25 @@ def test_state_goes_on_exactly():
 
 def test_episodes_count_for_the_attack_whose_row_they_drove():
     """Attacks 0 and 2 of three entered D'; rows beyond them are nominal or remembered."""
-    eta = torch.tensor([1.0, 2.0, 2.0])
-    template = torch.tensor([SINGLE, PAIR, PAIR])
-    row = torch.tensor([0, 0, 1, 2, 5, 1])
-    failed = torch.tensor([True, False, True, True, True, True])
-    share = torch.tensor([0.5, 0.5, 0.25, torch.nan, 1.0, 0.25])
     outcomes = outcomes_of(
-        eta,
-        template,
+        torch.tensor([1.0, 2.0, 2.0]),
         drawn=torch.tensor([0, 2]),
-        row=row,
-        failed=failed,
-        survivable=share,
+        row=torch.tensor([0, 0, 1, 2, 5, 1]),
+        failed=torch.tensor([True, False, True, True, True, True]),
     )
-    assert outcomes.survivable.nan_to_num(-1).tolist() == [0.5, -1.0, 0.25]
     assert outcomes.left_out.tolist() == [False, True, False]
-    assert outcomes.episodes.tolist() == [2, 0, 2] and outcomes.failures.tolist() == [
-        1,
-        0,
-        2,
-    ]
+    assert outcomes.episodes.tolist() == [2, 0, 2]
+    assert outcomes.failures.tolist() == [1, 0, 2]
 
 
-def test_the_table_counts_draws_episodes_and_failures_by_arm():
-    eta = torch.tensor([1.0, 2.0, 2.0])
-    template = torch.tensor([SINGLE, PAIR, PAIR])
-    flags = torch.tensor([False, True, False])
+def test_the_table_counts_draws_episodes_and_failures_by_multiples_of_a_half():
     outcomes = Outcomes(
-        eta,
-        template,
-        left_out=flags,
-        episodes=torch.tensor([2, 0, 2]),
-        failures=torch.tensor([1, 0, 2]),
-        survivable=torch.zeros(3),
+        torch.tensor([1.1, 2.2, 1.8, 3.0]),
+        left_out=torch.tensor([False, True, False, False]),
+        episodes=torch.tensor([2, 0, 2, 0]),
+        failures=torch.tensor([1, 0, 2, 0]),
     )
-    rows = tally(
-        4, eta, outcomes=outcomes, value={(0.5, "full"): 0.2, (1.0, "single"): 0.1}
-    )
-    plain = [
-        tuple(-1 if value != value else value for value in row.values()) for row in rows
-    ]
-    assert plain == [
-        (4, 1.0, "single", 1, 0, 2, 1, 0.5, 0.1),
-        (4, 2.0, "pair", 2, 1, 2, 2, 1.0, -1),
-        (4, 0.5, "full", 0, 0, 0, 0, -1, 0.2),
-    ]
+    rows = [tuple(row.values()) for row in tally(4, outcomes)]
+    assert rows[:2] == [(4, 1.0, 1, 0, 2, 1, 0.5), (4, 2.0, 2, 1, 2, 2, 1.0)]
+    assert rows[2][:-1] == (4, 3.0, 1, 0, 0, 0)
+    assert math.isnan(rows[2][-1]), "no episode, no rate"

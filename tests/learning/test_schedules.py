@@ -9,7 +9,6 @@ from e2rl.learning.schedules import (
     LinearCurriculum,
 )
 from e2rl.run.errors import InputError
-from e2rl.traffic.traffic import FULL
 
 SCENES = torch.zeros(4000, dtype=torch.int64)
 
@@ -82,23 +81,6 @@ def test_constant_intensities_take_turns():
         curriculum.advance(0.0)
     assert seen == [[1.0, 2.0, 3.0, 1.0], [2.0, 3.0, 1.0, 2.0], [3.0, 1.0, 2.0, 3.0]]
     assert curriculum.eta == 2.0 and curriculum.fraction == 0.3
-
-
-@pytest.mark.parametrize(
-    "kind", [AdaptiveCurriculum, LinearCurriculum, ConstantCurriculum]
-)
-def test_the_template_is_full_and_intensities_are_counted_under_multiples_of_a_half(
-    kind,
-):
-    one = kind(6, 10)
-    other = kind(6, 10)
-    etas, templates = one.choices(torch.arange(6))
-    assert (
-        torch.equal(etas, other.etas(torch.arange(6)))
-        and templates.tolist() == [FULL] * 6
-    )
-    assert one.templates == ("full",) and one.values() == {}
-    assert one.level(torch.tensor([0.6, 1.2, 3.0])).tolist() == [0.5, 1.0, 3.0]
 
 
 @pytest.mark.parametrize(

@@ -52,15 +52,22 @@ def begun(std=None, **changes):
     return ego, Learner(ego.network, settings_of(**changes)), batch_of(ego)
 
 
-def expert_of(data, action):
+def demonstrations_of(data, action):
+    """Demonstrations of all frames: one action."""
+    labels = labels_of(data, action)
+    shown = {"observation": labels["observation"], "action": labels["action"][:, 0]}
+    return TensorDict(shown, labels.batch_size)
+
+
+def labels_of(data, action):
+    """A teacher's labels of all frames: one action."""
     observation = data["observation"].reshape(-1, data["observation"].shape[-1])
-    action = torch.tensor(action).expand(len(observation), 1, 2)
-    shown = {
+    labels = {
         "observation": observation,
-        "action": action,
+        "action": torch.tensor(action).expand(len(observation), 1, 2),
         "weight": torch.ones(len(observation), 1),
     }
-    return [TensorDict(shown, [len(observation)])]
+    return TensorDict(labels, [len(observation)])
 
 
 def test_ppo_learns_to_drive_from_standing():
@@ -99,7 +106,7 @@ def test_a_teacher_of_the_left_teaches_the_right_too():
     ego, learner, data = begun(
         critic_warmup=0, teaching=1.0, learning_rate=3e-3, target_kl=1e9
     )
-    (labels,) = expert_of(data, [0.0, 0.3])
+    labels = labels_of(data, [0.0, 0.3])
 
     def turns():
         return [
@@ -155,14 +162,14 @@ def test_the_action_penalty_counts_calm_frames_alone():
 def test_the_first_updates_fit_the_critic_alone():
     ego, learner, data = begun(critic_warmup=1)
     before = {key: value.clone() for key, value in ego.network.weights().items()}
-    learner.update(data, expert_of(data, [1.0, 0.0]))
+    learner.update(data, demonstrations_of(data, [1.0, 0.0]))
     changed = {
         key
         for key, value in ego.network.weights().items()
         if not torch.equal(value, before[key])
     }
     assert changed and all(key.startswith(("critic", "normaliser")) for key in changed)
-    learner.update(data, expert_of(data, [1.0, 0.0]))
+    learner.update(data, demonstrations_of(data, [1.0, 0.0]))
     assert not torch.equal(
         ego.network.weights()["network.trunk.last.weight"],
         before["network.trunk.last.weight"],
@@ -281,12 +288,13 @@ def test_what_is_shown_counts_by_its_weight(name):
         ego, learner, data = begun(
             critic_warmup=0, epochs=1, minibatch=10_000, **others
         )
-        shown = expert_of(data, (1.0, 0.5))
+        labels = labels_of(data, (1.0, 0.5))
+        shown = demonstrations_of(data, (1.0, 0.5))
         torch.manual_seed(1)
         learner.update(
             data,
-            shown if name == "cloning" else (),
-            shown[0] if name == "teaching" else None,
+            shown if name == "cloning" else None,
+            labels if name == "teaching" else None,
         )
         with torch.no_grad():
             missed = (

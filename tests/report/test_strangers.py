@@ -14,8 +14,6 @@ from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_rows, write_
 from e2rl.evaluation.tuning import TUNING_FILE
 from e2rl.report import curves
 from e2rl.report import html as report
-from e2rl.report.curriculum_figure import CHOICES, draw_choices
-from e2rl.run.errors import InputError
 from e2rl.run.run import PROVENANCE
 from e2rl.sim.rollout_file import ROLLOUTS
 from tests.report.failed_run import failed_run
@@ -29,9 +27,6 @@ def run(tmp_path_factory):
     _, tuned = folders(folder.parent / "other")
     for name in (PROVENANCE, TUNING_FILE):
         shutil.copy(tuned / name, folder)
-    (folder / CHOICES).write_text(
-        "round,eta,template,draws,episodes,failures\n0,1.0,pair,3,4,1\n"
-    )
     (folder / "parts").mkdir()
     (folder / "parts" / "rollouts-000000.pt").write_bytes(b"a part")
     return folder
@@ -172,17 +167,3 @@ def test_a_link_out_of_the_folder_is_not_written_to(run, tmp_path, capsys, comma
         )
     assert end.value.code == 2 and "a link out of" in capsys.readouterr().err
     assert not list((tmp_path / "home").iterdir())
-
-
-@pytest.mark.parametrize(
-    "line",
-    ["0,1.0,unknown,3,4,1", "0,1.0,pair", "0,1.0,pair,x,4,1", "inf,1.0,pair,3,4,1"],
-)
-def test_a_damaged_table_of_choices_is_named(tmp_path, line):
-    (tmp_path / CHOICES).write_text(
-        f"round,eta,template,draws,episodes,failures\n{line}\n"
-    )
-    with pytest.raises(InputError, match=f"{CHOICES}: no table"):
-        draw_choices(tmp_path)
-    (tmp_path / CHOICES).write_text("round,eta,template,draws,episodes,failures\n")
-    assert draw_choices(tmp_path) is None, "nothing was drawn yet"

@@ -19,13 +19,13 @@ def test_help_has_every_line_of_the_files_that_are_chosen(tmp_path):
     (tmp_path / "ego" / "mine.yaml").write_text("gap: 3  # m\n")
     text = help_text(
         "train",
-        ["--config-dir", str(tmp_path), "ego=mine", "curriculum=bandit", "--help"],
+        ["--config-dir", str(tmp_path), "ego=mine", "curriculum=linear", "--help"],
     )
     for file in (
         "data/bundled",
         "sim/default",
         "synthesizer/e2",
-        "curriculum/bandit",
+        "curriculum/linear",
         "train",
     ):
         assert (conf_folder() / f"{file}.yaml").read_text().strip() in text

@@ -1,13 +1,10 @@
 """Rows of recorded, stored and live traffic: joined pools, row probabilities, and what
 is refused."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.traffic.decisions import OWES
 from e2rl.traffic.pool import LIVE, RECORDED, TrafficPool
 from tests.learning.small import brake_check, small_scenes
 
@@ -33,11 +30,8 @@ def test_joined_rows_keep_their_traffic():
     twice = attack + attack
     assert both.source.tolist() == [0, 1, 2] + [RECORDED] * 3 + [LIVE] * 3
     assert other_way.source.tolist() == [LIVE] * 3 + [RECORDED] * 3 + [0, 1, 2]
-    assert (
-        twice.source.tolist() == list(range(6))
-        and len(twice.parts) == 2
-        and len(twice.adversaries) == 6
-    )
+    assert twice.source.tolist() == list(range(6))
+    assert len(twice.parts) == 2
     for pool in (both, other_way):
         assert pool.parts[0] is attack.parts[0] and len(pool) == 9, (
             "the tracks are shared"
@@ -49,19 +43,6 @@ def test_joined_rows_keep_their_traffic():
     )
 
 
-def test_whether_adversaries_give_way_stays_with_their_rows():
-    traffic = brake_check(small_scenes())(None, INDEX, 2.0, 0)
-    some = TrafficPool.stored(
-        {**traffic, "owes": torch.tensor([True, False, True])}, 2.0
-    )
-    both = (recorded() + some).decisions[:, OWES].tolist()
-    assert both == [1, 1, 1, 1, 0, 1] and stored().decisions[:, OWES].tolist() == [
-        1,
-        1,
-        1,
-    ]
-
-
 def test_tracks_are_gathered_from_the_parts_as_from_one():
     """In any order, with repetition."""
     parts = [stored(eta) for eta in (0.5, 1.0, 2.0)]
@@ -71,28 +52,17 @@ def test_tracks_are_gathered_from_the_parts_as_from_one():
     assert torch.equal(states, torch.cat([part.parts[0].states for part in parts])[at])
     assert torch.equal(valid, torch.cat([part.parts[0].valid for part in parts])[at])
     assert torch.equal(pool.tracks(pool.source[7:8])[0], parts[1].parts[0].states[1:2])
-    assert torch.equal(
-        pool.adversaries, torch.cat([part.adversaries for part in parts])
-    )
 
 
-def test_weights_multiply_within_a_kind_and_leave_the_share():
-    """Scenes 2, 0, 1 by priorities 3, 1, 1, the first three rows of weight 3."""
+def test_a_kind_has_its_share_and_its_rows_theirs_by_priority():
+    """Scenes 2, 0, 1 by priorities 3, 1, 1."""
     priority = torch.tensor([0.2, 0.2, 0.6])
-    fresh = stored()
-    old = replace(stored(), fresh=torch.zeros(3, dtype=torch.bool))
-    pool = replace(fresh, weight=torch.full((3,), 3.0)) + old + recorded()
-    probability = pool.probabilities(priority, 0.8)
-    assert probability[:6].tolist() == pytest.approx(
-        [0.8 * w / 20 for w in (9, 3, 3, 3, 1, 1)]
-    )
-    assert probability[6:].sum().item() == pytest.approx(0.2)
-    assert probability[pool.fresh & pool.adversarial].sum().item() == pytest.approx(
-        0.8 * 3 / 4
-    )
+    probability = (stored() + recorded()).probabilities(priority, 0.8)
+    assert probability[:3].tolist() == pytest.approx([0.48, 0.16, 0.16])
+    assert probability[3:].tolist() == pytest.approx([0.12, 0.04, 0.04])
 
 
-@pytest.mark.parametrize("missing", ["scene_index", "states", "valid", "adversaries"])
+@pytest.mark.parametrize("missing", ["scene_index", "states", "valid"])
 def test_traffic_that_lacks_something_is_refused(missing):
     traffic = brake_check(small_scenes())(None, INDEX, 2.0, 0)
     del traffic[missing]

@@ -16,7 +16,6 @@ from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.attempt import attempt
-from e2rl.traffic.e2.reaiming import ReactSettings, Reaiming
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from e2rl.traffic.transform import AdversarialSynthesizer
@@ -110,18 +109,15 @@ def test_the_specs_hold(traffic):
 
 
 def random_environment(own=0, traffic=None):
-    """Draws and reactions by generators of their own, which begin with seed `own`."""
+    """Draws by a generator of their own, which begins with seed `own`."""
     scene_set = scenes(3, 10)
     pool = replayed(scene_set) if traffic is None else mixed(scene_set)
     draw = RowDraw(torch.ones(len(pool)).double(), own)
-    reaction = Reaiming(ReactSettings(fraction=1.0, scatter=1.0), own)
     base = DrivingEnv(scene_set, ON, 4, agents=True)
     return TransformedEnv(
         base,
         Compose(
-            AdversarialSynthesizer(
-                pool, draw, traffic=traffic, ego=None, reaction=reaction
-            ),
+            AdversarialSynthesizer(pool, draw, traffic=traffic),
             RewardSum(),
         ),
     )
