@@ -24,40 +24,22 @@ from e2rl.scenes.recording import (
     VEHICLE,
     Lane,
     Recording,
-    same_way,
+    name_neighbours,
 )
-from e2rl.scenes.smoothing import (
-    resample_heights,
-    resample_uniform,
-    signed_speed,
-    speeds,
-)
+from e2rl.scenes.resampling import resample_uniform
+from e2rl.scenes.smoothing import signed_speed, speeds
 from e2rl.scenes.source import Source
 
 FILES = ("scenario_*.parquet", "annotations*.feather")
 LEVELS = ("", "*/", "*/*/")  # of folders below `path` in which logs are looked for
-TYPES = {  # by the object types of scenarios and the categories of annotations, in lower case; others are OTHER
-    **dict.fromkeys(
-        [
-            "vehicle",
-            "regular_vehicle",
-            "large_vehicle",
-            "box_truck",
-            "truck",
-            "truck_cab",
-        ],
-        VEHICLE,
-    ),
-    **dict.fromkeys(
-        ["vehicular_trailer", "bus", "school_bus", "articulated_bus", "railed_vehicle"],
-        VEHICLE,
-    ),
-    **dict.fromkeys(["motorcyclist", "motorcycle"], VEHICLE),
-    **dict.fromkeys(
-        ["pedestrian", "official_signaler", "stroller", "wheelchair"], PEDESTRIAN
-    ),
-    **dict.fromkeys(["cyclist", "bicyclist", "wheeled_rider"], CYCLIST),
+KINDS = {  # object types of scenarios, categories of annotations; others are OTHER
+    VEHICLE: "vehicle regular_vehicle large_vehicle box_truck truck truck_cab "
+    "vehicular_trailer bus school_bus articulated_bus railed_vehicle motorcyclist "
+    "motorcycle",
+    PEDESTRIAN: "pedestrian official_signaler stroller wheelchair",
+    CYCLIST: "cyclist bicyclist wheeled_rider",
 }
+TYPES = {name: kind for kind, names in KINDS.items() for name in names.split()}
 SIZES = {  # m, of the object types of scenarios, which hold no sizes
     "vehicle": (4.7, 1.9),
     "bus": (12.0, 2.7),
@@ -66,14 +48,10 @@ SIZES = {  # m, of the object types of scenarios, which hold no sizes
     "riderless_bicycle": (1.8, 0.6),
 }
 SMALL = (0.7, 0.7)  # m, of a pedestrian and of every other type
-EGO, EGO_BOX = (
-    "AV",
-    "EGO_VEHICLE",
-)  # its track in a scenario; its annotation, which some logs have
-EGO_SIZE, AHEAD = (
-    (4.877, 2.0),
-    1.425,
-)  # m: the recording vehicle, and its middle ahead of its rear axle, its origin
+EGO = "AV"  # its track in a scenario
+EGO_BOX = "EGO_VEHICLE"  # its annotation, which some logs have
+EGO_SIZE = (4.877, 2.0)  # m
+AHEAD = 1.425  # m from the vehicle's rear axle, its origin, to its middle
 CITIES = {  # by the code in the name of a sensor log's map; scenarios have the name
     "ATX": "austin",
     "DTW": "dearborn",
@@ -83,11 +61,8 @@ CITIES = {  # by the code in the name of a sensor log's map; scenarios have the 
     "WDC": "washington-dc",
 }
 MID_POINTS = 10  # of a lane segment's centreline
-MAX_ROWS, MAX_COLUMNS, MAX_TABLE = (
-    500_000,
-    64,
-    1 << 28,
-)  # of a scenario; the last in bytes, unpacked
+MAX_ROWS, MAX_COLUMNS = 500_000, 64  # of a scenario
+MAX_TABLE = 1 << 28  # bytes of it, unpacked
 
 
 @dataclass
@@ -100,53 +75,52 @@ class Argoverse2Source(Source):
 
     def logs(self) -> list[str]:
         root = self.root()
-        found = {
-            file.parent: file
+        logs = {
+            file.parent: str(file.relative_to(root))
             for level in LEVELS
             for kind in FILES
             for file in sorted(root.glob(level + kind))
         }
-        if not found:
-            neither = f"holds neither {FILES[0]} nor {FILES[1]}"
+        if not logs:
             raise InputError(
-                f"data.path={root}: {neither}; pass a folder of {self.holds}"
+                f"data.path={root}: holds neither {FILES[0]} nor {FILES[1]}; "
+                f"pass a folder of {self.holds}"
             )
-        return sorted(str(file.relative_to(root)) for file in found.values())
+        return sorted(logs.values())
 
     def read(self, log: str) -> Iterator[Recording]:
         from av2.map.map_api import ArgoverseStaticMap
 
         path = self.root() / log
-        for file in _files(path):
+        files = _files(path)
+        for file in files:
             check_file(file)
         with bounded_memory():
-            recording = (
-                _scenario(path) if path.suffix == ".parquet" else _sensor_log(path)
-            )
-            recording.lanes, recording.drivable = _map(
-                ArgoverseStaticMap.from_json(_files(path)[-1])
-            )
+            kind = _scenario if path.suffix == ".parquet" else _sensor_log
+            recording = kind(path)
+            static_map = ArgoverseStaticMap.from_json(files[-1])
+            recording.lanes, recording.drivable = _map(static_map)
         yield recording
 
     def fingerprint(self) -> bytes:
-        return hash_files(
-            file for log in self.logs() for file in _files(self.root() / log)
-        )
+        root = self.root()
+        return hash_files(file for log in self.logs() for file in _files(root / log))
 
 
 def _files(path: Path) -> list[Path]:
     """The files of the log at `path`, its map last; raises InputError where there is no
     map."""
+    folder = path.parent
     maps = [
-        *path.parent.glob("log_map_archive_*.json"),
-        *path.parent.glob("map/log_map_archive_*.json"),
+        *folder.glob("log_map_archive_*.json"),
+        *folder.glob("map/log_map_archive_*.json"),
     ]
     if not maps:
         raise InputError(
-            f"{path.parent}: holds no log_map_archive_*.json; download the map beside the log"
+            f"{folder}: holds no log_map_archive_*.json; download the map beside the log"
         )
-    poses = path.parent / "city_SE3_egovehicle.feather"
-    return [path, *([poses] if path.suffix == ".feather" else ()), sorted(maps)[0]]
+    poses = [folder / "city_SE3_egovehicle.feather"]
+    return [path, *(poses if path.suffix == ".feather" else ()), min(maps)]
 
 
 def _scenario(path: Path) -> Recording:
@@ -157,42 +131,44 @@ def _scenario(path: Path) -> Recording:
 
     _check_table(path)
     scenario = load_argoverse_scenario_parquet(path)
-    frames = len(scenario.timestamps_ns)
     tracks = scenario.tracks
-    check({"states": frames * len(tracks)}, scenario.scenario_id)
-    states = np.zeros((frames, len(tracks), 4))
-    valid = np.zeros((frames, len(tracks)), bool)
+    shape = (len(scenario.timestamps_ns), len(tracks))
+    check({"states": shape[0] * shape[1]}, scenario.scenario_id)
+    states = np.zeros((*shape, 4))
+    valid = np.zeros(shape, bool)
     for index, track in enumerate(tracks):
         for state in track.object_states:
-            if valid[state.timestep, index]:
+            place = (state.timestep, index)
+            if valid[place]:
                 raise InputError(
-                    f"track {track.track_id} is recorded twice at step {state.timestep}; leave one out"
+                    f"track {track.track_id} is recorded twice at step "
+                    f"{state.timestep}; leave one out"
                 )
-            speed = float(
-                signed_speed(np.array(state.velocity), np.array(state.heading))
-            )
-            states[state.timestep, index] = [*state.position, state.heading, speed]
-            valid[state.timestep, index] = True
-    kinds = [track.object_type.value for track in tracks]
+            speed = signed_speed(np.array(state.velocity), np.array(state.heading))
+            states[place] = [*state.position, state.heading, float(speed)]
+            valid[place] = True
     names = [track.track_id for track in tracks]
     if EGO not in names:
         raise InputError(
             f"no ego: none of its {len(names)} tracks is {EGO!r}; leave it out"
         )
     ego = names.index(EGO)
+    kinds = [track.object_type.value for track in tracks]
     size = np.array([SIZES.get(kind, SMALL) for kind in kinds])
     size[ego] = EGO_SIZE
-    seconds = (
-        np.asarray(scenario.timestamps_ns, float) - scenario.timestamps_ns[0]
-    ) / 1e9
-    arrays = (*resample_uniform(states, valid, ts=seconds), size, _types(kinds))
+    stamps = np.asarray(scenario.timestamps_ns, float)
+    seconds = (stamps - scenario.timestamps_ns[0]) / 1e9
+    states, valid, _ = resample_uniform(states, valid, seconds)
     return Recording(
-        scenario.scenario_id,
-        scenario.city_name,
-        "argoverse2",
-        *arrays,
-        ego,
-        {},
+        scene_id=scenario.scenario_id,
+        location=scenario.city_name,
+        dataset="argoverse2",
+        states=states,
+        valid=valid,
+        size=size,
+        agent_type=_types(kinds),
+        ego=ego,
+        lanes={},
         current=None,
     )
 
@@ -201,14 +177,14 @@ def _check_table(path: Path) -> None:
     """InputError where a table claims to be larger than any scenario."""
     from pyarrow.parquet import read_metadata
 
-    about = read_metadata(path)
-    size = sum(
-        about.row_group(index).total_byte_size for index in range(about.num_row_groups)
-    )
-    if about.num_rows > MAX_ROWS or about.num_columns > MAX_COLUMNS or size > MAX_TABLE:
-        claim = f"{about.num_rows} rows of {about.num_columns} columns, unpacked {size / 1e6:.0f} MB"
+    table = read_metadata(path)
+    groups = map(table.row_group, range(table.num_row_groups))
+    size = sum(group.total_byte_size for group in groups)
+    if table.num_rows > MAX_ROWS or table.num_columns > MAX_COLUMNS or size > MAX_TABLE:
         raise InputError(
-            f"{claim}: more than {MAX_ROWS}, {MAX_COLUMNS}, {MAX_TABLE / 1e6:.0f} MB; cut it, or leave it out"
+            f"{table.num_rows} rows of {table.num_columns} columns, unpacked "
+            f"{size / 1e6:.0f} MB: more than {MAX_ROWS}, {MAX_COLUMNS}, "
+            f"{MAX_TABLE / 1e6:.0f} MB; cut it, or leave it out"
         )
 
 
@@ -223,42 +199,43 @@ def _sensor_log(path: Path) -> Recording:
     names, first, track = np.unique(
         table["track_uuid"].astype(str), return_index=True, return_inverse=True
     )
-    check({"states": len(stamps) * (len(names) + 1)}, path.parent.name)
+    track = track + 1  # behind the ego's
+    shape = (len(stamps), len(names) + 1)
+    check({"states": shape[0] * shape[1]}, path.parent.name)
     if len(np.unique(np.stack([frame, track]), axis=1).T) < len(frame):
         raise InputError("a track is annotated twice at one time stamp; leave one out")
     poses = read_city_SE3_ego(path.parent)
-    turn = np.stack([poses[int(stamp)].rotation for stamp in stamps])
+    rotation = np.stack([poses[int(stamp)].rotation for stamp in stamps])
     place = np.stack([poses[int(stamp)].translation for stamp in stamps])
     boxes = table[["tx_m", "ty_m", "tz_m"]].to_numpy(float)
-    axis = _forward(*table[["qw", "qx", "qy", "qz"]].to_numpy(float).T)
-    states = np.zeros((len(stamps), len(names) + 1, 4))
-    valid = np.zeros(states.shape[:2], bool)
-    position = np.einsum("kij,kj->ki", turn[frame], boxes) + place[frame]
-    states[frame, track + 1, :2] = position[:, :2]
-    heights = np.repeat(place[:, 2:], states.shape[1], axis=1)
-    heights[frame, track + 1] = position[:, 2]
-    states[frame, track + 1, 2] = _heading(np.einsum("kij,kj->ki", turn[frame], axis))
-    states[:, 0, :2], states[:, 0, 2] = (
-        (place + AHEAD * turn[..., 0])[:, :2],
-        _heading(turn[..., 0]),
-    )
-    valid[frame, track + 1], valid[:, 0] = True, True
+    position = np.einsum("kij,kj->ki", rotation[frame], boxes) + place[frame]
+    quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(float)
+    axis = np.einsum("kij,kj->ki", rotation[frame], _forward(quaternions))
+    states = np.zeros((*shape, 4))
+    valid = np.zeros(shape, bool)
+    heights = np.repeat(place[:, 2:], shape[1], axis=1)
+    states[:, 0, :2] = (place + AHEAD * rotation[..., 0])[:, :2]
+    states[:, 0, 2] = _heading(rotation[..., 0])
+    valid[:, 0] = True
+    states[frame, track, :2] = position[:, :2]
+    states[frame, track, 2] = _heading(axis)
+    valid[frame, track] = True
+    heights[frame, track] = position[:, 2]
     seconds = (stamps - stamps[0]) / 1e9
-    resampled = resample_heights(heights, valid, ts=seconds)
-    states, valid = resample_uniform(states, valid, ts=seconds)
+    states, valid, resampled = resample_uniform(states, valid, seconds, heights)
     states[..., 3] = speeds(states, valid)
-    size = np.stack([EGO_SIZE, *table[["length_m", "width_m"]].to_numpy(float)[first]])
-    kinds = ["regular_vehicle", *table["category"].to_numpy()[first]]
     code = _files(path)[-1].stem.split("____")[-1].split("_")[0]
-    arrays = (states, valid, size, _types(kinds))
-    place_name = CITIES.get(code, code)
+    sizes = table[["length_m", "width_m"]].to_numpy(float)[first]
     return Recording(
-        path.parent.name,
-        place_name,
-        "argoverse2",
-        *arrays,
-        0,
-        {},
+        scene_id=path.parent.name,
+        location=CITIES.get(code, code),
+        dataset="argoverse2",
+        states=states,
+        valid=valid,
+        size=np.stack([EGO_SIZE, *sizes]),
+        agent_type=_types(["vehicle", *table["category"].to_numpy()[first]]),
+        ego=0,
+        lanes={},
         current=None,
         heights=resampled,
     )
@@ -268,8 +245,9 @@ def _types(kinds: list[str]) -> np.ndarray:
     return np.array([TYPES.get(kind.lower(), OTHER) for kind in kinds])
 
 
-def _forward(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """The x axis [K, 3] that unit quaternions [K] turn to."""
+def _forward(quaternions: np.ndarray) -> np.ndarray:
+    """The x axis [K, 3] that unit quaternions [K, 4] turn to."""
+    w, x, y, z = quaternions.T
     return np.stack(
         [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1
     )
@@ -284,24 +262,21 @@ def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
     from av2.geometry.interpolate import compute_midpoint_line
     from av2.map.lane_segment import LaneType
 
-    segments = {
-        str(key): segment for key, segment in static_map.vector_lane_segments.items()
-    }
     lanes = {}
-    for key, segment in segments.items():
+    beside = {}
+    for key, segment in static_map.vector_lane_segments.items():
         if segment.lane_type == LaneType.BIKE:
             continue
-        left = segment.left_lane_boundary.xyz
-        right = segment.right_lane_boundary.xyz
-        points, width = compute_midpoint_line(left, right, MID_POINTS)
-        exits = [str(other) for other in segment.successors]
-        lanes[key] = Lane(
-            points[:, :2], float(width), exits=exits, heights=points[:, 2]
+        points, width = compute_midpoint_line(
+            segment.left_lane_boundary.xyz, segment.right_lane_boundary.xyz, MID_POINTS
         )
-    for key, lane in lanes.items():
-        lane.left = same_way(lanes, lane, neighbour=segments[key].left_neighbor_id)
-        lane.right = same_way(lanes, lane, neighbour=segments[key].right_neighbor_id)
-    return lanes, [
-        np.asarray(area.xyz[:, :2], float)
-        for area in static_map.vector_drivable_areas.values()
-    ]
+        lanes[str(key)] = Lane(
+            points=points[:, :2],
+            width=float(width),
+            exits=[str(other) for other in segment.successors],
+            heights=points[:, 2],
+        )
+        beside[str(key)] = (segment.left_neighbor_id, segment.right_neighbor_id)
+    name_neighbours(lanes, beside)
+    areas = static_map.vector_drivable_areas.values()
+    return lanes, [np.asarray(area.xyz[:, :2], float) for area in areas]

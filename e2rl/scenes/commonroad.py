@@ -32,42 +32,27 @@ from e2rl.scenes.recording import (
     Recording,
     light_colour,
 )
-from e2rl.scenes.smoothing import FRAME_STEPS, latest_frames, resample_uniform
+from e2rl.scenes.resampling import FRAME_STEPS, latest_frames, resample_uniform
 
-TYPES = {  # by the name of an ObstacleType
-    **dict.fromkeys(["car", "truck", "bus", "motorcycle", "taxi", "vehicle"], VEHICLE),
-    **dict.fromkeys(["priorityVehicle", "parkedVehicle"], VEHICLE),
-    **{"bicycle": CYCLIST, "pedestrian": PEDESTRIAN},
+KINDS = {  # ObstacleTypes; others are OTHER
+    VEHICLE: "car truck bus motorcycle taxi vehicle priorityVehicle parkedVehicle",
+    CYCLIST: "bicycle",
+    PEDESTRIAN: "pedestrian",
 }
-PAVED = {
-    "shoulder",
-    "busLane",
-}  # LaneletTypes on which a car does not drive, though it could
-FOR_OTHERS = {
-    *PAVED,
-    "sidewalk",
-    "crosswalk",
-    "bicycleLane",
-    "busStop",
-    "border",
-    "parking",
-}
-FOR_OTHERS |= {"restricted", "restricted_area"}
+TYPES = {name: kind for kind, names in KINDS.items() for name in names.split()}
+# LaneletTypes on which a car does not drive; on the first two it could
+PAVED = {"shoulder", "busLane"}
+UNPAVED = (
+    "sidewalk crosswalk bicycleLane busStop border parking restricted restricted_area"
+)
+FOR_OTHERS = PAVED.union(UNPAVED.split())
 CARS = {"vehicle", "car"}  # RoadUsers
-MOVES, NEAR = 0.5, 1.0  # m/s, m: a vehicle that moves; from a planning problem's start
-NUMBERS = {
-    "x",
-    "y",
-    "z",
-    "exact",
-    "intervalStart",
-    "intervalEnd",
-    "length",
-    "width",
-    "radius",
-    "orientation",
-}
-MAX_DEPTH, LARGEST_ANGLE = 32, 1000.0  # elements; rad
+MOVES = 0.5  # m/s: a vehicle that moves
+NEAR = 1.0  # m from a planning problem's start to the vehicle that is its ego
+ELEMENTS = "x y z exact intervalStart intervalEnd length width radius orientation"
+NUMBERS = frozenset(ELEMENTS.split())  # elements that hold one
+MAX_DEPTH = 32  # elements
+LARGEST_ANGLE = 1000.0  # rad
 STEPS = 80  # simulated steps of a scene, by default
 
 
@@ -85,13 +70,11 @@ class CommonRoadSource(LogFiles):
     extra = "commonroad"
 
     def read(self, log: str) -> Iterator[Recording]:
+        steps = self.build.steps
         with bounded_memory():
-            recording = read_scenario(
-                self.content(log), self.starts, steps=self.build.steps
-            )
-        if len(recording.states) - self.build.steps // 2 >= min(
-            self.starts or (HISTORY,)
-        ):
+            recording = read_scenario(self.content(log), self.starts, steps=steps)
+        first = min(self.starts or (HISTORY,))
+        if len(recording.states) - steps // 2 >= first:
             yield recording
 
 
@@ -111,20 +94,15 @@ def read_scenario(
 
     _check_content(content)
     scenario, problems = XMLFileReader(io.BytesIO(content)).open()
-    recording, begun = _recording(
+    recording, started = _recording(
         scenario, list(problems.planning_problem_dict.values())
     )
-    present = recording.valid & (recording.agent_type == VEHICLE)
     frames = recording.start_frames(starts, steps) or [HISTORY]
     for start in frames:
         span = slice(start, start + steps + 1) if len(frames) > 1 else slice(None)
-        there = present[min(start, len(present) - 1)]
-        recording.egos[start] = _ego(
-            recording.states[span], present[span], there=there, begun=begun
-        )
-    return replace(
-        recording, ego=next((ego for ego in recording.egos.values() if ego >= 0), -1)
-    )
+        recording.egos[start] = _ego(recording, start, span=span, started=started)
+    egos = [ego for ego in recording.egos.values() if ego >= 0]
+    return replace(recording, ego=egos[0] if egos else -1)
 
 
 def _check_content(content: bytes) -> None:
@@ -135,7 +113,8 @@ def _check_content(content: bytes) -> None:
 
     def refuse(*_: object) -> None:
         raise InputError(
-            "holds a document type declaration, which no CommonRoad scenario needs; remove it"
+            "holds a document type declaration, which no CommonRoad scenario needs; "
+            "remove it"
         )
 
     def begin(name: str, _: object) -> None:
@@ -175,43 +154,50 @@ def _recording(scenario: Any, problems: list) -> tuple[Recording, list[int]]:
         raise InputError("no dynamic obstacle; leave it out")
     steps = [state.time_step for track in tracks for state in track]
     first = min(steps)
-    count = max(steps) - min(steps) + 1
+    shape = (max(steps) - first + 1, len(obstacles))
     name = str(scenario.scenario_id)
-    check({"states": count * max(scenario.dt / DT, 1) * len(obstacles)}, name)
-    states = np.zeros((count, len(obstacles), 4))
-    valid = np.zeros((count, len(obstacles)), bool)
-    boxes = [_box(obstacle.obstacle_shape) for obstacle in obstacles]
+    check({"states": shape[0] * max(scenario.dt / DT, 1) * shape[1]}, name)
+    states = np.zeros((*shape, 4))
+    valid = np.zeros(shape, bool)
+    size = np.zeros((len(obstacles), 2))
     for index, obstacle in enumerate(obstacles):
-        moves = index < len(tracks)
-        for state in tracks[index] if moves else [obstacle.initial_state]:
-            at = state.time_step - first if moves else slice(None)
-            states[at, index], valid[at, index] = _state(state, boxes[index][1]), True
-    kinds = np.array(
-        [TYPES.get(obstacle.obstacle_type.value, OTHER) for obstacle in obstacles]
-    )
-    started = [
-        _started(problem.initial_state, states, valid=valid, first=first)
-        for problem in problems
-    ]
-    seconds = np.arange(count) * scenario.dt
-    states, valid = resample_uniform(states, valid, ts=seconds)
+        size[index], middle = _box(obstacle.obstacle_shape)
+        if index < len(tracks):
+            for state in tracks[index]:
+                states[state.time_step - first, index] = _state(state, middle)
+                valid[state.time_step - first, index] = True
+        else:
+            states[:, index] = _state(obstacle.initial_state, middle)
+            valid[:, index] = True
+    kinds = [obstacle.obstacle_type.value for obstacle in obstacles]
+    started = []
+    for problem in problems:
+        start = problem.initial_state
+        frame = start.time_step - first
+        if 0 <= frame < len(states):
+            offset = states[frame, :, :2] - start.position[:2]
+            distance = np.where(valid[frame], np.linalg.norm(offset, axis=-1), np.inf)
+            if distance.min() < NEAR:
+                started.append(int(distance.argmin()))
+    seconds = np.arange(shape[0]) * scenario.dt
+    states, valid, _ = resample_uniform(states, valid, seconds)
     lanes, drivable = _map(scenario.lanelet_network)
-    steps_at = first + latest_frames(seconds, len(states))
+    steps_of_grid = first + latest_frames(seconds, len(states))
     recording = Recording(
         scene_id=name,
         location=f"{scenario.scenario_id.country_id}_{scenario.scenario_id.map_name}",
         dataset="commonroad",
         states=states,
         valid=valid,
-        size=np.array([size for size, _ in boxes]),
-        agent_type=kinds,
+        size=size,
+        agent_type=np.array([TYPES.get(kind, OTHER) for kind in kinds]),
         ego=-1,
         lanes=lanes,
         drivable=drivable,
-        lights=_lights(scenario.lanelet_network, lanes, steps=steps_at),
+        lights=_lights(scenario.lanelet_network, lanes, steps=steps_of_grid),
         current=None,
     )
-    return recording, [track for track in started if track is not None]
+    return recording, started
 
 
 def _states(obstacle: Any) -> list:
@@ -220,26 +206,27 @@ def _states(obstacle: Any) -> list:
     trajectory = getattr(obstacle.prediction, "trajectory", None)
     if obstacle.prediction is not None and trajectory is None:
         raise InputError(
-            f"obstacle {obstacle.obstacle_id} has occupancy sets, no trajectory; leave it out"
+            f"obstacle {obstacle.obstacle_id} has occupancy sets, no trajectory; "
+            "leave it out"
         )
     return [obstacle.initial_state, *(trajectory.state_list if trajectory else ())]
 
 
-def _state(state: Any, offset: np.ndarray) -> list[float]:
-    """x, y of the box's middle, heading and speed; raises InputError where they are
+def _state(state: Any, middle: np.ndarray) -> list[float]:
+    """x, y of the box's middle, heading and speed; middle [2] m: seen from its origin. Raises InputError where they are
     intervals."""
     if state.is_uncertain_position or state.is_uncertain_orientation:
         raise InputError(
-            f"a state at time step {state.time_step} is uncertain; give exact positions and orientations"
+            f"a state at time step {state.time_step} is uncertain; "
+            "give exact positions and orientations"
         )
     cos = np.cos(state.orientation)
     sin = np.sin(state.orientation)
-    x, y = state.position[:2] + np.array([[cos, -sin], [sin, cos]]) @ offset
-    given = vars(
-        state
-    )  # of some kinds of state velocity_y is a second component, of others only derived
-    along = given.get("velocity") or 0.0
-    speed = np.copysign(np.hypot(along, given.get("velocity_y") or 0.0), along)
+    x, y = state.position[:2] + np.array([[cos, -sin], [sin, cos]]) @ middle
+    # velocity_y is a second component in some kinds of state, and derived in others
+    parts = vars(state)
+    along = parts.get("velocity") or 0.0
+    speed = np.copysign(np.hypot(along, parts.get("velocity_y") or 0.0), along)
     return [x, y, state.orientation, float(speed)]
 
 
@@ -247,47 +234,26 @@ def _box(shape: Any) -> tuple[np.ndarray, np.ndarray]:
     """Length and width [2] of the box around a shape, and its middle [2] seen from the
     shape's origin."""
     pose = SimpleNamespace(position=np.zeros(2), orientation=0.0, hitch=0.0)
-    left, low, right, high = shape.compute_occupancy_for_state(
-        pose
-    ).shapely_object.bounds
-    return np.array([right - left, high - low]), np.array(
-        [(left + right) / 2, (low + high) / 2]
-    )
+    bounds = np.array(shape.compute_occupancy_for_state(pose).shapely_object.bounds)
+    return bounds[2:] - bounds[:2], (bounds[:2] + bounds[2:]) / 2
 
 
-def _started(
-    begin: Any, states: np.ndarray, valid: np.ndarray, first: int
-) -> int | None:
-    """The track nearest to a planning problem's initial state, None where none is
-    within NEAR."""
-    frame = begin.time_step - first
-    if not 0 <= frame < len(states):
-        return None
-    away = np.linalg.norm(states[frame, :, :2] - begin.position[:2], axis=-1)
-    away[~valid[frame]] = np.inf
-    return int(away.argmin()) if away.min() < NEAR else None
-
-
-def _ego(
-    states: np.ndarray, present: np.ndarray, there: np.ndarray, begun: list[int]
-) -> int:
+def _ego(recording: Recording, start: int, *, span: slice, started: list[int]) -> int:
     """Returns the ego's track in a window; -1 where no vehicle is there at its start.
 
-    One of `begun`, else the vehicle that moves for the most frames, of several the one
-    that drives farthest.
-
-    Args:
-        states: [F, A, 4] of the simulated steps; of the whole log, where it makes one
-            scene.
-        present: [F, A] bool, the vehicles that are there.
-        there: [A] bool, those at the start frame.
-        begun: tracks that begin where a planning problem does.
+    One of `started`, tracks that begin where a planning problem does, else the vehicle
+    that moves for the most frames of `span`, of several the one that drives farthest.
     """
-    chosen = [track for track in begun if there[track]]
-    if chosen or not there.any():
-        return chosen[0] if chosen else -1
-    speed = np.abs(states[..., 3]) * present
-    return int(np.lexsort((speed.sum(0), (speed > MOVES).sum(0) * there, there))[-1])
+    vehicles = recording.valid & (recording.agent_type == VEHICLE)
+    present = vehicles[min(start, len(vehicles) - 1)]
+    for track in started:
+        if present[track]:
+            return track
+    if not present.any():
+        return -1
+    speed = np.abs(recording.states[span, :, 3]) * vehicles[span]
+    moves = (speed > MOVES).sum(0) * present
+    return int(np.lexsort((speed.sum(0), moves, present))[-1])
 
 
 def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
@@ -296,18 +262,12 @@ def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
     drivable = []
     for lanelet in network.lanelets:
         kinds = FOR_OTHERS & {kind.value for kind in lanelet.lanelet_type or ()}
-        users = {
-            user.value
-            for user in (
-                *(lanelet.user_one_way or ()),
-                *(lanelet.user_bidirectional or ()),
-            )
-        }
+        users = [*(lanelet.user_one_way or ()), *(lanelet.user_bidirectional or ())]
         left = lanelet.left_vertices[:, :2]
         right = lanelet.right_vertices[:, :2]
         if kinds <= PAVED:
             drivable.append(np.concatenate([left, right[::-1]]))
-        if kinds or (users and not users & CARS):
+        if kinds or (users and CARS.isdisjoint(user.value for user in users)):
             continue
         lanes[str(lanelet.lanelet_id)] = Lane(
             points=lanelet.center_vertices[:, :2],
@@ -322,21 +282,13 @@ def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
 
 def _speed_limit(network: Any, lanelet: Any) -> float:
     """The lowest limit [m/s] of a lanelet's traffic signs, 0 for none."""
-    signs = (
-        network.find_traffic_sign_by_id(sign) for sign in lanelet.traffic_signs or ()
-    )
-    elements = (
-        element
-        for sign in signs
-        if sign is not None
-        for element in sign.traffic_sign_elements
-    )
-    limits = [
-        float(element.additional_values[0])
-        for element in elements
-        if element.traffic_sign_element_id.name == "MAX_SPEED"
-        and element.additional_values
-    ]
+    limits = []
+    for sign_id in lanelet.traffic_signs or ():
+        sign = network.find_traffic_sign_by_id(sign_id)
+        for element in sign.traffic_sign_elements if sign is not None else ():
+            values = element.additional_values
+            if element.traffic_sign_element_id.name == "MAX_SPEED" and values:
+                limits.append(float(values[0]))
     return min(limits, default=0.0)
 
 
@@ -348,20 +300,14 @@ def _lights(
     left out, since each may be for another direction."""
     lights: dict[str, np.ndarray] = {}
     for lanelet in network.lanelets:
-        light = (
-            network.find_traffic_light_by_id(*lanelet.traffic_lights)
-            if len(lanelet.traffic_lights) == 1
-            else None
-        )
+        if len(lanelet.traffic_lights) != 1:
+            continue
+        light = network.find_traffic_light_by_id(*lanelet.traffic_lights)
         if light is None or not light.active or light.traffic_light_cycle is None:
             continue
-        cycle = [
-            light_colour(light.get_state_at_time_step(int(step)).value)
-            for step in steps
-        ]
+        colours = [light.get_state_at_time_step(int(step)).value for step in steps]
+        states = np.array([light_colour(colour) for colour in colours], np.int8)
         lights |= {
-            str(lane): np.array(cycle, np.int8)
-            for lane in lanelet.successor
-            if str(lane) in lanes
+            lane: states for lane in map(str, lanelet.successor) if lane in lanes
         }
     return lights

@@ -6,36 +6,35 @@ stands or faster than it can be steered.
 """
 
 import numpy as np
-from scipy.ndimage import convolve1d, maximum_filter1d, median_filter
-
-from e2rl.scenes.paths import wrap
-from e2rl.scenes.recording import DT, HIDDEN, PEDESTRIAN
-
-MAX_STEP = 5.0  # m from one frame to the next; more is a jump
-HALF = 3  # frames before and after over which the direction of motion is taken
-STRAIGHT = (
-    0.8  # of the path driven in this time: the least displacement that has a direction
+from scipy.ndimage import (
+    convolve1d,
+    maximum_filter1d,
+    median_filter,
+    minimum_filter1d,
 )
-MOVES, BACKWARDS = 0.5, 5.0  # m/s: has a direction; up to which a vehicle may reverse
+
+from e2rl.scenes.paths import direction, wrap
+from e2rl.scenes.recording import DT, HIDDEN, PEDESTRIAN
+from e2rl.scenes.runs import last_valid, runs_of
+from e2rl.scenes.smoothing import MAX_STEP
+
+HALF = 3  # frames before and after over which the direction of motion is taken
+STRAIGHT = 0.8  # of the path driven then: the least displacement with a direction
+MOVES = 0.5  # m/s, above which motion has a direction
+BACKWARDS = 5.0  # m/s up to which a vehicle may reverse
 AGAINST = 0.5  # cosine between heading and motion, beyond which they agree or disagree
 # In rad of turning from one frame to the next. Of a slow vehicle at least a fifth of
 # the headings must point forwards for all to be turned forwards, (1 - SLOW / TURNED) /
 # 2; with fewer it reverses, and these few are wrong.
 FAST_COST = 1.0  # of a frame of fast motion backwards
-SLOW_COST, SLOW = (
-    0.02,
-    1.0,
-)  # of a frame of slow motion backwards; of all of a track at most
-TURNED_COST, TURNED = (
-    0.1,
-    1.67,
-)  # of a frame that is turned round; of all of a track at most
-CONVENTION = 3  # tracks turned as a whole, and more than half of those that are fast, are no fault of single tracks
+SLOW_COST = 0.02  # of a frame of slow motion backwards
+SLOW = 1.0  # of all such frames of a track, at most
+TURNED_COST = 0.1  # of a frame that is turned round
+TURNED = 1.67  # of all such frames of a track, at most
+CONVENTION = 3  # so many fast tracks turned as a whole, and most, are the log's own way
 SPIKES = ((7, 0.35), (21, 1.0))  # frames of a median filter, rad from it
-WINDOW, STANDS = (
-    11,
-    0.15,
-)  # frames; m/s of the line through their positions, below which a vehicle stands
+WINDOW = 11  # frames through whose positions a line is laid
+STANDS = 0.15  # m/s of that line, below which a vehicle stands
 APART = 1.0  # m between two frames at which a vehicle stands at two places
 NEIGHBOURS = 5  # moving frames beside a stop that say its heading
 LOST = 10  # frames without the track, beyond which such neighbours say nothing
@@ -58,14 +57,13 @@ def mend_headings(
         agent_type: their types [A].
     """
     states = np.where(valid[..., None], states, 0.0)
-    rides = agent_type != PEDESTRIAN
-    turned = _turned_round(states, valid & rides)
+    rides = valid & (agent_type != PEDESTRIAN)
+    turned = _turned_round(states, rides)
     states[..., 2] = np.where(turned, wrap(states[..., 2] + np.pi), states[..., 2])
     states[..., 3] = np.where(turned, -states[..., 3], states[..., 3])
-    spiked = _interpolate_spikes(states, valid & rides)
     counts = {
         "headings turned round": int(turned.any(0).sum()),
-        "heading spikes": spiked,
+        "heading spikes": _interpolate_spikes(states, rides),
     }
     return states, {phrase: count for phrase, count in counts.items() if count}
 
@@ -87,19 +85,14 @@ def hold_headings(
     """
     out = states.copy()
     count = 0
-    standing = standing_frames(states[..., :2], valid) & (agent_type != PEDESTRIAN)
-    for agent in np.flatnonzero(standing.any(0)):
+    stands = standing_frames(states[..., :2], valid) & (agent_type != PEDESTRIAN)
+    for agent in np.flatnonzero(stands.any(0)):
         frames = np.flatnonzero(valid[:, agent])
-        heading = np.unwrap(states[frames, agent, 2])
-        held = _held(
-            frames,
-            heading,
-            standing=standing[frames, agent],
-            position=states[frames, agent, :2],
-        )
-        out[frames, agent, 2] = np.where(
-            standing[frames, agent], wrap(held), states[frames, agent, 2]
-        )
+        standing = stands[frames, agent]
+        track = states[frames, agent]
+        heading = np.unwrap(track[:, 2])
+        held = _held(frames, heading, standing=standing, position=track[:, :2])
+        out[frames, agent, 2] = np.where(standing, wrap(held), track[:, 2])
         count += bool((np.abs(held - heading) > HELD).any())
     return out, count
 
@@ -109,25 +102,18 @@ def standing_frames(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
     all that there are on end, the line through their positions has a slope of at most
     STANDS."""
     standing = np.zeros(valid.shape, bool)
-    edge = np.diff(np.pad(valid.T, ((0, 0), (1, 1))).astype(np.int8))
-    agent, start = np.nonzero(edge == 1)
-    length = np.nonzero(edge == -1)[1] - start
+    runs = runs_of(valid)
     for frames in range(2, WINDOW):
-        runs = length == frames
-        at = start[runs] + np.arange(frames)[:, None]
-        velocity = np.einsum("k,krc->rc", _slope(frames), position[at, agent[runs]])
-        standing[at, agent[runs]] = np.linalg.norm(velocity, axis=-1) < STANDS
+        short = runs.end - runs.start == frames
+        agent = runs.agent[short]
+        frame = runs.start[short] + np.arange(frames)[:, None]
+        velocity = np.einsum("k,krc->rc", _slope(frames), position[frame, agent])
+        standing[frame, agent] = np.linalg.norm(velocity, axis=-1) < STANDS
     if len(valid) >= WINDOW:
-        origin = (
-            np.where(valid, position[..., 0], np.inf).min(0),
-            np.where(valid, position[..., 1], np.inf).min(0),
-        )
-        place = np.where(valid[..., None], position - np.stack(origin, -1), 0.0)
+        origin = np.where(valid[..., None], position, np.inf).min(0)
+        place = np.where(valid[..., None], position - origin, 0.0)
         velocity = convolve1d(place, _slope(WINDOW)[::-1], axis=0, mode="constant")
-        whole = (
-            convolve1d(valid.astype(int), np.ones(WINDOW, int), axis=0, mode="constant")
-            == WINDOW
-        )
+        whole = minimum_filter1d(valid, WINDOW, axis=0, mode="constant")
         slow = whole & (np.linalg.norm(velocity, axis=-1) < STANDS)
         standing |= maximum_filter1d(slow, WINDOW, axis=0, mode="constant")
     return standing
@@ -140,26 +126,29 @@ def _slope(frames: int) -> np.ndarray:
 
 
 def _held(
-    frames: np.ndarray, heading: np.ndarray, standing: np.ndarray, position: np.ndarray
+    frames: np.ndarray,
+    heading: np.ndarray,
+    *,
+    standing: np.ndarray,
+    position: np.ndarray,
 ) -> np.ndarray:
     """The headings [K] of a track at its valid frames [K], held where it stands [K];
     heading [K]: without wraps."""
     held = heading.copy()
-    away = np.linalg.norm(np.diff(position, axis=0), axis=-1) > APART
-    edges = np.flatnonzero(np.diff(standing) | away) + 1
+    jump = np.linalg.norm(np.diff(position, axis=0), axis=-1) > APART
+    edges = np.flatnonzero(np.diff(standing) | jump) + 1
     for part in np.split(np.arange(len(frames)), edges):
         if not standing[part[0]]:
             continue
-        first = part[0]
-        last = part[-1]
-        before = slice(max(first - NEIGHBOURS, 0), first)
-        after = slice(last + 1, last + 1 + NEIGHBOURS)
-        sides = [
-            np.median(heading[side][~standing[side]])
-            for side, edge in ((before, first), (after, last))
-            if (~standing[side] & (np.abs(frames[side] - frames[edge]) <= LOST)).any()
-        ]
-        ends = sides or [_agreed(heading[part])]
+        ends = []
+        for edge, side in (
+            (part[0], slice(max(part[0] - NEIGHBOURS, 0), part[0])),
+            (part[-1], slice(part[-1] + 1, part[-1] + 1 + NEIGHBOURS)),
+        ):
+            moves = ~standing[side]
+            if (moves & (np.abs(frames[side] - frames[edge]) <= LOST)).any():
+                ends.append(np.median(heading[side][moves]))
+        ends = ends or [_agreed(heading[part])]
         held[part] = np.linspace(ends[0], ends[-1], len(part))
     return held
 
@@ -168,40 +157,28 @@ def _agreed(heading: np.ndarray) -> float:
     """The median of the headings [K] within CLUSTER of the one, the earliest, that most
     are near to."""
     ordered = np.sort(heading)
-    near = np.searchsorted(ordered, heading + CLUSTER, side="right") - np.searchsorted(
-        ordered, heading - CLUSTER
-    )
-    return float(
-        np.median(heading[np.abs(heading - heading[near.argmax()]) <= CLUSTER])
-    )
+    below = np.searchsorted(ordered, heading - CLUSTER)
+    near = np.searchsorted(ordered, heading + CLUSTER, side="right") - below
+    cluster = np.abs(heading - heading[near.argmax()]) <= CLUSTER
+    return float(np.median(heading[cluster]))
 
 
 def _motion(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Mean velocities [F, A, 2] m/s over HALF frames to both sides, 0 where these have
     no one direction; the recorded ones of a frame that stands alone."""
     step = np.diff(states[..., :2], axis=0)
-    length = np.linalg.norm(step, axis=-1)
-    known = valid[1:] & valid[:-1] & (length <= MAX_STEP)
-    columns = np.concatenate(
-        [
-            np.where(known[..., None], step, 0.0),
-            np.where(known, length, 0.0)[..., None],
-        ],
-        -1,
-    )
-    columns = np.concatenate([columns, known[..., None]], -1)
+    length = np.linalg.norm(step, axis=-1)[..., None]
+    recorded = (valid[1:] & valid[:-1])[..., None] & (length <= MAX_STEP)
+    columns = np.where(recorded, np.concatenate([step, length, recorded], -1), 0.0)
     total = np.concatenate([np.zeros_like(columns[:1]), np.cumsum(columns, axis=0)])
     frame = np.arange(len(valid))
-    moved = (
-        total[np.minimum(frame + HALF, len(valid) - 1)]
-        - total[np.maximum(frame - HALF, 0)]
-    )
-    straight = np.linalg.norm(moved[..., :2], axis=-1) >= STRAIGHT * moved[..., 2]
-    mean = moved[..., :2] * straight[..., None] / np.maximum(moved[..., 3:] * DT, DT)
-    recorded = states[..., 3:] * np.stack(
-        [np.cos(states[..., 2]), np.sin(states[..., 2])], -1
-    )
-    return np.where(moved[..., 3:] > 0, mean, recorded)
+    before = np.maximum(frame - HALF, 0)
+    moved = total[np.minimum(frame + HALF, len(valid) - 1)] - total[before]
+    path, count = np.split(moved[..., 2:], 2, axis=-1)
+    displacement = np.linalg.norm(moved[..., :2], axis=-1)[..., None]
+    straight = displacement >= STRAIGHT * path
+    mean = moved[..., :2] * straight / np.maximum(count * DT, DT)
+    return np.where(count > 0, mean, states[..., 3:] * direction(states[..., 2]))
 
 
 def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -211,26 +188,20 @@ def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     heading = states[..., 2]
     velocity = _motion(states, valid)
     speed = np.linalg.norm(velocity, axis=-1)
-    along = (
-        velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
-    ) / np.maximum(speed, 1e-9)
-    moves = valid & (speed > MOVES)
+    cosine = (velocity * direction(heading)).sum(-1) / np.maximum(speed, 1e-9)
+    backwards = cosine < -AGAINST
     fast = valid & (speed > BACKWARDS)
+    slow = valid & (speed > MOVES) & ~fast
     flips = np.abs(wrap(np.diff(heading, axis=0))) > np.pi / 2
-    odd = (flips & valid[1:] & valid[:-1]).any(0) | (fast & (along < -AGAINST)).any(0)
-    odd |= _flips_in_a_gap(heading, valid)
-    turned = np.zeros(valid.shape, bool)
-    agents = np.flatnonzero(odd)
-    slow = moves & ~fast
-    cost = fast * FAST_COST + slow * np.minimum(
-        SLOW_COST, SLOW / np.maximum(slow.sum(0), 1)
-    )
+    odd = (flips & valid[1:] & valid[:-1]).any(0) | (fast & backwards).any(0)
+    agents = np.flatnonzero(odd | _flips_in_a_gap(heading, valid))
+    slow_cost = np.minimum(SLOW_COST, SLOW / np.maximum(slow.sum(0), 1))
+    cost = fast * FAST_COST + slow * slow_cost
     turning = np.minimum(TURNED_COST, TURNED / np.maximum(valid.sum(0), 1))
-    backwards = np.stack(
-        [cost * (along < -AGAINST), cost * (along > AGAINST) + turning], -1
-    )
+    costs = np.stack([cost * backwards, cost * (cosine > AGAINST) + turning], -1)
+    turned = np.zeros(valid.shape, bool)
     turned[:, agents] = _least_cost(
-        heading[:, agents], valid[:, agents], own=backwards[:, agents]
+        heading[:, agents], valid[:, agents], costs[:, agents]
     )
     drives = fast.any(0)
     whole = drives & ((turned & fast).sum(0) > 0.5 * fast.sum(0))
@@ -241,14 +212,14 @@ def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 def _flips_in_a_gap(heading: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Whether a track [F, A] comes back from a gap turned by more than pi / 2 [A]."""
-    last = np.maximum.accumulate(
-        np.where(valid, np.arange(len(valid))[:, None], -1), axis=0
-    )[:-1]
+    last = last_valid(valid)[1:-1]
     turn = heading[1:] - heading[np.maximum(last, 0), np.arange(valid.shape[1])]
     return (valid[1:] & (last >= 0) & (np.abs(wrap(turn)) > np.pi / 2)).any(0)
 
 
-def _least_cost(heading: np.ndarray, valid: np.ndarray, own: np.ndarray) -> np.ndarray:
+def _least_cost(
+    heading: np.ndarray, valid: np.ndarray, costs: np.ndarray
+) -> np.ndarray:
     """Whether to turn each heading [F, A] round, at the least sum of turning from frame
     to frame [rad] and of the costs [F, A, 2] of the recorded heading and the turned one
     (Viterbi's algorithm). Turning in a gap costs less."""
@@ -260,16 +231,12 @@ def _least_cost(heading: np.ndarray, valid: np.ndarray, own: np.ndarray) -> np.n
     for frame in range(frames):
         here = valid[frame]
         turn = np.abs(wrap(heading[frame] - heading[np.maximum(last, 0), column]))
-        weight = np.where(
-            last >= 0, 1 / (1 + DT * np.maximum(frame - last - 1, 0)), 0.0
-        )
-        change = np.stack(
-            [turn * weight, (np.pi - turn) * weight], -1
-        )  # [A, 2]: keeps its side, or turns
-        other = total[:, ::-1] + change[:, 1:]
-        same = total + change[:, :1]
+        gap = 1 / (1 + DT * np.maximum(frame - last - 1, 0))
+        weight = np.where(last >= 0, gap, 0.0)
+        same = total + (turn * weight)[:, None]
+        other = total[:, ::-1] + ((np.pi - turn) * weight)[:, None]
         source[frame] = np.where(here[:, None] & (other < same), [1, 0], [0, 1])
-        total = np.where(here[:, None], np.minimum(same, other) + own[frame], total)
+        total = np.where(here[:, None], np.minimum(same, other) + costs[frame], total)
         last = np.where(here, frame, last)
     chosen = np.zeros((frames, agents), bool)
     side = total.argmin(1)
@@ -293,9 +260,8 @@ def _interpolate_spikes(states: np.ndarray, valid: np.ndarray) -> int:
         runs = np.split(heading, np.flatnonzero(np.diff(frames) > HIDDEN + 1) + 1)
         spike = np.concatenate([_spikes(run) for run in runs]) & moving[frames, agent]
         if spike.any() and not spike.all():
-            states[frames[spike], agent, 2] = wrap(
-                np.interp(frames[spike], frames[~spike], heading[~spike])
-            )
+            sound = np.interp(frames[spike], frames[~spike], heading[~spike])
+            states[frames[spike], agent, 2] = wrap(sound)
             count += 1
     return count
 
@@ -306,7 +272,6 @@ def _spikes(heading: np.ndarray) -> np.ndarray:
     spike = np.zeros(len(heading), bool)
     for window, height in SPIKES:
         if len(heading) >= window:
-            spike |= (
-                np.abs(heading - median_filter(heading, window, mode="mirror")) > height
-            )
+            median = median_filter(heading, window, mode="mirror")
+            spike |= np.abs(heading - median) > height
     return spike

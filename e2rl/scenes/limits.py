@@ -17,26 +17,21 @@ from e2rl.scenes.paths import arc_length, resample, tangent_angle, wrap
 from e2rl.scenes.recording import VEHICLE, Lane, Recording
 
 HIGHEST = 45.0  # m/s, 162 km/h: no road's limit is higher
-HIGH, UNUSUAL = 22.0, 36.0  # m/s: 79 and 130 km/h
+HIGH = 22.0  # m/s, 79 km/h
+UNUSUAL = 36.0  # m/s, 130 km/h
 ALIKE = 0.5  # m/s between limits that are one
 USED = 0.6  # of a limit, driven by the fastest vehicle, above which it may be one
-GRIP, SHARP = (
-    9.81,
-    3 * 9.81,
-)  # m/s^2 in a bend: the most that tyres hold, and what no road is built for
+GRIP = 9.81  # m/s^2 in a bend: the most that tyres hold
+SHARP = 3 * GRIP  # what no road is built for
 # Parts of the limited lanes, by length, that are such bends: at 100 km/h on nuScenes'
 # connectors 0.34 to 0.58 and 0.28 to 0.55, at 137 km/h on all lanes of a town 0.15 to
 # 0.38 and 0.13 to 0.34.
 GRIP_PART = 0.2
 SHARP_PART = 0.05
-BEND, SHORT = (
-    20,
-    5,
-)  # m over which a bend is measured, of a shorter lane all of it; lanes that have none
-MOVES, FAST = (
-    1.0,
-    95,
-)  # m/s, and the percentile of the speeds above it that is the fastest without glitches
+BEND = 20  # m over which a bend is measured, of a shorter lane all of it
+SHORT = 5  # m of lanes that have none
+MOVES = 1.0  # m/s
+FAST = 95  # percentile of the speeds above it that is the fastest without glitches
 
 
 def known_limits(recording: Recording) -> tuple[dict[str, Lane], Counter[str]]:
@@ -67,29 +62,23 @@ def known_limits(recording: Recording) -> tuple[dict[str, Lane], Counter[str]]:
 def _is_placeholder(recording: Recording, limits: dict[str, float]) -> bool:
     """Whether the limits [m/s] of lanes by name, which are all that a map has, are one
     that stands for none."""
-    if (
-        not limits
-        or min(limits.values()) < HIGH
-        or max(limits.values()) - min(limits.values()) > ALIKE
-    ):
+    if not limits:
         return False
     limit = min(limits.values())
-    speed = np.abs(
-        recording.states[recording.valid & (recording.agent_type == VEHICLE), 3]
-    )
+    if limit < HIGH or max(limits.values()) - limit > ALIKE:
+        return False
+    driven = recording.valid & (recording.agent_type == VEHICLE)
+    speed = np.abs(recording.states[driven, 3])
     moving = speed[speed > MOVES]
     fastest = np.percentile(moving, FAST) if len(moving) else 0.0
-    curvature, metres = map(
-        np.concatenate,
-        zip(*(_bends(recording.lanes[name]) for name in limits), strict=True),
-    )
-    lateral = limit**2 * curvature
+    bends = [_bends(recording.lanes[name]) for name in limits]
+    lateral = limit**2 * np.concatenate([curvature for curvature, _ in bends])
+    metres = np.concatenate([metres for _, metres in bends])
     whole = max(metres.sum(), 1e-6)
     if metres[lateral > SHARP].sum() > SHARP_PART * whole:
         return fastest < limit
-    return fastest < USED * limit and (
-        limit > UNUSUAL or metres[lateral > GRIP].sum() > GRIP_PART * whole
-    )
+    bent = metres[lateral > GRIP].sum() > GRIP_PART * whole
+    return fastest < USED * limit and (limit > UNUSUAL or bent)
 
 
 def _bends(lane: Lane) -> tuple[np.ndarray, np.ndarray]:
@@ -99,11 +88,8 @@ def _bends(lane: Lane) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros(0)
     angle = tangent_angle(resample(lane.points, 1.0))
     window = min(BEND, len(angle) - 1)
-    curvature = (
-        np.abs(wrap(angle[window:] - angle[:-window])) / window
-        if window >= SHORT
-        else np.zeros(1)
-    )
-    return curvature, np.full(
-        len(curvature), arc_length(lane.points)[-1] / len(curvature)
-    )
+    curvature = np.zeros(1)
+    if window >= SHORT:
+        curvature = np.abs(wrap(angle[window:] - angle[:-window])) / window
+    metres = arc_length(lane.points)[-1] / len(curvature)
+    return curvature, np.full(len(curvature), metres)

@@ -13,56 +13,56 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from e2rl.scenes.paths import resample, tangent_angle, wrap
 from e2rl.scenes.recording import Lane
 
-JOIN_GAP, JOIN_ANGLE, JOIN_HEIGHT = (
-    1.5,
-    0.6,
-    2.0,
-)  # where connectivity is inferred: m, rad, m
-LINK_GAP, LINK_ANGLE = 5.0, 1.0  # m along the lane, rad: of a link that is recorded
+JOIN_GAP = 1.5  # m between ends where a link is inferred
+JOIN_ANGLE = 0.6  # rad there
+JOIN_HEIGHT = 2.0  # m there
+LINK_GAP = 5.0  # m along the lane of a link that is recorded
+LINK_ANGLE = 1.0  # rad there
 END = 2.0  # m over which the direction of a lane's end is measured
 SAMPLES = 9  # points of a lane where its neighbours are looked for
-LEVEL_WITH, PARALLEL = (
-    1.5,
-    0.6,
-)  # m along, rad: a point of a neighbour is beside a point of the lane
-BESIDE, SPARE = (
-    0.5,
-    2.0,
-)  # m: distance of lanes that do not overlap, and what may lie between neighbours' borders
-ABSENT, ITSELF, UNDRIVABLE, INFERRED, NOT_ADJACENT = (
-    "links to lanes that are not in the map left out",
-    "links of lanes to themselves left out",
-    "links that cannot be driven left out",
-    "missing links inferred from geometry",
-    "neighbours that are not the adjacent lane replaced or left out",
-)  # phrases of `repairs`
+LEVEL_WITH = 1.5  # m along: a point of a neighbour is beside a point of the lane
+PARALLEL = 0.6  # rad between both there
+BESIDE = 0.5  # m between lanes that do not overlap
+SPARE = 2.0  # m that may lie between the borders of neighbours
+WIDTHS = (2.5, 6.0)  # m that a recorded width may be
+WIDTH = 3.7  # m of other lanes
+# phrases of `repairs`
+ABSENT = "links to lanes that are not in the map left out"
+ITSELF = "links of lanes to themselves left out"
+UNDRIVABLE = "links that cannot be driven left out"
+INFERRED = "missing links inferred from geometry"
+NOT_ADJACENT = "neighbours that are not the adjacent lane replaced or left out"
 
 
 def plausible_width(width: float) -> float:
-    """A recorded lane width, or 3.7 m where it is outside 2.5-6 m: half of Waymo's
-    connectors have 0, some 90 m."""
-    return float(width) if 2.5 <= width <= 6.0 else 3.7
+    """A recorded lane width, or WIDTH where it is none: half of Waymo's connectors have
+    0, some 90 m."""
+    return float(width) if WIDTHS[0] <= width <= WIDTHS[1] else WIDTH
 
 
 class Ends(NamedTuple):
     """Where lanes [N] begin and end.
 
-    first, last [N, 2] m; into, out [N] rad: directions there, over END m; low, high [N]
-    m: heights there, NaN unknown; width [N] m.
+    first, last [N, 2] m; into, out [N] rad: directions there, over END m; start, end
+    [N] rad: directions of the first and last metre; low, high [N] m: heights there, NaN
+    unknown; width [N] m.
     """
 
-    first: np.ndarray
-    last: np.ndarray
-    into: np.ndarray
-    out: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    width: np.ndarray
+    first: ndarray
+    last: ndarray
+    into: ndarray
+    out: ndarray
+    start: ndarray
+    end: ndarray
+    low: ndarray
+    high: ndarray
+    width: ndarray
 
 
 def ends_of(lanes: Iterable[Lane]) -> Ends:
@@ -71,23 +71,26 @@ def ends_of(lanes: Iterable[Lane]) -> Ends:
     for lane in lanes:
         line = resample(lane.points, 1.0)
         near = min(int(END), len(line) - 1)
-        begin = line[near] - line[0]
-        end = line[-1] - line[-1 - near]
-        low, high = (
-            (np.nan, np.nan)
-            if lane.heights is None
-            else (lane.heights[0], lane.heights[-1])
-        )
-        into = np.arctan2(begin[1], begin[0])
-        out = np.arctan2(end[1], end[0])
+        chords = np.array([line[near] - line[0], line[-1] - line[-1 - near]])
+        angle = tangent_angle(line)
+        heights = [np.nan] if lane.heights is None else lane.heights
         rows.append(
-            [*line[0], *line[-1], into, out, low, high, plausible_width(lane.width)]
+            [
+                *line[0],
+                *line[-1],
+                *np.arctan2(chords[:, 1], chords[:, 0]),
+                angle[0],
+                angle[-1],
+                heights[0],
+                heights[-1],
+                plausible_width(lane.width),
+            ]
         )
-    table = np.array(rows, float).reshape(-1, 9)
-    return Ends(table[:, :2], table[:, 2:4], *table[:, 4:].T)
+    columns = np.array(rows, float).reshape(-1, 11).T
+    return Ends(columns[:2].T, columns[2:4].T, *columns[4:])
 
 
-def drivable(ends: Ends, lane: np.ndarray, other: np.ndarray) -> np.ndarray:
+def drivable(ends: Ends, lane: ndarray, other: ndarray) -> ndarray:
     """Whether a vehicle can drive from the end of lanes [Q] into others [Q], both
     indices.
 
@@ -98,55 +101,18 @@ def drivable(ends: Ends, lane: np.ndarray, other: np.ndarray) -> np.ndarray:
     x, y = (ends.first[other] - ends.last[lane]).T
     cos = np.cos(ends.out[lane])
     sin = np.sin(ends.out[lane])
-    along = x * cos + y * sin
-    across = y * cos - x * sin
+    along = np.abs(x * cos + y * sin)
+    across = np.abs(y * cos - x * sin)
     half = np.minimum(ends.width[lane], ends.width[other]) / 2
     turn = np.abs(wrap(ends.into[other] - ends.out[lane]))
-    return (
-        (np.abs(along) <= LINK_GAP)
-        & (np.abs(across) < half)
-        & (turn < LINK_ANGLE)
-        & _level(ends, lane, other=other)
-    )
+    near = (along <= LINK_GAP) & (across < half)
+    return near & (turn < LINK_ANGLE) & _level(ends, lane, other)
 
 
-def _level(ends: Ends, lane: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _level(ends: Ends, lane: ndarray | int, other: ndarray) -> ndarray:
     """Whether lanes [Q] end at the height at which others [Q] begin, as far as that is
     known."""
     return ~(np.abs(ends.low[other] - ends.high[lane]) >= JOIN_HEIGHT)
-
-
-def infer_exits(
-    lanes: dict[str, Lane], names: Iterable[str] | None = None
-) -> dict[str, list[str]]:
-    """Returns the successors by geometry of the lanes `names`, by default of all.
-
-    A lane follows where another ends, in nearly the same direction and, where heights
-    are known, on the same level. Lanes that begin together do not follow each other,
-    however short they are.
-    """
-    if not lanes:
-        return {}
-    ids = list(lanes)
-    ends = ends_of(lanes.values())
-    into, out = (
-        np.array(
-            [tangent_angle(resample(lane.points, 1.0))[at] for lane in lanes.values()]
-        )
-        for at in (0, -1)
-    )
-    tree = cKDTree(ends.first)
-    number = {name: index for index, name in enumerate(ids)}
-    exits = {}
-    for name in ids if names is None else names:
-        lane = number[name]
-        other = np.array(tree.query_ball_point(ends.last[lane], JOIN_GAP), int)
-        gap = np.linalg.norm(ends.first[other] - ends.last[lane], axis=1)
-        follows = (other != lane) & (np.abs(wrap(into[other] - out[lane])) < JOIN_ANGLE)
-        follows &= gap <= np.linalg.norm(ends.first[other] - ends.first[lane], axis=1)
-        follows &= _level(ends, np.full_like(other, lane), other=other)
-        exits[name] = [ids[index] for index in other[follows]]
-    return exits
 
 
 def drivable_exits(lanes: dict[str, Lane]) -> tuple[dict[str, list[str]], Counter[str]]:
@@ -154,36 +120,55 @@ def drivable_exits(lanes: dict[str, Lane]) -> tuple[dict[str, list[str]], Counte
     inferred beside them.
 
     A lane without a recorded successor that can be driven has those that geometry
-    shows.
+    shows: a lane follows where another ends, in nearly the same direction and, where
+    heights are known, on the same level. Lanes that begin together do not follow each
+    other, however short they are.
     """
     repairs: Counter[str] = Counter()
-    number = {name: index for index, name in enumerate(lanes)}
-    recorded = [
+    exits: dict[str, list[str]] = {name: [] for name in lanes}
+    if not lanes:
+        return exits, repairs
+    ids = list(lanes)
+    number = {name: index for index, name in enumerate(ids)}
+    links = [
         (name, other)
         for name, lane in lanes.items()
         for other in dict.fromkeys(lane.exits)
     ]
-    repairs[ITSELF] = sum(name == other for name, other in recorded)
-    known = [
+    repairs[ITSELF] = sum(name == other for name, other in links)
+    repairs[ABSENT] = sum(other not in number for _, other in links)
+    pairs = [
         (number[name], number[other])
-        for name, other in recorded
+        for name, other in links
         if other in number and other != name
     ]
-    repairs[ABSENT] = len(recorded) - len(known) - repairs[ITSELF]
-    lane, other = np.array(known, int).reshape(-1, 2).T
-    kept = drivable(ends_of(lanes.values()), lane, other=other)
-    repairs[UNDRIVABLE] = int((~kept).sum())
-    ids = list(lanes)
-    exits: dict[str, list[str]] = {name: [] for name in lanes}
-    for first, second in zip(lane[kept], other[kept], strict=True):
+    lane, other = np.array(pairs, int).reshape(-1, 2).T
+    ends = ends_of(lanes.values())
+    fits = drivable(ends, lane, other)
+    repairs[UNDRIVABLE] = int((~fits).sum())
+    for first, second in zip(lane[fits], other[fits], strict=True):
         exits[ids[first]].append(ids[second])
-    inferred = infer_exits(lanes, [name for name, nexts in exits.items() if not nexts])
-    repairs[INFERRED] = sum(map(len, inferred.values()))
-    return exits | inferred, +repairs
+    tree = cKDTree(ends.first)
+    for name, nexts in exits.items():
+        if not nexts:
+            nexts += [ids[index] for index in _followers(ends, tree, number[name])]
+            repairs[INFERRED] += len(nexts)
+    return exits, +repairs
+
+
+def _followers(ends: Ends, tree: cKDTree, lane: int) -> ndarray:
+    """Indices of the lanes that follow one by geometry; tree: of their beginnings."""
+    last = ends.last[lane]
+    other = np.array(tree.query_ball_point(last, JOIN_GAP), int)
+    gap = np.linalg.norm(ends.first[other] - last, axis=1)
+    turn = np.abs(wrap(ends.start[other] - ends.end[lane]))
+    apart = np.linalg.norm(ends.first[other] - ends.first[lane], axis=1)
+    follows = (other != lane) & (turn < JOIN_ANGLE) & (gap <= apart)
+    return other[follows & _level(ends, lane, other)]
 
 
 def adjacent(
-    lanes: dict[str, Lane], lines: dict[str, np.ndarray]
+    lanes: dict[str, Lane], lines: dict[str, ndarray]
 ) -> tuple[dict[str, Lane], Counter[str]]:
     """Returns lanes with at most one neighbour on each side, and how often that is not
     the first one recorded.
@@ -196,16 +181,7 @@ def adjacent(
     angle = {name: tangent_angle(line) for name, line in lines.items()}
 
     def lateral(name: str, other: str) -> float:
-        distance = _lateral(
-            lines[name], angle[name], other=lines[other], other_angle=angle[other]
-        )
-        if np.isnan(
-            distance
-        ):  # the other may be short, between two places that were compared
-            distance = -_lateral(
-                lines[other], angle[other], other=lines[name], other_angle=angle[name]
-            )
-        return distance
+        return _lateral(lines[name], angle[name], lines[other], angle[other])
 
     def nearest(name: str, recorded: list[str], side: int) -> list[str]:
         others = [
@@ -215,22 +191,22 @@ def adjacent(
         ]
         if not others:
             return []
-        away = np.array([side * lateral(name, other) for other in others])
-        room = [
-            (plausible_width(lanes[name].width) + plausible_width(lanes[other].width))
-            / 2
-            for other in others
-        ]
-        near = (away > -BESIDE) & (away < np.array(room) + SPARE)
-        apart = near & (away > BESIDE)
-        least = away[apart].min(initial=np.inf)
-        chosen = np.flatnonzero(
-            (apart & (away < least + BESIDE)) if apart.any() else near
-        )[:1]
-        repairs[NOT_ADJACENT] += chosen.tolist() != [0]
+        width = plausible_width(lanes[name].width)
+        room = [(width + plausible_width(lanes[other].width)) / 2 for other in others]
+        offset = np.array([lateral(name, other) for other in others])
+        # the other may be short, between two places that were compared
+        for row in np.flatnonzero(np.isnan(offset)):
+            offset[row] = -lateral(others[row], name)
+        offset *= side
+        near = (offset > -BESIDE) & (offset < np.array(room) + SPARE)
+        apart = near & (offset > BESIDE)
+        if apart.any():
+            near = apart & (offset < offset[apart].min() + BESIDE)
+        chosen = np.flatnonzero(near)[:1].tolist()
+        repairs[NOT_ADJACENT] += chosen != [0]
         return [others[index] for index in chosen]
 
-    kept = {
+    neighboured = {
         name: replace(
             lane,
             left=nearest(name, lane.left, side=1),
@@ -238,21 +214,20 @@ def adjacent(
         )
         for name, lane in lanes.items()
     }
-    return kept, +repairs
+    return neighboured, +repairs
 
 
 def _lateral(
-    line: np.ndarray, angle: np.ndarray, other: np.ndarray, other_angle: np.ndarray
+    line: ndarray, angle: ndarray, other: ndarray, other_angle: ndarray
 ) -> float:
     """Median distance [m], left positive, of a line [Q, 2] beside a line [P, 2] with
     points every 1 m; NaN where it runs nowhere beside it in the same direction."""
     rows = np.linspace(0, len(line) - 1, SAMPLES).round().astype(int)
     point = line[rows] @ [1, 1j]
-    direction = np.exp(1j * angle[rows])
-    offset = (other @ [1, 1j] - point[:, None]) * direction.conj()[:, None]
+    unit = np.exp(1j * angle[rows])
+    offset = (other @ [1, 1j] - point[:, None]) * unit.conj()[:, None]
     nearest = np.abs(offset).argmin(1)
     offset = offset[np.arange(len(rows)), nearest]
-    beside = (np.abs(offset.real) < LEVEL_WITH) & (
-        np.abs(wrap(other_angle[nearest] - angle[rows])) < PARALLEL
-    )
+    parallel = np.abs(wrap(other_angle[nearest] - angle[rows])) < PARALLEL
+    beside = (np.abs(offset.real) < LEVEL_WITH) & parallel
     return float(np.median(offset.imag[beside])) if beside.any() else np.nan

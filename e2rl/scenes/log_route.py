@@ -4,7 +4,7 @@ changes, car parks)."""
 import numpy as np
 
 from e2rl.scenes.lane_graph import LaneGraph, Route, smooth_vertices
-from e2rl.scenes.paths import arc_length, points_at, tangent_angle
+from e2rl.scenes.paths import arc_length, direction, points_at, tangent_angle
 from e2rl.scenes.route import BEHIND, SPACING
 
 MARGIN = 10.0  # m after the recording that stay usable where no lane goes on
@@ -21,29 +21,33 @@ def route_from_log(graph: LaneGraph, track: np.ndarray, vertices: int) -> Route:
     lanes are those of the nearest lane at each vertex.
     """
     arc = arc_length(track[:, :2])
-    kept = track[np.unique(np.floor(arc / STRIDE), return_index=True)[1]]
-    direction = np.array([np.cos(track[0, 2]), np.sin(track[0, 2])])
-    line = np.concatenate(
-        [track[:1, :2] - BEHIND * direction, kept[:, :2], track[-1:, :2]]
-    )
-    known = arc_length(line)[-1] + MARGIN
-    onward = graph.candidates(track[-1, :2], track[-1, 2], track[-1, 3], 1, vertices)
+    steps = track[np.unique(np.floor(arc / STRIDE), return_index=True)[1]]
+    before = track[:1, :2] - BEHIND * direction(track[:1, 2])
+    line = np.concatenate([before, steps[:, :2], track[-1:, :2]])
+    length = arc_length(line)[-1] + MARGIN
+    onward = graph.candidates(track[-1], 1, vertices=vertices)
     if onward:
         ahead = int(np.ceil((onward[0].vehicle_s + JOIN) / SPACING))
-        used = onward[0].points[
-            ahead : max(int(onward[0].length / SPACING) + 1, ahead + 1)
-        ]
-        line = np.concatenate([line, used])
-        known = max(known, arc_length(line)[-1])
+        end = max(int(onward[0].length / SPACING) + 1, ahead + 1)
+        line = np.concatenate([line, onward[0].points[ahead:end]])
+        length = max(length, arc_length(line)[-1])
     line = np.concatenate([line, line[-1:] + vertices * SPACING * _end_direction(line)])
     at = np.arange(vertices) * SPACING
     points = smooth_vertices(points_at(line, arc_length(line), at=at))
-    lanes, limit = _lanes_along(graph, points, length=known)
+    lanes: dict[str, float] = {}
+    limit = np.zeros(len(points), np.float32)
+    for index, (point, angle) in enumerate(
+        zip(points, tangent_angle(points), strict=True)
+    ):
+        near = graph.near_lanes(point, angle) if at[index] <= length else []
+        if near:
+            limit[index] = graph.lanes[near[0][0]].speed_limit
+            lanes.setdefault(near[0][0], float(at[index]))
     return Route(
-        points,
-        min(known, at[-1]),
-        open=bool(known < at[-1]),
-        lanes=lanes,
+        points=points,
+        length=min(length, at[-1]),
+        open=bool(length < at[-1]),
+        lanes=list(lanes.items()),
         limit=limit,
         vehicle_s=BEHIND,
     )
@@ -54,20 +58,3 @@ def _end_direction(line: np.ndarray) -> np.ndarray:
     arc = arc_length(line)
     back = line[-1] - line[np.searchsorted(arc, arc[-1] - 1.0, side="right") - 1]
     return back / np.linalg.norm(back)
-
-
-def _lanes_along(
-    graph: LaneGraph, points: np.ndarray, length: float
-) -> tuple[list[tuple[str, float]], np.ndarray]:
-    """Lanes (id, arc length at which they begin) under the first `length` m of route
-    vertices [P, 2], and the speed limit [P] there."""
-    lanes: dict[str, float] = {}
-    limit = np.zeros(len(points), np.float32)
-    for index, (point, angle) in enumerate(
-        zip(points, tangent_angle(points), strict=True)
-    ):
-        near = graph.near_lanes(point, angle)
-        if near and index * SPACING <= length:
-            limit[index] = graph.lanes[near[0][0]].speed_limit
-            lanes.setdefault(near[0][0], index * SPACING)
-    return list(lanes.items()), limit

@@ -1,5 +1,6 @@
 """Polylines over their arc length, and angles."""
 
+from collections.abc import Iterable, Sized
 from typing import TypeVar
 
 import numpy as np
@@ -7,14 +8,28 @@ from torch import Tensor
 
 Angle = TypeVar("Angle", float, np.ndarray, Tensor)
 
-WHEELBASE = (
-    0.6  # of the body's length; the axles lie 0.3 lengths before and behind its centre
-)
+WHEELBASE = 0.6  # of the body's length, around its centre
 
 
 def wrap(angle: Angle) -> Angle:
     """Angles [rad] in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def direction(angle: np.ndarray) -> np.ndarray:
+    """Unit vectors [..., 2] of angles [...] rad."""
+    return np.stack([np.cos(angle), np.sin(angle)], -1)
+
+
+def stacked(lines: Iterable[np.ndarray]) -> np.ndarray:
+    """Points [P, 2] of polylines, one after another."""
+    return np.concatenate([np.zeros((0, 2)), *lines])
+
+
+def part_of(parts: Iterable[Sized]) -> np.ndarray:
+    """Index [P] of the part that each item belongs to, of parts one after another."""
+    counts = [len(part) for part in parts]
+    return np.repeat(np.arange(len(counts)), counts)
 
 
 def arc_length(points: np.ndarray) -> np.ndarray:

@@ -8,8 +8,10 @@ nuScenes, 239 bundled ones) stay far inside: their range stands beside each limi
 """
 
 from math import inf, isnan, pi
+from typing import NamedTuple
 
 import numpy as np
+from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from e2rl.run.errors import InputError
@@ -18,16 +20,19 @@ from e2rl.scenes.paths import arc_length, wrap
 from e2rl.scenes.recording import DT, FEW_FRAMES, VEHICLE, Recording
 
 FRAMES = 5  # between the two poses of a displacement: half a second
-MOVED, DRIVES = 1.0, 2.0  # m, m/s: a vehicle that moves
-DRIVEN, BACKWARDS = (
-    15.0,
-    5.0,
-)  # m that a vehicle drives before it is looked at alone; m/s up to which it may reverse
+MOVED = 1.0  # m of a displacement of a vehicle that moves
+DRIVES = 2.0  # m/s of one
+DRIVEN = 15.0  # m that a vehicle drives before it is looked at alone
+BACKWARDS = 5.0  # m/s up to which it may reverse
 ENOUGH = 20  # displacements that a median needs
 CROWD = 100_000  # pairs of vehicles at one place at one moment, of which all are one
 TWIN = 0.5  # m between the centres of vehicles that are one
-LANE_RADIUS, LANE_ANGLE, LANES = 3.0, 0.6, 8  # m, rad, neighbours: a vehicle on a lane
-PARALLEL, BESIDE = 0.2, (1.5, 20.0)  # rad, m: lanes side by side
+LANE_RADIUS = 3.0  # m from a lane of a vehicle on it
+LANE_ANGLE = 0.6  # rad from its direction
+LANES = 8  # points of lanes that are looked at
+PARALLEL = 0.2  # rad between lanes side by side
+BESIDE = (1.5, 20.0)  # m between them
+LEVEL_WITH = 1.0  # m along from a point of a lane to the point beside it
 VERGE = 2.0  # m that may lie between the borders of lanes that adjoin
 SAMPLES = 300  # lane points at most whose neighbours are looked at
 
@@ -180,31 +185,27 @@ def check(measures: dict[str, float], scene_id: str) -> None:
     """InputError for the first measure outside of its limits; NaN, of what a log is too
     short to tell, passes."""
     for name, value in measures.items():
-        low, high, what, mend = LIMITS[name]
+        low, high, meaning, mend = LIMITS[name]
         if name == "states" and value < low:
             raise InputError(f"scene {scene_id[:100]!r}: {FEW_FRAMES}")
         if not isnan(value) and not low <= value <= high:
             bound = f"at least {low:g}" if value < low else f"at most {high:g}"
             raise InputError(
-                f"scene {scene_id[:100]!r}: {value:.3g} {what}, plausible is {bound}; {mend}"
+                f"scene {scene_id[:100]!r}: {value:.3g} {meaning}, plausible is {bound}; "
+                f"{mend}"
             )
 
 
 def extent(recording: Recording) -> dict[str, float]:
     """Sizes of a validated recording."""
     valid = recording.valid
-    points = recording.states[..., :2][recording.valid]
+    points = recording.states[..., :2][valid]
     path = recording.states[valid[:, recording.ego], recording.ego, :2]
     ego = np.median(path, axis=0) if len(path) else np.full(2, np.nan)
-    rings = [lane.points for lane in recording.lanes.values()] + [
-        ring[:, :2] for ring in recording.drivable
-    ]
-    ground = np.concatenate([ring for ring in rings if len(ring)])
-    lengths = [
-        arc_length(lane.points)[-1]
-        for lane in recording.lanes.values()
-        if len(lane.points) > 1
-    ]
+    lines = [lane.points for lane in recording.lanes.values()]
+    rings = [ring[:, :2] for ring in recording.drivable]
+    ground = np.concatenate([line for line in lines + rings if len(line)])
+    lengths = [arc_length(line)[-1] for line in lines if len(line) > 1]
     size = recording.size[valid.any(0)]
     return {
         "states": valid.size,
@@ -214,57 +215,55 @@ def extent(recording: Recording) -> dict[str, float]:
         "map_reach": np.linalg.norm(ground - ego, axis=-1).max(),
         "lane": max(lengths, default=0.0),
         "lanes": sum(lengths),
-        "borders": sum(
-            arc_length(ring[:, :2])[-1] for ring in recording.drivable if len(ring)
-        ),
+        "borders": sum(arc_length(ring)[-1] for ring in rings if len(ring)),
         "links": links(recording),
-        **_extremes(size[:, 0], "length"),
-        **_extremes(size[:, 1], "width"),
+        "length": _extreme(size[:, 0], "length"),
+        "width": _extreme(size[:, 1], "width"),
     }
 
 
 def links(recording: Recording) -> int:
     """The most lanes that begin at one place, or are named to follow one: of so many,
     all pairs would be looked at."""
-    starts = np.array(
-        [lane.points[0] for lane in recording.lanes.values() if len(lane.points)]
-    )
-    together = (
-        cKDTree(starts).query_ball_point(starts, TWIN, return_length=True)
-        if len(starts)
-        else [0]
-    )
-    return max(
-        int(np.max(together)), *(len(lane.exits) for lane in recording.lanes.values())
-    )
+    lanes = recording.lanes.values()
+    most = max(len(lane.exits) for lane in lanes)
+    starts = np.array([lane.points[0] for lane in lanes if len(lane.points)])
+    if not len(starts):
+        return most
+    together = cKDTree(starts).query_ball_point(starts, TWIN, return_length=True)
+    return max(most, int(np.max(together)))
 
 
-def _extremes(sizes: np.ndarray, name: str) -> dict[str, float]:
+def _extreme(sizes: ndarray, name: str) -> float:
     """The size that is nearer to a limit."""
-    low, high, *_ = LIMITS[name]
-    return {name: float(sizes.min() if sizes.min() < low else sizes.max())}
+    return float(sizes.min() if sizes.min() < LIMITS[name][0] else sizes.max())
 
 
-def displacements(
-    recording: Recording,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """All displacements [K, 2] m, overlapping ones included, of vehicles that are
-    recorded for FRAMES frames on end and drive; the pose [K, 3] in its middle, the mean
-    recorded speed [K] m/s without its sign, and the track [K] whose it is."""
+class Displacements(NamedTuple):
+    """Displacements [K, 2] m over FRAMES frames; the pose [K, 3] in their middle, the
+    mean recorded speed [K] m/s without its sign, and the track [K] whose they are."""
+
+    moved: ndarray
+    pose: ndarray
+    speed: ndarray
+    track: ndarray
+
+
+def displacements(recording: Recording) -> Displacements:
+    """All displacements, overlapping ones included, of vehicles that are recorded for
+    FRAMES frames on end and drive."""
     states = recording.states
-    valid = recording.valid
-    count = len(states) - FRAMES
-    if count < 1:
-        return np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int)
-    known = np.logical_and.reduce([valid[k : count + k] for k in range(FRAMES + 1)])
-    speed = np.mean(
-        [np.abs(states[k : count + k, :, 3]) for k in range(FRAMES + 1)], axis=0
-    )
-    moved = states[FRAMES:, :, :2] - states[:count, :, :2]
+    count = max(len(states) - FRAMES, 0)
+    spans = [slice(first, first + count) for first in range(FRAMES + 1)]
+    recorded = np.logical_and.reduce([recording.valid[span] for span in spans])
+    speed = np.mean([np.abs(states[span, :, 3]) for span in spans], axis=0)
+    moved = states[spans[-1], :, :2] - states[spans[0], :, :2]
     drives = (np.linalg.norm(moved, axis=-1) > MOVED) | (speed > DRIVES)
-    chosen = known & drives & (recording.agent_type == VEHICLE)
-    middle = states[FRAMES // 2 :][:count]
-    return moved[chosen], middle[chosen][:, :3], speed[chosen], chosen.nonzero()[1]
+    chosen = recorded & drives & (recording.agent_type == VEHICLE)
+    pose = states[spans[FRAMES // 2], :, :3]
+    return Displacements(
+        moved[chosen], pose[chosen], speed[chosen], track=chosen.nonzero()[1]
+    )
 
 
 def motion(recording: Recording) -> dict[str, float]:
@@ -276,14 +275,12 @@ def motion(recording: Recording) -> dict[str, float]:
     ratio = (speed * FRAMES * DT + 0.05) / (distance + 0.05)
     far = distance > MOVED
     turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
-    turned = np.where(
-        distance < BACKWARDS * FRAMES * DT, np.minimum(turned, pi - turned), turned
-    )  # it may reverse
+    slow = distance < BACKWARDS * FRAMES * DT  # it may reverse
+    turned = np.where(slow, np.minimum(turned, pi - turned), turned)
     single = recording.valid.any(0) & (recording.agent_type == VEHICLE)
     single[[*recording.coupled, *recording.towed]] = False
-    length, width = (
-        np.median(recording.size[single], axis=0) if single.any() else (np.nan, np.nan)
-    )
+    size = recording.size[single]
+    length, width = np.median(size, axis=0) if len(size) else (np.nan, np.nan)
     return {
         "vehicle_length": float(length),
         "vehicle_width": float(width),
@@ -297,36 +294,31 @@ def motion(recording: Recording) -> dict[str, float]:
     }
 
 
-def _together(recording: Recording, tracks: np.ndarray) -> float:
+def _together(recording: Recording, tracks: ndarray) -> float:
     """The longest time [s] that two of these tracks [K] are at one place."""
     place = recording.states[::FRAMES, tracks, :2]
     valid = recording.valid[::FRAMES, tracks]
     pairs = [np.zeros((0, 2), int)]
-    for known, points in zip(valid, place, strict=True):
-        there = np.flatnonzero(known)
-        if len(there) > 1:
-            tree = cKDTree(points[there])
-            if tree.count_neighbors(tree, TWIN) > CROWD + len(there):
+    for recorded, points in zip(valid, place, strict=True):
+        index = np.flatnonzero(recorded)
+        if len(index) > 1:
+            tree = cKDTree(points[index])
+            if tree.count_neighbors(tree, TWIN) > CROWD + len(index):
                 return inf
-            pairs.append(there[tree.query_pairs(TWIN, output_type="ndarray")])
-    _, count = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
+            pairs.append(index[tree.query_pairs(TWIN, output_type="ndarray")])
+    count = np.unique(np.concatenate(pairs), axis=0, return_counts=True)[1]
     return float(count.max(initial=0) * FRAMES * DT)
 
 
 def _worst(
-    distance: np.ndarray, turned: np.ndarray, ratio: np.ndarray, track: np.ndarray
+    distance: ndarray, turned: ndarray, *, ratio: ndarray, track: ndarray
 ) -> dict[str, float]:
     """The largest deviations of one vehicle, of those that drive DRIVEN m: of its
     heading and of its speeds."""
-    drives = (
-        np.bincount(track, distance) / FRAMES > DRIVEN
-        if len(track)
-        else np.zeros(0, bool)
-    )
-    turn, factor, moved = (
-        _medians(values, track) for values in (turned, np.abs(np.log(ratio)), distance)
-    )
-    fast = moved > BACKWARDS * FRAMES * DT
+    drives = np.bincount(track, distance) / FRAMES > DRIVEN
+    turn = _medians(turned, track)
+    factor = _medians(np.abs(np.log(ratio)), track)
+    fast = _medians(distance, track) > BACKWARDS * FRAMES * DT
     return {
         "track_direction": _largest(turn[drives & fast]),
         "slow_direction": _largest(turn[drives & ~fast]),
@@ -334,35 +326,31 @@ def _worst(
     }
 
 
-def _largest(values: np.ndarray) -> float:
+def _largest(values: ndarray) -> float:
     return float(values.max()) if len(values) else np.nan
 
 
-def _medians(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _medians(values: ndarray, group: ndarray) -> ndarray:
     """The (lower) median of the values [K] of each group 0 .. G-1, of group [K]; NaN
     for a group without any."""
-    order = np.lexsort((values, group))
     count = np.bincount(group)
+    medians = np.full(len(count), np.nan)
     middle = np.cumsum(count) - count + (count - 1) // 2
-    return (
-        np.where(count > 0, values[order][np.where(count > 0, middle, 0)], np.nan)
-        if len(group)
-        else np.zeros(0)
-    )
+    ordered = values[np.lexsort((values, group))]
+    medians[count > 0] = ordered[middle[count > 0]]
+    return medians
 
 
 def map_fit(recording: Recording, graph: LaneGraph) -> dict[str, float]:
     """Whether the vehicles drive where the lanes are, and the lanes lie as far apart as
     lanes do."""
     ego = recording.states[recording.valid[:, recording.ego], recording.ego, :2]
-    moved, pose, *_ = displacements(recording)
-    pose = pose[np.linalg.norm(moved, axis=-1) > MOVED]
-    _, near = graph.tree.query(pose[:, :2], k=LANES, distance_upper_bound=LANE_RADIUS)
-    found = near < len(graph.points)
-    aligned = (
-        np.abs(wrap(graph.heading[np.where(found, near, 0)] - pose[:, 2:])) < LANE_ANGLE
-    )
-    on = (found & aligned).any(-1)
+    driven = displacements(recording)
+    pose = driven.pose[np.linalg.norm(driven.moved, axis=-1) > MOVED]
+    near = graph.tree.query(pose[:, :2], k=LANES, distance_upper_bound=LANE_RADIUS)[1]
+    exists = near < len(graph.points)
+    turn = graph.heading[np.where(exists, near, 0)] - pose[:, 2:]
+    on = (exists & (np.abs(wrap(turn)) < LANE_ANGLE)).any(-1)
     return {
         "lane_distance": float(np.median(graph.tree.query(ego)[0])),
         "on_lanes": float(on.mean()) if len(on) >= ENOUGH else np.nan,
@@ -380,38 +368,31 @@ def lane_spacing(graph: LaneGraph) -> float:
     """
     chosen = np.unique(np.linspace(0, len(graph.points) - 1, SAMPLES).astype(int))
     place = graph.points @ [1, 1j]
-    direction = np.exp(1j * graph.heading)
-    width = np.array(
-        [lane.width if lane.width > 0 else np.nan for lane in graph.lanes.values()]
-    )
-    nearest = np.full(len(chosen), inf)
-    named = graph.named_beside
-    for row, point in enumerate(
-        chosen
-    ):  # one by one: a map may have all its points at one place
-        other = np.array(
-            graph.tree.query_ball_point(graph.points[point], BESIDE[1]), dtype=int
-        )
-        turn = direction[point].conj()
-        away = (place[other] - place[point]) * turn
-        along = (direction[other] * turn).real
-        across = np.abs(away.imag)
-        beside = (
-            (np.abs(along) > np.cos(PARALLEL))
-            & (np.abs(away.real) < 1.0)
-            & (across > BESIDE[0])
-        )
+    unit = np.exp(1j * graph.heading)
+    width = np.array([lane.width for lane in graph.lanes.values()])
+    width = np.where(width > 0, width, np.nan)
+    nearest = []
+    for point in chosen:  # one by one: a map may have all its points at one place
+        other = graph.tree.query_ball_point(graph.points[point], BESIDE[1])
+        turn = unit[point].conj()
+        offset = (place[other] - place[point]) * turn
+        cosine = (unit[other] * turn).real
+        across = np.abs(offset.imag)
+        beside = (np.abs(cosine) > np.cos(PARALLEL)) & (across > BESIDE[0])
+        beside &= np.abs(offset.real) < LEVEL_WITH
+        across = across[beside]
         lane = graph.lane_of[point]
-        neighbour = graph.lane_of[other[beside]]
-        room = (width[lane] + width[neighbour]) / 2
-        adjoin = _adjoin(across[beside], room, same=along[beside] > 0)
-        beside_it = named.get(graph.ids[lane], ())
-        adjoin |= np.array([graph.ids[index] in beside_it for index in neighbour], bool)
-        nearest[row] = across[beside][adjoin].min(initial=inf)
-    return _median(nearest[nearest < inf])
+        others = graph.lane_of[other][beside]
+        room = (width[lane] + width[others]) / 2
+        adjoin = _adjoin(across, room, same=cosine[beside] > 0)
+        named = graph.named_beside.get(graph.ids[lane], ())
+        adjoin |= np.array([graph.ids[index] in named for index in others], bool)
+        if adjoin.any():
+            nearest.append(across[adjoin].min())
+    return _median(np.array(nearest))
 
 
-def _adjoin(apart: np.ndarray, room: np.ndarray, same: np.ndarray) -> np.ndarray:
+def _adjoin(apart: ndarray, room: ndarray, same: ndarray) -> ndarray:
     """Whether parallel lanes [Q] `apart` m from each other share a border.
 
     Their recorded widths say so, which make them `room` m apart. Where these are
@@ -422,5 +403,5 @@ def _adjoin(apart: np.ndarray, room: np.ndarray, same: np.ndarray) -> np.ndarray
     return np.where(np.isnan(room), unknown, apart < room + VERGE)
 
 
-def _median(values: np.ndarray) -> float:
+def _median(values: ndarray) -> float:
     return float(np.median(values)) if len(values) >= ENOUGH else np.nan

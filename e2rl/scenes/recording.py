@@ -4,6 +4,7 @@ host, in numpy."""
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,19 +15,15 @@ VEHICLE, PEDESTRIAN, CYCLIST, OTHER = range(4)
 AGENT_TYPES = ("vehicle", "pedestrian", "cyclist", "other")
 AGENT_WORDS = ("a vehicle", "a pedestrian", "a cyclist", "an object")  # in sentences
 LIGHT_UNKNOWN, LIGHT_RED, LIGHT_YELLOW, LIGHT_GREEN = range(4)
-COLOURS = {  # by the words in the names of logs; of several, such as "red yellow", the first here
-    **dict.fromkeys(("RED", "REDYELLOW", "STOP"), LIGHT_RED),
-    **dict.fromkeys(("YELLOW", "AMBER", "CAUTION"), LIGHT_YELLOW),
-    **dict.fromkeys(("GREEN", "GO"), LIGHT_GREEN),
+COLOURS = {  # words in the names of logs; of several ("red yellow") the first here
+    LIGHT_RED: "RED REDYELLOW STOP",
+    LIGHT_YELLOW: "YELLOW AMBER CAUTION",
+    LIGHT_GREEN: "GREEN GO",
 }
-NO_SIGNAL = {
-    "FLASHING",
-    "BLINKING",
-    "OFF",
-    "INACTIVE",
-}  # words of lights that let nobody wait for another colour
+# of lights that let nobody wait for another colour
+NO_SIGNAL = {"FLASHING", "BLINKING", "OFF", "INACTIVE"}
 DT = 0.1  # s, the time step of every recording, scene and simulation
-HIDDEN = 5  # steps of absence, at most, of an agent that is merely out of sight; after more it appears anew
+HIDDEN = 5  # steps of absence of who is merely out of sight; after more it is new
 HISTORY = 10  # frames of history before a start frame that is chosen here
 MOVED_START = "start frames moved to where enough past and future are recorded"
 MAX_NAME = 128  # characters of the name of a scene, a place or a data set
@@ -61,16 +58,14 @@ def light_colour(name: object, otherwise: int = LIGHT_UNKNOWN) -> int:
     words = set(str(name).upper().replace("-", "_").replace(" ", "_").split("_"))
     if words & NO_SIGNAL:
         return LIGHT_UNKNOWN
-    return next((state for word, state in COLOURS.items() if word in words), otherwise)
+    for state, names in COLOURS.items():
+        if not words.isdisjoint(names.split()):
+            return state
+    return otherwise
 
 
 NUMBERS = "fiu"  # kinds of arrays
-ARRAYS = (  # fields of a Recording: name, kinds of numbers, columns, in words
-    ("states", "f", 4, "a float array [frames, agents, 4]"),
-    ("size", NUMBERS, 2, "an array [agents, 2] of lengths and widths"),
-    ("agent_type", "iu", 0, "an integer array [agents]"),
-)
-FIELDS: tuple[tuple[str, Any, str], ...] = (  # further ones: name, classes, in words
+FIELDS: tuple[tuple[str, Any, str], ...] = (  # name, classes, in words
     ("ego", int | np.integer, "the index of a track"),
     ("current", int | np.integer | None, "a frame, or None"),
     ("lanes", Mapping, "a dict of Lane objects"),
@@ -82,19 +77,27 @@ FIELDS: tuple[tuple[str, Any, str], ...] = (  # further ones: name, classes, in 
     ("towed", list | tuple, "a tuple of tracks"),
     ("coupled", list | tuple, "a tuple of tracks"),
 )
+Field = tuple[str, Any, bool, str]  # name, value, whether it fits, what is expected
+IDS = "a list of ids of lanes, which are texts"
 FEW_FRAMES = "fewer than two frames of different time stamps; leave it out"
 
 
-def same_way(lanes: Mapping[str, Lane], lane: Lane, neighbour: object) -> list[str]:
-    """Returns the id of a lane's neighbour, if it is one of `lanes` and no oncoming
-    one, which maps name as well."""
-    other = lanes.get(str(neighbour))
-    if other is None:
-        return []
-    same = (
-        np.dot(lane.points[-1] - lane.points[0], other.points[-1] - other.points[0]) > 0
-    )
-    return [str(neighbour)] if same else []
+def name_neighbours(
+    lanes: Mapping[str, Lane], beside: Mapping[str, tuple[object, object]]
+) -> None:
+    """Set the neighbours of lanes to those that a map names, left and right, if they
+    are lanes and no oncoming ones, which maps name as well."""
+
+    def same_way(lane: Lane, name: str) -> list[str]:
+        other = lanes.get(name)
+        if other is None:
+            return []
+        chord = lane.points[-1] - lane.points[0]
+        return [name] if chord @ (other.points[-1] - other.points[0]) > 0 else []
+
+    for name, (left, right) in beside.items():
+        lanes[name].left = same_way(lanes[name], str(left))
+        lanes[name].right = same_way(lanes[name], str(right))
 
 
 @dataclass
@@ -140,15 +143,15 @@ class Recording:
 
         Args:
             starts: those that are asked for, of which each must leave half of the steps
-                recorded; None: the log's own,
-                or, where it names none, as many as fit one after another (at least one).
+                recorded; None: the log's own, or, where it names none, as many as fit
+                one after another (at least one).
             steps: simulated steps of a scene.
         """
         frames = len(self.states)
         if starts:
             return [start for start in starts if start <= frames - steps // 2]
         if self.current is not None:
-            return [self._own_start(steps)]
+            return [self._own_start(self.current, last=frames - steps // 2)]
         return list(range(HISTORY, frames - steps, steps + HISTORY + 1)) or [HISTORY]
 
     def windows(
@@ -165,53 +168,48 @@ class Recording:
         """
         frames = self.start_frames(starts, steps)
         repairs = Counter(self.repairs)
-        repairs[MOVED_START] += (
-            not starts and self.current is not None and frames != [self.current]
-        )
+        if not starts and self.current is not None and frames != [self.current]:
+            repairs[MOVED_START] += 1
         for start in frames:
-            name = (
-                f"{self.scene_id}@{start}"
-                if starts or len(frames) > 1
-                else self.scene_id
+            marked = starts or len(frames) > 1
+            yield replace(
+                self,
+                current=start,
+                scene_id=f"{self.scene_id}@{start}" if marked else self.scene_id,
+                ego=self.egos.get(start, self.ego),
+                repairs=+repairs,
             )
-            ego = self.egos.get(start, self.ego)
-            yield replace(self, current=start, scene_id=name, ego=ego, repairs=+repairs)
 
-    def _own_start(self, steps: int) -> int:
-        """Returns the log's own start frame, or the first with enough past and future
-        where it has not.
-
-        Enough are HISTORY frames with the ego before it, and half of the steps after
-        it.
-        """
-        assert self.current is not None
-        last = len(self.states) - steps // 2
-        if HISTORY <= self.current <= last or not 0 <= self.ego < self.valid.shape[1]:
-            return self.current
+    def _own_start(self, current: int, last: int) -> int:
+        """Returns the log's own start frame, or where that has not enough past and
+        future, the first that has: HISTORY frames with the ego before it, and at most
+        `last`."""
+        if HISTORY <= current <= last or not self._is_track(self.ego):
+            return current
         absent = np.cumsum(~self.valid[:, self.ego])
         before = np.concatenate([np.zeros(HISTORY + 1, int), absent])[: len(absent)]
         enough = np.flatnonzero((absent == before)[: last + 1])
         enough = enough[enough >= HISTORY]
-        return int(enough[0]) if len(enough) else self.current
+        return int(enough[0]) if len(enough) else current
 
     def has_ego(self) -> bool:
         """Returns whether the ego is recorded at the start frame."""
-        return 0 <= self.ego < self.valid.shape[1] and bool(
-            self.valid[self.current, self.ego]
-        )
+        return self._is_track(self.ego) and bool(self.valid[self.current, self.ego])
+
+    def _is_track(self, value: Any) -> bool:
+        is_index = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        return is_index and 0 <= value < self.valid.shape[1]
 
     def validate_names(self) -> "Recording":
         """Returns self; raises InputError for a name that is no short text: files,
         tables and messages hold it."""
-        for what in ("scene_id", "location", "dataset"):
-            name = getattr(self, what)
-            if (
-                not isinstance(name, str)
-                or not name.isprintable()
-                or len(name) > MAX_NAME
-            ):
+        for field_name in ("scene_id", "location", "dataset"):
+            name = getattr(self, field_name)
+            text = isinstance(name, str) and name.isprintable()
+            if not text or len(name) > MAX_NAME:
                 raise InputError(
-                    f"its {what} {ascii(name)[:60]} is no line of {MAX_NAME} printable characters; rename it"
+                    f"its {field_name} {ascii(name)[:60]} is no line of {MAX_NAME} "
+                    "printable characters; rename it"
                 )
         if not self.scene_id:
             raise InputError("it has no id; give it one")
@@ -220,129 +218,86 @@ class Recording:
     def validate_fields(self) -> "Recording":
         """Returns self; raises InputError naming the scene and a field that is of
         another kind, type or shape."""
-        frames, agents = (
-            self.valid.shape
-            if isinstance(self.valid, np.ndarray) and self.valid.ndim == 2
-            else (-1, -1)
-        )
-        shape = f"{frames} frames, {agents} agents"
-        if agents < 0 or self.valid.dtype != bool:
-            raise self._wrong(
-                "valid", self.valid, expected="a bool array [frames, agents]"
-            )
-        for name, kinds, columns, text in ARRAYS:
-            value = getattr(self, name)
-            sizes = (
-                (frames, agents, columns)
-                if name == "states"
-                else (agents, columns)[: 1 + (columns > 0)]
-            )
-            if (
-                not isinstance(value, np.ndarray)
-                or value.dtype.kind not in kinds
-                or value.shape != sizes
-            ):
-                raise self._wrong(
-                    name, value, expected=f"{text}, as valid is of {shape}"
+        for name, value, fits, expected in chain(self._fields(), self._map_fields()):
+            if not fits:
+                array = isinstance(value, np.ndarray)
+                text = " ".join(ascii(value).split())[:40] if not array else ""
+                kind = (
+                    f"{value.dtype} {list(value.shape)}"
+                    if array
+                    else f"{type(value).__name__} {text}"
                 )
-        if not ((self.agent_type >= VEHICLE) & (self.agent_type <= OTHER)).all():
-            raise self._wrong(
-                "agent_type",
-                self.agent_type,
-                expected=f"numbers from {VEHICLE} to {OTHER}",
-            )
-        for name, types, text in FIELDS:
-            value = getattr(self, name)
-            if not isinstance(value, types) or isinstance(value, bool):
-                raise self._wrong(name, value, expected=text)
-        if self.heights is not None and not _are_numbers(
-            self.heights, (frames, agents)
-        ):
-            raise self._wrong(
-                "heights",
-                self.heights,
-                expected=f"numbers [frames, agents], as valid is of {shape}",
-            )
-        for name in ("towed", "coupled"):
-            if not all(_is_index(track, agents) for track in getattr(self, name)):
-                raise self._wrong(
-                    name,
-                    getattr(self, name),
-                    expected=f"a tuple of tracks from 0 to {agents - 1}",
+                raise InputError(
+                    f"scene {self.scene_id!r}: its {name} is {kind}; "
+                    f"expected {expected}"
                 )
-        self._validate_map(frames)
         return self
 
-    def _validate_map(self, frames: int) -> None:
-        """Raises InputError for lanes, polygons and lights that are of another kind,
-        type or length."""
+    def _fields(self) -> Iterator[Field]:
+        valid = self.valid
+        is_valid = isinstance(valid, np.ndarray) and valid.ndim == 2
+        is_valid = is_valid and valid.dtype == bool
+        yield "valid", valid, is_valid, "a bool array [frames, agents]"
+        frames, agents = valid.shape
+        shape = f"as valid is of {frames} frames, {agents} agents"
+        for name, kinds, sizes, text in (
+            ("states", "f", (frames, agents, 4), "a float array [frames, agents, 4]"),
+            (
+                "size",
+                NUMBERS,
+                (agents, 2),
+                "an array [agents, 2] of lengths and widths",
+            ),
+            ("agent_type", "iu", (agents,), "an integer array [agents]"),
+        ):
+            value = getattr(self, name)
+            yield name, value, _is_array(value, kinds, sizes), f"{text}, {shape}"
+        kinds_fit = (self.agent_type >= VEHICLE) & (self.agent_type <= OTHER)
+        numbers = f"numbers from {VEHICLE} to {OTHER}"
+        yield "agent_type", self.agent_type, bool(kinds_fit.all()), numbers
+        for name, types, text in FIELDS:
+            value = getattr(self, name)
+            is_type = isinstance(value, types) and not isinstance(value, bool)
+            yield name, value, is_type, text
+        if self.heights is not None:
+            fits = _is_array(self.heights, NUMBERS, (frames, agents))
+            yield "heights", self.heights, fits, f"numbers [frames, agents], {shape}"
+        for name in ("towed", "coupled"):
+            value = getattr(self, name)
+            tracks = f"a tuple of tracks from 0 to {agents - 1}"
+            yield name, value, all(map(self._is_track, value)), tracks
+
+    def _map_fields(self) -> Iterator[Field]:
         for name, lane in self.lanes.items():
-            if not isinstance(name, str) or not isinstance(lane, Lane):
-                raise self._wrong(
-                    "lanes", {name: lane}, expected="a Lane by a text each"
-                )
-            for part in ("points", "heights"):
-                value = getattr(lane, part)
-                if not isinstance(value, np.ndarray) and not (
-                    part == "heights" and value is None
-                ):
-                    raise self._wrong(
-                        f"lanes[{name!r}].{part}", value, expected="an array"
-                    )
-            if lane.heights is not None and not _are_numbers(
-                lane.heights, lane.points.shape[:1]
-            ):
-                count = len(lane.points) if lane.points.ndim else 0
-                raise self._wrong(
-                    f"lanes[{name!r}].heights",
-                    lane.heights,
-                    expected=f"{count} numbers, one of each point",
-                )
+            is_lane = isinstance(name, str) and isinstance(lane, Lane)
+            yield "lanes", {name: lane}, is_lane, "a Lane by a text each"
+            at = f"lanes[{name!r}]."
+            points = lane.points
+            yield f"{at}points", points, isinstance(points, np.ndarray), "an array"
+            heights = lane.heights
+            if heights is not None:
+                is_array = isinstance(heights, np.ndarray)
+                yield f"{at}heights", heights, is_array, "an array"
+                fits = _is_array(heights, NUMBERS, points.shape[:1])
+                count = len(points) if points.ndim else 0
+                numbers = f"{count} numbers, one of each point"
+                yield f"{at}heights", heights, fits, numbers
             for part in ("width", "speed_limit"):
-                if not isinstance(getattr(lane, part), int | float | np.number):
-                    raise self._wrong(
-                        f"lanes[{name!r}].{part}",
-                        getattr(lane, part),
-                        expected="a number",
-                    )
+                value = getattr(lane, part)
+                is_number = isinstance(value, int | float | np.number)
+                yield f"{at}{part}", value, is_number, "a number"
             for part in ("exits", "left", "right"):
                 value = getattr(lane, part)
-                if not isinstance(value, list | tuple) or not all(
-                    isinstance(other, str) for other in value
-                ):
-                    raise self._wrong(
-                        f"lanes[{name!r}].{part}",
-                        value,
-                        expected="a list of ids of lanes, which are texts",
-                    )
+                are_ids = isinstance(value, list | tuple)
+                are_ids = are_ids and all(isinstance(other, str) for other in value)
+                yield f"{at}{part}", value, are_ids, IDS
         for ring in self.drivable:
-            if not isinstance(ring, np.ndarray):
-                raise self._wrong(
-                    "drivable", ring, expected="a list of arrays [points, 2]"
-                )
+            is_array = isinstance(ring, np.ndarray)
+            yield "drivable", ring, is_array, "a list of arrays [points, 2]"
+        states = f"an integer array of {len(self.valid)} states, by the id of a lane"
         for name, light in self.lights.items():
-            known = (
-                isinstance(light, np.ndarray)
-                and light.dtype.kind in "iu"
-                and light.shape == (frames,)
-            )
-            if name not in self.lanes or not known:
-                raise self._wrong(
-                    f"lights[{name!r}]",
-                    light,
-                    expected=f"an integer array of {frames} states, by the id of a lane",
-                )
-
-    def _wrong(self, name: str, value: object, expected: str) -> InputError:
-        """Returns the error of a field that is not what is expected."""
-        kind = (
-            f"{value.dtype} {list(value.shape)}"
-            if isinstance(value, np.ndarray)
-            else f"{type(value).__name__} {' '.join(ascii(value).split())[:40]}"
-        )
-        return InputError(
-            f"scene {self.scene_id!r}: its {name} is {kind}; expected {expected}"
-        )
+            fits = _is_array(light, "iu", (len(self.valid),)) and name in self.lanes
+            yield f"lights[{name!r}]", light, fits, states
 
     def validate_log(self) -> "Recording":
         """Returns self; raises InputError naming the scene where tracks, ego or lanes
@@ -357,9 +312,9 @@ class Recording:
         frames = len(self.states)
         scene = f"scene {self.scene_id!r}"
         if self.current is None or not 1 <= self.current < frames - 1:
-            start = f"start frame {self.current}"
             raise InputError(
-                f"{scene}: {start} leaves no history or no future in {frames} frames"
+                f"{scene}: start frame {self.current} leaves no history or no future "
+                f"in {frames} frames"
             )
         if not self.valid[self.current, self.ego]:
             raise InputError(
@@ -380,34 +335,36 @@ class Recording:
         if not self.lanes:
             return "no lanes; routes need lane centrelines, so leave the scene out"
         if self.agent_type[self.ego] != VEHICLE:
-            kind = AGENT_TYPES[self.agent_type[self.ego]]
-            return f"the ego is a {kind}, expected a vehicle; name another track, or leave the scene out"
+            return (
+                f"the ego is a {AGENT_TYPES[self.agent_type[self.ego]]}, expected a "
+                "vehicle; name another track, or leave the scene out"
+            )
         for name, lane in self.lanes.items():
             if not _are_points(lane.points) or lane.points.shape[1] != 2:
-                return f"the centreline of lane {name} is not a list of finite points; repair the map or drop the lane"
-        if not all(_are_points(ring) for ring in self.drivable):
+                return (
+                    f"the centreline of lane {name} is not a list of finite points; "
+                    "repair the map or drop the lane"
+                )
+        if not all(map(_are_points, self.drivable)):
             return "a drivable polygon is not a list of finite points; repair the map"
-        bad = self.valid & ~np.isfinite(self.states).all(-1)
-        if bad.any():
-            frame, agent = np.argwhere(bad)[0]
-            return f"NaN or infinite state of agent {agent} at frame {frame}; mark it invalid or repair the log"
+        bad = np.argwhere(self.valid & ~np.isfinite(self.states).all(-1))
+        if len(bad):
+            return (
+                f"NaN or infinite state of agent {bad[0][1]} at frame {bad[0][0]}; "
+                "mark it invalid or repair the log"
+            )
         size = self.size[self.valid.any(0)]
         if not (np.isfinite(size).all() and (size > 0).all()):
             return "an agent's length or width is not positive; repair the log"
         return None
 
 
-def _are_numbers(values: np.ndarray, shape: tuple[int, ...]) -> bool:
-    """Returns whether an array is of numbers and of a shape."""
-    return values.dtype.kind in NUMBERS and values.shape == shape
-
-
-def _is_index(value: object, count: int) -> bool:
-    """Returns whether a value is one of 0 .. count - 1."""
+def _is_array(value: object, kinds: str, shape: tuple[int, ...]) -> bool:
+    """Returns whether a value is an array of kinds of numbers and of a shape."""
     return (
-        isinstance(value, int | np.integer)
-        and not isinstance(value, bool)
-        and 0 <= int(value) < count
+        isinstance(value, np.ndarray)
+        and value.dtype.kind in kinds
+        and value.shape == shape
     )
 
 

@@ -28,29 +28,22 @@ from e2rl.scenes.recording import (
     Recording,
     light_colour,
 )
-from e2rl.scenes.smoothing import (
-    latest_frames,
-    resample_heights,
-    resample_uniform,
-    signed_speed,
-)
+from e2rl.scenes.resampling import latest_frames, resample_uniform
+from e2rl.scenes.smoothing import signed_speed
 
 TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
 OBSTACLES = (
-    "UNSET",
-    "TRAFFIC_CONE",
-    "TRAFFIC_BARRIER",
-    "TRAFFIC_OBJECT",
-    "TRAFFIC_LIGHT",
-    "BUILDING",
-    "GROUND",
+    "UNSET TRAFFIC_CONE TRAFFIC_BARRIER TRAFFIC_OBJECT TRAFFIC_LIGHT BUILDING GROUND"
 )
-LIMIT_UNITS = {
+LIMIT_UNITS = {  # key: m/s
     "speed_limit_kmh": 1 / 3.6,
     "speed_limit_mps": 1.0,
     "speed_limit_mph": 0.44704,
-}  # key: m/s
-TYPES |= dict.fromkeys(OBSTACLES, TYPES["OTHER"])  # MetaDrive's further names of tracks
+}
+NO_SIZE = "missing sizes, for which the usual one of the type is taken"
+TYPES |= dict.fromkeys(
+    OBSTACLES.split(), TYPES["OTHER"]
+)  # MetaDrive's further names of tracks
 SIZES = {  # m: usual length and width by a track's type, for those that say none
     "VEHICLE": (4.6, 1.9),
     "PEDESTRIAN": (0.7, 0.7),
@@ -59,7 +52,7 @@ SIZES = {  # m: usual length and width by a track's type, for those that say non
     "TRAFFIC_BARRIER": (2.0, 0.5),
 }
 SMALL = (0.7, 0.7)  # m: of every other type
-IS_HEADING = 0.3  # rad at most from the lanes' directions at all their points: their third numbers are headings
+IS_HEADING = 0.3  # rad at most from the lanes' directions, where heights are headings
 
 
 @dataclass
@@ -69,10 +62,7 @@ class ScenarioNetSource(LogFiles):
     holds = "ScenarioDescription pickles"
     ending = ".pkl"
     mend = "export the scenario again or leave it out"
-    ignored = (
-        "dataset_summary.pkl",
-        "dataset_mapping.pkl",
-    )  # pickles beside the scenarios that are none
+    ignored = ("dataset_summary.pkl", "dataset_mapping.pkl")  # lie beside scenarios
 
     def read(self, log: str) -> Iterator[Recording]:
         yield recording_of(
@@ -130,60 +120,59 @@ def recording_of(data: dict, location: str = "") -> Recording:
     if it names one."""
     metadata = data["metadata"]
     tracks = data["tracks"]
-    keys = [str(key) for key in tracks]
+    ids = [str(key) for key in tracks]
     ego = metadata.get("sdc_id")
-    if str(ego) not in keys:
+    if str(ego) not in ids:
         raise InputError(
-            f"no ego: metadata.sdc_id={ego!r} is none of its {len(tracks)} tracks; leave it out"
+            f"no ego: metadata.sdc_id={ego!r} is none of its {len(tracks)} tracks; "
+            "leave it out"
         )
-    if len(set(keys)) < len(keys):
-        twice = next(key for key, count in Counter(keys).items() if count > 1)
+    if len(set(ids)) < len(ids):
+        twice = next(key for key, count in Counter(ids).items() if count > 1)
         raise InputError(f"two of its tracks have the id {twice!r}; give each its own")
-    states, valid, size, repairs = _tracks(tracks)
-    frames = len(states)
+    log = _Log(tracks)
+    frames = len(log.states)
     scene_id = _text(data.get("id") or metadata.get("scenario_id"))
     ts = np.asarray(metadata.get("ts", np.arange(frames) * DT), float)
     if len(ts) != frames:
         raise InputError(
             f"{len(ts)} time stamps for {frames} frames; repair metadata.ts"
         )
-    check(
-        {"states": (ts.max() - ts.min()) / DT * len(keys)}, scene_id
-    )  # of the grid, whose size they give
-    heights = resample_heights(_heights(tracks, valid), valid, ts=ts)
-    states, valid = resample_uniform(states, valid, ts=ts)
+    # of the grid, whose size they give
+    check({"states": (ts.max() - ts.min()) / DT * len(ids)}, scene_id)
+    states, valid, heights = resample_uniform(log.states, log.valid, ts, log.heights)
     seconds = ts - ts[0]
     current = metadata.get("current_time_index")
-    if current is not None and not (
-        np.isreal(current) and 0 <= current < frames and current == int(current)
-    ):
-        raise InputError(
-            f"current_time_index={current!r} is no frame of {frames}; repair it"
-        )
+    if current is not None:
+        if not (
+            np.isreal(current) and 0 <= current < frames and current == int(current)
+        ):
+            raise InputError(
+                f"current_time_index={current!r} is no frame of {frames}; repair it"
+            )
+        current = int(round(seconds[int(current)] / DT))
     lanes, drivable = _map(data["map_features"])
-    return Recording(
+    recording = Recording(
         scene_id=scene_id,
         location=location or _text(metadata.get("e2rl", {}).get("location", "")),
         dataset=_text(metadata.get("dataset", "scenarionet")),
         states=states,
         valid=valid,
-        size=size,
-        agent_type=np.array(
-            [_type(key, track["type"]) for key, track in tracks.items()]
-        ),
-        ego=keys.index(str(ego)),
+        size=log.size,
+        agent_type=log.agent_type,
+        ego=ids.index(str(ego)),
         lanes=lanes,
         drivable=drivable,
-        lights=_lights(
-            data.get("dynamic_map_states", {}),
-            lanes,
-            seconds=seconds,
-            frames=len(states),
-        ),
-        current=None if current is None else int(round(seconds[int(current)] / DT)),
-        repairs=repairs,
+        current=current,
+        repairs=+log.repairs,
         heights=heights,
     )
+    frames_of_grid = latest_frames(seconds, len(states))
+    for key, light in data.get("dynamic_map_states", {}).items():
+        lane = str(light.get("lane", key))
+        if lane in lanes:
+            recording.lights[lane] = _light_states(light, len(ts))[frames_of_grid]
+    return recording
 
 
 def _text(value: object) -> str:
@@ -191,101 +180,80 @@ def _text(value: object) -> str:
     return str(value) if isinstance(value, str | int | float) else ""
 
 
-def _type(key: object, name: object) -> int:
-    """The agent type that a track's type stands for; InputError for one that is not
-    known."""
-    if not isinstance(name, str) or name not in TYPES:
-        raise InputError(
-            f"track {key} is of the unknown type {str(name)[:40]!r}; known are {', '.join(TYPES)}"
-        )
-    return TYPES[name]
+class _Log:
+    """The tracks of a ScenarioDescription at its own time stamps.
 
-
-def _tracks(tracks: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray, Counter[str]]:
-    """States [F, A, 4], valid [F, A], size [A, 2] and repairs of tracks.
-
-    Raises InputError where a valid state is not finite.
+    states [F, A, 4], 0 where they are not valid [F, A]; heights [F, A] m, NaN unknown;
+    size [A, 2] m; agent_type [A]; repairs.
     """
-    frames = len(next(iter(tracks.values()))["state"]["position"])
-    check({"states": frames * len(tracks)}, "of this log")
-    states = np.zeros((frames, len(tracks), 4))
-    valid = np.zeros((frames, len(tracks)), bool)
-    size = np.ones((len(tracks), 2))
-    repairs: Counter[str] = Counter()
-    for index, (key, track) in enumerate(tracks.items()):
+
+    def __init__(self, tracks: dict) -> None:
+        """Raises InputError where a valid state is not finite, or a type not known."""
+        frames = len(next(iter(tracks.values()))["state"]["position"])
+        check({"states": frames * len(tracks)}, "of this log")
+        self.states = np.zeros((frames, len(tracks), 4))
+        self.valid = np.zeros((frames, len(tracks)), bool)
+        self.heights = np.full((frames, len(tracks)), np.nan)
+        self.size = np.ones((len(tracks), 2))
+        self.agent_type = np.zeros(len(tracks), int)
+        self.repairs: Counter[str] = Counter()
+        for index, (key, track) in enumerate(tracks.items()):
+            kind = track["type"]
+            if not isinstance(kind, str) or kind not in TYPES:
+                raise InputError(
+                    f"track {key} is of the unknown type {str(kind)[:40]!r}; "
+                    f"known are {', '.join(TYPES)}"
+                )
+            self.agent_type[index] = TYPES[kind]
+            self._read(index, track)
+            bad = ~np.isfinite(self.states[:, index]).all(-1) & self.valid[:, index]
+            if bad.any():
+                raise InputError(
+                    f"track {key} is NaN or infinite at frame {bad.argmax()}, "
+                    "where it is marked valid"
+                )
+        self.states[~self.valid] = 0.0
+
+    def _read(self, index: int, track: dict) -> None:
         state = track["state"]
-        known = np.asarray(state["valid"]).astype(bool).reshape(-1)
-        states[:, index, :2], states[:, index, 2] = (
-            np.asarray(state["position"])[:, :2],
-            state["heading"],
-        )
-        states[:, index, 3] = signed_speed(
-            np.asarray(state["velocity"], float)[:, :2], states[:, index, 2]
-        )
-        valid[:, index] = known
-        bad = known & ~np.isfinite(states[:, index]).all(-1)
-        if bad.any():
-            raise InputError(
-                f"track {key} is NaN or infinite at frame {bad.argmax()}, where it is marked valid"
-            )
-        if known.any():
-            recorded = _recorded_size(track, known)
-            repairs["missing sizes, for which the usual one of the type is taken"] += (
-                recorded is None
-            )
-            size[index] = (
-                SIZES.get(track["type"], SMALL) if recorded is None else recorded
-            )
-        if track["type"] == "VEHICLE":  # some logs swap length and width
-            size[index] = sorted(size[index], reverse=True)
-    states[~valid] = 0.0
-    return states, valid, size, +repairs
-
-
-def _heights(tracks: dict, valid: np.ndarray) -> np.ndarray:
-    """Heights [F, A] m of tracks that are valid [F, A]; NaN where they are unknown."""
-    heights = np.full(valid.shape, np.nan)
-    for index, track in enumerate(tracks.values()):
-        position = np.asarray(track["state"]["position"], float)
+        position = np.asarray(state["position"], float)
+        heading = np.asarray(state["heading"], float)
+        velocity = np.asarray(state["velocity"], float)[:, :2]
+        valid = np.asarray(state["valid"]).astype(bool).reshape(-1)
+        self.states[:, index, :2] = position[:, :2]
+        self.states[:, index, 2] = heading
+        self.states[:, index, 3] = signed_speed(velocity, self.states[:, index, 2])
+        self.valid[:, index] = valid
         if position.shape[1] > 2:
-            heights[:, index] = position[:, 2]
-    return heights
+            self.heights[:, index] = position[:, 2]
+        if valid.any():
+            size = _recorded_size(track, valid)
+            self.repairs[NO_SIZE] += size is None
+            self.size[index] = size or SIZES.get(track["type"], SMALL)
+        if track["type"] == "VEHICLE":  # some logs swap length and width
+            self.size[index] = sorted(self.size[index], reverse=True)
 
 
-def _recorded_size(track: dict, known: np.ndarray) -> list[float] | None:
+def _recorded_size(track: dict, valid: np.ndarray) -> list[float] | None:
     """Returns the median length and width [m] that a track says; None where it says
     none that is positive.
 
     Each comes from the first of these that has it: `length` and `width`, or the first
     two columns of `size`, of the state (a value, or one a frame) or of the metadata.
-
-    Args:
-        track: of a ScenarioDescription.
-        known: [F] bool, the frames at which it is there.
+    valid [F]: the frames at which the track is there.
     """
     size: list[float] = []
     for column, name in enumerate(("length", "width")):
         for part in (track["state"], track.get("metadata") or {}):
-            both = np.atleast_2d(np.asarray(part.get("size"), float))[
-                :, column : column + 1
-            ]
-            values = np.asarray(part.get(name, both), float).reshape(-1)
-            values = values[known] if len(values) == len(known) else values
+            pairs = np.atleast_2d(np.asarray(part.get("size"), float))
+            pairs = pairs[:, column : column + 1]
+            values = np.asarray(part.get(name, pairs), float).reshape(-1)
+            values = values[valid] if len(values) == len(valid) else values
             values = values[np.isfinite(values) & (values > 0)]
             if len(values):
-                size.append(_median(values))
+                size.append(float(np.median(values)))
                 break
     return size if len(size) == 2 else None
-
-
-def _are_headings(lines: list[np.ndarray]) -> bool:
-    """Returns whether the third numbers of lanes [P, 3] are no heights but headings, as
-    ScenarioNet's converter of nuScenes writes them."""
-    numbers = np.concatenate([np.zeros(0), *(line[:, 2] for line in lines)])
-    tangents = np.concatenate(
-        [np.zeros(0), *(tangent_angle(line[:, :2]) for line in lines)]
-    )
-    return bool(numbers.any() and np.abs(wrap(numbers - tangents)).max() < IS_HEADING)
 
 
 def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
@@ -294,35 +262,38 @@ def _map(features: dict) -> tuple[dict[str, Lane], list[np.ndarray]]:
     drivable = []
     for key, feature in features.items():
         kind = str(feature["type"])
-        if (
-            not kind.startswith("LANE_")
-            or "BIKE" in kind
-            or len(feature.get("polyline", ())) < 2
-        ):
+        polyline = feature.get("polyline", ())
+        if not kind.startswith("LANE_") or "BIKE" in kind or len(polyline) < 2:
             continue
-        line = np.array(feature["polyline"], float)
+        line = np.array(polyline, float)
         width = np.asarray(feature.get("width", ()), float)
+        has_width = width.ndim == 2 and len(width)
+        has_heights = line.shape[1] > 2 and "polygon" not in feature
         lanes[str(key)] = Lane(
             points=line[:, :2],
-            width=_median(width.sum(-1)) if width.ndim == 2 and len(width) else 0.0,
+            width=float(np.median(width.sum(-1))) if has_width else 0.0,
             speed_limit=_speed_limit(feature),
             exits=[str(other) for other in feature.get("exit_lanes", ())],
             left=_ids(feature.get("left_neighbor", ())),
             right=_ids(feature.get("right_neighbor", ())),
-            heights=line[:, 2]
-            if line.shape[1] > 2 and "polygon" not in feature
-            else None,
+            heights=line[:, 2] if has_heights else None,
         )
         if len(feature.get("polygon", ())) >= 3:
             drivable.append(np.array(feature["polygon"], float)[:, :2])
-    lines = [
-        np.column_stack([lane.points, lane.heights])
-        for lane in lanes.values()
-        if lane.heights is not None
-    ]
-    if _are_headings(lines):
+    if _are_headings(lanes.values()):
         lanes = {name: replace(lane, heights=None) for name, lane in lanes.items()}
     return lanes, drivable
+
+
+def _are_headings(lanes: Iterable[Lane]) -> bool:
+    """Returns whether the heights of lanes are none but headings, as ScenarioNet's
+    converter of nuScenes writes them."""
+    lifted = [lane for lane in lanes if lane.heights is not None]
+    if not lifted:
+        return False
+    numbers = np.concatenate([lane.heights for lane in lifted])
+    tangents = np.concatenate([tangent_angle(lane.points) for lane in lifted])
+    return bool(numbers.any() and np.abs(wrap(numbers - tangents)).max() < IS_HEADING)
 
 
 def _speed_limit(feature: dict) -> float:
@@ -333,14 +304,10 @@ def _speed_limit(feature: dict) -> float:
     they do not know.
     """
     for key, factor in LIMIT_UNITS.items():
-        recorded = feature.get(key)
-        numbers = [
-            _number(value)
-            for value in np.atleast_1d(np.asarray(recorded, object)).tolist()
-        ]
-        known = [value for value in numbers if 0 < value < np.inf]
-        if known:
-            return min(known) * factor
+        values = np.atleast_1d(np.asarray(feature.get(key), object)).tolist()
+        limits = [limit for limit in map(_number, values) if 0 < limit < np.inf]
+        if limits:
+            return min(limits) * factor
     return 0.0
 
 
@@ -353,39 +320,21 @@ def _number(value: object) -> float:
         return float("nan")
 
 
-def _median(values: np.ndarray) -> float:
-    """`np.median` of values [n], n > 0, in a tenth of its time; NaN where one of them
-    is."""
-    ordered = np.sort(values)
-    middle = (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
-    return float("nan") if np.isnan(ordered[-1]) else float(middle)
-
-
 def _ids(items: Iterable) -> list[str]:
     return [
         str(item["feature_id"] if isinstance(item, dict) else item) for item in items
     ]
 
 
-def _lights(
-    dynamic: dict, lanes: dict[str, Lane], seconds: np.ndarray, frames: int
-) -> dict[str, np.ndarray]:
-    """Light states [frames] at 10 Hz by the lane they control, from states stamped
-    `seconds`; where a state is unknown, the last known one goes on."""
-    now = latest_frames(seconds, frames)
-    lights = {}
-    for key, light in dynamic.items():
-        lane = str(light.get("lane", key))
-        if lane not in lanes:
-            continue
-        states = np.zeros(len(seconds), np.int8)
-        last = LIGHT_UNKNOWN
-        words = light["state"].get("object_state")
-        words = [] if words is None else list(words)[: len(seconds)]
-        for frame, word in enumerate(
-            words
-        ):  # LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_... (nuPlan)
-            last = states[frame] = light_colour(word, otherwise=last)
-        states[len(words) :] = last
-        lights[lane] = states[now]
-    return lights
+def _light_states(light: dict, frames: int) -> np.ndarray:
+    """States [frames] of a light, named LANE_STATE_... (Waymo) or TRAFFIC_LIGHT_...
+    (nuPlan); where one is unknown, the last known one goes on."""
+    words = light["state"].get("object_state")
+    words = [] if words is None else list(words)
+    states = np.zeros(frames, np.int8)
+    colour = LIGHT_UNKNOWN
+    for frame in range(frames):
+        if frame < len(words):
+            colour = light_colour(words[frame], otherwise=colour)
+        states[frame] = colour
+    return states

@@ -39,7 +39,7 @@ def ways(
     graph: LaneGraph, x: float, speed: float = 8.0, y: float = 0.0, heading: float = 0.0
 ) -> list[tuple]:
     """Lanes of the candidates of a vehicle."""
-    found = graph.candidates(np.array([x, y]), heading, speed, 6, 150)
+    found = graph.candidates(np.array([x, y, heading, speed]), 6, vertices=150)
     return [tuple(name for name, _ in route.lanes) for route in found]
 
 
@@ -50,7 +50,7 @@ def test_every_branch_is_a_candidate_from_anywhere_on_the_lane(x):
 
 def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
     graph = LaneGraph(lanes())
-    on, left = graph.candidates(np.array([60.0, 0.5]), 0.05, 8.0, 6, 150)
+    on, left = graph.candidates(np.array([60.0, 0.5, 0.05, 8.0]), 6, vertices=150)
     assert on.vehicle_s == left.vehicle_s == 20.0 and on.length == 298.0 and not on.open
     assert np.allclose(on.points[:, 1], 0, atol=1e-6) and np.allclose(
         np.diff(on.points[:, 0]), SPACING, atol=1e-6
@@ -62,7 +62,7 @@ def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
         left.lanes[1][1] - 60.0
     ) < 0.5
     assert on.limit[10] == 14.0 and on.limit[40] == 20.0 and left.limit[40] == 10.0
-    late = graph.candidates(np.array([250.0, 0.0]), 0.0, 8.0, 6, 150)
+    late = graph.candidates(np.array([250.0, 0.0, 0.0, 8.0]), 6, vertices=150)
     assert len(late) == 1 and late[0].open and abs(late[0].length - 170.0) < 0.5
     assert np.allclose(
         late[0].points[-1], [230 + 298, 0], atol=1e-6
@@ -74,7 +74,9 @@ def test_the_map_does_not_end_where_a_long_lane_began_far_behind():
         "a": Lane(np.array([[-400.0, 0], [0, 0]]), exits=["b"]),
         "b": Lane(np.array([[0.0, 0], [400, 0]]), exits=[]),
     }
-    (route,) = LaneGraph(long).candidates(np.array([-5.0, 0.0]), 0.0, 8.0, 6, 150)
+    (route,) = LaneGraph(long).candidates(
+        np.array([-5.0, 0.0, 0.0, 8.0]), 6, vertices=150
+    )
     assert not route.open and route.length == 298.0
 
 
@@ -96,7 +98,9 @@ def test_a_roundabout_is_left_and_a_ring_does_not_end():
         )
         for k, a in enumerate(quarter)
     }
-    (route,) = LaneGraph(ring).candidates(np.array([15.0, 0.5]), np.pi / 2, 5.0, 6, 150)
+    (route,) = LaneGraph(ring).candidates(
+        np.array([15.0, 0.5, np.pi / 2, 5.0]), 6, vertices=150
+    )
     assert (
         not route.open
         and np.abs(np.linalg.norm(route.points[:-8], axis=1) - 15).max() < 0.3
@@ -116,7 +120,7 @@ def test_a_lane_that_begins_before_the_last_one_ends_does_not_turn_the_route_bac
         "b": Lane(np.array([[96.0, 0.3], [400, 0.3]])),
     }
     (route,) = LaneGraph(overlapping).candidates(
-        np.array([60.0, 0.0]), 0.0, 8.0, 1, 150
+        np.array([60.0, 0.0, 0.0, 8.0]), 1, vertices=150
     )
     assert (np.diff(route.points[:, 0]) > 1.5).all() and np.abs(
         np.diff(route.points[:, 1])

@@ -6,7 +6,7 @@ import pytest
 
 from e2rl.scenes import links
 from e2rl.scenes.lane_graph import LaneGraph
-from e2rl.scenes.links import infer_exits
+from e2rl.scenes.links import drivable_exits
 from e2rl.scenes.recording import Lane
 
 
@@ -33,7 +33,7 @@ def pieces(exits: dict[str, list[str]], count: int = 5) -> dict[str, Lane]:
 
 
 def test_connectivity_is_inferred_from_geometry_and_heights():
-    found = infer_exits(
+    found, _ = drivable_exits(
         {
             "a": flat([0, 0], [50, 0], height=5.0),
             "b": flat([50.5, 0.3], [90, 0], height=5.5),
@@ -44,7 +44,7 @@ def test_connectivity_is_inferred_from_geometry_and_heights():
         }
     )
     assert found["a"] == ["b"] and found["bridge"] == [] and found["back"] == []
-    no_heights = infer_exits(
+    no_heights, _ = drivable_exits(
         {
             "a": Lane(np.array([[0.0, 0], [50, 0]])),
             "b": flat([50, 0], [90, 0], height=40.0),
@@ -55,7 +55,7 @@ def test_connectivity_is_inferred_from_geometry_and_heights():
         "a": Lane(np.array([[0.0, 5], [0, 50], [0, 50]])),
         "b": Lane(np.array([[0.0, 50], [0, 50], [0, 90]])),
     }
-    assert infer_exits(doubled) == {"a": ["b"], "b": []}
+    assert drivable_exits(doubled)[0] == {"a": ["b"], "b": []}
 
 
 def test_lanes_that_begin_together_do_not_follow_each_other_however_short():
@@ -64,7 +64,7 @@ def test_lanes_that_begin_together_do_not_follow_each_other_however_short():
         "a": flat([0, 0], [1, 0.1]),
         "b": flat([0, 0], [1, -0.1]),
     }
-    assert infer_exits(short) == {"in": ["a", "b"], "a": [], "b": []}
+    assert drivable_exits(short)[0] == {"in": ["a", "b"], "a": [], "b": []}
 
 
 CONNECTED = {(f"{row}_{k}", f"{row}_{k + 1}") for row in range(2) for k in range(4)}
