@@ -8,10 +8,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from torch import Tensor
 
-Batch = dict[str, Tensor]
+Batch = dict[str, Any]  # tensors by name
 Compute = Callable[[Batch], Tensor | Batch]
 
 

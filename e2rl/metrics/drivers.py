@@ -1,10 +1,10 @@
-"""Four drivers who meet one other vehicle: R157's human driver, R157's limit, RSS and
-FSM (docs/verdicts.md).
+"""Four drivers who meet one other vehicle: UN R157's human driver, UN R157's limit, RSS
+and FSM (docs/verdicts.md).
 
-Each driver is a NamedTuple of parameters with `step(state, observation)`, which gives
-the next state (at first `no_conflict`) and the longitudinal acceleration [...] m/s^2
-for the coming step of DT, 0 where the driver does not react. All tensors share their
-leading dimensions [...].
+Each driver is a NamedTuple of parameters with `step(state, observation)`, which returns
+the next state (the first is `no_conflict`) and the longitudinal acceleration [...]
+m/s^2 for the coming step of DT, 0 where the driver does not react. All tensors share
+their leading dimensions [...].
 """
 
 from typing import NamedTuple
@@ -14,8 +14,19 @@ from torch import Tensor
 
 from e2rl.scenes.recording import DT
 
+# UN R157, Annex 4, Appendix 3: the competent and careful human driver.
+REACTION = 0.75  # s, from the end of the perception to the first braking
+FULL_BRAKING = 7.59  # m/s^2: 0.774 g
+MAX_JERK = 12.65  # m/s^3: 0.774 g after 0.6 s
+CRITICAL_TIME = 2.0  # s, time to collision below which there is a danger
+# UN R157, paragraph 5.2.5.2: cut-ins that an automated system has to survive.
+LIMIT_DELAY = 0.35  # s
+LIMIT_BRAKING = 6.0  # m/s^2
+LIMIT_INTRUSION = 0.5  # m between the sides: the other is 0.3 m beyond the lane marking
+# The reference study's programs.
+EASING = 0.4  # m/s^2, of a driver who has released the pedal
+WANDERING_GAP = 1.225  # m between the sides: vehicles 1.6 m apart, 0.375 m of wandering
 GAP_TOLERANCE = 1e-4  # m, decides equality in the time to collision
-MAX_JERK = 12.65  # m/s^3, at which brakes build up
 
 
 class Observation(NamedTuple):
@@ -24,20 +35,22 @@ class Observation(NamedTuple):
 
     speed: Tensor  # m/s, the ego's
     acceleration: Tensor  # m/s^2, the ego's in the step before
-    gap: Tensor  # m, from the ego's front to the other's rear; negative: side by side; inf: there is no other
-    other_speed: Tensor  # m/s, along the ego's way
-    lateral_gap: (
-        Tensor  # m, between the facing sides; at most 0: they overlap laterally
-    )
+    gap: Tensor  # m, ego's front to other's rear; < 0: side by side; inf: nobody
+    other_speed: Tensor  # m/s, along the ego's path
+    lateral_gap: Tensor  # m, between the facing sides; at most 0: lateral overlap
     lateral_speed: Tensor  # m/s, the other's towards the ego's lane
-    overlaps: Tensor  # bool, whether they overlap laterally
     length: Tensor  # m, the ego's
-    other_length: Tensor  # m, along the ego's way
+    other_length: Tensor  # m, along the ego's path
 
     @property
     def closing(self) -> Tensor:
         """Speed [...] m/s at which the ego gains on the other."""
         return self.speed - self.other_speed
+
+    @property
+    def overlaps(self) -> Tensor:
+        """Whether [...] the two overlap laterally."""
+        return self.lateral_gap <= 0
 
     @property
     def other_is_ahead(self) -> Tensor:
@@ -48,17 +61,14 @@ class Observation(NamedTuple):
     def resolved(self) -> Tensor:
         """Whether [...] the ego has passed the other's front, or is behind it and does
         not gain, or is alone."""
-        return (
-            ~self.other_is_ahead
-            | ((self.closing <= 0) & (self.gap > 0))
-            | (self.gap == torch.inf)
-        )
+        no_gain = (self.closing <= 0) & (self.gap > 0)
+        return ~self.other_is_ahead | no_gain | (self.gap == torch.inf)
 
 
 class DriverState(NamedTuple):
     """What a driver remembers, each field [...]."""
 
-    since: Tensor  # s since the driver has perceived the risk; -1: there is none
+    risk_time: Tensor  # s, from the perception of the risk on; -1: there is none
     braking: Tensor  # m/s^2, commanded in the step before
     decided: Tensor  # bool, whether `RegulationLimit` has judged this conflict
 
@@ -67,16 +77,17 @@ def no_conflict(like: Tensor) -> DriverState:
     """State of a driver without a conflict, of the shape, dtype and device of `like`
     [...]."""
     return DriverState(
-        torch.full_like(like, -1),
-        torch.zeros_like(like),
+        risk_time=torch.full_like(like, -1),
+        braking=torch.zeros_like(like),
         decided=torch.zeros_like(like, dtype=torch.bool),
     )
 
 
-def elapsed(since: Tensor, perceived: Tensor) -> Tensor:
-    """Time [...] s since the perception: counted on where it runs, 0 where the risk is
-    perceived now, else -1."""
-    return torch.where(since >= 0, since + DT, perceived.to(since.dtype) - 1)
+def next_risk_time(state: DriverState, perceived: Tensor) -> Tensor:
+    """Time [...] s from the perception on: counted on where it runs, 0 where the risk
+    is perceived in this step, else -1."""
+    time = state.risk_time
+    return torch.where(time >= 0, time + DT, perceived.to(time.dtype) - 1)
 
 
 class HumanDriver(NamedTuple):
@@ -89,37 +100,38 @@ class HumanDriver(NamedTuple):
     this time is too short, it perceives the risk when it needs the way that is left.
     """
 
-    perception_gap: float = 0.0  # m, between the sides; 1.225: the other leaves its wandering zone on 3.5 m lanes
-    time_to_collision: float = 2.0  # s
-    delay: float = 0.75  # s
-    release: float = 0.4  # m/s^2
-    braking: float = 7.59  # m/s^2, 0.774 g
+    perception_gap: float = 0.0  # m between the sides
+    time_to_collision: float = CRITICAL_TIME
+    delay: float = REACTION
+    release: float = EASING
+    braking: float = FULL_BRAKING
     jerk: float = MAX_JERK
 
     def stopping_gap(self, closing: Tensor) -> Tensor:
         """Gap [...] m that the driver needs from perception on to lose a closing speed
         [...] m/s."""
         speed = closing.clamp(min=0)
-        return speed * (
-            self.delay + self.braking / (2 * self.jerk)
-        ) + speed.square() / (2 * self.braking)
+        build_up = self.braking / (2 * self.jerk)
+        return speed * (self.delay + build_up) + speed.square() / (2 * self.braking)
 
     def step(
         self, state: DriverState, observation: Observation
     ) -> tuple[DriverState, Tensor]:
-        o = observation
-        intrudes = o.overlaps | (o.lateral_gap <= self.perception_gap)
+        """Next state and acceleration."""
+        gap = observation.gap
+        closing = observation.closing
+        intrudes = observation.lateral_gap <= self.perception_gap
         needed = torch.maximum(
-            o.closing * self.time_to_collision, self.stopping_gap(o.closing)
+            closing * self.time_to_collision, self.stopping_gap(closing)
         )
-        reach = needed + o.closing * DT + GAP_TOLERANCE
-        risk = intrudes & (o.closing > 0) & (o.gap > 0) & (o.gap <= reach)
-        since = elapsed(state.since, risk).masked_fill(~intrudes | o.resolved, -1)
+        within = gap <= needed + closing * DT + GAP_TOLERANCE
+        risk = intrudes & (closing > 0) & (gap > 0) & within
+        over = ~intrudes | observation.resolved
+        time = next_risk_time(state, risk).masked_fill(over, -1)
         rising = (state.braking + self.jerk * DT).clamp(max=self.braking)
-        braking = torch.where(
-            since >= self.delay, rising, self.release * (since >= 0).to(since)
-        )
-        return DriverState(since, braking, decided=state.decided), -braking
+        eased = self.release * (time >= 0).to(time)
+        braking = torch.where(time >= self.delay, rising, eased)
+        return DriverState(time, braking, decided=state.decided), -braking
 
 
 class RegulationLimit(NamedTuple):
@@ -132,35 +144,32 @@ class RegulationLimit(NamedTuple):
     lag` if the cut-in is survivable. If it is not, the driver does nothing.
     """
 
-    release_gap: float = (
-        1.225  # m between the sides: vehicles 1.6 m apart, 0.375 m of wandering
-    )
-    release: float = 0.4  # m/s^2
-    intrusion_gap: float = 0.5  # m between the sides: 0.3 m past the marking
-    delay: float = 0.35  # s
+    release_gap: float = WANDERING_GAP
+    release: float = EASING
+    intrusion_gap: float = LIMIT_INTRUSION
+    delay: float = LIMIT_DELAY
     lag: float = DT  # s, what the study's program takes longer
-    braking: float = 6.0  # m/s^2
+    braking: float = LIMIT_BRAKING
 
     def step(
         self, state: DriverState, observation: Observation
     ) -> tuple[DriverState, Tensor]:
-        o = observation
-        intrudes = o.overlaps | (o.lateral_gap <= self.intrusion_gap)
-        over = o.resolved | ~intrudes
-        survivable = (o.gap > 0) & (
-            o.gap > o.closing * (o.closing / (2 * self.braking) + self.delay)
-        )
-        since = elapsed(state.since, survivable & ~state.decided).masked_fill(over, -1)
+        """Next state and acceleration."""
+        gap = observation.gap
+        closing = observation.closing
+        over = observation.resolved | (observation.lateral_gap > self.intrusion_gap)
+        needed = closing * (closing / (2 * self.braking) + self.delay)
+        survivable = (gap > 0) & (gap > needed)
+        time = next_risk_time(state, survivable & ~state.decided).masked_fill(over, -1)
         decided = ~over
-        enters = (
-            (o.lateral_gap <= self.release_gap)
-            & (o.lateral_speed > 0)
-            & (o.closing > 0)
-            & (o.gap > 0)
+        leaves_its_lane = (observation.lateral_gap <= self.release_gap) & (
+            observation.lateral_speed > 0
         )
-        release = self.release * (enters & ~decided).to(since)
-        braking = torch.where(since >= self.delay + self.lag, self.braking, release)
-        return DriverState(since, braking, decided=decided), -braking
+        eases = leaves_its_lane & (closing > 0) & (gap > 0) & ~decided
+        braking = torch.where(
+            time >= self.delay + self.lag, self.braking, self.release * eases.to(time)
+        )
+        return DriverState(time, braking, decided=decided), -braking
 
 
 class ResponsibilitySensitiveSafety(NamedTuple):
@@ -172,12 +181,10 @@ class ResponsibilitySensitiveSafety(NamedTuple):
     with lateral a and b. r is the response time.
     """
 
-    response: float = 0.75  # s
-    acceleration: float = (
-        3.0  # m/s^2, the most the ego may accelerate during the response
-    )
-    braking: float = 7.59  # m/s^2
-    front_braking: float = 7.59  # m/s^2, the most the other may brake
+    response: float = REACTION
+    acceleration: float = 3.0  # m/s^2, the ego's most during the response
+    braking: float = FULL_BRAKING
+    front_braking: float = FULL_BRAKING  # the most that the other may brake
     jerk: float = MAX_JERK
     lateral_margin: float = 0.3  # m
     lateral_acceleration: float = 1.0  # m/s^2
@@ -187,12 +194,10 @@ class ResponsibilitySensitiveSafety(NamedTuple):
         """Longitudinal safe distance [...] m of an ego behind a vehicle that drives the
         same way."""
         fastest = speed + self.acceleration * self.response
-        way = (speed + fastest) / 2 * self.response + fastest.square() / (
-            2 * self.braking
-        )
-        return (
-            way - other_speed.clamp(min=0).square() / (2 * self.front_braking)
-        ).clamp(min=0)
+        way = (speed + fastest) / 2 * self.response
+        way = way + fastest.square() / (2 * self.braking)
+        other_way = other_speed.clamp(min=0).square() / (2 * self.front_braking)
+        return (way - other_way).clamp(min=0)
 
     def safe_lateral_distance(self, lateral_speed: Tensor) -> Tensor:
         """Safe distance [...] m between the sides, for the other's speed towards the
@@ -205,19 +210,22 @@ class ResponsibilitySensitiveSafety(NamedTuple):
     def step(
         self, state: DriverState, observation: Observation
     ) -> tuple[DriverState, Tensor]:
-        o = observation
-        near = o.overlaps | (
-            o.lateral_gap < self.safe_lateral_distance(o.lateral_speed)
-        )
+        """Next state and acceleration."""
         danger = (
-            near
-            & o.other_is_ahead
-            & (o.gap < self.safe_distance(o.speed, o.other_speed))
+            (
+                observation.lateral_gap
+                < self.safe_lateral_distance(observation.lateral_speed)
+            )
+            & observation.other_is_ahead
+            & (
+                observation.gap
+                < self.safe_distance(observation.speed, observation.other_speed)
+            )
         )
-        since = elapsed(state.since, danger).masked_fill(~danger, -1)
+        time = next_risk_time(state, danger).masked_fill(~danger, -1)
         rising = (state.braking + self.jerk * DT).clamp(max=self.braking)
-        braking = rising * (since >= self.response)
-        return DriverState(since, braking, decided=state.decided), -braking
+        braking = rising * (time >= self.response)
+        return DriverState(time, braking, decided=state.decided), -braking
 
 
 class FuzzySafetyModel(NamedTuple):
@@ -229,28 +237,34 @@ class FuzzySafetyModel(NamedTuple):
     each 0 (safe) to 1 (unsafe), set the braking after `reaction`.
     """
 
-    reaction: float = 0.75  # s
+    reaction: float = REACTION
     comfortable_braking: float = 4.0  # m/s^2
     braking: float = 6.0  # m/s^2
-    front_braking: float = 7.0  # m/s^2, the most the other may brake
-    margin: float = 2.0  # m, kept at standstill
+    front_braking: float = 7.0  # m/s^2, the most that the other may brake
+    margin: float = 2.0  # m, at standstill
     safe_margin: float = 2.0  # m, more than that to be safe
     jerk: float = MAX_JERK
     lateral_margin: float = 0.1  # s
 
     def proactive(self, gap: Tensor, speed: Tensor, other_speed: Tensor) -> Tensor:
-        """PFS [...]: what if the other brakes fully now."""
-        free = speed * self.reaction - other_speed.clamp(min=0).square() / (
-            2 * self.front_braking
-        )
+        """PFS [...]: what if the other brakes fully at once."""
+        other_way = other_speed.clamp(min=0).square() / (2 * self.front_braking)
+        free = speed * self.reaction - other_way
         unsafe = free + speed.square() / (2 * self.braking)
         safe = free + speed.square() / (2 * self.comfortable_braking) + self.safe_margin
         return ((safe + self.margin - gap) / (safe - unsafe)).clamp(0, 1)
 
     def critical(
-        self, gap: Tensor, speed: Tensor, acceleration: Tensor, other_speed: Tensor
+        self, gap: Tensor, speed: Tensor, *, acceleration: Tensor, other_speed: Tensor
     ) -> Tensor:
-        """CFS [...]: what if the other keeps its speed."""
+        """CFS [...]: what if the other keeps its speed.
+
+        Args:
+            gap: [...] m.
+            speed: [...] m/s, the ego's.
+            acceleration: [...] m/s^2, the ego's.
+            other_speed: [...] m/s.
+        """
         acceleration = acceleration.clamp(min=-self.comfortable_braking)
         after = speed + acceleration * self.reaction - other_speed
         way = (speed + acceleration * self.reaction / 2 - other_speed) * self.reaction
@@ -260,38 +274,40 @@ class FuzzySafetyModel(NamedTuple):
         # Where the present braking already suffices, the way until both are equally
         # fast decides.
         closing = speed - other_speed
-        sharp = (gap < closing.square() / (-2 * acceleration).clamp(min=1e-6)).to(
-            gap.dtype
-        )
+        way = closing.square() / (-2 * acceleration).clamp(min=1e-6)
+        sharp = (gap < way).to(gap.dtype)
         return torch.where(after > 0, fuzzy, sharp) * (closing > 0)
 
     def step(
         self, state: DriverState, observation: Observation
     ) -> tuple[DriverState, Tensor]:
-        o = observation
-        passing = (o.gap + o.length + o.other_length) / o.closing + self.lateral_margin
+        """Next state and acceleration."""
+        gap = observation.gap
+        speed = observation.speed
+        closing = observation.closing
+        way = gap + observation.length + observation.other_length
+        passing_time = way / closing + self.lateral_margin
         comes_over = (
-            (o.lateral_speed > 0)
-            & (o.closing > 0)
-            & (o.lateral_gap < passing * o.lateral_speed)
+            (observation.lateral_speed > 0)
+            & (closing > 0)
+            & (observation.lateral_gap < passing_time * observation.lateral_speed)
         )
-        checked = (o.overlaps | comes_over) & o.other_is_ahead
+        concerns = (observation.overlaps | comes_over) & observation.other_is_ahead
+        other_speed = observation.other_speed
         critical = self.critical(
-            o.gap, o.speed, acceleration=o.acceleration, other_speed=o.other_speed
+            gap,
+            speed,
+            acceleration=observation.acceleration,
+            other_speed=other_speed,
         )
-        hard = (
-            self.comfortable_braking
-            + (self.braking - self.comfortable_braking) * critical
-        )
-        soft = self.comfortable_braking * self.proactive(
-            o.gap, o.speed, other_speed=o.other_speed
-        )
-        wanted = torch.where(critical > 0, hard, soft) * checked
-        since = elapsed(state.since, wanted > 0).masked_fill(wanted <= 0, -1)
-        braking = torch.minimum(wanted, state.braking + self.jerk * DT) * (
-            since >= self.reaction
-        )
-        return DriverState(since, braking, decided=state.decided), -braking
+        comfortable = self.comfortable_braking
+        hard = comfortable + (self.braking - comfortable) * critical
+        soft = comfortable * self.proactive(gap, speed, other_speed=other_speed)
+        wanted = torch.where(critical > 0, hard, soft) * concerns
+        time = next_risk_time(state, wanted > 0).masked_fill(wanted <= 0, -1)
+        rising = torch.minimum(wanted, state.braking + self.jerk * DT)
+        braking = rising * (time >= self.reaction)
+        return DriverState(time, braking, decided=state.decided), -braking
 
 
 Driver = (

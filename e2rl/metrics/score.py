@@ -17,6 +17,7 @@ from e2rl.metrics.catalogue import (
     columns,
     row_columns,
 )
+from e2rl.metrics.collisions import Collisions
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
 from e2rl.metrics.sideways import moved_into
@@ -113,9 +114,14 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     batch["valid"] = (
         batch["valid"] & ~batch["born_inside"]
     )  # nobody avoids who appears within the ego
-    batch["moved_into"] = moved_into(batch)
-    verdicts, driver = judge(batch)
-    batch = batch | verdicts | {"driver": driver}
+    collisions = Collisions.of(batch)
+    moved = moved_into(collisions)
+    verdicts, driver = judge(batch, collisions, moved)
+    batch |= verdicts | {
+        "driver": driver,
+        "collisions": collisions,
+        "moved_into": moved,
+    }
     result = verdicts
     for name, compute in COMPUTE.items():
         found = compute(batch)

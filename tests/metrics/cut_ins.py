@@ -72,7 +72,6 @@ def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
             other_speed=other,
             lateral_gap=side,
             lateral_speed=lateral,
-            overlaps=overlaps,
             length=length,
             other_length=length,
         )

@@ -6,8 +6,8 @@ import math
 import pytest
 import torch
 
-from e2rl.metrics.contact import touched_columns
 from e2rl.metrics.score import score_rollouts
+from e2rl.metrics.traffic_contact import touched_columns
 from tests.metrics.random_rollouts import random_rollouts
 
 SIZE = (4.8, 2.0)

@@ -34,7 +34,6 @@ def observe(**fields):
         other_speed=10.0,
         lateral_gap=-1.9,
         lateral_speed=0.0,
-        overlaps=True,
         length=4.3,
         other_length=4.3,
     )._asdict()
@@ -79,7 +78,6 @@ def test_braking_keeps_its_bound_and_jerk_whatever_happens(name):
                 **fields,
                 acceleration=draw(-8, 3),
                 lateral_speed=draw(-1, 2),
-                overlaps=side <= 0,
             )
         )
     action = drive(DRIVERS[name], observations)
@@ -103,17 +101,11 @@ def test_the_human_driver_releases_the_pedal_then_brakes_ever_harder():
 @EACH
 def test_no_reaction_without_a_conflict(name):
     calm = {
-        "nobody is there": observe(
-            gap=torch.inf, lateral_gap=torch.inf, overlaps=False
-        ),
+        "nobody is there": observe(gap=torch.inf, lateral_gap=torch.inf),
         "the other is faster and far": observe(other_speed=25.0, gap=60.0),
-        "the other keeps its lane": observe(lateral_gap=1.6, overlaps=False, gap=8.0),
-        "the other leaves": observe(
-            lateral_gap=1.4, overlaps=False, lateral_speed=-0.5
-        ),
-        "the ego has passed": observe(
-            gap=-8.0, lateral_gap=0.2, lateral_speed=0.5, overlaps=False
-        ),
+        "the other keeps its lane": observe(lateral_gap=1.6, gap=8.0),
+        "the other leaves": observe(lateral_gap=1.4, lateral_speed=-0.5),
+        "the ego has passed": observe(gap=-8.0, lateral_gap=0.2, lateral_speed=0.5),
     }
     for case, observation in calm.items():
         assert not drive(DRIVERS[name], [observation] * 20).any(), case
@@ -125,7 +117,6 @@ def test_the_human_driver_perceives_overlap_within_two_seconds_and_a_step():
         [-0.4, 0]
     )
     aside = {
-        "overlaps": False,
         "lateral_gap": torch.tensor([1.2, 1.3]),
         "lateral_speed": 0.5,
     }
@@ -138,7 +129,7 @@ def test_the_human_driver_perceives_overlap_within_two_seconds_and_a_step():
 def test_the_regulation_judges_once_at_the_intrusion():
     limit = 10 * (10 / 12 + 0.35)
     gap = torch.tensor([limit - 0.1, limit + 0.1])
-    steps = [observe(gap=gap, lateral_gap=0.4, lateral_speed=0.5, overlaps=False)] + [
+    steps = [observe(gap=gap, lateral_gap=0.4, lateral_speed=0.5)] + [
         observe(gap=gap + 50)
     ] * 10
     assert drive(RegulationLimit(), steps)[-1].tolist() == pytest.approx([0, -6])
@@ -154,7 +145,7 @@ def test_rss_brakes_within_both_safe_distances():
     assert aside == pytest.approx([0.3 + 0.375 + 0.75**2 / 2 + 1.25**2 / 2, 0.3])
     gap = torch.tensor([ahead - 1, ahead - 1, ahead + 1])
     side = torch.tensor([aside[0] - 0.1, aside[0] + 0.1, 0.0])
-    danger = observe(gap=gap, lateral_gap=side, lateral_speed=0.5, overlaps=False)
+    danger = observe(gap=gap, lateral_gap=side, lateral_speed=0.5)
     assert (drive(rss, [danger] * 10)[-1] < 0).tolist() == [True, False, False]
 
 
@@ -171,14 +162,17 @@ def test_fuzzy_metrics_are_linear_between_unsafe_and_safe():
     unsafe = 7.5 + 100 / 12
     safe = 7.5 + 100 / 8
     gap = torch.tensor([unsafe - 1, unsafe, (unsafe + safe) / 2, safe, safe + 1])
-    assert fsm.critical(gap, speed, torch.tensor(0.0), other).tolist() == pytest.approx(
-        [1, 1, 0.5, 0, 0], abs=1e-5
-    )
+    assert fsm.critical(
+        gap, speed, acceleration=torch.tensor(0.0), other_speed=other
+    ).tolist() == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-5)
     # Braking by 4 m/s^2 makes 12 m/s as slow as the other within the reaction: 2 m / 8
     # decide.
     gap = torch.tensor([0.4, 0.6])
     assert fsm.critical(
-        gap, torch.tensor(12.0), torch.tensor(-9.0), other
+        gap,
+        torch.tensor(12.0),
+        acceleration=torch.tensor(-9.0),
+        other_speed=other,
     ).tolist() == [1, 0]
 
 
@@ -186,9 +180,7 @@ def test_fsm_anticipates_who_comes_over_before_the_ego_has_passed():
     gap = torch.tensor([10.0, 10.0, 10.0])
     side = torch.tensor([1.6, 1.6, 1.6])
     sideways = torch.tensor([0.9, 0.8, 0.0])
-    observation = observe(
-        gap=gap, lateral_gap=side, lateral_speed=sideways, overlaps=False
-    )
+    observation = observe(gap=gap, lateral_gap=side, lateral_speed=sideways)
     # The ego needs 18.6 m / 10 m/s = 1.86 s to pass, with 0.1 s of margin 1.96 s; the
     # other 1.78 s, 2 s or for ever.
     assert (drive(FuzzySafetyModel(), [observation] * 10)[-1] < 0).tolist() == [

@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 
+from e2rl.metrics.collisions import Collisions
 from e2rl.metrics.contact import first_contact
 from e2rl.metrics.failure_features import (
     LATE,
     MANOEUVRES,
     WINDOW,
-    last_seconds,
     manoeuvre,
 )
 from e2rl.metrics.score import as_doubles, score_rollouts
@@ -176,11 +176,11 @@ def test_contacts_soon_after_the_start_use_what_is_known():
         )
     )
     batch |= first_contact(batch)
-    window, known, size = last_seconds(batch)
-    assert window.shape == (1, WINDOW + 1, 2, 4) and size.shape == (1, 2, 2)
-    assert known.tolist() == [int(batch["before"]) - 2] and window[
-        0, 0, 0, 0
-    ] == pytest.approx(2.0)
+    collisions = Collisions.of(batch)
+    window, known = collisions.window(collisions.before, WINDOW)
+    assert window.shape == (1, WINDOW + 1, 2, 4)
+    assert known.tolist() == [int(batch["before"]) - 2]
+    assert window[0, 0, 0, 0] == pytest.approx(2.0)
     late = course(5.5, 0, heading=EAST, speed=5, appears=2)  # a step before the contact
     assert words(course(0, 0, heading=EAST, speed=8), late)[1:] == (
         "keeps speed",

@@ -10,7 +10,7 @@ from e2rl.metrics.drivers import DRIVERS, HumanDriver
 from e2rl.metrics.preventable import (
     Collision,
     Tracks,
-    along_way,
+    along_path,
     contacts,
     driven_length,
     poses,
@@ -61,7 +61,7 @@ def others(*tracks):
 def test_a_vehicle_alone_drives_as_recorded(way, name):
     far = others(track(0.0, start=(500.0, 500.0)))
     driven = redrive(
-        DRIVERS[name], way, size=SIZE, others=along_way(way, SIZE[:, 1], others=far)
+        DRIVERS[name], way, size=SIZE, others=along_path(way, SIZE[:, 1], others=far)
     )
     assert torch.allclose(driven[..., :2], way[..., :2], atol=0.02)
     assert torch.allclose(driven[..., 3], way[..., 3], atol=1e-9)
@@ -74,7 +74,10 @@ def test_it_never_leaves_its_way_nor_outruns_its_recording(name):
         torch.tensor([[[36.0, 22.0, 1.0, 0.0]]], dtype=torch.float64).expand(1, 81, 4)
     )
     driven = redrive(
-        DRIVERS[name], way, size=SIZE, others=along_way(way, SIZE[:, 1], others=blocker)
+        DRIVERS[name],
+        way,
+        size=SIZE,
+        others=along_path(way, SIZE[:, 1], others=blocker),
     )
     assert (
         (driven[..., :2] - torch.tensor([0.0, 40.0])).norm(dim=-1) - 40.0
@@ -115,7 +118,7 @@ def driven_again(driver, cut_in):
         size[:, None],
         present=torch.ones_like(other[..., :1], dtype=torch.bool),
     )
-    along = along_way(ego, size[:, 1], others=tracks)._replace(
+    along = along_path(ego, size[:, 1], others=tracks)._replace(
         lateral_speed=side_speed[: steps + 1, :, None]
     )
     return contacts(redrive(driver, ego, size=size, others=along), size, others=tracks)[

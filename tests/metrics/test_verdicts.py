@@ -6,9 +6,12 @@ import math
 import pytest
 import torch
 
+from e2rl.metrics.collisions import Collisions
+from e2rl.metrics.contact import FRONT
+from e2rl.metrics.duties import DUTIES, duties
 from e2rl.metrics.preventable import preventions
 from e2rl.metrics.score import score_rollouts
-from e2rl.metrics.verdicts import DUTIES, clean, duties
+from e2rl.metrics.verdicts import clean
 from tests.metrics.random_rollouts import random_rollouts
 from tests.metrics.test_failure_features import course, drive, scene
 from tests.metrics.test_preventable import collision, cut_in, track
@@ -82,16 +85,26 @@ def test_a_red_light_is_a_duty_where_it_is_known():
 NO_LANES = torch.zeros(1, 2, 2, dtype=torch.float64), torch.full((1, 2), -1)
 
 
-def duty(case, red=-1, lanes=NO_LANES):
-    struck = preventions(case)["human"].struck
-    duty, _ = duties(
-        case,
-        torch.tensor([False]),
+def collisions_of(case, red=-1, lanes=NO_LANES, kind=FRONT):
+    """The Collisions of an ego that hits the first of the others of a Collision."""
+    return Collisions(
+        hit=torch.tensor([True]),
+        states=case.states[:, :, :2],
+        valid=case.present[:, :, :2],
+        size=case.size[:, :2],
+        stop=case.stop,
+        before=case.stop - 1,
+        kind=torch.tensor([kind]),
         red=torch.tensor([[-1, red]]),
-        lanes=lanes,
-        struck=struck,
+        lane_points=lanes[0],
+        lane_index=lanes[1],
     )
-    return DUTIES[duty.item()]
+
+
+def duty(case, **options):
+    struck = preventions(case)["human"].struck
+    index, _ = duties(collisions_of(case, **options), struck)
+    return DUTIES[index.item()]
 
 
 def crossing(speed, from_left):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from e2rl.metrics.drivers import DriverState, HumanDriver, Observation
-from e2rl.metrics.preventable import Along, Tracks, along_way
+from e2rl.metrics.preventable import Along, Tracks, along_path
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
@@ -101,7 +101,7 @@ def foresee(
     plans = tracks.transpose(1, 2)
     box = sizes[:, None].expand(*tracks.shape[:2], 2)
     present = torch.ones_like(plans[..., 0], dtype=torch.bool)
-    along = along_way(path, size[:, 1], Tracks(plans, box, present))
+    along = along_path(path, size[:, 1], Tracks(plans, box, present))
     hit, time = _contacts(path, size[:, 0], along=along, since=since)
     prevented = ~hit[0]
     horizon = DT * tracks.shape[2]
@@ -194,7 +194,6 @@ def meet(
             other_speed=ahead.speed[step].expand_as(gap),
             lateral_gap=lateral_gap,
             lateral_speed=unseen,
-            overlaps=lateral_gap <= 0,
             length=length,
             other_length=ahead.length[step].expand_as(gap),
         )
@@ -230,7 +229,7 @@ def time_before(world: World, ego_plan: Tensor, since: Tensor) -> Tensor:
     path = torch.cat([world.states[:, :1], ego_plan[:, :HORIZON]], 1)
     present = world.valid[:, None, :vehicles]
     tracks = Tracks(world.states[:, None, :vehicles], size[:, :vehicles], present)
-    along = along_way(path, size[:, 0, 1], tracks)
+    along = along_path(path, size[:, 0, 1], tracks)
     gap = along.rear[0] - size[:, :1, 0] / 2
     closing = world.states[:, :1, 3].abs() - along.speed[0]
     driver = HumanDriver()
