@@ -17,9 +17,8 @@ def test_no_outputs_are_stored():
         for cell in json.loads(NOTEBOOK.read_text())["cells"]
         if cell["cell_type"] == "code"
     ]
-    assert cells and not [
-        cell for cell in cells if cell["outputs"] or cell["execution_count"]
-    ]
+    assert cells
+    assert not [cell for cell in cells if cell["outputs"] or cell["execution_count"]]
 
 
 @pytest.mark.slow
@@ -40,8 +39,6 @@ def test_the_notebook_runs_and_shows_a_failure(tmp_path, monkeypatch):
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     kinds = {kind for output in outputs for kind in output.get("data", {})}
     said = "".join(output.get("text", "") for output in outputs)
-    assert (
-        {"image/png", "image/gif"} <= kinds
-        and "duty broken" in said
-        and "12 rollouts" in said
-    )
+    assert {"image/png", "image/gif"} <= kinds
+    assert "duty broken" in said
+    assert "12 rollouts" in said
