@@ -24,6 +24,8 @@ PLACEHOLDER = re.compile(r"[<>*{}\[\]]|\.\.\.|(?<![a-zA-Z])[A-Z]{3,}(?![a-zA-Z])
 DOCUMENT = re.compile(r"(?<![\w/-])[\w-]+\.md\b")
 WRITTEN = {"tables.md", "methods.md", "egos.md", "budget.md"}  # by a run
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+BARE = re.compile(r"`(\w+\.py)\b")
+YOURS = {"my_planner.py", "FILE.py"}  # a reader's files
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
@@ -86,6 +88,14 @@ FORMER = re.compile(
     r"learning|method|modes|nuplan|nuplan-scores|observation|planner|planners|"
     r"reproduce|search|torchrl|training|verdicts)\.md"
 )
+
+
+@cache
+def python_files() -> set[str]:
+    """Names of the repository's Python files."""
+    folders = [ROOT / name for name in FOLDERS.split("|")]
+    inside = [path for folder in folders for path in folder.rglob("*.py")]
+    return {path.name for path in [*ROOT.glob("*.py"), *inside]}
 
 
 def anchors(path: Path) -> set[str]:
@@ -163,6 +173,12 @@ def test_what_is_named_exists(name):
     if name.startswith("e2rl/"):
         missing = {each for each in missing if not FORMER.search("docs/" + each)}
     assert not missing, f"{name} names what is not there: {', '.join(sorted(missing))}"
+
+
+@pytest.mark.parametrize("path", markdown(), ids=lambda path: path.name)
+def test_a_python_file_that_is_named_without_its_folder_exists(path):
+    names = set(BARE.findall(FENCE.sub("", path.read_text())))
+    assert names <= python_files() | YOURS
 
 
 @pytest.mark.parametrize("path", markdown(), ids=lambda path: path.name)
