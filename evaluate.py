@@ -60,7 +60,7 @@ def evaluate(run: Run) -> None:
     )
     rows = record(*scored, folder, partial(egos.metric_rows, **about))
     if searched:
-        save_budget(folder, plan, tries, *scored[:2])
+        save_budget(folder, plan, tries=tries, rows=scored[0], samples=scored[1])
     print("", *write_results(run, plan, rows), sep="\n")
     if then is not None:
         print(f"{config.failure}: {outcome(then, scored[0][0])}")

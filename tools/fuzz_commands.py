@@ -62,7 +62,7 @@ COMMANDS = {  # module, and arguments in the folder of the case; {cache}: of sce
         "hydra.run.dir=out",
     ),
     "merge": ("e2rl.commands.merge", "run", "whole", "--into", "out"),
-    "report": ("e2rl.report.html", "run"),
+    "report": ("e2rl.commands.report", "run"),
     "replay": ("e2rl.commands.replay", "run", "--pixels", "60"),
     "replay of a file": (
         "e2rl.commands.replay",
@@ -72,7 +72,6 @@ COMMANDS = {  # module, and arguments in the folder of the case; {cache}: of sce
         "--out",
         "out",
     ),
-    "curves": ("e2rl.report.curves", "run", "whole", "--out", "out"),
     "tune": ("e2rl.commands.tune", *TUNE, "data.cache={cache}"),
     "inspect": (
         "e2rl.commands.inspect",

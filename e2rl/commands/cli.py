@@ -22,7 +22,10 @@ COMMANDS = {  # module, and what the command does
         "improve a policy on the failures that are found; train a prior",
     ),
     "tune": ("e2rl.commands.tune", "tune the parameters of an adversary or a planner"),
-    "report": ("e2rl.report.html", "the page with a replay of every failure of a run"),
+    "report": (
+        "e2rl.commands.report",
+        "the page with a replay of every failure of a run",
+    ),
     "replay": ("e2rl.commands.replay", "videos and pictures of rollouts of a run"),
     "export": (
         "e2rl.commands.export",
@@ -37,17 +40,16 @@ COMMANDS = {  # module, and what the command does
         "what a data set holds, and a picture of a scene",
     ),
     "compare": (
-        "e2rl.report.compare",
+        "e2rl.commands.compare",
         "which failures of one run, or ego, are new or gone in another",
     ),
     "gate": (
-        "e2rl.report.gate",
+        "e2rl.commands.gate",
         "whether a run keeps within limits, for continuous integration",
     ),
     "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
-    "curves": ("e2rl.report.curves", "failures over realism, of one or several runs"),
     "policy-figure": (
-        "e2rl.report.policy_figure",
+        "e2rl.commands.policy_figure",
         "what training was worth, of one or several splits",
     ),
     "prior-tables": (
@@ -55,7 +57,7 @@ COMMANDS = {  # module, and what the command does
         "the prior as traffic: closed loop, spread of its samples",
     ),
     "skeleton": (
-        "e2rl.report.skeleton_figure",
+        "e2rl.commands.skeleton",
         "the figure of risks, skeleton and chain",
     ),
 }

@@ -1,5 +1,5 @@
 """`e2rl export RUN_DIR --to FORMAT`: failures of a run in the format of another tool
-(docs/export.md)."""
+(docs/guide/export.md)."""
 
 import argparse
 from collections.abc import Callable, Iterator

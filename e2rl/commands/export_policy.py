@@ -3,7 +3,7 @@ file.
 
 It maps observations [B, 326] to the actor's most central actions [B, 2], with the
 normalisation and the reference inside, and drives e2rl by `ego=policy_file
-ego.file=POLICY.onnx` (docs/observation.md).
+ego.file=POLICY.onnx` (docs/guide/policies.md).
 """
 
 import argparse

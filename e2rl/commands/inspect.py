@@ -292,7 +292,7 @@ def check_apart(rows: Sequence[Row], source: Source, other: Source) -> str:
     for path, places in ((source.path, here), (other.path, there)):
         if "" in places:
             raise InputError(
-                f"{path}: the place of some logs is not known; name it in index.csv (docs/data.md)"
+                f"{path}: the place of some logs is not known; name it in index.csv (docs/guide/data.md)"
             )
     if shared := sorted(here & there):
         common = f"{len(shared)} places in common ({', '.join(shared[:5])})"

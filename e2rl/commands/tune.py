@@ -1,9 +1,8 @@
 """`e2rl tune synthesizer=NAME`, or `e2rl tune tuning.group=ego ego=NAME`: parameters of
 most, or fewest, failures.
 
-Writes tuning.json, tuned.yaml (the lines to keep in conf/) and of an adversary the
-curve over its gain. The ranges are those of the class (`tuned`), or tuning.space
-(docs/adversaries.md, docs/how-to/planner.md).
+Writes tuning.json and tuned.yaml (the lines to keep in conf/). The ranges are those of
+the class (`tuned`), or tuning.space (docs/guide/adversary.md, docs/guide/planner.md).
 """
 
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
@@ -44,7 +43,6 @@ from e2rl.evaluation.tuning import (
     search,
     yaml_of,
 )
-from e2rl.report.curves import points_of_tuning, save_curves
 from e2rl.run.command import run_command
 from e2rl.run.config import resolved, with_changes
 from e2rl.run.errors import InputError
@@ -111,8 +109,6 @@ def tune(run: Run) -> dict:
         told=told,
     )
     result = save(rows, folder)
-    if group == "synthesizer":
-        save_curves(folder, points_of_tuning(result, config.synthesizer.name))
     best = "no trial keeps within the limits\n"
     if result["best"]:
         best = (

@@ -28,7 +28,7 @@ from e2rl.run.settings import check_choice, check_settings, setting, settings_of
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic
 
-FIGURES = ("intensity", "curves")
+FIGURES = ("intensity",)
 UNITS = ("nfe", "tries", "seconds")  # of a budget, a scene
 SEARCH = "search"  # the method whose tries are drawn from families
 FEW = 640.0  # NFE a scene: a rollout of CCDiff
@@ -268,10 +268,6 @@ def _check_compared(config: DictConfig, settings: EvaluationSettings) -> None:
     """Raises InputError where a name of `compare` is no row: of `egos` where there are
     any, else a method."""
     names = settings.compare
-    if config.egos and settings.figure == "curves":
-        raise InputError(
-            "figure=curves: of one ego; choose it with ego=NAME, and leave egos out"
-        )
     if not names:
         return
     where = f"compare=[{', '.join(names)}]"

@@ -194,23 +194,6 @@ def new_figure(width: float, height: float, dpi: float = 72) -> Figure:
     return Figure((width / 72, height / 72), dpi, facecolor=PANEL)
 
 
-def new_panels(
-    count: int, side: float, gap: float, head: float, foot: float = 0
-) -> tuple[Figure, list[Axes]]:
-    """A figure of square axes in a row; in points: their sides, and the spaces between,
-    above and below them."""
-    height = head + side + foot
-    figure = new_figure(count * (side + gap) - gap, height)
-    grid = {
-        "left": 0,
-        "right": 1,
-        "bottom": foot / height,
-        "top": 1 - head / height,
-        "wspace": gap / side,
-    }
-    return figure, list(figure.subplots(1, count, squeeze=False, gridspec_kw=grid)[0])
-
-
 def add_legend(
     figure: Figure | SubFigure, colours: Mapping[str, Colour], size: float
 ) -> None:

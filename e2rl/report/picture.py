@@ -25,6 +25,7 @@ from e2rl.report.drawing import (
     image_of,
     new_figure,
 )
+from e2rl.report.headline import grouped
 from e2rl.scenes.boxes import corners, to_frame
 from e2rl.sim.rollout_file import Failure, Rollout
 
@@ -32,19 +33,33 @@ TRAIL = 2.0  # s
 SMOOTHING = 41  # steps over which the camera's path is smoothed
 SLOW = 0.6  # s before contact that are played at half speed
 FREEZE = 14  # frames that hold the contact
-SIDE, HEAD, FOOT = 720, 50, 30  # points: of a picture, of its header and of its legend
-LARGE_HEAD, LARGE_FOOT = 86, 48  # the same with large letters
-SWEEP_METRES, SWEEP_GAP, SWEEP_COLUMNS = (
-    60.0,
-    10,
-    2,
-)  # side of a panel in m, points between panels, panels in a row
+SIDE = 720  # points, of a picture
+SWEEP_METRES = 60.0  # side of a panel of several intensities
+SWEEP_GAP = 10  # points between panels
+SWEEP_COLUMNS = 2
 LEGEND = {
     "ego": drawing.EGO,
     "adversary": drawing.ADVERSARY,
     "traffic": drawing.BACKGROUND,
+    "replayed": drawing.REPLAYED,
+    "pedestrian, cyclist": drawing.VULNERABLE,
 }
-LEGEND |= {"replayed": drawing.REPLAYED, "pedestrian, cyclist": drawing.VULNERABLE}
+
+
+@dataclass(frozen=True)
+class Letters:
+    """Sizes in points: of the header, the legend's foot, and letters."""
+
+    head: float
+    foot: float
+    title: float
+    detail: float
+    badge: float
+    legend: float
+
+
+SMALL = Letters(head=50, foot=30, title=16, detail=11, badge=13, legend=11)
+LARGE = Letters(head=86, foot=48, title=26, detail=20, badge=22, legend=20)
 
 
 @dataclass
@@ -53,7 +68,8 @@ class Replay:
     None; `last` is the last step shown: the contact, or the rollout's end.
 
     Args:
-        rollout, row: the rollout and its row of metrics.
+        rollout: what is shown.
+        row: its row of metrics.
         metres: side of the square that is shown.
         pixels: side of a picture.
         caption: two lines to show in large letters; by default the method, ego, scene,
@@ -66,20 +82,15 @@ class Replay:
     pixels: int = 720
     caption: tuple[str, str] | None = None
 
-    def __post_init__(self):
-        self.contact = (
-            None
-            if math.isnan(self.row["contact_step"])
-            else int(self.row["contact_step"])
-        )
-        self.last = (
-            len(self.rollout.states) - 1 if self.contact is None else self.contact
-        )
+    def __post_init__(self) -> None:
+        step = self.row["contact_step"]
+        self.contact = None if math.isnan(step) else int(step)
+        self.last = len(self.rollout.states) - 1
+        if self.contact is not None:
+            self.last = self.contact
         path = self.rollout.states[:, self.rollout.ego, :2]
         window = min(SMOOTHING, len(path))
-        self.centres = savgol_filter(
-            path, window, min(1, window - 1), axis=0
-        )  # smoothed, so that the camera glides
+        self.centres = savgol_filter(path, window, min(1, window - 1), axis=0)
         self.panel = Panel(self, new_figure(SIDE, SIDE, dpi=72 * self.pixels / SIDE))
 
     def picture(self, time: float, phase: float | None = None) -> Image.Image:
@@ -92,60 +103,46 @@ class Replay:
     def frames(self) -> Iterator[Image.Image]:
         """All frames, drawn as they are asked for: real time, half speed just before
         contact, then the contact held."""
-        if self.contact is None:
-            times = list(range(self.last + 1))
-        else:
-            slow_from = max(0, self.contact - round(SLOW / self.rollout.dt))
-            times = [*range(slow_from), *np.arange(slow_from, self.contact, 0.5)]
-        yield from map(
-            self.picture, tqdm(times, desc="frames", leave=False, disable=None)
-        )
+        times: list[float] = list(range(self.last + 1))
         if self.contact is not None:
-            yield from (
-                self.picture(self.contact, phase=(index % 7) / 6)
-                for index in range(FREEZE)
-            )
+            slow = max(0, self.contact - round(SLOW / self.rollout.dt))
+            times[slow:] = np.arange(slow, self.contact, 0.5).tolist()
+        for time in tqdm(times, desc="frames", leave=False, disable=None):
+            yield self.picture(time)
+        if self.contact is not None:
+            for index in range(FREEZE):
+                yield self.picture(self.contact, phase=(index % 7) / 6)
 
     def trails(self, time: float) -> list[Trail]:
         """The last two seconds of all agents that move, those of the adversaries and of
         the ego on top."""
-        end = math.floor(time) + 1
+        rollout = self.rollout
+        step = math.floor(time)
+        recent = slice(max(0, step - round(TRAIL / rollout.dt)), step + 1)
         trails = []
-        recent = slice(max(0, end - 1 - round(TRAIL / self.rollout.dt)), end)
-        for agent in sorted(range(self.rollout.states.shape[1]), key=self.layer):
-            path = self.rollout.states[recent, agent, :2][
-                self.rollout.valid[recent, agent]
-            ]
+        for agent in sorted(range(rollout.states.shape[1]), key=self.layer):
+            path = rollout.states[recent, agent, :2][rollout.valid[recent, agent]]
             if len(path) > 1 and np.ptp(path, axis=0).max() > 0.5:
-                trails.append(
-                    Trail(
-                        path,
-                        self.colour(agent),
-                        width=0.5 if self.layer(agent) >= 2 else 0.3,
-                    )
-                )
+                width = 0.5 if self.layer(agent) >= 2 else 0.3
+                trails.append(Trail(path, self.colour(agent), width=width))
         return trails
 
     def shapes(self, time: float, phase: float | None) -> list[Shape]:
         """All agents and the mark of contact, from the lowest to the highest."""
         rollout = self.rollout
         step = math.floor(time)
+        states = interpolated(rollout, time)
         shapes = []
-        states = interpolated(rollout.states, rollout.valid, time=time)
-        size = rollout.size
-        for agent in sorted(
-            np.flatnonzero(rollout.valid[step]).tolist(), key=self.layer
-        ):
+        for agent in sorted(np.flatnonzero(rollout.valid[step]), key=self.layer):
             shapes += drawing.agent(
                 rollout.agent_type[agent],
                 states[agent],
-                size=size[agent],
+                size=rollout.size[agent],
                 colour=self.colour(agent),
             )
         if phase is not None:
-            shapes += drawing.contact_mark(
-                contact_point(rollout, step, partner=self.row["partner"]), phase
-            )
+            point = contact_point(rollout, step, partner=self.row["partner"])
+            shapes += drawing.contact_mark(point, phase)
         return shapes
 
     def layer(self, agent: int) -> int:
@@ -158,105 +155,96 @@ class Replay:
         return int(self.rollout.agent_type[agent] in ("pedestrian", "cyclist"))
 
     def colour(self, agent: int) -> str:
-        others = (
-            drawing.BACKGROUND if self.rollout.simulated[agent] else drawing.REPLAYED
-        )
-        return (others, drawing.VULNERABLE, drawing.ADVERSARY, drawing.EGO)[
-            self.layer(agent)
-        ]
+        simulated = self.rollout.simulated[agent]
+        return (
+            drawing.BACKGROUND if simulated else drawing.REPLAYED,
+            drawing.VULNERABLE,
+            drawing.ADVERSARY,
+            drawing.EGO,
+        )[self.layer(agent)]
 
 
 class Panel:
     """A replay on a square figure of SIDE, with a header, a map and a legend; `show`
     moves it to another moment."""
 
-    def __init__(self, replay: Replay, figure: Figure | SubFigure):
+    def __init__(self, replay: Replay, figure: Figure | SubFigure) -> None:
         self.replay = replay
         self.figure = figure
         rollout = replay.rollout
-        large = replay.caption is not None
-        head, foot = (LARGE_HEAD, LARGE_FOOT) if large else (HEAD, FOOT)
-        title, detail = replay.caption or (
-            f"{rollout.method}  vs  {rollout.ego_policy}",
-            f"{shorten(rollout.scene_id)}   seed {rollout.seed}   intensity {rollout.eta:g}",
-        )
-        axes = self.figure.add_axes((0, foot / SIDE, 1, 1 - (head + foot) / SIDE))
+        letters = SMALL
+        title = f"{rollout.method}  vs  {rollout.ego_policy}"
+        detail = f"{shorten(rollout.scene_id)}   seed {rollout.seed}   "
+        detail += f"intensity {rollout.eta:g}"
+        badge = f"{contact_text(replay.row)}\n{verdict_text(replay.row)}"
+        legend = LEGEND
+        if replay.caption:
+            letters = LARGE
+            title, detail = replay.caption
+            badge = contact_text(replay.row)
+            legend = dict(list(LEGEND.items())[:3])
+        head = letters.head / SIDE
+        foot = letters.foot / SIDE
+        axes = figure.add_axes((0, foot, 1, 1 - head - foot))
         self.map = TrafficMap(axes, rollout, metres=replay.metres)
-        first, second = (26, 20) if large else (16, 11)  # points, of the letters
         left = 14 / SIDE
         right = 706 / SIDE
-        upper = 1 - 0.46 * head / SIDE
-        lower = 1 - 0.82 * head / SIDE
-        text = self.figure.text
-        text(left, upper, title, fontsize=first, color=drawing.INK)
-        text(left, lower, detail, fontsize=second, color=drawing.MUTED)
-        self.clock = text(
-            right, upper, "", fontsize=first, color=drawing.INK, ha="right"
-        )
-        self.speed = text(
-            right, lower, "", fontsize=second, color=drawing.MUTED, ha="right"
-        )
+        first = {"y": 1 - 0.46 * head, "fontsize": letters.title, "color": drawing.INK}
+        second = {
+            "y": 1 - 0.82 * head,
+            "fontsize": letters.detail,
+            "color": drawing.MUTED,
+        }
+        figure.text(left, s=title, **first)
+        figure.text(left, s=detail, **second)
+        self.clock = figure.text(right, s="", ha="right", **first)
+        self.speed = figure.text(right, s="", ha="right", **second)
         box = {
             "boxstyle": "round,pad=0.5,rounding_size=1",
             "facecolor": drawing.CONTACT,
             "edgecolor": "none",
         }
-        badge = (
-            contact_text(replay.row)
-            if large
-            else f"{contact_text(replay.row)}\n{verdict_text(replay.row)}"
-        )
-        self.badge = text(
+        self.badge = figure.text(
             0.5,
-            1 - (head + 40) / SIDE,
+            1 - head - 40 / SIDE,
             badge,
-            fontsize=22 if large else 13,
+            fontsize=letters.badge,
             color="w",
             bbox=box,
+            ha="center",
+            va="center",
         )
-        self.badge.set(ha="center", va="center")
-        add_legend(
-            self.figure,
-            dict(list(LEGEND.items())[:3]) if large else LEGEND,
-            size=20 if large else 11,
-        )
+        add_legend(figure, legend, size=letters.legend)
         bar = (right - 10 / replay.metres, right)
-        self.figure.add_artist(
+        figure.add_artist(
             Line2D(bar, (10 / SIDE, 10 / SIDE), color=drawing.INK, linewidth=2)
         )
-        text(
-            sum(bar) / 2,
-            14 / SIDE,
-            "10 m",
-            fontsize=second - 1,
-            color=drawing.MUTED,
-            ha="center",
-        )
+        second |= {"y": 14 / SIDE, "fontsize": letters.detail - 1}
+        figure.text(sum(bar) / 2, s="10 m", ha="center", **second)
 
     def show(self, time: float, phase: float | None) -> None:
         replay = self.replay
-        rollout = self.replay.rollout
-        centre = np.array(
-            [
-                np.interp(time, np.arange(len(replay.centres)), axis)
-                for axis in replay.centres.T
-            ]
-        )
+        rollout = replay.rollout
+        steps = np.arange(len(replay.centres))
+        centre = np.array([np.interp(time, steps, axis) for axis in replay.centres.T])
         self.map.show(centre, replay.trails(time), replay.shapes(time, phase))
-        speed = interpolated(rollout.states, rollout.valid, time=time)[rollout.ego, 3]
         self.clock.set_text(f"{time * rollout.dt:.1f} s")
-        self.speed.set_text(f"ego {speed:.1f} m/s")
+        self.speed.set_text(
+            f"ego {interpolated(rollout, time)[rollout.ego, 3]:.1f} m/s"
+        )
         self.badge.set_visible(replay.contact is not None and time >= replay.contact)
 
 
-def interpolated(states: np.ndarray, valid: np.ndarray, time: float) -> np.ndarray:
+def interpolated(rollout: Rollout, time: float) -> np.ndarray:
     """States [N, 4] at a fractional step; agents that are absent at the next step stay
     where they are."""
+    states = rollout.states
     low = math.floor(time)
     high = min(low + 1, len(states) - 1)
     change = states[high].astype(float) - states[low]
     change[:, 2] = (change[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    return states[low] + np.where(valid[high, :, None], (time - low) * change, 0)
+    stays = ~rollout.valid[high, :, None]
+    return states[low] + np.where(stays, 0, (time - low) * change)
 
 
 def contact_point(rollout: Rollout, step: int, partner: int) -> np.ndarray:
@@ -272,27 +260,24 @@ def contact_point(rollout: Rollout, step: int, partner: int) -> np.ndarray:
 
 
 def contact_text(row: Mapping[str, Any]) -> str:
-    return f"contact at {row['contact_time']:.1f} s: {row['contact_type']}, {row['relvel']:.1f} m/s"
+    return (
+        f"contact at {row['contact_time']:.1f} s: {row['contact_type']}, "
+        f"{row['relvel']:.1f} m/s"
+    )
 
 
 def verdict_text(row: Mapping[str, Any]) -> str:
     """Whether the collision counts and why, and the duty that the partner broke."""
-    reasons = {
-        "ego's fault": row["at_fault"] == 1,
-        "preventable": row["preventable"] == 1,
-    }
-    counts = ", ".join(name for name, holds in reasons.items() if holds)
-    return f"{counts or 'does not count'}; {row['duty']}".replace(
-        "; none", "; no duty broken"
-    )
+    reasons = {"ego's fault": row["at_fault"], "preventable": row["preventable"]}
+    counts = ", ".join(name for name, holds in reasons.items() if holds == 1)
+    duty = "no duty broken" if row["duty"] == "none" else row["duty"]
+    return f"{counts or 'does not count'}; {duty}"
 
 
 def shorten(name: str, limit: int = 42) -> str:
-    return (
-        name
-        if len(name) <= limit
-        else f"{name[: limit // 2 - 1]}…{name[-limit // 2 :]}"
-    )
+    if len(name) <= limit:
+        return name
+    return f"{name[: limit // 2 - 1]}…{name[-limit // 2 :]}"
 
 
 # --- one scene and seed at several intensities
@@ -302,28 +287,30 @@ def intensity_figure(sweep: Sequence[Failure]) -> Figure:
     """Returns a panel for each rollout, in the order of intensity, at the moment of its
     contact; one without contact is shown when the next one that has a contact has it,
     else at its end."""
-    replays = [Replay(each.rollout, each.row, metres=SWEEP_METRES) for each in sweep]
-    sizes = SWEEP_COLUMNS, math.ceil(len(replays) / SWEEP_COLUMNS)
-    figure = new_figure(*(count * (SIDE + SWEEP_GAP) - SWEEP_GAP for count in sizes))
-    wide, high = ([SIDE, *[SWEEP_GAP, SIDE] * (count - 1)] for count in sizes)
+    replays = [
+        Replay(failure.rollout, failure.row, metres=SWEEP_METRES) for failure in sweep
+    ]
+    rows = math.ceil(len(replays) / SWEEP_COLUMNS)
+    wide = [SIDE, *[SWEEP_GAP, SIDE] * (SWEEP_COLUMNS - 1)]
+    high = [SIDE, *[SWEEP_GAP, SIDE] * (rows - 1)]
+    figure = new_figure(sum(wide), sum(high))
     places = figure.add_gridspec(
         len(high), len(wide), width_ratios=wide, height_ratios=high
     )
     for index, replay in enumerate(replays):
-        contacts = [
+        row, column = divmod(index, SWEEP_COLUMNS)
+        contacts = (
             other.contact for other in replays[index:] if other.contact is not None
-        ]
-        phase = None if replay.contact is None else 0.25
-        place = places[2 * (index // SWEEP_COLUMNS), 2 * (index % SWEEP_COLUMNS)]
-        Panel(replay, figure.add_subfigure(place)).show(
-            contacts[0] if contacts else replay.last, phase
         )
+        phase = None if replay.contact is None else 0.25
+        panel = Panel(replay, figure.add_subfigure(places[2 * row, 2 * column]))
+        panel.show(next(contacts, replay.last), phase)
     return figure
 
 
 def intensity_sweep(folder: Path) -> list[Failure]:
     """Returns the rollouts of `best_sweep` of a run's folder."""
-    rows = [row for row in read_rows(Path(folder) / TABLE) if row["errored"] != 1]
+    rows = [row for row in read_rows(folder / TABLE) if row["errored"] != 1]
     return [Failure.read(folder, row) for row in best_sweep(rows)]
 
 
@@ -331,28 +318,19 @@ def best_sweep(rows: Sequence[dict]) -> list[dict]:
     """Returns the rows, by eta, of the one (method, scene, seed) that best shows the
     effect of eta: no contact at the lowest eta, contact at as many others as possible,
     earlier at greater eta, late at first."""
-    groups: dict[tuple, list[dict]] = {}
-    for row in rows:
-        groups.setdefault(
-            (row["method"], row["ego_policy"], row["scene_id"], row["seed"]), []
-        ).append(row)
-    sweeps = [sorted(group, key=lambda row: row["eta"]) for group in groups.values()]
-    most = max(map(len, sweeps))
-    return max((sweep for sweep in sweeps if len(sweep) == most), key=worth)
+    names = ("method", "ego_policy", "scene_id", "seed")
+    groups = grouped(
+        sorted(rows, key=lambda row: row["eta"]),
+        lambda row: tuple(row[name] for name in names),
+    )
+    most = max(map(len, groups.values()))
+    return max((sweep for sweep in groups.values() if len(sweep) == most), key=worth)
 
 
 def worth(sweep: Sequence[dict]) -> tuple[float, ...]:
     """Score of rows of rollouts by eta for `best_sweep`; greater is better."""
+    hits = [row["cfr"] == 1 for row in sweep]
     times = [row["contact_time"] for row in sweep if row["cfr"] == 1]
-    falls = sum(
-        later < earlier for earlier, later in zip(times, times[1:], strict=False)
-    )
-    found = [row["cfr"] == 1 for row in sweep]
-    monotone = found == sorted(found)
-    return (
-        not found[0],
-        monotone,
-        len(times),
-        falls,
-        times[0] - times[-1] if times else -sweep[-1]["min_dtc"],
-    )
+    falls = sum(np.diff(times) < 0)
+    reach = times[0] - times[-1] if times else -sweep[-1]["min_dtc"]
+    return not hits[0], hits == sorted(hits), len(times), falls, reach

@@ -5,10 +5,9 @@ import sys
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from e2rl.commands import prior_tables
+from e2rl.commands import prior_tables, skeleton
 from e2rl.evaluation.rollout_files import read_metrics
 from e2rl.metrics.catalogue import SPREAD_STAGE, STAGES
-from e2rl.report import skeleton_figure
 from tests.scripts import SHORT
 
 pytestmark = pytest.mark.slow
@@ -58,14 +57,10 @@ def test_the_prior_s_tables_have_rows_of_all_stages(
 
 
 def test_the_skeleton_is_drawn(world, tmp_path, monkeypatch, capsys):
-    run(skeleton_figure, tmp_path / "run", world=world, monkeypatch=monkeypatch)
+    run(skeleton, tmp_path / "run", world=world, monkeypatch=monkeypatch)
     drawn = {
         path.name
         for path in (tmp_path / "run").glob("*.p*")
         if path.suffix in (".png", ".pdf")
     }
-    assert drawn == {
-        f"{name}.{suffix}"
-        for name in ("skeleton", "anchoring")
-        for suffix in ("png", "pdf")
-    }
+    assert drawn == {"skeleton.png", "skeleton.pdf"}

@@ -139,7 +139,7 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(
             "variants.idm: idm is a row already",
         ),
         (["eta=nan"], "eta=nan: expected"),
-        (["tries=1", "figure=curves"], "figure=curves: name several"),
+        (["tries=1", "figure=intensity"], "figure=intensity: name several"),
         (
             ["tries=1", "figure=intensity", "eta=[1,2]", "save_rollouts=false"],
             "figure=intensity: .*save_rollouts=true",

@@ -319,6 +319,7 @@ def test_rollouts_in_which_the_planner_raised_are_failures_and_named():
     about = {
         "method": "e2",
         "eta": 2.0,
+        "ego_policy": "lane_graph",
         "seed": 0,
         "errored": 1.0,
         "raised_by": "ego",

@@ -8,8 +8,9 @@ import shutil
 
 import pytest
 
+from e2rl.commands.compare import main
 from e2rl.evaluation.comparison import CHANGES, Driven
-from e2rl.report.compare import PAGE, compare, main
+from e2rl.report.compare import PAGE, compare
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout
 from tests.evaluation.constructed_runs import run_of
 from tests.metrics.random_rollouts import random_rollouts

@@ -9,10 +9,10 @@ import torch
 
 from e2rl.metrics.score import score_rollouts
 from e2rl.report import drawing
-from e2rl.report.drawing import new_panels, save_figure
+from e2rl.report.drawing import new_figure, save_figure
 from e2rl.report.picture import SIDE, Replay, best_sweep, intensity_figure, worth
 from e2rl.report.picture import SWEEP_GAP as GAP
-from e2rl.report.skeleton_figure import SkeletonPicture
+from e2rl.report.skeleton import SkeletonPicture
 from e2rl.sim.rollout_file import Failure
 from e2rl.traffic.e2.skeleton import Selection
 from e2rl.traffic.e2.topology import TopologySettings, pair_weights
@@ -93,18 +93,6 @@ def test_the_moment_is_that_of_the_greatest_risk_of_the_links_and_times_are_thos
         assert shown.ttc(weight) == pytest.approx(ttc)
 
 
-def test_what_was_driven_takes_the_place_of_the_reference(shown):
-    driven = SkeletonPicture.driven(shown.rollout, shown.selection)
-    steps = 5 * torch.arange(driven.selection.weights.shape[1])
-    torch.testing.assert_close(driven.selection.moments[0].float(), 0.1 * steps)
-    np.testing.assert_array_equal(
-        driven.selection.reference[0], shown.rollout.states[steps]
-    )
-    assert driven.risky[0, 0] == pytest.approx(10 * driven.time), (
-        "the ego drives 10 m/s along x"
-    )
-
-
 def test_vehicles_have_the_colour_of_their_part(shown):
     assert [shown.colour(agent) for agent in (0, 1, 3)] == [
         drawing.EGO,
@@ -117,7 +105,8 @@ def test_the_same_figure_is_written_as_the_same_pixels_and_vectors_and_no_name_i
     tmp_path,
 ):
     for name in "ab":
-        made, axes = new_panels(2, 200, gap=10, head=40, foot=30)
+        made = new_figure(410, 270)
+        axes = made.subplots(1, 2)
         axes[0].plot([0, 1, 2], [0, 1, 0], linewidth=2)
         axes[0].set_title("$\\frac{")
         save_figure(tmp_path / f"{name}.png", made)

@@ -8,12 +8,11 @@ import shlex
 
 import pytest
 
-from e2rl.commands import export, replay
+from e2rl.commands import export, replay, report
 from e2rl.evaluation.modes import read_modes
 from e2rl.evaluation.rollout_files import read_rows
 from e2rl.metrics.atlas import CELL, atlas_of
 from e2rl.metrics.failure_modes import is_failure
-from e2rl.report import html as report
 from e2rl.report.html import replay_order, write_report
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout
 from tests.metrics.random_rollouts import random_rollouts

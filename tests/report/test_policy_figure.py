@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from e2rl.report import policy_figure as module
+from e2rl.commands import policy_figure as module
 from e2rl.report.policy_figure import PANELS, policy_figure
 
 

@@ -8,25 +8,22 @@ from functools import reduce
 
 import pytest
 
-from e2rl.commands import export, merge, replay
+from e2rl.commands import export, merge, replay, report
 from e2rl.evaluation.modes import MODES_FILE
 from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_rows, write_rows
-from e2rl.evaluation.tuning import TUNING_FILE
-from e2rl.report import curves
-from e2rl.report import html as report
 from e2rl.run.run import PROVENANCE
 from e2rl.sim.rollout_file import ROLLOUTS
 from tests.report.failed_run import failed_run
-from tests.report.test_curves import folders
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run that all commands read."""
     folder = failed_run(tmp_path_factory.mktemp("strange") / "run")
-    _, tuned = folders(folder.parent / "other")
-    for name in (PROVENANCE, TUNING_FILE):
-        shutil.copy(tuned / name, folder)
+    names = ("choices", "files", "inputs", "settings")
+    provenance = {"command": "", "cwd": ""} | {name: {} for name in names}
+    provenance["versions"] = [{"git": "0"}]
+    (folder / PROVENANCE).write_text(json.dumps(provenance))
     (folder / "parts").mkdir()
     (folder / "parts" / "rollouts-000000.pt").write_bytes(b"a part")
     return folder
@@ -77,7 +74,6 @@ COMMANDS = {
     "export": lambda run, out: export.main(
         [str(run), "--to", "npz", "--no-scene", "--out", str(out)]
     ),
-    "curves": lambda run, out: curves.main([str(run), "--out", str(out)]),
     "merge": lambda run, out: merge.main([str(run), "--into", str(out)]),
 }
 DAMAGE = [
@@ -114,11 +110,6 @@ DAMAGE = [
         ROLLOUTS,
         lambda path: [link("/dev/zero")(file) for file in path.iterdir()],
     ),
-    ("curves", TUNING_FILE, json_with("trials", [])),
-    ("curves", TUNING_FILE, json_with("trials", 0, "metrics", "cfr", "x")),
-    ("curves", TUNING_FILE, json_with("trials", 1, "parameters", {"other": 1})),
-    ("curves", TUNING_FILE, pipe),
-    ("curves", PROVENANCE, json_with("settings", "synthesizer", "\x1b[2J")),
     ("merge", "parts/rollouts-000000.pt", link("/etc/hostname")),
     ("merge", "parts/rollouts-000000.pt", pipe),
     ("merge", TABLE, link("/dev/zero")),

@@ -1,1 +1,1 @@
-"""Rollouts of a run in the formats of other tools (docs/export.md)."""
+"""Rollouts of a run in the formats of other tools (docs/guide/export.md)."""

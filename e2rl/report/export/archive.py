@@ -1,4 +1,4 @@
-"""Rollout files as they are, and their scenes (docs/export.md)."""
+"""Rollout files as they are, and their scenes (docs/guide/export.md)."""
 
 import io
 from collections.abc import Iterable, Iterator

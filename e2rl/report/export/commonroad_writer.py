@@ -1,5 +1,5 @@
 """CommonRoad scenarios, format 2020a, by commonroad-io (extra `commonroad`;
-docs/export.md).
+docs/guide/export.md).
 
 Obstacle 1 is the ego, obstacle n + 1 the agent of row n. An agent that comes back after
 a gap is a further obstacle, since a CommonRoad trajectory has no gaps. Late agents have

@@ -1,5 +1,5 @@
 """MCAP files of Foxglove's scene updates, to watch in Foxglove or Lichtblick (extra
-`mcap`; docs/export.md).
+`mcap`; docs/guide/export.md).
 
 | topic | schema | messages |
 | --- | --- | --- |

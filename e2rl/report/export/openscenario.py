@@ -1,5 +1,5 @@
 """ASAM OpenSCENARIO XML 1.2 with its road in OpenDRIVE, by scenariogeneration (extra
-`openscenario`; docs/export.md).
+`openscenario`; docs/guide/export.md).
 
 Every agent follows a polyline with a time at every vertex (FollowTrajectoryAction,
 following mode `position`). A vertex is the place of an entity's reference point, which

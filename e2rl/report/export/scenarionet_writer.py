@@ -1,5 +1,5 @@
 """ScenarioNet: a ScenarioDescription pickle of each episode, and the summary of the
-folder (docs/export.md).
+folder (docs/guide/export.md).
 
 Pickles hold python containers and numpy arrays only. Where the scene is known, the
 second before the start comes first, so the start is frame 10 as in Waymo's files.
