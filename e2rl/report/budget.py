@@ -54,7 +54,7 @@ def seed_of(row: Mapping) -> int:
 
 
 def findings(
-    tries: Sequence[Mapping],
+    tries: Sequence[dict],
     seeds: Sequence[int],
     *,
     scenes: Sequence[Scene],
@@ -132,7 +132,7 @@ def key_of(row: Mapping) -> TryKey:
 
 
 def budget_rows(
-    tries: Sequence[Mapping],
+    tries: Sequence[dict],
     scenes: Sequence[Scene],
     *,
     budgets: Sequence[float],
@@ -258,7 +258,7 @@ def save_budget(
     folder: Path,
     plan: Evaluation,
     *,
-    tries: Sequence[Mapping],
+    tries: Sequence[dict],
     rows: Sequence[Mapping],
     samples: Sequence[Samples],
 ) -> None:

@@ -148,7 +148,11 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
     outcome = UNDECIDED
     if high <= rule.limit if rule.upper else low >= rule.limit:
         outcome = PASSED
-    elif (low > rule.limit if rule.upper else high < rule.limit) or alone and summary.raised == summary.scenes:
+    elif (
+        (low > rule.limit if rule.upper else high < rule.limit)
+        or alone
+        and summary.raised == summary.scenes
+    ):
         outcome = FAILED
     estimated = estimate(
         metric,

@@ -189,8 +189,12 @@ class Panel:
         self.map = TrafficMap(axes, rollout, metres=replay.metres)
         left = 14 / SIDE
         right = 706 / SIDE
-        first = {"y": 1 - 0.46 * head, "fontsize": letters.title, "color": drawing.INK}
-        second = {
+        first: dict[str, Any] = {
+            "y": 1 - 0.46 * head,
+            "fontsize": letters.title,
+            "color": drawing.INK,
+        }
+        second: dict[str, Any] = {
             "y": 1 - 0.82 * head,
             "fontsize": letters.detail,
             "color": drawing.MUTED,

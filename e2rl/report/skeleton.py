@@ -222,8 +222,9 @@ class SkeletonPicture:
             )
         for agent in self.members:
             corner = (nodes.index(self.target[agent]), nodes.index(agent))
-            frame = {"edgecolor": drawing.INK, "linewidth": 4, "zorder": 3}
-            table.add_patch(Rectangle(corner, 1, 1, fill=False, **frame))
+            frame = Rectangle(corner, 1, 1, fill=False, edgecolor=drawing.INK)
+            frame.set(linewidth=4, zorder=3)
+            table.add_patch(frame)
         centres = np.arange(count) + 0.5
         names = list(map(name_of, nodes))
         table.set_xticks(centres, names)
@@ -298,7 +299,7 @@ class SkeletonPicture:
         for agent in self.nodes():
             axes.annotate(
                 name_of(agent),
-                states[agent, :2],
+                tuple(states[agent, :2]),
                 (13, 9),
                 textcoords="offset points",
                 fontsize=15,
