@@ -133,7 +133,9 @@ class Replay:
         step = math.floor(time)
         states = interpolated(rollout, time)
         shapes = []
-        for agent in sorted(np.flatnonzero(rollout.valid[step]), key=self.layer):
+        for agent in sorted(
+            np.flatnonzero(rollout.valid[step]).tolist(), key=self.layer
+        ):
             shapes += drawing.agent(
                 rollout.agent_type[agent],
                 states[agent],

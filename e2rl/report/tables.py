@@ -123,7 +123,7 @@ def metric_tables(
     )
     tables = []
     for (*_, stage), group in groups.items():
-        metrics = STAGES.get(stage, table_metrics(table))
+        metrics = STAGES[stage] if stage else table_metrics(table)
         tables.append(means_table(group, settings, metrics=metrics))
         tables.append(paired_table(group, metrics))
     return [table for table in tables if table.rows]

@@ -18,7 +18,8 @@ from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.recording import Lane, Recording
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, Rollout
 
-FACTS = (  # columns of rollouts.csv that go along; docs/reference/verdicts.md and docs/reference/metrics.md say what they mean
+# Columns of rollouts.csv that go along (docs/reference/verdicts.md, metrics.md there).
+FACTS = (
     *(
         "dataset",
         "split",
