@@ -13,24 +13,28 @@ import sys
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_traffic, caption
 from e2rl.evaluation.rollout_files import ERRORED_FILE, add_errored
-from e2rl.learning.bits_training import run_bits_stage
-from e2rl.learning.build import (
+from e2rl.learning.logging import RunLogger
+from e2rl.learning.pretraining.bits import run_bits_stage
+from e2rl.learning.pretraining.imitation import run_imitation_stage
+from e2rl.learning.pretraining.prior.distributed import (
+    follower_overrides,
+    follows,
+    started_by_torchrun,
+)
+from e2rl.learning.pretraining.prior.stage import run_prior_stage
+from e2rl.learning.rounds.build import (
     build_evolution,
     build_logger,
     build_measure,
     build_progress,
     check_training,
 )
-from e2rl.learning.evolution import Evolution
-from e2rl.learning.imitation import run_imitation_stage
-from e2rl.learning.logging import RunLogger
-from e2rl.learning.prior_training.distributed import (
-    follower_overrides,
-    follows,
-    started_by_torchrun,
+from e2rl.learning.rounds.checkpoint import (
+    load_checkpoint,
+    rounds_done,
+    save_checkpoint,
 )
-from e2rl.learning.prior_training.stage import run_prior_stage
-from e2rl.learning.run_checkpoint import load_checkpoint, rounds_done, save_checkpoint
+from e2rl.learning.rounds.evolution import Evolution
 from e2rl.report.answer import compared_answer
 from e2rl.report.rounds import round_line, save_videos
 from e2rl.report.tables import metric_tables, print_tables, save_tables

@@ -8,7 +8,7 @@ from e2rl.scripts.train import train_round
 from measure import Bench, Row
 
 from e2rl.evaluation.methods import build_ego
-from e2rl.learning.build import build_evolution
+from e2rl.learning.rounds.build import build_evolution
 
 
 def evolution_round(bench: Bench) -> Iterator[Row]:

@@ -8,7 +8,7 @@ import torch
 from measure import Bench, Row
 
 from e2rl.evaluation.methods import build_ego, build_sim
-from e2rl.learning.policy import PolicyImprovement, steps_of
+from e2rl.learning.rounds.policy import PolicyImprovement, steps_of
 from e2rl.run import fused
 
 WARM_UP = 2  # iterations that are not counted: the first updates fit the critic alone

@@ -6,7 +6,7 @@ from hydra.utils import instantiate
 from measure import Bench, Row
 from torchrl.collectors import Collector
 
-from e2rl.learning.update import Learner
+from e2rl.learning.rounds.update import Learner
 from e2rl.planners.actor import ActorEgo
 from e2rl.sim.env import DrivingEnv
 

@@ -27,7 +27,7 @@ from torchrl.envs import TransformedEnv
 
 from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
 from e2rl.evaluation.protocol import Method, Setup, Task
-from e2rl.learning.policy import RowDraw
+from e2rl.learning.rounds.policy import RowDraw
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.planners.policy_file import write_policy
@@ -220,7 +220,7 @@ def make_gym_env(
             whose action is ignored, as gymnasium's wrappers of a batch's observations want it.
         settings: of make_env.
     """
-    module = library("e2rl.learning.gym_env", "make_gym_env", extra="gym")
+    module = library("e2rl.learning.adapters.gym_env", "make_gym_env", extra="gym")
     check_choice("autoreset", autoreset, choices=module.AUTORESET)
     if num_envs is None:
         return module.DrivingGymEnv(make_env(1, **settings))
@@ -231,7 +231,7 @@ def make_gym_env(
 
 def make_sb3_env(num_envs: int = 16, **settings: Any) -> Any:
     """Returns the batch as a VecEnv of Stable-Baselines3. settings: of make_env."""
-    return library("e2rl.learning.sb3", "make_sb3_env", extra="gym").SB3Env(
+    return library("e2rl.learning.adapters.sb3", "make_sb3_env", extra="gym").SB3Env(
         make_gym_env(num_envs, **settings)
     )
 
@@ -247,9 +247,9 @@ def save_policy(policy: Any, path: str | Path, env: Any = None) -> Path:
             (docs/how-to/gym.md).
     """
     if not isinstance(policy, torch.nn.Module):
-        policy = library("e2rl.learning.sb3", "save_policy", extra="gym").Deterministic(
-            policy, env
-        )
+        policy = library(
+            "e2rl.learning.adapters.sb3", "save_policy", extra="gym"
+        ).Deterministic(policy, env)
     write_policy(policy, Path(path))
     return Path(path)
 

@@ -10,7 +10,7 @@ from PIL import Image
 from torchrl.record.loggers import CSVLogger, TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
 
-from e2rl.learning.scheduler import COLUMNS, Choice
+from e2rl.learning.rounds.scheduler import COLUMNS, Choice
 from e2rl.run.config import library
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically

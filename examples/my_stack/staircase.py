@@ -1,7 +1,7 @@
 """A curriculum: the intensity climbs one stair whenever the ego has coped with the
 present one."""
 
-from e2rl.learning.scheduler import CurriculumScheduler
+from e2rl.learning.rounds.scheduler import CurriculumScheduler
 
 
 class Staircase(CurriculumScheduler):

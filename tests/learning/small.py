@@ -3,10 +3,10 @@
 import torch
 from e2rl.scripts.train import train_round
 
-from e2rl.learning.evolution import Evolution, RoundSettings
-from e2rl.learning.memory import Memory
-from e2rl.learning.policy import PolicyImprovement
-from e2rl.learning.schedules import AdaptiveCurriculum
+from e2rl.learning.rounds.evolution import Evolution, RoundSettings
+from e2rl.learning.rounds.memory import Memory
+from e2rl.learning.rounds.policy import PolicyImprovement
+from e2rl.learning.rounds.schedules import AdaptiveCurriculum
 from e2rl.planners.actor import ActorEgo
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity

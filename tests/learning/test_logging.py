@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from e2rl.learning.logging import CHOICES, RunLogger
-from e2rl.learning.scheduler import COLUMNS
+from e2rl.learning.rounds.scheduler import COLUMNS
 from e2rl.run.errors import InputError
 
 WANDB_HEADER, LEVELDB_BLOCK = 7, 1 << 15  # bytes

@@ -5,7 +5,7 @@ import torch
 from e2rl.scripts.train import train_round
 from PIL import Image
 
-from e2rl.learning.schedules import AdaptiveCurriculum
+from e2rl.learning.rounds.schedules import AdaptiveCurriculum
 from e2rl.report.rounds import hits, save_videos
 from tests.learning.small import small_run, small_scenes
 

@@ -11,7 +11,7 @@ import torch
 from e2rl.scripts.train import train_round
 
 from e2rl.evaluation.protocol import Method, Setup, run_protocol
-from e2rl.learning.attack import make_traffic
+from e2rl.learning.rounds.attack import make_traffic
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run import ray_workers
 from e2rl.run.errors import InputError

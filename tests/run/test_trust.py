@@ -84,7 +84,7 @@ def test_a_policy_that_holds_arithmetic_goes_on():
         {"synthesizer": {"deep": [{"x": [{"_target_": "pickle.loads"}]}]}},
         {"ego": {"_target_": "e2rl.run.files.write_atomically"}},  # a function of e2rl
         {
-            "ego": {"_target_": "e2rl.learning.memory.Memory"}
+            "ego": {"_target_": "e2rl.learning.rounds.memory.Memory"}
         },  # a class of e2rl that is no extension
         {
             "ego": {"_target_": "e2rl.run.run.subprocess.Popen"}

@@ -8,7 +8,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from e2rl.learning.policy import RowDraw
+from e2rl.learning.rounds.policy import RowDraw
 from e2rl.planners.ego import Ego
 from e2rl.planners.ego_errors import PlannerError, TrafficNotFinite
 from e2rl.planners.ego_policy import EgoPolicy

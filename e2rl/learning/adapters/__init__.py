@@ -1,0 +1,1 @@
+"""The environment by the interfaces of other libraries: gymnasium, Stable-Baselines3."""

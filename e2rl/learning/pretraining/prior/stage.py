@@ -1,0 +1,117 @@
+"""`python train.py stage=prior`: train a prior on the user's data and measure its
+closed loop on held-out logs."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.learning.logging import RunLogger
+from e2rl.learning.pretraining.prior.distributed import process_group
+from e2rl.learning.pretraining.prior.training import (
+    TrainingSettings,
+    held_out,
+    train_prior,
+)
+from e2rl.learning.pretraining.supervised import stage_settings
+from e2rl.planners.log_replay import ReplayEgo
+from e2rl.prior.bounds import BoundSettings
+from e2rl.prior.denoiser import DenoiserSettings
+from e2rl.prior.prior import Prior
+from e2rl.prior.sde import SamplerSettings
+from e2rl.run.parts import Parts
+from e2rl.run.run import Run, origin_of
+from e2rl.run.settings import settings_of
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.scene_list import listed, scene_hashes
+from e2rl.scenes.source import load_scenes
+from e2rl.sim.env import SimSettings
+from e2rl.traffic.nominal import NominalTraffic
+
+
+def run_prior_stage(
+    run: Run, logger: RunLogger | None
+) -> tuple[Path, list[dict]] | None:
+    """Train a prior; returns its checkpoint's path and the metrics rows of the nominal
+    closed loop on held-out scenes, the ego replayed. None in processes other than the
+    leader."""
+    config = run.config
+    settings = stage_settings(config, TrainingSettings)
+    with process_group(config.device) as (processes, device):
+        folder = processes.from_leader(lambda: run.folder)
+        own = config.prior
+        prior = Prior(  # whose first weights follow the run's seed
+            settings_of(DenoiserSettings, own.network, where="prior.network"),
+            settings_of(SamplerSettings, own.sampler, where="prior.sampler"),
+            bounds=settings_of(BoundSettings, own.bounds, where="prior.bounds"),
+        ).to(device)
+        scenes = processes.leader_first(
+            lambda: load_scenes(
+                config.data,
+                config.num_scenes,
+                split="train",
+                starts=list(settings.starts),
+                scenes=config.scenes,
+            )
+        )
+        processes.from_leader(lambda: run.begin({"scenes": listed(scenes)}))
+        data = hashlib.sha256("\n".join(scene_hashes(scenes)).encode()).hexdigest()[:16]
+        about = {
+            "data": f"{scenes.dataset}/{scenes.split}",
+            "scenes": len(scenes),
+            "fingerprint": data,
+        }
+        origin = about | origin_of(folder) | {"settings": vars(settings)}
+        parts = Parts(folder, "training", about=data)
+        path = train_prior(
+            prior,
+            scenes,
+            settings=settings,
+            folder=folder,
+            origin=origin,
+            processes=processes,
+            logger=logger,
+            parts=parts,
+        )
+        if path is None:
+            return None
+        fields: dict[str, Any] = {
+            "stage": "prior",
+            "parts": Parts(folder, "prior", about=path.name),
+            **origin_of(folder),
+        }
+        setup = Setup(
+            _first_starts(scenes),
+            ReplayEgo(),
+            ego_name="replay",
+            sim=SimSettings(),
+            device=device,
+        )
+        return path, run_protocol(
+            setup,
+            [Method("nominal", NominalTraffic(prior))],
+            seeds=[0],
+            folder=folder,
+            **fields,
+        )
+
+
+def _first_starts(scenes: SceneSet) -> SceneSet:
+    """Of each held-out log the scene with the earliest start frame, i.e. the longest
+    recorded future."""
+    first: dict[str, tuple[int, int]] = {}
+    for index in held_out(scenes).nonzero()[:, 0].tolist():
+        log, _, start = scenes.scene_id[index].rpartition("@")
+        first[log] = min(first.get(log, (int(start), index)), (int(start), index))
+    keep = [index for _, index in first.values()]
+    names, places = (
+        [values[i] for i in keep] for values in (scenes.scene_id, scenes.location)
+    )
+    return SceneSet(
+        scenes.batch(keep),
+        names,
+        location=places,
+        dataset=scenes.dataset,
+        split=f"{scenes.split}-held-out",
+        dropped={},
+    )

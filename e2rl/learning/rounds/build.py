@@ -1,0 +1,271 @@
+"""Builds the parts of an evolution from a run's configuration, and says how long the
+rest takes."""
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from e2rl.evaluation.budget import methods_at, portfolio_plan
+from e2rl.evaluation.methods import (
+    SEARCH,
+    as_list,
+    build_sim,
+    processes_of,
+)
+from e2rl.evaluation.protocol import Method, Setup
+from e2rl.learning.logging import RunLogger
+from e2rl.learning.rounds.attack import Synthesize, solvable
+from e2rl.learning.rounds.before_after import BeforeAfter
+from e2rl.learning.rounds.evolution import Evolution, RoundSettings
+from e2rl.learning.rounds.improvement import Improvement
+from e2rl.learning.rounds.memory import Memory
+from e2rl.learning.rounds.prefetch import why_no_prefetch
+from e2rl.learning.rounds.scheduler import CurriculumScheduler
+from e2rl.planners.ego import Ego
+from e2rl.prior.prior import Prior
+from e2rl.run.config import built, check_device, load_choice, resolved
+from e2rl.run.errors import InputError
+from e2rl.run.ray_workers import RayWorkers
+from e2rl.run.settings import setting, settings_of
+from e2rl.run.terminal import Bar, duration
+from e2rl.scenes.scene import SceneSet
+from e2rl.scenes.source import load_scenes, source_of
+from e2rl.scenes.versions import RECORDED
+from e2rl.traffic.rollout import synthesize_traffic
+from e2rl.traffic.traffic import Traffic
+
+
+def build_evolution(
+    config: DictConfig,
+    scenes: SceneSet,
+    *,
+    ego: Ego,
+    traffic: Traffic,
+    synthesize: Synthesize | None = None,
+    folder: Path | None = None,
+) -> Evolution:
+    """Returns an evolution by config.learner and config.curriculum over config.rounds
+    rounds.
+
+    Args:
+        config: of train.py.
+        scenes: to train on.
+        ego: that is hardened.
+        traffic: that attacks it.
+        synthesize: makes D'; None: closed-loop rollouts with `traffic`.
+        folder: of the run, where D' is remembered; None: a temporary one.
+
+    Returns:
+        The run before its first round.
+
+    Raises:
+        InputError: parts of the configuration that do not fit each other.
+    """
+    sim = build_sim(config)
+    curriculum = built(
+        config.curriculum,
+        "curriculum",
+        kind=CurriculumScheduler,
+        num_scenes=len(scenes),
+        rounds=config.rounds,
+        seed=config.seed,
+    )
+    settings = settings_of(
+        RoundSettings, _with_prefetch(config, ego), where="learner.round"
+    )
+    learner = OmegaConf.create(
+        {key: value for key, value in config.learner.items() if key != "round"}
+    )
+    improve = built(
+        learner,
+        "learner",
+        kind=Improvement,
+        ego=ego,
+        scenes=scenes,
+        sim=sim,
+        seed=config.seed,
+        device=learner.pop("device", config.device),
+    )
+    workers = processes_of(config)
+    return Evolution(
+        curriculum,
+        improve,
+        synthesize
+        or synthesize_traffic(
+            scenes, traffic, sim=sim, batch=config.batch, device=config.device
+        ),
+        settings,
+        config.seed,
+        solvable=(
+            partial(solvable, scenes=scenes, sim=sim)
+            if curriculum.solvable_only
+            else None
+        ),
+        memory=Memory(folder, settings.memory),
+        batch=config.batch,
+        workers=workers if isinstance(workers, RayWorkers) else None,
+    )
+
+
+def _with_prefetch(config: DictConfig, ego: Ego) -> dict:
+    """`config.learner.round`, with a `prefetch` that is left open decided by what is
+    possible."""
+    options = {"prefetch": None} | resolved(config.learner.round)
+    learns = config.learner.get("device", "cpu")
+    device = str(learns if config.device == "cpu" else config.device)
+    reason = why_no_prefetch(device, config.threads, ego=ego)
+    if options["prefetch"] and reason:
+        raise InputError(
+            f"learner.round.prefetch=true: {reason}; set it to null or false"
+        )
+    return options | ({"prefetch": not reason} if options["prefetch"] is None else {})
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Counts of conf/train.yaml, checked."""
+
+    rounds: int = setting(low=1)
+    keep_last: int = setting(low=1)
+    seed: int = setting(low=0)
+    num_scenes: int | None = setting(low=1, optional=True)
+
+
+@dataclass(frozen=True)
+class MeasureSettings:
+    """Settings `measure` of conf/train.yaml, checked."""
+
+    path: str | None
+    scenes: int = setting(low=1)
+    seeds: tuple[int, ...] = setting(low=0)
+    eta: tuple[float, ...] = setting(low=0)
+    budget: float = setting(low=0)
+
+
+def measure_settings(config: DictConfig) -> MeasureSettings:
+    """Returns `config.measure`, checked."""
+    lists = {name: as_list(config.measure[name]) for name in ("seeds", "eta")}
+    return settings_of(MeasureSettings, {**config.measure, **lists}, where="measure")
+
+
+def check_training(config: DictConfig) -> MeasureSettings:
+    """Returns what is measured; InputError for what train.py cannot run, before
+    anything is built."""
+    settings_of(
+        TrainSettings,
+        {field.name: config[field.name] for field in fields(TrainSettings)},
+    )
+    processes_of(config)
+    check_device("learner.device", config.learner.get("device", config.device))
+    build_sim(config)
+    return measure_settings(config)
+
+
+def build_logger(config: DictConfig, folder: Path) -> RunLogger:
+    """The logger of config.logger, writing under a run's folder."""
+    return RunLogger(
+        config.logger.kind,
+        folder,
+        project=config.logger.project,
+        name=config.logger.name,
+    )
+
+
+def build_measure(
+    config: DictConfig,
+    ego: Ego,
+    ego_name: str,
+    traffic: Traffic,
+    prior: Prior,
+    folder: Path,
+) -> BeforeAfter:
+    """The before/after table: nominal and adversarial traffic, and a search, on the
+    scenes of `config.measure`.
+
+    Sources with splits are measured on their tune split; a path's scenes on
+    `measure.path`, both as recorded; or without it on the first training scenes (see
+    `split` in the rows).
+    """
+    options = measure_settings(config)
+    data = config.data.copy()
+    with open_dict(data):
+        data.versions = [RECORDED]
+        if options.path:
+            data.path = options.path
+            data.split = None
+    apart = options.path or source_of(data).has_splits
+    scenes = load_scenes(
+        data, options.scenes, split="tune", scenes=None if apart else config.scenes
+    )
+    nominal = built(
+        load_choice("synthesizer", "nominal"), "synthesizer", kind=Traffic, prior=prior
+    )
+    methods = [
+        Method("nominal", nominal),
+        *(Method(config.synthesizer.name, traffic, eta=eta) for eta in options.eta),
+    ]
+    setup = Setup(
+        scenes,
+        ego,
+        ego_name=ego_name,
+        sim=build_sim(config),
+        batch=config.batch,
+        device=config.device,
+    )
+    given = (setup, methods, options.seeds, folder, processes_of(config))
+    if not options.budget:
+        return BeforeAfter(*given)
+
+    search = portfolio_plan(
+        SEARCH, config, method=partial(methods_at(max(options.eta)), prior)
+    )
+    return BeforeAfter(*given, search, options.budget)
+
+
+class Progress:
+    """The phases of a training, by their kinds, in order. Phases of one kind take about
+    equally long."""
+
+    def __init__(self, kinds: Sequence[str]) -> None:
+        """kinds: of the phases of which one of its kind has to be over before its
+        length is known."""
+        self._kinds = list(kinds)
+        self._spent: dict[str, list[float]] = defaultdict(list)
+
+    @contextmanager
+    def phase(self, kind: str) -> Iterator[None]:
+        """The next phase, of this kind, is done in the block."""
+        begin = time.monotonic()
+        yield
+        self._spent[kind].append(time.monotonic() - begin)
+
+    def left(self) -> str:
+        """Returns the time left in words, "about 12 min left", by what phases of this
+        run have taken.
+
+        "" where nothing is left, and where no phase of a kind that is to come is over.
+        """
+        coming = Counter(self._kinds)
+        coming.subtract({kind: len(seconds) for kind, seconds in self._spent.items()})
+        rest = {kind: count for kind, count in coming.items() if count > 0}
+        if not rest or not all(self._spent[kind] for kind in rest):
+            return ""
+        means = {kind: sum(self._spent[kind]) / len(self._spent[kind]) for kind in rest}
+        return f"about {duration(sum(count * means[kind] for kind, count in rest.items()))} left"
+
+    def say(self, text: str) -> None:
+        """Print a line with the time left, where it is known, above any progress bar."""
+        with Bar.external_write_mode():
+            print("; ".join(filter(None, [text, self.left()])), flush=True)
+
+
+def build_progress(config: DictConfig, done: int = 0) -> Progress:
+    """The phases of an evolution of which so many rounds are done."""
+    before = [] if done else ["measurement"]
+    return Progress([*before, *["round"] * (config.rounds - done), "measurement"])

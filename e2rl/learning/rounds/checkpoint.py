@@ -1,0 +1,173 @@
+"""Checkpoints of an evolution run: all state that later rounds depend on, written
+atomically.
+
+A checkpoint is a folder checkpoints/round-000002 of state.pt (optimiser, curriculum,
+sampler, counters, generators, and which rounds are in memory, whose traffic stays in
+memory/ beside checkpoints/; read with weights_only) and actor.safetensors (weights and
+observation statistics; also what `ego.checkpoint` takes). It is sealed by the hashes of
+these files: a torn or altered one is noticed, and the one before it is used.
+"""
+
+import io
+import random
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from e2rl.learning.rounds.evolution import Evolution
+from e2rl.planners.actor import ActorEgo
+from e2rl.planners.network import WEIGHTS
+from e2rl.run.errors import InputError
+from e2rl.run.files import altered, misfit, read_regular, seal, written_whole
+from e2rl.run.parts import load_plain
+
+STATE = "state.pt"
+FORMAT = "e2rl-checkpoint/9"
+
+
+def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:
+    """Write checkpoints/round-<rounds done> under a run's folder; only the keep_last
+    newest are kept, and of the memory the files that these name."""
+    parent = Path(folder) / "checkpoints"
+    target = parent / f"round-{run.round:06d}"
+    with written_whole(target) as part:
+        _write(part, run)
+        shutil.rmtree(target, ignore_errors=True)
+    *older, newest = sorted(parent.glob("round-*"))
+    kept = [*older, newest][-max(1, keep_last) :]
+    for old in set(older) - set(kept):
+        shutil.rmtree(old)
+    whole = [
+        load_plain(read_regular(each / STATE, within=each))
+        for each in kept
+        if altered(each) is None
+    ]
+    first = [entry["round"] for state in whole for entry in state["memory"]]
+    run.memory.prune(
+        min(first, default=0)
+    )  # a file goes when no checkpoint names it any more
+    return target
+
+
+def _write(folder: Path, run: Evolution) -> None:
+    """The files of a checkpoint, sealed."""
+    state = io.BytesIO()  # a full disk is an OSError then
+    content = {"format": FORMAT, "memory": run.memory.index(), "run": run.state_dict()}
+    torch.save(content | {"generators": generator_states()}, state)
+    (folder / STATE).write_bytes(state.getbuffer())
+    if isinstance(run.ego, ActorEgo):
+        run.ego.network.save(folder / WEIGHTS)
+    seal(folder)
+
+
+def checkpoints(path: str | Path) -> list[Path]:
+    """The checkpoint folders that `path` names, the oldest first: itself, or those of a
+    run's folder."""
+    path = Path(path)
+    return (
+        [path] if (path / STATE).is_file() else sorted(path.glob("checkpoints/round-*"))
+    )
+
+
+def rounds_done(path: str | Path | None) -> int:
+    """Rounds of the newest checkpoint that `path` names; 0 without one."""
+    found = checkpoints(path) if path else []
+    return int(found[-1].name.rpartition("-")[2]) if found else 0
+
+
+def load_checkpoint(path: str | Path, run: Evolution) -> int:
+    """Restore a run built from the same configuration, generators last; returns the
+    rounds done.
+
+    Of a run's folder it is the newest checkpoint that is whole; those that are not are
+    named on stderr. Raises InputError where none is, and for one of another
+    configuration or version.
+    """
+    damages = []
+    for folder in reversed(checkpoints(path)):
+        try:
+            state = _whole(folder, run)
+        except InputError as error:
+            damages.append(str(error))
+            print(f"passed over: {error}", file=sys.stderr)
+            continue
+        _restore(folder, state, run=run)
+        return run.round
+    missing = f"{path}: holds no checkpoint; give a run's folder or one of its checkpoints/round-*"
+    raise InputError(damages[0] if damages else missing)
+
+
+def _whole(folder: Path, run: Evolution) -> dict:
+    """The state in a checkpoint, and its memory restored; InputError where either is
+    damaged."""
+    file = folder / STATE
+    if name := altered(folder):
+        raise InputError(
+            f"{folder / name}: missing or damaged; resume from an older checkpoint"
+        )
+    try:
+        state = load_plain(read_regular(file, within=folder))
+        written = state["format"]
+    except Exception as error:  # a stranger's pickle can raise any exception
+        raise InputError(
+            f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint"
+        ) from error
+    if written != FORMAT:
+        raise InputError(
+            f"{file}: of another version of this program ({written}, not {FORMAT}); begin a new run"
+        )
+    if wrong := misfit(state, {"memory": [{"round": int, "crc32": int}]}):
+        raise InputError(f"{file}: damaged ({wrong}); resume from an older checkpoint")
+    run.memory.restore(state["memory"])
+    return state
+
+
+def _restore(folder: Path, state: dict, run: Evolution) -> None:
+    """Weights, learner, curriculum and generators of a whole checkpoint."""
+    if isinstance(run.ego, ActorEgo):
+        run.ego.network.load(folder / WEIGHTS)
+    try:
+        run.load_state_dict(state["run"])
+        restore_generators(state["generators"])
+    except InputError:
+        raise
+    except (
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        ArithmeticError,
+    ) as error:
+        reason = f"its learner is of another kind or shape ({error}); resume with the configuration of its run"
+        raise InputError(f"{folder / STATE}: {reason}") from None
+
+
+def generator_states() -> dict:
+    """States of the global generators of torch, CUDA, numpy and python, as plain values
+    and tensors."""
+    state = np.random.get_state()
+    assert isinstance(state, tuple)  # the global generator is a Mersenne Twister
+    name, keys, position, has_gauss, cached = state
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [name, keys.tolist(), position, has_gauss, cached],
+        "python": list(random.getstate()),
+    }
+
+
+def restore_generators(states: dict) -> None:
+    """Set the global generators to `generator_states`."""
+    torch.set_rng_state(states["torch"])
+    if torch.cuda.is_available() and states["cuda"]:
+        torch.cuda.set_rng_state_all(states["cuda"])
+    name, keys, position, has_gauss, cached = states["numpy"]
+    np.random.set_state(
+        (name, np.array(keys, dtype=np.uint32), position, has_gauss, cached)
+    )
+    version, internal, gauss = states["python"]
+    random.setstate((version, tuple(internal), gauss))

@@ -1,0 +1,181 @@
+"""A planner's labels in states that the policy comes to (DAgger, Ross, Gordon and
+Bagnell 2011), where they matter.
+
+A label of every state teaches the planner's speed: it would rather drive faster nearly
+everywhere. What it knows better is how to get away. So states are labelled shortly
+before a contact or a near miss, and of these only where, by the planner's costs, the
+policy's own plan is worse by far and the planner's is not a contact itself.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from e2rl.learning.pretraining.cloning import clip_expert
+from e2rl.planners.ego import Ego
+from e2rl.planners.ego_policy import ask
+from e2rl.planners.sampling import ScoringEgo, ranked_actions
+from e2rl.run.errors import InputError
+from e2rl.run.settings import configured, setting, settings_of
+from e2rl.scenes.recording import DT
+from e2rl.scenes.scene import SceneSet
+from e2rl.sim.env import touches
+from e2rl.sim.prospects import time_to_contact
+from e2rl.sim.world import World
+from e2rl.traffic.e2.skeleton import first_after
+
+BATCH, GPU_BATCH = 32, 2048  # states that are labelled at once
+
+
+CANDIDATES = (
+    48  # soft labels: the teacher's cheapest candidates, of which the nearest ones draw
+)
+TEMPERATURE = 5.0  # of their weights softmax(-cost / TEMPERATURE)
+COSTLY = 60.0  # cost from which on a plan counts as one that ends in a contact
+NOTHING = (
+    torch.zeros(0, dtype=torch.int64),
+    torch.zeros(0, dtype=torch.bool),
+)  # rows of decisions, and which are survived
+
+
+@configured("learner/ppo_bc", "teaching")
+@dataclass(frozen=True)
+class TeachingSettings:
+    """Settings `learner.teaching`."""
+
+    states: int = setting(low=1)
+    memory: int = setting(low=1)
+    window: float = setting(low=0)
+    near: float = setting(low=0)
+    regret: float = setting()
+    survivable: float = setting()
+
+
+def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
+    """Bool [B, T]: decisions of a collected batch at most `window` s before a contact,
+    or before a near miss: less than `near` s to a contact if the ego goes on. Both in
+    the same episode."""
+    metrics = data["next", "metrics"]
+    length = data.shape[1]
+    contact = touches(metrics)[..., 0]
+    event = first_after(contact | (time_to_contact(data["observation"]) < near))[:, :-1]
+    step = data["timestep"][..., 0]
+    wait = step.gather(1, event.clamp(max=length - 1)) - step
+    same = (event < length) & (
+        event <= first_after(data["next", "done"][..., 0])[:, :-1]
+    )
+    return same & (wait * DT <= window)
+
+
+class Teacher:
+    """Labels states of collected batches; `labelled` [M] (e2rl.learning.pretraining.cloning) are
+    the newest ones of all rounds.
+
+    It knows of the others what it sees, so that a critical decision from which it would
+    get away, where the policy would not, is one that the policy has to learn:
+    `survivable`.
+    """
+
+    def __init__(
+        self,
+        planner: Ego,
+        scenes: SceneSet,
+        bounds: tuple[Tensor, Tensor],
+        hold: int,
+        settings: Mapping[str, Any],
+    ) -> None:
+        """bounds: lowest and highest action [2]; hold: steps of a decision; settings:
+        of TeachingSettings. Raises InputError if the planner does not rank candidates.
+        """
+        if not isinstance(planner, ScoringEgo):
+            raise InputError(
+                f"learner.teacher={type(planner).__name__}: it cannot tell what its candidates cost; take an "
+                "ScoringEgo such as e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
+            )
+        self.settings = settings_of(
+            TeachingSettings, settings, where="learner.teaching"
+        )
+        self.planner = planner
+        self.scenes = scenes
+        self.bounds = bounds
+        self.hold = hold
+        self.labelled: TensorDict | None = None
+        self._looked_at = NOTHING
+
+    def survivable(self, rows: int) -> Tensor:
+        """Of the decisions judged in each of the pool's rows, the fraction [R] that the
+        planner survives and the policy's plan does not; NaN in rows without any. Then
+        all counts are reset."""
+        row, away = self._looked_at
+        self._looked_at = NOTHING
+        return torch.bincount(row, away.float(), rows) / torch.bincount(
+            row, minlength=rows
+        )
+
+    def watch(
+        self, data: TensorDictBase, adversarial: Tensor, ego: Ego, count: int
+    ) -> dict[str, float]:
+        """Look at up to `count` critical decisions, drawn evenly, of adversarial
+        episodes in a batch [B, T] that `ego` drove. adversarial [R] bool: of the pool's
+        rows. Returns how many there were, and the labels that they made."""
+        attacked = adversarial.to(data.device)[data["traffic", "row"][..., 0]]
+        places = (
+            attacked & critical(data, self.settings.window, near=self.settings.near)
+        ).nonzero()
+        row, column = places[
+            torch.randperm(len(places), device=places.device)[:count]
+        ].unbind(1)
+        frames = data.select("observation", "timestep", "scene_index", "agents")[
+            row, column
+        ]
+        if not len(frames):
+            return {"critical": 0.0, "labels": 0.0}
+        size = GPU_BATCH if frames.device.type == "cuda" else BATCH
+        parts, away = zip(
+            *(self.labels(part, ego) for part in frames.split(size)), strict=True
+        )
+        known = [] if self.labelled is None else [self.labelled]
+        self.labelled = torch.cat([*known, *parts])[-self.settings.memory :]
+        rows, survived = self._looked_at
+        rows = torch.cat([rows, data["traffic", "row"][row, column, 0].cpu()])
+        self._looked_at = rows, torch.cat([survived, *(each.cpu() for each in away)])
+        return {"critical": float(len(places)), "labels": float(sum(map(len, parts)))}
+
+    def labels(self, frames: TensorDictBase, ego: Ego) -> tuple[TensorDict, Tensor]:
+        """Labels [K] of the states frames [M] of a DrivingEnv with `agents=True` in
+        which ego's plan costs at least `regret` more than the planner's, whose own cost
+        is below `survivable`; and bool [M]: where the planner survives and ego's plan
+        does not."""
+        settings = self.settings
+        world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0]))
+        action, cost = ranked_actions(
+            self.planner, world, count=CANDIDATES, hold=self.hold
+        )
+        own = self.planner.rated(world, ask(ego, "plan", world=world)[:, None])[:, 0]
+        weight = torch.softmax(-cost / TEMPERATURE, -1)
+        found = {
+            "observation": frames["observation"],
+            "action": clip_expert(action, *self.bounds),
+            "weight": weight,
+        }
+        kept = (own - cost[:, 0] >= settings.regret) & (
+            cost[:, 0] < settings.survivable
+        )
+        return TensorDict(found, batch_size=frames.batch_size)[kept], (
+            own >= COSTLY
+        ) & (cost[:, 0] < COSTLY)
+
+    def state_dict(self) -> dict:
+        """The labels, of plain tensors."""
+        return {} if self.labelled is None else self.labelled.to_dict()
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore a `state_dict`."""
+        device = self.bounds[0].device
+        self.labelled = (
+            TensorDict(state, [len(state["weight"])]).to(device) if state else None
+        )

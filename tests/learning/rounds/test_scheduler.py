@@ -1,0 +1,171 @@
+"""Learnability, priorities and draws of scenes as defined; what counts for which
+attack; exact resume."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.learning.rounds import scheduler
+from e2rl.learning.rounds.scheduler import Outcomes, outcomes_of, ranks, tally
+from e2rl.learning.rounds.schedules import AdaptiveCurriculum
+from e2rl.run.errors import InputError
+
+
+def curriculum_of(num_scenes=6, **settings):
+    return AdaptiveCurriculum(num_scenes, 10, **settings)
+
+
+def episodes(curriculum, scenes, failed, adversarial=True):
+    """Episodes in scenes, each failed or not."""
+    untold = torch.full((len(scenes),), torch.nan)
+    curriculum.update(
+        torch.tensor(scenes),
+        torch.tensor(failed),
+        torch.full((len(scenes),), adversarial),
+        untold,
+    )
+
+
+def failing(curriculum, *rates):
+    """Ten episodes in each of the first scenes, which fail at these rates."""
+    for scene, rate in enumerate(rates):
+        episodes(
+            curriculum, [scene] * 10, failed=[k < round(10 * rate) for k in range(10)]
+        )
+
+
+def test_regret_is_the_variance_of_recent_failures_in_adversarial_traffic(monkeypatch):
+    monkeypatch.setattr(scheduler, "SMOOTHING", 0.25)
+    curriculum = curriculum_of()
+    episodes(curriculum, [0, 1, 1], failed=[True, False, True], adversarial=False)
+    assert curriculum.regret().isnan().all(), (
+        "nothing is known of adversarial traffic yet"
+    )
+    failing(curriculum, 0.2, 1.0, 0.0)
+    torch.testing.assert_close(curriculum.regret()[:3], torch.tensor([0.16, 0.0, 0.0]))
+    episodes(curriculum, [1], failed=[False])
+    assert curriculum.regret()[1] == pytest.approx(0.75 * 0.25), (
+        "the rate is a moving average"
+    )
+
+
+def test_priorities_are_by_rank_of_regret_and_by_staleness(monkeypatch):
+    monkeypatch.setattr(scheduler, "STALENESS", 0.0)
+    curriculum = curriculum_of(4)
+    assert curriculum.priority().tolist() == [0.25] * 4
+    failing(curriculum, 1.0, 0.9, 0.4)  # the last scene is unseen and comes first
+    weight = torch.tensor([4.0, 3.0, 2.0, 1.0]) ** -0.5
+    torch.testing.assert_close(curriculum.priority(), weight / weight.sum())
+    monkeypatch.setattr(scheduler, "STALENESS", 0.5)
+    curriculum._drawn = torch.tensor([0, 1, 2, 3])
+    curriculum.round = 3
+    stale = torch.tensor([3.0, 2.0, 1.0, 0.0]) / 6
+    torch.testing.assert_close(
+        curriculum.priority(), (weight / weight.sum() + stale) / 2
+    )
+    assert curriculum_of(4, prioritised=False).priority().tolist() == [0.25] * 4
+
+
+def test_draws_follow_the_priorities_without_repetition_within_a_pass(monkeypatch):
+    monkeypatch.setattr(scheduler, "STALENESS", 0.0)
+    curriculum = curriculum_of(5)
+    failing(curriculum, 0.0, 0.1, 0.2, 0.3, 0.4)
+    counts = torch.bincount(
+        torch.stack([curriculum.draw(1) for _ in range(4000)]).flatten(), minlength=5
+    )
+    assert torch.allclose(counts / 4000, curriculum.priority(), atol=0.03)
+    chosen = curriculum.draw(13)
+    assert sorted(torch.bincount(chosen, minlength=5).tolist()) == [2, 2, 3, 3, 3]
+    assert len(curriculum.draw(4).unique()) == 4
+
+
+def test_a_drawn_scene_is_not_stale():
+    curriculum = curriculum_of(4)
+    curriculum.round = 5
+    drawn = curriculum.draw(2)
+    assert (curriculum._drawn == 5).nonzero()[:, 0].tolist() == sorted(drawn.tolist())
+
+
+def test_regret_is_what_a_teacher_would_have_survived_where_one_tells():
+    given = [torch.tensor([0, 0, 1, 2])] + [torch.tensor([True, False, True, True])]
+    told = [0.25, 0.75, torch.nan, 1.0]
+    adversarial = torch.tensor([True, True, True, False])
+    curriculum = curriculum_of()
+    deaf = curriculum_of(regret=False)
+    for each in (curriculum, deaf):
+        each.update(*given, adversarial, torch.tensor(told))
+    assert curriculum.regret()[:3].nan_to_num(-1).tolist() == [0.5 * 0.5, 0.0, -1.0]
+    curriculum.update(
+        torch.tensor([1]),
+        torch.tensor([True]),
+        torch.tensor([True]),
+        torch.tensor([0.75]),
+    )
+    assert curriculum.regret()[1] == 0.75 and deaf.regret()[:2].tolist() == [0.25, 0.0]
+
+
+def test_ranks_share_ties():
+    assert ranks(torch.tensor([5.0, 1.0, 5.0, torch.inf, 0.0])).tolist() == [
+        2.5,
+        4.0,
+        2.5,
+        1.0,
+        5.0,
+    ]
+
+
+def test_scenes_left_out_are_not_drawn_first():
+    curriculum = curriculum_of(4)
+    failing(curriculum, 0.5)
+    curriculum.leave_out(torch.tensor([0, 1]))
+    assert curriculum.regret().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
+
+
+def test_state_goes_on_exactly():
+    first = curriculum_of()
+    second = curriculum_of(seed=4)
+    for _ in range(3):
+        first.draw(2)
+        episodes(first, [0, 3], failed=[True, False])
+        first.advance(0.1)
+    second.load_state_dict(first.state_dict())
+    for curriculum in (first, second):
+        curriculum.advance(0.9)
+    assert (
+        torch.equal(first.draw(4), second.draw(4))
+        and first.eta == second.eta
+        and first.round == second.round
+    )
+    assert torch.equal(first.etas(torch.arange(4)), second.etas(torch.arange(4)))
+    assert torch.equal(first.priority(), second.priority())
+    with pytest.raises(InputError, match="holds 6 scenes, the data 5"):
+        curriculum_of(5).load_state_dict(first.state_dict())
+    with pytest.raises(InputError, match="no scenes"):
+        curriculum_of(0)
+
+
+def test_episodes_count_for_the_attack_whose_row_they_drove():
+    """Attacks 0 and 2 of three entered D'; rows beyond them are nominal or remembered."""
+    outcomes = outcomes_of(
+        torch.tensor([1.0, 2.0, 2.0]),
+        drawn=torch.tensor([0, 2]),
+        row=torch.tensor([0, 0, 1, 2, 5, 1]),
+        failed=torch.tensor([True, False, True, True, True, True]),
+    )
+    assert outcomes.left_out.tolist() == [False, True, False]
+    assert outcomes.episodes.tolist() == [2, 0, 2]
+    assert outcomes.failures.tolist() == [1, 0, 2]
+
+
+def test_the_table_counts_draws_episodes_and_failures_by_multiples_of_a_half():
+    outcomes = Outcomes(
+        torch.tensor([1.1, 2.2, 1.8, 3.0]),
+        left_out=torch.tensor([False, True, False, False]),
+        episodes=torch.tensor([2, 0, 2, 0]),
+        failures=torch.tensor([1, 0, 2, 0]),
+    )
+    rows = [tuple(row.values()) for row in tally(4, outcomes)]
+    assert rows[:2] == [(4, 1.0, 1, 0, 2, 1, 0.5), (4, 2.0, 2, 1, 2, 2, 1.0)]
+    assert rows[2][:-1] == (4, 3.0, 1, 0, 0, 0)
+    assert math.isnan(rows[2][-1]), "no episode, no rate"
