@@ -24,11 +24,16 @@ from e2rl.sim.dynamics import constant_velocity
 NO_CAP = 20.0  # m/s^2: the cap of a vehicle whose plan is feasible
 STRIDE = 3  # steps between the times at which plans are compared
 GAP = 1.2  # m kept to the agent that a plan runs into
+LEAST_ROOM = 0.3  # m: braking is never asked for in less
 LATERAL_MARGIN = 0.1  # m kept to either side
-ONSET = 2.0  # m/s^2 by which a bound lowers the acceleration at once; the rest follows over 0.5 s
+# m/s^2 by which a bound lowers the acceleration at once; the rest follows over 0.5 s.
+ONSET = 2.0
 WAIT = 0.5  # s until a vehicle that waits decides again
 MIN_BRAKING = 0.5  # m/s^2 of a vehicle that must give way
-ALONGSIDE = 0.7  # cosine between the headings of vehicles that touch side by side rather than crossing
+# Cosine between the headings of vehicles that touch side by side rather than crossing.
+ALONGSIDE = 0.7
+
+Rows = tuple[Tensor, ...]  # scene and vehicle [Q] int64 of Q vehicles
 
 
 @configured("prior/default", "bounds")
@@ -68,98 +73,78 @@ class Obstacles:
     duty: Duty | None = None
 
 
-Rows = tuple[Tensor, ...]  # scene and vehicle [Q] int64 of Q vehicles
-
-
 def bounded(
     settings: BoundSettings,
-    decode: Callable[[Rows | None, Tensor | None], LaneState],
+    motion: LaneState,
+    *,
+    capped: Callable[[Rows, Tensor], LaneState],
     state: LaneState,
     obstacles: Obstacles,
 ) -> LaneState:
-    """The motion decode(None, None), fields [B, V, HORIZON], with that of decode(rows,
-    cap), fields [Q, HORIZON], of the vehicles that get a cap [Q].
+    """The planned motion with that of the vehicles that get a cap.
 
     Braking may put a vehicle in the way of the one behind it, so plans are compared
     twice.
+
+    Args:
+        settings: what is allowed.
+        motion: fields [B, V, HORIZON], as planned.
+        capped: from rows and caps [Q] to motion, fields [Q, HORIZON].
+        state: fields [B, V], where the motion begins.
+        obstacles: everybody now.
     """
-    motion = decode(None, None)
     cap = torch.full_like(state.v, NO_CAP)
     for _ in range(2):
-        cap = torch.minimum(
-            cap, acceleration_caps(settings, motion, state=state, obstacles=obstacles)
-        )
+        caps = acceleration_caps(settings, motion, state=state, obstacles=obstacles)
+        cap = torch.minimum(cap, caps)
         rows = (cap < NO_CAP).nonzero(as_tuple=True)
         if len(rows[0]):
-            motion = motion.put(rows, decode(rows, cap[rows]))
+            motion = motion.put(rows, capped(rows, cap[rows]))
     return motion
 
 
 def acceleration_caps(
-    settings: BoundSettings, motion: LaneState, state: LaneState, obstacles: Obstacles
+    settings: BoundSettings,
+    motion: LaneState,
+    *,
+    state: LaneState,
+    obstacles: Obstacles,
 ) -> Tensor:
-    """Highest acceleration [B, V] each vehicle may take now, NO_CAP where its planned
-    motion [B, V, HORIZON] from state [B, V] is feasible."""
-    steps = torch.arange(
-        STRIDE - 1, round(settings.look / DT), STRIDE, device=state.v.device
-    )
+    """Highest acceleration [B, V] m/s^2 each vehicle may take, NO_CAP where its plan is
+    feasible.
+
+    Args:
+        settings: what is allowed.
+        motion: fields [B, V, HORIZON], as planned.
+        state: fields [B, V], where the motion begins.
+        obstacles: everybody now.
+    """
+    last = round(settings.look / DT)
+    steps = torch.arange(STRIDE - 1, last, STRIDE, device=state.v.device)
     braking = torch.full_like(state.v, -NO_CAP)
     if settings.meeting:
-        braking = torch.maximum(
-            braking, _meeting_braking(motion, state, obstacles=obstacles, steps=steps)
-        )
+        meeting = _meeting_braking(motion, state, obstacles=obstacles, steps=steps)
+        braking = torch.maximum(braking, meeting)
     if settings.curve:
-        braking = torch.maximum(
-            braking, _curve_braking(settings, motion, state=state, steps=steps)
-        )
+        curve = _curve_braking(motion, state, lateral=settings.lateral, steps=steps)
+        braking = torch.maximum(braking, curve)
     return (-braking).clamp(min=settings.floor)
 
 
-def apply_cap(
-    cap: Tensor | None, x0: Tensor, state: LaneState
-) -> tuple[Tensor, LaneState]:
+def apply_cap(cap: Tensor, x0: Tensor, state: LaneState) -> tuple[Tensor, LaneState]:
     """x0 [B, V, SIZE] and state [B, V] with the next and (by at most ONSET) the current
     acceleration under the cap [B, V]."""
-    if cap is None:
-        return x0, state
     current = torch.minimum(state.a, torch.maximum(cap, state.a - ONSET))
     first = torch.minimum(x0[..., :1], cap[..., None] / ACCEL_SCALE)
     return torch.cat([first, x0[..., 1:]], -1), replace(state, a=current)
 
 
-def _meeting_braking(
-    motion: LaneState, state: LaneState, obstacles: Obstacles, steps: Tensor
-) -> Tensor:
-    """`meeting_braking` [B, V] of planned motions, towards the agent that each runs
-    into first."""
-    vehicles = state.v.shape[1]
-    duty = obstacles.duty
-    others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
-    own = motion.states()[:, :, steps]
-    driven = motion.s[..., steps] - state.s[..., None]
-    sizes = obstacles.size[:, :vehicles], obstacles.size
-    here = obstacles.present[:, :vehicles]
-    plans = Plans(
-        own,
-        torch.cat([own, others], 1),
-        driven,
-        *sizes,
-        here,
-        obstacles.present,
-        steps + 1,
-    )
-    length = (obstacles.size[:, :vehicles, 0] + obstacles.size[:, :1, 0]) / 2
-    if duty is None:  # nobody is behind the ego by any duty
-        none = torch.zeros_like(here)
-        duty = Duty(none, none, patience=torch.zeros_like(length))
-        length = torch.full_like(length, -torch.inf)
-    return braking_for_meetings(plans, state.v, length, duty)
-
-
 class Plans(NamedTuple):
-    """Vehicles and everybody after steps [K]: own [B, V, K, 4] and everybody [B, N, K,
-    4], their states; driven [B, V, K] m; own_size [B, V, 2], size [B, N, 2]; whether
-    vehicles are here [B, V] and agents present [B, N]."""
+    """What vehicles [B, V] and all agents [B, N] do up to steps [K].
+
+    own [B, V, K, 4] and everybody [B, N, K, 4]: states; driven [B, V, K] m; own_size
+    [B, V, 2], size [B, N, 2]; here [B, V], present [B, N]: whether they are there.
+    """
 
     own: Tensor
     everybody: Tensor
@@ -171,23 +156,50 @@ class Plans(NamedTuple):
     steps: Tensor
 
 
-PLANS = (
-    "B V K 4",
-    "B N K 4",
-    "B V K",
-    "B V 2",
-    "B N 2",
-    "B V:bool",
-    "B N:bool",
-    "K:int64",
+def _meeting_braking(
+    motion: LaneState, state: LaneState, *, obstacles: Obstacles, steps: Tensor
+) -> Tensor:
+    """`meeting_braking` [B, V] of planned motion, towards the agent that each vehicle
+    runs into first."""
+    size = obstacles.size
+    present = obstacles.present
+    vehicles = state.v.shape[1]
+    others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
+    own = motion.states()[:, :, steps]
+    plans = Plans(
+        own=own,
+        everybody=torch.cat([own, others], 1),
+        driven=motion.s[..., steps] - state.s[..., None],
+        own_size=size[:, :vehicles],
+        size=size,
+        here=present[:, :vehicles],
+        present=present,
+        steps=steps + 1,
+    )
+    length = (size[:, :vehicles, 0] + size[:, :1, 0]) / 2
+    duty = obstacles.duty
+    if duty is None:  # nobody is behind the ego by any duty
+        nobody = torch.zeros_like(plans.here)
+        duty = Duty(nobody, nobody, patience=torch.zeros_like(length))
+        length = torch.full_like(length, -torch.inf)
+    return braking_for_meetings(plans, state.v, length, duty)
+
+
+@fused(
+    ("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64"),
+    "B V",
+    "B V",
+    ("B V:bool", "B V:bool", "B V"),
 )
-
-
-@fused(PLANS, "B V", "B V", ("B V:bool", "B V:bool", "B V"))
 def braking_for_meetings(
     plans: Plans, speed: Tensor, length: Tensor, duty: Duty
 ) -> Tensor:
-    """`meeting_braking` [B, V] for the `first_meeting`."""
+    """`meeting_braking` [B, V] for the `first_meeting`.
+
+    Args:
+        plans: of vehicles and everybody.
+        speed, length, duty: of `meeting_braking`.
+    """
     return meeting_braking(first_meeting(plans), speed, length=length, duty=duty)
 
 
@@ -206,43 +218,34 @@ class Meeting(NamedTuple):
 def first_meeting(plans: Plans) -> Meeting:
     """Where boxes of vehicles, wider by LATERAL_MARGIN on both sides, first overlap
     those of everybody."""
-    own, everybody, driven, own_size, size, here, present, steps = plans
-    vehicles = own.shape[1]
-    wide = torch.stack([own_size[..., 0], own_size[..., 1] + 2 * LATERAL_MARGIN], -1)
+    own = plans.own
+    length, width = plans.own_size.unbind(-1)
+    wide = torch.stack([length, width + 2 * LATERAL_MARGIN], -1)
     meets = overlap(
         own[:, :, None],
         wide[:, :, None, None],
-        second=everybody[:, None],
-        second_size=size[:, None, :, None],
+        second=plans.everybody[:, None],
+        second_size=plans.size[:, None, :, None],
+    )  # [B, V, N, K]
+    number = torch.arange(plans.present.shape[1], device=own.device)
+    itself = number == torch.arange(own.shape[1], device=own.device)[:, None]
+    counts = plans.present[:, None, :] & plans.here[..., None] & ~itself
+    count = plans.steps.shape[0]
+    rest = torch.arange(count, 0, -1, dtype=own.dtype, device=own.device)
+    left = torch.where(meets & counts[..., None], rest, 0.0).amax(-1)
+    first = torch.where(left > 0, count - left, 0.0).long()  # [B, V, N]
+    index = first[..., None, None]
+    return Meeting(
+        own=torch.take_along_dim(own[:, :, None], index, 3)[..., 0, :],
+        other=torch.take_along_dim(plans.everybody[:, None], index, 3)[..., 0, :],
+        driven=torch.take_along_dim(plans.driven[:, :, None], index[..., 0], 3)[..., 0],
+        steps=plans.steps[first],
+        happens=left > 0,
     )
-    other = torch.arange(present.shape[1], device=present.device)
-    itself = other == torch.arange(vehicles, device=own.device)[:, None]
-    counts = present[:, None, :] & here[..., None] & ~itself
-    meets = meets & counts[..., None]
-    count = steps.shape[0]
-    left = torch.where(
-        meets, torch.arange(count, 0, -1, dtype=own.dtype, device=own.device), 0.0
-    ).amax(-1)
-    first = torch.where(left > 0, count - left, 0.0).long()
-    index = first[..., None, None].expand(*first.shape, 1, 4)
-    they = (
-        everybody[:, None].expand(-1, vehicles, -1, -1, -1).gather(3, index)[..., 0, :]
-    )
-    mine = (
-        own[:, :, None]
-        .expand(-1, -1, first.shape[2], -1, -1)
-        .gather(3, index)[..., 0, :]
-    )
-    way = (
-        driven[:, :, None]
-        .expand(-1, -1, first.shape[2], -1)
-        .gather(3, first[..., None])[..., 0]
-    )
-    return Meeting(mine, they, driven=way, steps=steps[first], happens=left > 0)
 
 
 def meeting_braking(
-    meeting: Meeting, speed: Tensor, length: Tensor, duty: Duty
+    meeting: Meeting, speed: Tensor, *, length: Tensor, duty: Duty
 ) -> Tensor:
     """Braking [B, V] m/s^2 that keeps vehicles GAP short of what they meet, -NO_CAP
     where none has to brake.
@@ -251,59 +254,43 @@ def meeting_braking(
     crosses or comes towards it. Of two that meet, the one that has the other farther
     ahead of itself brakes. Adversaries that come into the ego's side fall behind it.
 
-    speed: v [B, V] m/s; length [B, V] m: between the centres if the vehicle were just
-    behind the ego, -inf: nobody falls behind it.
+    Args:
+        meeting: of vehicles and everybody.
+        speed: [B, V] m/s, v.
+        length: [B, V] m between the centres if the vehicle were just behind the ego,
+            -inf: nobody falls behind it.
+        duty: how adversaries treat the ego.
     """
     own, other, driven, steps, happens = meeting
     dx, dy = (other[..., :2] - own[..., :2]).unbind(-1)
-    ahead = dx * torch.cos(own[..., 2]) + dy * torch.sin(
-        own[..., 2]
-    )  # m, the other along the vehicle's heading
+    ahead = dx * torch.cos(own[..., 2]) + dy * torch.sin(own[..., 2])
     ahead_of_other = -(dx * torch.cos(other[..., 2]) + dy * torch.sin(other[..., 2]))
     yields = happens & (ahead > ahead_of_other)
     along = torch.cos(other[..., 2] - own[..., 2])
     u = (other[..., 3] * along).clamp(min=0)
-    room = (driven - GAP - u * DT * steps).clamp(min=0.3)
+    room = (driven - GAP - u * DT * steps).clamp(min=LEAST_ROOM)
     closing = (speed[..., None] - u).clamp(min=0)
     braking = closing**2 / (2 * room)
-    to_ego = _towards_ego(
-        duty,
-        happens[..., 0],
-        yields=yields[..., 0],
-        room=room[..., 0],
-        closing=closing[..., 0],
-    )
+
+    later = room[..., 0] - closing[..., 0] * WAIT
+    waits = (closing[..., 0] ** 2 < 2 * later * duty.patience) & (later > 0)
+    to_ego = happens[..., 0] & ~duty.exempt & (yields[..., 0] | duty.yields) & ~waits
     yields = torch.cat([to_ego[..., None], yields[..., 1:]], -1)
+
     back = 2 * (length + GAP - ahead[..., 0]).clamp(min=0) / (DT * steps[..., 0]) ** 2
-    back = back * (
-        along[..., 0] > ALONGSIDE
-    )  # who comes into the ego's side is behind it when they would touch
-    braking = torch.cat(
-        [torch.maximum(braking[..., 0], back)[..., None], braking[..., 1:]], -1
-    )
+    back = back * (along[..., 0] > ALONGSIDE)  # who comes into the ego's side
+    to_ego_braking = torch.maximum(braking[..., 0], back)
+    braking = torch.cat([to_ego_braking[..., None], braking[..., 1:]], -1)
     return torch.where(yields, braking.clamp(min=MIN_BRAKING), -NO_CAP).amax(-1)
 
 
-def _towards_ego(
-    duty: Duty, meets: Tensor, yields: Tensor, room: Tensor, closing: Tensor
-) -> Tensor:
-    """Bool [B, V]: vehicles brake for the ego now.
-
-    meets: plans meet; yields: the ordinary rule; room [m] until there, closing [m/s].
-    """
-    later = room - closing * WAIT
-    waits = (closing**2 < 2 * later * duty.patience) & (later > 0)
-    return meets & ~duty.exempt & (yields | duty.yields) & ~waits
-
-
 def _curve_braking(
-    settings: BoundSettings, motion: LaneState, state: LaneState, steps: Tensor
+    motion: LaneState, state: LaneState, *, lateral: float, steps: Tensor
 ) -> Tensor:
-    """Braking [B, V] by which v^2 kappa is at most `lateral` at every point of the
-    plan."""
-    v = motion.v[..., steps]
-    kappa = motion.kappa[..., steps].abs()
-    allowed = settings.lateral / kappa.clamp(min=1e-4)
+    """Braking [B, V] by which v^2 kappa is at most `lateral` m/s^2 at every point of
+    the plan."""
+    allowed = lateral / motion.kappa[..., steps].abs().clamp(min=1e-4)
     driven = (motion.s[..., steps] - state.s[..., None]).clamp(min=1.0)
     braking = ((state.v[..., None] ** 2 - allowed) / (2 * driven)).clamp(min=0)
-    return torch.where(v**2 > allowed, braking, -NO_CAP).amax(-1)
+    too_fast = motion.v[..., steps] ** 2 > allowed
+    return torch.where(too_fast, braking, -NO_CAP).amax(-1)

@@ -16,14 +16,8 @@ from e2rl.prior.lane_relative import LEAST_STRETCH, LaneState, select
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import rolling_back, steered, turn_bound, wrap
 
-ALONG_LINE = (
-    "s",
-    "d",
-    "d1",
-    "d2",
-    "heading",
-    "kappa",
-)  # what is looked up where the vehicle is on its line
+# What is looked up where the vehicle is on its line.
+ALONG_LINE = ("s", "d", "d1", "d2", "heading", "kappa")
 TINY = 1e-6  # m: a shorter piece of a line is none
 
 
@@ -49,9 +43,7 @@ def as_driven(motion: LaneState, state: LaneState, on_lane: Tensor) -> LaneState
     before = torch.cat([state.v[..., None], motion.v[..., :-1]], -1)
     driven = ((before + motion.v) / 2 * DT).cumsum(-1)
     placed = _placed(motion, state, driven=driven, on_lane=on_lane)
-    placed = select(
-        state.v < 0, motion, other=placed
-    )  # there is no line behind the vehicle
+    placed = select(state.v < 0, motion, placed)  # no line lies behind the vehicle
     headings = torch.cat([state.heading[..., None], placed.heading], -1)
     bound = turn_bound((before + motion.v) / 2)
     turn = torch.maximum(torch.minimum(wrap(headings.diff(dim=-1)), bound), -bound)
@@ -60,40 +52,34 @@ def as_driven(motion: LaneState, state: LaneState, on_lane: Tensor) -> LaneState
 
 
 def _placed(
-    motion: LaneState, state: LaneState, driven: Tensor, on_lane: Tensor
+    motion: LaneState, state: LaneState, *, driven: Tensor, on_lane: Tensor
 ) -> LaneState:
     """The motion with its places ALONG_LINE those after `driven` [..., H] m of its
     line."""
-    stretch = torch.hypot(
-        (1 - (motion.kappa - motion.d2) * motion.d).clamp(min=LEAST_STRETCH), motion.d1
-    )
-    stretch = torch.where(
-        on_lane[..., None], stretch, 1.0
-    )  # m of the line per m of the route
+    along = (1 - (motion.kappa - motion.d2) * motion.d).clamp(min=LEAST_STRETCH)
+    stretch = torch.hypot(along, motion.d1)  # m of the line per m of the route
+    stretch = torch.where(on_lane[..., None], stretch, 1.0)
     mean = (stretch + torch.cat([stretch[..., :1], stretch[..., :-1]], -1)) / 2
     metres = (mean * motion.s.diff(dim=-1, prepend=state.s[..., None])).cumsum(-1)
     metres = torch.nn.functional.pad(metres, (1, 0))
-    turned = wrap(
-        torch.cat([state.heading[..., None], motion.heading], -1).diff(dim=-1)
-    ).cumsum(-1)
-    line = replace(motion, heading=state.heading[..., None] + turned)
-    pairs = (
-        torch.cat([getattr(state, name)[..., None], getattr(line, name)], -1)
-        for name in ALONG_LINE
+
+    whole = state.map(
+        lambda begin, rest: torch.cat([begin[..., None], rest], -1), motion
     )
-    table = torch.stack(list(pairs), -2)
-    after = torch.searchsorted(metres, driven.contiguous()).clamp(
-        1, metres.shape[-1] - 1
-    )
+    turned = wrap(whole.heading.diff(dim=-1)).cumsum(-1)
+    begin = whole.heading[..., :1]
+    whole.heading = torch.cat([begin, begin + turned], -1)
+    table = torch.stack([getattr(whole, name) for name in ALONG_LINE], -2)
+
+    last = metres.shape[-1] - 1
+    after = torch.searchsorted(metres, driven.contiguous()).clamp(1, last)
     low = metres.gather(-1, after - 1)
     high = metres.gather(-1, after)
     part = ((driven - low) / (high - low).clamp(min=TINY)).clamp(0, 1)[..., None, :]
     index = after[..., None, :].expand(*table.shape[:-1], after.shape[-1])
     values = torch.lerp(table.gather(-1, index - 1), table.gather(-1, index), part)
-    fields = dict(zip(ALONG_LINE, values.unbind(-2), strict=True))
-    beyond = (driven - metres[..., -1:]).clamp(
-        min=0
-    )  # where the line goes on as it ends
-    fields["s"] = fields["s"] + beyond / stretch[..., -1:]
-    fields["heading"] = fields["heading"] + beyond * motion.kappa[..., -1:]
-    return replace(motion, **fields)
+    places = dict(zip(ALONG_LINE, values.unbind(-2), strict=True))
+    beyond = (driven - metres[..., -1:]).clamp(min=0)  # the line goes on as it ends
+    places["s"] = places["s"] + beyond / stretch[..., -1:]
+    places["heading"] = places["heading"] + beyond * motion.kappa[..., -1:]
+    return replace(motion, **places)

@@ -25,6 +25,8 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
 YAW_RATE_SCALE = 0.1  # rad/s a unit of x, at the current speed or 3 m/s
+DAMPING = 1e-3  # ridge on fitted lateral knots
+LARGEST = 6.0  # fitted lateral knot
 
 
 def curvature_scale(v: Tensor) -> Tensor:
@@ -47,41 +49,29 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     are 0.
     """
     v, travelled = speeds(state, ACCEL_SCALE * x[..., :KNOTS])
-    scale = curvature_scale(state.v)[..., None]
-    reach = lateral_horizon(state.v)[..., None]
+    begin = state.map(lambda value: value[..., None])
+    scale = curvature_scale(begin.v)
+    reach = lateral_horizon(begin.v)
     half = scale * x[..., KNOTS, None]
     end = scale * x[..., KNOTS + 1, None]
     first, second, beyond = _segments(travelled, reach)
-    now = state.kappa[..., None]
-    kappa = now + (half - now) * first + (end - half) * second
-    turned = (
-        0.5
-        * reach
-        * (
-            now * first
-            + (half - now) * first**2 / 2
-            + half * second
-            + (end - half) * second**2 / 2
-        )
-    )
-    heading = state.heading[..., None] + turned + end * beyond
-    before = torch.cat([state.heading[..., None], heading[..., :-1]], -1)
+    kappa = begin.kappa + (half - begin.kappa) * first + (end - half) * second
+    of_first = begin.kappa * first + (half - begin.kappa) * first**2 / 2
+    turned = 0.5 * reach * (of_first + half * second + (end - half) * second**2 / 2)
+    heading = begin.heading + turned + end * beyond
+    before = torch.cat([begin.heading, heading[..., :-1]], -1)
     step = torch.diff(travelled, dim=-1, prepend=torch.zeros_like(travelled[..., :1]))
     middle = (heading + before) / 2
-    xs = state.x[..., None] + (step * torch.cos(middle)).cumsum(-1)
-    ys = state.y[..., None] + (step * torch.sin(middle)).cumsum(-1)
-    accel = (v - torch.cat([state.v[..., None], v[..., :-1]], -1)) / DT
-    s = state.s[..., None] + travelled
     zero = torch.zeros_like(v)
     return LaneState(
-        s,
-        state.d[..., None] + zero,
+        s=begin.s + travelled,
+        d=begin.d + zero,
         d1=zero,
         d2=zero,
         v=v,
-        a=accel,
-        x=xs,
-        y=ys,
+        a=(v - torch.cat([begin.v, v[..., :-1]], -1)) / DT,
+        x=begin.x + (step * torch.cos(middle)).cumsum(-1),
+        y=begin.y + (step * torch.sin(middle)).cumsum(-1),
         heading=heading,
         kappa=kappa,
     )
@@ -91,19 +81,28 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
 def decode_plans(
     x: Tensor, state: LaneState, points: Tensor, on_lane: Tensor
 ) -> LaneState:
-    """Planned motion of every vehicle, on its route where on_lane [B, V], in free space
-    elsewhere."""
-    return select(
-        on_lane, lane_relative.decode(x, state, points=points), other=decode(x, state)
-    )
+    """Planned motion, fields [B, V, HORIZON], of every vehicle.
+
+    Args:
+        x: [B, V, SIZE].
+        state: fields [B, V], where the motion begins.
+        points: [B, V, P, 2] m, routes.
+        on_lane: [B, V] bool, who drives on its route; the others do in free space.
+    """
+    return select(on_lane, lane_relative.decode(x, state, points), decode(x, state))
 
 
-def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tensor:
-    """Lateral knots [..., V, 2] whose path has the recorded headings [..., V, HORIZON],
-    by ridge least squares.
+def fit(heading: Tensor, known: Tensor, *, state: LaneState, knots: Tensor) -> Tensor:
+    """Lateral knots [..., V, 2] whose path has the recorded headings, by ridge least
+    squares.
 
-    The heading is linear in the curvature knots once the travelled distance (from
-    `knots`, m/s^2) is known.
+    The heading is linear in the curvature knots once the travelled distance is known.
+
+    Args:
+        heading: [..., V, HORIZON] rad.
+        known: [..., V, HORIZON], 1 where it is, else 0.
+        state: fields [..., V], where the motion begins.
+        knots: [..., V, KNOTS] m/s^2, accelerations.
     """
     _, travelled = speeds(state, knots)
     reach = lateral_horizon(state.v)[..., None]
@@ -111,9 +110,8 @@ def fit(heading: Tensor, known: Tensor, state: LaneState, knots: Tensor) -> Tens
     scale = curvature_scale(state.v)[..., None]
     half = 0.5 * reach * (first**2 / 2 + second - second**2 / 2)
     end = 0.5 * reach * second**2 / 2 + beyond
-    given = 0.5 * reach * state.kappa[..., None] * (first - first**2 / 2)
+    base = 0.5 * reach * state.kappa[..., None] * (first - first**2 / 2)
     turn = wrap(heading - state.heading[..., None])
     unit = torch.stack([scale * half, scale * end], -1) * known[..., None]
-    return ridge(
-        unit, (turn - given) * known, damping=1e-3 * torch.eye(2, device=unit.device)
-    ).clamp(-6.0, 6.0)
+    damping = DAMPING * torch.eye(2, device=unit.device)
+    return ridge(unit, (turn - base) * known, damping).clamp(-LARGEST, LARGEST)

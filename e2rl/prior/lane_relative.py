@@ -7,7 +7,7 @@ vehicle leaves its route by its offset only, and one that stands cannot move sid
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -24,17 +24,18 @@ KNOTS = 10
 SIZE = KNOTS + 2
 KNOT_STEPS = HORIZON // KNOTS
 ACCEL_SCALE = 1.0  # m/s^2 a unit of x
-OFFSET_SCALE, BEND_SCALE = (
-    0.5,
-    0.15,
-)  # m a unit of x: end offset; half-way offset from the mean of now and the end
-LEAST_STRETCH = (
-    0.3  # m of a vehicle's line per m of its route, at least: deep inside a bend
-)
+OFFSET_SCALE = 0.5  # m a unit of x: end offset
+# m a unit of x: half-way offset from the mean of the present and the end offset.
+BEND_SCALE = 0.15
+# m of a vehicle's line per m of its route, at least: deep inside a bend.
+LEAST_STRETCH = 0.3
 LEAK = 0.05  # gradient that passes where the speed is held at 0
 # Weight of the squared second differences of fitted accelerations: what changes faster
 # is noise of the recording.
 ROUGHNESS = 0.3
+KNOT_DAMPING = 1e-3  # ridge on fitted accelerations
+LATERAL_DAMPING = (0.05, 0.02)  # ridge on fitted lateral knots
+HARDEST = (-8.0, 5.0)  # m/s^2, range of fitted accelerations
 
 
 @dataclass
@@ -60,60 +61,66 @@ class LaneState:
 
     @classmethod
     def from_states(cls, states: Tensor, s: Tensor, d: Tensor) -> "LaneState":
-        """States [..., 4] with arc length s and offset d [...]; what is not known is 0."""
+        """States [..., 4] with arc length s and offset d [...]; the rest is 0."""
         x, y, heading, v = states.unbind(-1)
         zero = torch.zeros_like(v)
         return cls(s, d, zero, zero, v, zero, x, y, heading, zero)
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> "LaneState":
-        """A LaneState with `function` applied to every field."""
-        return LaneState(
-            *(function(getattr(self, field.name)) for field in fields(self))
-        )
+    def map(
+        self, function: Callable[..., Tensor], *others: "LaneState"
+    ) -> "LaneState":
+        """A LaneState with `function` applied to every field, and to those of others
+        beside it."""
+        states = (vars(state).values() for state in (self, *others))
+        return LaneState(*map(function, *states))
 
     def put(self, rows: tuple[Tensor, ...], other: "LaneState") -> "LaneState":
         """A LaneState with `rows` of every field replaced by `other`."""
-        fresh = vars(other)
-        return LaneState(
-            **{
-                name: old.index_put(rows, fresh[name])
-                for name, old in vars(self).items()
-            }
-        )
+        return self.map(lambda old, new: old.index_put(rows, new), other)
 
     def states(self) -> Tensor:
         """[..., 4]: x, y, heading, speed."""
         return torch.stack([self.x, self.y, self.heading, self.v], -1)
 
 
-def select(rows: Tensor, one: LaneState, other: LaneState) -> LaneState:
-    """The fields of `one` for vehicles rows [B, V], of `other` elsewhere; fields [B, V]
-    or [B, V, HORIZON]."""
-    rows = rows.view(*rows.shape, *[1] * (one.v.ndim - rows.ndim))
-    names = [field.name for field in fields(LaneState)]
-    return LaneState(
-        *(torch.where(rows, getattr(one, name), getattr(other, name)) for name in names)
-    )
+def select(rows: Tensor, chosen: LaneState, other: LaneState) -> LaneState:
+    """The fields of `chosen` for vehicles rows [B, V], of `other` elsewhere; fields
+    [B, V] or [B, V, HORIZON]."""
+    rows = rows.view(*rows.shape, *[1] * (chosen.v.ndim - rows.ndim))
+    return chosen.map(lambda one, two: torch.where(rows, one, two), other)
 
 
 def locate(
     states: Tensor,
     accel: Tensor,
+    *,
     yaw_rate: Tensor,
     points: Tensor,
     hint: Tensor | None = None,
 ) -> LaneState:
-    """LaneState of vehicles states [B, V, 4] on their routes points [B, V, P, 2]; hint
-    [B, V]: expected arc length."""
-    given = states, accel, yaw_rate, points
-    return locate_anywhere(*given) if hint is None else locate_near(*given, hint)
+    """LaneState of vehicles on their routes.
+
+    Args:
+        states: [B, V, 4].
+        accel: [B, V] m/s^2.
+        yaw_rate: [B, V] rad/s.
+        points: [B, V, P, 2] m, the routes.
+        hint: [B, V] m, expected arc length; None: anywhere.
+    """
+    if hint is None:
+        return locate_anywhere(states, accel, yaw_rate, points)
+    return locate_near(states, accel, yaw_rate, points, hint)
 
 
 @fused("B V 4", "B V", "B V", "B V P 2!")
 def locate_anywhere(
     states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor
 ) -> LaneState:
-    """`locate` without a hint."""
+    """`locate` without a hint.
+
+    Args:
+        states, accel, yaw_rate, points: of `locate`.
+    """
     return _locate(states, accel, yaw_rate=yaw_rate, points=points, hint=None)
 
 
@@ -121,38 +128,34 @@ def locate_anywhere(
 def locate_near(
     states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor
 ) -> LaneState:
-    """`locate` with a hint."""
-    return _locate(
-        states, accel, yaw_rate=yaw_rate, points=points, hint=hint[..., None]
-    )
+    """`locate` with a hint.
+
+    Args:
+        states, accel, yaw_rate, points, hint: of `locate`.
+    """
+    hint = hint[..., None]
+    return _locate(states, accel, yaw_rate=yaw_rate, points=points, hint=hint)
 
 
 def _locate(
-    states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor | None
+    states: Tensor,
+    accel: Tensor,
+    *,
+    yaw_rate: Tensor,
+    points: Tensor,
+    hint: Tensor | None,
 ) -> LaneState:
-    s, d, _ = (
-        value[..., 0] for value in project(states[..., None, :2], points, hint=hint)
-    )
-    heading, curvature = (
-        value[..., 0] for value in interpolate(points, s[..., None])[1:]
-    )
-    turn = wrap(states[..., 2] - heading)
-    v = states[..., 3]
+    x, y, heading, v = states.unbind(-1)
+    place = project(states[..., None, :2], points, hint=hint)
+    s, d, _ = (value[..., 0] for value in place)
+    _, route_heading, curvature = interpolate(points, s[..., None])
+    curvature = curvature[..., 0]
+    turn = wrap(heading - route_heading[..., 0])
     kappa = (yaw_rate / at_least(v, 1.0)).clamp(-0.25, 0.25)
-    d1 = torch.tan(turn.clamp(-1.0, 1.0)) * (1 - curvature * d).clamp(min=LEAST_STRETCH)
+    stretch = (1 - curvature * d).clamp(min=LEAST_STRETCH)
+    d1 = torch.tan(turn.clamp(-1.0, 1.0)) * stretch
     d2 = (kappa - curvature).clamp(-0.1, 0.1)
-    return LaneState(
-        s,
-        d,
-        d1=d1,
-        d2=d2,
-        v=v,
-        a=accel,
-        x=states[..., 0],
-        y=states[..., 1],
-        heading=states[..., 2],
-        kappa=kappa,
-    )
+    return LaneState(s, d, d1, d2, v, accel, x, y, heading, kappa)
 
 
 @cache
@@ -168,16 +171,15 @@ def _speed_basis(device: torch.device) -> Tensor:
 def _distance_basis(device: torch.device) -> Tensor:
     """[HORIZON, KNOTS + 1]: distance gained up to each step per unit of each
     acceleration knot."""
-    basis = _speed_basis(device)
-    return (
-        (torch.cat([torch.zeros_like(basis[:1]), basis[:-1]]) + basis) / 2 * DT
-    ).cumsum(0)
+    speed = _speed_basis(device)
+    before = torch.cat([torch.zeros_like(speed[:1]), speed[:-1]])
+    return ((before + speed) / 2 * DT).cumsum(0)
 
 
 @cache
 def _offset_basis(device: torch.device) -> Tensor:
     """[4, 4]: polynomial coefficients of u^3..u^6 from (d(1/2), d(1), d'(1), d''(1))
-    less the given lower terms."""
+    less what the lower terms give."""
     power = torch.arange(3, 7, dtype=torch.float64)
     rows = [0.5**power, torch.ones(4, dtype=torch.float64), power, power * (power - 1)]
     return torch.linalg.inv(torch.stack(rows)).float().to(device)
@@ -196,11 +198,10 @@ def offset_coefficients(state: LaneState, half: Tensor, end: Tensor) -> Tensor:
     """
     reach = lateral_horizon(state.v)
     low = torch.stack([state.d, state.d1 * reach, 0.5 * state.d2 * reach**2], -1)
-    at_half = low[..., 0] + 0.5 * low[..., 1] + 0.25 * low[..., 2]
-    slope = low[..., 1] + 2 * low[..., 2]
-    bend = 2 * low[..., 2]
-    target = torch.stack([half - at_half, end - low.sum(-1), -slope, -bend], -1)
-    return torch.cat([low, target @ _offset_basis(low.device).T], -1)
+    d, slope, bend = low.unbind(-1)
+    at_half = d + 0.5 * slope + 0.25 * bend
+    target = [half - at_half, end - low.sum(-1), -(slope + 2 * bend), -(2 * bend)]
+    return torch.cat([low, torch.stack(target, -1) @ _offset_basis(low.device).T], -1)
 
 
 def speeds(state: LaneState, knots: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,10 +210,8 @@ def speeds(state: LaneState, knots: Tensor) -> tuple[Tensor, Tensor]:
 
     Speeds are held at 0 from below; a small gradient still passes there.
     """
-    free = (
-        state.v[..., None]
-        + torch.cat([state.a[..., None], knots], -1) @ _speed_basis(knots.device).T
-    )
+    accel = torch.cat([state.a[..., None], knots], -1)
+    free = state.v[..., None] + accel @ _speed_basis(knots.device).T
     below = free.clamp(max=0)
     v = free.clamp(min=0) + LEAK * (below - below.detach())
     before = torch.cat([state.v[..., None], v[..., :-1]], -1)
@@ -231,52 +230,48 @@ def decode(
     x: Tensor,
     state: LaneState,
     points: Tensor,
+    *,
     steps: slice = slice(None),
     along: tuple[Tensor, Tensor] | None = None,
 ) -> LaneState:
-    """Planned motion [..., V, HORIZON] of x [..., V, SIZE] on routes [..., V, P, 2], or
-    those `steps` of it; along: the routes' tangents, see `interpolate`."""
+    """Planned motion, fields [..., V, HORIZON] or those `steps` of them.
+
+    Args:
+        x: [..., V, SIZE].
+        state: fields [..., V], where the motion begins.
+        points: [..., V, P, 2] m, routes.
+        steps: of the motion, all by default.
+        along: the routes' tangents, see `interpolate`.
+    """
     knots, half, end = split(x, state)
     v, travelled = speeds(state, knots)
     accel = torch.diff(v, dim=-1, prepend=state.v[..., None])[..., steps] / DT
     v = v[..., steps]
     travelled = travelled[..., steps]
     reach = lateral_horizon(state.v)[..., None]
-    d, d1, d2 = polynomial(
-        offset_coefficients(state, half, end=end), (travelled / reach).clamp(max=1.0)
-    )
+    coefficients = offset_coefficients(state, half, end)
+    d, d1, d2 = polynomial(coefficients, (travelled / reach).clamp(max=1.0))
     d1 = d1 / reach
     d2 = d2 / reach**2
     s = state.s[..., None] + travelled
     xy, heading, curvature = interpolate(points, s, tangents=along)
     normal = torch.stack([-torch.sin(heading), torch.cos(heading)], -1)
-    xy = xy + d[..., None] * normal
+    x, y = (xy + d[..., None] * normal).unbind(-1)
     heading = heading + torch.atan(d1 / (1 - curvature * d).clamp(min=LEAST_STRETCH))
-    return LaneState(
-        s,
-        d,
-        d1=d1,
-        d2=d2,
-        v=v,
-        a=accel,
-        x=xy[..., 0],
-        y=xy[..., 1],
-        heading=heading,
-        kappa=curvature + d2,
-    )
+    return LaneState(s, d, d1, d2, v, accel, x, y, heading, kappa=curvature + d2)
 
 
 @fused(f"B V {SIZE}", "B V", "B V P 2!")
 def decode_plans(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     """`decode` of every vehicle's plan."""
-    return decode(x, state, points=points)
+    return decode(x, state, points)
 
 
 @fused(f"G O {SIZE}", "G O", "G P 2!")
 def decode_options(x: Tensor, state: LaneState, points: Tensor) -> LaneState:
     """`decode` of O plans of each of G vehicles on its route."""
     routes = points[:, None]
-    return decode(x, state, points=routes, along=tangents(routes))
+    return decode(x, state, routes, along=tangents(routes))
 
 
 class _Polynomial(torch.autograd.Function):
@@ -309,14 +304,10 @@ class _Polynomial(torch.autograd.Function):
         )
         power = torch.arange(7, device=c.device, dtype=c.dtype)
         pad = torch.nn.functional.pad
-        of_c = (
-            of_value
-            + power * pad(of_first, (1, 0))
-            + power * (power - 1) * pad(of_second, (2, 0))
-        )
-        return of_c.sum_to_size(c.shape), grads[0] * first + grads[1] * second + grads[
-            2
-        ] * third
+        of_c = of_value + power * pad(of_first, (1, 0))
+        of_c = of_c + power * (power - 1) * pad(of_second, (2, 0))
+        of_u = grads[0] * first + grads[1] * second + grads[2] * third
+        return of_c.sum_to_size(c.shape), of_u
 
 
 def polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -339,28 +330,22 @@ def fit(
     known = torch.ones_like(track.v) if known is None else known
     _, travelled = speeds(state, knots)
     u = (travelled / lateral_horizon(state.v)[..., None]).clamp(max=1.0)
+
+    def offsets(begin: LaneState, half: Tensor, end: Tensor) -> Tensor:
+        return polynomial(offset_coefficients(begin, half, end), u)[0]
+
     zero = torch.zeros_like(state.d)
-    base = polynomial(offset_coefficients(state, zero, end=zero), u)[0]
-    still = state.map(torch.zeros_like)
-    still.v = state.v
-    parts = [
-        polynomial(offset_coefficients(still, *pair), u)[0]
-        for pair in ((zero + 1, zero), (zero, zero + 1))
-    ]
-    basis = torch.stack(parts, -1) * known[..., None]
+    still = replace(state.map(torch.zeros_like), v=state.v)
+    of_half = offsets(still, zero + 1, zero)
+    half = of_half * known
+    end = offsets(still, zero, zero + 1) * known
     # In units of x: half = (d + end) / 2 + BEND_SCALE x_0, end = OFFSET_SCALE x_1.
-    unit = torch.stack(
-        [
-            BEND_SCALE * basis[..., 0],
-            OFFSET_SCALE * (basis[..., 1] + 0.5 * basis[..., 0]),
-        ],
-        -1,
-    )
-    rest = (track.d - base - 0.5 * state.d[..., None] * parts[0]) * known
-    lateral = ridge(unit, rest, damping=torch.diag(unit.new_tensor([0.05, 0.02])))
-    left = (rest - (unit * lateral[..., None, :]).sum(-1)).abs() + (
-        track.s - state.s[..., None] - travelled
-    ).abs()
+    unit = torch.stack([BEND_SCALE * half, OFFSET_SCALE * (end + 0.5 * half)], -1)
+    base = offsets(state, zero, zero)
+    rest = (track.d - base - 0.5 * state.d[..., None] * of_half) * known
+    lateral = ridge(unit, rest, torch.diag(unit.new_tensor(LATERAL_DAMPING)))
+    beside = (rest - (unit * lateral[..., None, :]).sum(-1)).abs()
+    left = beside + (track.s - state.s[..., None] - travelled).abs()
     error = (left * known).sum(-1) / known.sum(-1).clamp(min=1)
     return torch.cat([knots / ACCEL_SCALE, lateral], -1), error
 
@@ -369,20 +354,16 @@ def ridge(unit: Tensor, target: Tensor, damping: Tensor) -> Tensor:
     """Weights [..., D] of columns unit [..., H, D] that fit target [..., H], with
     damping [D, D] on their squares."""
     right = (unit * target[..., None]).sum(-2)
-    if (
-        torch.compiler.is_compiling() and unit.shape[-1] == 2
-    ):  # Cramer's rule, as the compiler has no `solve`
-        one, two = unit.unbind(-1)
-        a = (one * one).sum(-1)
-        b = (one * two).sum(-1)
-        d = (two * two).sum(-1)
-        a, d, (e, f) = a + damping[0, 0], d + damping[1, 1], right.unbind(-1)
-        return (
-            torch.stack([d * e - b * f, a * f - b * e], -1) / (a * d - b * b)[..., None]
-        )
-    return torch.linalg.solve(
-        unit.transpose(-1, -2) @ unit + damping, right[..., None]
-    )[..., 0]
+    if torch.compiler.is_compiling():  # of two columns; the compiler has no `solve`
+        first, second = unit.unbind(-1)
+        a = (first * first).sum(-1) + damping[0, 0]
+        b = (first * second).sum(-1)
+        d = (second * second).sum(-1) + damping[1, 1]
+        e, f = right.unbind(-1)
+        cramer = torch.stack([d * e - b * f, a * f - b * e], -1)
+        return cramer / (a * d - b * b)[..., None]
+    gram = unit.transpose(-1, -2) @ unit + damping
+    return torch.linalg.solve(gram, right[..., None])[..., 0]
 
 
 def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tensor:
@@ -391,30 +372,22 @@ def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tens
     basis = _speed_basis(device)
     distance = _distance_basis(device)
     time = DT * torch.arange(1, HORIZON + 1, device=device)
-    weight = (
-        torch.ones_like(track.v)[..., None]
-        if known is None
-        else known.to(basis.dtype)[..., None]
-    )
-    rows_of_all, inverse = _fit_of_all(device)
-    rows = torch.cat([weight * basis[:, 1:], 0.5 * weight * distance[:, 1:]], -2)
-    speed = track.v - state.v[..., None] - state.a[..., None] * basis[:, 0]
-    driven = (
-        track.s
-        - state.s[..., None]
-        - state.v[..., None] * time
-        - state.a[..., None] * distance[:, 0]
-    )
-    target = torch.cat([weight[..., 0] * speed, 0.5 * weight[..., 0] * driven], -1)
+    begin = state.map(lambda value: value[..., None])
+    speed = track.v - begin.v - begin.a * basis[:, 0]
+    driven = track.s - begin.s - begin.v * time - begin.a * distance[:, 0]
     damp, bend = _roughness(device)
-    pull = bend * state.a[..., None]
-    if (
-        known is None and torch.compiler.is_compiling()
-    ):  # the same system for all, which is solved already
-        return ((target @ rows_of_all + pull) @ inverse).clamp(-8.0, 5.0)
+    pull = bend * begin.a
+    if torch.compiler.is_compiling():  # all is known: the system is solved already
+        rows, inverse = _fit_of_all(device)
+        target = torch.cat([speed, 0.5 * driven], -1)
+        return ((target @ rows + pull) @ inverse).clamp(*HARDEST)
+    weight = torch.ones_like(track.v) if known is None else known.to(basis.dtype)
+    target = torch.cat([weight * speed, 0.5 * weight * driven], -1)
+    weight = weight[..., None]
+    rows = torch.cat([weight * basis[:, 1:], 0.5 * weight * distance[:, 1:]], -2)
     gram = rows.transpose(-1, -2) @ rows + damp
     right = (rows.transpose(-1, -2) @ target[..., None])[..., 0] + pull
-    return torch.linalg.solve(gram, right[..., None])[..., 0].clamp(-8.0, 5.0)
+    return torch.linalg.solve(gram, right[..., None])[..., 0].clamp(*HARDEST)
 
 
 @cache
@@ -422,9 +395,8 @@ def _roughness(device: torch.device) -> tuple[Tensor, Tensor]:
     """The damping [KNOTS, KNOTS] of fitted knots, and the pull [KNOTS] of a present
     acceleration of 1 on them."""
     second = torch.diff(torch.eye(KNOTS + 1, device=device), n=2, dim=0)
-    damp = ROUGHNESS * second[:, 1:].T @ second[:, 1:] + 1e-3 * torch.eye(
-        KNOTS, device=device
-    )
+    ridge_of_knots = KNOT_DAMPING * torch.eye(KNOTS, device=device)
+    damp = ROUGHNESS * second[:, 1:].T @ second[:, 1:] + ridge_of_knots
     return damp, -ROUGHNESS * second[:, 1:].T @ second[:, 0]
 
 
@@ -432,9 +404,7 @@ def _roughness(device: torch.device) -> tuple[Tensor, Tensor]:
 def _fit_of_all(device: torch.device) -> tuple[Tensor, Tensor]:
     """Of motion that is known throughout: the rows [2 HORIZON, KNOTS] of the least
     squares, and the inverse of their damped Gram matrix [KNOTS, KNOTS]."""
-    rows = torch.cat(
-        [_speed_basis(device)[:, 1:], 0.5 * _distance_basis(device)[:, 1:]]
-    )
-    return rows, torch.linalg.inv(
-        rows.double().T @ rows.double() + _roughness(device)[0]
-    ).float()
+    basis = [_speed_basis(device)[:, 1:], 0.5 * _distance_basis(device)[:, 1:]]
+    rows = torch.cat(basis)
+    gram = rows.double().T @ rows.double() + _roughness(device)[0]
+    return rows, torch.linalg.inv(gram).float()

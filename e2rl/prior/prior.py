@@ -25,24 +25,24 @@ from e2rl.prior.lane_relative import (
 from e2rl.prior.routes import (
     RouteChoice,
     RoutedScene,
+    on_map,
     route_scene,
     sample_route,
     start_state,
 )
-from e2rl.prior.sde import SamplerSettings, fused_controlled_step, fused_step
+from e2rl.prior.sde import Account, Estimates, Interval, SamplerSettings, fused_step
 from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.sim.leaders import Leaders
+from e2rl.sim.world import World
 
-BUDGET_SPENT = (
-    0.999  # fraction of a transport budget from which on it counts as used up
-)
+# Fraction of a transport budget from which on it counts as used up.
+BUDGET_SPENT = 0.999
 EGO_LEVEL = 0.01  # noise level at which the network sees the ego's plan
-STANDING_SPEED, HOLD_DISTANCE = (
-    0.5,
-    2.0,
-)  # m/s, m: a vehicle slower than this with a 5-s plan shorter than this is held
+# A vehicle slower than this (m/s) with a 5-s plan shorter than this (m) is held.
+STANDING_SPEED = 0.5
+HOLD_DISTANCE = 2.0
 
 
 @dataclass
@@ -124,9 +124,8 @@ class Prior(nn.Module):
     def choose_routes(self, scene: TensorDictBase, uniform: Tensor) -> Tensor:
         """A route candidate [B, V] for each vehicle, drawn by uniform [B, V]; the ego's
         is its mission."""
-        chosen = sample_route(
-            self.route_choice(scene), self.sampler.route_temperature, uniform=uniform
-        )
+        logits = self.route_choice(scene)
+        chosen = sample_route(logits, self.sampler.route_temperature, uniform=uniform)
         return torch.cat([scene["route_log"][:, :1], chosen[:, 1:]], 1)
 
     @torch.no_grad()
@@ -143,86 +142,93 @@ class Prior(nn.Module):
         self,
         routed: RoutedScene,
         state: LaneState,
-        agents: Tensor,
-        present: Tensor,
-        step: Tensor,
-        ego_plan: Tensor | None,
+        world: World,
+        *,
+        ego_plan: Tensor | None = None,
         known: Context | None = None,
     ) -> Context:
         """The Context of a replan.
 
-        agents [B, N, 4], present [B, N]: every agent now; step [B]: simulated steps;
-        ego_plan [B, HORIZON, 4]: states of the ego ahead, None (open loop) where
-        unknown; known: a context of the same moment, which gives the leaders of scenes
-        in which everybody is at the same place of the same route.
+        Args:
+            routed: the scenes with their routes.
+            state: fields [B, V], the vehicles on these.
+            world: everybody now.
+            ego_plan: [B, HORIZON, 4] states of the ego ahead; None: unknown (open
+                loop).
+            known: a context of the same moment, which gives the leaders of scenes in
+                which everybody is at the same place of the same route.
         """
+        agents = world.states
+        present = world.valid
         here = present[:, : state.s.shape[1]]
-        followed = _leaders_ahead(
-            routed, state.s, agents=agents, present=present, known=known
-        )
-        nodes = node_features(routed, state, followed, step, step == 0)
-        encoding = self.denoiser.encode(nodes, edge_features(routed, state), here)
-        obstacles = Obstacles(agents, routed.size, present=present)
+        if known is None:
+            followed = leaders_ahead(routed, state.s, agents=agents, present=present)
+        else:
+            followed = _leaders_anew(known, routed, s=state.s, world=world)
+        begins = world.step == 0
+        nodes = node_features(routed, state, followed, world.step, begins)
         active = here & routed.modelled
-        active = torch.cat([torch.zeros_like(active[:, :1]), active[:, 1:]], 1)
-        ego_x = None if ego_plan is None else plan_to_x(ego_plan, state, routed=routed)
-        all_on_lane = bool((routed.has_lane | ~here).all())
+        active[:, 0] = False
         return Context(
-            routed,
-            state,
+            routed=routed,
+            state=state,
             followed=followed,
-            encoding=encoding,
-            ego_x=ego_x,
-            obstacles=obstacles,
+            encoding=self.denoiser.encode(nodes, edge_features(routed, state), here),
+            ego_x=None if ego_plan is None else plan_to_x(ego_plan, state, routed),
+            obstacles=Obstacles(agents, routed.size, present),
             active=active,
-            all_on_lane=all_on_lane,
+            all_on_lane=bool((routed.has_lane | ~here).all()),
         )
 
     def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; a known plan of the ego
         replaces its row, nearly noise-free."""
-        if context.ego_x is None:
-            return self.denoiser(x, level.expand(1, x.shape[1]), context.encoding)
-        x = torch.cat([context.ego_x[:, None], x[:, 1:]], 1)
         levels = level.repeat(1, x.shape[1])
+        if context.ego_x is None:
+            return self.denoiser(x, levels, context.encoding)
+        ego = context.ego_x[:, None]
         levels[:, 0] = EGO_LEVEL
-        x0 = self.denoiser(x, levels, context.encoding)
-        return torch.cat([context.ego_x[:, None], x0[:, 1:]], 1)
+        x0 = self.denoiser(torch.cat([ego, x[:, 1:]], 1), levels, context.encoding)
+        return torch.cat([ego, x0[:, 1:]], 1)
 
     @torch.no_grad()
     def estimate(self, context: Context) -> Tensor:
         """x0 [B, V, SIZE] at the highest noise level without noise (one NFE): nearly
         the mean of the samples."""
         x = torch.zeros(*context.state.v.shape, SIZE, device=context.state.v.device)
-        return self.denoise(x, self.schedule.levels(1, x.device)[0], context=context)
+        return self.denoise(x, self.schedule.levels(1, x.device)[0], context)
 
     def decode(
         self,
         x0: Tensor,
         context: Context,
+        *,
         cap: Tensor | None = None,
         steps: slice = slice(None),
     ) -> LaneState:
-        """Planned motion of x0, fields [B, V, HORIZON] or those `steps` of it; cap [B,
-        V]: of the acceleration in the executed part."""
-        x0, state = apply_cap(cap, x0, state=context.state)
-        if steps == slice(None) and not context.all_on_lane:
-            return free_space.decode_plans(
-                x0, state, context.routed.points, context.routed.has_lane
-            )
-        if steps == slice(None):
-            lane = lane_relative.decode_plans(x0, state, context.routed.points)
-        else:
-            lane = lane_relative.decode(
-                x0, state, points=context.routed.points, steps=steps
-            )
+        """Planned motion, fields [B, V, HORIZON] or those `steps` of them.
+
+        Args:
+            x0: [B, V, SIZE].
+            context: of the replan.
+            cap: [B, V] m/s^2, of the acceleration in the executed part.
+            steps: of the motion, all by default.
+        """
+        state = context.state
+        points = context.routed.points
+        has_lane = context.routed.has_lane
+        if cap is not None:
+            x0, state = apply_cap(cap, x0, state)
+        whole = steps == slice(None)
+        if whole and not context.all_on_lane:
+            return free_space.decode_plans(x0, state, points, has_lane)
+        if whole:
+            return lane_relative.decode_plans(x0, state, points)
+        lane = lane_relative.decode(x0, state, points, steps=steps)
         if context.all_on_lane:
             return lane
-        return select(
-            context.routed.has_lane,
-            lane,
-            other=free_space.decode(x0, state).map(lambda value: value[..., steps]),
-        )
+        free = free_space.decode(x0, state).map(lambda value: value[..., steps])
+        return select(has_lane, lane, free)
 
     def sample(
         self,
@@ -231,7 +237,7 @@ class Prior(nn.Module):
         control: Control | None = None,
         budget: Tensor | None = None,
     ) -> Sample:
-        """One joint sample by the reverse SDE, from level `start` to 0.
+        """One joint sample by the reverse SDE (eq. 1), from level `start` to 0.
 
         Args:
             context: of the replan.
@@ -239,131 +245,121 @@ class Prior(nn.Module):
                 reverse SDE, the others drive it.
             control: moves the clean estimates; None: the nominal prior.
             budget: [B], path KL that control may add to a scene, all vehicles together
-                (None: any). A step that would
-                exceed it takes the fraction of its control that uses the budget up; no later step is controlled.
+                (None: any). A step that would exceed it takes the fraction of its
+                control that uses the budget up; no later step is controlled.
         """
         settings = self.sampler
-        levels = self.sampler.levels(self.schedule, noise.device)
+        levels = settings.levels(self.schedule, noise.device)
         noise = settings.temperature * noise
+        step = fused_step(settings, SIZE, limited=budget is not None)
+        control = uncontrolled if control is None else control
         x = noise[0]
-        past = None
-        last = levels[1]
+        before = levels[1]
         kl = log_ratio = torch.zeros(noise.shape[1:3], device=noise.device)
-        any_budget = kl.new_full(kl.shape[:1], torch.inf) if budget is None else budget
-        for k in range(settings.steps, 0, -1):
-            index = settings.steps - k
+        allowed = kl.new_full(kl.shape[:1], torch.inf) if budget is None else budget
+        past = None
+        for index in range(settings.steps - 1):
             high = levels[index]
-            low = levels[index + 1]
-            if control is None:
-                with torch.no_grad():
-                    x0 = nominal = self.denoise(x, high, context=context)
-            else:
-                x, nominal, x0 = control(
-                    x,
-                    high,
-                    k,
-                    context,
-                    partial(self.denoise, level=high, context=context),
-                )
-            if k > 1:  # the last step takes x0 itself
-                before = past or (x0, nominal)
-                walk = (last, high, low, noise[index + 1])
-                if control is None:
-                    x = fused_step(settings, SIZE)(x, x0, before[0], *walk)
-                else:
-                    step = fused_controlled_step(
-                        settings, SIZE, limited=budget is not None
-                    )
-                    x, x0, kl, log_ratio = step(
-                        x, x0, nominal, *before, *walk, kl, log_ratio, any_budget
-                    )
-                past = (x0, nominal)
-                last = high
-            elif (
-                budget is not None and control is not None
-            ):  # without noise there is no KL to count
-                x0 = torch.where(
-                    (kl.sum(-1) < BUDGET_SPENT * budget)[:, None, None], x0, nominal
-                )
-        return Sample(x0, kl, log_ratio=log_ratio)
+            denoise = partial(self.denoise, level=high, context=context)
+            k = settings.steps - index
+            x, nominal, x0 = control(x, high, k, context, denoise)
+            clean = Estimates(x0, nominal)
+            interval = Interval(before, high, levels[index + 1], noise[index + 1])
+            account = Account(kl, log_ratio, allowed)
+            x, x0, kl, log_ratio = step(x, clean, past or clean, interval, account)
+            past = Estimates(x0, nominal)
+            before = high
+        # The last step takes x0 itself: without noise there is no KL to count.
+        denoise = partial(self.denoise, level=levels[-2], context=context)
+        _, nominal, x0 = control(x, levels[-2], 1, context, denoise)
+        if budget is not None:
+            within = kl.sum(-1) < BUDGET_SPENT * budget
+            x0 = torch.where(within[:, None, None], x0, nominal)
+        return Sample(x0, kl, log_ratio)
 
     @torch.no_grad()
     def plan(self, x0: Tensor, context: Context) -> Plan:
         """The motion that is executed: decoded, `as_driven` and bounded; standing
         vehicles are held, routes end."""
         held = ~context.active
-        routed = context.routed
-        state = context.state
         held[:, 0] = False
 
-        def decode(rows: Rows | None, cap: Tensor | None) -> LaneState:
-            if rows is None:
-                motion = as_driven(
-                    self.decode(x0, context), state, on_lane=routed.has_lane
-                )
-                return _held(motion, state, always=held)
-            some = {
-                name: getattr(routed, name)[rows][:, None]
-                for name in ("points", "has_lane")
-            }
-            now = state.map(lambda value: value[rows][:, None])
-            part = replace(context, routed=replace(routed, **some), state=now)
-            assert cap is not None
-            motion = as_driven(
-                self.decode(x0[rows][:, None], part, cap=cap[:, None]),
-                now,
-                on_lane=part.routed.has_lane,
-            )
-            return _held(motion, now, always=held[rows][:, None]).map(
-                lambda value: value[:, 0]
-            )
+        def capped(rows: Rows, cap: Tensor) -> LaneState:
+            def alone(value: Tensor) -> Tensor:
+                return value[rows][:, None]
 
-        motion = bounded(self.bounds, decode, state=state, obstacles=context.obstacles)
-        ended = (
-            routed.open[..., None]
-            & (motion.s >= routed.length[..., None])
-            & routed.has_lane[..., None]
+            points = alone(context.routed.points)
+            has_lane = alone(context.routed.has_lane)
+            part = replace(
+                context,
+                routed=replace(context.routed, points=points, has_lane=has_lane),
+                state=context.state.map(alone),
+            )
+            motion = self._driven(alone(x0), part, held=alone(held), cap=cap[:, None])
+            return motion.map(lambda value: value[:, 0])
+
+        motion = bounded(
+            self.bounds,
+            self._driven(x0, context, held=held),
+            capped=capped,
+            state=context.state,
+            obstacles=context.obstacles,
         )
-        return Plan(motion, ~(ended.cumsum(-1) > 0))
+        return Plan(motion, on_map(context.routed, motion.s))
+
+    def _driven(
+        self, x0: Tensor, context: Context, *, held: Tensor, cap: Tensor | None = None
+    ) -> LaneState:
+        """The motion of x0 `as_driven`, with vehicles `held` [B, V], and standing ones
+        whose plan is too short for a start, held in place."""
+        state = context.state
+        motion = self.decode(x0, context, cap=cap)
+        motion = as_driven(motion, state, on_lane=context.routed.has_lane)
+        short = (motion.s[..., -1] - state.s) < HOLD_DISTANCE
+        still = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
+        zero = torch.zeros_like(still.v)
+        return select(
+            ((state.v.abs() < STANDING_SPEED) & short) | held,
+            replace(still, v=zero, a=zero),
+            motion,
+        )
 
 
-def _held(motion: LaneState, state: LaneState, always: Tensor) -> LaneState:
-    """The motion with vehicles `always` [B, V], and standing ones whose plan is too
-    short for a start, held in place."""
-    short = (motion.s[..., -1] - state.s) < HOLD_DISTANCE
-    held = state.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
-    zero = torch.zeros_like(held.v)
-    return select(
-        ((state.v.abs() < STANDING_SPEED) & short) | always,
-        replace(held, v=zero, a=zero),
-        other=motion,
-    )
+@torch.no_grad()
+def uncontrolled(
+    x: Tensor,
+    level: Tensor,
+    k: int,
+    context: Context,
+    denoise: Callable[[Tensor], Tensor],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The Control of the nominal prior: none.
+
+    Args:
+        x: [B, V, SIZE] at the noise level.
+        level, k, context: unused.
+        denoise: from x to x0.
+    """
+    x0 = denoise(x)
+    return x, x0, x0
 
 
-def _leaders_ahead(
-    routed: RoutedScene,
-    s: Tensor,
-    agents: Tensor,
-    present: Tensor,
-    known: Context | None,
+def _leaders_anew(
+    known: Context, routed: RoutedScene, *, s: Tensor, world: World
 ) -> Leaders:
-    """`leaders_ahead`, of scenes in which nobody has moved those of a Context."""
-    if known is None:
-        return leaders_ahead(routed, s, agents=agents, present=present)
+    """`leaders_ahead`, of scenes in which nobody has moved those of the known Context."""
     moved = s != known.state.s
     if routed.points is not known.routed.points:
         moved = moved | (routed.points != known.routed.points).flatten(2).any(-1)
     rows = moved.any(1).nonzero()[:, 0]
     if not len(rows):
         return known.followed
-    there = replace(routed, points=routed.points[rows], size=routed.size[rows])
-    new = leaders_ahead(there, s[rows], agents=agents[rows], present=present[rows])
-    return Leaders(
-        *(
-            old.index_copy(0, rows, now)
-            for old, now in zip(known.followed, new, strict=True)
-        )
+    part = replace(routed, points=routed.points[rows], size=routed.size[rows])
+    anew = leaders_ahead(
+        part, s[rows], agents=world.states[rows], present=world.valid[rows]
     )
+    pairs = zip(known.followed, anew, strict=True)
+    return Leaders(*(old.index_copy(0, rows, new) for old, new in pairs))
 
 
 def plan_to_x(plan: Tensor, state: LaneState, routed: RoutedScene) -> Tensor:
@@ -375,13 +371,21 @@ def plan_to_x(plan: Tensor, state: LaneState, routed: RoutedScene) -> Tensor:
 
 @fused("B 50 4", "B", "B P 2!", "B 1:bool")
 def mission_x(plan: Tensor, ego: LaneState, points: Tensor, on_lane: Tensor) -> Tensor:
-    """`plan_to_x` of an ego on a route [B, P, 2], or, where it is not on_lane [B, 1],
-    in free space."""
-    before = torch.cat([ego.v[:, None], plan[..., :-1, 3]], 1)
-    hint = ego.s[:, None] + ((plan[..., 3] + before) / 2 * DT).cumsum(-1)
+    """`plan_to_x` of an ego on a route, or in free space.
+
+    Args:
+        plan: [B, HORIZON, 4] states.
+        ego: fields [B], where the plan begins.
+        points: [B, P, 2] m, its route.
+        on_lane: [B, 1] bool, whether it has one.
+    """
+    v = plan[..., 3]
+    before = torch.cat([ego.v[:, None], v[..., :-1]], 1)
+    hint = ego.s[:, None] + ((v + before) / 2 * DT).cumsum(-1)
     s, d, _ = project(plan[..., :2], points, hint=hint)
-    x = lane_relative.fit(LaneState.from_states(plan, s, d=d), None, state=ego)[0]
+    x, _ = lane_relative.fit(LaneState.from_states(plan, s, d), None, ego)
+    knots = x[..., :KNOTS]
     lateral = free_space.fit(
-        plan[..., 2], torch.ones_like(s), state=ego, knots=ACCEL_SCALE * x[..., :KNOTS]
+        plan[..., 2], torch.ones_like(s), state=ego, knots=ACCEL_SCALE * knots
     )
-    return torch.where(on_lane, x, torch.cat([x[..., :KNOTS], lateral], -1))
+    return torch.where(on_lane, x, torch.cat([knots, lateral], -1))

@@ -134,6 +134,14 @@ def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
     )
 
 
+def on_map(routed: RoutedScene, s: Tensor) -> Tensor:
+    """[B, V, H] bool: vehicles at arc lengths s [B, V, H] m have not come to the end of
+    an open route yet."""
+    ended = routed.open & routed.has_lane
+    gone = ended[..., None] & (s >= routed.length[..., None])
+    return ~(gone.cumsum(-1) > 0)
+
+
 def reroute(
     routed: RoutedScene,
     scene: TensorDictBase,

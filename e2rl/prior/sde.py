@@ -2,14 +2,15 @@
 discrete path KL.
 
 Noise level t in [0, 1]: x_t = alpha(t) x_0 + sigma(t) eps with alpha = cos(pi t / 2),
-sigma = sin(pi t / 2); as an SDE dx = f dt + g dw with f = -beta(t) x / 2, g^2 = beta(t)
-= pi tan(pi t / 2). The paper's gamma-bar_t is alpha(t)^2.
+sigma = sin(pi t / 2); as an SDE (eq. 1) dx = f dt + g dw with f = -beta(t) x / 2, g^2 =
+beta(t) = pi tan(pi t / 2). The paper's gamma-bar_t (eq. 13) is alpha(t)^2.
 """
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,12 +18,12 @@ from torch import Tensor
 from e2rl.run.fused import Fused
 from e2rl.run.settings import configured, setting
 
-END = 0.24  # noise level of the last of `steps` steps, times steps, where levels are spaced by log(alpha / sigma)
+# Noise level of the last of `steps` steps, times steps, where levels are spaced by
+# log(alpha / sigma).
+END = 0.24
 SPACINGS = ("level", "log_ratio")
 Past = tuple[Tensor, Tensor] | None  # clean estimate and noise level of a step
-Stepped = tuple[
-    Tensor, Tensor
-]  # x at the lower level, and the variance of the noise in it
+Stepped = tuple[Tensor, Tensor]  # x at the lower level, and the variance of its noise
 
 
 @dataclass(frozen=True)
@@ -65,29 +66,33 @@ class NoiseSchedule:
     ) -> Tensor:
         """Noise levels t_K > ... > t_0 = 0, [steps + 1].
 
-        spacing: `level`: evenly in t; `log_ratio`: evenly in log(alpha / sigma) from
-        `start` to END / steps (Lu et al. 2022), then 0, where the last step takes the
-        clean estimate itself and so leaves out the noise at its level.
+        Args:
+            steps: K.
+            device: of the levels.
+            spacing: `level`: evenly in t; `log_ratio`: evenly in log(alpha / sigma)
+                from `start` to END / steps (Lu et al. 2022), then 0, where the last
+                step takes the clean estimate itself and so leaves out the noise at its
+                level.
         """
         if spacing == "level":
             return torch.linspace(self.start, 0.0, steps + 1, device=device)
-        first, last = (
-            math.log(math.tan(0.5 * math.pi * t)) for t in (self.start, END / steps)
-        )
+        first = math.log(math.tan(0.5 * math.pi * self.start))
+        last = math.log(math.tan(0.5 * math.pi * (END / steps)))
         ratio = torch.linspace(first, last, steps, device=device).exp()
         return torch.nn.functional.pad(torch.atan(ratio) * (2 / math.pi), (0, 1))
 
 
 class Sampler(ABC):
-    """Steps of the reverse process from one noise level to a lower one.
+    """Steps of the reverse process (eq. 1) from one noise level to a lower one.
 
-    Given `past`, a step is affine in x0, so that two steps with the same noise differ
-    by the shift of their means. churn: DDIM's eta (Song et al. 2021, eq. 16), the
-    fraction of ancestral noise in a step: 1 is the reverse SDE, 0 deterministic. eta
-    always means the adversarial intensity.
+    With the same noise and `past`, a step is affine in x0, so that two steps differ by
+    the shift of their means.
     """
 
     def __init__(self, schedule: NoiseSchedule, churn: float = 1.0) -> None:
+        """churn: DDIM's eta (Song et al. 2021, eq. 16), the fraction of ancestral noise
+        in a step: 1 is the reverse SDE, 0 deterministic. Elsewhere eta is the
+        adversarial intensity."""
         self.schedule = schedule
         self.churn = churn
 
@@ -101,9 +106,17 @@ class Sampler(ABC):
         noise: Tensor,
         past: Past = None,
     ) -> Stepped:
-        """Returns x at the noise level `low`, above 0, from x and its clean estimate x0
-        at level `high`. noise: standard normal, of the shape of x; past: of the
-        previous step, None at the first."""
+        """x at the noise level `low`, and the variance of the noise in it.
+
+        Args:
+            x: [..., D] at the noise level `high`.
+            x0: [..., D] its clean estimate.
+            high: [] noise level of x.
+            low: [] noise level to go to, above 0.
+            noise: [..., D] standard normal.
+            past: clean estimate and noise level of the previous step, None at the
+                first.
+        """
 
 
 class DDIM(Sampler):
@@ -119,17 +132,14 @@ class DDIM(Sampler):
         past: Past = None,
     ) -> Stepped:
         schedule = self.schedule
-        alpha_high = schedule.alpha(high)
         alpha_low = schedule.alpha(low)
-        sigma_high = schedule.sigma(high)
         sigma_low = schedule.sigma(low)
-        ratio = (alpha_high / alpha_low) ** 2
-        scale = (
-            self.churn * sigma_low / sigma_high * torch.sqrt((1 - ratio).clamp(min=0))
-        )
-        eps = schedule.noise(x, x0, high)
+        ratio = (schedule.alpha(high) / alpha_low) ** 2
+        ancestral = torch.sqrt((1 - ratio).clamp(min=0))
+        scale = self.churn * sigma_low / schedule.sigma(high) * ancestral
         rest = torch.sqrt((sigma_low**2 - scale**2).clamp(min=0))
-        return alpha_low * x0 + rest * eps + scale * noise, scale**2
+        mean = alpha_low * x0 + rest * schedule.noise(x, x0, high)
+        return mean + scale * noise, scale**2
 
 
 class DPMSolverPP(DDIM):
@@ -150,16 +160,17 @@ class DPMSolverPP(DDIM):
         past: Past = None,
     ) -> Stepped:
         if past is not None:
-            middle, last, end = (
-                self.schedule.log_ratio(t) for t in (high, past[1], low)
-            )
-            x0 = x0 + 0.5 * (end - middle) / (middle - last) * (x0 - past[0])
+            past_x0, past_level = past
+            begin = self.schedule.log_ratio(high)
+            end = self.schedule.log_ratio(low)
+            before = self.schedule.log_ratio(past_level)
+            x0 = x0 + 0.5 * (end - begin) / (begin - before) * (x0 - past_x0)
         return super().step(x, x0, high, low, noise)
 
 
 class EulerMaruyama(Sampler):
-    """x_low = x - (f - g^2 score) |dt| + g sqrt|dt| noise, with g^2 |dt| the exact
-    integral of beta over the step."""
+    """The paper's eq. 17: x_low = x - (f - g^2 score) |dt| + g sqrt|dt| noise, with
+    g^2 |dt| the exact integral of beta over the step."""
 
     def step(
         self,
@@ -205,75 +216,85 @@ class SamplerSettings:
         return schedule.levels(self.steps, device, self.spacing)
 
 
+class Estimates(NamedTuple):
+    """Clean estimates x0 [B, V, D] at one visited state: under control, and the
+    prior's own."""
+
+    controlled: Tensor
+    nominal: Tensor
+
+
+class Interval(NamedTuple):
+    """A step of the reverse process: the noise levels [] of the step before (in the
+    first step any other than `high`), of its begin and of its end, and its noise
+    [B, V, D]."""
+
+    before: Tensor
+    high: Tensor
+    low: Tensor
+    noise: Tensor
+
+
+class Account(NamedTuple):
+    """Path KL and log density ratio, control over prior, of the steps so far [B, V],
+    and the budget of path KL of a scene [B]."""
+
+    kl: Tensor
+    log_ratio: Tensor
+    budget: Tensor
+
+
+class Moved(NamedTuple):
+    """x [B, V, D] at the lower level, the clean estimate x0 [B, V, D] that led there,
+    and the account [B, V] with this step."""
+
+    x: Tensor
+    x0: Tensor
+    kl: Tensor
+    log_ratio: Tensor
+
+
 @cache
-def fused_step(settings: SamplerSettings, size: int) -> Fused:
-    """`Sampler.step` of these settings for x [B, V, size]: of x, x0, past x0, the
-    levels past, high and low and noise, to x at level low. In the first step the past
-    is x0 at any other level."""
-    sampler = settings.on(NoiseSchedule())
+def fused_step(settings: SamplerSettings, size: int, limited: bool) -> Fused:
+    """A step of x [B, V, size] under control, against what the prior would do from the
+    same visited state (eq. 5 in discrete form); limited: there is a budget.
 
-    def step(
-        x: Tensor,
-        x0: Tensor,
-        past: Tensor,
-        last: Tensor,
-        high: Tensor,
-        low: Tensor,
-        noise: Tensor,
-    ) -> Tensor:
-        return sampler.step(x, x0, high, low, noise, (past, last))[0]
-
-    each = f"B V {size}"
-    return Fused(step, (each, each, each, "", "", "", each), settings=settings)
-
-
-@cache
-def fused_controlled_step(settings: SamplerSettings, size: int, limited: bool) -> Fused:
-    """A step under control, against what the prior would do from the same visited
-    states; see `Prior.sample`.
-
-    Of x, clean estimates x0 and nominal, those of the past, the levels past, high and
-    low, noise, the KL and log ratio [B, V] so far and the budget [B] to x, x0, KL and
-    log ratio. limited: there is a budget.
+    A step that would exceed its scene's budget takes the fraction of its control that
+    uses the budget up. In the first step the past estimates are the present ones.
     """
     sampler = settings.on(NoiseSchedule())
     temperature = settings.temperature
 
-    def step(*given: Tensor) -> tuple[Tensor, ...]:
-        (
-            x,
-            x0,
-            nominal,
-            past,
-            past_nominal,
-            last,
-            high,
-            low,
-            noise,
-            kl,
-            log_ratio,
-            budget,
-        ) = given
-        moved, variance = sampler.step(x, x0, high, low, noise, (past, last))
-        plain = sampler.step(x, nominal, high, low, noise, (past_nominal, last))[0]
+    def step(
+        x: Tensor,
+        clean: Estimates,
+        past: Estimates,
+        interval: Interval,
+        account: Account,
+    ) -> Moved:
+        before, high, low, noise = interval
+        x0, nominal = clean
+        moved, variance = sampler.step(
+            x, x0, high, low, noise, (past.controlled, before)
+        )
+        plain, _ = sampler.step(x, nominal, high, low, noise, (past.nominal, before))
         variance = variance * temperature**2
         added = path_kl(moved - plain, variance)
         if limited:
-            fraction = within_budget(budget, kl, added=added)[:, None, None]
+            fraction = within_budget(account.budget, account.kl, added)[:, None, None]
             moved = plain + fraction * (moved - plain)
             x0 = nominal + fraction * (x0 - nominal)
             added = fraction[..., 0] ** 2 * added
         martingale = path_martingale(
             moved - plain, noise, variance=variance, temperature=temperature
         )
-        return moved, x0, kl + added, log_ratio + added + martingale
+        return Moved(
+            moved, x0, account.kl + added, account.log_ratio + added + martingale
+        )
 
-    each = f"B V {size}"
-    return Fused(
-        step,
-        (*[each] * 5, "", "", "", each, "B V", "B V", "B"),
-        settings=(settings, limited),
-    )
+    rows = f"B V {size}"
+    shapes = (rows, rows, rows, ("", "", "", rows), ("B V", "B V", "B"))
+    return Fused(step, shapes, settings=(settings, limited))
 
 
 def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
@@ -285,27 +306,28 @@ def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
 
 
 def path_kl(shift: Tensor, variance: Tensor) -> Tensor:
-    """Path KL [...] that one step adds, ||shift of the mean||^2 / (2 variance), of
-    shift [..., D].
+    """Path KL [...] that one step adds (eq. 5 in discrete form), ||shift of the mean||^2
+    / (2 variance), of shift [..., D].
 
     Two Gaussians of equal variance have this divergence; the sum over the steps is the
     KL of the discrete paths (chain rule). Steps without noise have no density: 0 where
     the variance is 0.
     """
     energy = (shift**2).sum(-1)
-    return torch.where(
-        variance > 0, energy / (2 * variance.clamp(min=1e-12)), torch.zeros_like(energy)
-    )
+    return torch.where(variance > 0, energy / (2 * variance.clamp(min=1e-12)), 0.0)
 
 
 def path_martingale(
-    shift: Tensor, noise: Tensor, variance: Tensor, temperature: float
+    shift: Tensor, noise: Tensor, *, variance: Tensor, temperature: float
 ) -> Tensor:
     """What log q/p [...] of one step is beyond `path_kl`: shift . noise / standard
     deviation, of mean 0 under q.
 
-    shift, noise [..., D]: of the mean, and what was injected, `temperature` times a
-    standard normal; variance of the injection.
+    Args:
+        shift: [..., D] of the mean.
+        noise: [..., D] injected, `temperature` times a standard normal.
+        variance: [] of the injection.
+        temperature: scale of the noise.
     """
     along = (shift * noise).sum(-1) / (temperature * variance.clamp(min=1e-12).sqrt())
-    return torch.where(variance > 0, along, torch.zeros_like(along))
+    return torch.where(variance > 0, along, 0.0)

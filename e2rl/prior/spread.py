@@ -9,6 +9,7 @@ from e2rl.prior import lane_relative
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE
 from e2rl.prior.prior import Prior
 from e2rl.scenes.route import project
+from e2rl.sim.world import World
 
 MOVING = 1.0  # m/s, of vehicles that count
 REGIONS = {"covered_50": 0.5, "covered_90": 0.9}  # central regions of the samples
@@ -36,8 +37,7 @@ def sample_variances(
     routed, lane = prior.start(
         scene, torch.where(scene["route_log"] >= 0, scene["route_log"], drawn_route)
     )
-    step = torch.zeros(shape[0], dtype=torch.long, device=device)
-    context = prior.encode(routed, lane, scene["start"], scene["valid"], step, None)
+    context = prior.encode(routed, lane, World.at_start(scene))
     counted = context.active & routed.has_lane & (lane.v > MOVING)
     drawn = []
     for _ in range(samples):

@@ -10,7 +10,7 @@ from e2rl.planners import hazard, reference, trunk
 from e2rl.prior import bounds, features, free_space, lane_relative, prior, routes
 from e2rl.prior.denoiser import DenoiserSettings, fused_encoding, fused_estimate
 from e2rl.prior.lane_relative import SIZE
-from e2rl.prior.sde import SamplerSettings, fused_controlled_step, fused_step
+from e2rl.prior.sde import SamplerSettings, fused_step
 from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, check_compiler, has_compiler, switch
 from e2rl.run.processes import cores, in_processes
@@ -61,10 +61,7 @@ def prepare_fused(config: DictConfig) -> None:
     sampler = SamplerSettings()
     network = DenoiserSettings()
     found += fused_encoding(network), fused_estimate(network)
-    found += (
-        fused_step(sampler, SIZE),
-        fused_controlled_step(sampler, SIZE, limited=False),
-    )
+    found.append(fused_step(sampler, SIZE, limited=False))
     missing = [each for each in found if not each.file.exists()]
     on = asked is not False and config.device == "cpu"
     if on and missing and asked == "auto":

@@ -195,9 +195,7 @@ class NominalTraffic(Traffic):
             world.states[:, 0], action[:, None].expand(-1, HORIZON, -1)
         )
         lane = self.lane_now(state, world, ego_plan=seen)
-        context = self.prior.encode(
-            state.routed, lane, world.states, world.valid, world.step, None
-        )
+        context = self.prior.encode(state.routed, lane, world)
         return self.prior.decode(self.prior.estimate(context), context).states()[
             :, 0
         ], context
@@ -211,8 +209,9 @@ class NominalTraffic(Traffic):
         self, state: State, world: World, ego_plan: Tensor, known: Context | None = None
     ) -> Context:
         """Returns the prior's context of a replan; known: see `Prior.encode`."""
-        now = world.states, world.valid, world.step
-        return self.prior.encode(state.routed, state.lane, *now, ego_plan, known)
+        return self.prior.encode(
+            state.routed, state.lane, world, ego_plan=ego_plan, known=known
+        )
 
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:
         """Returns the current lane states: the ego's from its state and planned yaw

@@ -26,7 +26,7 @@ from e2rl.prior.lane_relative import (
     select,
 )
 from e2rl.prior.prior import STANDING_SPEED, Prior
-from e2rl.prior.routes import RoutedScene, route_scene, start_state
+from e2rl.prior.routes import RoutedScene, on_map, route_scene, start_state
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import SPACING
 from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders
@@ -145,25 +145,22 @@ class IDM(Traffic):
             | ~present
         )
 
-        def decoded(rows: Rows | None, cap: Tensor | None) -> LaneState:
-            if rows is None:
-                return _driven(
-                    decode(x, lane, points=routed.points), lane, frozen=frozen
-                )
-            now = lane.map(lambda value: value[rows])
-            motion = decode(*apply_cap(cap, x[rows], state=now), routed.points[rows])
-            return _driven(motion, now, frozen=frozen[rows])
+        def capped(rows: Rows, cap: Tensor) -> LaneState:
+            begin = lane.map(lambda value: value[rows])
+            slowed, braked = apply_cap(cap, x[rows], begin)
+            motion = decode(slowed, braked, routed.points[rows])
+            return _driven(motion, begin, frozen=frozen[rows])
 
-        obstacles = Obstacles(world.states, routed.size, present=world.valid)
-        motion = bounded(self.bounds, decoded, state=lane, obstacles=obstacles)
-        gone = (
-            routed.open[..., None]
-            & (motion.s >= routed.length[..., None])
-            & routed.has_lane[..., None]
+        motion = bounded(
+            self.bounds,
+            _driven(decode(x, lane, routed.points), lane, frozen=frozen),
+            capped=capped,
+            state=lane,
+            obstacles=Obstacles(world.states, routed.size, present=world.valid),
         )
         plan = TrafficPlan(
             motion.states(),
-            present[..., None] & ~(gone.cumsum(-1) > 0),
+            present[..., None] & on_map(routed, motion.s),
             route=routed.route,
         )
         return IDMState(

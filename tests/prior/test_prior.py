@@ -11,6 +11,7 @@ from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.prior import Prior
 from e2rl.prior.routes import sample_route
 from e2rl.prior.sde import SamplerSettings
+from e2rl.sim.world import World
 from tests.prior.small import VEHICLES, arc, curved_scenes, small_prior
 
 FREE = BoundSettings(meeting=False, curve=False)
@@ -21,10 +22,9 @@ STD = 0.6
 def context_of(prior, scene):
     vehicles = scene["route_log"].shape[1]
     routed, state = prior.start(scene, scene["route_log"].clamp(min=0))
-    ego = scene["logged"][:, 1 : HORIZON + 1, 0]
-    step = torch.zeros(len(scene), dtype=torch.long)
+    ego_plan = scene["logged"][:, 1 : HORIZON + 1, 0]
     assert state.s.shape[1] == vehicles
-    return prior.encode(routed, state, scene["start"], scene["valid"], step, ego)
+    return prior.encode(routed, state, World.at_start(scene), ego_plan=ego_plan)
 
 
 def noise_for(prior, scene, seed=0):
@@ -317,16 +317,9 @@ def test_what_is_known_of_the_moment_changes_no_context(moved):
     prior = small_prior()
     before = context_of(prior, scene)
     state = replace(before.state, s=before.state.s + 7.0 * moved)
-    given = (
-        before.routed,
-        state,
-        scene["start"],
-        scene["valid"],
-        torch.zeros(len(scene), dtype=torch.long),
-        None,
-    )
-    known = prior.encode(*given, known=before)
-    anew = prior.encode(*given)
+    world = World.at_start(scene)
+    known = prior.encode(before.routed, state, world, known=before)
+    anew = prior.encode(before.routed, state, world)
     assert torch.equal(known.encoding.nodes, anew.encoding.nodes)
     assert all(
         torch.equal(one, other)
@@ -339,10 +332,7 @@ def test_without_a_plan_the_ego_is_sampled_like_everybody_else():
     prior = small_prior()
     scene = curved_scenes(2)
     known = context_of(prior, scene)
-    step = torch.zeros(len(scene), dtype=torch.long)
-    unknown = prior.encode(
-        known.routed, known.state, scene["start"], scene["valid"], step, None
-    )
+    unknown = prior.encode(known.routed, known.state, World.at_start(scene))
     one, two = (
         prior.sample(unknown, noise_for(prior, scene, seed=seed)).x0[:, 0]
         for seed in (0, 1)

@@ -96,9 +96,7 @@ class CAT(OpenLoop):
             return torch.stack([now.react(one) for one in futures[: self.tracks]])
         state = now.state
         world = now.world
-        free = self.prior.encode(
-            state.routed, state.lane, world.states, world.valid, world.step, None
-        )
+        free = self.prior.encode(state.routed, state.lane, world)
         many = tiled(free, self.tracks)
         x0 = self.prior.sample(many, folded(now.noise[..., : self.tracks, :])).x0
         return motion_of(
