@@ -55,13 +55,12 @@ class ObservingEgo(Ego):
         for step in range(0, PLAN_STEPS, HOLD):
             ego = placed_ego(
                 static.mission,
-                world.step + step,
-                state=state,
+                state,
+                step=world.step + step,
                 action=action,
                 present=present,
-                on_road=present,
                 place=place,
-                agents=static.vehicle,
+                others=static.vehicle,
             )
             others = others_at(world, expected, step=step)
             action = self.decide(features(static, ego, others, ego.step / horizon))

@@ -95,13 +95,12 @@ def observed(world: World) -> Tensor:
     present = world.valid[:, 0]
     ego = placed_ego(
         static.mission,
-        world.step,
-        state=state,
+        state,
+        step=world.step,
         action=world.ego_action(),
         present=present,
-        on_road=present,
         place=world.mission_s,
-        agents=static.vehicle,
+        others=static.vehicle,
     )
     observation = features(static, ego, world.others(), world.step.to(state.dtype))
     elapsed = torch.tensor([ELAPSED], device=state.device)

@@ -186,7 +186,16 @@ def _meeting_braking(
 
 
 @fused(
-    ("B V K 4", "B N K 4", "B V K", "B V 2", "B N 2", "B V:bool", "B N:bool", "K:int64"),
+    (
+        "B V K 4",
+        "B N K 4",
+        "B V K",
+        "B V 2",
+        "B N 2",
+        "B V:bool",
+        "B N:bool",
+        "K:int64",
+    ),
     "B V",
     "B V",
     ("B V:bool", "B V:bool", "B V"),

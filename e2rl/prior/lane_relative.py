@@ -66,9 +66,7 @@ class LaneState:
         zero = torch.zeros_like(v)
         return cls(s, d, zero, zero, v, zero, x, y, heading, zero)
 
-    def map(
-        self, function: Callable[..., Tensor], *others: "LaneState"
-    ) -> "LaneState":
+    def map(self, function: Callable[..., Tensor], *others: "LaneState") -> "LaneState":
         """A LaneState with `function` applied to every field, and to those of others
         beside it."""
         states = (vars(state).values() for state in (self, *others))

@@ -1,7 +1,7 @@
-"""DrivingEnv: a batch of B scenes; actions drive the ego, given trajectories drive the
-traffic."""
+"""DrivingEnv: a batch of B scenes; actions drive the ego, tracks drive the traffic."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -22,9 +22,10 @@ from e2rl.sim.world import (
     AGENT_KEYS,
     START_KEYS,
     Agents,
+    Tracks,
     Trajectories,
     World,
-    trajectories_at,
+    agents_at,
 )
 
 OF_ROUTE = ("points", "length", "open", "limit", "light", "light_s", "log")
@@ -106,44 +107,23 @@ class DrivingEnv(EnvBase):
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
         """The running scenes, in one storage for the environment's lifetime: a reset overwrites its rows."""
         self.horizon = self.scene["logged"].shape[1] - 1
-        low = torch.tensor(
-            [-settings.max_braking, -settings.max_yaw_rate], device=device
-        )
-        high = torch.tensor(
-            [settings.max_acceleration, settings.max_yaw_rate], device=device
-        )
-        weights = torch.tensor(check_weights(settings.reward), device=device)
-        ends = settings.end_on_contact, settings.end_off_road, settings.end_when_gone
-        self._config = StepConfig(
-            torch.tensor(ends, device=device), weights, low=low, high=high
-        )
+        low = [-settings.max_braking, -settings.max_yaw_rate]
+        high = [settings.max_acceleration, settings.max_yaw_rate]
+        ends = [settings.end_on_contact, settings.end_off_road, settings.end_when_gone]
+        numbers = (ends, check_weights(settings.reward), low, high)
+        self._config = StepConfig(*(torch.tensor(x, device=device) for x in numbers))
         self._trajectories = Trajectories(self.scene)
-        mission = mission_of(self.scene)
-        start = self.scene["start"][:, 0]
-        self._static = static_scene(self.scene, mission)
+        self._static = static_scene(self.scene, mission_of(self.scene))
         flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
-        action = torch.zeros_like(start[:, :2])
-        place = start_place(mission, start)
-        self._ego = placed_ego(
-            mission,
-            flags.long(),
-            state=start,
-            action=action,
-            present=flags,
-            on_road=flags,
-            place=place,
-            agents=self._static.vehicle,
-        )
-        self._features = torch.zeros(
-            batch_size, width, device=device
-        )  # as last observed
+        self._ego = self._at_start(self.scene, self._static.mission, on_road=flags)
+        # As last observed.
+        self._features = torch.zeros(batch_size, width, device=device)
         self._make_specs(batch_size, self.scene["start"].shape[1])
 
     def _make_specs(self, batch: int, agents: int) -> None:
-        low = self._config.low
-        high = self._config.high
+        bounds = (self._config.low, self._config.high)
         self.action_spec = Bounded(
-            low.repeat(batch, 1), high.repeat(batch, 1), device=self.device
+            *(bound.repeat(batch, 1) for bound in bounds), device=self.device
         )
 
         def flag(size: int = 1) -> Binary:
@@ -164,12 +144,11 @@ class DrivingEnv(EnvBase):
             "metrics": group(**dict.fromkeys(METRICS[:-1], flag()), progress=number()),
         }
         if self.agents:
-            states = number(agents, 4)
-            valid = flag(agents)
-            accel = number(agents)
-            turn = number(agents)
             specs["agents"] = group(
-                states=states, valid=valid, accel=accel, turn_rate=turn
+                states=number(agents, 4),
+                valid=flag(agents),
+                accel=number(agents),
+                turn_rate=number(agents),
             )
         self.observation_spec = group(**specs)
         self.reward_spec = number()
@@ -196,32 +175,32 @@ class DrivingEnv(EnvBase):
 
         states [b, V, H, 4], valid [b, V, H].
         """
-        self._trajectories.write(rows, self._ego.step[rows], states, valid)
+        step = self._ego.step[rows]
+        self._trajectories.write(rows, step=step, states=states, valid=valid)
 
     def world(self) -> World:
         """The current World. Its `scene` is the environment's own storage, which the
         next reset overwrites."""
         ego = self._ego
-        begins = (self._ego.step == 0)[:, None]
-        own = ego.state, ego.present, ego.action[:, 0], ego.action[:, 1]
-        start = (self.scene[key] for key in START_KEYS)
-        driven = trajectories_at(
-            self._trajectories.states, self._trajectories.valid, step=ego.step
-        )
+        of_ego = (ego.state, ego.present, ego.action[:, 0], ego.action[:, 1])
+        driven = agents_at(self._trajectories.tracks, ego.step)
+        begins = ego.step == 0
         agents = {}
-        for key, mine, first, later in zip(AGENT_KEYS, own, start, driven, strict=True):
-            known = torch.where(
-                begins[..., None] if first.ndim > 2 else begins, first, later
-            )
-            agents[key] = torch.cat([mine[:, None], known[:, 1:]], 1)
+        for key, start_key, mine, later in zip(
+            AGENT_KEYS, START_KEYS, of_ego, driven, strict=True
+        ):
+            first = self.scene[start_key]
+            begins = begins.view(-1, *[1] * (first.ndim - 1))
+            others = torch.where(begins, first, later)[:, 1:]
+            agents[key] = torch.cat([mine[:, None], others], 1)
         return World(self.scene, ego.step, **agents, mission_s=ego.pose.s)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
         batch = self.batch_size[0]
-        given = TensorDict() if tensordict is None else tensordict
+        request = TensorDict() if tensordict is None else tensordict
         every = torch.ones(batch, dtype=torch.bool, device=self.device)
-        index = given.get("_reset", every).view(batch).nonzero().squeeze(-1)
-        chosen = given.get("scene_index", None)
+        index = request.get("_reset", every).view(batch).nonzero().squeeze(-1)
+        chosen = request.get("scene_index", None)
         if chosen is None:
             rows = torch.randint(
                 len(self.scenes), (len(index),), generator=self._generator
@@ -231,108 +210,89 @@ class DrivingEnv(EnvBase):
         self.scenes.copy_into(self.scene, index, rows)
         fresh = self.scene if len(index) == batch else self._beginning(index)
         static = static_scene(fresh, mission_of(fresh))
-        write_rows(self._static, index, new=static)
+        write_rows(self._static, index, static)
         self._trajectories.reset(self.scene, index)
-        begun = self._restart(index, fresh, mission=static.mission)
-        if len(index) < batch:
-            static = static._replace(field=self.scene["field"].index_select(0, index))
-        others = Agents(*(fresh[name][:, 1:] for name in START_KEYS))
-        if self._look:
-            seen = features(static, begun, others, begun.step / self.horizon)
-            self._features = self._features.index_copy(0, index, seen)
-        ego = self._ego
-        outcome = dict.fromkeys((*FLAGS, *METRICS), torch.zeros_like(ego.present))
-        return self._output(
-            outcome
-            | {"observation": self._features, "progress": ego.pose.s - ego.start_s}
+        # Of all environments: the fields stay where they are.
+        start = self.scene["start"][:, :1, :2]
+        field = self.scene["field"]
+        beyond = off_road(start, field, origin=self.scene["field_origin"])[index, 0]
+        ego = self._at_start(fresh, static.mission, on_road=beyond <= 0)
+        self._ego = self._ego.merged(
+            ego, lambda old, new: old.index_copy(0, index, new)
         )
+        if self._look:
+            if len(index) < batch:
+                static = static._replace(field=field.index_select(0, index))
+            others = Agents(*(fresh[name][:, 1:] for name in START_KEYS))
+            seen = features(static, ego, others, ego.step / self.horizon)
+            self._features = self._features.index_copy(0, index, seen)
+        nothing = torch.zeros_like(self._ego.present)
+        outcome = dict.fromkeys((*FLAGS, *METRICS), nothing)
+        outcome["progress"] = self._ego.pose.s - self._ego.start_s
+        return self._output(outcome | {"observation": self._features})
 
     def _beginning(self, index: Tensor) -> TensorDict:
         """What a reset of environments index [b] needs of their scenes; of routes and
         recording, that of the ego."""
         scene = {name: self.scene[name].index_select(0, index) for name in OF_SCENE}
-        scene |= {
-            name: self.scene[name][:, :1][index]
-            for name in (f"route_{key}" for key in OF_ROUTE)
-        }
-        scene |= {
-            name: self.scene[name][:, :, :1][index]
-            for name in ("logged", "logged_valid")
-        }
-        scene["field"] = self.scene["field"][
-            : len(index)
-        ]  # storage that write_rows leaves alone
+        for name in OF_ROUTE:
+            scene[f"route_{name}"] = self.scene[f"route_{name}"][:, :1][index]
+        for name in ("logged", "logged_valid"):
+            scene[name] = self.scene[name][:, :, :1][index]
+        # Storage that write_rows leaves alone.
+        scene["field"] = self.scene["field"][: len(index)]
         return TensorDict(scene, batch_size=[len(index)], device=self.device)
 
-    def _restart(
-        self, index: Tensor, scene: TensorDictBase, mission: Mission
-    ) -> EgoState:
-        """Write, and return, the start states [b] of environments index [b] in scenes
-        scene [b]."""
-        start = self.scene["start"][
-            :, :1, :2
-        ]  # of all environments: the fields stay where they are
-        on_road = (
-            off_road(start, self.scene["field"], origin=self.scene["field_origin"])[
-                index, 0
-            ]
-            <= 0
-        )
-        action = torch.stack(
-            [scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]], -1
-        )
-        flags = torch.ones_like(on_road), on_road
+    @staticmethod
+    def _at_start(scene: TensorDictBase, mission: Mission, on_road: Tensor) -> EgoState:
+        """The egos at the start of scenes [b], on_road [b] or not."""
         state = scene["start"][:, 0]
-        fresh = placed_ego(
+        action = [scene["start_accel"][:, 0], scene["start_yaw_rate"][:, 0]]
+        ego = placed_ego(
             mission,
-            torch.zeros_like(index),
             state,
-            action,
-            *flags,
-            start_place(mission, state),
-            scene["valid"][:, 1:],
+            step=torch.zeros_like(on_road, dtype=torch.int64),
+            action=torch.stack(action, -1),
+            present=torch.ones_like(on_road),
+            place=start_place(mission, state),
+            others=scene["valid"][:, 1:],
         )
-
-        self._ego = self._ego.merged(
-            fresh, lambda old, new: old.index_copy(0, index, new)
-        )
-        return fresh
+        return ego._replace(been_on_road=on_road)
 
     @torch.no_grad()  # the stored state must not accumulate an autograd graph
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        tracks = self._trajectories.states, self._trajectories.valid
-        recording = self.scene["logged"], self.scene["logged_valid"]
-        given = recording if self.settings.replay_ego else tensordict["action"]
+        command = tensordict["action"]
+        if self.settings.replay_ego:
+            command = Tracks(self.scene["logged"], self.scene["logged_valid"])
         self._ego, outcome = hold_step(
-            self.hold,
-            self._look,
-            ego=self._ego,
-            given=given,
-            tracks=tracks,
+            self._ego,
+            command,
+            hold=self.hold,
+            tracks=self._trajectories.tracks,
             static=self._static,
             config=self._config,
+            look=self._look,
         )
         self._features = outcome["observation"]
         return self._output(outcome).set("reward", outcome["reward"][:, None])
 
     def _output(self, outcome: Outcome) -> TensorDict:
         """The step's output TensorDict without the reward."""
-        shape = self.batch_size
-        device = self.device
         flags = {name: outcome[name][:, None] for name in FLAGS}
+        metrics = {name: outcome[name][:, None] for name in METRICS}
         result = {
             "observation": outcome["observation"],
             "scene_index": self.scene["scene_index"][:, None].clone(),
             "timestep": self._ego.step[:, None].clone(),
-            "metrics": TensorDict(
-                {name: outcome[name][:, None] for name in METRICS}, shape, device=device
-            ),
+            "metrics": self._group(metrics),
             "done": flags["terminated"] | flags["truncated"],
             **flags,
         }
         if self.agents:
-            now = self.world()
-            result["agents"] = TensorDict(
-                {key: getattr(now, key) for key in AGENT_KEYS}, shape, device=device
-            )
-        return TensorDict(result, shape, device=device)
+            world = self.world()
+            agents = {key: getattr(world, key) for key in AGENT_KEYS}
+            result["agents"] = self._group(agents)
+        return self._group(result)
+
+    def _group(self, values: dict[str, Any]) -> TensorDict:
+        return TensorDict(values, self.batch_size, device=self.device)

@@ -11,7 +11,19 @@ from e2rl.scenes.recording import DT
 from e2rl.scenes.route import first_least
 from e2rl.sim.passing import is_fast, time_inside
 from e2rl.sim.static import StaticScene
-from e2rl.sim.world import Agents
+from e2rl.sim.world import Agents, Tracks
+
+# m: gap of boxes that have passed through each other, at the moment of their contact.
+TOUCHING = -1e-6
+# m/s of relative velocity below which nobody passes through the ego in a step: it takes
+# half a pedestrian.
+SLOWEST = 2.0
+SLACK = 1.5  # of the distance that agents are expected to have come in a step
+STANDING = 0.1  # m/s
+# Steps: who keeps two seconds of distance (UK Highway Code, rule 126) stops behind what
+# stood for so long.
+STOOD = round(2.0 / DT)
+LOOKED = 4  # steps between those that are looked at
 
 
 class Neighbours(NamedTuple):
@@ -37,164 +49,138 @@ def rotation_into(ego: Tensor) -> Tensor:
 
 
 def neighbours_of(
-    ego: Tensor, rotation: Tensor, size: Tensor, half_size: Tensor, agents: Agents
+    ego: Tensor, rotation: Tensor, *, static: StaticScene, agents: Agents
 ) -> Neighbours:
-    """Neighbours of egos [B, 4] among M agents.
+    """Neighbours of egos.
 
-    rotation: `rotation_into(ego)`; size [B, 2]: length and width of the egos; half_size
-    [B, 2, M]: of the agents.
+    Args:
+        ego: [B, 4] states.
+        rotation: [B, 2, 2], `rotation_into(ego)`.
+        static: sizes of all.
+        agents: M others of each ego.
     """
     x, y, heading, _ = agents.states.unbind(-1)
-    poses = torch.stack(
-        [x - ego[:, :1], heading.cos(), y - ego[:, 1:2], heading.sin()], 1
-    )
-    seen = product(rotation, poses.view(ego.shape[0], 2, -1)).view(
-        ego.shape[0], 2, 2, -1
-    )
-    position, direction = seen.unbind(2)
-    gap = separation_in_frame(
-        position, direction, own=size[..., None] / 2, half_size=half_size
-    )
-    return Neighbours(position, direction, gap=gap, agents=agents)
+    ahead = [x - ego[:, :1], heading.cos()]
+    poses = torch.stack([*ahead, y - ego[:, 1:2], heading.sin()], 1)
+    batch = ego.shape[0]
+    turned = product(rotation, poses.view(batch, 2, -1)).view(batch, 2, 2, -1)
+    position, direction = turned.unbind(2)
+    half = static.size[..., None] / 2
+    gap = separation_in_frame(position, direction, own=half, half_size=static.half_size)
+    return Neighbours(position, direction, gap, agents)
 
 
 def separation_in_frame(
-    position: Tensor, direction: Tensor, own: Tensor, half_size: Tensor
+    position: Tensor, direction: Tensor, *, own: Tensor, half_size: Tensor
 ) -> Tensor:
-    """Box separation [B, M] of a box at the origin from boxes at `position`,
-    `direction` [B, 2, M] in its frame.
+    """Box separation [B, M] m of a box at the origin from others, by the separating
+    axis theorem, as in `separation`.
 
-    own [B, 2, 1], half_size [B, 2, M]: half lengths and widths. The separating axis
-    theorem, as in `separation`.
+    Args:
+        position: [B, 2, M] m, of the others in the box's frame.
+        direction: [B, 2, M], cosine and sine of their headings there.
+        own: [B, 2, 1] m, half length and width of the box.
+        half_size: [B, 2, M] m, of the others.
     """
     size = direction.abs()
-    size = torch.stack(
-        [size, size.flip(1)], 1
-    )  # rows: extent of a box's length and width along the other's axes
+    # Rows: extent of a box's length and width along the other's axes.
+    size = torch.stack([size, size.flip(1)], 1)
     from_own = position.abs() - own - (size * half_size[:, None]).sum(2)
     ahead = (position * direction).sum(1)
     across = position[:, 1] * direction[:, 0] - position[:, 0] * direction[:, 1]
-    from_other = (
-        torch.stack([ahead, across], 1).abs() - half_size - (size * own[:, None]).sum(2)
-    )
+    place = torch.stack([ahead, across], 1).abs()
+    from_other = place - half_size - (size * own[:, None]).sum(2)
     return torch.maximum(from_own, from_other).amax(1)
 
 
-TOUCHING = (
-    -1e-6
-)  # m: gap of boxes that have passed through each other, at the moment of their contact
-
-
-# m/s of relative velocity below which nobody passes through the ego in a step: it takes
-# half a pedestrian
-SLOWEST = 2.0
-SLACK = 1.5  # of the distance that agents are expected to have come in a step
+def relative_velocity(ego: Tensor, speed: Tensor, direction: Tensor) -> Tensor:
+    """Velocity [B, 2, K] m/s of others in the frame of the egos [B, 4], relative to
+    them; speed [B, 1, K] m/s, direction [B, 2, K]."""
+    of_ego = torch.nn.functional.pad(ego[:, 3:, None], (0, 0, 0, 1))
+    return speed * direction - of_ego
 
 
 def passed(
     near: Neighbours,
-    ego: tuple[Tensor, Tensor],
-    tracks: tuple[Tensor, Tensor],
-    row: Tensor,
-    step: Tensor,
-    size: Tensor,
-    half_size: Tensor,
+    *,
+    ego: Tensor,
+    ego_before: Tensor,
+    tracks: Tracks,
+    static: StaticScene,
+    before: Tensor,
 ) -> Neighbours:
     """The neighbours, where they have passed through the ego since the last step as
     they were on contact with it.
 
     Args:
-        near: of the egos now.
-        ego: [B, 4] at the last step and now.
-        tracks: of all agents, the ego first; row [B, 1]: 0 .. B - 1; step [B]: the last
-            one.
-        size: [B, 2] m of the egos; half_size: [B, 2, M] m of the agents.
+        near: of the egos.
+        ego: [B, 4] states.
+        ego_before: [B, 4], at the last step.
+        tracks: of all agents, the ego first.
+        static: sizes of all.
+        before: [B], the last step.
     """
-    states, there, *_ = near.agents
-    motion = states[:, None, :, 3] * near.direction - torch.nn.functional.pad(
-        ego[1][:, 3:, None], (0, 0, 0, 1)
-    )
-    pace = motion.norm(dim=1)
-    asked = there & (near.gap >= 0) & (pace > SLOWEST) & (near.gap < SLACK * DT * pace)
-    if (
-        not torch.compiler.is_compiling()
-        and not asked.is_cuda
-        and not bool(asked.any())
-    ):
+    states, present, *_ = near.agents
+    velocity = relative_velocity(ego, states[:, None, :, 3], near.direction)
+    pace = velocity.norm(dim=1)
+    fast = present & (near.gap >= 0) & (pace > SLOWEST) & (near.gap < SLACK * DT * pace)
+    eager = not torch.compiler.is_compiling() and not fast.is_cuda
+    if eager and not bool(fast.any()):
         return near
-    if torch.compiler.is_compiling():
-        scene = row.expand_as(asked)
-        agent = torch.arange(asked.shape[1], device=row.device).expand_as(asked)
-    else:
-        scene, agent = asked.nonzero(as_tuple=True)
-    then = step[scene]
-    moved = (
-        states[scene, agent, :2]
-        - tracks[0][scene, then, agent + 1, :2]
-        - (ego[1] - ego[0])[scene, :2]
-    )
-    cos = ego[1][:, 2].cos()[scene]
-    sin = ego[1][:, 2].sin()[scene]
-    x, y = moved.unbind(-1)
+    agent = torch.arange(1, fast.shape[1] + 1, device=fast.device)
+    at = static.row, before[:, None], agent
+    moved = states[..., :2] - tracks.states[at][..., :2]
+    x, y = (moved - (ego - ego_before)[:, None, :2]).unbind(-1)
+    cos = ego[:, 2:3].cos()
+    sin = ego[:, 2:3].sin()
     change = torch.stack([cos * x + sin * y, cos * y - sin * x])
-    position, direction, half = (
-        torch.stack([value[:, 0][scene, agent], value[:, 1][scene, agent]])
-        for value in (near.position, near.direction, half_size)
-    )
-    own = torch.stack([size[:, 0][scene], size[:, 1][scene]]) / 2
+    position = near.position.transpose(0, 1)
+    own = (static.size / 2).T[..., None]
+    other = static.half_size.transpose(0, 1)
     begin, end = time_inside(
-        position - change, change, direction=direction, own=own, other=half
+        position - change,
+        change,
+        direction=near.direction.transpose(0, 1),
+        own=own,
+        other=other,
     )
-    passes = (
-        is_fast(change, own, other=half)
-        & tracks[1][scene, then, agent + 1]
-        & (begin > 0)
-        & (begin < end)
-    )
-    passes = passes & asked[scene, agent]
+    passes = is_fast(change, own, other) & tracks.valid[at] & (begin > 0)
+    passes = passes & (begin < end) & fast
     touch = torch.where(passes, position - (1 - begin) * change, position)
-    gap = torch.where(passes, TOUCHING, near.gap[scene, agent])
-    if torch.compiler.is_compiling():
-        return near._replace(position=touch.transpose(0, 1), gap=gap)
-    place = (
-        near.position.transpose(1, 2).index_put((scene, agent), touch.T).transpose(1, 2)
+    return near._replace(
+        position=touch.transpose(0, 1),
+        gap=torch.where(passes, TOUCHING, near.gap),
     )
-    return near._replace(position=place, gap=near.gap.index_put((scene, agent), gap))
-
-
-STANDING = 0.1  # m/s
-STOOD = round(
-    2.0 / DT
-)  # steps; who keeps two seconds of distance (UK Highway Code, rule 126) stops behind what stood
-LOOKED = 4  # steps between those that are looked at
 
 
 def standing(
-    tracks: tuple[Tensor, Tensor],
-    row: Tensor,
-    step: Tensor,
-    agent: Tensor,
-    long: Tensor,
+    tracks: Tracks, *, row: Tensor, step: Tensor, agent: Tensor, long: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Whether agents [B] of tracks (states [B, T+1, N, 4], presence [B, T+1, N]) move
-    at step [B], and whether they have stood up to it: for STOOD steps, or as long as
-    they are known, if `long` [B], else at it; each [B] bool.
+    """Whether agents move at a step, and whether they have stood up to it; each [B]
+    bool. Every LOOKED-th step is looked at.
 
-    row [B, 1]: 0 .. B - 1. Every LOOKED-th step is looked at.
+    Args:
+        tracks: of all agents.
+        row: [B, 1], 0 .. B - 1.
+        step: [B].
+        agent: [B], whom to look at.
+        long: [B] bool: to have stood is to do so for STOOD steps, or as long as it is
+            known, else at the step.
     """
     back = torch.arange(0, STOOD + 1, LOOKED, device=step.device) * long[:, None]
     at = row, (step[:, None] - back).clamp(min=0), agent[:, None]
-    known = tracks[1][at]
-    moves = (tracks[0][..., 3][at].abs() > STANDING) & known
+    known = tracks.valid[at]
+    moves = (tracks.states[..., 3][at].abs() > STANDING) & known
     return moves[:, 0], known[:, 0] & ~some(moves)
 
 
 def own_fault(
     speed: Tensor,
     near: Neighbours,
+    *,
     hit: Tensor,
     static: StaticScene,
-    tracks: tuple[Tensor, Tensor],
+    tracks: Tracks,
     before: Tensor,
 ) -> Tensor:
     """Bool [B]: the ego overlaps an agent while it moves, and either that agent has
@@ -208,10 +194,12 @@ def own_fault(
 
     Args:
         speed: [B] m/s, of the ego before the contact.
+        near: of the egos.
         hit: [B, M], the neighbours that each ego overlaps; the one with the deepest
             overlap is judged.
-        tracks: of all agents, the ego first; what they did up to the step `before` [B],
-            the one before the contact.
+        static: sizes and kinds of all.
+        tracks: of all agents, the ego first.
+        before: [B], the step before the contact.
     """
     if hit.shape[1] == 0:
         return hit.any(1)
@@ -225,8 +213,11 @@ def own_fault(
     extent = torch.stack([(turn * half).sum(1), (turn.flip(1) * half).sum(1)], 1)
     ahead, across = (position.abs() - static.size / 2 - extent).unbind(1)
     front = ((position[:, 0] > 0) == (speed >= -STANDING)) & (ahead > across)
-    vehicle = static.vehicle.gather(1, partner[:, None])[:, 0]
     moves, stood = standing(
-        tracks, static.row, step=before, agent=partner + 1, long=vehicle
+        tracks,
+        row=static.row,
+        step=before,
+        agent=partner + 1,
+        long=static.vehicle.gather(1, partner[:, None])[:, 0],
     )
     return some(hit) & (speed.abs() > STANDING) & (stood | (front & moves))

@@ -17,7 +17,12 @@ from e2rl.scenes.drivable_area import off_road, off_road_at
 from e2rl.scenes.route import project
 from e2rl.sim.dynamics import Arc, curvature_of
 from e2rl.sim.mission import Mission, limit_at
-from e2rl.sim.neighbours import Neighbours, neighbours_of, rotation_into
+from e2rl.sim.neighbours import (
+    Neighbours,
+    neighbours_of,
+    relative_velocity,
+    rotation_into,
+)
 from e2rl.sim.prospects import (
     ACCELERATIONS,
     OFFSETS,
@@ -30,30 +35,20 @@ from e2rl.sim.prospects import (
 from e2rl.sim.static import STATIC, FrenetPose, StaticScene, look_along, seen_from
 from e2rl.sim.world import AGENTS, Agents
 
-LOOK_AHEAD = (
-    2.0,
-    4.0,
-    7.0,
-    10.0,
-    14.0,
-    19.0,
-    25.0,
-    32.0,
-    40.0,
-    50.0,
-    62.0,
-    75.0,
-)  # m along the mission
-PROBE_X, PROBE_Y = (
-    (-3.0, 0.0, 5.0, 11.0, 20.0),
-    (-5.0, -2.5, 0.0, 2.5, 5.0),
-)  # m in the ego's frame
+# m along the mission.
+LOOK_AHEAD = (2.0, 4.0, 7.0, 10.0, 14.0, 19.0, 25.0, 32.0, 40.0, 50.0, 62.0, 75.0)
+# m in the ego's frame.
+PROBE_X = (-3.0, 0.0, 5.0, 11.0, 20.0)
+PROBE_Y = (-5.0, -2.5, 0.0, 2.5, 5.0)
 UNLIMITED = 12.0  # m/s, the limit that a policy reads at least where none is known
-CENTRE = PROBE_X.index(0.0) * len(PROBE_Y) + PROBE_Y.index(
-    0.0
-)  # the probe at the ego itself
+# The probe at the ego itself.
+CENTRE = PROBE_X.index(0.0) * len(PROBE_Y) + PROBE_Y.index(0.0)
 NEAREST = 12  # agents
-SPEED, FAR, NEAR, TURNING = 15.0, 40.0, 10.0, 0.5  # scales: m/s, m, m, rad/s
+# Scales.
+SPEED = 15.0  # m/s
+FAR = 40.0  # m
+NEAR = 10.0  # m
+TURNING = 0.5  # rad/s
 PER_AGENT = 16  # numbers
 LOOKED_AT = 6  # of them, whose motion manoeuvres are held against
 ELAPSED = 10  # the number that tells the elapsed fraction of the episode
@@ -92,63 +87,55 @@ class EgoState(NamedTuple):
     ) -> "EgoState":
         """An EgoState of function(own, other's) of every tensor."""
         pose = FrenetPose(*map(function, self.pose, other.pose))
-        names = [name for name in self._fields if name != "pose"]
-        return EgoState(
-            pose=pose,
-            **{
-                name: function(getattr(self, name), getattr(other, name))
-                for name in names
-            },
-        )
+        rest = {
+            name: function(value, getattr(other, name))
+            for name, value in self._asdict().items()
+            if name != "pose"
+        }
+        return EgoState(pose=pose, **rest)
 
 
 def placed_ego(
     mission: Mission,
-    step: Tensor,
     state: Tensor,
+    *,
+    step: Tensor,
     action: Tensor,
     present: Tensor,
-    on_road: Tensor,
     place: Tensor | None,
-    agents: Tensor,
+    others: Tensor,
 ) -> EgoState:
-    """The egos of B scenes at states [B, 4], projected on their missions, from which
-    progress counts.
+    """The egos of B scenes on their missions, from where progress counts; who is
+    present is on the road.
 
-    place [B]: arc length [m] near which they are, None where it is unknown; agents [B,
-    M]: any tensor of the others.
+    Args:
+        mission: of the scenes.
+        state: [B, 4].
+        step: [B].
+        action: [B, 2], last executed.
+        present: [B] bool.
+        place: [B] m, arc length near which they are, None where it is unknown.
+        others: [B, M], any tensor of the other agents.
     """
     hint = None if place is None else place[:, None]
-    pose = FrenetPose(
-        *(
-            value[:, 0]
-            for value in project(state[:, None, :2], mission.points, hint=hint)
-        )
-    )
-    inside = torch.zeros_like(agents, dtype=torch.bool)
+    projected = project(state[:, None, :2], mission.points, hint=hint)
+    pose = FrenetPose(*(value[:, 0] for value in projected))
     return EgoState(
-        step,
-        state,
+        step=step,
+        state=state,
         action=action,
         pose=pose,
         present=present,
-        been_on_road=on_road,
+        been_on_road=present,
         start_s=pose.s,
-        inside=inside,
+        inside=torch.zeros_like(others, dtype=torch.bool),
     )
 
 
 EGO_STATE = (
-    "B:int64",
-    "B 4!",
-    "B 2!",
-    "B",
-    "B",
-    "B",
-    "B:bool",
-    "B:bool",
-    "B",
-    "B M:bool",
+    *("B:int64", "B 4!", "B 2!"),
+    *("B", "B", "B"),
+    *("B:bool", "B:bool", "B", "B M:bool"),
 )
 """Shapes of an EgoState's tensors in fused functions."""
 
@@ -182,40 +169,30 @@ def observation_config(device: torch.device) -> ObservationConfig:
     def numbers(*values: float) -> Tensor:
         return torch.tensor(values, device=device)
 
-    scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)[
-        :, None
-    ]
-    probes = torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y))
+    scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)
     return ObservationConfig(
-        numbers(*LOOK_AHEAD, 0.0), probes, agent=scales, colours=numbers(1, 2, 3)
+        ahead=numbers(*LOOK_AHEAD, 0.0),
+        probes=torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y)),
+        agent=scales[:, None],
+        colours=numbers(1, 2, 3),
     )
 
 
 def observe(
     static: StaticScene, ego: EgoState, agents: Agents, time: Tensor
 ) -> Observed:
-    """The observation of egos at a time [B], the elapsed fraction of the episode."""
+    """The observation of egos.
+
+    Args:
+        static: of the scenes.
+        ego: the egos.
+        agents: all others.
+        time: [B], the elapsed fraction of the episode.
+    """
     config = observation_config(ego.state.device)
     rotation = rotation_into(ego.state)
-    neighbours = neighbours_of(
-        ego.state, rotation, size=static.size, half_size=static.half_size, agents=agents
-    )
-    if torch.compiler.is_compiling():
-        ahead, left = config.probes.unbind(1)
-        x, y = (
-            ego.state[:, k, None]
-            + ahead * rotation[:, 0, k, None]
-            + left * rotation[:, 1, k, None]
-            for k in (0, 1)
-        )
-        border = off_road_at(x, y, field=static.field, origin=static.origin)
-    else:
-        probes = torch.baddbmm(
-            ego.state[:, None, :2],
-            config.probes.expand(len(rotation), -1, -1),
-            rotation,
-        )
-        border = off_road(probes, static.field, origin=static.origin)
+    neighbours = neighbours_of(ego.state, rotation, static=static, agents=agents)
+    border = _border(config, static, ego.state, rotation=rotation)
     route, limit = route_features(config, static, ego=ego, rotation=rotation)
     near = nearest(static, neighbours)
     blocks = [
@@ -228,63 +205,82 @@ def observe(
             static, ego.state, pose=ego.pose, rotation=rotation, others=others_of(near)
         ),
     ]
-    return Observed(
-        neighbours, border[:, CENTRE], limit=limit, features=torch.cat(blocks, -1)
-    )
+    return Observed(neighbours, border[:, CENTRE], limit, torch.cat(blocks, -1))
 
 
 @fused(STATIC, EGO_STATE, AGENTS, "B")
 def features(
     static: StaticScene, ego: EgoState, agents: Agents, time: Tensor
 ) -> Tensor:
-    """The features [B, OBSERVATION_SIZE] of `observe`, alone."""
-    return observe(static, ego, agents=agents, time=time).features
+    """The features [B, OBSERVATION_SIZE] of `observe`, alone.
+
+    Args:
+        static, ego, agents, time: of `observe`.
+    """
+    return observe(static, ego, agents, time).features
 
 
 def glance(
     static: StaticScene, ego: EgoState, agents: Agents, time: Tensor
 ) -> Observed:
     """`observe` without the features: what events and reward need, at a moment at which
-    no policy looks."""
-    neighbours = neighbours_of(
-        ego.state,
-        rotation_into(ego.state),
-        size=static.size,
-        half_size=static.half_size,
-        agents=agents,
+    no policy looks.
+
+    Args:
+        static, ego, agents, time: of `observe`.
+    """
+    rotation = rotation_into(ego.state)
+    neighbours = neighbours_of(ego.state, rotation, static=static, agents=agents)
+    beyond = off_road(ego.state[:, None, :2], static.field, origin=static.origin)
+    limit = limit_at(static.mission, ego.pose.s)
+    return Observed(neighbours, beyond[:, 0], limit, features=ego.state[:, :0])
+
+
+def _border(
+    config: ObservationConfig, static: StaticScene, state: Tensor, *, rotation: Tensor
+) -> Tensor:
+    """[B, 25] m that the probes of egos [B, 4] are beyond the drivable border."""
+    if not torch.compiler.is_compiling():
+        probes = config.probes.expand(len(rotation), -1, -1)
+        places = torch.baddbmm(state[:, None, :2], probes, rotation)
+        return off_road(places, static.field, origin=static.origin)
+    ahead, left = config.probes.unbind(1)
+    x, y = (
+        state[:, k, None]
+        + ahead * rotation[:, 0, k, None]
+        + left * rotation[:, 1, k, None]
+        for k in (0, 1)
     )
-    beyond = off_road(ego.state[:, None, :2], static.field, origin=static.origin)[:, 0]
-    nothing = ego.state[:, :0]
-    return Observed(
-        neighbours, beyond, limit=limit_at(static.mission, ego.pose.s), features=nothing
-    )
+    return off_road_at(x, y, field=static.field, origin=static.origin)
 
 
 def ego_features(
-    static: StaticScene, ego: EgoState, limit: Tensor, time: Tensor
+    static: StaticScene, ego: EgoState, *, limit: Tensor, time: Tensor
 ) -> Tensor:
     """[B, 11]: speed, last action (2), offset and heading to the mission (3), speed
-    limit, distance to the map's end, size (2), elapsed fraction of the episode."""
-    state = ego.state
-    action = ego.action
+    limit, distance to the map's end, size (2), elapsed fraction of the episode.
+
+    Args:
+        static: of the scenes.
+        ego: the egos.
+        limit: [B] m/s, where they are.
+        time: [B], the elapsed fraction.
+    """
     pose = ego.pose
-    size = static.size
-    turned = state[:, 2] - pose.heading
-    left = ((static.mission.end - pose.s) / 100).clamp(0, 1)
-    limit = read_as(limit, state[:, 3])
+    speed = ego.state[:, 3]
+    length, width = static.size.unbind(1)
+    turned = ego.state[:, 2] - pose.heading
     features = [
-        state[:, 3] / SPEED,
-        action[:, 0] / 4,
-        action[:, 1],
+        speed / SPEED,
+        ego.action[:, 0] / 4,
+        ego.action[:, 1],
         (pose.d / 3).clamp(-2, 2),
         turned.sin(),
-    ]
-    features += [
         turned.cos(),
-        limit / SPEED,
-        left,
-        size[:, 0] / 5,
-        size[:, 1] / 2,
+        read_as(limit, speed) / SPEED,
+        ((static.mission.end - pose.s) / 100).clamp(0, 1),
+        length / 5,
+        width / 2,
         time,
     ]
     return torch.stack(features, -1)
@@ -297,71 +293,64 @@ def read_as(limit: Tensor, speed: Tensor) -> Tensor:
 
 
 def route_features(
-    config: ObservationConfig, static: StaticScene, ego: EgoState, rotation: Tensor
+    config: ObservationConfig, static: StaticScene, *, ego: EgoState, rotation: Tensor
 ) -> tuple[Tensor, Tensor]:
     """[B, 12 * 5]: mission points ahead in the ego's frame (2), relative heading,
-    curvature, speed limit; and the speed limit at the ego [B]."""
-    x, y, heading, curvature, limit = look_along(
-        static, ego.pose.s[:, None] + config.ahead
-    )
-    x, y = seen_from(ego.state, rotation, x=x, y=y)
-    turned = (heading - ego.state[:, 2:3]).sin()
-    seen = read_as(limit, ego.state[:, 3:])
-    features = torch.stack(
-        [x / FAR, y / NEAR, turned, (10 * curvature).clamp(-2, 2), seen / SPEED], -1
-    )
-    return features[:, :-1].clamp(-5, 5).flatten(1), limit[:, -1]
+    curvature, speed limit; and the speed limit at the ego [B] m/s.
+
+    Args:
+        config: where to look.
+        static: of the scenes.
+        ego: the egos.
+        rotation: [B, 2, 2], into their frames.
+    """
+    ahead = look_along(static, ego.pose.s[:, None] + config.ahead)
+    x, y = seen_from(ego.state, rotation, x=ahead.x, y=ahead.y)
+    columns = [
+        x / FAR,
+        y / NEAR,
+        (ahead.heading - ego.state[:, 2:3]).sin(),
+        (10 * ahead.curvature).clamp(-2, 2),
+        read_as(ahead.limit, ego.state[:, 3:]) / SPEED,
+    ]
+    features = torch.stack(columns, -1)[:, :-1].clamp(-5, 5)
+    return features.flatten(1), ahead.limit[:, -1]
 
 
 def light_features(
-    config: ObservationConfig, static: StaticScene, step: Tensor, s: Tensor
+    config: ObservationConfig, static: StaticScene, *, step: Tensor, s: Tensor
 ) -> Tensor:
     """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and
-    nearness (1 at the line, 0 far)."""
-    light = static.mission.light
+    nearness (1 at the line, 0 far).
+
+    Args:
+        config: the colours.
+        static: of the scenes.
+        step: [B].
+        s: [B] m, where the egos are on their missions.
+    """
     ahead = static.mission.light_s - s[:, None]
-    seen = (light >= 0) & (ahead > -2)
+    seen = (static.mission.light >= 0) & (ahead > -2)
     state = static.lights[static.row[:, 0], step.clamp(0, static.lights.shape[1] - 1)]
     colours = state[..., None] == config.colours
     near = (-ahead.clamp(min=0) / 30).exp()
-    return (
-        torch.cat([colours.to(s.dtype), near[..., None]], -1) * seen[..., None]
-    ).flatten(1)
+    features = torch.cat([colours.to(s.dtype), near[..., None]], -1)
+    return (features * seen[..., None]).flatten(1)
 
 
 def nearest(static: StaticScene, others: Neighbours) -> Tensor:
-    """Table [B, 12, K] of the K <= NEAREST nearest agents: position (2), direction (2),
-    half sizes (2), gap, speed, acceleration, turn rate, whether it is a vehicle,
-    presence."""
+    """Table [B, 12, NEAREST] of the nearest agents: position (2), direction (2), half
+    sizes (2), gap, speed, acceleration, turn rate, whether it is a vehicle, presence;
+    zeros where there are fewer."""
     states, present, accel, turn_rate = others.agents
+    scalars = (others.gap, states[..., 3], accel, turn_rate, static.vehicle, present)
+    columns = [others.position, others.direction, static.half_size]
+    columns += [value[:, None] for value in scalars]
+    pad = torch.nn.functional.pad
+    table = pad(torch.cat(columns, 1), (0, NEAREST))
     apart = others.position.square().sum(1).masked_fill(~present, torch.inf)
-    scalars = others.gap, states[..., 3], accel, turn_rate, static.vehicle, present
-    columns = [
-        others.position,
-        others.direction,
-        static.half_size,
-        *(value[:, None] for value in scalars),
-    ]
-    if (
-        torch.compiler.is_compiling()
-    ):  # for any number of agents; of none but the nearest more than its place
-        apart = torch.nn.functional.pad(apart, (0, NEAREST), value=torch.inf)
-        index = apart.topk(NEAREST, dim=1, largest=False).indices[:, None]
-        columns = [
-            torch.nn.functional.pad(value.to(apart.dtype), (0, NEAREST))
-            for value in columns
-        ]
-        return torch.cat(
-            [
-                value.gather(2, index.expand(-1, value.shape[1], -1))
-                for value in columns
-            ],
-            1,
-        )
-    index = apart.topk(min(NEAREST, apart.shape[1]), dim=1, largest=False).indices[
-        :, None
-    ]
-    table = torch.cat(columns, 1)
+    apart = pad(apart, (0, NEAREST), value=torch.inf)
+    index = apart.topk(NEAREST, dim=1, largest=False).indices[:, None]
     return table.gather(2, index.expand(-1, table.shape[1], -1))
 
 
@@ -373,34 +362,25 @@ def agent_features(config: ObservationConfig, ego: EgoState, near: Tensor) -> Te
     local, direction, half, gap, speed, accel, turn_rate, vehicle, present = near.split(
         COLUMNS, 1
     )
-    velocity = speed * direction - torch.nn.functional.pad(
-        ego.state[:, 3:, None], (0, 0, 0, 1)
-    )
-    time = (
-        -(local * velocity).sum(1, True) / (velocity.square().sum(1, True) + 1e-3)
-    ).clamp(0, 8)
+    velocity = relative_velocity(ego.state, speed, direction)
+    closing = -(local * velocity).sum(1, True)
+    time = (closing / (velocity.square().sum(1, True) + 1e-3)).clamp(0, 8)
     miss = (local + velocity * time).norm(dim=1, keepdim=True)
-    scaled = (
-        torch.cat([local, direction, velocity, speed, accel, half, vehicle], 1)
-        / config.agent
-    )
-    decay = torch.cat([-time / 2, -miss / 5], 1).exp()
-    turning = (turn_rate / TURNING).clamp(-5, 5)
-    features = (
-        torch.cat(
-            [present, scaled.clamp(-5, 5), (gap / NEAR).clamp(-1, 2), decay, turning], 1
-        )
-        * present
-    )
-    features = features.transpose(1, 2).flatten(1)
-    return torch.nn.functional.pad(features, (0, PER_AGENT * (NEAREST - near.shape[2])))
+    motion = torch.cat([local, direction, velocity, speed, accel, half, vehicle], 1)
+    columns = [
+        present,
+        (motion / config.agent).clamp(-5, 5),
+        (gap / NEAR).clamp(-1, 2),
+        torch.cat([-time / 2, -miss / 5], 1).exp(),
+        (turn_rate / TURNING).clamp(-5, 5),
+    ]
+    return (torch.cat(columns, 1) * present).transpose(1, 2).flatten(1)
 
 
 def others_of(near: Tensor) -> Others:
     """The LOOKED_AT nearest agents of the table `nearest`."""
-    near = near[..., :LOOKED_AT]
     local, direction, half, _, speed, accel, turn_rate, _, present = (
-        x.squeeze(1) for x in near.split(COLUMNS, 1)
+        column.squeeze(1) for column in near[..., :LOOKED_AT].split(COLUMNS, 1)
     )
     return Others(
         local,
@@ -466,34 +446,29 @@ def observation_layout() -> list[Entry]:
     """The OBSERVATION_SIZE entries of an observation, in order, named
     `block.number.quantity` (docs/observation.md)."""
     manoeuvres = [
-        f"{accel:+g}.{offset:+g}" for accel in ACCELERATIONS for offset in OFFSETS
+        f"manoeuvre.{accel:+g}.{offset:+g}"
+        for accel in ACCELERATIONS
+        for offset in OFFSETS
     ]
+    probes = [f"border.{x:+g}.{y:+g}" for x in PROBE_X for y in PROBE_Y]
+    last = TIMES[-1] + TIMES[0]
     blocks = [
         _named("ego", EGO),
         *(_named(f"route.{k}", POINT) for k in range(len(LOOK_AHEAD))),
         *(_named(f"light.{k}", LIGHT) for k in range(2)),
-        [
-            Entry(f"border.{x:+g}.{y:+g}", "m", scale=4.0)
-            for x in PROBE_X
-            for y in PROBE_Y
-        ],
+        [Entry(name, "m", scale=4.0) for name in probes],
         *(_named(f"agent.{k}", AGENT) for k in range(NEAREST)),
-        [Entry(f"manoeuvre.{name}.gap", "m", scale=WIDEST) for name in manoeuvres],
-        [
-            Entry(f"manoeuvre.{name}.contact", "s", scale=TIMES[-1] + TIMES[0])
-            for name in manoeuvres
-        ],
+        [Entry(f"{name}.gap", "m", scale=WIDEST) for name in manoeuvres],
+        [Entry(f"{name}.contact", "s", scale=last) for name in manoeuvres],
     ]
-    found = [entry for block in blocks for entry in block]
-    assert len(found) == OBSERVATION_SIZE
-    return found
+    return [entry for block in blocks for entry in block]
 
 
 def _named(block: str, entries: tuple[Entry, ...]) -> list[Entry]:
     return [entry._replace(name=f"{block}.{entry.name}") for entry in entries]
 
 
-# quantities that change sign
+# Quantities that change sign in a mirror.
 SIDED = (
     "yaw_rate",
     "offset",
@@ -510,20 +485,22 @@ def _mirror(device: torch.device) -> tuple[Tensor, Tensor]:
     """Whose number [D] each number becomes, and its sign [D]."""
     names = [entry.name for entry in observation_layout()]
     source = torch.arange(len(names))
-    for start, end, shape in (
-        ("border.", "", (len(PROBE_X), len(PROBE_Y))),
-        ("manoeuvre.", ".gap", (len(ACCELERATIONS), len(OFFSETS))),
-        ("manoeuvre.", ".contact", (len(ACCELERATIONS), len(OFFSETS))),
+    # Blocks whose last axis runs from right to left.
+    for start, end, width in (
+        ("border.", "", len(PROBE_Y)),
+        ("manoeuvre.", ".gap", len(OFFSETS)),
+        ("manoeuvre.", ".contact", len(OFFSETS)),
     ):
-        block = [
-            index
-            for index, name in enumerate(names)
-            if name.startswith(start) and name.endswith(end)
-        ]
-        source[block] = torch.tensor(block).reshape(shape).flip(1).flatten()
-    sign = torch.tensor(
-        [-1.0 if name.rsplit(".", 1)[1] in SIDED else 1.0 for name in names]
-    )
+        block = torch.tensor(
+            [
+                index
+                for index, name in enumerate(names)
+                if name.startswith(start) and name.endswith(end)
+            ]
+        )
+        source[block] = block.view(-1, width).flip(1).flatten()
+    sided = [name.rsplit(".", 1)[1] in SIDED for name in names]
+    sign = torch.where(torch.tensor(sided), -1.0, 1.0)
     return source.to(device), sign.to(device)
 
 

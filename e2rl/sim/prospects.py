@@ -82,9 +82,10 @@ def manoeuvres(
     distance = travelled(
         state[:, 3:].clamp(min=0), plan.accel, time=plan.moment
     )  # [B, T A]
-    x, y, heading, *_ = look_along(static, pose.s[:, None] + distance)
-    turned = heading - state[:, 2:3]
-    places = *seen_from(state, rotation, x=x, y=y), turned.cos(), turned.sin()
+    ahead = look_along(static, pose.s[:, None] + distance)
+    turned = ahead.heading - state[:, 2:3]
+    places = seen_from(state, rotation, x=ahead.x, y=ahead.y)
+    places = (*places, turned.cos(), turned.sin())
     x, y, cos, sin = (
         value.unflatten(1, (len(TIMES), -1))[..., None] for value in places
     )

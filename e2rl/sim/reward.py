@@ -2,6 +2,7 @@
 conf/sim/default.yaml)."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,9 +20,28 @@ TERMS = (
     "speeding",
     "lane_offset",
 )
-LEAST_TOP_SPEED = (
-    5.0  # m/s: progress at this speed is rewarded even where the recorded ego stands
-)
+# m/s: progress at this speed is rewarded even where the recorded ego stands.
+LEAST_TOP_SPEED = 5.0
+
+
+class Conduct(NamedTuple):
+    """What egos did in a step.
+
+    progress [B]: m along the mission (`rewarded_progress`); contact, fault, off_road
+    [B] bool, fault: a contact of the ego's own making; action, last_action [B, 2]:
+    executed acceleration m/s^2 and yaw rate rad/s; speed, limit [B] m/s, limit 0:
+    unknown, never exceeded; offset [B]: m from the mission route.
+    """
+
+    progress: Tensor
+    contact: Tensor
+    fault: Tensor
+    off_road: Tensor
+    action: Tensor
+    last_action: Tensor
+    speed: Tensor
+    limit: Tensor
+    offset: Tensor
 
 
 def rewarded_progress(progress: Tensor, limit: Tensor, top_speed: Tensor) -> Tensor:
@@ -36,39 +56,23 @@ def rewarded_progress(progress: Tensor, limit: Tensor, top_speed: Tensor) -> Ten
     return torch.minimum(progress, allowed * DT)
 
 
-def reward_terms(
-    progress: Tensor,
-    contact: Tensor,
-    fault: Tensor,
-    off_road: Tensor,
-    action: Tensor,
-    last_action: Tensor,
-    speed: Tensor,
-    limit: Tensor,
-    offset: Tensor,
-) -> dict[str, Tensor]:
-    """The TERMS, each [B], of one step.
-
-    Args:
-        progress: [B] m along the mission (`rewarded_progress`).
-        contact, fault, off_road: [B] bool; fault: a contact of the ego's own making.
-        action, last_action: [B, 2], executed acceleration m/s^2 and yaw rate rad/s.
-        speed, limit: [B] m/s; limit 0: unknown, never exceeded.
-        offset: [B] m from the mission route.
-    """
-    jerk = (action[:, 0] - last_action[:, 0]) / DT
-    lateral = speed * action[:, 1]
-    comfort = (action[:, 0] / 4) ** 2 + (lateral / 4) ** 2 + (jerk / 20) ** 2
-    excess = (speed - limit).clamp(min=0) / limit.clamp(min=1.0)
+def reward_terms(conduct: Conduct) -> dict[str, Tensor]:
+    """The TERMS, each [B], of one step."""
+    acceleration, yaw_rate = conduct.action.unbind(-1)
+    jerk = (acceleration - conduct.last_action[:, 0]) / DT
+    lateral = conduct.speed * yaw_rate
+    comfort = (acceleration / 4) ** 2 + (lateral / 4) ** 2 + (jerk / 20) ** 2
+    limit = conduct.limit
+    excess = (conduct.speed - limit).clamp(min=0) / limit.clamp(min=1.0)
     return {
-        "progress": progress,
-        "contact": contact.float(),
-        "fault": fault.float(),
-        "off_road": off_road.float(),
+        "progress": conduct.progress,
+        "contact": conduct.contact.float(),
+        "fault": conduct.fault.float(),
+        "off_road": conduct.off_road.float(),
         "comfort": comfort.clamp(max=3.0),
-        "acceleration": (action[:, 0].abs() / 4).clamp(max=1.0),
+        "acceleration": (acceleration.abs() / 4).clamp(max=1.0),
         "speeding": torch.where(limit > 0, excess, 0.0).clamp(max=1.0),
-        "lane_offset": (offset.abs() / 2).clamp(max=1.0),
+        "lane_offset": (conduct.offset.abs() / 2).clamp(max=1.0),
     }
 
 
@@ -78,7 +82,8 @@ def check_weights(weights: Mapping[str, float]) -> list[float]:
     wrong = set(weights) ^ set(TERMS)
     if wrong:
         raise InputError(
-            f"sim.reward: {', '.join(sorted(wrong))} missing or unknown; give exactly {', '.join(TERMS)}"
+            f"sim.reward: {', '.join(sorted(wrong))} missing or unknown; give exactly "
+            f"{', '.join(TERMS)}"
         )
     return [float(weights[name]) for name in TERMS]
 

@@ -1,8 +1,7 @@
 """One simulation step of B scenes, as a pure function of tensors, and several under one
 action.
 
-Only the ego's motion is integrated; the other agents' states are looked up in given
-trajectories.
+Only the ego's motion is integrated; the other agents' states are looked up in tracks.
 """
 
 from typing import NamedTuple
@@ -15,19 +14,13 @@ from e2rl.scenes.recording import DT, HIDDEN
 from e2rl.sim import dynamics
 from e2rl.sim.neighbours import own_fault, passed
 from e2rl.sim.observation import EGO_STATE, EgoState, features, glance, observe
-from e2rl.sim.reward import reward_terms, rewarded_progress, weighted_sum
+from e2rl.sim.reward import Conduct, reward_terms, rewarded_progress, weighted_sum
 from e2rl.sim.static import STATIC, FrenetPose, StaticScene, follow
-from e2rl.sim.world import AGENTS, Agents, trajectories_at
+from e2rl.sim.world import AGENTS, Agents, Tracks, agents_at
 
-Tracks = tuple[
-    Tensor, Tensor
-]  # states [B, T+1, N, 4] and presence [B, T+1, N] of all agents
 Outcome = dict[str, Tensor]  # see `step`
-CONTACTS = (
-    "contact",
-    "contact_vru",
-    "contact_object",
-)  # with a vehicle, a pedestrian or cyclist, an object
+# With a vehicle, a pedestrian or cyclist, an object.
+CONTACTS = ("contact", "contact_vru", "contact_object")
 FLAGS = (*CONTACTS, "off_road", "terminated", "truncated")
 
 
@@ -62,7 +55,8 @@ class Driven(NamedTuple):
 
 def step(
     ego: EgoState,
-    given: Tensor | Tracks,
+    command: Tensor | Tracks,
+    *,
     tracks: Tracks,
     static: StaticScene,
     config: StepConfig,
@@ -72,11 +66,13 @@ def step(
     """The egos after a step, and the outcome of the step.
 
     Args:
-        ego: the egos of B scenes now.
-        given: their actions [B, 2] (acceleration m/s^2, yaw rate rad/s), which are
-            clamped to the bounds; or the
-            recording, which they follow, and leave the scene at its end.
+        ego: the egos of B scenes before it.
+        command: their actions [B, 2] (acceleration m/s^2, yaw rate rad/s), which are
+            clamped to the bounds; or the recording, which they follow, and leave the
+            scene at its end.
         tracks: what all agents do.
+        static: of the scenes.
+        config: of the settings.
         look: whether a policy looks at the observation.
         ended: [B] bool, egos that stay where they are.
 
@@ -86,49 +82,44 @@ def step(
         start), each [B]. Whoever appears within the ego touches it only after they have
         been apart once, as in `metrics.contact.since_birth`.
     """
-    horizon = tracks[0].shape[1] - 1
-    now = (ego.step + 1).clamp(max=horizon)
+    horizon = tracks.states.shape[1] - 1
+    moment = (ego.step + 1).clamp(max=horizon)
     if ended is not None:
-        now = torch.where(ended, ego.step, now)
-    others = Agents(*(value[:, 1:] for value in trajectories_at(*tracks, now)))
-    if not isinstance(given, Tensor):
-        row = static.row[:, 0]
-        given = given[0][row, now, 0], given[1][row, now, 0]
-    elif is_on():
-        stay = torch.zeros_like(ego.present) if ended is None else ended
-        driven = drive(ego, given, now, others, *tracks, static, config, stay)
-        *flags, present, on_road = (driven.truths > 0).unbind()
-        pose = FrenetPose(driven.s, driven.d, heading=driven.heading)
-        moved = EgoState(
-            now,
-            driven.state,
-            action=driven.action,
-            pose=pose,
-            present=present,
-            been_on_road=on_road,
-            start_s=ego.start_s,
-            inside=driven.inside > 0,
+        moment = torch.where(ended, ego.step, moment)
+    others = Agents(*(value[:, 1:] for value in agents_at(tracks, moment)))
+    if not is_on() or not isinstance(command, Tensor):
+        return _step(
+            ego,
+            command,
+            moment=moment,
+            others=others,
+            tracks=tracks,
+            static=static,
+            config=config,
+            look=look,
+            ended=ended,
         )
-        seen = (
-            features(static, moved, others, now / horizon) if look else ego.state[:, :0]
-        )
-        numbers = {
-            "observation": seen,
-            "reward": driven.reward,
-            "progress": driven.progress,
-        }
-        return moved, numbers | dict(zip(FLAGS, flags, strict=True))
-    return _step(
-        ego,
-        given,
-        now=now,
-        others=others,
-        tracks=tracks,
-        static=static,
-        config=config,
-        look=look,
-        ended=ended,
+    stay = torch.zeros_like(ego.present) if ended is None else ended
+    driven = drive(ego, command, moment, others, tracks, static, config, stay)
+    *flags, present, on_road = (driven.truths > 0).unbind()
+    moved = ego._replace(
+        step=moment,
+        state=driven.state,
+        action=driven.action,
+        pose=FrenetPose(driven.s, driven.d, driven.heading),
+        present=present,
+        been_on_road=on_road,
+        inside=driven.inside > 0,
     )
+    observation = ego.state[:, :0]
+    if look:
+        observation = features(static, moved, others, moment / horizon)
+    return moved, {
+        "observation": observation,
+        "reward": driven.reward,
+        "progress": driven.progress,
+        **dict(zip(FLAGS, flags, strict=True)),
+    }
 
 
 @fused(
@@ -136,55 +127,86 @@ def step(
     "B 2!",
     "B:int64",
     AGENTS,
-    "B T N 4!",
-    "B T N:bool!",
+    ("B T N 4!", "B T N:bool!"),
     STATIC,
     ("3:bool!", "8", "2", "2"),
     "B:bool",
 )
 def drive(
     ego: EgoState,
-    given: Tensor,
-    now: Tensor,
+    action: Tensor,
+    moment: Tensor,
     others: Agents,
-    states: Tensor,
-    known: Tensor,
+    tracks: Tracks,
     static: StaticScene,
     config: StepConfig,
     ended: Tensor,
 ) -> Driven:
-    """`step` of actions without a look; now [B] is the step that the egos come to, at
-    which others are met."""
-    moved, of = _step(
+    """`step` of actions without a look.
+
+    Args:
+        ego, action, tracks, static, config, ended: of `step`.
+        moment: [B], the step that the egos come to.
+        others: at that step.
+    """
+    moved, outcome = _step(
         ego,
-        given,
-        now=now,
+        action,
+        moment=moment,
         others=others,
-        tracks=(states, known),
+        tracks=tracks,
         static=static,
         config=config,
         look=False,
         ended=ended,
     )
-    truths = torch.stack(
-        [*(of[name] for name in FLAGS), moved.present, moved.been_on_road]
-    ).to(given.dtype)
-    inside = moved.inside.to(given.dtype)
+    flags = [outcome[name] for name in FLAGS]
+    truths = torch.stack([*flags, moved.present, moved.been_on_road])
     return Driven(
         moved.state,
         moved.action,
         *moved.pose,
-        of["reward"],
-        of["progress"],
-        truths,
-        inside,
+        reward=outcome["reward"],
+        progress=outcome["progress"],
+        truths=truths.to(action.dtype),
+        inside=moved.inside.to(action.dtype),
+    )
+
+
+def _moved(
+    ego: EgoState,
+    command: Tensor | Tracks,
+    *,
+    moment: Tensor,
+    static: StaticScene,
+    config: StepConfig,
+) -> EgoState:
+    """The egos at step `moment` [B]: driven by their actions or along their recording."""
+    present = ego.present
+    if isinstance(command, Tensor):
+        action = torch.clamp(command, config.low, config.high)
+        state = dynamics.step(ego.state, action)
+    else:
+        row = static.row[:, 0]
+        recorded = command.valid[row, moment, 0]
+        state = command.states[row, moment, 0]
+        state = torch.where(recorded[:, None], state, ego.state)
+        present = present & recorded
+    hint = ego.pose.s + ego.state[:, 3] * DT
+    return ego._replace(
+        step=moment,
+        state=state,
+        action=dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0],
+        pose=follow(static, state[:, :2], hint),
+        present=present,
     )
 
 
 def _step(
     ego: EgoState,
-    given: Tensor | Tracks,
-    now: Tensor,
+    command: Tensor | Tracks,
+    *,
+    moment: Tensor,
     others: Agents,
     tracks: Tracks,
     static: StaticScene,
@@ -192,25 +214,9 @@ def _step(
     look: bool,
     ended: Tensor | None,
 ) -> tuple[EgoState, Outcome]:
-    horizon = tracks[0].shape[1] - 1
-    if isinstance(given, Tensor):
-        state = dynamics.step(ego.state, torch.clamp(given, config.low, config.high))
-        present = ego.present
-    else:
-        state = torch.where(given[1][:, None], given[0], ego.state)
-        present = ego.present & given[1]
-    action = dynamics.inverse(torch.stack([ego.state, state], 1))[:, 0]
-    pose = follow(static, state[:, :2], hint=ego.pose.s + ego.state[:, 3] * DT)
-    moved = EgoState(
-        now,
-        state,
-        action=action,
-        pose=pose,
-        present=present,
-        been_on_road=ego.been_on_road,
-        start_s=ego.start_s,
-        inside=ego.inside,
-    )
+    """See `step`; moment [B]: the step that the egos come to, others: at that step."""
+    horizon = tracks.states.shape[1] - 1
+    moved = _moved(ego, command, moment=moment, static=static, config=config)
     if ended is not None:
         stay = ended
         moved = ego.merged(
@@ -219,126 +225,136 @@ def _step(
                 stay.view(-1, *[1] * (new.ndim - 1)), old, new
             ),
         )
-        _, state, action, pose, present, *_ = moved
-    seen = (observe if look else glance)(static, moved, others, now / horizon)
-    both = ego.state, state
+    seen = (observe if look else glance)(static, moved, others, moment / horizon)
+
     near = passed(
         seen.neighbours,
-        both,
+        ego=moved.state,
+        ego_before=ego.state,
         tracks=tracks,
-        row=static.row,
-        step=ego.step,
-        size=static.size,
-        half_size=static.half_size,
+        static=static,
+        before=ego.step,
     )
-    hit = (near.gap < 0) & others.present & present[:, None]
+    overlap = (near.gap < 0) & others.present & moved.present[:, None]
     inside = since_birth(
-        hit,
+        overlap,
         ego.inside,
         present=others.present,
-        valid=tracks[1],
+        valid=tracks.valid,
         row=static.row,
-        now=now,
+        moment=moment,
     )
-    hit = hit & ~inside
-    kinds = static.vehicle, ~(static.vehicle | static.plain), static.plain
+    hit = overlap & ~inside
+    kinds = (static.vehicle, ~(static.vehicle | static.plain), static.plain)
     contacts = [some(hit & kind) for kind in kinds]
-    off = seen.beyond > 0
-    off_road = off & ego.been_on_road & present
-    gone = ~present | (pose.s >= static.mission.end)
     touched = contacts[0] | contacts[1] | contacts[2]
-    fault = own_fault(
-        ego.state[:, 3], near, hit=hit, static=static, tracks=tracks, before=ego.step
-    )
-    progress = rewarded_progress(
-        pose.s - ego.pose.s, seen.limit, top_speed=static.top_speed
-    )
-    terms = reward_terms(
-        progress,
-        touched,
-        fault=fault,
+    off = seen.beyond > 0
+    off_road = off & ego.been_on_road & moved.present
+    gone = ~moved.present | (moved.pose.s >= static.mission.end)
+
+    conduct = Conduct(
+        progress=rewarded_progress(
+            moved.pose.s - ego.pose.s, seen.limit, static.top_speed
+        ),
+        contact=touched,
+        fault=own_fault(
+            ego.state[:, 3],
+            near,
+            hit=hit,
+            static=static,
+            tracks=tracks,
+            before=ego.step,
+        ),
         off_road=off_road,
-        action=action,
+        action=moved.action,
         last_action=ego.action,
-        speed=state[:, 3],
+        speed=moved.state[:, 3],
         limit=seen.limit,
-        offset=pose.d,
+        offset=moved.pose.d,
     )
     on_contact, off_the_road, when_gone = config.ends.unbind()
     outcome = {
         "observation": seen.features,
-        "reward": weighted_sum(terms, config.weights),
+        "reward": weighted_sum(reward_terms(conduct), config.weights),
         **dict(zip(CONTACTS, contacts, strict=True)),
         "off_road": off_road,
         "terminated": (touched & on_contact) | (off_road & off_the_road),
-        "truncated": (now >= horizon) | (gone & when_gone),
-        "progress": pose.s - ego.start_s,
+        "truncated": (moment >= horizon) | (gone & when_gone),
+        "progress": moved.pose.s - ego.start_s,
     }
-    return moved._replace(
-        present=~gone, been_on_road=ego.been_on_road | ~off, inside=inside
-    ), outcome
+    on_road = ego.been_on_road | ~off
+    return moved._replace(present=~gone, been_on_road=on_road, inside=inside), outcome
 
 
 def since_birth(
     overlap: Tensor,
     inside: Tensor,
+    *,
     present: Tensor,
     valid: Tensor,
     row: Tensor,
-    now: Tensor,
+    moment: Tensor,
 ) -> Tensor:
-    """Returns the agents [B, M] bool that have overlapped the ego ever since they
-    appeared.
+    """The agents [B, M] bool that have overlapped the ego ever since they appeared.
 
     Args:
-        overlap, present: [B, M] bool, who overlaps the ego and who is there at this
-            step.
+        overlap: [B, M] bool, who overlaps the ego at this step.
         inside: [B, M] bool, this function's result of the step before.
-        valid: [B, T+1, N] bool, presence of all agents, the ego first; row [B, 1]: 0 ..
-            B - 1; now [B]: this step.
+        present: [B, M] bool, who is there at this step.
+        valid: [B, T+1, N] bool, presence of all agents, the ego first.
+        row: [B, 1], 0 .. B - 1.
+        moment: [B], this step.
     """
     eager = not torch.compiler.is_compiling() and not overlap.is_cuda
     if eager and not bool((overlap | inside).any()):
         return inside
-    steps = (now[:, None] - torch.arange(1, HIDDEN + 2, device=now.device)).clamp(min=0)
-    agent = torch.arange(1, overlap.shape[1] + 1, device=now.device)
+    back = torch.arange(1, HIDDEN + 2, device=moment.device)
+    steps = (moment[:, None] - back).clamp(min=0)
+    agent = torch.arange(1, overlap.shape[1] + 1, device=moment.device)
     absent = ~some(valid[row[..., None], steps[..., None], agent])
     return torch.where(present, overlap & (inside | absent), inside)
 
 
 def hold_step(
-    hold: int,
-    look: bool,
     ego: EgoState,
-    given: Tensor | Tracks,
+    command: Tensor | Tracks,
+    *,
+    hold: int,
     tracks: Tracks,
     static: StaticScene,
     config: StepConfig,
+    look: bool,
 ) -> tuple[EgoState, Outcome]:
     """`hold` times `step` under one action: rewards are summed, flags are of any step;
     a policy looks after the last.
 
     Egos whose episode ends stay at that moment, which is also the one they observe; the
     others observe the last one.
+
+    Args:
+        hold: steps, at least 1.
+        ego, command, tracks, static, config, look: of `step`.
     """
     ego, outcome = step(
-        ego, given, tracks=tracks, static=static, config=config, look=look and hold == 1
+        ego,
+        command,
+        tracks=tracks,
+        static=static,
+        config=config,
+        look=look and hold == 1,
     )
     for last in range(2, hold + 1):
         ended = outcome["terminated"] | outcome["truncated"]
         ego, later = step(
             ego,
-            given,
+            command,
             tracks=tracks,
             static=static,
             config=config,
             look=look and last == hold,
             ended=ended,
         )
+        reward = outcome["reward"] + later["reward"].masked_fill(ended, 0)
         flags = {name: outcome[name] | (later[name] & ~ended) for name in FLAGS}
-        outcome = (
-            later
-            | flags
-            | {"reward": outcome["reward"] + later["reward"].masked_fill(ended, 0)}
-        )
+        outcome = later | flags | {"reward": reward}
     return ego, outcome

@@ -1,5 +1,5 @@
 """The input of planners and traffic methods, the current state of running scenes, and
-the trajectories of others."""
+the tracks of others."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,18 +13,10 @@ from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.mission import mission_of, start_place
 
-AGENT_KEYS = (
-    "states",
-    "valid",
-    "accel",
-    "turn_rate",
-)  # of World, of the environment's `agents`, and of Agents
-START_KEYS = (
-    "start",
-    "valid",
-    "start_accel",
-    "start_yaw_rate",
-)  # of a scene: the same at its start
+# Of World, of the environment's `agents`, and of Agents.
+AGENT_KEYS = ("states", "valid", "accel", "turn_rate")
+# Of a scene: the same at its start.
+START_KEYS = ("start", "valid", "start_accel", "start_yaw_rate")
 
 
 @dataclass
@@ -52,41 +44,33 @@ class World:
     @classmethod
     def at_start(cls, scene: TensorDictBase) -> "World":
         """Scenes [B] at their start frames."""
-        step = torch.zeros(
-            scene.batch_size[0], dtype=torch.int64, device=scene["start"].device
-        )
         states, valid, accel, turn_rate = (scene[key] for key in START_KEYS)
-        mission_s = start_place(mission_of(scene), states[:, 0])
         return cls(
             scene,
-            step,
-            states,
-            valid,
-            accel,
-            turn_rate,
-            scene["route_log"],
-            mission_s=mission_s,
+            step=torch.zeros(len(states), dtype=torch.int64, device=states.device),
+            states=states,
+            valid=valid,
+            accel=accel,
+            turn_rate=turn_rate,
+            route=scene["route_log"],
+            mission_s=start_place(mission_of(scene), states[:, 0]),
         )
 
     @classmethod
     def of(cls, tensordict: TensorDictBase, scene: TensorDictBase) -> "World":
         """The World that a DrivingEnv with `agents=True` reports in a TensorDict [B];
         scene: `DrivingEnv.scene`."""
-        states, valid, accel, turn_rate = (
-            tensordict["agents"][key] for key in AGENT_KEYS
-        )
-        plan = tensordict.get(("traffic", "plan"), None)
-        progress, mission_s = (
-            tensordict.get(("metrics", "progress"), None),
-            None,
-        )  # collected frames may have none
-        if progress is not None:
-            mission_s = (
-                start_place(mission_of(scene), scene["start"][:, 0]) + progress[:, 0]
-            )
-        step = tensordict["timestep"][:, 0]
+        progress = tensordict.get(("metrics", "progress"), None)
+        mission_s = None
+        if progress is not None:  # collected frames may have none
+            begin = start_place(mission_of(scene), scene["start"][:, 0])
+            mission_s = begin + progress[:, 0]
         return cls(
-            scene, step, states, valid, accel, turn_rate, plan=plan, mission_s=mission_s
+            scene,
+            step=tensordict["timestep"][:, 0],
+            **{key: tensordict["agents"][key] for key in AGENT_KEYS},
+            plan=tensordict.get(("traffic", "plan"), None),
+            mission_s=mission_s,
         )
 
     def shown(self, scene: TensorDictBase | None = None) -> "World":
@@ -94,17 +78,15 @@ class World:
         it holds nothing of the future. Lights stay as they are now, absent agents have
         no size and type, and no plan is known.
 
-        scene: `without_future` of this World's scene, where it is made already.
+        scene: `without_future` of this World's scene, where it is at hand.
         """
         scene = (without_future(self.scene) if scene is None else scene).copy()
         lights = self.scene["light_state"]
-        there = self.valid
-        last = torch.arange(lights.shape[1], device=there.device).minimum(
-            self.step[:, None]
-        )
-        scene["light_state"] = lights.gather(1, last[..., None].expand_as(lights))
-        scene["size"] = torch.where(there[..., None], self.scene["size"], 1.0)
-        scene["agent_type"] = self.scene["agent_type"] * there
+        steps = torch.arange(lights.shape[1], device=lights.device)
+        last = steps.minimum(self.step[:, None])[..., None]
+        scene["light_state"] = lights.gather(1, last.expand_as(lights))
+        scene["size"] = torch.where(self.valid[..., None], self.scene["size"], 1.0)
+        scene["agent_type"] = self.scene["agent_type"] * self.valid
         agents = {key: getattr(self, key).clone() for key in AGENT_KEYS}
         mission_s = None if self.mission_s is None else self.mission_s.clone()
         return World(scene, self.step.clone(), **agents, mission_s=mission_s)
@@ -142,88 +124,93 @@ AGENTS = ("B M 4", "B M:bool", "B M", "B M")
 """Shapes of Agents' tensors in fused functions."""
 
 
+class Tracks(NamedTuple):
+    """What all agents of B scenes do, the ego first: states [B, T+1, N, 4], valid [B,
+    T+1, N] bool."""
+
+    states: Tensor
+    valid: Tensor
+
+
 class Trajectories:
-    """Trajectories states [B, T+1, N, 4], valid [B, T+1, N] of B running scenes.
+    """The tracks of B running scenes.
 
     Vehicles (the first V rows) may be overwritten; pedestrians, cyclists and others
     always replay the recording.
     """
 
     def __init__(self, scene: TensorDictBase) -> None:
-        self.states = scene["logged"].clone()
-        self.valid = scene["logged_valid"].clone()
+        self.tracks = Tracks(scene["logged"].clone(), scene["logged_valid"].clone())
         self.vehicles = scene["route_log"].shape[1]
-        self._scheduled: list[tuple[Tensor, Tensor, Tensor]] = []
+        self._scheduled: list[tuple[Tensor, Tracks]] = []
 
     def schedule(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
         """See `DrivingEnv.set_traffic`."""
-        expected = (len(rows), *self.states.shape[1:])
+        expected = (len(rows), *self.tracks.states.shape[1:])
         if tuple(states.shape) != expected or tuple(valid.shape) != expected[:-1]:
-            given = f"states {tuple(states.shape)} and valid {tuple(valid.shape)}"
             raise InputError(
-                f"set_traffic: {given} for {len(rows)} rows; expected {expected} and {expected[:-1]}"
+                f"set_traffic: states {tuple(states.shape)} and valid "
+                f"{tuple(valid.shape)} for {len(rows)} rows; expected {expected} and "
+                f"{expected[:-1]}"
             )
         if not torch.isfinite(states[valid]).all():
             raise InputError(
                 "set_traffic: NaN or infinite states marked valid; mark them invalid"
             )
-        device = self.states.device
-        self._scheduled.append((rows.to(device), states.to(device), valid.to(device)))
+        states = states.to(self.tracks.states)
+        traffic = Tracks(states, valid.to(states.device))
+        self._scheduled.append((rows.to(states.device), traffic))
 
     def reset(self, scene: TensorDictBase, index: Tensor) -> None:
         """Restart scenes index [b] with their scheduled trajectories, by default with
         the recording."""
-        if len(index) == len(self.states):
-            self.states.copy_(scene["logged"]), self.valid.copy_(scene["logged_valid"])
-        else:
-            self.states.index_copy_(0, index, scene["logged"].index_select(0, index))
-            self.valid.index_copy_(
-                0, index, scene["logged_valid"].index_select(0, index)
-            )
+        recording = Tracks(scene["logged"], scene["logged_valid"])
+        for track, recorded in zip(self.tracks, recording, strict=True):
+            if len(index) == len(track):
+                track.copy_(recorded)
+            else:
+                track.index_copy_(0, index, recorded.index_select(0, index))
         waiting = self._scheduled
         self._scheduled = []
-        for rows, states, valid in waiting:
-            now = torch.isin(rows, index)
-            self.states[rows[now], :, : self.vehicles] = states[now][
-                :, :, : self.vehicles
-            ].to(self.states.dtype)
-            self.valid[rows[now], :, : self.vehicles] = valid[now][
-                :, :, : self.vehicles
-            ]
-            if not bool(now.all()):
-                self._scheduled.append((rows[~now], states[~now], valid[~now]))
+        for rows, traffic in waiting:
+            due = torch.isin(rows, index)
+            for track, value in zip(self.tracks, traffic, strict=True):
+                track[rows[due], :, : self.vehicles] = value[due][:, :, : self.vehicles]
+            if not bool(due.all()):
+                rest = Tracks(*(value[~due] for value in traffic))
+                self._scheduled.append((rows[~due], rest))
 
-    def write(self, rows: Tensor, step: Tensor, states: Tensor, valid: Tensor) -> None:
-        """See `DrivingEnv.write_traffic`; from step [b] + 1 on."""
+    def write(
+        self, rows: Tensor, *, step: Tensor, states: Tensor, valid: Tensor
+    ) -> None:
+        """See `DrivingEnv.write_traffic`.
+
+        Args:
+            rows, states, valid: as there.
+            step: [b], after which the states follow.
+        """
         at = step[:, None] + torch.arange(1, states.shape[2] + 1, device=step.device)
-        inside = at < self.states.shape[1]
+        inside = at < self.tracks.states.shape[1]
         row = rows[:, None].expand_as(at)[inside]
         at = at[inside]
-        self.states[row, at, : self.vehicles] = states.transpose(1, 2)[inside].to(
-            self.states.dtype
-        )
-        self.valid[row, at, : self.vehicles] = valid.transpose(1, 2)[inside]
+        for track, value in zip(self.tracks, (states, valid), strict=True):
+            coming = value.transpose(1, 2)[inside]
+            track[row, at, : self.vehicles] = coming.to(track.dtype)
 
 
-def trajectories_at(states: Tensor, valid: Tensor, step: Tensor) -> Agents:
-    """The agents of trajectories [B, T+1, N, 4], [B, T+1, N] at step [B].
+def agents_at(tracks: Tracks, step: Tensor) -> Agents:
+    """The agents of tracks [B, T+1, N] at step [B].
 
     Acceleration and turn rate are differences of speed and heading over the last step,
     0 without a last step.
     """
-    first = torch.arange(
-        0, valid.shape[0] * valid.shape[1], valid.shape[1], device=step.device
-    )
-    at = torch.cat(
-        [first + step, first + (step - 1).clamp(min=0)]
-    )  # whole rows are copied faster than picked numbers
-    now, before = states.flatten(0, 1).index_select(0, at).chunk(2)
-    there, was = valid.flatten(0, 1).index_select(0, at).chunk(2)
-    change = now[..., 2:] - before[..., 2:]
-    known = there & was
-    return Agents(
-        now,
-        there,
-        accel=change[..., 1] / DT * known,
-        turn_rate=wrap(change[..., 0]) / DT * known,
-    )
+    batch, steps, _ = tracks.valid.shape
+    first = torch.arange(0, batch * steps, steps, device=step.device)
+    # Whole rows are copied faster than picked numbers.
+    at = torch.cat([first + step, first + (step - 1).clamp(min=0)])
+    states, before = tracks.states.flatten(0, 1).index_select(0, at).chunk(2)
+    present, was = tracks.valid.flatten(0, 1).index_select(0, at).chunk(2)
+    change = states[..., 2:] - before[..., 2:]
+    known = present & was
+    accel = change[..., 1] / DT * known
+    return Agents(states, present, accel, turn_rate=wrap(change[..., 0]) / DT * known)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from e2rl.sim.neighbours import STOOD, neighbours_of, own_fault, rotation_into
-from e2rl.sim.world import Agents
+from e2rl.sim.world import Agents, Tracks
 
 SIZE = torch.tensor([[4.0, 2.0]])
 
@@ -19,22 +19,21 @@ def judged(ego, others, since=0, vehicle=True, steps=40):
     count, agents = others.shape[:2]
     half = SIZE.T[None].expand(count, 2, agents) / 2
     still = torch.zeros(count, agents)
-    near = neighbours_of(
-        ego,
-        rotation_into(ego),
-        size=SIZE.expand(count, 2),
-        half_size=half,
-        agents=Agents(others, still == 0, accel=still, turn_rate=still),
-    )
-    states = torch.cat([ego[:, None], others], 1)[:, None].repeat(1, steps + 1, 1, 1)
-    states[:, :since, 1:2, 3] = 6.0
-    tracks = states, torch.ones_like(states[..., 0], dtype=torch.bool)
     static = SimpleNamespace(
         size=SIZE.expand(count, 2),
         half_size=half,
         vehicle=torch.full((count, agents), vehicle),
+        row=torch.arange(count)[:, None],
     )
-    static.row = torch.arange(count)[:, None]
+    near = neighbours_of(
+        ego,
+        rotation_into(ego),
+        static=static,
+        agents=Agents(others, still == 0, accel=still, turn_rate=still),
+    )
+    states = torch.cat([ego[:, None], others], 1)[:, None].repeat(1, steps + 1, 1, 1)
+    states[:, :since, 1:2, 3] = 6.0
+    tracks = Tracks(states, torch.ones_like(states[..., 0], dtype=torch.bool))
     return own_fault(
         ego[:, 3],
         near,

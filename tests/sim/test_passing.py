@@ -2,6 +2,7 @@
 are in between."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ import torch
 from e2rl.scenes.boxes import separation
 from e2rl.sim.neighbours import neighbours_of, passed, rotation_into
 from e2rl.sim.passing import is_fast, time_inside
-from e2rl.sim.world import Agents
+from e2rl.sim.world import Agents, Tracks
 
 FINE = 400  # moments of a step that are looked at
 
@@ -81,20 +82,18 @@ def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
     still = torch.zeros(1, 1)
     half = torch.tensor([[[1.1], [0.4]]])
     agents = Agents(now, still == 0, accel=still, turn_rate=still)
-    near = neighbours_of(
-        ego, rotation_into(ego), size=size, half_size=half, agents=agents
-    )
+    first = torch.zeros(1, 1, dtype=torch.int64)
+    static = SimpleNamespace(size=size, half_size=half, row=first)
+    near = neighbours_of(ego, rotation_into(ego), static=static, agents=agents)
     tracks = torch.stack([torch.cat([ego[:, None], at], 1) for at in (before, now)], 1)
     there = torch.tensor([[[True, known], [True, True]]])
-    first = torch.zeros(1, 1, dtype=torch.int64)
     found = passed(
         near,
-        (ego_before, ego),
-        tracks=(tracks, there),
-        row=first,
-        step=first[0],
-        size=size,
-        half_size=half,
+        ego=ego,
+        ego_before=ego_before,
+        tracks=Tracks(tracks, there),
+        static=static,
+        before=first[0],
     )
     assert (near.gap > 0).all() and bool((found.gap < 0).all()) == hits
     if hits:

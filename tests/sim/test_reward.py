@@ -4,6 +4,7 @@ import torch
 
 from e2rl.sim.reward import (
     TERMS,
+    Conduct,
     check_weights,
     reward_terms,
     rewarded_progress,
@@ -24,11 +25,11 @@ QUIET = {
 
 
 def term(name, **changes):
-    return reward_terms(**QUIET | changes)[name].item()
+    return reward_terms(Conduct(**QUIET | changes))[name].item()
 
 
 def test_quiet_driving_only_earns_progress():
-    terms = reward_terms(**QUIET)
+    terms = reward_terms(Conduct(**QUIET))
     assert set(terms) == set(TERMS)
     assert {name: value.item() for name, value in terms.items()} == {
         name: float(name == "progress") for name in TERMS

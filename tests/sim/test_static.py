@@ -44,13 +44,14 @@ def test_the_pose_is_the_projection_on_the_mission():
 def test_the_way_ahead_is_interpolated_with_its_limit():
     static, mission, draw = winding()
     s = 160 * torch.rand(BATCH, 40, generator=draw) - 20
-    x, y, heading, curvature, limit = look_along(static, s)
-    xy = torch.stack([x, y], -1)
-    for found, value in zip(
-        (xy, heading, curvature), interpolate(mission.points, s), strict=True
-    ):
-        assert torch.allclose(found, value, atol=1e-5)
-    assert torch.equal(limit, limit_at(mission, s))
+    ahead = look_along(static, s)
+    xy, heading, curvature = interpolate(mission.points, s)
+    torch.testing.assert_close(
+        torch.stack([ahead.x, ahead.y], -1), xy, rtol=1e-5, atol=1e-5
+    )
+    torch.testing.assert_close(ahead.heading, heading, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(ahead.curvature, curvature, rtol=1e-5, atol=1e-5)
+    assert torch.equal(ahead.limit, limit_at(mission, s))
 
 
 def test_others_are_seen_in_the_ego_frame_with_their_gap():
@@ -61,13 +62,12 @@ def test_others_are_seen_in_the_ego_frame_with_their_gap():
     states = scale * torch.randn(BATCH, 48, 4, generator=draw)
     ego = states[:, 0]
     others = states[:, 1:]
-    sizes = (static.size, static.half_size)
     present = scene["valid"][:, 1:]
     seen = neighbours_of(
         ego,
         rotation_into(ego),
-        *sizes,
-        Agents(others, present, accel=others[..., 0], turn_rate=others[..., 1]),
+        static=static,
+        agents=Agents(others, present, accel=others[..., 0], turn_rate=others[..., 1]),
     )
     assert torch.allclose(
         seen.position.transpose(1, 2),

@@ -47,7 +47,7 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
     plan = plan if knowledge == "plan" else on.predicted_ego(state, world)[0]
     routed, lane = on.prior.start(scene, state.routed.route)
     lane = on.lane_now(replace(state, routed=routed, lane=lane), world, plan)
-    context = on.prior.encode(routed, lane, world.states, world.valid, world.step, plan)
+    context = on.prior.encode(routed, lane, world, ego_plan=plan)
     noise = noise_of(
         state.seed, torch.ones(2, dtype=torch.long), shape=(4, ROWS, SIZE)
     ).transpose(0, 1)
