@@ -11,14 +11,13 @@ from torch import Tensor, nn
 from e2rl.prior.lane_relative import LaneState, locate
 from e2rl.run.fused import fused
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
-from e2rl.scenes.route import SPACING, interpolate, project
+from e2rl.scenes.route import BEHIND, SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.mission import light_state_at
 
 CONFLICT_STRIDE = 2  # vertices: conflicts are looked for every 4 m
 CONFLICT_RANGE = 80  # vertices from the route's start on
 CONFLICT_GAP = 2.5  # m: routes nearer than this are in conflict
-START = 20.0  # m: arc length near which a route passes its vehicle's start
 ROUTE_FIELDS = (
     "points",
     "length",
@@ -130,7 +129,7 @@ def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
         accel,
         yaw_rate=yaw_rate,
         points=routed.points,
-        hint=torch.full_like(routed.length, START),
+        hint=torch.full_like(routed.length, BEHIND),
     )
 
 

@@ -84,8 +84,8 @@ def manoeuvres(
     )  # [B, T A]
     ahead = look_along(static, pose.s[:, None] + distance)
     turned = ahead.heading - state[:, 2:3]
-    places = seen_from(state, rotation, x=ahead.x, y=ahead.y)
-    places = (*places, turned.cos(), turned.sin())
+    place = seen_from(state, rotation, x=ahead.x, y=ahead.y)
+    places = (*place, turned.cos(), turned.sin())
     x, y, cos, sin = (
         value.unflatten(1, (len(TIMES), -1))[..., None] for value in places
     )

@@ -3,6 +3,7 @@
 import torch
 
 from e2rl.prior.lane_relative import HORIZON, KNOTS, SIZE
+from e2rl.sim.world import World
 from e2rl.traffic.potentials import PotentialContext
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import ROWS, scenes
@@ -22,11 +23,10 @@ class Case:
         routed, state = self.prior.start(self.scene, route)
         plan = self.scene["logged"][:, 1:2, 0].repeat(1, HORIZON, 1)
         plan[..., 0] += torch.arange(HORIZON)  # 10 m/s
-        step = torch.zeros(count, dtype=torch.long)
         self.coalition = torch.zeros(count, ROWS, dtype=torch.bool)
         self.coalition[:, MEMBER] = True
         self.context = self.prior.encode(
-            routed, state, self.scene["start"], self.scene["valid"], step, plan
+            routed, state, World.at_start(self.scene), ego_plan=plan
         )
         self.conditions = PotentialContext(
             scene=self.scene,
