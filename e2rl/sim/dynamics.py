@@ -8,8 +8,6 @@ acceleration (`yaw_rate_bound`). Nobody begins to reverse here; who does at the 
 comes to a halt (`rolling_back`).
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -20,6 +18,8 @@ MAX_SPEED = 40.0  # m/s
 MAX_LATERAL = 8.0  # m/s^2, about the grip of tyres
 MAX_CURVATURE = 0.3  # 1/m, path of a car's centre at full steering lock
 HALTING = 3.0  # m/s^2 with which who reverses comes to a halt, at least
+SLOW = 1.0  # m/s below which a turn rate says little of the path's curvature
+SHARPEST = 0.12  # 1/m, of a path that is expected of a vehicle
 
 
 def constant_velocity(states: Tensor, times: Tensor) -> Tensor:
@@ -127,10 +127,19 @@ def steered(start: Tensor, speed: Tensor, turn: Tensor) -> Tensor:
 
 
 def bounded_speed(
-    v0: Tensor, change: Tensor, low: Tensor | float = 0.0, high: float = MAX_SPEED
+    v0: Tensor,
+    change: Tensor,
+    *,
+    low: Tensor | float = 0.0,
+    high: float = MAX_SPEED,
 ) -> Tensor:
-    """Speeds [..., H] of v' = clip(v + change, low, high) from v0 [..., 1] under change
-    [..., H]; exact, parallel in H. low: one for all, or [..., H].
+    """Speeds [..., H] m/s of v' = clip(v + change, low, high); exact, parallel in H.
+
+    Args:
+        v0: [..., 1] m/s.
+        change: [..., H] m/s.
+        low: m/s, one for all, or [..., H].
+        high: m/s.
 
     Each step maps v to clip(v + c, l, h); after clip(v + c1, l1, h1) it is clip(v + c1
     + c2, clip(l1 + c2, l2, h2), clip(h1 + c2, l2, h2)) (Hillis and Steele's scan over
@@ -138,27 +147,21 @@ def bounded_speed(
     """
     shape = torch.broadcast_shapes(v0.shape[:-1], change.shape[:-1])
     change = change.expand(*shape, change.shape[-1])
-    lo = (
-        low.expand_as(change)
-        if isinstance(low, Tensor)
-        else torch.full_like(change, low)
-    )
+    lo = torch.as_tensor(low).to(change).expand_as(change)
     hi = torch.full_like(change, high)
-    horizon = change.shape[-1]
     width = 1
-    while width < horizon:
-        c = change[..., width:]
-        low_then = lo[..., width:]
-        high_then = hi[..., width:]
+    while width < change.shape[-1]:
+        added = change[..., width:]
         moved = [
-            torch.minimum(torch.maximum(bound[..., :-width] + c, low_then), high_then)
+            torch.minimum(
+                torch.maximum(bound[..., :-width] + added, lo[..., width:]),
+                hi[..., width:],
+            )
             for bound in (lo, hi)
         ]
-        lo, hi = (
-            torch.cat([bound[..., :width], then], -1)
-            for bound, then in zip((lo, hi), moved, strict=True)
-        )
-        change = torch.cat([change[..., :width], change[..., :-width] + c], -1)
+        lo = torch.cat([lo[..., :width], moved[0]], -1)
+        hi = torch.cat([hi[..., :width], moved[1]], -1)
+        change = torch.cat([change[..., :width], change[..., :-width] + added], -1)
         width *= 2
     return torch.minimum(torch.maximum(v0 + change, lo), hi)
 
@@ -174,22 +177,6 @@ def inverse(states: Tensor) -> Tensor:
     return torch.stack([change[..., 1], wrap(change[..., 0])], -1) / DT
 
 
-HOLD, TURN = (
-    1.0,
-    2.0,
-)  # s for which a seen acceleration and a seen curvature are expected to last
-SLOW = 1.0  # m/s below which a turn rate says little of the path's curvature
-SHARPEST = 0.12  # 1/m, of a path that is expected of a vehicle
-
-
-class Arc(NamedTuple):
-    """Constant acceleration [...] m/s^2 and path curvature [...] 1/m (left positive):
-    how others may go on."""
-
-    accel: Tensor
-    curvature: Tensor
-
-
 def curvature_of(turn_rate: Tensor, speed: Tensor) -> Tensor:
     """Path curvature [...] 1/m of vehicles that turn with turn_rate [...] rad/s at
     speed [...] m/s."""
@@ -199,63 +186,3 @@ def curvature_of(turn_rate: Tensor, speed: Tensor) -> Tensor:
 def at_least(speed: Tensor, least: float) -> Tensor:
     """Speeds [...] m/s, forwards or backwards, of `least` at least."""
     return torch.where(speed < 0, speed.clamp(max=-least), speed.clamp(min=least))
-
-
-def along_arc(
-    states: Tensor,
-    arc: Arc,
-    times: Tensor,
-    hold: float = torch.inf,
-    turn: float = torch.inf,
-) -> tuple[Tensor, Tensor]:
-    """States [..., T, 4] and metres driven [..., T] at times [..., T] s ahead of states
-    [..., 4].
-
-    The acceleration [...] is held for `hold` s, never beyond a halt; the curvature
-    [...] for the distance that the present speed drives in `turn` s; then speed and
-    heading stay. In reverse metres are negative.
-    """
-    x, y, heading, v = (value[..., None] for value in states.unbind(-1))
-    arc = Arc(*(value[..., None] for value in arc))
-    *places, driven = arc_places(
-        x, y, heading=heading, v=v, arc=arc, times=times, hold=hold, turn=turn
-    )
-    return torch.stack(torch.broadcast_tensors(*places), -1), driven
-
-
-def arc_places(
-    x: Tensor,
-    y: Tensor,
-    heading: Tensor,
-    v: Tensor,
-    arc: Arc,
-    times: Tensor,
-    hold: float,
-    turn: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """`along_arc` of x, y, heading, speed, accelerations, curvatures and times that
-    broadcast: these four then, and the metres driven."""
-    accel, curvature = arc
-    sign = torch.where(v < 0, -1.0, 1.0)
-    v = v * sign
-    accel = accel * sign
-    halt = torch.where(accel < 0, v / (-accel).clamp(min=1e-6), torch.inf)
-    held = torch.minimum(times.clamp(max=hold), halt)
-    speed = (v + accel * held).clamp(min=0)
-    driven = (v + speed) / 2 * held + speed * (times - held)
-    bent = (
-        driven if turn == torch.inf else torch.minimum(driven, turn * v.clamp(min=SLOW))
-    )
-    driven = driven * sign
-    bent = bent * sign
-    speed = speed * sign
-    angle = curvature * bent
-    chord = bent * torch.sinc(angle / (2 * torch.pi))
-    middle = heading + angle / 2
-    end = heading + angle
-    x = x + chord * middle.cos()
-    y = y + chord * middle.sin()
-    if turn < torch.inf:
-        x = x + (driven - bent) * end.cos()
-        y = y + (driven - bent) * end.sin()
-    return x, y, wrap(end), speed, driven

@@ -15,7 +15,7 @@ from torch import Tensor
 from e2rl.run.fused import fused
 from e2rl.scenes.drivable_area import off_road, off_road_at
 from e2rl.scenes.route import project
-from e2rl.sim.dynamics import Arc, curvature_of
+from e2rl.sim.dynamics import curvature_of
 from e2rl.sim.mission import Mission, limit_at
 from e2rl.sim.neighbours import (
     Neighbours,
@@ -29,6 +29,7 @@ from e2rl.sim.prospects import (
     PROSPECTS,
     TIMES,
     WIDEST,
+    Arc,
     Others,
     prospects,
 )

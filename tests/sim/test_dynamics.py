@@ -8,7 +8,6 @@ import torch
 
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.dynamics import Arc, along_arc
 
 
 def random_case(batch=64, horizon=50, seed=0):
@@ -161,61 +160,6 @@ def test_constant_velocity_is_a_rollout_without_actions():
     expected = dynamics.rollout(start, actions)
     torch.testing.assert_close(found[..., :2], expected[..., :2])
     assert torch.equal(found[..., 2:], start[:, None, 2:].expand(-1, 20, -1))
-
-
-def test_an_arc_is_the_unicycle_s_motion_at_constant_acceleration_and_curvature():
-    states = torch.tensor([1.0, -2.0, 0.4, 9.0])
-    given = Arc(torch.tensor(-3.0), torch.tensor(0.04))
-    times = DT * torch.arange(1, 51)
-    arc, driven = along_arc(states, given, times=times)
-    speed = torch.nn.functional.pad(arc[:, 3], (1, 0), value=9.0)
-    actions = torch.stack(
-        [torch.full((50,), -3.0), 0.04 * (speed[1:] + speed[:-1]) / 2], -1
-    )
-    torch.testing.assert_close(
-        arc, dynamics.rollout(states, actions), rtol=0, atol=0.02
-    )
-    assert driven[-1].item() == pytest.approx(9.0**2 / 6, abs=1e-4), (
-        "to the halt, never backwards"
-    )
-    assert (driven.diff() >= 0).all() and (arc[31:, 3] == 0).all()
-
-
-@pytest.mark.parametrize("accel", [-2.0, 0.0, 1.5])
-def test_an_arc_in_reverse_is_the_arc_forwards_of_who_looks_the_other_way(accel):
-    times = DT * torch.arange(1, 51)
-    ways = [dict(hold=1.0, turn=2.0), {}]
-    for way in ways:
-        back, metres = along_arc(
-            torch.tensor([1.0, 2.0, 0.3, -4.0]),
-            Arc(torch.tensor(-accel), torch.tensor(0.05)),
-            times=times,
-            **way,
-        )
-        facing = torch.tensor([1.0, 2.0, 0.3 + math.pi, 4.0])
-        ahead, driven = along_arc(
-            facing, Arc(torch.tensor(accel), torch.tensor(-0.05)), times=times, **way
-        )
-        torch.testing.assert_close(back[:, :2], ahead[:, :2], rtol=0, atol=1e-4)
-        torch.testing.assert_close(metres, -driven)
-        torch.testing.assert_close(back[:, 3], -ahead[:, 3])
-        assert dynamics.wrap(back[:, 2] + math.pi - ahead[:, 2]).abs().max() < 1e-5
-    assert dynamics.curvature_of(
-        torch.tensor(-0.2), torch.tensor(-4.0)
-    ).item() == pytest.approx(0.05)
-
-
-def test_what_is_seen_lasts_a_while_then_speed_and_heading_stay():
-    given = Arc(torch.tensor(2.0), torch.tensor(0.05))
-    times = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    arc, driven = along_arc(
-        torch.tensor([0.0, 0.0, 0.0, 10.0]), given, times=times, hold=1.0, turn=2.0
-    )
-    torch.testing.assert_close(arc[:, 3], torch.full((4,), 12.0))
-    torch.testing.assert_close(driven, torch.tensor([11.0, 23.0, 35.0, 47.0]))
-    torch.testing.assert_close(arc[1:, 2], torch.full((3,), 1.0))
-    assert arc[0, 2].item() == pytest.approx(0.55)
-    torch.testing.assert_close((arc[3, :2] - arc[2, :2]).norm(), torch.tensor(12.0))
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,23 @@
 """Prospects: gaps of short manoeuvres are those of the boxes but for rounded corners;
 others go on as they do."""
 
+import math
+
 import pytest
 import shapely
 import torch
 
-from e2rl.sim.dynamics import Arc, along_arc
+from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.prospects import TIMES, Others, gaps, time_to_contact, travelled
+from e2rl.sim.prospects import (
+    TIMES,
+    Arc,
+    Others,
+    arc_places,
+    gaps,
+    time_to_contact,
+    travelled,
+)
 from tests.synthetic import make_scenes
 
 CAR = (4.6, 2.0)
@@ -94,15 +104,16 @@ def test_who_turns_goes_on_turning():
     speed = 6.0
     curvature = 0.06
     found = gaps(ego, size, others=others((*pose, speed, 0.0, curvature)))[0, :, 0]
-    arc = Arc(torch.tensor(0.0), torch.tensor(curvature))
-    path, _ = along_arc(
-        torch.tensor([*pose, speed]), arc, times=torch.tensor(TIMES[:4])
-    )
-    standing = [
-        gaps(ego, size, others=others((*state[:3], 0.0, 0.0)))[0, 0, 0]
-        for state in path.tolist()
-    ]
-    torch.testing.assert_close(found[:4], torch.stack(standing))
+    x, y, heading = pose
+    standing = []
+    for time in TIMES[:4]:
+        turn = curvature * speed * time
+        middle = heading + turn / 2
+        chord = 2 / curvature * math.sin(turn / 2)
+        there = (x + chord * math.cos(middle), y + chord * math.sin(middle))
+        car = others((*there, heading + turn, 0.0, 0.0))
+        standing.append(gaps(ego, size, others=car)[0, 0, 0])
+    torch.testing.assert_close(found[:4], torch.stack(standing), rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -116,3 +127,48 @@ def test_the_time_to_contact_is_that_of_going_on_behind_a_standing_car(gap, expe
         make_scenes(1, vehicles=cars, num_vrus=0), SimSettings(), 1
     ).reset()["observation"]
     assert time_to_contact(observation).item() == pytest.approx(expected, abs=1e-3)
+
+
+def test_an_arc_is_the_unicycle_s_motion_while_it_lasts():
+    """Braking by 3 m/s^2 for a second, in a bend of 25 m; a bend that goes on for 2 s."""
+    arc = Arc(torch.tensor(-3.0), torch.tensor(0.04))
+    steps = torch.arange(1, 11)
+    ahead, left, turn = arc_places(torch.tensor(9.0), arc, 0.1 * steps)
+    speed = 9.0 - 0.3 * torch.arange(11)
+    actions = torch.stack(
+        [torch.full((10,), -3.0), 0.04 * (speed[1:] + speed[:-1]) / 2], -1
+    )
+    states = dynamics.rollout(torch.tensor([0.0, 0.0, 0.0, 9.0]), actions)
+    torch.testing.assert_close(
+        torch.stack([ahead, left, turn], -1), states[:, :3], rtol=0, atol=0.01
+    )
+
+
+def test_an_acceleration_lasts_a_second_and_a_bend_two():
+    """From 10 m/s by 2 m/s^2: 11 m, then 12 m/s; 20 m of a bend of 20 m, then straight."""
+    arc = Arc(torch.tensor(2.0), torch.tensor(0.05))
+    times = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    ahead, left, turn = arc_places(torch.tensor(10.0), arc, times)
+    torch.testing.assert_close(turn, torch.tensor([0.55, 1.0, 1.0, 1.0]))
+    last = torch.hypot(ahead.diff()[-1], left.diff()[-1])
+    assert last.item() == pytest.approx(12.0, abs=1e-4)
+
+
+def test_nobody_drives_backwards_after_a_halt():
+    arc = Arc(torch.tensor(-4.0), torch.tensor(0.0))
+    ahead, _, _ = arc_places(torch.tensor(2.0), arc, torch.tensor([0.5, 1.0, 3.0]))
+    torch.testing.assert_close(ahead, torch.tensor([0.5, 0.5, 0.5]))
+
+
+@pytest.mark.parametrize("accel", [-2.0, 0.0, 1.5])
+def test_an_arc_in_reverse_is_the_arc_forwards_of_who_looks_the_other_way(accel):
+    times = 0.1 * torch.arange(1, 33)
+    back = arc_places(
+        torch.tensor(-4.0), Arc(torch.tensor(-accel), torch.tensor(0.05)), times
+    )
+    ahead = arc_places(
+        torch.tensor(4.0), Arc(torch.tensor(accel), torch.tensor(-0.05)), times
+    )
+    torch.testing.assert_close(back[0], -ahead[0])
+    torch.testing.assert_close(back[1], -ahead[1])
+    torch.testing.assert_close(back[2], ahead[2])
