@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.prior.sde import DDIM, SAMPLERS, path_kl
-from e2rl.traffic.e2.control import gradient_weight
+from e2rl.traffic.e2.paper import gradient_weight
 from tests.prior.gaussian import SCHEDULE, denoiser, flow, moments, run
 
 MEAN, STD, WEIGHT = 1.3, 0.4, 5.0  # data N(1.3, 0.4^2) and V = WEIGHT x^2 / 2
