@@ -84,16 +84,16 @@ def metric_rows(
         ]
         for other in others[: 0 if searched else 1 if egos else None]:
             differences = paired_differences(
-                *ours, *members[other], draws, realism_draws
+                *ours, *members[other], draws=draws, realism_draws=realism_draws
             )
             paired[_method_name(other, members)] = differences
         for first, second in () if searched else egos:
             other = (*key[:3], second, key[4])
             if first == key[3] and other in members:
                 paired[f"ego {second}"] = paired_differences(
-                    *ours, *members[other], draws, 0, relative=True
+                    *ours, *members[other], draws=draws, realism_draws=0, relative=True
                 )
-        metrics = summarise(*ours, draws, realism_draws)
+        metrics = summarise(*ours, draws=draws, realism_draws=realism_draws)
         if searched:
             metrics |= scene_metrics(ours[0], draws)
         scenes = {row["scene_id"] for row in ours[0]}

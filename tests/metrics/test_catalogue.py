@@ -8,7 +8,7 @@ from e2rl.evaluation.rollout_files import read_rows, write_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.catalogue import Metric, register, table_metrics, unregister
 from e2rl.metrics.score import score_rollouts
-from e2rl.metrics.statistics import metric_table, paired_differences, summarise
+from e2rl.metrics.statistics import MetricTable, paired_differences, summarise
 from e2rl.report.tables import legend, metric_tables
 from tests.metrics.random_rollouts import random_rollouts
 
@@ -47,9 +47,9 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
     rollouts = random_rollouts(40)  # more than one batch
     rows, samples = score_rollouts(rollouts)
     assert all(0 < row["fast"] < 1 and row["fast_steps"] > 0 for row in rows)
-    values, weights = metric_table(rows, [fast])
+    table = MetricTable.of(rows, [fast])
     assert torch.equal(
-        values / weights,
+        table.totals / table.weights,
         torch.tensor([[row["fast"]] for row in rows], dtype=torch.float64),
     )
     expected = sum(row["fast"] * row["fast_steps"] for row in rows) / sum(

@@ -192,25 +192,27 @@ def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
 
 
 def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkeypatch):
-    (scene, rollouts), asked = collided(), []
+    scene, rollouts = collided()
+    moments = []
 
-    def late_only(scene, states, valid, sim, moment=None):
-        asked.append(None if moment is None else moment.tolist())
-        found = torch.tensor([moment is not None] * len(states))
+    def late_only(scene, states, valid, sim, moment):
+        moments.append(moment.tolist())
         track = torch.full((len(states), 60, 4), 7.0)
-        peak = torch.full((len(states),), 3.0)
         return evasion.Evasions(
-            found, track[..., :2], states=track, peak=peak, batch_size=[len(states)]
+            found=(moment > 0).any().expand(len(states)),
+            actions=track[..., :2],
+            states=track,
+            peak=torch.full((len(states),), 3.0),
+            batch_size=[len(states)],
         )
 
     monkeypatch.setattr(evasion, "find_evasions", late_only)
     rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 1, "contact_step": 4.0}]
     add_avoidable(rows, rollouts, scene=scene, sim=SimSettings())
-    assert asked == [None, [30, 0]]
-    assert [
-        (row["avoidable"], row["avoidable_1s"], row["evasion_accel"]) for row in rows
-    ] == [(1, 1, 3.0)] * 2
-    assert (
-        torch.equal(rollouts.evasion[0, :31], scene["logged"][0, :31, 0])
-        and (rollouts.evasion[0, 31:] == 7).all()
-    )
+    assert moments == [[0, 0], [30, 0]]
+    for row in rows:
+        assert row["avoidable"] == 1
+        assert row["avoidable_1s"] == 1
+        assert row["evasion_accel"] == 3.0
+    assert torch.equal(rollouts.evasion[0, :31], scene["logged"][0, :31, 0])
+    assert (rollouts.evasion[0, 31:] == 7).all()

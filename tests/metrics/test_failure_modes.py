@@ -2,6 +2,7 @@
 failures does not matter."""
 
 import random
+from functools import partial
 
 import pytest
 import torch
@@ -16,8 +17,8 @@ from e2rl.metrics.failure_modes import (
     split_side,
 )
 from e2rl.metrics.statistics import (
+    MetricTable,
     bootstrap_draws,
-    metric_table,
     resampled_labels,
     row_metrics,
 )
@@ -208,21 +209,26 @@ def expected_labels(labels, places, count):
 def test_coverage_is_the_expected_number_of_modes_at_so_many_places():
     labels = [1, 1, 2, 3, 1, 4, 2, 2, 5, 1]
     places = [0, 0, 0, 1, 2, 2, 3, 4, 5, 5]
-    given = torch.tensor(labels, dtype=torch.float64), torch.tensor(places)
+    coverage = partial(
+        resampled_labels,
+        torch.tensor(labels, dtype=torch.float64),
+        torch.tensor(places),
+        draws=bootstrap_draws(6, 3),
+    )
     for count in (1, 2, 4, 6):
-        found = resampled_labels(*given, bootstrap_draws(6, 3), count)
+        found = coverage(places=count)
         assert found[0].item() == pytest.approx(
             expected_labels(labels, places, count=count), abs=0.05
         )
-    assert resampled_labels(*given, bootstrap_draws(6, 3), 7).isnan().all(), (
-        "there are only six places"
-    )
+    assert coverage(places=7).isnan().all(), "there are only six places"
     rows = [
         failure(CROSSING, scene=str(index), mode=3) | {"counted": float(index % 3 == 0)}
         for index in range(36)
     ]
     coverage = [metric for metric in row_metrics() if metric.places]
-    totals, weights = metric_table(rows, coverage)
+    table = MetricTable.of(rows, coverage)
+    totals = table.totals
+    weights = table.weights
     assert [metric.name for metric in coverage] == [
         "mode_coverage",
         "mode_coverage_counted",

@@ -3,16 +3,14 @@ what DrivingEnv counts."""
 
 import torch
 
+from e2rl.metrics.evasion_scene import AWAY, EvasionScene, violations
 from e2rl.metrics.manoeuvre import (
-    AWAY,
-    EvasionScene,
     accelerations,
     execute,
     knot_count,
     knots_of,
     peak_acceleration,
     shifts,
-    violations,
 )
 from e2rl.scenes.route import SPACING, project
 from e2rl.sim import dynamics
