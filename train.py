@@ -11,7 +11,7 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 import math
 import sys
 
-from e2rl.evaluation.methods import build_ego, build_prior, build_traffic, caption
+from e2rl.evaluation.build import build_ego, build_prior, build_traffic
 from e2rl.evaluation.rollout_files import ERRORED_FILE, add_errored
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.pretraining.bits import run_bits_stage
@@ -36,6 +36,7 @@ from e2rl.learning.rounds.checkpoint import (
 )
 from e2rl.learning.rounds.evolution import Evolution
 from e2rl.report.answer import compared_answer
+from e2rl.report.caption import caption
 from e2rl.report.rounds import round_line, save_videos
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.run.command import run_command

@@ -7,7 +7,7 @@ import torch
 from e2rl.scripts.train import train_round
 from measure import Bench, Row
 
-from e2rl.evaluation.methods import build_ego
+from e2rl.evaluation.build import build_ego
 from e2rl.learning.rounds.build import build_evolution
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from measure import Bench, Row
 
-from e2rl.evaluation.methods import build_ego
+from e2rl.evaluation.build import build_ego
 from e2rl.run.config import load_config
 
 ETA = 2.0

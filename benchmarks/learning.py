@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from measure import Bench, Row
 
-from e2rl.evaluation.methods import build_ego, build_sim
+from e2rl.evaluation.build import build_ego, build_sim
 from e2rl.learning.rounds.policy import PolicyImprovement, steps_of
 from e2rl.run import fused
 

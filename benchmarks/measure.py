@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from torch import Tensor
 
-from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
+from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_traffic
 from e2rl.planners.ego import Ego
 from e2rl.run.config import load_config
 from e2rl.scenes.scene import SceneSet

@@ -9,7 +9,7 @@ import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 
-from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
+from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_traffic
 from e2rl.learning.rounds.policy import PolicyImprovement
 from e2rl.run.config import load_choice
 from e2rl.traffic.rollout import roll_out

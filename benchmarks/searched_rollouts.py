@@ -8,9 +8,10 @@ from dataclasses import replace
 from measure import Bench, Row
 from torch import arange
 
-from e2rl.evaluation.budget import Plan, batches, build_plans, spend
-from e2rl.evaluation.protocol import Setup
+from e2rl.driving.setup import Setup
+from e2rl.evaluation.build import build_searches
 from e2rl.search.search import Search
+from e2rl.search.spending import SearchMethod, Spending, spend_together
 from e2rl.search.tries import Try
 
 SCENES = 32
@@ -24,16 +25,16 @@ def searched_rollouts(bench: Bench) -> Iterator[Row]:
     index = arange(scenes)
     only = range(scenes)
     setup = Setup(bench.scenes, bench.ego, "lane_graph", bench.sim, 32, "cpu")
-    plan = build_plans(bench.config, bench.traffic.prior)[0]
-    tries, talk = searched(setup, plan, only)
+    method = build_searches(bench.config, bench.traffic.prior, 2.0)[0]
+    tries, talk = searched(setup, method, only)
     count = len(tries)
 
     def plain() -> None:
-        for _, method, tasks in batches(setup, plan, 0, only, tries):
-            setup.score(method, tasks, None)
+        for _, traffic, tasks in spending(setup, method, only).batches(tries):
+            setup.score(traffic, tasks)
 
     spent = (
-        bench.both(lambda: searched(setup, plan, only))[1],
+        bench.both(lambda: searched(setup, method, only))[1],
         bench.both(plain)[1],
         talk,
     )
@@ -45,7 +46,9 @@ def searched_rollouts(bench: Bench) -> Iterator[Row]:
         )
 
 
-def searched(setup: Setup, plan: Plan, only: range) -> tuple[list[Try], float]:
+def searched(
+    setup: Setup, method: SearchMethod, only: range
+) -> tuple[list[Try], float]:
     """The tries of a search, and the seconds that it took to ask and tell."""
     tries: list[Try] = []
     talked = 0.0
@@ -65,5 +68,10 @@ def searched(setup: Setup, plan: Plan, only: range) -> tuple[list[Try], float]:
             super().tell(*told)
             talked += time.process_time() - begun
 
-    spend([(setup, replace(plan, search=Timed), 0, only, TRIES, "tries")])
+    spend_together([spending(setup, replace(method, search=Timed), only)])
     return tries, talked
+
+
+def spending(setup: Setup, method: SearchMethod, only: range) -> Spending:
+    """A search with TRIES tries a scene."""
+    return Spending(setup, method, seed=0, scenes=only, budget=TRIES, unit="tries")

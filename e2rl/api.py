@@ -25,8 +25,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TransformedEnv
 
-from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
-from e2rl.evaluation.protocol import Method, Setup, Task
+from e2rl.driving.setup import Method, Setup, Task
+from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_traffic
 from e2rl.learning.rounds.policy import RowDraw
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego

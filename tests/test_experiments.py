@@ -65,6 +65,26 @@ def test_the_dial_has_a_row_and_a_picture_for_every_eta(evaluated):
     }
 
 
+def test_the_curves_have_a_line_for_every_method_and_eta(evaluated):
+    """Differences are to nominal traffic alone; the tables have a row for each."""
+    run = evaluated("experiment=curves", "methods=[nominal,ctg_adv,cat]", "eta=[1,2]")
+    lines = (run / "curves.csv").read_text().splitlines()[1:]
+    points = [
+        ("nominal", "0"),
+        ("ctg_adv", "1"),
+        ("ctg_adv", "2"),
+        ("cat", "1"),
+        ("cat", "2"),
+    ]
+    assert [
+        (line.split(",")[0], f"{float(line.split(',')[2]):g}") for line in lines
+    ] == points
+    rows = read_metrics(run / "metrics.json")
+    assert [list(row["paired"]) for row in rows] == [[], *[["nominal"]] * 4]
+    assert (run / "curves.png").exists() and not (run / "rollouts").exists()
+    assert "Difference of each method to nominal" in (run / "methods.md").read_text()
+
+
 def test_nuplan_s_scores_are_a_table_of_their_own(evaluated):
     """The recorded ego in its own recording drives all of its way, hits nobody, and is
     within 1 m of the road."""
@@ -98,27 +118,17 @@ def test_the_public_protocol_has_crash_rates_and_route_completion_of_every_ego(
     )
 
 
-def test_the_budget_has_a_row_for_the_search_and_for_every_rival_as_its_authors_have_it_and_with_one_sample(
-    evaluated,
-):
-    run = evaluated("experiment=budget", "methods=[search,nominal]", "budget=[40]")
-    head, *rows = (run / "budget.csv").read_text().splitlines()
-    names = [
-        "search",
-        "nominal",
-        *(
-            f"{name}, one sample"
-            for name in ("ccdiff", "ctg_adv", "safe_sim_opt", "diffscene")
-        ),
-    ]
-    assert [next(csv.reader([row]))[1] for row in rows] == names and head.startswith(
-        "ego,method,budget,unit"
-    )
-    assert "Told the ego's plan: ccdiff, one sample" in (run / "budget.md").read_text()
-    assert {path.name for path in run.glob("budget.*")} == {
-        "budget.csv",
-        "budget.md",
-    }
+def test_a_budget_has_a_row_for_the_search_and_for_every_rival(evaluated):
+    """As its authors have it, and with one sample."""
+    run = evaluated("experiment=budget", "methods=[search,nominal]", "budget=40")
+    rows = read_metrics(run / "metrics.json")
+    samples = ("ccdiff", "ctg_adv", "safe_sim_opt", "diffscene")
+    names = ["search", "nominal", *(f"{name}, one sample" for name in samples)]
+    assert [row["method"] for row in rows] == names
+    assert all(row["searched"] for row in rows)
+    with (run / "tries.csv").open(newline="") as file:
+        tried = {line["method"] for line in csv.DictReader(file)}
+    assert tried == set(names)
 
 
 def test_egos_before_and_after_are_rated_in_one_run(evaluated):

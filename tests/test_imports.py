@@ -21,6 +21,7 @@ ORDER = (  # of the rooms
         "planners",
         "metrics",
         "traffic",
+        "driving",
         "search",
         "evaluation",
     ),

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import e2rl
-from e2rl.evaluation.methods import build_prior, build_sim, build_traffic
-from e2rl.evaluation.protocol import Method, Setup, Task
+from e2rl.driving.setup import Method, Setup, Task
+from e2rl.evaluation.build import build_prior, build_sim, build_traffic
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 

@@ -8,8 +8,8 @@ actor attacked by e2; the trained actor, which e2 attacks anew.
 import argparse
 from pathlib import Path
 
-from e2rl.evaluation.methods import build_ego, build_prior, build_sim, build_traffic
-from e2rl.evaluation.protocol import Method, Setup, Task
+from e2rl.driving.setup import Method, Setup, Task
+from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_traffic
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation

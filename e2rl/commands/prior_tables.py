@@ -8,9 +8,8 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 from dataclasses import dataclass
 
-from e2rl.evaluation.methods import processes_of
 from e2rl.evaluation.plan import begin
-from e2rl.evaluation.protocol import Work, drive_all, record
+from e2rl.evaluation.record import record
 from e2rl.evaluation.spread_table import spread_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.report.results import write_results
@@ -19,7 +18,7 @@ from e2rl.run.command import run_command
 from e2rl.run.run import Run, origin_of
 from e2rl.run.settings import setting, settings_of
 
-MAY_CHANGE = ("processes", "launcher")  # when a run is resumed
+MAY_CHANGE = ("processes",)  # when a run is resumed
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,6 @@ def prior_tables(run: Run) -> None:
     config = run.config
     settings = settings_of(TableSettings, {"spread_samples": config.spread_samples})
     plan = begin(run)
-    parts = run.parts()
     spread = []
     if settings.spread_samples:
         spread = spread_rows(
@@ -42,17 +40,14 @@ def prior_tables(run: Run) -> None:
             plan.methods,
             samples=settings.spread_samples,
             device=config.device,
-            parts=parts,
+            parts=run.parts(),
         )
-    work = Work(
-        plan.rollouts(run.folder), processes_of(config), only=plan.only, parts=parts
-    )
-    scored = drive_all([plan.setup], plan.methods, seeds=plan.asked.seeds, work=work)
+    scored = plan.drive().scored
 
     def summarise(*scores: Any) -> list[dict]:
         return [row | origin_of(run.folder) for row in (*spread, *metric_rows(*scores))]
 
-    rows = record(*scored, run.folder, summarise)
+    rows = record(scored, run.folder, summarise)
     answer = write_results(run, plan, rows=rows)
     print_tables(metric_tables(spread))
     print("", *answer, sep="\n")

@@ -5,8 +5,8 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
-from e2rl.evaluation.rollout_files import TABLE, own_folder, read_rows
+from e2rl.evaluation.modes import OTHER, read_modes
+from e2rl.evaluation.rollout_files import MODES_FILE, TABLE, own_folder, read_rows
 from e2rl.metrics.score import score_rollouts
 from e2rl.report.picture import Replay
 from e2rl.report.videos import found_failures, save_animation

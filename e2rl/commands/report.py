@@ -5,7 +5,7 @@ and a list of its failures.
 import argparse
 from pathlib import Path
 
-from e2rl.evaluation.methods import SEARCH
+from e2rl.evaluation.check import SEARCH
 from e2rl.evaluation.rollout_files import TABLE
 from e2rl.report.html import PAGE, REPLAYS, write_report
 from e2rl.run.endings import ending

@@ -5,8 +5,9 @@ rollout (Sec. IV-A), as a picture.
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
+from dataclasses import replace
+
 from e2rl.evaluation.plan import begin
-from e2rl.evaluation.protocol import run_protocol
 from e2rl.report.drawing import save_figure
 from e2rl.report.skeleton import LongestChain
 from e2rl.run.command import run_command
@@ -17,13 +18,8 @@ def draw(run: Run) -> None:
     """Roll out every scene in this process and draw the longest chain selected."""
     plan = begin(run)
     chain = LongestChain(plan.methods[0])
-    run_protocol(
-        plan.setup,
-        plan.methods,
-        seeds=plan.asked.seeds,
-        folder=run.folder,
-        only=plan.only,
-    )
+    plan = replace(plan, work=replace(plan.work, processes=1))
+    plan.record(plan.drive(), run.folder)
     picture = run.folder / "skeleton.png"
     save_figure(picture, chain.figure(plan.scenes, plan.setup.ego_name, run.folder))
     print(f"drawn: {picture}")

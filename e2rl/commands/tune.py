@@ -10,22 +10,21 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 from collections.abc import Mapping
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.evaluation.budget import TRIES_FILE, failures_of, methods_at, portfolio_plan
-from e2rl.evaluation.methods import (
-    SEARCH,
+from e2rl.driving.batches import Batch
+from e2rl.driving.setup import Method
+from e2rl.evaluation.build import (
     build_ego,
+    build_search,
     build_traffic,
     method_config,
-    processes_of,
 )
+from e2rl.evaluation.check import SEARCH, processes_of
 from e2rl.evaluation.plan import Evaluation, begin
-from e2rl.evaluation.protocol import Method, Part
 from e2rl.evaluation.trials import (
     NOMINAL,
     AttackObjective,
@@ -48,8 +47,9 @@ from e2rl.run.config import resolved, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from e2rl.run.settings import check_choice, settings_of
+from e2rl.search.tries_file import TRIES_FILE, failures_of
 
-MAY_CHANGE = ("processes", "launcher")  # when a run is resumed
+MAY_CHANGE = ("processes",)  # when a run is resumed
 GROUPS = ("synthesizer", "ego")
 
 
@@ -84,13 +84,13 @@ def tune(run: Run) -> dict:
         "rows": [f"{method.name}@{method.eta:g}" for method in plan.methods]
         if group == "ego"
         else [NOMINAL],
-        "seeds": list(plan.asked.seeds),
+        "seeds": list(plan.settings.seeds),
         "failures": [
-            [list(task.one or ()) for task in part[2]]
-            for part in getattr(trials, "failures", ())
+            [list(task) for task in batch.tasks]
+            for batch in getattr(trials, "failures", ())
         ],
         "scenes": plan.scenes.scene_id,
-        "eta": list(plan.asked.eta),
+        "eta": list(plan.settings.eta),
     }
     space = resolved(config.tuning.space) or ranges
     file = (
@@ -133,19 +133,17 @@ def planner_trials(config: DictConfig, plan: Evaluation) -> PlannerTrials:
             )
         )
 
-    failures: list[Part] = []
+    failures: list[Batch] = []
     if config.tuning.failures is not None:
-        portfolio = portfolio_plan(
-            SEARCH, config, method=partial(methods_at(max(plan.asked.eta)), plan.prior)
-        )
+        method = build_search(SEARCH, config, plan.prior, eta=max(plan.settings.eta))
         file = Path(config.tuning.failures) / TRIES_FILE
         failures = failures_of(
-            file, plan.setup.ego_name, plan=portfolio, setup=plan.setup
+            file, plan.setup.ego_name, method=method, setup=plan.setup
         )
     return PlannerTrials(
         plan.setup,
         plan.methods,
-        seeds=plan.asked.seeds,
+        seeds=plan.settings.seeds,
         make=make,
         processes=processes_of(config),
         failures=failures,
@@ -155,7 +153,7 @@ def planner_trials(config: DictConfig, plan: Evaluation) -> PlannerTrials:
 def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, Mapping]:
     """Returns trials of the group `synthesizer` at `config.eta` beside nominal traffic,
     and the ranges of its class."""
-    etas = plan.asked.eta
+    etas = plan.settings.eta
     if len(etas) != 1 or not etas[0]:
         raise InputError(
             f"eta={config.eta}: an adversary is tuned at one intensity above 0"
@@ -182,7 +180,7 @@ def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, M
         plan.setup,
         nominal,
         eta=etas[0],
-        seeds=plan.asked.seeds,
+        seeds=plan.settings.seeds,
         make=make,
         processes=processes_of(config),
     )

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.rollout_files import TABLE, cell, read_run
 from e2rl.evaluation.summary import scene_rows
 from e2rl.metrics.atlas import cell_of
@@ -26,6 +25,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.run import changed, read_provenance
 from e2rl.scenes.scene_list import SCENES, read_list
 from e2rl.search.tries import TRIES
+from e2rl.search.tries_file import TRIES_FILE
 
 PAIR = ("method", "eta", "scene_id", "seed")
 CHANGES = ("new", "gone", "moved", "same")

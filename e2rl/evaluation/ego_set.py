@@ -18,8 +18,9 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 
-from e2rl.evaluation.methods import as_list, build_ego, rows_of
-from e2rl.evaluation.protocol import Setup
+from e2rl.driving.setup import Setup
+from e2rl.evaluation.build import build_ego
+from e2rl.evaluation.check import as_list, row_names
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.proximity import ego_path, mean_acceleration
 from e2rl.planners.ego import Ego
@@ -242,7 +243,7 @@ def compared(config: DictConfig) -> list[tuple[str, str]]:
             raise InputError(
                 f"policy_learning.{role}={roles.get(role)}: none of egos ({', '.join(names)}); name one"
             )
-    if "nominal" not in rows_of(config):
+    if "nominal" not in row_names(config):
         raise InputError(
             f"methods={list(config.methods)}: policy_learning compares nominal driving; name nominal, too"
         )

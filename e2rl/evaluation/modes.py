@@ -24,8 +24,6 @@ from e2rl.metrics.failure_modes import (
 from e2rl.run.files import misfit
 from e2rl.sim.rollout_file import rollout_name
 
-MODES_FILE = "modes.json"
-ATLAS_FILE = "atlas.json"
 OTHER = 0  # number of the small modes together
 VERDICTS = (
     "counted",

@@ -3,31 +3,31 @@ in every scene and seed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from e2rl.evaluation.budget import TRIES_FILE, Plan, build_plans, failures_of
+from e2rl.driving.batches import Batch, Work, drive_all, score_all
+from e2rl.driving.setup import Method, Setup, Task
+from e2rl.evaluation.build import build_methods, build_prior, build_searches, build_sim
+from e2rl.evaluation.check import EvaluationSettings, evaluation_settings, processes_of
 from e2rl.evaluation.ego_set import EgoSet, build_egos
-from e2rl.evaluation.methods import (
-    EvaluationSettings,
-    build_methods,
-    build_prior,
-    build_sim,
-    evaluation_settings,
-)
-from e2rl.evaluation.protocol import Method, Part, Setup, Task
+from e2rl.evaluation.record import record
 from e2rl.evaluation.reproduce import files_of_run
 from e2rl.prior.prior import Prior
 from e2rl.run.config import set_up
 from e2rl.run.errors import InputError
-from e2rl.run.run import Run
+from e2rl.run.run import Run, origin_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
+from e2rl.search.spending import SearchMethod, Spent, search_all
+from e2rl.search.tries_file import TRIES_FILE, failures_of, write_tries
 from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.traffic.fusing import prepare_fused
 
 CLASS = "class"  # the file of conf/ego for a class by its name alone
+NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
 
 
 @dataclass(frozen=True)
@@ -35,56 +35,102 @@ class Evaluation:
     """The objects of an evaluation.
 
     Args:
-        asked: the checked settings.
+        settings: keys of conf/evaluate.yaml.
+        egos: that are rated.
+        prior: of all methods.
         origin: of the prior, from its checkpoint.
-        methods, searches: what is driven without and with a budget.
+        methods: that are driven once a seed; none where there is a budget.
+        searches: that are driven with a budget.
         setup: scenes, simulator and the first of `egos`.
         only: positions of the scenes to drive (None: all).
+        work: how rollouts are driven.
     """
 
-    asked: EvaluationSettings
+    settings: EvaluationSettings
     egos: EgoSet
     prior: Prior
     origin: Mapping[str, Any]
     methods: list[Method]
-    searches: list[Plan]
+    searches: list[SearchMethod]
     setup: Setup
     only: list[int] | None
-
-    def rollouts(self, folder: Path) -> Path | None:
-        """Returns where a run's rollouts are written; None: nowhere."""
-        return folder / ROLLOUTS if self.asked.save_rollouts else None
+    work: Work
 
     @property
     def scenes(self) -> SceneSet:
         """The scenes, of which `only` may be a part."""
         return self.setup.scenes
 
-    def part_of(self, row: Mapping[str, Any], run: Path) -> Part:
-        """Returns the rollout of a row in the table of a run of this plan, to be driven
-        again, in a batch of its own. Raises InputError where the run's folder does not
-        say what was tried."""
-        setup = next(
-            each
-            for each in self.egos.setups(self.setup)
-            if each.ego_name == row["ego_policy"]
+    @property
+    def references(self) -> tuple[str, ...] | None:
+        """The methods that all are compared with; None: each with every other."""
+        compared = self.settings.compare
+        return (*compared, NOMINAL) if compared and not self.egos.pairs else None
+
+    def drive(self) -> Spent:
+        """Returns what all rollouts score; of searches also their tries."""
+        setups = self.egos.setups(self.setup)
+        seeds = self.settings.seeds
+        if not self.searches:
+            return Spent(drive_all(setups, self.methods, seeds=seeds, work=self.work))
+        assert self.settings.budget is not None
+        return search_all(
+            setups,
+            self.searches,
+            budget=self.settings.budget,
+            unit=self.settings.budget_unit,
+            seeds=seeds,
+            work=self.work,
         )
-        name = row["method"]
-        task = Task(self.scenes.index(row["scene_id"]), row["seed"])
-        methods = [
-            each for each in self.methods if (each.name, each.eta) == (name, row["eta"])
+
+    def drive_again(self, row: Mapping[str, Any], run: Path) -> Spent:
+        """Returns what the rollout of a row in the table of a run of this plan scores,
+        driven again in a batch of its own. Raises InputError where the run's folder
+        does not say what was tried."""
+        job = ("failure", self.batch_of(row, run))
+        (scored,) = score_all([job], self.work, cost=lambda job: 1.0)
+        return Spent(scored)
+
+    def batch_of(self, row: Mapping[str, Any], run: Path) -> Batch:
+        """Returns the rollout of a row in the table of a run as a batch; raises as
+        `drive_again`."""
+        (setup,) = (
+            setup
+            for setup in self.egos.setups(self.setup)
+            if setup.ego_name == row["ego_policy"]
+        )
+        wanted = (self.scenes.index(row["scene_id"]), row["seed"])
+        batches = [
+            Batch(setup, method, [Task(*wanted)])
+            for method in self.methods
+            if (method.name, method.eta) == (row["method"], row["eta"])
         ]
-        parts: list[Part] = [(setup, method, [task]) for method in methods]
-        for search in (each for each in self.searches if each.name == name):
-            parts += failures_of(
-                run / TRIES_FILE, setup.ego_name, plan=search, setup=setup
-            )
-        for _, method, tasks in parts:
-            if found := [each for each in tasks if each[:2] == task[:2]]:
-                return setup, method, found
+        for search in self.searches:
+            if search.name == row["method"]:
+                file = run / TRIES_FILE
+                batches += failures_of(file, setup.ego_name, method=search, setup=setup)
+        for batch in batches:
+            tasks = [task for task in batch.tasks if task[:2] == wanted]
+            if tasks:
+                return batch._replace(tasks=tasks)
         raise InputError(
-            f"{run}: does not say how {row['scene_id']} was driven; give the whole folder of the run"
+            f"{run}: does not say how {row['scene_id']} was driven; give the whole "
+            "folder of the run"
         )
+
+    def record(self, driven: Spent, folder: Path) -> list[dict]:
+        """Writes the tables of rollouts into a run's folder; returns the rows of
+        metrics.json."""
+        summarise = partial(
+            self.egos.metric_rows,
+            references=self.references,
+            searched=bool(driven.tries),
+            **origin_of(folder),
+        )
+        rows = record(driven.scored, folder, summarise)
+        if driven.tries:
+            write_tries(folder / TRIES_FILE, driven.tries)
+        return rows
 
 
 def begin(run: Run) -> Evaluation:
@@ -93,17 +139,20 @@ def begin(run: Run) -> Evaluation:
     """
     config = run.config
     set_up(config)
-    asked = evaluation_settings(config)
+    settings = evaluation_settings(config)
     egos = build_egos(config, ego_name(config.ego, run.choices["ego"]))
-    print(purpose(run, asked, egos=list(egos.egos)), flush=True)
+    print(purpose(run, settings, egos=list(egos.egos)), flush=True)
     prepare_fused(config)
-    prior, origin = build_prior(
-        config, config.device
-    )  # before the scenes, which take longer than a wrong path
-    methods = [] if asked.budget else build_methods(config, prior)
-    searches = build_plans(config, prior) if asked.budget else []
+    # before the scenes, which take longer than a wrong path
+    prior, origin = build_prior(config, config.device)
+    methods = [] if settings.budget else build_methods(config, prior)
+    searches = build_searches(config, prior, settings.eta[0]) if settings.budget else []
+    sim = build_sim(config)
     scenes = load_scenes(
-        config.data, asked.num_scenes, scenes=config.scenes, files=files_of_run(config)
+        config.data,
+        settings.num_scenes,
+        scenes=config.scenes,
+        files=files_of_run(config),
     )
     only = None if config.scene is None else [scenes.index(config.scene)]
     name, ego = next(iter(egos.egos.items()))
@@ -111,13 +160,20 @@ def begin(run: Run) -> Evaluation:
         scenes,
         ego,
         ego_name=name,
-        sim=build_sim(config),
+        sim=sim,
         batch=config.batch,
         device=config.device,
     )
+    work = Work(
+        into=run.folder / ROLLOUTS if settings.save_rollouts else None,
+        processes=processes_of(config),
+        only=only,
+        parts=run.parts(),
+        shard=settings.shard,
+    )
     run.begin({"scenes": listed(scenes)})
     return Evaluation(
-        asked,
+        settings,
         egos,
         prior=prior,
         origin=origin,
@@ -125,6 +181,7 @@ def begin(run: Run) -> Evaluation:
         searches=searches,
         setup=setup,
         only=only,
+        work=work,
     )
 
 
@@ -134,7 +191,7 @@ def ego_name(ego: Mapping[str, Any], choice: str) -> str:
     return str(ego["_target_"]).rpartition(".")[2] if choice == CLASS else choice
 
 
-def purpose(run: Run, asked: EvaluationSettings, egos: Sequence[str]) -> str:
+def purpose(run: Run, settings: EvaluationSettings, egos: Sequence[str]) -> str:
     """Returns what a run does, in a line."""
     config = run.config
     if config.failure is not None:
@@ -142,13 +199,15 @@ def purpose(run: Run, asked: EvaluationSettings, egos: Sequence[str]) -> str:
     scenes = f"{run.choices['data']} scenes"
     if config.scene is not None:
         scenes = f"scene {config.scene}"
-    elif asked.num_scenes == 1:
+    elif settings.num_scenes == 1:
         scenes = f"the first of {scenes}"
-    elif asked.num_scenes is not None:
-        scenes = f"the first {asked.num_scenes} {scenes}"
-    often = f"{', '.join(f'{value:g}' for value in asked.budget)} {asked.budget_unit} a scene and seed"
-    often = often if asked.budget else "once a scene and seed"
+    elif settings.num_scenes is not None:
+        scenes = f"the first {settings.num_scenes} {scenes}"
+    often = "once a scene and seed"
+    if settings.budget:
+        often = f"{settings.budget:g} {settings.budget_unit} a scene and seed"
+    seeds = ", ".join(map(str, settings.seeds))
     return (
-        f"Drives {', '.join(egos)} in {scenes} against {', '.join(asked.methods)}, "
-        f"seeds {', '.join(map(str, asked.seeds))}, {often}, into {run.folder}."
+        f"Drives {', '.join(egos)} in {scenes} against {', '.join(settings.methods)}, "
+        f"seeds {seeds}, {often}, into {run.folder}."
     )

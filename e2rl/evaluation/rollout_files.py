@@ -12,7 +12,7 @@ from types import NoneType
 from typing import IO, Any
 
 from e2rl.metrics.catalogue import LATER, SOURCE, WORDS, row_columns
-from e2rl.metrics.errored import errored_row
+from e2rl.metrics.errored import errored_row, lost
 from e2rl.run.errors import InputError
 from e2rl.run.files import (
     CsvReader,
@@ -30,6 +30,8 @@ from e2rl.traffic.attempt import summary_of
 TABLE = "rollouts.csv"
 METRICS_FILE = "metrics.json"
 ERRORED_FILE = "errored.json"
+MODES_FILE = "modes.json"
+ATLAS_FILE = "atlas.json"
 MAX_JSON, MOST_ROWS = (
     48 << 20,
     300_000,
@@ -72,6 +74,24 @@ def write_rows(path: Path, rows: Sequence[dict]) -> None:
     columns = table_columns()
     lines = ([cell(row.get(column, math.nan)) for column in columns] for row in rows)
     write_atomically(path, csv_text([columns, *lines]))
+
+
+def write_rollouts(
+    folder: Path | None, rows: Sequence[dict], errored: Sequence[dict]
+) -> None:
+    """Write rollouts.csv and, where rollouts errored, errored.json into a folder (None:
+    nothing is written). Raises InputError where the traffic lost all rollouts."""
+    if folder is not None:
+        write_errored(folder / ERRORED_FILE, errored)
+        write_rows(folder / TABLE, rows)
+    require_rows([row for row in rows if not lost(row)], errored, folder)
+
+
+def write_tables(folder: Path, rows: Sequence[dict], modes: dict, atlas: dict) -> None:
+    """Write modes.json, atlas.json and metrics.json, whose rows are given."""
+    write_json(folder / MODES_FILE, modes)
+    write_json(folder / ATLAS_FILE, atlas)
+    write_json(folder / METRICS_FILE, rows)
 
 
 def cell(value: object) -> object:
@@ -296,7 +316,9 @@ def add_errored(path: Path, number: int, errored: Sequence[dict]) -> None:
     write_errored(path, [*earlier, *errored])
 
 
-def require_rows(rows: Sequence, errored: Sequence[dict], folder: Path | None) -> None:
+def require_rows(
+    rows: Sequence, errored: Sequence[dict], folder: Path | None = None
+) -> None:
     """InputError where all rollouts errored."""
     if rows or not errored:
         return

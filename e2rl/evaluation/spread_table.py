@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from e2rl.evaluation.protocol import Method
+from e2rl.driving.setup import Method
 from e2rl.evaluation.summary import metric_row
 from e2rl.metrics.catalogue import SPREAD_STAGE, STAGES, Metric
 from e2rl.metrics.statistics import (

@@ -12,21 +12,13 @@ from typing import ClassVar
 
 import torch
 
-from e2rl.evaluation.protocol import (
-    Method,
-    Part,
-    Setup,
-    Work,
-    drive_all,
-    extend,
-    score_all,
-)
+from e2rl.driving.batches import Batch, Work, drive_all, score_all
+from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.rollout_files import require_rows
 from e2rl.evaluation.tuning import Parameters
 from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.statistics import summarise
 from e2rl.planners.ego import Ego
-from e2rl.run.processes import Processes
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.attempt import count_reasons
 from e2rl.traffic.traffic import Traffic
@@ -131,8 +123,8 @@ class PlannerTrials:
     methods: Sequence[Method]
     seeds: Sequence[int]
     make: Callable[[Parameters], Ego]
-    processes: Processes = 1
-    failures: Sequence[Part] = ()
+    processes: int = 1
+    failures: Sequence[Batch] = ()
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
         """Returns the means of DRIVING, also of every method alone as `NAME
@@ -147,12 +139,13 @@ class PlannerTrials:
         work = Work(processes=self.processes)
         found = drive_all([setup], self.methods, seeds=self.seeds, work=work)
         jobs = [
-            (f"{number}", (setup, method, tasks))
-            for number, (_, method, tasks) in enumerate(self.failures)
+            (f"{number}", batch._replace(setup=setup))
+            for number, batch in enumerate(self.failures)
         ]
-        for scored in score_all(jobs, work, cost=lambda job: len(job[1][2])):
-            extend(found, scored)
-        every, _, errored = found
+        for scored in score_all(jobs, work, cost=lambda job: len(job[1].tasks)):
+            found.add(scored)
+        every = found.rows
+        errored = found.errored
         rows = [row for row in every if row["errored"] != 1]
         metrics = driving(rows)
         driven = [*self.methods, *(method for _, method, _ in self.failures)]
@@ -194,7 +187,7 @@ class AttackTrials:
     eta: float
     seeds: Sequence[int]
     make: Callable[[Parameters], Traffic]
-    processes: Processes = 1
+    processes: int = 1
 
     def __call__(self, parameters: Parameters) -> dict[str, float]:
         """Returns the means of MEASURED, NAME_low and NAME_high of the 95% intervals of
@@ -214,14 +207,13 @@ class AttackTrials:
     def measure(self, method: Method) -> dict[str, float]:
         """Returns the metrics of a method; InputError where all rollouts errored."""
         setup = replace(self.setup, evasions=False)  # no trial is judged by them
-        rows, samples, errored = drive_all(
+        scored = drive_all(
             [setup], [method], seeds=self.seeds, work=Work(processes=self.processes)
         )
-        require_rows([row for row in rows if row["errored"] != 1], errored, folder=None)
+        rows = scored.rows
+        require_rows([row for row in rows if row["errored"] != 1], scored.errored)
         kept = [k for k, row in enumerate(rows) if not lost(row)]
-        found = summarise(
-            [rows[k] for k in kept], [samples[k] for k in kept], realism_draws=0
-        )
+        found = summarise(*scored.where(kept), realism_draws=0)
         metrics = {name: found[name]["mean"] for name in MEASURED}
         metrics["errored"] = 1 - len(kept) / len(rows)
         return metrics | {

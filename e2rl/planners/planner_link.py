@@ -20,7 +20,7 @@ from e2rl.planners.planner_messages import (
     BadReply,
     message,
 )
-from e2rl.run import process_tree
+from e2rl.run import guard
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT
 
@@ -28,6 +28,7 @@ STDERR = 2  # file descriptor
 PAUSE = 0.02  # s between two attempts to connect
 ANSWERS = 5.0  # s in which a planner that runs takes a connection
 GRACE = 1.0  # s that a connection, or the end of a process, may take
+PATIENCE = 5.0  # s in which a killed process ends
 RECEIVED = 1 << 16  # bytes taken from the socket at a time
 Process = subprocess.Popen[bytes]
 
@@ -164,16 +165,15 @@ class PlannerLink:
 def start(command: str, address: str) -> Process:
     """The process of a command, which is given the address to listen at.
 
-    On Linux it ends with this process, with all that it has started
-    (`e2rl.run.process_tree`). Raises InputError where there is no such program.
+    It ends with this process, with all of its process group
+    (`e2rl.run.guard`). Raises InputError where there is no such program.
     """
     try:
         words = [*shlex.split(command), address]
         if shutil.which(words[0]) is None:
             raise FileNotFoundError(f"no program {words[0]}")
-        guard = [sys.executable, "-I", "-S", process_tree.__file__]
         return subprocess.Popen(
-            [*guard, *words],
+            [sys.executable, "-I", "-S", guard.__file__, *words],
             stdin=subprocess.PIPE,
             stdout=STDERR,
             start_new_session=True,
@@ -211,7 +211,7 @@ def close(connection: socket.socket | None, process: Process | None) -> None:
         return
     process.terminate()
     try:
-        process.wait(process_tree.GRACE + process_tree.PATIENCE)
+        process.wait(guard.GRACE + PATIENCE)
     except subprocess.TimeoutExpired:
         process.kill()
     if process.stdin is not None:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from tabulate import tabulate
 
-from e2rl.evaluation.methods import SEARCH
-from e2rl.evaluation.modes import ATLAS_FILE, OTHER
-from e2rl.evaluation.rollout_files import ERRORED_FILE
+from e2rl.evaluation.check import SEARCH
+from e2rl.evaluation.modes import OTHER
+from e2rl.evaluation.rollout_files import ATLAS_FILE, ERRORED_FILE
 from e2rl.metrics.atlas import CELL
 from e2rl.metrics.catalogue import METRICS
 from e2rl.report.comparison_tables import by_ego

@@ -17,12 +17,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.evaluation.headline import headline
-from e2rl.evaluation.modes import MODES_FILE, OTHER, read_modes
+from e2rl.evaluation.modes import OTHER, read_modes
 from e2rl.evaluation.rollout_files import (
     ERRORED_FILE,
     METRICS_FILE,
+    MODES_FILE,
     TABLE,
     cell,
     nulls,
@@ -55,6 +55,7 @@ from e2rl.run.config import assigned
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically, write_beside
 from e2rl.run.trust import CONFIG, read_yaml
+from e2rl.search.tries_file import TRIES_FILE
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_key, rollout_name
 
 PAGE = "failures.html"

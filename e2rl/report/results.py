@@ -3,13 +3,14 @@ lines that answer it."""
 
 from collections.abc import Sequence
 
+from e2rl.evaluation.check import ALL
 from e2rl.evaluation.ego_set import recorded_acceleration
-from e2rl.evaluation.methods import ALL, caption, terms_by_method
-from e2rl.evaluation.modes import MODES_FILE, read_modes
+from e2rl.evaluation.modes import read_modes
 from e2rl.evaluation.plan import Evaluation
-from e2rl.evaluation.rollout_files import TABLE, read_rows
+from e2rl.evaluation.rollout_files import MODES_FILE, TABLE, read_rows
 from e2rl.metrics.evasion import search_effort
 from e2rl.report.answer import answer_lines
+from e2rl.report.caption import caption, terms_by_method
 from e2rl.report.comparison_tables import (
     EGOS,
     guard_table,
@@ -31,7 +32,6 @@ from e2rl.report.tables import (
 )
 from e2rl.run.run import Run
 
-NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
 MAIN = "main"  # table of metrics
 
 
@@ -43,7 +43,7 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
         rows: of metrics.json.
     """
     folder = run.folder
-    settings = plan.asked
+    settings = plan.settings
     modes = read_modes(folder / MODES_FILE)
     notes = [
         f"left out: {count} scenes ({reason})"
@@ -76,12 +76,6 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
     )
 
 
-def references(plan: Evaluation) -> tuple[str, ...] | None:
-    """Returns the methods that all are compared with; None: each with every other."""
-    compared = plan.asked.compare
-    return (*compared, NOMINAL) if compared and not plan.egos.pairs else None
-
-
 def evaluation_tables(
     run: Run, plan: Evaluation, *, rows: Sequence[dict], text: str
 ) -> tuple[list[Table], list[Table]]:
@@ -98,9 +92,9 @@ def evaluation_tables(
         text: settings, for the captions.
     """
     config = run.config
-    compared = plan.asked.compare
+    compared = plan.settings.compare
     egos = plan.egos
-    table = MAIN if plan.asked.metrics == ALL else plan.asked.metrics
+    table = MAIN if plan.settings.metrics == ALL else plan.settings.metrics
     if compared and not egos.pairs:
         tables = method_tables(
             rows,

@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
-from e2rl.evaluation.protocol import SEEDS_APART, Method
+from e2rl.driving.setup import SEED_STRIDE, Method
 from e2rl.report import drawing
 from e2rl.report.drawing import TrafficMap, Trail, add_legend, new_figure
 from e2rl.report.picture import shorten
@@ -76,7 +76,7 @@ class LongestChain:
                 "any scene; name e2 first in methods, at an eta above 0, and evaluate "
                 "more scenes, or name one with scene="
             )
-        seed, scene = divmod(int(self.selection.seed), SEEDS_APART)
+        seed, scene = divmod(int(self.selection.seed), SEED_STRIDE)
         identity = {
             "method": method.name,
             "ego_policy": ego,

@@ -152,7 +152,6 @@ class Machine:
 
     batch: int = setting(low=1)
     threads: int = setting(low=1)
-    launcher: str = setting(choices=("processes", "ray"))
     processes: int | None = setting(low=1, optional=True)
 
 

@@ -7,33 +7,31 @@ import select
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
 
 from e2rl.run.errors import InputError
-from e2rl.run.process_tree import descendants, kill_descendants
+from e2rl.run.processes import kill_workers
 
 WRITING = {
-    *(
-        errno.ENOSPC,
-        errno.EDQUOT,
-        errno.EFBIG,
-        errno.EROFS,
-        errno.EIO,
-        errno.EEXIST,
-        errno.ENAMETOOLONG,
-    ),
-    *(errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.ELOOP),
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EIO,
+    errno.EEXIST,
+    errno.ENAMETOOLONG,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.ELOOP,
 }
 REFUSED = 2  # status of a command that bad input ends
-MEMORY = (
-    "can't allocate memory",
-    "not enough memory",
-    "out of memory",
-)  # in what torch raises, of a GPU's memory, too
+# in what torch raises, of a GPU's memory, too
+MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
 def program() -> list[str]:
@@ -45,11 +43,8 @@ def program() -> list[str]:
         return sys.argv[0].split()
     if package not in script.resolve().parents:
         return ["python", sys.argv[0]]
-    return [
-        "python",
-        "-m",
-        ".".join(script.resolve().relative_to(package.parent).with_suffix("").parts),
-    ]
+    module = script.resolve().relative_to(package.parent).with_suffix("")
+    return ["python", "-m", ".".join(module.parts)]
 
 
 def command_line() -> str:
@@ -72,81 +67,71 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
         arrived.append(number)
         raise KeyboardInterrupt
 
-    heeded = [
-        each
-        for each in (signal.SIGINT, signal.SIGTERM)
-        if signal.getsignal(each) is not signal.SIG_IGN
-    ]
-    before = {number: signal.signal(number, interrupt) for number in heeded}
-    others = descendants(os.getpid())
+    before = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            before[number] = signal.signal(number, interrupt)
     try:
         yield
         if sys.stdout is not None:  # as after `>&-`
             sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
-        if arrived or isinstance(error, KeyboardInterrupt):
-            number = signal.Signals(arrived[0] if arrived else signal.SIGINT)
-            _end(
-                f"\ninterrupted ({number.name}); go on with: {go_on()}",
-                128 + number,
-                others=others,
-            )
-        if isinstance(error, InputError):
-            _end(f"error: {' '.join(str(error).split())}", REFUSED, others=others)
-        if isinstance(error, BrokenPipeError) and _is_unread():
-            os.dup2(
-                os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-            )  # or the end of python complains, too
-            _end(
-                f"\nerror: nobody reads the output any more; go on with: {go_on()}",
-                1,
-                others=others,
-            )
-        failed = (
-            error.__cause__ if isinstance(error.__cause__, OSError) else error
-        )  # of logging that is set up
-        if isinstance(failed, OSError) and failed.errno in WRITING:
-            where = failed.filename or "a file"
-            reason = f"{where}: cannot be written ({failed.strerror}); what was written before is whole"
-            _end(
-                f"\nerror: {reason}. Mend that, then go on with: {go_on()}",
-                1,
-                others=others,
-            )
-        memory = isinstance(error, MemoryError) or (
-            isinstance(error, OSError) and error.errno == errno.ENOMEM
-        )
-        if memory or (
-            isinstance(error, RuntimeError)
-            and any(words in str(error) for words in MEMORY)
-        ):
-            reason = "out of memory; what was written before is whole"
-            _end(
-                f"\nerror: {reason}. Free memory, or use fewer processes, then go on with: {go_on()}",
-                1,
-                others=others,
-            )
-        raise
+        if isinstance(error, KeyboardInterrupt):
+            arrived.append(signal.SIGINT)
+        message, status = _told(error, arrived, go_on)
+        if message is None:
+            raise
+        kill_workers()
+        print(message, file=sys.stderr)
+        sys.exit(status)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _told(
+    error: BaseException, arrived: list[int], go_on: Callable[[], str]
+) -> tuple[str | None, int]:
+    """The line that an error ends in, and the status; None where it is of the code."""
+    if arrived:
+        number = signal.Signals(arrived[0])
+        message = f"\ninterrupted ({number.name}); go on with: {go_on()}"
+        return message, 128 + number
+    if isinstance(error, InputError):
+        return f"error: {' '.join(str(error).split())}", REFUSED
+    if isinstance(error, BrokenPipeError) and _is_unread():
+        # or the end of python complains, too
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return f"\nerror: nobody reads the output any more; go on with: {go_on()}", 1
+    cause = error.__cause__  # of logging that is set up
+    failed = cause if isinstance(cause, OSError) else error
+    if isinstance(failed, OSError) and failed.errno in WRITING:
+        where = failed.filename or "a file"
+        message = (
+            f"\nerror: {where}: cannot be written ({failed.strerror}); what was written "
+            f"before is whole. Mend that, then go on with: {go_on()}"
+        )
+        return message, 1
+    memory = isinstance(error, MemoryError)
+    if isinstance(error, OSError):
+        memory = error.errno == errno.ENOMEM
+    if isinstance(error, RuntimeError):
+        memory = any(words in str(error) for words in MEMORY)
+    if memory:
+        message = (
+            "\nerror: out of memory; what was written before is whole. Free memory, or "
+            f"use fewer processes, then go on with: {go_on()}"
+        )
+        return message, 1
+    return None, 1
 
 
 def _is_unread() -> bool:
     """Returns whether the standard output is a pipe that nobody reads any more."""
     try:
         number = sys.stdout.fileno()
-    except (
-        AttributeError,
-        ValueError,
-    ):  # it is closed, or something else stands for it
+    except (AttributeError, ValueError):  # closed, or something else stands for it
         return False
     poll = select.poll()
     poll.register(number, 0)
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
-
-
-def _end(message: str, status: int, others: Collection[int]) -> NoReturn:
-    kill_descendants(others)
-    print(message, file=sys.stderr)
-    sys.exit(status)

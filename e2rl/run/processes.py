@@ -1,5 +1,4 @@
-"""Jobs spread over forked processes that share the parent's memory, or over the workers
-of a Ray cluster.
+"""Jobs spread over processes that share the parent's memory.
 
 The processes end with their parent: on Ctrl-C, on SIGTERM, on an error, and where it is
 killed.
@@ -12,102 +11,88 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import partial
+from multiprocessing.queues import SimpleQueue
 from typing import Any, TypeVar
 
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.run.process_tree import adopting, descendants, kill_descendants
-from e2rl.run.ray_workers import RayWorkers
+from e2rl.run.guard import kill_group
 
 PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-Processes = int | RayWorkers  # how many are forked here, or those elsewhere
 _work: Callable[[int], bytes]  # of a forked worker, which has it without its being sent
+_started: list[SimpleQueue] = []  # of each pool, the numbers of its workers
 
 
 def cores() -> int:
     """Returns how many cores this process may use."""
-    return (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def in_processes(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
-    processes: Processes,
+    *,
+    processes: int,
     cost: Callable[[Job], float],
     ended: Callable[[Job], object] = lambda job: None,
 ) -> Iterator[Result]:
-    """Returns function(job) of each job, in their order, computed by several processes.
+    """Yields function(job) of each job, in their order, computed by several processes.
 
-    Forks share the parent's scenes and weights, and Ray workers are sent them, so
-    results do not depend on `processes`. Raises InputError where a process was killed.
+    Forks share the parent's scenes and weights, so results do not depend on
+    `processes`.
 
     Args:
-        processes: number of forked processes of one thread each, or Ray workers. With
-            one process or one job nothing is
-            forked.
+        function: returns tensors and plain values.
+        jobs: its arguments.
+        processes: forked ones of one thread each. With one process or one job nothing
+            is forked.
         cost: the jobs of greatest cost start first.
         ended: called with each job that has ended, in whatever order they do.
+
+    Raises:
+        InputError: where a process was killed.
     """
-    if isinstance(processes, int) and min(processes, len(jobs)) <= 1:
+    if min(processes, len(jobs)) <= 1:
         for job in jobs:
             result = function(job)
             ended(job)
             yield result
         return
-    order = sorted(range(len(jobs)), key=lambda k: -cost(jobs[k]))
-    work = partial(_packed, function)
-    with (
-        _forked(work, jobs, processes=processes)
-        if isinstance(processes, int)
-        else processes.tasks(work, jobs) as submit
-    ):
-        with interrupts_held():
-            futures = {submit(k): k for k in order}
-        early = {}
-        coming = 0
-        for future in as_completed(futures):
-            number = futures.pop(future)  # or all results would stay in memory
-            early[number] = future.result()
-            ended(jobs[number])
-            while coming in early:
-                yield torch.load(io.BytesIO(early.pop(coming)), weights_only=True)
-                coming += 1
 
+    def packed(number: int) -> bytes:
+        # tensors sent directly would each hold a shared-memory file open
+        buffer = io.BytesIO()
+        torch.save(function(jobs[number]), buffer)
+        return buffer.getvalue()
 
-def _packed(function: Callable[[Job], Result], job: Job) -> bytes:
-    """The result as bytes: tensors sent directly would each hold a shared-memory file
-    open."""
-    buffer = io.BytesIO()
-    torch.save(function(job), buffer)
-    return buffer.getvalue()
-
-
-@contextmanager
-def _forked(
-    work: Callable[[Job], bytes], jobs: Sequence[Job], processes: int
-) -> Iterator[Callable[[int], Future]]:
-    """A function that submits a job by its number to forked workers."""
+    order = sorted(range(len(jobs)), key=lambda number: -cost(jobs[number]))
+    early: dict[int, bytes] = {}
+    coming = 0
     try:
-        with worker_pool(
-            min(processes, len(jobs)), "fork", _adopt, lambda number: work(jobs[number])
-        ) as pool:
-            yield lambda number: pool.submit(_do, number)
+        with worker_pool(min(processes, len(jobs)), "fork", _adopt, packed) as pool:
+            with interrupts_held():
+                futures = {pool.submit(_do, number): number for number in order}
+            for future in as_completed(futures):
+                number = futures.pop(future)  # or all results would stay in memory
+                early[number] = future.result()
+                ended(jobs[number])
+                while coming in early:
+                    buffer = io.BytesIO(early.pop(coming))
+                    yield torch.load(buffer, weights_only=True)
+                    coming += 1
     except BrokenProcessPool as error:
         raise InputError(
-            f"processes={processes}: a process was killed, perhaps for lack of memory; use fewer "
-            "(a run that is resumed may, too), or a smaller batch"
+            f"processes={processes}: a process was killed, perhaps for lack of memory; "
+            "use fewer (a run that is resumed may, too), or a smaller batch"
         ) from error
 
 
@@ -130,34 +115,57 @@ def worker_pool(
     begin: Callable[..., object] | None = None,
     *arguments: Any,
 ) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes of one thread each, started by `method` (fork or spawn),
-    which call begin(*arguments) first.
+    """Gives a pool of processes of one thread each.
 
     Left by an exception, KeyboardInterrupt included, it kills its workers instead of
     waiting for them, with what these have started, such as the programs of a planner.
+
+    Args:
+        processes: number of workers.
+        method: that starts them, fork or spawn.
+        begin: called with the arguments in each worker first.
+        arguments: of `begin`.
     """
-    others = descendants(os.getpid())
-    given = (os.getpid(), begin, arguments)
+    context = multiprocessing.get_context(method)
+    started = context.SimpleQueue()
     pool = ProcessPoolExecutor(
-        processes, multiprocessing.get_context(method), _begin, given
+        processes,
+        context,
+        initializer=_begin,
+        initargs=(started, os.getpid(), begin, arguments),
     )
-    with adopting():
-        try:
-            yield pool
-        except BaseException:
-            kill_descendants(others)
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    _started.append(started)
+    try:
+        yield pool
+    except BaseException:
+        kill_workers()
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    else:
         pool.shutdown(cancel_futures=True)
+    finally:
+        _started.remove(started)
 
 
-def _begin(parent: int, begin: Callable[..., object] | None, arguments: tuple) -> None:
-    """Make this process a worker of `parent`."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # sent to all processes of a terminal; the parent decides
+def kill_workers() -> None:
+    """Kill the workers of all pools, each with its process group."""
+    for started in _started:
+        while not started.empty():
+            kill_group(started.get())
+
+
+def _begin(
+    started: SimpleQueue,
+    parent: int,
+    begin: Callable[..., object] | None,
+    arguments: tuple,
+) -> None:
+    """Make this process a worker of `parent`, in a process group of its own, which a
+    terminal's Ctrl-C does not reach."""
+    os.setpgid(0, 0)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_parent(parent)
+    started.put(os.getpid())
     torch.set_num_threads(1)
     if begin is not None:
         begin(*arguments)

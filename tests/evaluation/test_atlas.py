@@ -2,8 +2,8 @@
 
 import json
 
-from e2rl.evaluation.modes import ATLAS_FILE, find_atlas
-from e2rl.evaluation.rollout_files import write_json
+from e2rl.evaluation.modes import find_atlas
+from e2rl.evaluation.rollout_files import ATLAS_FILE, write_json
 from e2rl.sim.rollout_file import rollout_name
 from tests.evaluation.test_modes import crashes
 from tests.metrics.test_failure_modes import CROSSING, REAR_END

@@ -6,20 +6,15 @@ import math
 import pytest
 import torch
 
+from e2rl.driving.batches import Work, drive_all
+from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.ego_set import (
     EgoSet,
     build_egos,
     pool_trainings,
     recorded_acceleration,
 )
-from e2rl.evaluation.protocol import (
-    Method,
-    Setup,
-    Work,
-    drive_all,
-    record,
-    run_protocol,
-)
+from e2rl.evaluation.record import record, run_protocol
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
@@ -65,7 +60,7 @@ def run(tmp_path_factory):
         seeds=[0],
         work=Work(folder / ROLLOUTS),
     )
-    return record(*scored, folder, chosen.metric_rows), folder
+    return record(scored, folder, chosen.metric_rows), folder
 
 
 def test_every_ego_has_its_rows_and_files_and_drives_as_if_alone(run, tmp_path):

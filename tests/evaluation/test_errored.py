@@ -7,7 +7,8 @@ import re
 import pytest
 import torch
 
-from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.record import run_protocol
 from e2rl.evaluation.rollout_files import (
     ERRORED_FILE,
     METRICS_FILE,

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation import rollout_files as files
-from e2rl.evaluation.protocol import Method, Setup
 from e2rl.evaluation.rollout_files import read_metrics, read_rows, write_json
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.realism import NO_SAMPLES

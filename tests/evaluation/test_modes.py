@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from e2rl.evaluation.modes import MODES_FILE, find_modes, read_modes
-from e2rl.evaluation.rollout_files import write_json
+from e2rl.evaluation.modes import find_modes, read_modes
+from e2rl.evaluation.rollout_files import MODES_FILE, write_json
 from e2rl.report.tables import mode_tables
 from e2rl.sim.rollout_file import rollout_name
 from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure

@@ -4,9 +4,16 @@ independent scorer."""
 import pytest
 import torch
 
-from e2rl.evaluation.modes import MODES_FILE, read_modes
-from e2rl.evaluation.protocol import Method, Setup, run_protocol, scene_seed
-from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_metrics, read_rows
+from e2rl.driving.setup import Method, Setup, scene_seed
+from e2rl.evaluation.modes import read_modes
+from e2rl.evaluation.record import run_protocol
+from e2rl.evaluation.rollout_files import (
+    METRICS_FILE,
+    MODES_FILE,
+    TABLE,
+    read_metrics,
+    read_rows,
+)
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
@@ -122,7 +129,7 @@ class Stopped(Setup):
             raise KeyboardInterrupt
         self.left -= 1
         found = super().score(method, tasks, folder, begins)
-        self.done += [(method.name, *task) for task in tasks]
+        self.done += [(method.name, task.scene, task.seed) for task in tasks]
         return found
 
 

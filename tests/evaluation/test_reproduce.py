@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
-from e2rl.evaluation.protocol import Setup
+from e2rl.driving.setup import Setup
 from e2rl.evaluation.reproduce import compare_tables
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.scenes.scene_list import read_list
@@ -362,8 +362,7 @@ def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(
     )
     assert (
         status == 2
-        and "leave out seeds (only processes, launcher, shard can change)"
-        in error_line(said)
+        and "leave out seeds (only processes, shard can change)" in error_line(said)
     )
     status, said = call("evaluate.py", named, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0 and left == [0], said

@@ -3,8 +3,8 @@ many steps itself."""
 
 import pytest
 
+from e2rl.driving.setup import Method
 from e2rl.evaluation import spread_table
-from e2rl.evaluation.protocol import Method
 from e2rl.evaluation.spread_table import spread_rows
 from e2rl.metrics.catalogue import SPREAD_STAGE, STAGES
 from e2rl.prior.sde import SamplerSettings

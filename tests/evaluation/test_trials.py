@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from e2rl.commands.tune import flat
-from e2rl.evaluation.methods import build_traffic
-from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.build import build_traffic
+from e2rl.evaluation.record import run_protocol
 from e2rl.evaluation.trials import (
     DRIVING,
     MEASURED,

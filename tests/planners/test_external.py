@@ -19,7 +19,8 @@ import pytest
 import torch
 
 from e2rl import roll_out
-from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.record import run_protocol
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.planners.external import ExternalEgo
 from e2rl.planners.planner_messages import plan_message, scene_messages
@@ -227,14 +228,13 @@ def test_no_process_is_left(tmp_path, how):
 
 
 def starting(folder):
-    """The statements of a planner that starts two programs, one in a session of its
-    own, and hangs."""
+    """The statements of a planner that starts two programs, and hangs."""
     (folder / "children").mkdir()
     return "; ".join(
         [
             "import subprocess",
             "sleep = [sys.executable, '-S', '-c', 'import time; time.sleep(100)']",
-            "pids = [subprocess.Popen(sleep, start_new_session=alone).pid for alone in (False, True)]",
+            "pids = [subprocess.Popen(sleep).pid for _ in range(2)]",
             f"[Path({str(folder / 'children')!r}, str(pid)).touch() for pid in pids]",
             "time.sleep(100)",
         ]

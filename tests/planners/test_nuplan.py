@@ -14,7 +14,8 @@ import pytest
 import torch
 
 import e2rl
-from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.record import run_protocol
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.planners.external import ExternalEgo
 from e2rl.scenes.recording import DT

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import torch
 
-from e2rl.evaluation.protocol import record
+from e2rl.driving.setup import Scored
+from e2rl.evaluation.record import record
 from e2rl.evaluation.rollout_files import TABLE, read_rows, write_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.failure_modes import is_failure
@@ -33,21 +34,17 @@ def planned(rollouts: Rollouts) -> Rollouts:
 
 def write_run(folder: Path, rollouts: dict[str, Rollouts]) -> Path:
     """Write all files of a run of {method: rollouts} into a folder."""
-    rows = []
-    features = []
+    scored = Scored()
     for method, driven in rollouts.items():
         driven.scene_id = [f"{SCENE}{index}" for index in range(len(driven))]
         driven.method = [method] * len(driven)
         scores, samples = score_rollouts(driven)
         driven.to_npz(folder / ROLLOUTS)
-        rows += scores
-        features += samples
+        scored.add(Scored(scores, samples))
     record(
-        rows,
-        features,
-        errored=[],
-        folder=folder,
-        summarise=lambda *found: metric_rows(*found, draws=20, realism_draws=2),
+        scored,
+        folder,
+        lambda *given: metric_rows(*given, draws=20, realism_draws=2),
     )
     return folder
 

@@ -9,10 +9,10 @@ import pytest
 from scipy.stats import binom
 
 from e2rl.commands.gate import main
-from e2rl.evaluation.budget import TRIES_FILE
 from e2rl.metrics.errored import errored_row
 from e2rl.metrics.statistics import LEAST, Z, exact_interval
 from e2rl.report.gate import growth
+from e2rl.search.tries_file import TRIES_FILE
 from tests.evaluation.constructed_runs import row_of, run_of
 
 

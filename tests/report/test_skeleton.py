@@ -2,7 +2,7 @@
 
 import torch
 
-from e2rl.evaluation.protocol import Method
+from e2rl.driving.setup import Method
 from e2rl.report.skeleton import LongestChain, link_risk
 from e2rl.traffic.e2.skeleton import Selection
 from e2rl.traffic.e2.topology import TopologySettings

@@ -9,8 +9,13 @@ from functools import reduce
 import pytest
 
 from e2rl.commands import export, merge, replay, report
-from e2rl.evaluation.modes import MODES_FILE
-from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_rows, write_rows
+from e2rl.evaluation.rollout_files import (
+    METRICS_FILE,
+    MODES_FILE,
+    TABLE,
+    read_rows,
+    write_rows,
+)
 from e2rl.run.run import PROVENANCE
 from e2rl.sim.rollout_file import ROLLOUTS
 from tests.report.failed_run import failed_run

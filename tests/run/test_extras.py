@@ -26,7 +26,7 @@ def test_elsewhere_the_libraries_are_named(monkeypatch, tmp_path):
         "torch>=2.7",
         'mcap>=1.2; extra == "mcap"',
         "x<2,>=1 ; extra == 'mcap'",
-        'ray>=2.40; extra == "ray"',
+        'cma>=4; extra == "optimisers"',
     ]
     monkeypatch.setattr(extras, "requires", lambda name: metadata)
     assert how_to_install("mcap").endswith("pip install 'mcap>=1.2' 'x<2,>=1'")

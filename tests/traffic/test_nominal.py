@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.api import build_traffic, load_prior
-from e2rl.evaluation.methods import method_config
+from e2rl.evaluation.build import method_config
 from e2rl.planners.ego import Ego, track
 from e2rl.prior.lane_relative import HORIZON, SIZE
 from e2rl.prior.sde import SamplerSettings

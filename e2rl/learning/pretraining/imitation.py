@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from e2rl.evaluation.methods import build_ego, build_sim
+from e2rl.evaluation.build import build_ego, build_sim
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.pretraining.cloning import NOISE, clip_expert, cloning_loss
 from e2rl.learning.pretraining.driving import Disturbance, PoolDriver, filled_batches

@@ -13,7 +13,7 @@ from e2rl.metrics.contact import first_contact
 from e2rl.metrics.evasion import find_evasions
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
-from e2rl.run.processes import Processes, in_processes
+from e2rl.run.processes import in_processes
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.attempt import count_reasons, summary_of
@@ -79,7 +79,7 @@ def make_traffic(
     solvable: Solvable | None = None,
     nominal: bool = True,
     batch: int = 64,
-    processes: Processes = 1,
+    processes: int = 1,
 ) -> tuple[dict[str, Tensor], list[dict]]:
     """Returns the traffic [R] of an order, and its rows that errored.
 

@@ -7,18 +7,25 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from e2rl.evaluation.budget import TRIES_FILE, Plan, search_all, write_tries
-from e2rl.evaluation.methods import SEARCH
-from e2rl.evaluation.modes import ATLAS_FILE, read_atlas
-from e2rl.evaluation.protocol import Method, Setup, Work, drive_all, record
-from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics, write_json
+from e2rl.driving.batches import Work, drive_all
+from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.check import SEARCH
+from e2rl.evaluation.modes import read_atlas
+from e2rl.evaluation.record import record
+from e2rl.evaluation.rollout_files import (
+    ATLAS_FILE,
+    METRICS_FILE,
+    read_metrics,
+    write_json,
+)
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.realism import Samples
 from e2rl.metrics.statistics import paired_differences
 from e2rl.planners.ego import Ego
 from e2rl.run.parts import Parts
-from e2rl.run.processes import Processes
 from e2rl.run.run import origin_of
+from e2rl.search.spending import SearchMethod, search_all
+from e2rl.search.tries_file import TRIES_FILE, write_tries
 from e2rl.sim.rollout_file import ROLLOUTS
 
 
@@ -34,8 +41,8 @@ class BeforeAfter:
     methods: Sequence[Method]
     seeds: Sequence[int]
     folder: Path
-    processes: Processes = 1
-    search: Plan | None = None
+    processes: int = 1
+    search: SearchMethod | None = None
     budget: float = 0.0
 
     def __call__(self, stage: str, ego: Ego, rounds: int) -> list[dict]:
@@ -55,14 +62,14 @@ class BeforeAfter:
         if self.search is not None:
             self._search(self.search, setup, work=work, folder=folder / SEARCH)
         rows = record(
-            *scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder))
+            scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder))
         )
         if stage == "before":
-            measured.save(stage, None, scored[:2])
+            measured.save(stage, None, (scored.rows, scored.samples))
         elif (before := measured.load("before", None)) is not None:
             for row in rows:
                 row["paired"]["before"] = paired_differences(
-                    *_of_row(row, scored[:2]), *_of_row(row, before)
+                    *_of_row(row, (scored.rows, scored.samples)), *_of_row(row, before)
                 )
         file = self.folder / METRICS_FILE
         earlier = [
@@ -73,19 +80,21 @@ class BeforeAfter:
         write_json(file, earlier + rows)
         return earlier + rows
 
-    def _search(self, plan: Plan, setup: Setup, work: Work, folder: Path) -> None:
+    def _search(
+        self, method: SearchMethod, setup: Setup, work: Work, folder: Path
+    ) -> None:
         """Write the tries of a stage, their rollouts and their atlas into a folder."""
         work = replace(work, into=folder / ROLLOUTS)
-        found, tries = search_all(
+        spent = search_all(
             [setup],
-            [plan],
+            [method],
             budget=self.budget,
             unit="nfe",
             seeds=self.seeds[:1],
             work=work,
         )
-        record(*found, folder, partial(metric_rows, searched=True))
-        write_tries(folder / TRIES_FILE, tries)
+        record(spent.scored, folder, partial(metric_rows, searched=True))
+        write_tries(folder / TRIES_FILE, spent.tries)
 
     def atlases(self) -> tuple[dict, dict] | None:
         """The atlas of each stage (`evaluation.modes.group_atlas`); None without a

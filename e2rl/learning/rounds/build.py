@@ -11,14 +11,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from e2rl.evaluation.budget import methods_at, portfolio_plan
-from e2rl.evaluation.methods import (
-    SEARCH,
-    as_list,
-    build_sim,
-    processes_of,
-)
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.build import build_search, build_sim
+from e2rl.evaluation.check import SEARCH, as_list, processes_of
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.rounds.attack import Synthesize, solvable
 from e2rl.learning.rounds.before_after import BeforeAfter
@@ -31,7 +26,6 @@ from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built, check_device, load_choice, resolved
 from e2rl.run.errors import InputError
-from e2rl.run.ray_workers import RayWorkers
 from e2rl.run.settings import setting, settings_of
 from e2rl.run.terminal import Bar, duration
 from e2rl.scenes.scene import SceneSet
@@ -92,7 +86,6 @@ def build_evolution(
         seed=config.seed,
         device=learner.pop("device", config.device),
     )
-    workers = processes_of(config)
     return Evolution(
         curriculum,
         improve,
@@ -109,7 +102,6 @@ def build_evolution(
         ),
         memory=Memory(folder, settings.memory),
         batch=config.batch,
-        workers=workers if isinstance(workers, RayWorkers) else None,
     )
 
 
@@ -222,9 +214,7 @@ def build_measure(
     if not options.budget:
         return BeforeAfter(*given)
 
-    search = portfolio_plan(
-        SEARCH, config, method=partial(methods_at(max(options.eta)), prior)
-    )
+    search = build_search(SEARCH, config, prior, eta=max(options.eta))
     return BeforeAfter(*given, search, options.budget)
 
 

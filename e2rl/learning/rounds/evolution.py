@@ -27,7 +27,6 @@ from e2rl.learning.rounds.scheduler import (
 )
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
-from e2rl.run.ray_workers import RayWorkers
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.pool import TrafficPool
 
@@ -75,7 +74,6 @@ class Evolution:
         solvable: traffic -> bool [S]: the rows that enter D'; None: all.
         memory: None: in a temporary folder.
         batch: scenes that are synthesized at once.
-        workers: that do it; None: a process here.
     """
 
     def __init__(
@@ -88,7 +86,6 @@ class Evolution:
         solvable: Solvable | None = None,
         memory: Memory | None = None,
         batch: int = 64,
-        workers: RayWorkers | None = None,
     ) -> None:
         self.curriculum = curriculum
         self.improve = improve
@@ -98,7 +95,6 @@ class Evolution:
         self.solvable = solvable
         self.memory = memory or Memory(None, settings.memory)
         self.batch = batch
-        self.workers = workers
         self.episodes: Episodes | None = None
         self.choices: list[Choice] = []
         self.errored: list[dict] = []
@@ -233,9 +229,7 @@ class Evolution:
 
     def _begin(self, order: Order) -> Prefetch:
         name = f"round {order.number + 1}: synthesis beside learning failed, checkpoints remain (resume=RUN_DIR)"
-        if self.workers is not None:
-            self.workers.connect()
-        return Prefetch(lambda: self._make(order), name, forked=self.workers is None)
+        return Prefetch(lambda: self._make(order), name)
 
     def _make(self, order: Order) -> None:
         """Write the traffic of an order into the memory's folder."""
@@ -245,7 +239,6 @@ class Evolution:
             solvable=self.solvable,
             nominal=self.settings.nominal == "prior",
             batch=self.batch,
-            processes=self.workers or 1,
         )
         self.memory.write(order.number, traffic, errored)
 

@@ -1,5 +1,4 @@
-"""Work beside this process, whose result is a file that it writes: in a forked process,
-or in a thread that waits for workers elsewhere."""
+"""Work beside this process, in a forked one, whose result is a file that it writes."""
 
 import multiprocessing
 import os
@@ -8,7 +7,6 @@ import time
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from threading import Thread
 
 import torch
 
@@ -22,24 +20,17 @@ class Prefetch:
     """`work()`, begun at once. A forked process sees what this one holds now; later
     changes of either are not the other's."""
 
-    def __init__(
-        self, work: Callable[[], None], name: str, forked: bool = True
-    ) -> None:
-        """name: of the work, in messages; forked: in a process with one thread, else in
-        a thread of this process."""
+    def __init__(self, work: Callable[[], None], name: str) -> None:
+        """name: of the work, in messages."""
         context = multiprocessing.get_context("fork")
         self._name, (self._receiver, sender) = name, context.Pipe(duplex=False)
         for stream in filter(None, (sys.stdout, sys.stderr)):
             stream.flush()  # or the fork would write it once more
-        start: Callable = context.Process if forked else Thread
-        self._worker = start(
-            target=_run,
-            args=(work, sender, os.getpid() if forked else None),
-            daemon=True,
+        self._worker = context.Process(
+            target=_run, args=(work, sender, os.getpid()), daemon=True
         )
         self._worker.start()
-        if forked:
-            sender.close()
+        sender.close()
 
     def wait(self) -> float:
         """Wait for the end; returns the seconds that the work took. Raises InputError
@@ -56,10 +47,9 @@ class Prefetch:
         return seconds
 
 
-def _run(work: Callable[[], None], sender: Connection, parent: int | None) -> None:
-    if parent is not None:
-        die_with_parent(parent)
-        torch.set_num_threads(1)
+def _run(work: Callable[[], None], sender: Connection, parent: int) -> None:
+    die_with_parent(parent)
+    torch.set_num_threads(1)
     begin = time.perf_counter()
     reason = ""
     try:

@@ -3,7 +3,7 @@ paired with the first."""
 
 import torch
 
-from e2rl.evaluation.protocol import Method, Setup
+from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics
 from e2rl.learning.rounds.before_after import BeforeAfter
 from e2rl.planners.idm_planner import IDMEgo

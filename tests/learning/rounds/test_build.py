@@ -5,7 +5,7 @@ import pytest
 from e2rl.scripts.train import train_round
 from omegaconf import open_dict
 
-from e2rl.evaluation.methods import build_ego
+from e2rl.evaluation.build import build_ego
 from e2rl.learning.rounds.build import build_evolution, build_progress, check_training
 from e2rl.learning.rounds.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.rounds.policy import PolicyImprovement

@@ -5,7 +5,8 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from e2rl.evaluation.protocol import Method, Setup, run_protocol
+from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.record import run_protocol
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.pretraining.prior.distributed import process_group
 from e2rl.learning.pretraining.prior.training import (

@@ -6,22 +6,24 @@ from dataclasses import replace
 import pytest
 import torch
 
-from e2rl.evaluation.budget import (
-    Plan,
-    build_plans,
-    failures_of,
-    search_all,
-    spend,
-    write_tries,
-)
-from e2rl.evaluation.protocol import Method, Setup, Work
+from e2rl.driving.batches import HERE, Work
+from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.build import build_searches
+from e2rl.evaluation.check import evaluation_settings
 from e2rl.evaluation.trials import PlannerTrials
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.search.search import RAISES, Search, SearchSettings
+from e2rl.search.spending import (
+    SearchMethod,
+    Spending,
+    search_all,
+    spend_together,
+)
 from e2rl.search.tries import TRIES, Family
+from e2rl.search.tries_file import failures_of, write_tries
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.prior.small import small_prior
@@ -45,7 +47,7 @@ def setup_of():
 def plan_of():
     on = Method("e2", synthesizer(), eta=2.0)
     settings = replace(SearchSettings(), cover=1)
-    return Plan(
+    return SearchMethod(
         "search", [RULE, LATE], traffic={"rule": on, "late": on}, settings=settings
     )
 
@@ -60,13 +62,20 @@ def plan():
     return plan_of()
 
 
+def spend(setup, plan, work=HERE, **settings):
+    """What one search spends."""
+    given = {"seed": 3, "scenes": range(3), "budget": 4.0, "unit": "tries"}
+    (spent,) = spend_together([Spending(setup, plan, **given | settings)], work)
+    return spent
+
+
 def found(setup, plan, processes=1, parts=NO_PARTS, tries=4.0, unit="tries"):
     work = Work(processes=processes, parts=parts)
-    (((rows, samples, errored), told),) = spend(
-        [(setup, plan, 3, range(3), tries, unit)], work
-    )
-    assert len(rows) == len(samples) == len(told) and not errored
-    return told
+    spent = spend(setup, plan, work, budget=tries, unit=unit)
+    scored = spent.scored
+    assert len(scored.rows) == len(scored.samples) == len(spent.tries)
+    assert not scored.errored
+    return spent.tries
 
 
 def known(told):
@@ -90,9 +99,10 @@ def test_a_budget_of_tries_is_spent_and_not_exceeded(setup, plan):
 )
 def test_what_is_returned_is_within_the_budget(setup, plan, unit, budget):
     """Rows, samples and lines of tries; one more try would exceed it."""
-    ((scored, told),) = spend([(setup, plan, 3, range(3), budget, unit)])
-    rows, samples, _ = scored
-    assert len(rows) == len(samples) == len(told) > 0
+    spent = spend(setup, plan, budget=budget, unit=unit)
+    rows = spent.scored.rows
+    told = spent.tries
+    assert len(rows) == len(spent.scored.samples) == len(told) > 0
     cost = {"tries": [1.0] * len(rows), "nfe": [row["nfe"] for row in rows]}[unit]
     assert sum(cost) / 3 == pytest.approx(told[-1][unit]) and told[-1][
         unit
@@ -118,14 +128,12 @@ class Crashes(IDMEgo):
 def test_a_planner_that_always_raises_does_not_use_up_the_budget(plan):
     own = setup_of()
     own.scenes.scenes["start"][:, 0, 3] = torch.tensor([6.0, 7.0, 8.0])
-    (((rows, _, errored), told),) = spend(
-        [(replace(own, ego=Crashes([6.0, 7.0, 8.0])), plan, 3, range(3), 50.0, "tries")]
-    )
-    assert len(rows) == len(errored) == len(told) == RAISES * 3
-    (((rows, _, _), told),) = spend(
-        [(replace(own, ego=Crashes([7.0])), plan, 3, range(3), 8.0, "tries")]
-    )
-    names = [row["scene_id"] for row in rows]
+    spent = spend(replace(own, ego=Crashes([6.0, 7.0, 8.0])), plan, budget=50.0)
+    assert len(spent.scored.rows) == len(spent.tries) == RAISES * 3
+    assert len(spent.scored.errored) == RAISES * 3
+    spent = spend(replace(own, ego=Crashes([7.0])), plan, budget=8.0)
+    told = spent.tries
+    names = [row["scene_id"] for row in spent.scored.rows]
     crashed = own.scenes.scene_id[1]
     assert names.count(crashed) == RAISES < len(names) / 2
     assert all(bool(row["raised"]) == (row["scene_id"] == crashed) for row in told)
@@ -133,10 +141,8 @@ def test_a_planner_that_always_raises_does_not_use_up_the_budget(plan):
 
 def test_a_budget_that_ends_within_a_round_goes_to_scenes_at_random(setup, plan):
     firsts = {
-        told[0]["scene_id"]
-        for _, told in spend(
-            [(setup, plan, seed, range(3), 0.3, "tries") for seed in range(4)]
-        )
+        spend(setup, plan, seed=seed, budget=0.3).tries[0]["scene_id"]
+        for seed in range(4)
     }
     assert len(firsts) > 1
 
@@ -161,18 +167,19 @@ def test_a_search_goes_on_where_it_was_killed(setup, plan, tmp_path):
 
 
 def test_the_tries_that_hit_an_ego_are_driven_again_as_they_were(setup, plan, tmp_path):
-    (((rows, _, _), told),) = spend([(setup, plan, 3, range(3), 4.0, "tries")])
+    spent = spend(setup, plan)
+    told = spent.tries
+    rows = spent.scored.rows
     chosen = [k for k in range(len(told)) if k % 3 != 1]
     write_tries(
         tmp_path / "tries.csv",
         [row | {"margin": 0.5 if k in chosen else -1.0} for k, row in enumerate(told)],
     )
-    parts = failures_of(tmp_path / "tries.csv", "idm", plan=plan, setup=setup)
+    parts = failures_of(tmp_path / "tries.csv", "idm", method=plan, setup=setup)
     again = {}
     for part, method, tasks in parts:
-        again |= {
-            (row["scene_id"], row["seed"]): row for row in part.score(method, tasks)[0]
-        }
+        scored = part.score(method, tasks)
+        again |= {(row["scene_id"], row["seed"]): row for row in scored.rows}
     keys = [(told[k]["scene_id"], told[k]["seed"]) for k in chosen]
     before = {
         (row["scene_id"], row["seed"]): row
@@ -194,33 +201,33 @@ def test_the_tries_that_hit_an_ego_are_driven_again_as_they_were(setup, plan, tm
 
 
 def test_tries_that_are_not_of_this_search_are_refused(setup, plan, tmp_path):
-    (((rows, _, _), told),) = spend([(setup, plan, 3, range(3), 1.0, "tries")])
+    told = spend(setup, plan, budget=1.0).tries
     file = tmp_path / "tries.csv"
     with pytest.raises(InputError, match="no table of a search's tries"):
-        failures_of(file, "idm", plan=plan, setup=setup)
+        failures_of(file, "idm", method=plan, setup=setup)
     write_tries(file, [row | {"margin": -1.0} for row in told])
     with pytest.raises(InputError, match="no try of search hits idm"):
-        failures_of(file, "idm", plan=plan, setup=setup)
+        failures_of(file, "idm", method=plan, setup=setup)
     for change, what in (
         ({"family": "other"}, "family other"),
         ({"scene_id": "elsewhere"}, "scene=elsewhere"),
     ):
         write_tries(file, [row | {"margin": 1.0} | change for row in told])
         with pytest.raises(InputError, match=what):
-            failures_of(file, "idm", plan=plan, setup=setup)
+            failures_of(file, "idm", method=plan, setup=setup)
     write_tries(file, [row | {"margin": 1.0} for row in told])
     with pytest.raises(InputError, match="a try of Own depends on those before it"):
         failures_of(
             file,
             "idm",
-            plan=replace(plan, search=type("Own", (Search,), {})),
+            method=replace(plan, search=type("Own", (Search,), {})),
             setup=setup,
         )
 
 
 def test_a_method_that_evaluates_no_network_has_no_budget_of_evaluations(setup):
     traffic = {"still": Method("still", ConstantVelocity(), eta=0.0)}
-    still = Plan(
+    still = SearchMethod(
         "still",
         [Family("still", "still", ranges={})],
         traffic=traffic,
@@ -239,9 +246,9 @@ def test_a_line_for_each_try(setup, plan, tmp_path):
 
 
 def plans(*overrides):
-    return build_plans(
-        load_config("evaluate", ["budget=640", *overrides]), small_prior()
-    )
+    config = load_config("evaluate", ["budget=640", *overrides])
+    settings = evaluation_settings(config)
+    return build_searches(config, small_prior(), settings.eta[0])
 
 
 def test_a_row_for_each_method_and_variant_and_its_families_from_the_configuration():
@@ -281,7 +288,7 @@ class Broken(ConstantVelocity):
 
 def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
     broken = Method("broken", Broken(), eta=0.0)
-    plan = Plan(
+    plan = SearchMethod(
         "search",
         [Family("broken", "broken", ranges={}, nfe=100.0)],
         traffic={"broken": broken},
@@ -292,14 +299,11 @@ def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
         (3.0, "tries", 3),
         (1.0, "seconds", 1),
     ):
-        (((rows, _, errored), told),) = spend(
-            [(setup, plan, 0, range(3), budget, unit)]
-        )
-        assert (
-            not told
-            and len(rows) == len(errored) == 3 * tries
-            and all(row["errored"] == 1 for row in rows)
-        )
+        spent = spend(setup, plan, seed=0, budget=budget, unit=unit)
+        rows = spent.scored.rows
+        assert not spent.tries
+        assert len(rows) == len(spent.scored.errored) == 3 * tries
+        assert all(row["errored"] == 1 for row in rows)
 
 
 @pytest.mark.parametrize(
