@@ -104,14 +104,15 @@ class E2(NominalTraffic):
     @property
     def tuned(self) -> Mapping[str, tuple]:  # type: ignore[override]
         """e2 has no gain: eta multiplies the limits of its interceptions. Where V_adv
-        acts, its clip is the gain."""
+        acts, its clip is the gain, or, without a clip, the weight of its distance."""
         lateral = {"interception.lateral": (0.5, 4.0, "log")}
+        distance = {"potentials.distance": (1.0, 40.0, "log")}
+        if self.guidance is None or self.guidance.adversarial_clip == 0:
+            return lateral | {"interception.push": (0.5, 3.0, "log")}
+        if self.guidance.adversarial_clip is None:
+            return distance | {"anchor.strength": (0.05, 1.0, "log")}
         clip = {"guidance.adversarial_clip": (0.05, 4.0, "log")}
-        if self.skeleton.pursuit:
-            return clip | {"potentials.distance": (1.0, 40.0, "log")}
-        if self.guidance is not None and self.guidance.adversarial_clip != 0:
-            return clip | lateral
-        return lateral | {"interception.push": (0.5, 3.0, "log")}
+        return clip | (distance if self.skeleton.pursuit else lateral)
 
     def reset(
         self,
