@@ -6,9 +6,11 @@ from math import fsum
 import networkx
 import numpy as np
 
+Clique = tuple[int, ...]  # indices of its members, ascending
+
 
 @lru_cache(maxsize=8192)
-def maximal_cliques(adjacency: bytes, nodes: int) -> tuple[tuple[int, ...], ...]:
+def maximal_cliques(adjacency: bytes, nodes: int) -> tuple[Clique, ...]:
     """Maximal cliques of size >= 2 of the graph whose nodes x nodes matrix of bytes is
     `adjacency` (rows in order)."""
     edges = np.argwhere(
@@ -20,7 +22,7 @@ def maximal_cliques(adjacency: bytes, nodes: int) -> tuple[tuple[int, ...], ...]
     )
 
 
-def cliques_in(adjacency: np.ndarray) -> list[tuple[int, ...]]:
+def cliques_in(adjacency: np.ndarray) -> list[Clique]:
     """Maximal cliques of size >= 2 of a graph [V, V] of bytes."""
     nodes = np.flatnonzero(adjacency.any(-1))
     found = maximal_cliques(
@@ -29,6 +31,6 @@ def cliques_in(adjacency: np.ndarray) -> list[tuple[int, ...]]:
     return [tuple(int(nodes[i]) for i in clique) for clique in found]
 
 
-def weight_of(clique: tuple[int, ...], weight: np.ndarray) -> float:
+def weight_of(clique: Clique, weight: np.ndarray) -> float:
     """Total weight [V, V] of a clique's pairs."""
     return fsum(weight[i, j] for k, i in enumerate(clique) for j in clique[k + 1 :])

@@ -17,9 +17,9 @@ from torch import Tensor
 from e2rl.prior.prior import Context
 from e2rl.sim.world import World
 
-Value = TypeVar(
-    "Value"
-)  # a tensor, a TensorDict, a (nested) dataclass of them, or None
+# A tensor, a TensorDict, a (nested) dataclass of them, or None.
+Value = TypeVar("Value")
+PRIME = 1_000_003  # between the seeds of two scenes' generators
 
 
 def take_rows(value: Value, rows: Tensor) -> Value:
@@ -71,24 +71,28 @@ def mapped(context: Context, function: Callable[[Tensor], Tensor]) -> Context:
 def noise_of(
     seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool = False
 ) -> Tensor:
-    """Random numbers [B, *shape] that depend only on each scene's seed [B] and draw
-    number [B], not on the batch: standard normal, or uniform in [0, 1)."""
-    rows = []
+    """Returns random numbers [B, *shape] that do not depend on the batch.
+
+    Args:
+        seed: [B] int64, of each scene.
+        draw: [B] int64, number of the draw.
+        shape: of a scene's numbers.
+        uniform: in [0, 1), else standard normal.
+    """
+    sample = torch.rand if uniform else torch.randn
+    rows = [torch.empty(0, *shape)]
     for value, number in torch.stack([seed, draw], -1).tolist():
-        generator = torch.Generator().manual_seed(
-            (value * 1_000_003 + number) % (2**63)
-        )
-        rows.append(
-            (torch.rand if uniform else torch.randn)(shape, generator=generator)
-        )
-    return (torch.stack(rows) if rows else torch.empty(0, *shape)).to(seed.device)
+        generator = torch.Generator().manual_seed((value * PRIME + number) % (2**63))
+        rows.append(sample((1, *shape), generator=generator))
+    return torch.cat(rows).to(seed.device)
 
 
-ROWS = (
-    160,
-    1024,
-)  # vehicle rows of a group: SHRUNK applies from the first number on, the second is the maximum
-SHRUNK = 0.55  # a scene of at most this fraction of the group's largest scene starts a new group
+# Vehicle rows of a group: SHRUNK applies from FULL_ROWS on.
+FULL_ROWS = 160
+MOST_ROWS = 1024
+# A scene of at most this fraction of the group's largest scene starts a new group.
+SHRUNK = 0.55
+# Keys of a scene with a row for each agent.
 OF_ALL = {
     "size",
     "start",
@@ -97,7 +101,8 @@ OF_ALL = {
     "valid",
     "agent_type",
     "parked",
-}  # keys with all agents
+}
+# Keys of a scene with a row for each vehicle.
 OF_VEHICLES = {
     "past",
     "route_points",
@@ -106,8 +111,10 @@ OF_VEHICLES = {
     "route_valid",
     "route_recorded",
     "route_limit",
+    "route_light",
+    "route_light_s",
+    "route_log",
 }
-OF_VEHICLES |= {"route_light", "route_light_s", "route_log"}
 
 
 def no_vehicles() -> Any:
@@ -129,10 +136,15 @@ class Group:
     vehicles: int
     others: int
 
+    def agents(self, width: int) -> Tensor:
+        """Their rows int64 in scenes of `width` vehicle rows."""
+        others = width + torch.arange(self.others)
+        return torch.cat([torch.arange(self.vehicles), others]).to(self.rows.device)
+
 
 def group_scenes(world: World) -> list[Group]:
-    """The scenes of a batch in groups by vehicles in use (see ROWS and SHRUNK; one
-    scene at least)."""
+    """The scenes of a batch in groups by vehicles in use (see FULL_ROWS and SHRUNK;
+    one scene at least)."""
     width = world.scene["route_log"].shape[1]
     used = world.valid | world.scene["valid"]
     position = torch.arange(1, used.shape[1] + 1, device=used.device)
@@ -149,8 +161,8 @@ def group_scenes(world: World) -> list[Group]:
         filled = sizes[begin] * (end - begin)
         if (
             end < len(sizes)
-            and filled + size <= ROWS[1]
-            and (filled < ROWS[0] or sizes[end] > SHRUNK * size)
+            and filled + size <= MOST_ROWS
+            and (filled < FULL_ROWS or sizes[end] > SHRUNK * size)
         ):
             continue
         rows = order[begin:end]
@@ -186,39 +198,25 @@ class SceneRows:
         rows = self._group.rows
         vehicles = self._group.vehicles
         if key in OF_ALL:
-            width = self._scene["route_log"].shape[1]
-            agents = torch.cat(
-                [torch.arange(vehicles), width + torch.arange(self._group.others)]
-            )
-            return self._scene[key][rows][:, agents.to(rows.device)]
-        return (
-            self._scene[key][rows, :vehicles]
-            if key in OF_VEHICLES
-            else self._scene[key][rows]
-        )
+            agents = self._group.agents(self._scene["route_log"].shape[1])
+            return self._scene[key][rows][:, agents]
+        if key in OF_VEHICLES:
+            return self._scene[key][rows, :vehicles]
+        return self._scene[key][rows]
 
 
 def crop_world(world: World, group: Group) -> World:
     """The group's World [G]."""
-    width = world.scene["route_log"].shape[1]
     rows = group.rows
-    agents = torch.cat(
-        [torch.arange(group.vehicles), width + torch.arange(group.others)]
-    ).to(rows.device)
-    states, valid, accel = (
-        getattr(world, name)[rows][:, agents] for name in ("states", "valid", "accel")
-    )
-    scene = cast(TensorDictBase, SceneRows(world.scene, group))
-    mission_s = None if world.mission_s is None else world.mission_s[rows]
-    turn_rate = world.turn_rate[rows][:, agents]
+    agents = group.agents(world.scene["route_log"].shape[1])
     return World(
-        scene,
+        cast(TensorDictBase, SceneRows(world.scene, group)),
         world.step[rows],
-        states=states,
-        valid=valid,
-        accel=accel,
-        turn_rate=turn_rate,
-        mission_s=mission_s,
+        states=world.states[rows][:, agents],
+        valid=world.valid[rows][:, agents],
+        accel=world.accel[rows][:, agents],
+        turn_rate=world.turn_rate[rows][:, agents],
+        mission_s=None if world.mission_s is None else world.mission_s[rows],
     )
 
 

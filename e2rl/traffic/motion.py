@@ -33,19 +33,26 @@ def compact(mask: Tensor) -> tuple[Tensor, Tensor]:
 
 def take(values: Tensor, index: Tensor) -> Tensor:
     """Rows index [B, M] of values [B, V, ...] -> [B, M, ...]."""
-    shape = (*index.shape, *values.shape[2:])
-    return values.gather(
-        1, index.reshape(*index.shape, *[1] * (values.dim() - 2)).expand(shape)
-    )
+    return values.gather(1, _wide(index, values).expand(-1, -1, *values.shape[2:]))
 
 
 def put(values: Tensor, index: Tensor, mask: Tensor, rows: Tensor) -> Tensor:
-    """values [B, V, ...] with rows [B, M, ...] at index [B, M] where mask [B, M]."""
-    ones = [1] * (values.dim() - 2)
-    at = index.view(*index.shape, *ones).expand(*index.shape, *values.shape[2:])
-    return values.scatter(
-        1, at, torch.where(mask.view(*mask.shape, *ones), rows, values.gather(1, at))
-    )
+    """Returns values with some rows replaced.
+
+    Args:
+        values: [B, V, ...].
+        index: [B, M] int64, of the rows.
+        mask: [B, M] bool, which of them are replaced.
+        rows: [B, M, ...], the new ones.
+    """
+    place = _wide(index, values).expand(-1, -1, *values.shape[2:])
+    new = torch.where(_wide(mask, values), rows, values.gather(1, place))
+    return values.scatter(1, place, new)
+
+
+def _wide(rows: Tensor, values: Tensor) -> Tensor:
+    """rows [B, M] with as many axes as values [B, V, ...]."""
+    return rows.reshape(*rows.shape, *[1] * (values.dim() - 2))
 
 
 def smallest(mask: Tensor, key: Tensor, count: Tensor | int) -> Tensor:
@@ -77,18 +84,18 @@ def remaining_offset(travelled: Tensor, speed: Tensor) -> Tensor:
 
 
 def states_on_route(route: Tensor, s: Tensor, d: Tensor, speed: Tensor) -> Tensor:
-    """States [..., K, 4] at arc lengths s [..., K] and lateral offsets d [..., K] of
-    route [..., P, 2], at `speed`."""
+    """Returns the states [..., K, 4] of vehicles on routes.
+
+    Args:
+        route: [..., P, 2] m.
+        s: [..., K] m, arc length.
+        d: [..., K] m, lateral offset.
+        speed: m/s, of the shape of s or broadcast to it.
+    """
     xy, heading, _ = interpolate(route, s)
     normal = torch.stack([-heading.sin(), heading.cos()], -1)
-    return torch.cat(
-        [
-            xy + d[..., None] * normal,
-            heading[..., None],
-            speed.expand(s.shape)[..., None],
-        ],
-        -1,
-    )
+    speed = speed.expand(s.shape)[..., None]
+    return torch.cat([xy + d[..., None] * normal, heading[..., None], speed], -1)
 
 
 def constant_speed_states(scene: TensorDictBase, world: World, times: Tensor) -> Tensor:
@@ -148,9 +155,8 @@ def reachable_distance(speed: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
     return least, speed * ramp + 0.5 * MAX_ACCELERATION * ramp**2 + cap * (times - ramp)
 
 
-YELLOW_BRAKING = (
-    3.0  # m/s^2 with which a vehicle halts at a yellow light, or else goes on
-)
+# m/s^2 with which a vehicle halts at a yellow light, or else goes on.
+YELLOW_BRAKING = 3.0
 
 
 def distance_to_stop_line(world: World, index: Tensor, number: Tensor) -> Tensor:

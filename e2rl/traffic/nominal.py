@@ -37,9 +37,8 @@ from e2rl.traffic.traffic import REPLAN_STEPS, State, Traffic, TrafficPlan
 
 KNOWLEDGE = ("predicted", "plan")
 LOOK = 5  # steps of the ego's plan over which its current yaw rate is estimated
-React = Callable[
-    [Tensor, Tensor], Tensor
-]  # rows [G], planned states [G, V, HORIZON, 4] -> the egos' [G, HORIZON, 4]
+# Rows [G] and planned states [G, V, HORIZON, 4] -> the egos' [G, HORIZON, 4].
+React = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass
@@ -91,65 +90,62 @@ class NominalTraffic(Traffic):
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
         """Returns the states of scenes [B] with routes drawn from the prior."""
-        uniform = noise_of(
-            seed,
-            torch.zeros_like(seed),
-            shape=tuple(scenes["route_valid"].shape[1:2]),
-            uniform=True,
-        )
+        vehicles = scenes["route_valid"].shape[1]
+        first = torch.zeros_like(seed)
+        uniform = noise_of(seed, first, shape=(vehicles,), uniform=True)
         scenes = self.as_seen(World.at_start(scenes)).scene
-        routed, lane = self.prior.start(
-            scenes, self.prior.choose_routes(scenes, uniform)
-        )
+        routes = self.prior.choose_routes(scenes, uniform)
+        routed, lane = self.prior.start(scenes, routes)
         return PriorState(seed, torch.zeros_like(seed), routed=routed, lane=lane)
 
     def replan(
         self, state: State, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[State, TrafficPlan]:
         """Returns states and plans of the coming HORIZON steps; scenes of similar size
-        are planned together."""
+        are planned together.
+
+        Args:
+            state: of B scenes.
+            world: the scenes now.
+            ego_plan: [B, >= HORIZON, 4], what the ego announces, looked at where
+                `knowledge` is "plan".
+            react: the ego's answers to plans (`Traffic.queries_ego`).
+        """
         world = self.as_seen(world)
         ego_plan = ego_plan.detach()
         noise = self.noise(state)
         batch, width = state.routed.route.shape
         whole = clone(state)
         states = world.states.new_zeros(batch, width, HORIZON, 4)
-        present = torch.zeros(
-            batch, width, HORIZON, dtype=torch.bool, device=states.device
-        )
+        present = torch.zeros_like(states[..., 0], dtype=torch.bool)
         for group in group_scenes(world):
             rows = group.rows
             vehicles = group.vehicles
             part = crop_state(state, group, width=width)
-            there = crop_world(world, group)
-            part = self._expecting(part, there)
-            announced = (ego_plan[rows], None)
-            known, context = (
-                announced
-                if self.knowledge == "plan"
-                else self.predicted_ego(part, there)
-            )
-            part = replace(part, lane=self.lane_now(part, there, ego_plan=known))
-            answer = None if react is None else partial(react, rows)
-            now = Replan(
-                part,
-                there,
-                ego_plan=known,
+            scenes = crop_world(world, group)
+            part = self._expecting(part, scenes)
+            expected = ego_plan[rows]
+            context = None
+            if self.knowledge != "plan":
+                expected, context = self.predicted_ego(part, scenes)
+            lane = self.lane_now(part, scenes, ego_plan=expected)
+            replan = Replan(
+                replace(part, lane=lane),
+                scenes,
+                ego_plan=expected,
                 noise=noise[:, rows, :vehicles],
-                react=answer,
+                react=None if react is None else partial(react, rows),
                 before=context,
             )
-            part, x0, context = self.replan_group(now)
+            part, x0, context = self.replan_group(replan)
             plan = self.prior.plan(x0, context)
             part = replace(
                 part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS)
             )
             write_state(whole, part, group=group)
             states[rows, :vehicles] = plan.states()
-            valid = world.valid[
-                rows, :vehicles, None
-            ]  # a vehicle that has left does not return
-            present[rows, :vehicles] = plan.on_map & valid
+            # A vehicle that has left does not return.
+            present[rows, :vehicles] = plan.on_map & world.valid[rows, :vehicles, None]
         return whole, TrafficPlan(states, present, route=whole.routed.route)
 
     @torch.no_grad()
@@ -168,22 +164,19 @@ class NominalTraffic(Traffic):
 
     def _expecting(self, state: State, world: World) -> State:
         """Returns the state with the ego on the route that it is expected to follow."""
-        expected = torch.cat(
-            [world.scene["route_log"][:, :1], state.routed.route[:, 1:]], 1
-        )
-        moved = expected != state.routed.route
-        return (
-            onto(state, world, route=expected, moved=moved)
-            if bool(moved.any())
-            else state
-        )
+        route = state.routed.route
+        expected = torch.cat([world.scene["route_log"][:, :1], route[:, 1:]], 1)
+        moved = expected != route
+        if not bool(moved.any()):
+            return state
+        return onto(state, world, route=expected, moved=moved)
 
-    def replan_group(self, now: Replan) -> tuple[State, Tensor, Context]:
+    def replan_group(self, replan: Replan) -> tuple[State, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
         context = self.encode(
-            now.state, now.world, ego_plan=now.ego_plan, known=now.before
+            replan.state, replan.world, ego_plan=replan.ego_plan, known=replan.before
         )
-        return now.state, self.prior.sample(context, now.noise).x0, context
+        return replan.state, self.prior.sample(context, replan.noise).x0, context
 
     @torch.no_grad()
     def predicted_ego(self, state: State, world: World) -> tuple[Tensor, Context]:
@@ -191,14 +184,12 @@ class NominalTraffic(Traffic):
         its row of the joint clean estimate, which is nearer to what egos drive than a
         sample; and the context of that."""
         action = torch.stack([world.accel[:, 0], world.turn_rate[:, 0]], -1)
-        seen = dynamics.rollout(
-            world.states[:, 0], action[:, None].expand(-1, HORIZON, -1)
-        )
-        lane = self.lane_now(state, world, ego_plan=seen)
+        actions = action[:, None].expand(-1, HORIZON, -1)
+        going_on = dynamics.rollout(world.states[:, 0], actions)
+        lane = self.lane_now(state, world, ego_plan=going_on)
         context = self.prior.encode(state.routed, lane, world)
-        return self.prior.decode(self.prior.estimate(context), context).states()[
-            :, 0
-        ], context
+        plans = self.prior.decode(self.prior.estimate(context), context)
+        return plans.states()[:, 0], context
 
     def noise(self, state: State) -> Tensor:
         """Returns standard normal noise [K, B, V, SIZE] of the next replan."""
@@ -208,7 +199,14 @@ class NominalTraffic(Traffic):
     def encode(
         self, state: State, world: World, ego_plan: Tensor, known: Context | None = None
     ) -> Context:
-        """Returns the prior's context of a replan; known: see `Prior.encode`."""
+        """Returns the prior's context of a replan.
+
+        Args:
+            state: of G scenes.
+            world: the scenes now.
+            ego_plan: [G, HORIZON, 4], the ego's expected states.
+            known: see `Prior.encode`.
+        """
         return self.prior.encode(
             state.routed, state.lane, world, ego_plan=ego_plan, known=known
         )
@@ -223,46 +221,56 @@ class NominalTraffic(Traffic):
         ego = torch.zeros_like(routed.parked)
         ego[:, 0] = True
         v = torch.where(ego, world.states[:, :1, 3], lane.v)
-        accel = torch.where(ego, world.accel[:, :1], lane.a)
-        turning = torch.where(ego, yaw_rate[:, None], lane.kappa * lane.v)
-        now = locate(
+        projected = locate(
             world.states[:, : ego.shape[1]],
-            accel,
-            yaw_rate=turning,
+            torch.where(ego, world.accel[:, :1], lane.a),
+            yaw_rate=torch.where(ego, yaw_rate[:, None], lane.kappa * lane.v),
             points=routed.points,
             hint=lane.s + ego * v / 2,
         )
-        projected = {name: torch.ones_like(ego) for name in ("s", "d", "d1")}
-        projected["d2"] = ego | ~routed.has_lane
-
-        def merged(name: str) -> Tensor:
-            return torch.where(
-                projected.get(name, ego), getattr(now, name), getattr(lane, name)
+        everybody = torch.ones_like(ego)
+        replaced = {"s": everybody, "d": everybody, "d1": everybody}
+        replaced["d2"] = ego | ~routed.has_lane
+        merged = {
+            field.name: torch.where(
+                replaced.get(field.name, ego),
+                getattr(projected, field.name),
+                getattr(lane, field.name),
             )
-
-        return LaneState(*(merged(field.name) for field in fields(LaneState)))
+            for field in fields(LaneState)
+        }
+        return LaneState(**merged)
 
 
 def onto(
     state: Own,
     world: World,
+    *,
     route: Tensor,
     moved: Tensor,
     off_lane: Tensor | None = None,
     paths: Tensor | None = None,
 ) -> Own:
-    """Returns states [B] with vehicles moved [B, V] on candidates route [B, V], or,
-    off_lane [B, V], on paths [B, V, P, 2], and with their poses there."""
-    lines = (
-        torch.zeros_like(moved) if off_lane is None else off_lane,
-        state.routed.points if paths is None else paths,
-    )
-    routed = reroute(state.routed, world.scene, route, moved, *lines)
-    old = state.lane
+    """Returns states with vehicles on other routes or paths, and with their poses
+    there.
+
+    Args:
+        state: of B scenes.
+        world: the scenes now.
+        route: [B, V] int64, candidates.
+        moved: [B, V] bool, who is moved.
+        off_lane: [B, V] bool, who is moved on a path instead (None: nobody).
+        paths: [B, V, P, 2] m.
+    """
+    if off_lane is None:
+        off_lane = torch.zeros_like(moved)
+    if paths is None:
+        paths = state.routed.points
+    routed = reroute(state.routed, world.scene, route, moved, off_lane, paths)
     lane = locate(
         world.states[:, : route.shape[1]],
-        old.a,
-        yaw_rate=old.kappa * old.v,
+        state.lane.a,
+        yaw_rate=state.lane.kappa * state.lane.v,
         points=routed.points,
     )
-    return replace(state, routed=routed, lane=select(moved, lane, other=old))
+    return replace(state, routed=routed, lane=select(moved, lane, other=state.lane))

@@ -36,11 +36,9 @@ MAX_EXCESS = 5.0  # m: excesses of offset and of distance off the road are cut t
 OFF_ROAD_MARGIN = 0.3  # m inside the border of the drivable area where its term begins
 LATERAL_BOUND = 1.0  # m of offset that cost nothing
 PAIR_MARGIN = 0.3  # m of gap that is wanted
-MIN_ACCEL, MAX_ACCEL, MAX_LATERAL_ACCEL = (
-    -3.5,
-    2.0,
-    4.0,
-)  # m/s^2: what is beyond them costs
+MIN_ACCEL = -3.5  # m/s^2: what is beyond these bounds costs
+MAX_ACCEL = 2.0  # m/s^2
+MAX_LATERAL_ACCEL = 4.0  # m/s^2
 MAX_JERK = 2.0  # m/s^3
 
 

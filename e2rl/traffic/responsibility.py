@@ -18,12 +18,10 @@ from e2rl.sim.world import World
 
 RESPONSIBILITIES = ("full", "rear", "none")
 NEAR = 4.0  # m ahead of the ego's centre from which on a vehicle leads it
-CROSSING = (
-    torch.pi / 6
-)  # rad between headings above which a vehicle crosses the ego's path
-SAME_DIRECTION = (
-    0.5  # cosine between the headings of vehicles that drive in the same direction
-)
+# rad between headings above which a vehicle crosses the ego's path.
+CROSSING = torch.pi / 6
+# Cosine between the headings of vehicles that drive in the same direction.
+SAME_DIRECTION = 0.5
 
 
 @configured("synthesizer/e2", "yielding")
@@ -40,9 +38,8 @@ def place_of(world: World, vehicles: int) -> tuple[Tensor, Tensor]:
     drive in its direction [B, V]."""
     states = world.states[:, :vehicles]
     ego = world.states[:, :1]
-    return to_frame(states[..., :2], ego), (
-        states[..., 2] - ego[..., 2]
-    ).cos() > SAME_DIRECTION
+    along = (states[..., 2] - ego[..., 2]).cos() > SAME_DIRECTION
+    return to_frame(states[..., :2], ego), along
 
 
 def followed(world: World, vehicles: int) -> Tensor:
@@ -77,9 +74,14 @@ def duty_of(
     lateness: Tensor | None = None,
     owes: Tensor | None = None,
 ) -> Duty:
-    """The Duty of a coalition [B, V] at intensities eta [B].
+    """Returns the Duty of a coalition.
 
     Args:
+        responsibility: one of RESPONSIBILITIES.
+        settings: how late they yield.
+        world: B scenes.
+        coalition: [B, V] bool.
+        eta: [B], intensities.
         lateness: [B] factor of the patience, and where it is above 1 of its bound
             (None: 1).
         owes: [B] bool, false: it owes the ego nothing (None: it does).

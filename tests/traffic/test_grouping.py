@@ -6,7 +6,8 @@ from tensordict import TensorDict
 from e2rl.prior.lane_relative import LaneState
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import (
-    ROWS,
+    FULL_ROWS,
+    MOST_ROWS,
     SHRUNK,
     clone,
     crop_state,
@@ -50,8 +51,8 @@ def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_tha
     for group in groups:
         here = [counts[row] for row in group.rows.tolist()]
         rows = group.vehicles * len(here)
-        assert group.vehicles == max(here) and group.others == 3 and rows <= ROWS[1]
-        assert min(here) > SHRUNK * group.vehicles or rows < 2 * ROWS[0]
+        assert group.vehicles == max(here) and group.others == 3 and rows <= MOST_ROWS
+        assert min(here) > SHRUNK * group.vehicles or rows < 2 * FULL_ROWS
 
 
 def test_what_changes_in_a_crop_arrives_where_it_belongs_and_nothing_else_changes():

@@ -92,8 +92,8 @@ class Selector:
         if self.reselect > 0:
             due = due | (state.replans % self.reselect == 0)
         anchor = self._anchor(state, world, ego_plan)
-        lost = due & state.attacked & ~anchor.feasible.any(1)
-        rows = lost.nonzero()[:, 0]
+        chosen_anew = due & state.attacked & ~anchor.feasible.any(1)
+        rows = chosen_anew.nonzero()[:, 0]
         if not len(rows):
             return state, anchor
         world = take_rows(world, rows)
@@ -294,13 +294,18 @@ class Selector:
 def on_paths(
     state: E2State, world: World, route: Tensor, off_lane: Tensor, paths: Tensor
 ) -> E2State:
-    """Returns states with vehicles on candidates route [B, V], or, where off_lane
-    [B, V], on paths [B, V, P, 2], and with their poses there.
+    """Returns states with vehicles on routes or interceptions, and with their poses
+    there. A vehicle that was off its lane and no longer is returns to its route.
 
-    A vehicle that was off its lane and no longer is returns to its route.
+    Args:
+        state: of B scenes.
+        world: the scenes now.
+        route: [B, V] int64, candidates.
+        off_lane: [B, V] bool, who is on a path instead.
+        paths: [B, V, P, 2] m.
     """
     moved = (route != state.routed.route) | off_lane | state.off_lane
     if not bool(moved.any()):
         return state
-    state = onto(state, world, route, moved=moved, off_lane=off_lane, paths=paths)
+    state = onto(state, world, route=route, moved=moved, off_lane=off_lane, paths=paths)
     return replace(state, off_lane=off_lane)

@@ -46,12 +46,28 @@ class Guidance(Protocol):
     def blend(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
     ) -> Tensor:
-        """Returns x [B, V, SIZE] of step k after anchoring."""
+        """Returns x after anchoring; arguments of `SparseControl`.
+
+        Args:
+            x: [B, V, SIZE], of step k.
+            level: noise level of the step.
+            k: steps left, this one included.
+            context: of the replan.
+            denoise: the prior's clean estimate of x at this level.
+        """
 
     def estimate(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
     ) -> tuple[Tensor, Tensor]:
-        """Returns the clean estimate x0 and the guided one, [B, V, SIZE] each."""
+        """Returns the clean estimate x0 and the guided one, [B, V, SIZE] each.
+
+        Args:
+            x: [B, V, SIZE], of step k.
+            level: noise level of the step.
+            k: steps left, this one included.
+            context: of the replan.
+            denoise: the prior's clean estimate of x at this level.
+        """
 
 
 @dataclass

@@ -154,7 +154,14 @@ class E2(NominalTraffic):
     def replan(
         self, state: E2State, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[E2State, TrafficPlan]:
-        """Returns states and plans of the coming HORIZON steps."""
+        """Returns states and plans of the coming HORIZON steps.
+
+        Args:
+            state: of B scenes.
+            world: the scenes now.
+            ego_plan: [B, >= HORIZON, 4], what the ego announces.
+            react: not asked.
+        """
         state, plan = super().replan(state, world, ego_plan=ego_plan, react=react)
         plan = replace(
             plan,

@@ -23,14 +23,16 @@ from e2rl.traffic.motion import (
 EGO_ACCELERATION = 2.0  # m/s^2 that the ego is expected to use at most
 SAMPLE_SPACING = 3.0  # m between the points of two routes that are compared
 SAMPLE_REACH = 120.0  # m of route ahead that is sampled
-SEPARATION_COST = 10.0  # s of time gap that 1 m between the routes weighs: they meet where they touch, if they touch
+# s of time gap that 1 m between the routes weighs: they meet where they touch, if they
+# touch.
+SEPARATION_COST = 10.0
 LATERAL_BOUND = 2.0  # m from a lane's centreline that still counts as on the lane
 HEADING_BOUND = 0.8  # rad, the same for the heading
 MOVING_SPEED = 0.5  # m/s above which a vehicle counts as moving
-BLOCKING_DISTANCE = 15.0  # m ahead of the ego, bumper to bumper, within which a standing vehicle blocks it
-BLOCKING_MARGIN = (
-    0.3  # m beside the ego's own width in which a standing vehicle still blocks it
-)
+# m ahead of the ego, bumper to bumper, within which a standing vehicle blocks it.
+BLOCKING_DISTANCE = 15.0
+# m beside the ego's own width in which a standing vehicle still blocks it.
+BLOCKING_MARGIN = 0.3
 
 
 @configured("synthesizer/e2", "feasibility")
@@ -39,9 +41,8 @@ class FeasibilitySettings:
     """Thresholds of the three criteria; conf/synthesizer/e2.yaml explains each."""
 
     horizon: float = setting(low=0.1)
-    corridor: float = setting(
-        low=0.8 * SAMPLE_SPACING
-    )  # in a narrower one a crossing could fall between the samples
+    # In a narrower one a crossing could fall between the samples.
+    corridor: float = setting(low=0.8 * SAMPLE_SPACING)
 
 
 @dataclass(frozen=True)
@@ -119,38 +120,46 @@ def _sample(
     )
 
 
-def _conflict_samples(
-    own: _Samples, ego: _Samples, settings: FeasibilitySettings
-) -> tuple[Tensor, ...]:
-    """Index on both, earliest, latest and time gap of the samples at which each
-    candidate [Q] meets the mission: of those within the corridor that both vehicles can
-    occupy at once, that of least time gap (inf for none)."""
-    squared = torch.cdist(
-        own.xy, ego.xy, compute_mode="use_mm_for_euclid_dist"
-    ).square()
+class _Meeting(NamedTuple):
+    """The samples at which each candidate [Q] meets the mission: index on both,
+    earliest, latest and time gap [s], inf for none."""
+
+    own: Tensor
+    ego: Tensor
+    earliest: Tensor
+    latest: Tensor
+    time_gap: Tensor
+
+
+def _meeting(own: _Samples, ego: _Samples, settings: FeasibilitySettings) -> _Meeting:
+    """Of the samples within the corridor that both vehicles can occupy at once, that of
+    least time gap."""
+    squared = torch.cdist(own.xy, ego.xy, compute_mode="use_mm_for_euclid_dist")
+    squared = squared.square()
     earliest = torch.maximum(own.earliest[:, :, None], ego.earliest[:, None])
-    latest = torch.minimum(own.latest[:, :, None], ego.latest[:, None]).clamp(
-        max=settings.horizon
-    )
+    latest = torch.minimum(own.latest[:, :, None], ego.latest[:, None])
+    latest = latest.clamp(max=settings.horizon)
     time_gap = (own.nominal[:, :, None] - ego.nominal[:, None]).abs()
     meets = (squared < settings.corridor**2) & (earliest <= latest)
     meets &= own.on_route[:, :, None] & ego.on_route[:, None]
-    order = (
-        torch.arange(time_gap.shape[1], device=time_gap.device)[:, None] * 1e-3
-    )  # the first of equals
+    number = torch.arange(time_gap.shape[1], device=time_gap.device)[:, None]
+    order = number * 1e-3  # the first of equals
     separation = (squared.sqrt() - SAMPLE_SPACING).clamp(min=0)
-    cost = (
-        (time_gap + order + SEPARATION_COST * separation)
-        .masked_fill(~meets, torch.inf)
-        .flatten(1)
-    )
+    cost = time_gap + order + SEPARATION_COST * separation
+    cost = cost.masked_fill(~meets, torch.inf).flatten(1)
     pick = cost.argmin(-1, keepdim=True)
     count = ego.xy.shape[1]
-    values = (earliest, latest, time_gap.masked_fill(~meets, torch.inf))
-    return (
-        pick[:, 0] // count,
-        pick[:, 0] % count,
-        *(value.flatten(1).gather(1, pick)[:, 0] for value in values),
+    time_gap = time_gap.masked_fill(~meets, torch.inf)
+    earliest, latest, time_gap = (
+        value.flatten(1).gather(1, pick)[:, 0] for value in (earliest, latest, time_gap)
+    )
+    index = pick[:, 0]
+    return _Meeting(
+        index // count,
+        index % count,
+        earliest=earliest,
+        latest=latest,
+        time_gap=time_gap,
     )
 
 
@@ -174,52 +183,61 @@ def _to_intersection(
 def find_conflicts(
     scene: TensorDictBase, world: World, own_s: Tensor, settings: FeasibilitySettings
 ) -> Conflicts:
-    """Returns the conflict points of scenes [B]; own_s [B, V, R]: arc length of
-    vehicles on their candidates."""
+    """Returns the conflict points of scenes with the ego's mission.
+
+    Args:
+        scene: B scenes.
+        world: the scenes now.
+        own_s: [B, V, R] m, arc length of vehicles on their candidates.
+        settings: thresholds.
+    """
     vehicles = own_s.shape[1]
     states = world.states[:, :vehicles]
     length = scene["size"][..., 0]
     mission = mission_of(scene)
-    asked = scene["route_valid"] & world.valid[:, :vehicles, None]
-    asked[:, 0] = False
-    at = b, v, r = asked.nonzero(as_tuple=True)  # padding would be most of the work
-    ego_s = project(states[:, :1, :2], mission.points)[0][:, 0]
+    candidates = scene["route_valid"] & world.valid[:, :vehicles, None]
+    candidates[:, 0] = False
+    place = candidates.nonzero(as_tuple=True)  # padding would be most of the work
+    b, v, _ = place
     ego = _sample(
         mission.points,
-        ego_s,
+        project(states[:, :1, :2], mission.points)[0][:, 0],
         end=mission.end,
         speed=states[:, 0, 3],
         length=length[:, 0],
         acceleration=EGO_ACCELERATION,
     )
     ego = _Samples(*(value[b] for value in ego))
-    route = scene["route_points"][at]
-    end = scene["route_length"][at]
     own = _sample(
-        route,
-        own_s[at],
-        end=end,
+        scene["route_points"][place],
+        own_s[place],
+        end=scene["route_length"][place],
         speed=states[b, v, 3],
         length=length[b, v],
         acceleration=MAX_ACCELERATION,
     )
-    i, j, earliest, latest, time_gap = _conflict_samples(own, ego, settings=settings)
+    meeting = _meeting(own, ego, settings=settings)
     row = torch.arange(len(b), device=b.device)
-    mine = (row, i)
-    its = (row, j)
-    conflict_s = own.s[mine] + _to_intersection(
-        own.xy[mine], own.heading[mine], ego=ego.xy[its], ego_heading=ego.heading[its]
+    on_own = (row, meeting.own)
+    on_ego = (row, meeting.ego)
+    conflict_s = own.s[on_own] + _to_intersection(
+        own.xy[on_own],
+        own.heading[on_own],
+        ego=ego.xy[on_ego],
+        ego_heading=ego.heading[on_ego],
     )
-    found = time_gap.isfinite()
+    exists = meeting.time_gap.isfinite()
 
     def table(value: Tensor) -> Tensor:
-        return torch.zeros_like(own_s).index_put(
-            at, torch.where(found, value, 0.0).to(own_s.dtype)
-        )
+        value = torch.where(exists, value, 0.0).to(own_s.dtype)
+        return torch.zeros_like(own_s).index_put(place, value)
 
-    exists = torch.zeros_like(asked).index_put(at, found)
     return Conflicts(
-        exists, *(table(value) for value in (conflict_s, earliest, latest, time_gap))
+        exists=torch.zeros_like(candidates).index_put(place, exists),
+        s=table(conflict_s),
+        earliest=table(meeting.earliest),
+        latest=table(meeting.latest),
+        time_gap=table(meeting.time_gap),
     )
 
 

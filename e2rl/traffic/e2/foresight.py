@@ -120,15 +120,15 @@ def _contacts(
     path [G, T + 1, 4]; length [G] m of the ego; along: the plans on it, [T + 1, G, O]
     each; since [G] s.
     """
-    plans = along.rear.shape[1:]
+    pairs = along.rear.shape[1:]
     steps = path.shape[1] - 1
     population = Population(path.new_tensor(DELAYS), path.new_tensor(BRAKING))
     pace = path[..., 3].abs()
-    planned = (pace.diff(dim=1) / DT).T[..., None].expand(steps, *plans).flatten(1)
+    planned = (pace.diff(dim=1) / DT).T[..., None].expand(steps, *pairs).flatten(1)
     length, speed, since = (
-        value[:, None].expand(plans).flatten() for value in (length, pace[:, 0], since)
+        value[:, None].expand(pairs).flatten() for value in (length, pace[:, 0], since)
     )
-    zero = path.new_zeros(len(DELAYS), plans.numel())
+    zero = path.new_zeros(len(DELAYS), pairs.numel())
     encounter = Encounter(
         speed=speed.expand_as(zero),
         travelled=zero,
@@ -148,9 +148,9 @@ def _contacts(
         encounter = meet(
             population, moments, length, planned[step:last], encounter, ahead
         )
-    hit = encounter.hit.unflatten(1, plans) > 0
-    front = encounter.front.unflatten(1, plans) > 0
-    return torch.cat([hit[:1], front[1:]]), encounter.time[-1].view(plans)
+    hit = encounter.hit.unflatten(1, pairs) > 0
+    front = encounter.front.unflatten(1, pairs) > 0
+    return torch.cat([hit[:1], front[1:]]), encounter.time[-1].view(pairs)
 
 
 @fused("D", f"{STEPS}", "C", f"{STEPS} C", "D C", f"{STEPS + 1} C")
@@ -197,10 +197,10 @@ def meet(
             length=length,
             other_length=ahead.length[step].expand_as(gap),
         )
-        memory, asked = drivers.step(memory, observation)
-        reacts = reacts | (asked < REACTION)
+        memory, wanted = drivers.step(memory, observation)
+        reacts = reacts | (wanted < REACTION)
         accel = planned[step].expand_as(speed)
-        accel = torch.where(reacts, torch.minimum(asked, accel), accel)
+        accel = torch.where(reacts, torch.minimum(wanted, accel), accel)
         after = (speed + DT * accel).clamp(min=0)
         travelled = travelled + (speed + after) / 2 * DT
         speed = after
@@ -237,6 +237,6 @@ def time_before(world: World, ego_plan: Tensor, since: Tensor) -> Tensor:
     needed = torch.maximum(
         closing * driver.time_to_collision, driver.stopping_gap(closing)
     )
-    begun = torch.where(gap <= needed, 0.0, -1.0)
-    later = torch.where(since >= 0, since + REPLAN_STEPS * DT, begun)
+    first = torch.where(gap <= needed, 0.0, -1.0)
+    later = torch.where(since >= 0, since + REPLAN_STEPS * DT, first)
     return torch.where(in_front, later, -1.0)

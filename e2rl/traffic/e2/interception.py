@@ -396,13 +396,13 @@ def _worth(
     states = take(world.states, index)[place]
     some = _Paths(*(value[place] for value in paths))
     tracks = _tracks(some, states[:, None, 3], accel=drive.accel[place])
-    now = states[:, None, None].expand(*tracks.shape[:2], 1, 4)
+    start = states[:, None, None].expand(*tracks.shape[:2], 1, 4)
     path = torch.cat([world.states[:, :1], ego_plan], 1)[row]
     never = torch.full_like(path[:, 0, 3], -1.0)
     foresight = foresee(
         path,
         world.scene["size"][row, 0],
-        tracks=torch.cat([now, tracks], 2),
+        tracks=torch.cat([start, tracks], 2),
         sizes=take(world.scene["size"], index)[place],
         since=never,
         settled=never > 0,
@@ -482,16 +482,23 @@ def interception_nats(
 def lateral_nats(
     states: Tensor, lane: LaneState, points: Tensor, path: Tensor, knots: Tensor
 ) -> Tensor:
-    """`interception_nats` [Q] of vehicles that leave lanes points [Q, P, 2] for a path
-    [Q, P, 2]."""
-    now = lane_relative.locate(
+    """Returns `interception_nats` [Q], compiled.
+
+    Args:
+        states: [Q, 4], of vehicles that leave their lanes.
+        lane: lane states [Q], on whatever they follow.
+        points: [Q, P, 2] m, of the lanes.
+        path: [Q, P, 2] m.
+        knots: [Q, KNOTS] m/s^2.
+    """
+    present = lane_relative.locate(
         states, lane.a, yaw_rate=lane.kappa * lane.v, points=points
     )
-    speed, travelled = lane_relative.speeds(now, knots)
+    speed, travelled = lane_relative.speeds(present, knots)
     start = project(states[:, None, :2], path)[0]
     xy, heading, _ = interpolate(path, start + travelled)
-    s, d, _ = project(xy, points, hint=now.s[..., None] + travelled)
+    s, d, _ = project(xy, points, hint=present.s[..., None] + travelled)
     track = torch.cat([xy, heading[..., None], speed[..., None]], -1)
-    x = lane_relative.fit(LaneState.from_states(track, s, d=d), None, state=now)[0]
+    x = lane_relative.fit(LaneState.from_states(track, s, d=d), None, state=present)[0]
     variance = torch.tensor(SPREAD[KNOTS:], device=x.device).square()
     return (x[..., KNOTS:].square() / (2 * variance)).sum(-1)

@@ -153,12 +153,12 @@ class KernelAttack:
         attack = self if index is None else self._some(index)
         size = attack.world.scene["size"]
         states = attack.world.states
-        now = states[attack.row, attack.vehicle, None, None]
+        start = states[attack.row, attack.vehicle, None, None]
         path = torch.cat([states[:, :1], attack.ego_plan[:, :HORIZON]], 1)
         return foresee(
             path[attack.row],
             size[attack.row, 0],
-            tracks=torch.cat([now.expand(*tracks.shape[:2], 1, 4), tracks], 2),
+            tracks=torch.cat([start.expand(*tracks.shape[:2], 1, 4), tracks], 2),
             sizes=size[attack.row, attack.vehicle],
             since=attack.since,
             settled=attack.settled,
@@ -194,8 +194,8 @@ class KernelAttack:
         """Bool [G, O]: points [G, O, T, 2] are farther off the road than now."""
         field = self.world.scene["field"]
         origin = self.world.scene["field_origin"]
-        now = self.world.states[self.row, self.vehicle, None, :2]
-        allowed = off_road(now, field, origin, self.row).clamp(min=-SHOULDER)
+        present = self.world.states[self.row, self.vehicle, None, :2]
+        allowed = off_road(present, field, origin, self.row).clamp(min=-SHOULDER)
         beyond = off_road(points.flatten(1, 2), field, origin, self.row)
         return beyond.view(points.shape[:-1]).amax(-1) > allowed
 

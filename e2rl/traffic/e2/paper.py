@@ -130,7 +130,15 @@ class MaskedGuidance:
     def blend(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
     ) -> Tensor:
-        """Returns x [B, V, SIZE] of step k, after eq. 14 where that is due."""
+        """Returns x after eq. 14, where that is due.
+
+        Args:
+            x: [B, V, SIZE], of step k.
+            level: noise level of the step.
+            k: steps left, this one included.
+            context: of the replan.
+            denoise: the prior's clean estimate of x at this level.
+        """
         if self.anchor is None or k != self.anchor_step:
             return x
         with torch.no_grad():
@@ -140,7 +148,16 @@ class MaskedGuidance:
     def estimate(
         self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
     ) -> tuple[Tensor, Tensor]:
-        """Returns the clean estimate x0 and the guided one, [B, V, SIZE] each."""
+        """Returns the clean estimate x0 and the one guided by eq. 16, [B, V, SIZE]
+        each.
+
+        Args:
+            x: [B, V, SIZE], of step k.
+            level: noise level of the step.
+            k: steps left, this one included.
+            context: of the replan.
+            denoise: the prior's clean estimate of x at this level.
+        """
         settings = self.settings
         with_feasibility = 1 < k <= self.feasibility_step
         x0, adversarial, feasibility = self._gradients(

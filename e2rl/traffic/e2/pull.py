@@ -91,7 +91,15 @@ class Pull:
 def pull_to(
     x0: Tensor, goal: Tensor, vehicles: Tensor, strength: Tensor, level: Tensor
 ) -> Tensor:
-    """`Pull` of x0 at a noise level, compiled."""
+    """Returns x0 after a `Pull`, compiled.
+
+    Args:
+        x0: [B, V, SIZE].
+        goal: [B, V, SIZE], NaN where nothing is pulled.
+        vehicles: [B, V] bool.
+        strength: [B].
+        level: noise level.
+    """
     goal = torch.where(goal.isnan(), x0, goal)
     schedule = NoiseSchedule()
     moved = pulled(

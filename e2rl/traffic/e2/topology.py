@@ -9,19 +9,23 @@ clique never weighs less than the whole, so ranking all cliques would leave pair
 
 from dataclasses import dataclass
 from math import fsum
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from e2rl.run.settings import configured, setting
-from e2rl.traffic.cliques import cliques_in, weight_of
+from e2rl.traffic.cliques import Clique, cliques_in, weight_of
 from e2rl.traffic.motion import smallest
 
 STRIDE = 5  # steps between the graphs (0.5 s)
 RISK_SECONDS = 8.0  # s; no contact within it at constant velocity is no risk
-NODES = 24  # vehicles nearest to the ego that a graph may have: enumeration is exponential at worst
-HOPS = 2  # edges from the ego within which a clique must have a member (or the ego): a far queue is no candidate
+# Vehicles nearest to the ego that a graph may have: enumeration is exponential at worst.
+NODES = 24
+# Edges from the ego within which a clique must have a member (or the ego): a far queue is
+# no candidate.
+HOPS = 2
 
 
 @configured("synthesizer/e2", "topology")
@@ -50,7 +54,7 @@ class TopologyResult:
     candidates: Tensor
     weights: Tensor
     steps: Tensor
-    cliques: list[list[list[tuple[int, ...]]]]
+    cliques: list[list[list[Clique]]]
 
 
 def _overlap_interval(
@@ -79,13 +83,9 @@ def time_to_collision(
     """
     cos = states[..., 2].cos()
     sin = states[..., 2].sin()
-    moving = (
-        states[..., 0],
-        states[..., 1],
-        cos * states[..., 3],
-        sin * states[..., 3],
-    )
-    dx, dy, dvx, dvy = (value[..., None, :] - value[..., :, None] for value in moving)
+    speed = states[..., 3]
+    motion = (states[..., 0], states[..., 1], cos * speed, sin * speed)
+    dx, dy, dvx, dvy = (value[..., None, :] - value[..., :, None] for value in motion)
     ci = cos[..., :, None]
     si = sin[..., :, None]
     cj = cos[..., None, :]
@@ -93,10 +93,8 @@ def time_to_collision(
     turn_cos = (ci * cj + si * sj).abs()
     turn_sin = (ci * sj - si * cj).abs()
     half = size / 2
-    (li, wi), (lj, wj) = (
-        half[..., :, None, :].unbind(-1),
-        half[..., None, :, :].unbind(-1),
-    )
+    li, wi = half[..., :, None, :].unbind(-1)
+    lj, wj = half[..., None, :, :].unbind(-1)
     along = _overlap_interval(
         ci * dx + si * dy,
         ci * dvx + si * dvy,
@@ -107,29 +105,31 @@ def time_to_collision(
         ci * dvy - si * dvx,
         extent=wi + turn_sin * lj + turn_cos * wj,
     )
-    begin, end = (
-        torch.maximum(along[0], across[0]),
-        torch.minimum(along[1], across[1]),
-    )  # on the normals of box i
+    begin = torch.maximum(along[0], across[0])  # on the normals of box i
+    end = torch.minimum(along[1], across[1])
     begin = torch.maximum(begin, begin.transpose(-1, -2))
     end = torch.minimum(end, end.transpose(-1, -2))
     first = begin.clamp(min=0)
-    return torch.where(
-        (begin <= end) & (end >= 0) & (first <= horizon), first, torch.inf
-    )
+    touch = (begin <= end) & (end >= 0) & (first <= horizon)
+    return torch.where(touch, first, torch.inf)
 
 
 def pair_weights(
     states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings
 ) -> Tensor:
-    """Risk weights [..., N, N] of eq. (ttc_weight_t), 0 on the diagonal: states [...,
-    N, 4], valid [..., N] bool."""
+    """Returns risk weights [..., N, N] of eq. (ttc_weight_t), 0 on the diagonal.
+
+    Args:
+        states: [..., N, 4].
+        valid: [..., N] bool.
+        size: [..., N, 2] m.
+        settings: of the analysis.
+    """
     ttc = time_to_collision(states, size + settings.clearance)
     weight = torch.sigmoid((settings.tau_max - ttc) / settings.beta)
     both = valid[..., :, None] & valid[..., None, :]
-    return weight * (
-        both & ~torch.eye(both.shape[-1], dtype=torch.bool, device=both.device)
-    )
+    itself = torch.eye(both.shape[-1], dtype=torch.bool, device=both.device)
+    return weight * (both & ~itself)
 
 
 def _within_hops(adjacency: Tensor, hops: int) -> Tensor:
@@ -141,55 +141,55 @@ def _within_hops(adjacency: Tensor, hops: int) -> Tensor:
     return near
 
 
-def _trim(
-    clique: tuple[int, ...], weight: np.ndarray, distance: np.ndarray, limit: int
-) -> tuple[int, ...]:
+class _Graph(NamedTuple):
+    """The risk graph of one step: adjacency and weights [V, V]; relevant nodes [V] bool;
+    distance [V] of each vehicle to the ego in m."""
+
+    adjacency: np.ndarray
+    relevant: np.ndarray
+    weight: np.ndarray
+    distance: np.ndarray
+
+
+def _trim(clique: Clique, graph: _Graph, limit: int) -> Clique:
     """The `limit` members of a clique with the largest total weight inside it; the ego
     always stays."""
     if len(clique) <= limit:
         return clique
+    weight = graph.weight
     total = {i: round(fsum(weight[i, j] for j in clique), 6) for i in clique}
-    return tuple(
-        sorted(
-            sorted(clique, key=lambda i: (i != 0, -total[i], distance[i], i))[:limit]
-        )
-    )
+    ranked = sorted(clique, key=lambda i: (i != 0, -total[i], graph.distance[i], i))
+    return tuple(sorted(ranked[:limit]))
 
 
-def _top_cliques(
-    graph: tuple[np.ndarray, ...], settings: TopologySettings
-) -> list[tuple[int, ...]]:
+def _top_cliques(graph: _Graph, settings: TopologySettings) -> list[Clique]:
     """The cliques of largest mean weight in a graph that have a relevant node; ties by
-    distance, then index.
+    distance, then index."""
 
-    graph: adjacency [V, V], relevant nodes [V] bool, weights [V, V], distance [V] of
-    each vehicle to the ego in m.
-    """
-    adjacency, relevant, weight, distance = graph
-
-    def rank(clique: tuple[int, ...]) -> tuple[float, float, tuple[int, ...]]:
+    def rank(clique: Clique) -> tuple[float, float, Clique]:
         size = len(clique)
-        mean = weight_of(clique, weight) / (size * (size - 1) / 2)
-        return -round(mean, 6), fsum(distance[i] for i in clique) / size, clique
+        mean = weight_of(clique, graph.weight) / (size * (size - 1) / 2)
+        distance = fsum(graph.distance[i] for i in clique) / size
+        return -round(mean, 6), distance, clique
 
-    trimmed = {
-        _trim(clique, weight, distance=distance, limit=settings.max_clique)
-        for clique in cliques_in(adjacency)
-    }
-    return sorted(
-        (clique for clique in trimmed if relevant[list(clique)].any()), key=rank
-    )[: settings.top_cliques]
+    cliques = cliques_in(graph.adjacency)
+    trimmed = {_trim(clique, graph, limit=settings.max_clique) for clique in cliques}
+    relevant = (clique for clique in trimmed if graph.relevant[list(clique)].any())
+    return sorted(relevant, key=rank)[: settings.top_cliques]
 
 
 def topological_candidates(
     states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings
 ) -> TopologyResult:
-    """Candidates S_top of a reference rollout (Sec. IV-A1, eqs. ttc_weight and
-    temporal_scoring).
+    """Returns the candidates S_top of a reference rollout (Sec. IV-A1, eqs. ttc_weight
+    and temporal_scoring). Every STRIDE-th step is analysed and counts once.
 
-    states [B, T, V, 4], valid [B, T, V] bool, size [B, V, 2] m; row 0 is the ego, which
-    is a node of the graphs but never a candidate. Every STRIDE-th step is analysed and
-    counts once.
+    Args:
+        states: [B, T, V, 4]; row 0 is the ego, which is a node of the graphs but never
+            a candidate.
+        valid: [B, T, V] bool.
+        size: [B, V, 2] m.
+        settings: of the analysis.
     """
     steps = torch.arange(0, states.shape[1], STRIDE, device=states.device)
     states = states[:, steps].detach()
@@ -211,15 +211,15 @@ def topological_candidates(
     relevant = _within_hops(adjacency, HOPS)
     nodes = _within_hops(adjacency, HOPS + 1)
     adjacency = adjacency & nodes[..., :, None] & nodes[..., None, :]
-    host = [
-        x.cpu().numpy()
-        for x in (adjacency.to(torch.uint8), relevant, weights, distance)
+    arrays = [
+        value.cpu().numpy()
+        for value in (adjacency.to(torch.uint8), relevant, weights, distance)
+    ]
+    cliques = [
+        [_top_cliques(_Graph(*step), settings) for step in zip(*scene, strict=True)]
+        for scene in zip(*arrays, strict=True)
     ]
     score = torch.zeros(states.shape[0], states.shape[2])
-    cliques = [
-        [_top_cliques(graph, settings) for graph in zip(*scene, strict=True)]
-        for scene in zip(*host, strict=True)
-    ]
     for row, scene in zip(score, cliques, strict=True):
         for clique in (clique for step in scene for clique in step):
             row[list(clique)] += 1

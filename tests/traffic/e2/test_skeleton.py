@@ -193,9 +193,12 @@ def test_influence_is_that_of_the_equations_of_motion(seed):
     settings = SkeletonSettings(tau_long=12.0)
     times = STEP * torch.arange(1, 11)
     expected = constant_speed_states(world.scene, world, times=times)
-    slots = torch.arange(1, 8)[None], torch.ones(1, 7, dtype=torch.bool)
     found = influence(
-        world.scene, world, slots=slots, expected=expected, settings=settings
+        world,
+        index=torch.arange(1, 8)[None],
+        present=torch.ones(1, 7, dtype=torch.bool),
+        expected=expected,
+        settings=settings,
     )[0]
     states = world.states[0]
     wanted = torch.zeros_like(found)
@@ -235,11 +238,10 @@ def test_a_chain_is_a_shortest_one_whose_effects_never_precede_their_causes(seed
     expected = constant_speed_states(
         world.scene, world, times=STEP * torch.arange(1, 11)
     )
-    slots = torch.arange(1, 8)[None], torch.ones(1, 7, dtype=torch.bool)
     link = influence(
-        world.scene,
         world,
-        slots=slots,
+        index=torch.arange(1, 8)[None],
+        present=torch.ones(1, 7, dtype=torch.bool),
         expected=expected,
         settings=SkeletonSettings(**settings),
     )[0]
