@@ -15,10 +15,9 @@ from torch import Tensor
 from e2rl.run.config import library
 from e2rl.run.errors import InputError
 
-MAX_FIELDS, MAX_REST = (
-    200_000,
-    1 << 22,
-)  # fields, and bytes beside tensors: libraries need a hundred times as much
+MAX_FIELDS = 200_000  # for which libraries need a hundred times the memory
+MAX_REST = 1 << 22  # bytes beside tensors
+NO_ONNX = "its bytes are no ONNX"
 MAX_MEMORY = 1 << 30  # bytes of all tensors while it runs
 PARTS = {
     "model": {7: "graph"},
@@ -35,7 +34,10 @@ REFUSED = {
     ("attribute", 23): "sparse tensors",
     ("tensor", 13): "data in another file (export with external_data=False)",
 }
-VARINT, EIGHT, LENGTH, FOUR = 0, 1, 2, 5  # how a field is written
+VARINT = 0  # ways in which a field is written
+EIGHT = 1
+LENGTH = 2
+FOUR = 5
 
 
 class OnnxPolicy:
@@ -58,7 +60,8 @@ class OnnxPolicy:
         onnxruntime = library("onnxruntime", self.where, extra="onnx")
         bound_memory()
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
         options.log_severity_level = 4  # what fails is raised
         options.add_session_config_entry("session.use_env_allocators", "1")
         try:
@@ -96,47 +99,48 @@ def check_arithmetic(content: memoryview) -> None:
     one of REFUSED."""
     fields = 0
     rest = 0
-    waiting = [("model", content)]
-    while waiting:
-        kind, message = waiting.pop()
-        at = 0
-        while at < len(message):
-            tag, at = _varint(message, at)
+    messages = [("model", content)]
+    while messages:
+        kind, message = messages.pop()
+        position = 0
+        while position < len(message):
+            tag, position = _varint(message, position)
             number = tag >> 3
-            written = tag & 7
-            length, start = _length(message, at, written=written)
-            at = start + length
-            if tag >= 1 << 14 or not number or at > len(message):
-                raise ValueError("its bytes are no ONNX")
+            wire = tag & 7
+            length, start = _length(message, position, wire=wire)
+            position = start + length
+            if tag >= 1 << 14 or not number or position > len(message):
+                raise ValueError(NO_ONNX)
             if (kind, number) in REFUSED:
                 raise ValueError(f"it has {REFUSED[kind, number]}")
             fields += 1
-            if written == LENGTH and number in PARTS.get(kind, {}):
-                waiting.append((PARTS[kind][number], message[start:at]))
+            if wire == LENGTH and number in PARTS.get(kind, {}):
+                messages.append((PARTS[kind][number], message[start:position]))
             elif kind != "tensor":
                 rest += length
             if fields > MAX_FIELDS or rest > MAX_REST:
                 raise ValueError(
-                    f"it has more than {MAX_FIELDS} parts, or {MAX_REST} bytes beside its tensors"
+                    f"it has more than {MAX_FIELDS} parts, or {MAX_REST} bytes beside "
+                    "its tensors"
                 )
 
 
-def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """The number that begins at a place, and where it ends."""
+def _varint(message: memoryview, position: int) -> tuple[int, int]:
+    """The number that begins at a position, and where it ends."""
     value = 0
-    for place, byte in enumerate(message[at : at + 10]):
+    for place, byte in enumerate(message[position : position + 10]):
         value |= (byte & 127) << 7 * place
         if byte < 128:
-            return value, at + place + 1
-    raise ValueError("its bytes are no ONNX")
+            return value, position + place + 1
+    raise ValueError(NO_ONNX)
 
 
-def _length(message: memoryview, at: int, written: int) -> tuple[int, int]:
+def _length(message: memoryview, position: int, wire: int) -> tuple[int, int]:
     """The bytes of a field's content, and where they begin."""
-    if written == VARINT:
-        return 0, _varint(message, at)[1]
-    if written == LENGTH:
-        return _varint(message, at)
-    if written in (FOUR, EIGHT):
-        return 4 if written == FOUR else 8, at
-    raise ValueError("its bytes are no ONNX")
+    if wire == VARINT:
+        return 0, _varint(message, position)[1]
+    if wire == LENGTH:
+        return _varint(message, position)
+    if wire in (FOUR, EIGHT):
+        return 4 if wire == FOUR else 8, position
+    raise ValueError(NO_ONNX)

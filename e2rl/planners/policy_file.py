@@ -30,7 +30,11 @@ from e2rl.sim.observation import OBSERVATION_SIZE
 
 ONNX = ".onnx"
 TORCHSCRIPT = ".pt"
-MAPS = f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] for every B (docs/observation.md)"
+MAPS = (
+    f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] for every B "
+    "(docs/observation.md)"
+)
+Policy = Callable[[Tensor], Any]
 PROBED = (1, 3)  # batches that a file is tried with
 MAX_FILE = 1 << 26  # bytes: 16 million weights
 SECONDS = 20.0  # to open and try a file
@@ -68,55 +72,49 @@ class PolicyFileEgo(ObservingEgo):
 def within_time(work: Callable[[], Any], where: str) -> Any:
     """What work() returns or raises; raises InputError where it goes on for longer than
     SECONDS."""
-    ended: Future = Future()
+    result: Future = Future()
 
     def run() -> None:
         try:
-            ended.set_result(work())
+            result.set_result(work())
         except BaseException as error:
-            ended.set_exception(error)
+            result.set_exception(error)
 
     Thread(target=run, daemon=True).start()  # what does not end is left behind
-    if wait([ended], SECONDS).not_done:
+    if wait([result], SECONDS).not_done:
         raise InputError(
             f"{where}: opening it takes longer than {SECONDS} s; give a smaller policy"
         )
-    return ended.result()
+    return result.result()
 
 
-def probe(policy: Callable[[Tensor], Any], where: str, count: int) -> None:
+def probe(policy: Policy, where: str, count: int) -> None:
     """Raises InputError where a policy does not map observations of a batch of `count`
     to actions."""
     try:
         action = policy(torch.zeros(count, OBSERVATION_SIZE))
-        fits = (
-            isinstance(action, Tensor)
-            and action.is_floating_point()
-            and action.shape == (count, 2)
-        )
-        found = (
-            f"maps them to {action.dtype} {list(action.shape)}"
-            if isinstance(action, Tensor)
-            else type(action)
-        )
+        if not isinstance(action, Tensor):
+            raise TypeError(f"returns {type(action)}")
+        if not action.is_floating_point() or action.shape != (count, 2):
+            raise TypeError(f"maps them to {action.dtype} {list(action.shape)}")
     except Exception as error:  # the file's own
-        fits = False
-        found = " ".join(str(error).split())[-300:]
-    if not fits:
+        reason = " ".join(str(error).split())[-300:]
         raise InputError(
-            f"{where}: fails at observations [{count}, {OBSERVATION_SIZE}]: {found}; {MAPS}"
-        )
+            f"{where}: fails at observations [{count}, {OBSERVATION_SIZE}]: {reason}; "
+            f"{MAPS}"
+        ) from error
 
 
-def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
+def open_policy(file: Path, where: str) -> Policy:
     """The function of a policy's file, told by the file's suffix and tried."""
-    kinds: dict[str, Callable[[bytes, str], Callable[[Tensor], Any]]] = {
+    kinds: dict[str, Callable[[bytes, str], Policy]] = {
         ONNX: OnnxPolicy,
         TORCHSCRIPT: torchscript_policy,
     }
     if file.suffix not in kinds:
         raise InputError(
-            f"{where}: no kind of policy; pass POLICY{ONNX}, or POLICY{TORCHSCRIPT} of TorchScript"
+            f"{where}: no kind of policy; pass POLICY{ONNX}, or POLICY{TORCHSCRIPT} of "
+            "TorchScript"
         )
     try:
         content = read_regular(file, MAX_FILE)
@@ -130,7 +128,7 @@ def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
     return policy
 
 
-def torchscript_policy(content: bytes, where: str) -> Callable[[Tensor], Any]:
+def torchscript_policy(content: bytes, where: str) -> Policy:
     """The module of a TorchScript archive."""
     try:
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
@@ -145,42 +143,34 @@ def torchscript_policy(content: bytes, where: str) -> Callable[[Tensor], Any]:
 def write_policy(policy: nn.Module, file: Path) -> None:
     """Write a module of such a map, whose argument is `observation`, as the suffix
     says; raises InputError."""
-    writers: dict[str, Callable[[nn.Module, Path], None]] = {
-        ONNX: _write_onnx,
-        TORCHSCRIPT: _write_torchscript,
-    }
+    writers = {ONNX: _write_onnx, TORCHSCRIPT: _write_torchscript}
     if file.suffix not in writers:
         raise InputError(
             f"{file}: no kind of policy; name it {ONNX}, or {TORCHSCRIPT} for TorchScript"
         )
     if file.suffix == ONNX:
         library("onnxscript", str(file), extra="onnx")
-    write_atomically(file, partial(writers[file.suffix], policy.eval()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        write_atomically(file, partial(writers[file.suffix], policy.eval()))
 
 
 def _write_torchscript(policy: nn.Module, file: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        traced = torch.jit.trace(policy, torch.zeros(EXAMPLE, OBSERVATION_SIZE))
-        buffer = io.BytesIO()
-        torch.jit.save(traced, buffer)
-    file.write_bytes(buffer.getvalue())
+    traced = torch.jit.trace(policy, torch.zeros(EXAMPLE, OBSERVATION_SIZE))
+    torch.jit.save(traced, file)
 
 
 def _write_onnx(policy: nn.Module, file: Path) -> None:
-    logging.getLogger("torch.onnx").setLevel(
-        logging.ERROR
-    )  # it tells which packages it does without
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        program = torch.onnx.export(
-            policy,
-            (torch.zeros(EXAMPLE, OBSERVATION_SIZE),),
-            input_names=["observation"],
-            output_names=["action"],
-            dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
-            dynamo=True,
-            verbose=False,
-        )
+    # It tells which packages it does without.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    program = torch.onnx.export(
+        policy,
+        (torch.zeros(EXAMPLE, OBSERVATION_SIZE),),
+        input_names=["observation"],
+        output_names=["action"],
+        dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
+        dynamo=True,
+        verbose=False,
+    )
     assert program is not None
     file.write_bytes(program.model_proto.SerializeToString())

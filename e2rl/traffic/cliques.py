@@ -13,22 +13,17 @@ Clique = tuple[int, ...]  # indices of its members, ascending
 def maximal_cliques(adjacency: bytes, nodes: int) -> tuple[Clique, ...]:
     """Maximal cliques of size >= 2 of the graph whose nodes x nodes matrix of bytes is
     `adjacency` (rows in order)."""
-    edges = np.argwhere(
-        np.triu(np.frombuffer(adjacency, np.uint8).reshape(nodes, nodes), 1)
-    )
-    return tuple(
-        tuple(sorted(clique))
-        for clique in networkx.find_cliques(networkx.Graph(edges.tolist()))
-    )
+    matrix = np.frombuffer(adjacency, np.uint8).reshape(nodes, nodes)
+    graph = networkx.Graph(np.argwhere(np.triu(matrix, 1)).tolist())
+    return tuple(tuple(sorted(clique)) for clique in networkx.find_cliques(graph))
 
 
 def cliques_in(adjacency: np.ndarray) -> list[Clique]:
     """Maximal cliques of size >= 2 of a graph [V, V] of bytes."""
     nodes = np.flatnonzero(adjacency.any(-1))
-    found = maximal_cliques(
-        np.ascontiguousarray(adjacency[np.ix_(nodes, nodes)]).tobytes(), len(nodes)
-    )
-    return [tuple(int(nodes[i]) for i in clique) for clique in found]
+    matrix = adjacency[np.ix_(nodes, nodes)]
+    cliques = maximal_cliques(matrix.tobytes(), len(nodes))
+    return [tuple(int(nodes[i]) for i in clique) for clique in cliques]
 
 
 def weight_of(clique: Clique, weight: np.ndarray) -> float:

@@ -57,14 +57,14 @@ class Baseline(NominalTraffic):
         """Returns the states of scenes [B] with routes drawn from the prior and no
         adversary."""
         nominal = super().reset(scenes, seed, eta)
-        none = torch.zeros_like(nominal.routed.parked)
+        nobody = torch.zeros_like(nominal.routed.parked)
         zero = torch.zeros_like(nominal.routed.length)
-        return BaselineState(**vars(nominal), eta=eta, adversary=none, path_kl=zero)
+        return BaselineState(**vars(nominal), eta=eta, adversary=nobody, path_kl=zero)
 
     def replan(
         self, state: State, world: World, ego_plan: Tensor, react: React | None = None
     ) -> tuple[State, TrafficPlan]:
-        """Returns states and plans of the coming HORIZON steps."""
+        """Returns states and plans of the coming HORIZON steps (`Traffic.replan`)."""
         state, plan = super().replan(state, world, ego_plan, react)
         return state, replace(plan, adversary=state.adversary, path_kl=state.path_kl)
 
@@ -87,11 +87,8 @@ class Baseline(NominalTraffic):
             now.state, now.world, ego_plan=now.ego_plan, known=now.before
         )
         if not bool((self.strength(now.state) > 0).any()):
-            return (
-                now.state,
-                self.prior.sample(context, now.noise[..., 0, :]).x0,
-                context,
-            )
+            sample = self.prior.sample(context, now.noise[..., 0, :])
+            return now.state, sample.x0, context
         state, x0 = self.attack(now, context)
         if self.adversarial:
             context.obstacles.duty = duty_of(
@@ -104,27 +101,38 @@ class Baseline(NominalTraffic):
         return state, x0, context
 
     @abstractmethod
-    def attack(self, now: Replan, context: Context) -> tuple[BaselineState, Tensor]:
+    def attack(self, replan: Replan, context: Context) -> tuple[BaselineState, Tensor]:
         """Returns state and joint sample x0 [G, V, SIZE] of a group of which some scene
         has strength above 0."""
 
 
 def replay_others(
-    state: Own, plan: TrafficPlan, world: World, driven: Tensor
+    state: Own, plan: TrafficPlan, *, world: World, driven: Tensor
 ) -> tuple[Own, TrafficPlan]:
-    """Returns state and plan with every vehicle that is not driven [B, V] on its
-    recording, from which the prior sees it."""
+    """Returns state and plan with every vehicle that is not driven on its recording,
+    from which the prior sees it.
+
+    Args:
+        state: of B scenes, after their replan.
+        plan: of that replan.
+        world: the scenes now.
+        driven: [B, V] bool.
+    """
     logged = RECORDED.replan(None, world, plan.states[:, 0])[1]
-    own = driven[..., None]
-    states = torch.where(own[..., None], plan.states, logged.states)
-    present = torch.where(own, plan.present, logged.present)
-    now = logged.states[:, :, REPLAN_STEPS - 1]
-    before = logged.states[:, :, REPLAN_STEPS - 2]
-    accel = (now[..., 3] - before[..., 3]) / DT
-    yaw_rate = wrap(now[..., 2] - before[..., 2]) / DT
-    lane = select(
-        driven,
-        state.lane,
-        other=locate(now, accel, yaw_rate=yaw_rate, points=state.routed.points),
+    last = logged.states[:, :, REPLAN_STEPS - 1]
+    change = last - logged.states[:, :, REPLAN_STEPS - 2]
+    recorded = locate(
+        last,
+        change[..., 3] / DT,
+        yaw_rate=wrap(change[..., 2]) / DT,
+        points=state.routed.points,
     )
-    return replace(state, lane=lane), replace(plan, states=states, present=present)
+    mask = driven[..., None]
+    return (
+        replace(state, lane=select(driven, state.lane, other=recorded)),
+        replace(
+            plan,
+            states=torch.where(mask[..., None], plan.states, logged.states),
+            present=torch.where(mask, plan.present, logged.present),
+        ),
+    )

@@ -6,6 +6,7 @@ Dense adversarial guidance: CTG's machinery turned on the ego, by every vehicle 
 
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
@@ -15,9 +16,8 @@ from e2rl.traffic.baselines.guidance import MeanGuided
 from e2rl.traffic.baselines.losses import (
     approach_term,
     discounts,
-    disk_overlap,
     off_road_term,
-    pair_term,
+    overlap_term,
     speeding_term,
 )
 from e2rl.traffic.baselines.view import View
@@ -33,33 +33,22 @@ class CTG(MeanGuided):
     margin: float = setting(low=0)
     off_road: float = setting()
     speed: float = setting()
-    responsibility: str = field(
-        default="", init=False
-    )  # there is no adversary that owes anything
+    responsibility: str = field(default="", init=False)  # nobody owes anything
 
     adversarial = False
     guides_everybody = True
 
     def strength(self, state: BaselineState) -> Tensor:
         """Returns the gain [B], whatever the intensity."""
-        return state.eta * 0 + self.gain
+        return torch.full_like(state.eta, self.gain)
 
-    def attackers(self, state: BaselineState, view: View) -> Tensor:
-        """No vehicle."""
-        return view.active & False
-
-    def loss(self, motion: LaneState, state: BaselineState, view: View) -> Tensor:
+    def loss(self, motion: LaneState, view: View) -> Tensor:
         """Weighted collision, off-road and speeding terms."""
         states = view.with_ego(motion)
         weights = discounts(states)
-        total = self.collision * pair_term(
-            states,
-            view,
-            cost=disk_overlap(self.margin),
-            reach=self.margin,
-            weights=weights,
-        )
-        total = total + self.off_road * off_road_term(states, view, weights=weights)
+        collision = overlap_term(states, view, margin=self.margin, weights=weights)
+        off_road = off_road_term(states, view, weights=weights)
+        total = self.collision * collision + self.off_road * off_road
         return total + self.speed * speeding_term(motion, view)
 
 
@@ -75,21 +64,14 @@ class CTGAdv(MeanGuided):
 
     tuned = {"gain": (0.05, 4.0, "log"), "step_size": (0.03, 3.0, "log")}
 
-    def loss(self, motion: LaneState, state: BaselineState, view: View) -> Tensor:
+    def loss(self, motion: LaneState, view: View) -> Tensor:
         """Soft-min distance to the ego, and metres off the road."""
         states = view.with_ego(motion)
-        near = approach_term(states, self.temperature)
-        return self.approach * near + self.off_road * off_road_term(
-            states, view, weights=discounts(states)
-        )
+        approach = approach_term(states, self.temperature)
+        off_road = off_road_term(states, view, weights=discounts(states))
+        return self.approach * approach + self.off_road * off_road
 
-    def chosen(
-        self, motion: LaneState, state: BaselineState, view: View, guided: Tensor
-    ) -> Tensor:
+    def chosen(self, motion: LaneState, view: View, guided: Tensor) -> Tensor:
         """Sample [B] in which some vehicle comes nearest to the ego."""
-        return (
-            self.loss(motion, state, view=view)
-            .masked_fill(~guided, float("inf"))
-            .amin(-1)
-            .argmin(0)
-        )
+        loss = self.loss(motion, view).masked_fill(~guided, torch.inf)
+        return loss.amin(-1).argmin(0)

@@ -1,7 +1,7 @@
 """DiffScene (Xu et al. 2025): one adversary, generated once by three objectives and
 driven open loop."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -11,20 +11,23 @@ from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import project
-from e2rl.traffic.baselines.guidance import CleanGuidance
+from e2rl.traffic.baselines.guidance import CleanGuidance, guided_samples
 from e2rl.traffic.baselines.losses import (
     approach_term,
     comfort_term,
+    even,
     off_road_term,
     off_route_term,
     speeding_term,
 )
-from e2rl.traffic.baselines.open_loop import OpenLoop, OpenLoopState, Scenario
-from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
+from e2rl.traffic.baselines.open_loop import OpenLoop, Scenario
+from e2rl.traffic.baselines.view import View, pick
 from e2rl.traffic.motion import smallest
 from e2rl.traffic.nominal import Replan
 
-LOW, HIGH, JERK = -3.5, 2.0, 2.0  # m/s^2, m/s^2, m/s^3: what the constraint lets pass
+LOW = -3.5  # m/s^2 that the constraint lets pass
+HIGH = 2.0  # m/s^2
+JERK = 2.0  # m/s^3
 CORRIDOR = 1.0  # m beside the ego's route in which an adversary obstructs it
 
 
@@ -44,65 +47,52 @@ class DiffScene(OpenLoop):
 
     tuned = {"gain": (0.2, 20.0, "log"), "step_size": (0.2, 20.0, "log")}
 
-    def scenario(self, now: Replan, context: Context, nominal: Tensor) -> Scenario:
+    def scenario(self, replan: Replan, context: Context, nominal: Tensor) -> Scenario:
         """The guided joint sample of least loss; the adversary alone is held."""
-        view = View.of(now.world, context, ego_plan=now.ego_plan)
-        count = now.noise.shape[3]
-        adversary = (
-            smallest(view.active, view.distance_to_ego(), count=1)
-            & (self.strength(now.state) > 0)[:, None]
-        )
-        loss = partial(self.loss, state=now.state, view=view, adversary=adversary)
-        control = CleanGuidance(
+        strength = self.strength(replan.state)
+        view = View.of(replan, context, strength)
+        adversary = smallest(view.active, view.distance_to_ego(), count=1)
+        adversary = adversary & (strength > 0)[:, None]
+        loss = partial(self.loss, view=replace(view, adversary=adversary))
+        samples = guided_samples(
             self.prior,
-            loss,
-            guided=adversary.repeat(count, 1),
-            samples=count,
-            step_size=self.step_size,
-            clip=self.clip,
+            replan,
+            context,
+            loss=loss,
+            control=partial(
+                CleanGuidance,
+                guided=adversary.repeat(self.samples, 1),
+                step_size=self.step_size,
+                clip=self.clip,
+            ),
         )
-        many = tiled(context, count)
-        sample = self.prior.sample(many, folded(now.noise), control)
-        index = (
-            loss(motion_of(self.prior, sample.x0, context=many, count=count))
-            .sum(-1)
-            .argmin(0)
+        index = loss(samples.motion).sum(-1).argmin(0)
+        return Scenario(
+            pick(samples.x0, index),
+            adversary,
+            adversary=adversary,
+            path_kl=pick(samples.kl, index),
         )
-        x0, kl = (
-            pick(value.unflatten(0, (count, -1)), index)
-            for value in (sample.x0, sample.kl)
-        )
-        return Scenario(x0, adversary, adversary=adversary, path_kl=kl)
 
-    def loss(
-        self, motion: LaneState, state: OpenLoopState, view: View, adversary: Tensor
-    ) -> Tensor:
-        """The three objectives of the adversary [B, V]; 0 for others."""
+    def loss(self, motion: LaneState, view: View) -> Tensor:
+        """The three objectives of the adversary; 0 for others."""
         states = view.with_ego(motion)
-        attack = self.safety * approach_term(states, self.temperature)
-        attack = attack + self.functionality * corridor_term(
-            states, view, adversary=adversary
-        )
-        even = torch.full_like(states[0, 0, 0, :, 0], 1 / states.shape[-2])
-        lawful = off_route_term(motion, view) + comfort_term(
-            motion, LOW, high=HIGH, jerk=JERK
-        )
-        lawful = (
-            lawful
-            + off_road_term(states, view, weights=even)
-            + speeding_term(motion, view)
-        )
-        return (
-            self.strength(state)[:, None] * attack + self.constraint * lawful
-        ) * adversary
+        safety = approach_term(states, self.temperature)
+        functionality = corridor_term(states, view)
+        attack = self.safety * safety + self.functionality * functionality
+        lawful = off_route_term(motion, view)
+        lawful = lawful + comfort_term(motion, low=LOW, high=HIGH, jerk=JERK)
+        lawful = lawful + off_road_term(states, view, weights=even(states))
+        lawful = lawful + speeding_term(motion, view)
+        total = view.strength[:, None] * attack + self.constraint * lawful
+        return total * view.adversary
 
 
-def corridor_term(states: Tensor, view: View, adversary: Tensor) -> Tensor:
+def corridor_term(states: Tensor, view: View) -> Tensor:
     """Metres [S, B, V] of the adversary beyond CORRIDOR from the ego's route, mean over
     time; 0 for others."""
-    row = adversary.long().argmax(-1)
-    at = row[None, :, None, None, None].expand(len(states), -1, 1, *states.shape[-2:])
-    _, offset, _ = project(
-        states.gather(2, at)[:, :, 0, :, :2], view.routed.points[:, 0]
-    )
-    return (offset.abs() - CORRIDOR).clamp(min=0).mean(-1)[..., None] * adversary
+    scene = torch.arange(states.shape[1], device=states.device)
+    adversary = view.adversary.long().argmax(-1)
+    xy = states[:, scene, adversary, :, :2]
+    offset = project(xy, view.routed.points[:, 0])[1].abs()
+    return (offset - CORRIDOR).clamp(min=0).mean(-1)[..., None] * view.adversary

@@ -24,17 +24,19 @@ from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
 from e2rl.traffic.nominal import Replan
 from e2rl.traffic.traffic import State
 
-Loss = Callable[
-    [LaneState], Tensor
-]  # motion, fields [S, B, V, T] -> [S, B, V]; each row's own, others detached
+# Motion, fields [S, B, V, T] -> [S, B, V]; each row's own, others detached.
+Loss = Callable[[LaneState], Tensor]
+Objective = Callable[[Tensor], Tensor]  # x [S * B, V, SIZE] -> [], the sum of a loss
 Denoise = Callable[[Tensor], Tensor]
-ROUNDING = 1e-3  # of Adam: its steps are as long for any gradient, so that rounding would decide where there is none
+# Of Adam: its steps are as long for any gradient, so rounding would decide where there
+# is none.
+ROUNDING = 1e-3
 
 
 @dataclass
 class MeanGuidance:
     """Adam steps on the posterior mean z of x at the next level, whose decoded plan the
-    loss rates.
+    objective rates.
 
     guided [S * B, V] bool: rows that move; limit [S * B]: largest change of an element,
     in standard deviations of the step's noise. The last step, which has no noise, is
@@ -42,10 +44,9 @@ class MeanGuidance:
     """
 
     prior: Prior
-    loss: Loss
+    objective: Objective
     guided: Tensor
     limit: Tensor
-    samples: int
     step_size: float
     iterations: int
     past: Past = None  # of the step, where the sampler is of second order
@@ -67,22 +68,17 @@ class MeanGuidance:
         mean, variance = step(x=x, x0=x0, past=past)
         none = None if past is None else (zero, past[1])
         per_x0, _ = step(x=zero, x0=zero + 1, past=none)  # a step is affine in x0
-        shift = self._shift(
-            mean, self.limit[:, None, None] * variance.sqrt(), context=context
-        )
-        moved = x0 + shift / per_x0
+        limit = self.limit[:, None, None] * variance.sqrt()
+        moved = x0 + self._shift(mean, limit) / per_x0
         self.past = moved, level
         return x, x0, moved
 
-    def _shift(self, mean: Tensor, limit: Tensor, context: Context) -> Tensor:
+    def _shift(self, mean: Tensor, limit: Tensor) -> Tensor:
         with torch.enable_grad():
             z = mean.detach().clone().requires_grad_(True)
             adam = torch.optim.Adam([z], lr=self.step_size, eps=ROUNDING)
             for _ in range(self.iterations):
-                value = self.loss(
-                    motion_of(self.prior, z, context=context, count=self.samples)
-                ).sum()
-                (z.grad,) = torch.autograd.grad(value, z)
+                (z.grad,) = torch.autograd.grad(self.objective(z), z)
                 adam.step()
                 z.data = mean + (z.data - mean).clamp(-limit, limit)
         return torch.where(self.guided[..., None], z.detach() - mean, 0.0)
@@ -97,10 +93,8 @@ class CleanGuidance:
     step, in x.
     """
 
-    prior: Prior
-    loss: Loss
+    objective: Objective
     guided: Tensor
-    samples: int
     step_size: float
     clip: float
 
@@ -111,13 +105,45 @@ class CleanGuidance:
         with torch.enable_grad():
             variable = x.detach().requires_grad_(True)
             x0 = denoise(variable)
-            value = self.loss(
-                motion_of(self.prior, x0, context=context, count=self.samples)
-            ).sum()
-            (gradient,) = torch.autograd.grad(value, variable)
+            (gradient,) = torch.autograd.grad(self.objective(x0), variable)
         shift = (self.step_size * gradient).clamp(-self.clip, self.clip)
         x0 = x0.detach()
         return x, x0, x0 - torch.where(self.guided[..., None], shift, 0.0)
+
+
+@dataclass
+class Samples:
+    """S joint samples of B scenes: x0 [S * B, V, SIZE], kl [S * B, V] of their control,
+    motion: their plans, fields [S, B, V, T]."""
+
+    x0: Tensor
+    kl: Tensor
+    motion: LaneState
+
+
+def guided_samples(
+    prior: Prior,
+    replan: Replan,
+    context: Context,
+    *,
+    loss: Loss,
+    control: Callable[[Objective], Control],
+) -> Samples:
+    """Returns joint samples under a control.
+
+    Args:
+        prior: that is guided.
+        replan: holds the noise of S samples.
+        context: of the replan.
+        loss: of the samples' motion.
+        control: of the loss, as a function of x.
+    """
+    count = replan.noise.shape[3]
+    samples = tiled(context, count)
+    motion = partial(motion_of, prior, context=samples, batch=len(context.active))
+    objective = control(lambda x: loss(motion(x)).sum())
+    sample = prior.sample(samples, folded(replan.noise), objective)
+    return Samples(sample.x0, sample.kl, motion=motion(sample.x0))
 
 
 @dataclass(eq=False, repr=False)
@@ -128,55 +154,53 @@ class Guided(Baseline):
 
     guides_everybody = False  # or adversaries alone
 
-    def attack(self, now: Replan, context: Context) -> tuple[State, Tensor]:
+    def attack(self, replan: Replan, context: Context) -> tuple[State, Tensor]:
         """Returns state and chosen joint sample x0 [G, V, SIZE]; scenes without
         strength keep the nominal one."""
-        state = now.state
-        count = now.noise.shape[3]
-        view = View.of(now.world, context, ego_plan=now.ego_plan)
-        acts = self.strength(state) > 0
-        adversary = self.attackers(state, view) & acts[:, None]
-        state = replace(state, adversary=adversary)
-        guided = (context.active if self.guides_everybody else adversary) & acts[
-            :, None
-        ]
-        loss = partial(self.loss, state=state, view=view)
-        many = tiled(context, count)
-        control = self.guidance(
-            loss, guided.repeat(count, 1), strength=self.strength(state).repeat(count)
+        state = replan.state
+        strength = self.strength(state)
+        acts = (strength > 0)[:, None]
+        view = View.of(replan, context, strength)
+        view = replace(view, adversary=self.attackers(state, view) & acts)
+        guided = view.adversary
+        if self.guides_everybody:
+            guided = view.active & acts
+        samples = guided_samples(
+            self.prior,
+            replan,
+            context,
+            loss=partial(self.loss, view=view),
+            control=partial(
+                self.guidance,
+                guided=guided.repeat(self.samples, 1),
+                strength=strength.repeat(self.samples),
+            ),
         )
-        sample = self.prior.sample(many, folded(now.noise), control)
-        motion = motion_of(self.prior, sample.x0, context=many, count=count)
-        index = self.chosen(motion, state, view=view, guided=guided)
-        index = index * acts if index.ndim == 1 else index * acts[:, None]
-        x0, kl = (
-            pick(value.unflatten(0, (count, -1)), index)
-            for value in (sample.x0, sample.kl)
-        )
-        return replace(state, path_kl=state.path_kl + kl), x0
+        index = self.chosen(samples.motion, view, guided=guided)
+        index = index * (acts[:, 0] if index.ndim == 1 else acts)
+        kl = state.path_kl + pick(samples.kl, index)
+        state = replace(state, adversary=view.adversary, path_kl=kl)
+        return state, pick(samples.x0, index)
 
-    def chosen(
-        self, motion: LaneState, state: State, view: View, guided: Tensor
-    ) -> Tensor:
+    def chosen(self, motion: LaneState, view: View, guided: Tensor) -> Tensor:
         """Sample [B] of each scene that is driven: that of least loss over the guided
         vehicles."""
-        return (
-            torch.where(guided, self.loss(motion, state, view=view), 0.0)
-            .sum(-1)
-            .argmin(0)
-        )
+        loss = torch.where(guided, self.loss(motion, view), 0.0)
+        return loss.sum(-1).argmin(0)
 
     def attackers(self, state: State, view: View) -> Tensor:
         """Bool [B, V]: vehicles under adversarial control, all that the prior moves by
         default."""
-        return view.active
+        return view.active & self.adversarial
 
     @abstractmethod
-    def loss(self, motion: LaneState, state: State, view: View) -> Tensor:
+    def loss(self, motion: LaneState, view: View) -> Tensor:
         """The loss of a replan (`Loss`)."""
 
     @abstractmethod
-    def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> Control:
+    def guidance(
+        self, objective: Objective, guided: Tensor, strength: Tensor
+    ) -> Control:
         """The control of `Prior.sample`; guided [S * B, V] bool, strength [S * B]."""
 
 
@@ -194,18 +218,19 @@ class MeanGuided(Guided):
         sampler = self.prior.sampler
         if sampler.churn == 0 and sampler.sampler != "euler_maruyama":
             raise InputError(
-                f"prior.sampler.churn=0: {type(self).__name__} moves the mean of a step by a fraction of its noise, of "
-                "which there is none; set it above 0"
+                f"prior.sampler.churn=0: {type(self).__name__} moves the mean of a step "
+                "by a fraction of its noise, of which there is none; set it above 0"
             )
 
-    def guidance(self, loss: Loss, guided: Tensor, strength: Tensor) -> MeanGuidance:
+    def guidance(
+        self, objective: Objective, guided: Tensor, strength: Tensor
+    ) -> MeanGuidance:
         """The control of `Prior.sample`."""
         return MeanGuidance(
             self.prior,
-            loss,
+            objective,
             guided=guided,
             limit=strength,
-            samples=self.samples,
             step_size=self.step_size,
             iterations=self.iterations,
         )

@@ -48,7 +48,7 @@ def test_the_vehicle_and_the_future_of_greatest_value_are_driven(monkeypatch):
         0.9,
     )  # the seventh is not tried
     values[1, 1, 5] = 0.9  # a parked vehicle
-    monkeypatch.setattr(cat, "overlap_value", lambda *_: values)
+    monkeypatch.setattr(cat, "overlap_value", lambda *_, size: values)
     state, x0 = on.attack(now, context)
     assert state.adversary.nonzero().tolist() == [[0, 3]] and torch.equal(
         state.held, state.adversary

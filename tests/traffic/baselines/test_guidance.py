@@ -1,7 +1,7 @@
 """Guidance: the posterior mean moves as far as it is said to, masked rows not at all,
 and the loss falls."""
 
-from functools import partial
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,25 +14,29 @@ from tests.traffic.e2.traffic_scenes import scenes
 
 
 def control_inputs():
-    """A baseline's first replan, a noisy x at the third of four levels, and the
-    denoiser there."""
+    """A baseline, the context of its first replan, the sum of its loss as a function of
+    x, a noisy x at the third of four levels, that level and the next."""
     on = baseline("ctg_adv")
-    (now, context), view = first_replan(on, scenes(2).scenes)
+    (replan, context), view = first_replan(on, scenes(2).scenes)
     level, low = on.prior.sampler.levels(on.prior.schedule)[1:3]
-    return on, now.state, view, context, now.noise[0, :, :, 0], level, low
+
+    def objective(x):
+        motion = motion_of(on.prior, x, context=context, batch=2)
+        return on.loss(motion, view).sum()
+
+    return on, context, objective, replan.noise[0, :, :, 0], level, low
 
 
 def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
-    on, state, view, context, x, level, low = control_inputs()
+    on, context, objective, x, level, low = control_inputs()
     guided = context.active.clone()
     limit = torch.tensor([0.05, 10.0])
     guided[1, 1] = False
     control = MeanGuidance(
         on.prior,
-        partial(on.loss, state=state, view=view),
+        objective,
         guided=guided,
         limit=limit,
-        samples=1,
         step_size=0.3,
         iterations=1,
     )
@@ -58,13 +62,12 @@ def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
 
 
 def test_the_last_step_of_mean_guidance_is_free():
-    on, state, view, context, x, level, _ = control_inputs()
+    on, context, objective, x, level, _ = control_inputs()
     control = MeanGuidance(
         on.prior,
-        partial(on.loss, state=state, view=view),
+        objective,
         guided=context.active,
         limit=torch.ones(2),
-        samples=1,
         step_size=0.3,
         iterations=1,
     )
@@ -75,14 +78,12 @@ def test_the_last_step_of_mean_guidance_is_free():
 
 
 def test_clean_guidance_is_clipped_and_leaves_masked_rows_alone():
-    on, state, view, context, x, level, _ = control_inputs()
+    on, context, objective, x, level, _ = control_inputs()
     guided = context.active.clone()
     guided[:, 1] = False
     control = CleanGuidance(
-        on.prior,
-        partial(on.loss, state=state, view=view),
+        objective,
         guided=guided,
-        samples=1,
         step_size=1e6,
         clip=0.25,
     )
@@ -98,16 +99,16 @@ def test_clean_guidance_is_clipped_and_leaves_masked_rows_alone():
 def test_samples_go_along_the_batch_and_back():
     on = baseline("ctg_adv", samples=3)
     (now, context), _ = first_replan(on, scenes(2).scenes)
-    many = on.prior.sample(tiled(context, 3), folded(now.noise)).x0.unflatten(0, (3, 2))
+    flat = on.prior.sample(tiled(context, 3), folded(now.noise)).x0
+    many = flat.unflatten(0, (3, 2))
     for number in range(3):
         one = on.prior.sample(context, now.noise[..., number, :].contiguous()).x0
         torch.testing.assert_close(many[number], one, rtol=1e-4, atol=1e-4)
     by_scene = torch.tensor([2, 0])
     by_vehicle = torch.arange(8).expand(2, -1) % 3
-    assert torch.equal(pick(many, by_scene)[0], many[2, 0]) and torch.equal(
-        pick(many, by_scene)[1], many[0, 1]
-    )
-    assert torch.equal(pick(many, by_vehicle)[1, 4], many[1, 1, 4])
+    assert torch.equal(pick(flat, by_scene)[0], many[2, 0])
+    assert torch.equal(pick(flat, by_scene)[1], many[0, 1])
+    assert torch.equal(pick(flat, by_vehicle)[1, 4], many[1, 1, 4])
     assert torch.equal(now.state.lane.v, context.state.v)
 
 
@@ -125,14 +126,14 @@ def test_guidance_lowers_the_loss_of_bundled_scenes(name, bundled):
     (now, context), view = first_replan(on, scene)
     state, x0 = on.attack(now, context)
     nominal = prior.sample(context, now.noise[..., 0, :].contiguous()).x0
-    given = {"adversary": state.adversary} if name == "diffscene" else {}
-    loss = partial(on.loss, state=state, view=view, **given)
-    values = [
-        loss(motion_of(prior, value, context=context, count=1))
-        for value in (x0, nominal)
-    ]
+    view = replace(view, adversary=state.adversary)
     guided = state.adversary if on.adversarial else context.active
-    after, before = (torch.where(guided, value[0], 0.0).sum() for value in values)
-    assert after < before
+
+    def loss(x):
+        motion = motion_of(prior, x, context=context, batch=len(x))
+        return torch.where(guided, on.loss(motion, view)[0], 0.0).sum()
+
+    assert loss(x0) < loss(nominal)
     if on.adversarial:
-        assert bool(guided.any()) and not torch.equal(x0[guided], nominal[guided])
+        assert bool(guided.any())
+        assert not torch.equal(x0[guided], nominal[guided])

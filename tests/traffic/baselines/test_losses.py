@@ -8,14 +8,14 @@ import torch
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.traffic.baselines.losses import (
+    Pairs,
     approach_term,
     comfort_term,
     discounts,
     disk_gap,
-    disk_overlap,
     gaussian_overlap,
     off_road_term,
-    pair_term,
+    overlap_term,
 )
 from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import scenes
@@ -28,20 +28,19 @@ def pose(x, y=0.0, heading=0.0, speed=5.0):
 
 
 def test_disks_reach_from_bumper_to_bumper():
-    distance, radii = disk_gap(pose(0.0), SIZE, other=pose(10.0), other_size=SIZE)
-    assert (
-        distance.item() == pytest.approx(8.0, abs=1e-3) and radii.item() == 2.0
-    )  # centres 1 m inside both bumpers
-    cost = disk_overlap(0.5)(pose(0.0), SIZE, pose(4.0), SIZE)
-    assert cost.item() == pytest.approx(1 - 2.0 / 2.5, abs=1e-3)
-    assert disk_overlap(0.5)(pose(0.0), SIZE, pose(6.0), SIZE).item() == 0
+    """Their centres lie 1 m inside both bumpers of a car of 4 x 2 m."""
+    distance, radii = disk_gap(pair(10.0))
+    assert distance.item() == pytest.approx(8.0, abs=1e-3)
+    assert radii.item() == 2.0
+
+
+def pair(x):
+    """A vehicle, and another x m ahead of it."""
+    return Pairs(pose(0.0), SIZE, other=pose(x), other_size=SIZE)
 
 
 def test_the_gaussian_is_flat_inside_the_box_and_falls_outside():
-    values = [
-        gaussian_overlap(pose(0.0), SIZE, other=pose(x), other_size=SIZE).item()
-        for x in (0.0, 1.9, 3.0, 4.0)
-    ]
+    values = [gaussian_overlap(pair(x)).item() for x in (0.0, 1.9, 3.0, 4.0)]
     assert values[0] == values[1] > values[2] > values[3]
     assert values[2] == pytest.approx(10 * math.exp(-0.5 * (1 - 2.25)), rel=1e-4)
 
@@ -65,28 +64,27 @@ def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
         states[..., :2].shape, generator=generator
     )
     weights = torch.tensor([0.5, 0.3, 0.2])
-    found = pair_term(states, view, cost=disk_overlap(0.2), reach=0.2, weights=weights)
-    expected = torch.zeros_like(found)
+    term = overlap_term(states, view, margin=0.2, weights=weights)
+    expected = torch.zeros_like(term)
     for s, b in product(range(2), range(2)):
         for i, j in permutations(view.valid[b].nonzero()[:, 0].tolist(), 2):
-            first, second = (
-                (states[s, b, k][None], view.size[b, k][None]) for k in (i, j)
+            distance, radii = disk_gap(
+                Pairs(
+                    states[s, b, i][None],
+                    view.size[b, i][None],
+                    other=states[s, b, j][None],
+                    other_size=view.size[b, j][None],
+                )
             )
-            expected[s, b, i] += (disk_overlap(0.2)(*first, *second)[0] * weights).sum()
+            cost = (1 - distance / (radii + 0.2)).clamp(min=0)
+            expected[s, b, i] += (cost[0] * weights).sum()
     assert expected.max() > 0.1
-    torch.testing.assert_close(found, expected)
-    none = torch.ones_like(view.routed.conflict)
-    assert (
-        pair_term(
-            states,
-            view,
-            cost=disk_overlap(0.2),
-            reach=0.2,
-            weights=weights,
-            left_out=none,
-        )
-        == 0
-    ).all()
+    torch.testing.assert_close(term, expected)
+    everybody = torch.ones_like(view.routed.conflict)
+    without = overlap_term(
+        states, view, margin=0.2, weights=weights, left_out=everybody
+    )
+    assert (without == 0).all()
 
 
 def test_leaving_the_road_costs_and_the_gradient_leads_back():
@@ -107,5 +105,5 @@ def test_discounts_sum_to_one_and_comfort_is_free_within_its_bounds():
     accel = torch.tensor([[[[0.0, 1.0, 2.0], [-6.0, -6.0, -6.0]]]])
     motion = LaneState(*([torch.zeros_like(accel)] * 10))
     motion.a = accel
-    value = comfort_term(motion, -3.5, high=2.0, jerk=2.0)[0, 0]
+    value = comfort_term(motion, low=-3.5, high=2.0, jerk=2.0)[0, 0]
     assert value[0] == 0 and value[1].item() == pytest.approx(2.5**2)

@@ -67,8 +67,8 @@ def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
     scene = scenes(2).scenes
     made = []
     scenario = on.scenario
-    on.scenario = lambda now, *rest: (
-        made.append(now.state.replans.tolist()) or scenario(now, *rest)
+    on.scenario = lambda replan, *rest: (
+        made.append(replan.state.replans.tolist()) or scenario(replan, *rest)
     )
     state = begin(on, scene, eta=2.0)
     world = World.at_start(scene)

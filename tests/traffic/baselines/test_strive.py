@@ -7,8 +7,7 @@ import torch
 
 from e2rl.prior.sde import SamplerSettings
 from e2rl.sim.world import World
-from e2rl.traffic.baselines.strive import blend, decode_latent, softmin
-from e2rl.traffic.baselines.view import motion_of
+from e2rl.traffic.baselines.strive import blend, softmin
 from e2rl.traffic.transform import Lookahead
 from tests.prior.small import small_prior
 from tests.traffic.baselines.attacks import baseline, first_replan
@@ -17,15 +16,13 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, scenes
 
 def test_latents_are_decoded_as_by_ddim_without_noise():
     on = baseline("strive")
+    on.steps = 4
     (now, context), _ = first_replan(on, scenes(2).scenes)
     prior = small_prior(
         0, sampler=SamplerSettings(sampler="ddim", spacing="level", steps=4, churn=0.0)
     )
     expected = prior.sample(context, now.noise[..., 0, :]).x0
-    torch.testing.assert_close(
-        decode_latent(on.prior, now.noise[0, ..., 0, :], context=context, steps=4),
-        expected,
-    )
+    torch.testing.assert_close(on.decode(now.noise[0, ..., 0, :], context), expected)
 
 
 def test_the_objective_falls_over_the_iterations():
@@ -35,17 +32,13 @@ def test_the_objective_falls_over_the_iterations():
     values = []
 
     def loss(latent):
-        motion = motion_of(
-            on.prior,
-            decode_latent(on.prior, latent, context=context, steps=on.steps),
-            context=context,
-            count=1,
-        )
-        values.append(on.loss(motion, latent, first, now.state, view).detach())
-        return on.loss(motion, latent, first, now.state, view)
+        motion = on.motion(on.decode(latent, context), context)
+        values.append(on.loss(motion, latent, first=first, view=view))
+        return values[-1]
 
     on.optimised(first, loss)
-    assert (values[-1] < values[0]).all() and values[-1].sum() < 0.9 * values[0].sum()
+    assert (values[-1] < values[0]).all()
+    assert values[-1].sum() < 0.9 * values[0].sum()
 
 
 def test_the_planner_is_driven_anew_at_every_iteration_and_not_without_its_plan():
@@ -88,7 +81,8 @@ def test_an_ego_that_is_boxed_in_has_no_solution():
     )  # stands a box's length ahead, at 10 m/s
     found = []
     for states in (far, walled):
-        motion = motion_of(on.prior, torch.zeros_like(first), context=context, count=1)
+        motion = on.motion(torch.zeros_like(first), context)
         motion.x, motion.y, motion.heading, motion.v = states.unbind(-1)
-        found.append(on.solvable(first, motion, view, context).tolist())
+        solved = on.solvable(first, motion, view=view, context=context)
+        found.append(solved.tolist())
     assert found == [[True], [False]]
