@@ -1,7 +1,7 @@
 """The interface of all egos: planners, the learned actor, users' code.
 
 A user's planner is a class and a YAML file in conf/ego with its `_target_` and
-arguments (docs/how-to/planner.md, examples/). It overrides `plan`, and `act` tracks the
+arguments (docs/guide/planner.md, examples/). It overrides `plan`, and `act` tracks the
 plan; or `act`, which maps observations to actions.
 """
 

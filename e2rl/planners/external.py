@@ -1,4 +1,4 @@
-"""A planner in another process or language, behind a socket (docs/how-to/planner.md
+"""A planner in another process or language, behind a socket (docs/guide/planner.md
 describes the protocol)."""
 
 import os

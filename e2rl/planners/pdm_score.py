@@ -2,7 +2,7 @@
 others that keep their velocity.
 
 Where the paper is silent, numbers and rules are those of its published code;
-docs/planners.md lists what differs.
+docs/reference/deviations.md lists what differs.
 """
 
 import math

@@ -1,6 +1,6 @@
 """The messages between e2rl and a planner outside of it.
 
-docs/how-to/planner.md has these field by field. All numbers have 4 bytes,
+docs/guide/planner.md has these field by field. All numbers have 4 bytes,
 little-endian.
 """
 

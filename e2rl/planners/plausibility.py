@@ -110,7 +110,7 @@ def checked_answer(
     if not floats or tuple(answer.shape) != shape:
         raise WrongPlan(
             f"{type(ego).__name__}.{method}: returns {_described(answer)}, expected a "
-            f"tensor of floats {list(shape)} (docs/how-to/planner.md)",
+            f"tensor of floats {list(shape)} (docs/guide/planner.md)",
             begins,
         )
     return finite(answer, "plan" if method == "plan" else "action")

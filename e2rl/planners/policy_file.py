@@ -1,5 +1,5 @@
 """ego=policy_file: the policy of an ONNX or TorchScript file, by the observation
-(docs/observation.md).
+(docs/guide/policies.md).
 
 An ONNX file holds arithmetic. A TorchScript file is a program, which may write files:
 run those that you trust.
@@ -32,7 +32,7 @@ ONNX = ".onnx"
 TORCHSCRIPT = ".pt"
 MAPS = (
     f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] for every B "
-    "(docs/observation.md)"
+    "(docs/guide/policies.md)"
 )
 Policy = Callable[[Tensor], Any]
 PROBED = (1, 3)  # batches that a file is tried with

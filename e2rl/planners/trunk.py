@@ -2,7 +2,7 @@
 
 Every nearby agent goes through the same layers, and the largest of each unit over the
 agents joins the rest of the scene (Qi et al., PointNet, 2017; its effect:
-docs/notes/training.md).
+docs/reference/learning.md).
 """
 
 from collections.abc import Sequence

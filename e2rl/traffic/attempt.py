@@ -23,12 +23,10 @@ from e2rl.run.errors import InputError
 from e2rl.sim.rollouts import Rollouts
 
 NOT_FINITE = "a state was NaN or infinite"
-EGO, TRAFFIC = "ego", "traffic"  # by whom a rollout errored
-OF_THE_RUN = (
-    InputError,
-    MemoryError,
-    torch.OutOfMemoryError,
-)  # errors that are no single rollout's
+EGO = "ego"  # by whom a rollout errored
+TRAFFIC = "traffic"
+# Errors that are no single rollout's.
+OF_THE_RUN = (InputError, MemoryError, torch.OutOfMemoryError)
 EXHAUSTED = (
     errno.ENOSPC,
     errno.EDQUOT,
@@ -41,69 +39,74 @@ EXHAUSTED = (
 
 Task = TypeVar("Task")
 Batch = TypeVar("Batch", Rollouts, TensorDictBase)
+Parts = list[tuple[list[Task], Batch]]  # tasks that could be rolled out, and how
+Errored = list[tuple[Task, dict]]  # tasks that could not, and why
 
 
 def attempt(
     roll_out: Callable[[Sequence[Task]], Batch],
     tasks: Sequence[Task],
     begins: bool = False,
-) -> tuple[list[tuple[list[Task], Batch]], list[tuple[Task, dict]]]:
-    """(the tasks that could be rolled out, in parts with their rollouts; the others
-    with the reasons).
+) -> tuple[Parts, Errored]:
+    """The tasks that could be rolled out, in parts with their rollouts; the others with
+    the reasons.
 
     roll_out(tasks) returns Rollouts, or a TensorDict with states [B, ..., C] and valid
     [B, ...]. What raises for a batch is looked for by halving the batch, where a
-    RowsError does not name it.
-
-    Args:
-        begins: the run begins with these rollouts, so that a planner whose first plan
-            is a WrongPlan, which is then
-            raised, has a mistake in its code.
+    RowsError does not name it. begins: the run begins with these rollouts, so that a
+    planner whose first plan is a WrongPlan, which is then raised, has a mistake in its
+    code.
     """
     try:
         rollouts = roll_out(tasks)
     except (Exception, SystemExit) as error:  # outside code raises anything
-        if isinstance(error, WrongPlan):
-            if begins and error.begins:
-                raise
-        elif isinstance(error, OF_THE_RUN):
-            raise
-        if isinstance(error, OSError) and error.errno in EXHAUSTED:
+        if _ends_the_run(error, begins):
             raise
         named = error.rows if isinstance(error, RowsError) else {}
-        rows = {row: why for row, why in named.items() if 0 <= row < len(tasks)}
-        if len(tasks) > 1 and not rows:
+        details = {row: why for row, why in named.items() if 0 <= row < len(tasks)}
+        if len(tasks) > 1 and not details:
             half = len(tasks) // 2
             first = attempt(roll_out, tasks[:half])
             second = attempt(roll_out, tasks[half:])
             return first[0] + second[0], first[1] + second[1]
-        reason = (
-            NOT_FINITE
-            if isinstance(error, TrafficNotFinite)
-            else f"raised {type(error).__name__}"
-        )
         why = {
-            "reason": reason,
+            "reason": f"raised {type(error).__name__}",
             "detail": str(error),
             "traceback": traceback.format_exc(),
             "raised_by": raiser(error),
         }
-        rows = rows or {0: str(error)}
-        others = [task for row, task in enumerate(tasks) if row not in rows]
-        own = [(tasks[row], why | {"detail": detail}) for row, detail in rows.items()]
+        if isinstance(error, TrafficNotFinite):
+            why["reason"] = NOT_FINITE
+        details = details or {0: str(error)}
+        errored = [
+            (tasks[row], why | {"detail": detail}) for row, detail in details.items()
+        ]
+        others = [task for row, task in enumerate(tasks) if row not in details]
         parts, further = attempt(roll_out, others) if others else ([], [])
-        return parts, own + further
-    known = rollouts.get("states").isfinite().all(-1) | ~rollouts.get("valid")
-    finite = known.flatten(1).all(1).tolist()
-    kept = [task for task, good in zip(tasks, finite, strict=True) if good]
-    of_traffic = (~known[..., 1:]).flatten(1).any(1).tolist()  # row 0 is the ego
+        return parts, errored + further
+    return _finite(rollouts, tasks)
+
+
+def _ends_the_run(error: BaseException, begins: bool) -> bool:
+    if isinstance(error, WrongPlan):
+        return begins and error.begins
+    if isinstance(error, OF_THE_RUN):
+        return True
+    return isinstance(error, OSError) and error.errno in EXHAUSTED
+
+
+def _finite(rollouts: Batch, tasks: Sequence[Task]) -> tuple[Parts, Errored]:
+    """`attempt` of rollouts in which some state may be NaN or infinite."""
+    finite = rollouts.get("states").isfinite().all(-1) | ~rollouts.get("valid")
+    good = finite.flatten(1).all(1)
+    of_traffic = (~finite[..., 1:]).flatten(1).any(1)  # row 0 is the ego
     why = {"reason": NOT_FINITE, "detail": "", "traceback": ""}
     errored = [
-        (task, why | {"raised_by": TRAFFIC if theirs else EGO})
-        for task, good, theirs in zip(tasks, finite, of_traffic, strict=True)
-        if not good
+        (tasks[row], why | {"raised_by": TRAFFIC if of_traffic[row] else EGO})
+        for row in (~good).nonzero()[:, 0].tolist()
     ]
-    rest = rollouts if all(finite) else rollouts[torch.tensor(finite)]
+    kept = [tasks[row] for row in good.nonzero()[:, 0].tolist()]
+    rest = rollouts[good.cpu()] if errored else rollouts
     return ([(kept, rest)] if kept else []), errored
 
 
@@ -117,9 +120,8 @@ def raiser(error: BaseException) -> str:
 def summary_of(errored: Iterable[dict]) -> str:
     """The reasons with their counts, and the first one's own words, for a message."""
     entries = list(errored)
-    counts = ", ".join(
-        f"{count} {reason}" for reason, count in count_reasons(entries).items()
-    )
+    reasons = count_reasons(entries)
+    counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
     return f"{counts} ({entries[0]['detail'][:200]})"
 
 

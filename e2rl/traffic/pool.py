@@ -53,18 +53,19 @@ class TrafficPool:
     def _ends(self) -> Tensor:
         return torch.tensor([len(part.states) for part in self.parts]).cumsum(0)
 
-    def tracks(self, at: Tensor) -> tuple[Tensor, Tensor]:
+    def tracks(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Stored states [b, T+1, N, 4] and valid [b, T+1, N] at positions [b]; only
         these are read."""
         first = self.parts[0]
-        number = torch.bucketize(at, self._ends, right=True)
-        states = first.states.new_empty(len(at), *first.states.shape[1:])
-        valid = first.valid.new_empty(len(at), *first.valid.shape[1:])
+        number = torch.bucketize(position, self._ends, right=True)
+        states = first.states.new_empty(len(position), *first.states.shape[1:])
+        valid = first.valid.new_empty(len(position), *first.valid.shape[1:])
         for k in number.unique().tolist():
             part = self.parts[k]
-            rows = (number == k).nonzero()[:, 0]
-            inside = at[rows] - (self._ends[k] - len(part.states))
-            states[rows], valid[rows] = part.states[inside], part.valid[inside]
+            rows = number == k
+            inside = position[rows] - (self._ends[k] - len(part.states))
+            states[rows] = part.states[inside]
+            valid[rows] = part.valid[inside]
         return states, valid
 
     @staticmethod
@@ -108,9 +109,7 @@ class TrafficPool:
         eta = torch.as_tensor(eta, dtype=torch.float32).cpu().expand(len(index))
         pool = _rows(index, RECORDED, eta=eta)
         pool.source = torch.arange(len(index))
-        pool.parts = [
-            StoredTraffic(traffic["states"].cpu(), traffic["valid"].cpu()),
-        ]
+        pool.parts = [StoredTraffic(traffic["states"].cpu(), traffic["valid"].cpu())]
         return pool
 
     def __add__(self, other: "TrafficPool") -> "TrafficPool":
@@ -132,12 +131,11 @@ class TrafficPool:
         is one kind), within a kind in proportion to the priority [S] of its scene."""
         weight = priority.cpu().double()[self.scene_index].clamp(min=1e-12)
         result = torch.zeros(len(self), dtype=torch.float64)
-        for kind, part in ((True, fraction), (False, 1 - fraction)):
-            rows = self.adversarial == kind
+        for adversarial, share in ((True, fraction), (False, 1 - fraction)):
+            rows = self.adversarial == adversarial
+            share = 1.0 if rows.all() else share
             if rows.any():
-                result[rows] = (
-                    (1.0 if rows.all() else part) * weight[rows] / weight[rows].sum()
-                )
+                result[rows] = share * weight[rows] / weight[rows].sum()
         return result
 
 
