@@ -34,9 +34,9 @@ NOISE_STEP = 1_000_003  # between the noise of a scene in two rounds
 def roll_out(
     scenes: SceneSet,
     index: Tensor,
-    *,
     seed: Tensor,
     eta: Tensor,
+    *,
     ego: Ego,
     traffic: Traffic,
     sim: SimSettings,
