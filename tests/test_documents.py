@@ -151,6 +151,24 @@ def test_notes_of_what_did_not_help_have_at_most_12_kilobytes():
     assert (DOCS / "results" / "did-not-help.md").stat().st_size <= 12_000
 
 
+ROOMS = sorted(
+    path.parent.name
+    for path in (ROOT / "e2rl").glob("*/__init__.py")
+    if path.parent.name != "scripts"
+)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_room_is_on_an_api_page(room):
+    text = "".join(path.read_text() for path in (DOCS / "reference").glob("api*.md"))
+    assert f"\n::: e2rl.{room}\n" in text
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_room_is_on_the_map(room):
+    assert f"| `{room}` |" in (ROOT / "CONTRIBUTING.md").read_text()
+
+
 @pytest.mark.parametrize("path", markdown(), ids=lambda path: path.name)
 def test_relative_links_lead_to_a_file_and_a_heading(path):
     broken = []
