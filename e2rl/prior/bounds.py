@@ -243,11 +243,15 @@ def first_meeting(plans: Plans) -> Meeting:
     rest = torch.arange(count, 0, -1, dtype=own.dtype, device=own.device)
     left = torch.where(meets & counts[..., None], rest, 0.0).amax(-1)
     first = torch.where(left > 0, count - left, 0.0).long()  # [B, V, N]
-    index = first[..., None, None]
+    vehicles, agents = first.shape[1:]
+    index = first[..., None, None].expand(*first.shape, 1, 4)
+    everybody = plans.everybody[:, None].expand(-1, vehicles, -1, -1, -1)
+    driven = plans.driven[:, :, None].expand(-1, -1, agents, -1)
+    own = own[:, :, None].expand(-1, -1, agents, -1, -1)
     return Meeting(
-        own=torch.take_along_dim(own[:, :, None], index, 3)[..., 0, :],
-        other=torch.take_along_dim(plans.everybody[:, None], index, 3)[..., 0, :],
-        driven=torch.take_along_dim(plans.driven[:, :, None], index[..., 0], 3)[..., 0],
+        own=own.gather(3, index)[..., 0, :],
+        other=everybody.gather(3, index)[..., 0, :],
+        driven=driven.gather(3, first[..., None])[..., 0],
         steps=plans.steps[first],
         happens=left > 0,
     )

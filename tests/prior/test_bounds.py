@@ -8,24 +8,27 @@ import torch
 
 from e2rl.prior import lane_relative
 from e2rl.prior.bounds import (
-    GAP,
-    LATERAL_MARGIN,
-    MIN_BRAKING,
     NO_CAP,
-    ONSET,
-    STRIDE,
     BoundSettings,
     Duty,
+    Meeting,
     Obstacles,
     acceleration_caps,
     apply_cap,
     bounded,
+    meeting_braking,
 )
 from e2rl.prior.lane_relative import SIZE, locate
 from e2rl.scenes.recording import DT
 from tests.prior.small import arc
 
 CAR = (4.0, 2.0)
+# The values of docs/method.md.
+GAP = 1.2
+LATERAL_MARGIN = 0.1
+MIN_BRAKING = 0.5
+ONSET = 2.0
+STRIDE = 3
 
 
 def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
@@ -101,7 +104,7 @@ def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
     time = contact_time((15 - CAR[0]) / (10 - speed))
     room = 10 * time - GAP - speed * time
     assert cap.tolist() == pytest.approx(
-        [-((10 - speed) ** 2) / (2 * room), NO_CAP], rel=2e-2
+        [-((10 - speed) ** 2) / (2 * room), NO_CAP], rel=1e-3
     )
 
 
@@ -224,3 +227,64 @@ def test_a_cap_lowers_the_next_knot_and_at_most_by_its_onset_the_present_acceler
         0, :, 0
     ].tolist() == [-4.0, -3.0, -5.0]
     assert torch.equal(capped[..., 1:], x0[..., 1:])
+
+
+def braking_of(
+    speed,
+    room,
+    *,
+    other_speed=0.0,
+    angle=0.0,
+    ahead=10.0,
+    steps=10,
+    length=4.0,
+    yields=False,
+    patience=0.0,
+):
+    """Braking of a vehicle that meets the ego, `ahead` m before it then, after driving
+    GAP + room m in so many steps."""
+    number = lambda value: torch.full((1, 1, 1), float(value))  # noqa: E731
+    meeting = Meeting(
+        own=torch.tensor([0.0, 0.0, 0.0, speed]).view(1, 1, 1, 4),
+        other=torch.tensor([ahead, 0.0, angle, other_speed]).view(1, 1, 1, 4),
+        driven=number(GAP + room),
+        steps=number(steps),
+        happens=number(1) > 0,
+    )
+    duty = Duty(
+        exempt=torch.zeros(1, 1, dtype=torch.bool),
+        yields=torch.full((1, 1), yields),
+        patience=torch.full((1, 1), patience),
+    )
+    return meeting_braking(
+        meeting,
+        torch.tensor([[speed]]),
+        length=torch.tensor([[length]]),
+        duty=duty,
+    ).item()
+
+
+def test_braking_is_that_of_constant_deceleration_in_the_room():
+    assert braking_of(6.0, 9.0) == pytest.approx(6**2 / (2 * 9))
+
+
+def test_no_more_is_asked_for_than_in_a_third_of_a_metre():
+    assert braking_of(1.5, 0.05) == pytest.approx(1.5**2 / (2 * 0.3))
+
+
+@pytest.mark.parametrize(("patience", "waits"), [(0.98, False), (1.02, True)])
+def test_who_waits_looks_half_a_second_ahead(patience, waits):
+    """At 4 m/s with 10 m of room: 8 m are left then, in which 1 m/s^2 suffices."""
+    assert (braking_of(4.0, 10.0, patience=patience) == -NO_CAP) == waits
+
+
+@pytest.mark.parametrize(("cosine", "behind"), [(0.72, True), (0.68, False)])
+def test_who_comes_alongside_falls_behind_and_who_crosses_does_not(cosine, behind):
+    """4 + 1.2 - 0.5 m back within a second."""
+    braking = braking_of(2.0, 50.0, angle=math.acos(cosine), ahead=0.5, yields=True)
+    assert braking == pytest.approx(2 * 4.7 if behind else MIN_BRAKING, rel=1e-3)
+
+
+def test_whoever_is_free_has_a_cap_beyond_what_a_car_can_do():
+    decode, state, obstacles = traffic((0, 0, 0, 10))
+    assert caps(decode, state, obstacles=obstacles).tolist() == [20.0]

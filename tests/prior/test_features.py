@@ -113,3 +113,81 @@ def test_the_curve_speed_of_a_circle_is_that_of_its_radius():
     assert curve_speed(state, points, lateral=2.5, brake=1.2).item() == pytest.approx(
         math.sqrt(2.5 / 0.02), rel=1e-2
     )
+
+
+def spiral(rate):
+    """Vertices [150, 2] every 2 m of a route whose curvature grows by `rate` a metre
+    from 20 m on."""
+    s = 0.02 * torch.arange(15_000, dtype=torch.float64) - 20.0
+    heading = rate * s.clamp(min=0) ** 2 / 2
+    step = 0.02 * torch.stack([heading.cos(), heading.sin()], -1)
+    line = step.cumsum(0) - step[0] + torch.tensor([-20.0, 0.0])
+    return line[::100].float()
+
+
+def ego_nodes(points, **options):
+    scene = curved_scenes(**options)
+    scene["start"][:, 0] = torch.tensor([0.0, 0.0, 0.0, 8.0])
+    scene["route_points"][:, 0] = points
+    scene["start_yaw_rate"][:, 0] = 0.0
+    return features(scene)[0][0, 0]
+
+
+def test_curvature_is_seen_now_and_up_to_60_metres_ahead():
+    """15 times the curvature."""
+    nodes = ego_nodes(spiral(0.001))
+    at = torch.tensor([5.0, 10.0, 20.0, 30.0, 45.0, 60.0])
+    torch.testing.assert_close(nodes[10:16], 15 * 0.001 * at, rtol=0, atol=2e-2)
+
+
+def test_turns_are_seen_10_to_80_metres_ahead():
+    nodes = ego_nodes(arc(0.0, 0.0, heading=0.0, curvature=0.01))
+    expected = torch.tensor([0.1, 0.2, 0.4, 0.6, 0.8])
+    torch.testing.assert_close(nodes[16:21], expected, rtol=0, atol=5e-3)
+
+
+def test_speed_to_spare_is_that_of_comfortable_curves():
+    """2.5 m/s^2 of lateral acceleration in a circle of 50 m."""
+    nodes = ego_nodes(arc(0.0, 0.0, heading=0.0, curvature=0.02))
+    assert nodes[22].item() == pytest.approx((math.sqrt(2.5 * 50) - 8) / 5, abs=0.01)
+
+
+def test_speed_to_spare_before_a_curve_is_that_of_comfortable_braking():
+    """Straight for 40 m, then a circle of 10 m, met after braking by 1.2 m/s^2; the
+    vertices round where it begins."""
+    bend = arc(40.0, 0.0, heading=0.0, curvature=0.1, back=0.0)
+    straight = torch.stack([torch.arange(-20.0, 40.0, 2.0), torch.zeros(30)], -1)
+    nodes = ego_nodes(torch.cat([straight, bend])[:150])
+    expected = math.sqrt(2.5 * 10 + 2 * 1.2 * 40) - 8
+    assert nodes[22].item() == pytest.approx(expected / 5, abs=0.08)
+
+
+def test_leaders_are_seen_now_and_in_one_and_a_half_and_three_seconds():
+    """At constant velocity, while the vehicle stays where it is."""
+    scene = curved_scenes()
+    scene["start"][:, 1] = torch.tensor([18.0, 0.0, 0.0, 6.0])
+    routed = route_scene(scene, scene["route_log"].clamp(min=0))
+    present = scene["valid"].clone()
+    present[:, 2:] = False
+    gap = leaders_ahead(
+        routed,
+        torch.full(scene["route_log"].shape, 20.0),
+        agents=scene["start"],
+        present=present,
+    ).gap[0, 0]
+    assert gap.diff().tolist() == pytest.approx([9.0, 9.0], abs=0.1)
+
+
+def idm(v, limit, gap=None, leading=0.0):
+    """Acceleration of a driver with 1 s of headway, 2 m at a standstill, 1.5 and 2
+    m/s^2."""
+    wanted = 2.0 + max(0, v + v * (v - leading) / (2 * math.sqrt(1.5 * 2.0)))
+    interaction = 0.0 if gap is None else (wanted / gap) ** 2
+    return 1.5 * (1 - (v / limit) ** 4 - interaction)
+
+
+def test_what_a_driver_would_do_is_seen():
+    nodes = ego_nodes(arc(0.0, 0.0, heading=0.0, curvature=0.0), limit=15.0)
+    gap = -20 * math.log(nodes[25])
+    expected = idm(8.0, 15.0, gap=gap, leading=6.0)
+    assert nodes[31].item() == pytest.approx(expected / 2, abs=0.02)

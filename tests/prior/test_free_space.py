@@ -1,5 +1,6 @@
 """Free-space plans: circles at constant curvature, the round trip, standing still."""
 
+import pytest
 import torch
 
 from e2rl.prior.free_space import curvature_scale, decode, fit
@@ -91,3 +92,36 @@ def test_a_standing_vehicle_stays_and_gradients_are_finite():
     torch.testing.assert_close(plan.heading, state.heading[:, None].expand(4, HORIZON))
     (gradient,) = torch.autograd.grad(plan.states().sum(), x)
     assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize(("speed", "curvature"), [(8.0, 0.1 / 8), (1.0, 0.1 / 3)])
+def test_a_unit_is_a_tenth_of_a_radian_a_second(speed, curvature):
+    scale = curvature_scale(torch.tensor(speed)).item()
+    assert scale == pytest.approx(curvature)
+
+
+def test_fitted_knots_are_no_larger_than_six_units():
+    state = start(torch.full((1,), 8.0), torch.zeros(1), heading=torch.zeros(1))
+    spin = 0.05 * torch.arange(1, HORIZON + 1)[None]
+    lateral = fit(
+        spin, torch.ones(1, HORIZON), state=state, knots=torch.zeros(1, KNOTS)
+    )
+    assert lateral.abs().max().item() == pytest.approx(6.0)
+
+
+def test_fitted_knots_are_those_of_the_ridge():
+    """Weighted by 0.001, of a turn that the first steps know, in which knots matter
+    little."""
+    state = start(torch.full((1,), 8.0), torch.zeros(1), heading=torch.zeros(1))
+    known = (torch.arange(HORIZON) < 6).float()[None]
+    units = []
+    for number in (KNOTS, KNOTS + 1):
+        x = torch.zeros(1, SIZE)
+        x[0, number] = 1.0
+        units.append(decode(x, state).heading[0, :6])
+    rows = torch.stack(units, -1).double()
+    gram = rows.T @ rows + 1e-3 * torch.eye(2).double()
+    expected = torch.linalg.solve(gram, (0.02 * rows).sum(0))
+    heading = torch.full((1, HORIZON), 0.02)
+    lateral = fit(heading, known, state=state, knots=torch.zeros(1, KNOTS))
+    torch.testing.assert_close(lateral[0].double(), expected, rtol=1e-2, atol=1e-4)

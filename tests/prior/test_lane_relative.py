@@ -7,12 +7,12 @@ import torch
 from e2rl.prior.lane_relative import (
     HORIZON,
     KNOTS,
-    OFFSET_SCALE,
     SIZE,
     LaneState,
     decode,
     fit,
     lateral_horizon,
+    locate,
     polynomial,
     speeds,
     split,
@@ -21,6 +21,7 @@ from tests.prior.small import arc, random_state
 
 COUNT = 64
 TIME = 0.1 * torch.arange(1, HORIZON + 1)
+OFFSET_SCALE = 0.5
 
 
 @pytest.fixture
@@ -205,3 +206,113 @@ def test_the_polynomial_and_its_gradients():
         (c[..., None, 2:] * (power * (power - 1))[2:] * at ** power[:-2]).sum(-1),
     )
     assert torch.autograd.gradcheck(polynomial, (c, u))
+
+
+def test_a_plan_is_five_seconds_long_with_a_knot_every_half_second():
+    assert (HORIZON, KNOTS, SIZE) == (50, 10, 12)
+
+
+def test_lateral_knots_are_half_metres_at_the_end_and_a_bend_half_way():
+    state = straight(8.0, d=1.0)
+    x = torch.zeros(1, SIZE)
+    x[0, KNOTS:] = torch.tensor([2.0, -3.0])
+    _, half, end = split(x, state)
+    assert end.item() == pytest.approx(0.5 * -3.0)
+    assert half.item() == pytest.approx((1.0 - 1.5) / 2 + 0.15 * 2.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "reach"), [(1.0, 10.0), (8.0, 32.0), (19.0, 76.0), (30.0, 80.0)]
+)
+def test_an_offset_settles_within_four_seconds_and_ten_to_eighty_metres(speed, reach):
+    assert lateral_horizon(torch.tensor(speed)).item() == pytest.approx(reach)
+
+
+def test_deep_inside_a_bend_a_metre_of_route_is_three_tenths_of_the_line():
+    """At 19 m inside of a circle of 20 m it would be a twentieth."""
+    turn = 0.2
+    state = locate(
+        torch.tensor([[[0.0, 19.0, turn, 5.0]]]),
+        torch.zeros(1, 1),
+        yaw_rate=torch.zeros(1, 1),
+        points=arc(0.0, 0.0, heading=0.0, curvature=0.05)[None, None],
+        hint=torch.full((1, 1), 20.0),
+    )
+    at_nearest = state.d1 / torch.tan(wrap_of(state, turn))
+    assert at_nearest.item() == pytest.approx(0.3, rel=1e-3)
+
+
+def wrap_of(state, heading):
+    """Angle of a vehicle to a circle of 0.05 / m that it looks along at 20 m."""
+    return heading - 0.05 * (state.s - 20.0)
+
+
+def test_a_twentieth_of_the_gradient_passes_where_the_speed_is_held_at_0():
+    """The last knot's share of the last speed is half of 0.5 s."""
+    knots = torch.full((1, KNOTS), -4.0, requires_grad=True)
+    v, _ = speeds(straight(1.0), knots)
+    v[0, -1].backward()
+    assert v[0, -1] == 0
+    assert knots.grad[0, -1].item() == pytest.approx(0.05 * 0.25, rel=1e-4)
+
+
+def ridge_fit(track, known, state):
+    """Acceleration knots by least squares on stacked rows, second differences weighted
+    by 0.3, knots by 0.001."""
+    columns = [speeds(state, unit[None]) for unit in torch.eye(KNOTS)]
+    base_v, base_s = speeds(state, torch.zeros(1, KNOTS))
+    rows_v = torch.cat([v - base_v for v, _ in columns]).T * known.T
+    rows_s = torch.cat([s - base_s for _, s in columns]).T * known.T / 2
+    bend = torch.eye(KNOTS + 1).diff(n=2, dim=0)
+    rows = [rows_v, rows_s, 0.3**0.5 * bend[:, 1:], 1e-3**0.5 * torch.eye(KNOTS)]
+    right = [
+        (known * (track.v - base_v))[0],
+        (known * (track.s - state.s[:, None] - base_s))[0] / 2,
+        -(0.3**0.5) * bend[:, 0] * state.a,
+        torch.zeros(KNOTS),
+    ]
+    system = torch.cat(rows).double()
+    return torch.linalg.lstsq(system, torch.cat(right).double()[:, None])[0][:, 0]
+
+
+@pytest.mark.parametrize("steps", [0, 12, 50])
+def test_fitted_accelerations_are_those_of_the_ridge(steps):
+    """Of a motion that changes fast, known for so many steps."""
+    state = straight(12.0, a=1.0)
+    x = torch.zeros(1, SIZE)
+    x[0, :KNOTS:2] = 2.0
+    track = decode(x, state, arc(0, 0, heading=0, curvature=0)[None])
+    known = (torch.arange(HORIZON) < steps).float()[None]
+    knots = fit(track, known, state)[0][0, :KNOTS]
+    expected = ridge_fit(track, known, state)
+    torch.testing.assert_close(knots.double(), expected, rtol=0, atol=2e-3)
+
+
+def test_fitted_lateral_knots_are_those_of_the_ridge():
+    """Weighted by 0.05 and 0.02, of a jump of 2 m that five steps know."""
+    state = straight(8.0)
+    route = arc(0, 0, heading=0, curvature=0)[None]
+    track = decode(torch.zeros(1, SIZE), state, route)
+    track.d = torch.full_like(track.d, 2.0)
+    known = torch.zeros(1, HORIZON)
+    known[:, 20:25] = 1.0
+    units = []
+    for number in (KNOTS, KNOTS + 1):
+        x = torch.zeros(1, SIZE)
+        x[0, number] = 1.0
+        units.append(decode(x, state, route).d[0, 20:25])
+    rows = torch.stack(units, -1).double()
+    gram = rows.T @ rows + torch.diag(torch.tensor([0.05, 0.02])).double()
+    expected = torch.linalg.solve(gram, (2.0 * rows).sum(0))
+    lateral = fit(track, known, state)[0][0, KNOTS:]
+    torch.testing.assert_close(lateral.double(), expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("accel", "limit"), [(-15.0, -8.0), (12.0, 5.0)])
+def test_fitted_accelerations_are_what_a_car_can_do(accel, limit):
+    state = straight(60.0 if accel < 0 else 5.0)
+    track = straight(0.0).map(lambda value: value[:, None].expand(1, HORIZON))
+    track.v = state.v[:, None] + accel * TIME
+    track.s = state.s[:, None] + state.v[:, None] * TIME + accel * TIME**2 / 2
+    knots = fit(track, torch.ones(1, HORIZON), state)[0][0, :KNOTS]
+    assert knots.abs().max().item() == pytest.approx(abs(limit))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.prior.bounds import BoundSettings, Duty
-from e2rl.prior.lane_relative import HORIZON, SIZE
+from e2rl.prior.lane_relative import HORIZON, KNOTS, SIZE
 from e2rl.prior.prior import Prior
 from e2rl.prior.routes import sample_route
 from e2rl.prior.sde import SamplerSettings
@@ -338,3 +338,52 @@ def test_without_a_plan_the_ego_is_sampled_like_everybody_else():
         for seed in (0, 1)
     )
     assert (one - two).abs().amin() > 0
+
+
+def test_the_network_sees_the_ego_s_plan_nearly_noise_free(monkeypatch):
+    scene = curved_scenes()
+    prior = small_prior()
+    context = context_of(prior, scene)
+    seen = []
+    monkeypatch.setattr(
+        prior.denoiser, "forward", lambda x, level, encoding: seen.append(level) or x
+    )
+    prior.denoise(noise_for(prior, scene)[0], torch.tensor(0.7), context)
+    assert seen[0][0].tolist() == pytest.approx([0.01] + [0.7] * (seen[0].shape[1] - 1))
+
+
+@pytest.mark.parametrize(
+    ("speed", "accel", "held"),
+    [
+        (0.48, -0.05, True),  # 1.8 m in 5 s
+        (0.52, -0.06, False),  # 1.9 m, but it moves
+        (0.4, -0.01, True),  # 1.9 m
+        (0.4, 0.01, False),  # 2.1 m
+    ],
+)
+def test_who_stands_is_held_until_its_plan_leads_two_metres_on(speed, accel, held):
+    scene = curved_scenes()
+    scene["start"][:, 4, 3] = speed
+    scene["start_accel"][:, 4] = accel
+    prior = small_prior(bounds=FREE)
+    x0 = torch.zeros(*scene["route_log"].shape, SIZE)
+    x0[:, 4, :KNOTS] = accel
+    plan = prior.plan(x0, context_of(prior, scene))
+    assert (plan.motion.v[0, 4, 0].item() == 0) == held
+
+
+@pytest.mark.parametrize(("spent", "controlled"), [(0.9, True), (0.9995, False)])
+def test_a_budget_counts_as_spent_a_thousandth_before_its_end(spent, controlled):
+    """The step without noise is controlled where some of the budget is left."""
+    prior = gaussian_prior(steps=3)
+    noise = torch.randn(3, 1, 1, SIZE, generator=torch.Generator().manual_seed(3))
+
+    def control(x, level, k, context, denoise):
+        x0 = denoise(x)
+        return x, x0, x0 + 0.5
+
+    used = prior.sample(None, noise, control).kl[:, 0]
+    sample = prior.sample(None, noise, control, budget=used / spent)
+    free = prior.sample(None, noise, control)
+    shift = (sample.x0 - free.x0).abs().max().item()
+    assert (shift < 0.05) == controlled

@@ -133,6 +133,13 @@ def test_levels_are_even_in_what_they_are_spaced_by():
     )
 
 
+def test_levels_begin_at_nearly_pure_noise_and_end_at_little():
+    """0.98, and 0.24 divided by the number of steps before the last."""
+    levels = SCHEDULE.levels(8, spacing="log_ratio")
+    assert levels[0].item() == pytest.approx(0.98)
+    assert levels[-2].item() == pytest.approx(0.24 / 8)
+
+
 @pytest.mark.parametrize("std", [0.35, 0.5, 0.7, 1.0, 1.5])
 def test_eight_steps_even_in_the_log_ratio_keep_the_spread(std):
     """Within 5% of the data's, over all spreads that knots have; ancestral steps, even

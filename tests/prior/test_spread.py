@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from e2rl.prior.sde import SamplerSettings
-from e2rl.prior.spread import central, sample_variances
+from e2rl.prior.spread import REGIONS, central, sample_variances
 from tests.prior.gaussian import denoiser, moments
-from tests.prior.small import small_prior
+from tests.prior.small import curved_scenes, small_prior
 from tests.traffic.e2.traffic_scenes import scenes
 
 STD = 0.6
@@ -56,3 +56,17 @@ def test_a_value_of_the_samples_own_law_lies_in_their_central_part_that_often(
     assert torch.equal(
         central(ranks, samples, part=part), central(samples - ranks, samples, part=part)
     )
+
+
+def test_the_regions_are_half_and_nine_tenths_of_the_samples():
+    assert REGIONS == {"covered_50": 0.5, "covered_90": 0.9}
+
+
+def test_vehicles_above_a_metre_a_second_count():
+    scene = curved_scenes()
+    count = {}
+    for speed in (0.95, 1.05):
+        scene["start"][:, 4, 3] = speed
+        prior = small_prior(sampler=SamplerSettings(steps=2))
+        count[speed] = sample_variances(prior, scene, samples=2)["vehicles"].item()
+    assert count[1.05] == count[0.95] + 1
