@@ -9,6 +9,11 @@ import torch
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 
+# The values of docs/method.md.
+MAX_SPEED = 40.0
+MAX_LATERAL = 8.0
+MAX_CURVATURE = 0.3
+
 
 def random_case(batch=64, horizon=50, seed=0):
     generator = torch.Generator().manual_seed(seed)
@@ -47,7 +52,7 @@ def test_rollout_equals_recursion_with_clipped_speeds():
     state = start
     speeds = []
     for k in range(actions.shape[1]):
-        expected = (state[:, 3] + actions[:, k, 0] * DT).clamp(0, dynamics.MAX_SPEED)
+        expected = (state[:, 3] + actions[:, k, 0] * DT).clamp(0, MAX_SPEED)
         state = dynamics.step(state, actions[:, k])
         speeds.append(expected)
         assert torch.allclose(state, parallel[:, k], atol=1e-9)
@@ -106,7 +111,7 @@ def test_a_rollout_is_repeated_steps_forwards_and_backwards():
 def test_who_reverses_turns_within_the_steering_s_limits():
     """A path's curvature times the metres driven, which are negative."""
     state = dynamics.step(torch.tensor([0.0, 0.0, 0.0, -5.0]), torch.tensor([0.0, 9.0]))
-    assert state[2].item() == pytest.approx(dynamics.MAX_CURVATURE * 0.485, abs=1e-4)
+    assert state[2].item() == pytest.approx(MAX_CURVATURE * 0.485, abs=1e-4)
 
 
 def test_turns_respect_curvature_and_lateral_acceleration():
@@ -115,9 +120,7 @@ def test_turns_respect_curvature_and_lateral_acceleration():
     rate = dynamics.wrap(states[:, 1:, 2] - states[:, :-1, 2]).abs() / DT
     speed = (states[:, 1:, 3] + states[:, :-1, 3]) / 2
     asked = (10 * actions[..., 1]).abs()
-    allowed = torch.minimum(
-        dynamics.MAX_CURVATURE * speed, dynamics.MAX_LATERAL / speed.clamp(min=1e-3)
-    )
+    allowed = torch.minimum(MAX_CURVATURE * speed, MAX_LATERAL / speed.clamp(min=1e-3))
     torch.testing.assert_close(rate, torch.minimum(asked, allowed))
     assert (asked < allowed).any() and (speed > 6).any() and (speed < 4).any(), (
         "by steering lock, grip, or neither"
@@ -147,9 +150,7 @@ def test_the_curvature_that_is_expected_of_a_turn():
     rate = torch.tensor([0.5, -0.3, 0.05, 2.0])
     speed = torch.tensor([10.0, 6.0, 0.2, 5.0])
     found = dynamics.curvature_of(rate, speed)
-    torch.testing.assert_close(
-        found, torch.tensor([0.05, -0.05, 0.05, dynamics.SHARPEST])
-    )
+    torch.testing.assert_close(found, torch.tensor([0.05, -0.05, 0.05, 0.12]))
 
 
 def test_constant_velocity_is_a_rollout_without_actions():
@@ -179,3 +180,10 @@ def test_the_cost_of_the_closest_approach_has_its_published_values(
         torch.tensor(offset).double(), torch.tensor(closing).double()
     )
     assert found.item() == pytest.approx(cost, abs=1e-4)
+
+
+def test_nobody_is_faster_than_40_metres_a_second():
+    states = dynamics.rollout(
+        torch.tensor([0.0, 0.0, 0.0, 39.0]), torch.tensor([5.0, 0.0]).expand(10, 2)
+    )
+    assert states[:, 3].max().item() == MAX_SPEED

@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from e2rl.sim.neighbours import STOOD, neighbours_of, own_fault, rotation_into
+from e2rl.sim.neighbours import neighbours_of, own_fault, rotation_into
 from e2rl.sim.world import Agents, Tracks
 
 SIZE = torch.tensor([[4.0, 2.0]])
+STOOD = 20  # steps: two seconds (UK Highway Code, rule 126)
 
 
 def judged(ego, others, since=0, vehicle=True, steps=40):
@@ -57,6 +58,8 @@ def judged(ego, others, since=0, vehicle=True, steps=40):
         ((3.8, 0.0), -2.0, 3.0, False),  # at its trailing front
         ((3.8, 0.0), 5.0, -2.0, True),  # ahead, and reversing
         ((0.0, 1.9), 5.0, -2.0, False),  # beside, and reversing: it does not stand
+        ((0.0, 1.9), 5.0, 0.09, True),  # slower than a decimetre a second: it stands
+        ((0.0, 1.9), 5.0, 0.11, False),
     ],
 )
 def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):

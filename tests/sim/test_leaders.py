@@ -5,8 +5,6 @@ import torch
 
 from e2rl.scenes.route import project
 from e2rl.sim.leaders import (
-    FREE_GAP,
-    GATE_MARGIN,
     IDMParameters,
     Leaders,
     desired_gap,
@@ -16,6 +14,8 @@ from e2rl.sim.leaders import (
 from tests.loops import CROSSING, loop, track
 from tests.prior.small import arc
 
+FREE_GAP = 200.0
+GATE_MARGIN = 0.3
 LENGTH = 4.0
 WIDTH = 2.0
 DRIVER = IDMParameters(headway=1.0, standstill_gap=5.0, acceleration=1.0, braking=3.0)
@@ -192,3 +192,16 @@ def test_above_the_desired_speed_only_the_improved_term_brakes_comfortably():
     assert accel(20, 10, gap=torch.inf, leading=0, improved=False) == pytest.approx(
         1 - 2**4
     )
+
+
+@pytest.mark.parametrize(("clearance", "leads"), [(0.28, True), (0.32, False)])
+def test_who_is_within_three_tenths_of_a_metre_of_the_lane_taken_leads(
+    clearance, leads
+):
+    gap, _, _ = lead([(0, 0, 0, 9), (30, WIDTH + clearance, 0, 6)])
+    assert (gap.item() < 200.0) == leads
+
+
+@pytest.mark.parametrize(("distance", "gap"), [(203.0, 199.0), (206.0, 200.0)])
+def test_who_is_beyond_200_metres_leads_nobody(distance, gap):
+    assert lead([(0, 0, 0, 9), (distance, 0, 0, 6)])[0].item() == pytest.approx(gap)

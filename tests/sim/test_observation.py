@@ -9,7 +9,7 @@ from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import mission_of
-from e2rl.sim.observation import UNLIMITED, light_features, mirrored, observation_config
+from e2rl.sim.observation import light_features, mirrored, observation_config
 from e2rl.sim.static import static_scene
 from tests.synthetic import make_scenes
 
@@ -88,7 +88,7 @@ def test_absent_agents_leave_no_trace():
 
 
 @pytest.mark.parametrize(
-    ("speed", "limit"), [(8.0, UNLIMITED), (15.0, 15.5)]
+    ("speed", "limit"), [(8.0, 12.0), (15.0, 15.5)]
 )  # m/s; the ego accelerates by half
 def test_a_map_without_limits_looks_like_one_with_the_usual_one_or_that_of_the_ego_s_speed(
     speed, limit

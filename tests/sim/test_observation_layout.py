@@ -120,3 +120,62 @@ def test_manoeuvres(seen):
     """To brake hard keeps the distance, to accelerate on the lane does not."""
     assert seen["manoeuvre.+3.5.+0.gap"] < seen["manoeuvre.-7.+0.gap"]
     assert seen["manoeuvre.-7.+0.contact"] == pytest.approx(3.7), "none within 3.2 s"
+
+
+def test_the_mission_is_seen_up_to_75_metres_ahead(seen):
+    ahead = [2, 4, 7, 10, 14, 19, 25, 32, 40, 50, 62, 75]
+    places = [seen[f"route.{k}.x"] for k in range(12)]
+    assert places == pytest.approx(ahead, abs=1e-2)
+
+
+def test_the_border_is_probed_five_times_five_times():
+    probes = [e.name for e in observation_layout() if e.name.startswith("border")]
+    ahead = ("-3", "+0", "+5", "+11", "+20")
+    aside = ("-5", "-2.5", "+0", "+2.5", "+5")
+    assert probes == [f"border.{x}.{y}" for x in ahead for y in aside]
+
+
+def test_numbers_are_in_units_that_policies_were_trained_with():
+    """A scale that changes makes every trained network blind."""
+    scale = {entry.name: entry.scale for entry in observation_layout()}
+    expected = {
+        "ego.speed": 15.0,
+        "ego.acceleration": 4.0,
+        "ego.offset": 3.0,
+        "route.0.x": 40.0,
+        "route.0.y": 10.0,
+        "agent.0.gap": 10.0,
+        "agent.0.turn_rate": 0.5,
+        "agent.0.half_length": 2.5,
+        "manoeuvre.+1.+0.gap": 3.0,
+        "manoeuvre.+1.+0.contact": 3.7,
+    }
+    assert {name: scale[name] for name in expected} == expected
+
+
+def test_twelve_agents_are_seen_and_fifteen_manoeuvres():
+    names = [entry.name for entry in observation_layout()]
+    assert sum(name.endswith(".present") for name in names) == 12
+    manoeuvres = [name for name in names if name.startswith("manoeuvre")]
+    accelerations = ("-7", "-3.5", "-1", "+1", "+3.5")
+    offsets = ("-2.5", "+0", "+2.5")
+    assert manoeuvres[:15] == [
+        f"manoeuvre.{accel}.{offset}.gap"
+        for accel in accelerations
+        for offset in offsets
+    ]
+
+
+@pytest.mark.parametrize(("nearer", "counts"), [(5, True), (6, False)])
+def test_manoeuvres_are_held_against_the_six_nearest(nearer, counts):
+    """A car 20 m ahead, with so many pedestrians nearer than that, far aside."""
+    gaps = []
+    for ahead in (20.0, 200.0):
+        scenes = make_scenes(
+            1, vehicles=[(0.0, 0, 10.0), (ahead, 0, 0.0)], num_vrus=nearer
+        )
+        scenes.scenes["start"][0, 32 : 32 + nearer, :2] = torch.tensor([-9.0, -9.0])
+        names = [entry.name for entry in observation_layout()]
+        observation = DrivingEnv(scenes, SimSettings(), 1).reset()["observation"][0]
+        gaps.append(observation[names.index("manoeuvre.+3.5.+0.gap")].item())
+    assert (gaps[0] < gaps[1]) == counts

@@ -102,3 +102,48 @@ def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
         assert torch.equal(found.gap, near.gap) and torch.equal(
             found.position, near.position
         )
+
+
+def tiny_pass(displacement, speed, past):
+    """Whether the ego, which stands, is passed by a box of its size, 10 cm, that moves
+    `displacement` m along x to `past` m behind the ego's centre, at `speed` m/s."""
+    ego = torch.zeros(1, 4)
+    agent = torch.tensor([[[past, 0.0, 0.0, speed]]])
+    before = agent - torch.tensor([displacement, 0.0, 0.0, 0.0])
+    still = torch.zeros(1, 1)
+    first = torch.zeros(1, 1, dtype=torch.int64)
+    static = SimpleNamespace(
+        size=torch.tensor([[0.1, 0.1]]),
+        half_size=torch.full((1, 2, 1), 0.05),
+        row=first,
+    )
+    agents = Agents(agent, still == 0, accel=still, turn_rate=still)
+    near = neighbours_of(ego, rotation_into(ego), static=static, agents=agents)
+    states = torch.stack(
+        [torch.cat([ego[:, None], at], 1) for at in (before, agent)], 1
+    )
+    tracks = Tracks(states, torch.ones_like(states[..., 0], dtype=torch.bool))
+    found = passed(
+        near,
+        ego=ego,
+        ego_before=ego,
+        tracks=tracks,
+        static=static,
+        before=first[0],
+    )
+    return bool(found.gap < 0)
+
+
+@pytest.mark.parametrize(("speed", "looked_at"), [(1.9, False), (2.1, True)])
+def test_who_is_slower_than_half_a_pedestrian_in_a_step_is_not_looked_at(
+    speed, looked_at
+):
+    assert tiny_pass(0.25, speed=speed, past=0.12) == looked_at
+
+
+@pytest.mark.parametrize(("past", "looked_at"), [(1.55, True), (1.65, False)])
+def test_who_is_farther_than_half_as_much_again_as_it_moves_is_not_looked_at(
+    past, looked_at
+):
+    """At 10 m/s: 1 m in a step; gaps of 1.45 and 1.55 m."""
+    assert tiny_pass(3.0, speed=10.0, past=past) == looked_at

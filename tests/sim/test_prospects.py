@@ -15,6 +15,7 @@ from e2rl.sim.prospects import (
     Others,
     arc_places,
     gaps,
+    manoeuvres_on,
     time_to_contact,
     travelled,
 )
@@ -172,3 +173,37 @@ def test_an_arc_in_reverse_is_the_arc_forwards_of_who_looks_the_other_way(accel)
     torch.testing.assert_close(back[0], -ahead[0])
     torch.testing.assert_close(back[1], -ahead[1])
     torch.testing.assert_close(back[2], ahead[2])
+
+
+def test_gaps_are_looked_at_for_three_seconds():
+    assert TIMES == (0.5, 1.0, 1.5, 2.0, 2.6, 3.2)
+
+
+def test_an_offset_is_reached_smoothly_in_a_second_and_a_half():
+    """A third of the time: 3 / 9 - 2 / 27 of the way."""
+    fraction = manoeuvres_on(torch.device("cpu")).fraction
+    expected = torch.tensor([7 / 27, 20 / 27, 1.0, 1.0, 1.0, 1.0])
+    torch.testing.assert_close(fraction, expected)
+
+
+def standing_beside(gap):
+    """Prospects of an ego that stands, `gap` m beside a car that stands."""
+    scenes = make_scenes(1, vehicles=[(0.0, 0, 0.0), (0.0, 1, 0.0)], num_vrus=0)
+    scene = scenes.scenes
+    width = scene["size"][0, 0, 1].item()
+    for key in ("start", "logged"):
+        scene[key][..., 1, 1] = -(gap + width)
+    observation = DrivingEnv(scenes, SimSettings(), 1).reset()["observation"][0]
+    return observation[-30:].view(2, 5, 3)
+
+
+@pytest.mark.parametrize(("gap", "seen"), [(1.5, 0.5), (2.7, 0.9), (3.5, 1.0)])
+def test_gaps_are_told_apart_up_to_three_metres(gap, seen):
+    """Of braking in the lane."""
+    assert standing_beside(gap)[0, 0, 1].item() == pytest.approx(seen, abs=0.01)
+
+
+@pytest.mark.parametrize(("gap", "contact"), [(0.18, True), (0.22, False)])
+def test_a_gap_below_two_tenths_of_a_metre_is_none(gap, contact):
+    first = standing_beside(gap)[1, 0, 1].item()
+    assert first == pytest.approx(0.5 / 3.7 if contact else 1.0)
