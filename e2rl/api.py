@@ -27,7 +27,6 @@ from torchrl.envs import TransformedEnv
 
 from e2rl.driving.setup import Method, Setup, Task
 from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_traffic
-from e2rl.learning.rounds.policy import RowDraw
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.planners.policy_file import write_policy
@@ -42,7 +41,7 @@ from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.rollout_file import Failure
 from e2rl.sim.rollouts import Rollouts
 from e2rl.traffic.fusing import prepare_fused
-from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.pool import RowDraw, TrafficPool
 from e2rl.traffic.traffic import Traffic
 from e2rl.traffic.transform import AdversarialSynthesizer
 

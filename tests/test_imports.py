@@ -86,6 +86,5 @@ def test_learning_can_be_imported_after_an_ego_was_built():
     """TorchRL changes a module class when it is first built: other classes must not
     copy its attributes."""
     EgoPolicy(IDMEgo(), DrivingEnv(make_scenes(1), SimSettings(), 1, agents=True))
-    assert "PoolDriver" in runpy.run_path(
-        str(PACKAGE / "learning" / "pretraining" / "driving.py")
-    )
+    path = PACKAGE / "learning" / "rounds" / "policy.py"
+    assert "PolicyImprovement" in runpy.run_path(str(path))

@@ -10,7 +10,6 @@ from PIL import Image
 from torchrl.record.loggers import CSVLogger, TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
 
-from e2rl.learning.rounds.scheduler import COLUMNS, Choice
 from e2rl.run.config import library
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically
@@ -34,10 +33,14 @@ class RunLogger:
         self._logger = _logger(kind, self._folder, project=project, name=name)
 
     def log(
-        self, metrics: Mapping[str, float], step: int, choices: Sequence[Choice] = ()
+        self,
+        metrics: Mapping[str, float],
+        step: int,
+        choices: Sequence[Mapping[str, float]] = (),
     ) -> None:
-        """Write the metrics of a step, and the rows of a round's choices beside those
-        of earlier rounds; raises InputError for a name outside GROUPS."""
+        """Write the metrics of a step, and the rows of a round's choices, which have
+        the same columns, below those of earlier rounds; raises InputError for a name
+        outside GROUPS."""
         wrong = [
             name
             for name in metrics
@@ -49,26 +52,25 @@ class RunLogger:
             )
         if self._logger is None:
             return
-        known = {
+        numbers = {
             name: float(value)
             for name, value in metrics.items()
             if not math.isnan(value)
         }
         if isinstance(self._logger, WandbLogger):
-            self._write_row(known, step)
+            self._write_row(numbers, step)
         else:
-            for name, value in known.items():
+            for name, value in numbers.items():
                 self._logger.log_scalar(name, value, step=step)
         if choices:
             path = self._folder / CHOICES
             earlier = lines_before(path, step) if path.is_file() else []
+            header = ",".join(choices[0]) + "\n"
             rows = [
-                ["" if row[name] != row[name] else row[name] for name in COLUMNS]
+                ["" if math.isnan(value) else value for value in row.values()]
                 for row in choices
-            ]  # NaN: empty
-            write_atomically(
-                path, "".join([",".join(COLUMNS) + "\n", *earlier, csv_text(rows)])
-            )
+            ]
+            write_atomically(path, "".join([header, *earlier, csv_text(rows)]))
 
     def show(self, name: str, path: Path, step: int) -> None:
         """Put a picture (PNG) or video (GIF) on the dashboard, if there is one; name:
@@ -86,14 +88,14 @@ class RunLogger:
         elif isinstance(self._logger, TensorboardLogger):
             from tensorboard.compat.proto.summary_pb2 import Summary
 
-            with Image.open(
-                path
-            ) as image:  # its bytes as they are, since a video moves there, too
-                given = {"width": image.width, "height": image.height, "colorspace": 3}
-            value = Summary.Value(
-                tag=name,
-                image=Summary.Image(encoded_image_string=path.read_bytes(), **given),
-            )
+            with Image.open(path) as image:
+                picture = Summary.Image(
+                    encoded_image_string=path.read_bytes(),  # a video moves there, too
+                    width=image.width,
+                    height=image.height,
+                    colorspace=3,
+                )
+            value = Summary.Value(tag=name, image=picture)
             self._logger.experiment.file_writer.add_summary(
                 Summary(value=[value]), step
             )
@@ -130,13 +132,13 @@ def _logger(kind: str, folder: Path, project: str, name: str | None) -> Logger |
     if kind == "csv":
         return CSVLogger("logs", log_dir=str(folder))
     if kind == "wandb":
-        given = {
-            "offline": True,
-            "save_dir": str(folder),
-            "project": project,
-            "log_env_packages": False,
-        }
-        return WandbLogger(name or folder.name, **given)
+        return WandbLogger(
+            name or folder.name,
+            offline=True,
+            save_dir=str(folder),
+            project=project,
+            log_env_packages=False,
+        )
     if kind == "tensorboard":
         library("tensorboard", "logger=tensorboard", extra="tensorboard")
         return TensorboardLogger("tensorboard", log_dir=str(folder))

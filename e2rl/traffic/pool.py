@@ -1,6 +1,7 @@
 """The pool of episodes: scenes with recorded traffic, stored traffic (D'), or reactive
 traffic."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -158,3 +159,29 @@ def _rows(
             torch.tensor(RULE).repeat(len(zero), 1) if decisions is None else decisions
         ),
     )
+
+
+class RowDraw:
+    """Draws pool rows by probability [R], with a generator of its own."""
+
+    def __init__(self, probability: Tensor, seed: int | None = 0) -> None:
+        """seed: None, of the system's entropy, anew in every process that a copy draws
+        in until somebody seeds it."""
+        self.probability = probability
+        self.generator = torch.Generator()
+        self._process = os.getpid()
+        self._entropy = None
+        if seed is None:
+            self._entropy = self.generator.seed()
+        else:
+            self.generator.manual_seed(seed)
+
+    def __call__(self, count: int) -> Tensor:
+        """Rows [count]."""
+        unseeded = self._entropy == self.generator.initial_seed()
+        if unseeded and self._process != os.getpid():
+            self._process = os.getpid()
+            self._entropy = self.generator.seed()
+        return torch.multinomial(
+            self.probability, count, replacement=True, generator=self.generator
+        )

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from e2rl.learning.logging import CHOICES, RunLogger
-from e2rl.learning.rounds.scheduler import COLUMNS
 from e2rl.run.errors import InputError
 
 WANDB_HEADER, LEVELDB_BLOCK = 7, 1 << 15  # bytes
@@ -40,10 +39,9 @@ def test_what_a_resumed_run_logs_again_is_not_doubled(tmp_path):
 def test_the_table_of_choices_goes_on_where_a_round_is_logged_again(tmp_path):
     logger = RunLogger("csv", tmp_path)
     for number in (0, 1, 1):
-        logger.log({}, number, [dict.fromkeys(COLUMNS, math.nan) | {"round": number}])
-    header, *rows = (tmp_path / CHOICES).read_text().splitlines()
-    assert header == ",".join(COLUMNS)
-    assert rows == ["0,,,,,,", "1,,,,,,"], "NaN is empty"
+        logger.log({}, number, [{"round": number, "eta": 0.5, "rate": math.nan}])
+    lines = (tmp_path / CHOICES).read_text().splitlines()
+    assert lines == ["round,eta,rate", "0,0.5,", "1,0.5,"], "NaN is empty"
 
 
 def test_wandb_has_scalars_and_media_of_a_step_in_one_row(tmp_path, monkeypatch):

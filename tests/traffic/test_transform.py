@@ -8,7 +8,6 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from e2rl.learning.rounds.policy import RowDraw
 from e2rl.planners.ego import Ego
 from e2rl.planners.ego_errors import PlannerError, TrafficNotFinite
 from e2rl.planners.ego_policy import EgoPolicy
@@ -16,7 +15,7 @@ from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.attempt import attempt
-from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.pool import RowDraw, TrafficPool
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from e2rl.traffic.transform import AdversarialSynthesizer
 from tests.learning.small import brake_check

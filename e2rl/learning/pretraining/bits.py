@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.pretraining.supervised import Epochs, stage_settings
@@ -41,41 +42,24 @@ from e2rl.sim.dynamics import wrap
 from e2rl.sim.mission import mission_of
 from e2rl.sim.world import World
 
-AGENT_KEYS = (
-    "start",
-    "start_accel",
-    "start_yaw_rate",
-    "valid",
-    "size",
-    "agent_type",
-)  # one row an agent
-LOG_KEYS = ("logged", "logged_valid")  # one column an agent
-ROUTE_KEYS = (
-    "points",
-    "length",
-    "open",
-    "limit",
-    "light",
-    "light_s",
-)  # of "route_...", by vehicle
+# Keys of scenes: with one row an agent, one column an agent, and of vehicles' routes.
+AGENT_KEYS = ("start", "start_accel", "start_yaw_rate", "valid", "size", "agent_type")
+LOG_KEYS = ("logged", "logged_valid")
+ROUTE_KEYS = tuple(
+    f"route_{name}"
+    for name in ("points", "length", "open", "limit", "light", "light_s")
+)
 MAP_KEYS = ("light_state", "field", "field_origin")
 CHUNK = 64  # windows that are made at once
 MOVES = 2.0  # m that a vehicle moves in the recording, at least
 FARTHEST = 6.0  # m beside its route from which on a vehicle does not follow it
-
-
 EVERY = 5  # frames of 0.1 s between the windows of a vehicle
-DISTURBED = (
-    0.5,
-    0.06,
-    1.0,
-)  # m beside the recording, rad, m/s: standard deviations of the start of disturbed windows
+# Standard deviations of where disturbed windows start: m beside the recording, rad, m/s.
+DISTURBED = (0.5, 0.06, 1.0)
 DROPOUT = 0.2  # fraction of the scene's code that is left out in training
 WEIGHT_DECAY = 0.1
-FEATURE_NOISE, LAST_ACTION_NOISE = (
-    0.5,
-    1.0,
-)  # standard deviations on the network's normalised input
+FEATURE_NOISE = 0.5  # standard deviations on the network's normalised input
+LAST_ACTION_NOISE = 1.0
 
 
 @configured("stage/bits")
@@ -99,20 +83,24 @@ def as_ego(scenes: TensorDictBase, scene: Tensor, vehicle: Tensor) -> TensorDict
     other vehicle's route: what a `BitsEgo` reads."""
     row = torch.arange(len(scene))
     order = torch.arange(scenes["valid"].shape[1]).repeat(len(scene), 1)
-    order[row, vehicle], order[:, 0] = 0, vehicle
-    out = {key: scenes[key][scene[:, None], order] for key in AGENT_KEYS}
-    out |= {
-        key: scenes[key][scene].transpose(1, 2)[row[:, None], order].transpose(1, 2)
-        for key in LOG_KEYS
-    }
-    out |= {key: scenes[key][scene] for key in MAP_KEYS}
-    pick = scenes["route_log"][scene, vehicle]
-    out |= {
-        f"route_{key}": scenes[f"route_{key}"][scene, vehicle, pick][:, None, None]
-        for key in ROUTE_KEYS
-    }
+    order[row, vehicle] = 0
+    order[:, 0] = vehicle
+    route = scenes["route_log"][scene, vehicle]
     return TensorDict(
-        out | {"route_log": torch.zeros_like(pick)[:, None]}, batch_size=[len(scene)]
+        {
+            **{key: scenes[key][scene[:, None], order] for key in AGENT_KEYS},
+            **{
+                key: scenes[key].transpose(1, 2)[scene[:, None], order].transpose(1, 2)
+                for key in LOG_KEYS
+            },
+            **{key: scenes[key][scene] for key in MAP_KEYS},
+            **{
+                key: scenes[key][scene, vehicle, route][:, None, None]
+                for key in ROUTE_KEYS
+            },
+            "route_log": torch.zeros_like(route)[:, None],
+        },
+        batch_size=[len(scene)],
     )
 
 
@@ -121,19 +109,17 @@ def world_at(scene: TensorDictBase, step: int) -> World:
     later as recorded."""
     if step == 0:
         return World.at_start(scene)
-    now = scene["logged"][:, step]
-    before = scene["logged"][:, step - 1]
+    states = scene["logged"][:, step]
     valid = scene["logged_valid"][:, step]
-    change = (
-        torch.where(
-            (valid & scene["logged_valid"][:, step - 1])[..., None], now - before, 0.0
-        )
-        / DT
-    )
-    turn = wrap(change[..., 2] * DT) / DT
-    steps = torch.full((len(now),), step)
+    moved = (valid & scene["logged_valid"][:, step - 1])[..., None]
+    change = torch.where(moved, states - scene["logged"][:, step - 1], 0.0) / DT
     return World(
-        scene, steps, states=now, valid=valid, accel=change[..., 3], turn_rate=turn
+        scene,
+        torch.full((len(states),), step),
+        states=states,
+        valid=valid,
+        accel=change[..., 3],
+        turn_rate=wrap(change[..., 2] * DT) / DT,
     )
 
 
@@ -143,39 +129,38 @@ def windows(
     """Returns windows [W] of all moving vehicles: observation [D], start [4], route [P,
     2], future [PLAN_STEPS, 4], scene_index, and the goal: distance along the route and
     lateral offset. Raises InputError where there are none."""
-    every = scenes.scenes
+    recordings = scenes.scenes
     generator = torch.Generator().manual_seed(seed)
-    vehicles = every["route_log"].shape[1]
-    logged = every["logged"][:, :, :vehicles, :2]
-    moved = (
-        (logged - logged[:, :1])
-        .norm(dim=-1)
-        .masked_fill(~every["logged_valid"][:, :, :vehicles], 0)
-        .amax(1)
-    )
-    moving = (
-        every["valid"][:, :vehicles]
-        & ~every["parked"][:, :vehicles]
-        & (every["route_log"] >= 0)
-    )
-    rows = (moving & (moved > MOVES)).nonzero()
     parts = []
+    vehicles = moving_vehicles(recordings).nonzero().split(CHUNK)
     for scene, vehicle in Bar(
-        [part.unbind(1) for part in rows.split(CHUNK) if len(part)], "windows"
+        [part.unbind(1) for part in vehicles if len(part)], "windows"
     ):
-        own = as_ego(every, scene, vehicle=vehicle)
-        for step in range(0, own["logged"].shape[1] - PLAN_STEPS, EVERY):
-            exact = world_at(own, step)
-            parts += [
-                _windows(world, scene)
-                for world in (exact, _disturbed(exact, disturbed, generator=generator))
-            ]
-    found = torch.cat(parts) if parts else TensorDict({}, [0])
-    if not len(found):
+        exchanged = as_ego(recordings, scene, vehicle=vehicle)
+        for step in range(0, exchanged["logged"].shape[1] - PLAN_STEPS, EVERY):
+            exact = world_at(exchanged, step)
+            parts.append(_windows(exact, scene))
+            displaced = _disturbed(exact, disturbed, generator=generator)
+            parts.append(_windows(displaced, scene))
+    joined = torch.cat(parts) if parts else TensorDict({}, [0])
+    if not len(joined):
         raise InputError(
-            f"{scenes.dataset}: no vehicle moves and is recorded for {PLAN_STEPS * DT:g} s; pass others"
+            f"{scenes.dataset}: no vehicle moves and is recorded for "
+            f"{PLAN_STEPS * DT:g} s; pass others"
         )
-    return found
+    return joined
+
+
+def moving_vehicles(scenes: TensorDictBase) -> Tensor:
+    """Bool [S, V]: vehicles on known routes that move in the recording."""
+    route = scenes["route_log"]
+    vehicles = slice(route.shape[1])
+    logged = scenes["logged"][:, :, vehicles, :2]
+    distance = (logged - logged[:, :1]).norm(dim=-1)
+    unknown = ~scenes["logged_valid"][:, :, vehicles]
+    moves = distance.masked_fill(unknown, 0).amax(1) > MOVES
+    present = scenes["valid"][:, vehicles] & ~scenes["parked"][:, vehicles]
+    return present & (route >= 0) & moves
 
 
 def _disturbed(
@@ -188,12 +173,13 @@ def _disturbed(
     states = world.states.clone()
     x, y, heading, speed = states[:, 0].unbind(-1)
     part = (speed / 5).clamp(max=1)
-    moved = [
+    displaced = [
         x - sideways * part * heading.sin(),
         y + sideways * part * heading.cos(),
         wrap(heading + turned * part),
+        (speed + faster * part).clamp(min=0),
     ]
-    states[:, 0] = torch.stack([*moved, (speed + faster * part).clamp(min=0)], -1)
+    states[:, 0] = torch.stack(displaced, -1)
     return replace(world, states=states)
 
 
@@ -201,10 +187,10 @@ def _windows(world: World, scene: Tensor) -> TensorDict:
     """Windows of Worlds [B], without those whose ego's next 5 s are not recorded or
     lead away from its route."""
     step = int(world.step[0])
+    stop = step + 1 + PLAN_STEPS
     route = mission_of(world.scene).points
-    ahead = slice(step + 1, step + 1 + PLAN_STEPS)
-    future = world.scene["logged"][:, ahead, 0]
-    known = world.scene["logged_valid"][:, step : ahead.stop, 0].all(1)
+    future = world.scene["logged"][:, step + 1 : stop, 0]
+    recorded = world.scene["logged_valid"][:, step:stop, 0].all(1)
     path = RoutePath(world.states[:, 0], route)
     hint = path.s + (future[..., 3] * DT).sum(1)
     end, offset, _ = (
@@ -215,17 +201,12 @@ def _windows(world: World, scene: Tensor) -> TensorDict:
         "start": world.states[:, 0],
         "route": route,
         "future": future,
-    }
-    columns |= {
         "distance": (end - path.s).clamp(min=0),
         "offset": offset,
         "scene_index": scene,
     }
-    follows = (
-        known
-        & world.valid[:, 0]
-        & (torch.maximum(offset.abs(), path.d.abs()) < FARTHEST)
-    )
+    near = torch.maximum(offset.abs(), path.d.abs()) < FARTHEST
+    follows = recorded & world.valid[:, 0] & near
     return TensorDict(columns, batch_size=[len(scene)])[follows]
 
 
@@ -270,22 +251,16 @@ class BitsTraining(Epochs):
         self, network: BitsNetwork, data: TensorDictBase, settings: BitsSettings
     ) -> None:
         super().__init__(network, data, settings, network, WEIGHT_DECAY)
-        total = settings.epochs * -(-len(self.train) // settings.minibatch)
-        self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-            self.optimiser, total
-        )
+        steps = settings.epochs * -(-len(self.train) // settings.minibatch)
+        self.schedule = CosineAnnealingLR(self.optimiser, steps)
         self.noise = torch.full_like(network.normaliser.mean, FEATURE_NOISE)
         self.noise[list(LAST_ACTION)] = LAST_ACTION_NOISE
 
     def loss(self, batch: TensorDictBase) -> Tensor:
         """The sum [] of the losses under noise on the input."""
         self.network.train()
-        parts = losses(
-            self.network,
-            batch,
-            noise=self.noise * torch.randn_like(batch["observation"]),
-        )
-        return torch.stack(list(parts.values())).sum()
+        noise = self.noise * torch.randn_like(batch["observation"])
+        return torch.stack([*losses(self.network, batch, noise).values()]).sum()
 
     def step(self, loss: Tensor) -> None:
         super().step(loss)
@@ -328,14 +303,14 @@ def run_bits_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     data = windows(scenes, settings.seed)
     training = BitsTraining(network, data, settings=settings)
     run.begin({"scenes": listed(scenes)})
-    row = training.fit(
-        "bits", settings.epochs, run.parts("bits"), vars(settings), logger
-    )
+    row = training.fit("bits", settings.epochs, run.parts("bits"), logger=logger)
     origin = {
         "data": f"{scenes.dataset}/{scenes.split}",
         "scenes": len(scenes),
         **origin_of(run.folder),
+        "windows": len(data),
+        "settings": vars(settings),
+        "result": row,
     }
-    given = {"windows": len(data), "settings": vars(settings), "result": row}
-    save_bits(network, run.folder / WEIGHTS, origin=origin | given)
+    save_bits(network, run.folder / WEIGHTS, origin=origin)
     return row

@@ -11,39 +11,43 @@ actions are strongly autocorrelated, so the actor would copy it instead of learn
 causes (de Haan et al. 2019).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from e2rl.evaluation.build import build_ego, build_sim
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.pretraining.cloning import NOISE, clip_expert, cloning_loss
-from e2rl.learning.pretraining.driving import Disturbance, PoolDriver, filled_batches
 from e2rl.learning.pretraining.supervised import Epochs, stage_settings
 from e2rl.planners.actor import ActorEgo
+from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.planners.network import WEIGHTS, ActorCritic
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from e2rl.run.settings import configured, setting
 from e2rl.run.terminal import Bar
+from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
-from e2rl.sim.env import SimSettings
+from e2rl.sim.dynamics import wrap
+from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.transform import AdversarialSynthesizer
 
-BURST, PAUSE = (
-    10,
-    20,
-)  # steps: duration of a disturbance, and from the start of one to the next
+BURST = 10  # steps of a disturbance
+PAUSE = 20  # steps from the start of a disturbance to the next
 DISTURBED = (1.0, 0.15)  # m/s^2, rad/s: standard deviations of the disturbances
-DRIVES = 3  # drives of a scene that track the log under disturbances, besides its exact replay
+DRIVES = 3  # of a scene under disturbances, besides its exact replay
 BATCH = 64  # environments that run at once
 WEIGHT_DECAY = 1e-2
+# (action [B, 2], step [B]) -> the action [B, 2] that is executed instead
+Disturbance = Callable[[Tensor, Tensor], Tensor]
 
 
 @configured("stage/imitation")
@@ -59,52 +63,80 @@ class ImitationSettings:
 
 
 def recorded_demonstrations(
-    scenes: SceneSet, sim: SimSettings, seed: int, drives: int = DRIVES
+    scenes: SceneSet, sim: SimSettings, *, seed: int, drives: int = DRIVES
 ) -> TensorDict:
-    """Returns demonstrations [M] (e2rl.learning.pretraining.cloning) of the recorded egos, on the
-    CPU, with their scene_index [M].
+    """Returns demonstrations of the recorded egos.
 
     Every recording is replayed once, and driven `drives` times under disturbances. A
     disturbed episode counts until contact or off the road; actions are clipped to 0.99
     of the bounds.
+
+    Args:
+        scenes: the recordings.
+        sim: settings of the simulator.
+        seed: of the disturbances.
+        drives: of each scene under disturbances.
+
+    Returns:
+        [M] with scene_index [M] (e2rl/learning/pretraining/cloning.py), on the CPU.
     """
     generator = torch.Generator().manual_seed(seed)
-    pool = TrafficPool.recorded(torch.arange(len(scenes)))
-    parts = []
     batch = min(BATCH, len(scenes))
-    exact = PoolDriver(
-        scenes,
-        replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False),
-        batch=batch,
-    )
-    free = PoolDriver(scenes, replace(sim, replay_ego=False), batch=batch)
-    todo = [
-        (rows, number)
-        for number in range(drives + 1)
-        for rows in filled_batches(len(pool), batch)
-    ]
-    for rows, number in Bar(todo, "demonstrations", unit="batch", leave=False):
-        driver, label = (free, "intended") if number else (exact, "executed")
-        frames = driver.drive(
-            ReplayEgo(), pool, rows, _bursts(len(rows), generator) if number else None
-        )
-        alive = frames["alive"]
-        bounds = driver.env.action_spec.space
-        parts.append(
-            TensorDict(
-                {
-                    "observation": frames["observation"][alive],
-                    "action": clip_expert(
-                        frames[label][alive], bounds.low[0], high=bounds.high[0]
-                    ),
-                    "scene_index": pool.scene_index[rows][:, None].expand_as(alive)[
-                        alive
-                    ],
-                },
-                batch_size=[int(alive.sum())],
-            )
-        )
+    replay = replace(sim, replay_ego=True, end_on_contact=False, end_off_road=False)
+    exact = DrivingEnv(scenes, replay, batch, agents=True)
+    free = DrivingEnv(scenes, replace(sim, replay_ego=False), batch, agents=True)
+    turns = -(-len(scenes) // batch)  # the last one is filled up by repetition
+    batches = (torch.arange(turns * batch) % len(scenes)).split(batch)
+    jobs = [(rows, number) for number in range(drives + 1) for rows in batches]
+    parts = []
+    for rows, number in Bar(jobs, "demonstrations", unit="batch", leave=False):
+        if number:
+            parts.append(shown(free, rows, _bursts(batch, generator)))
+        else:
+            parts.append(shown(exact, rows))
     return torch.cat(parts)
+
+
+def shown(
+    env: DrivingEnv, scenes: Tensor, disturb: Disturbance | None = None
+) -> TensorDict:
+    """Demonstrations [M] of egos that follow their logs for an episode in scenes [B],
+    of an environment's batch: what they executed, or under disturbances meant to."""
+    transform = AdversarialSynthesizer(
+        TrafficPool.recorded(scenes), lambda count: torch.arange(count)
+    )
+    driven = TransformedEnv(env, transform)
+    policy = EgoPolicy(ReplayEgo(), driven)
+
+    def disturbed(tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = policy(tensordict)
+        tensordict["intended"] = action = tensordict["action"]
+        if disturb is not None:
+            tensordict["action"] = disturb(action, tensordict["timestep"][:, 0])
+        return tensordict
+
+    steps = driven.rollout(env.horizon, disturbed, break_when_any_done=False)
+    done = steps["next", "done"][..., 0].int()
+    alive = done.cumsum(1) - done == 0
+    action = executed(steps) if disturb is None else steps["intended"]
+    bounds = env.action_spec.space
+    return TensorDict(
+        {
+            "observation": steps["observation"][alive],
+            "action": clip_expert(action[alive], bounds.low[0], high=bounds.high[0]),
+            "scene_index": scenes[:, None].expand_as(alive)[alive],
+        },
+        batch_size=[int(alive.sum())],
+    )
+
+
+def executed(steps: TensorDictBase) -> Tensor:
+    """Accelerations and yaw rates [B, T, 2] (m/s^2, rad/s) of the ego in the steps of a
+    rollout."""
+    before = steps["agents", "states"][:, :, 0]
+    after = steps["next", "agents", "states"][:, :, 0]
+    turn = wrap(after[..., 2:3] - before[..., 2:3])
+    return torch.cat([after[..., 3:] - before[..., 3:], turn], -1) / DT
 
 
 def _bursts(batch: int, generator: torch.Generator) -> Disturbance:
@@ -115,12 +147,9 @@ def _bursts(batch: int, generator: torch.Generator) -> Disturbance:
     phase = torch.randint(PAUSE, (batch,), generator=generator)
 
     def disturb(action: Tensor, step: Tensor) -> Tensor:
-        since = step.cpu() + phase
-        offset = (
-            offsets[torch.arange(batch), since // PAUSE]
-            * (since % PAUSE < BURST)[:, None]
-        )
-        return action + offset.to(action.device)
+        time = step.cpu() + phase
+        offset = offsets[torch.arange(batch), time // PAUSE]
+        return action + (offset * (time % PAUSE < BURST)[:, None]).to(action.device)
 
     return disturb
 
@@ -165,7 +194,7 @@ def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     its weights are written to the run's folder. Returns the losses of the chosen epoch.
     """
     config = run.config
-    ego = build_ego(run.config)
+    ego = build_ego(config)
     if not isinstance(ego, ActorEgo):
         raise InputError("stage=imitation trains ego=actor; set it")
     settings = stage_settings(config, ImitationSettings)
@@ -176,7 +205,7 @@ def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     training = Imitation(ego.network, shown, settings=settings)
     run.begin({"scenes": listed(scenes)})
     row = training.fit(
-        "imitation", settings.epochs, run.parts("imitation"), vars(settings), logger
+        "imitation", settings.epochs, run.parts("imitation"), logger=logger
     )
     ego.network.save(run.folder / WEIGHTS)
     return row

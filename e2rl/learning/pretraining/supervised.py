@@ -12,26 +12,25 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from e2rl.learning.generators import generator_states, restore_generators
 from e2rl.learning.logging import RunLogger
-from e2rl.learning.rounds.checkpoint import generator_states, restore_generators
 from e2rl.run.config import resolved
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.settings import Settings, settings_of
 from e2rl.run.terminal import Bar
 
-STATE, PROGRESS = (
-    "turns",
-    ("history", "best", "chosen"),
-)  # a part of the run; what it holds of a training
+STATE = "turns"  # a part of the run
+PROGRESS = ("history", "best", "chosen")  # what it holds of a training
 MAX_GRAD_NORM = 1.0
 
 
 def stage_settings(config: DictConfig, kind: type[Settings]) -> Settings:
     """Returns the settings of the stage that a configuration has chosen, with the run's
     seed."""
-    own = {key: value for key, value in resolved(config.stage).items() if key != "name"}
-    return settings_of(kind, own | {"seed": config.seed}, where="stage")
+    options = resolved(config.stage) | {"seed": config.seed}
+    del options["name"]
+    return settings_of(kind, options, where="stage")
 
 
 class Supervised(ABC):
@@ -41,9 +40,11 @@ class Supervised(ABC):
     the last one where nothing is held out; chosen: the weights after it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, settings: Any) -> None:
+        """settings: a dataclass of plain values."""
+        self.settings = settings
         self.history: list[dict[str, float]] = []
-        self.best: dict[str, float] | None = None
+        self.best: dict[str, float] = {}
         self.chosen: dict[str, Tensor] = {}
         self.writes = True  # whether this process logs and keeps the state
 
@@ -65,7 +66,7 @@ class Supervised(ABC):
         name: str,
         turns: int,
         parts: Parts = NO_PARTS,
-        about: Any = None,
+        *,
         logger: RunLogger | None = None,
     ) -> dict[str, float]:
         """Do the turns that are missing and take the chosen weights; returns the row of
@@ -73,23 +74,22 @@ class Supervised(ABC):
 
         Args:
             name: of the training.
-            parts: where the state after each turn is kept.
-            about: plain values that a kept state must agree in, such as the settings.
+            turns: of the whole training.
+            parts: where the state after each turn is kept, of the same settings.
             logger: of the rows of the turns, as train/NAME_...
         """
+        about = vars(self.settings)
         if (state := parts.load(STATE, about)) is not None:
             self.load_state_dict(state)
-        begun = len(self.history)
-        if logger is not None and self.writes:
-            logger.forget(begun)
-        for number in (
-            bar := Bar(range(begun, turns), name, turns, initial=begun, unit="turn")
-        ):
+        first = len(self.history)
+        if not self.writes:
+            logger = None
+        if logger is not None:
+            logger.forget(first)
+        bar = Bar(range(first, turns), name, turns, initial=first, unit="turn")
+        for number in bar:
             row = self.turn()
-            if (
-                self.best is None
-                or not row["held_out_loss"] >= self.best["held_out_loss"]
-            ):
+            if not self.best or not row["held_out_loss"] >= self.best["held_out_loss"]:
                 self.best = row | {"turn": float(number)}
                 self.chosen = {
                     key: value.detach().clone() for key, value in self.weights().items()
@@ -99,12 +99,11 @@ class Supervised(ABC):
             state = self.state_dict()
             if self.writes:
                 parts.save(STATE, about, state)
-                if logger is not None:
-                    logger.log(
-                        {f"train/{name}_{key}": value for key, value in row.items()},
-                        number,
-                    )
-        assert self.best is not None
+            if logger is not None:
+                logger.log(
+                    {f"train/{name}_{key}": value for key, value in row.items()},
+                    number,
+                )
         self.set_weights(self.chosen)
         return self.best
 
@@ -137,9 +136,8 @@ class Epochs(Supervised):
         """network: with `device` and `normaliser`; settings: minibatch, learning_rate,
         held_out and seed; parameters: the module whose parameters are trained. Raises
         InputError where no scene is left to train on."""
-        super().__init__()
+        super().__init__(settings)
         self.network = network
-        self.settings = settings
         self._generator = torch.Generator().manual_seed(settings.seed)
         scenes = data["scene_index"].unique()
         scenes = scenes[torch.randperm(len(scenes), generator=self._generator)]
@@ -151,12 +149,12 @@ class Epochs(Supervised):
                 else "no scene is left to train on"
             )
             raise InputError(
-                f"stage.held_out={settings.held_out:g}: {reason}; pass more, or set it to 0"
+                f"stage.held_out={settings.held_out:g}: {reason}; "
+                "pass more, or set it to 0"
             )
-        apart = torch.isin(data["scene_index"], scenes[:count])
-        self.train, self.held_out = (
-            data[rows].to(network.device) for rows in (~apart, apart)
-        )
+        held_out = torch.isin(data["scene_index"], scenes[:count])
+        self.train = data[~held_out].to(network.device)
+        self.held_out = data[held_out].to(network.device)
         network.normaliser.observe(self.train["observation"])
         self.optimiser = torch.optim.AdamW(
             parameters.parameters(), settings.learning_rate, weight_decay=weight_decay
@@ -173,30 +171,28 @@ class Epochs(Supervised):
     def turn(self) -> dict[str, float]:
         """One pass over the training rows; returns the mean of its losses, and the
         held-out ones."""
-        order = torch.randperm(len(self.train), generator=self._generator).to(
-            self.train.device
-        )
-        seen = []
-        for index in order.split(self.settings.minibatch):
-            loss = self.loss(self.train[index])
+        order = torch.randperm(len(self.train), generator=self._generator)
+        losses = []
+        for rows in order.to(self.train.device).split(self.settings.minibatch):
+            loss = self.loss(self.train[rows])
             self.step(loss)
-            seen.append(loss.detach())
-        measured = (
-            self.measure(self.held_out) if len(self.held_out) else {"loss": math.nan}
-        )
-        held_out = {f"held_out_{name}": value for name, value in measured.items()}
-        return {"loss": torch.stack(seen).mean().item(), **held_out}
+            losses.append(loss.detach())
+        row = {"loss": torch.stack(losses).mean().item(), "held_out_loss": math.nan}
+        if len(self.held_out):
+            for name, value in self.measure(self.held_out).items():
+                row[f"held_out_{name}"] = value
+        return row
 
     def step(self, loss: Tensor) -> None:
         """One step of the optimiser."""
         take_step(self.optimiser, loss, max_grad_norm=MAX_GRAD_NORM)
 
     def state_dict(self) -> dict:
-        own = {
+        return super().state_dict() | {
             "optimiser": self.optimiser.state_dict(),
             "order": self._generator.get_state(),
+            "weights": self.weights(),
         }
-        return super().state_dict() | own | {"weights": dict(self.weights())}
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
@@ -213,7 +209,8 @@ def take_step(
     loss is not finite."""
     if not torch.isfinite(loss):
         raise InputError(
-            "learner: the loss is not finite; lower the learning_rate or check the observations"
+            "learner: the loss is not finite; "
+            "lower the learning_rate or check the observations"
         )
     optimiser.zero_grad(set_to_none=True)
     loss.backward()

@@ -69,16 +69,13 @@ class BeforeAfter:
         elif (before := measured.load("before", None)) is not None:
             for row in rows:
                 row["paired"]["before"] = paired_differences(
-                    *_of_row(row, (scored.rows, scored.samples)), *_of_row(row, before)
+                    *_of_row(row, scored.rows, scored.samples), *_of_row(row, *before)
                 )
         file = self.folder / METRICS_FILE
-        earlier = [
-            row
-            for row in (read_metrics(file) if file.exists() else [])
-            if row.get("stage") != stage
-        ]
-        write_json(file, earlier + rows)
-        return earlier + rows
+        earlier = read_metrics(file) if file.exists() else []
+        others = [row for row in earlier if row.get("stage") != stage]
+        write_json(file, others + rows)
+        return others + rows
 
     def _search(
         self, method: SearchMethod, setup: Setup, work: Work, folder: Path
@@ -97,25 +94,23 @@ class BeforeAfter:
         write_tries(folder / TRIES_FILE, spent.tries)
 
     def atlases(self) -> tuple[dict, dict] | None:
-        """The atlas of each stage (`evaluation.modes.group_atlas`); None without a
+        """The atlas before and after (`evaluation.modes.group_atlas`); None without a
         search."""
         if self.search is None:
             return None
-        before, after = (
-            read_atlas(self.folder / stage / SEARCH / ATLAS_FILE)
-            for stage in ("before", "after")
-        )
-        return before, after
+        return self._atlas("before"), self._atlas("after")
+
+    def _atlas(self, stage: str) -> dict:
+        return read_atlas(self.folder / stage / SEARCH / ATLAS_FILE)
 
 
 def _of_row(
-    row: dict, scored: tuple[list[dict], list[Samples]]
+    row: dict, scores: list[dict], samples: list[Samples]
 ) -> tuple[list[dict], list[Samples]]:
     """What the rollouts of a row of metrics.json scored."""
-    rows, samples = scored
-    own = [
-        k
-        for k, one in enumerate(rows)
-        if (one["method"], one["eta"]) == (row["method"], row["eta"])
+    places = [
+        place
+        for place, score in enumerate(scores)
+        if (score["method"], score["eta"]) == (row["method"], row["eta"])
     ]
-    return [rows[k] for k in own], [samples[k] for k in own]
+    return [scores[k] for k in places], [samples[k] for k in places]

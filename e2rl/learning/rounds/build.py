@@ -70,9 +70,7 @@ def build_evolution(
         rounds=config.rounds,
         seed=config.seed,
     )
-    settings = settings_of(
-        RoundSettings, _with_prefetch(config, ego), where="learner.round"
-    )
+    settings = _round_settings(config, ego)
     learner = OmegaConf.create(
         {key: value for key, value in config.learner.items() if key != "round"}
     )
@@ -86,26 +84,23 @@ def build_evolution(
         seed=config.seed,
         device=learner.pop("device", config.device),
     )
+    synthesize = synthesize or synthesize_traffic(
+        scenes, traffic, sim=sim, batch=config.batch, device=config.device
+    )
+    enters = partial(solvable, scenes=scenes, sim=sim)
     return Evolution(
         curriculum,
         improve,
-        synthesize
-        or synthesize_traffic(
-            scenes, traffic, sim=sim, batch=config.batch, device=config.device
-        ),
-        settings,
-        config.seed,
-        solvable=(
-            partial(solvable, scenes=scenes, sim=sim)
-            if curriculum.solvable_only
-            else None
-        ),
+        synthesize=synthesize,
+        settings=settings,
         memory=Memory(folder, settings.memory),
+        seed=config.seed,
+        solvable=enters if curriculum.solvable_only else None,
         batch=config.batch,
     )
 
 
-def _with_prefetch(config: DictConfig, ego: Ego) -> dict:
+def _round_settings(config: DictConfig, ego: Ego) -> RoundSettings:
     """`config.learner.round`, with a `prefetch` that is left open decided by what is
     possible."""
     options = {"prefetch": None} | resolved(config.learner.round)
@@ -116,7 +111,9 @@ def _with_prefetch(config: DictConfig, ego: Ego) -> dict:
         raise InputError(
             f"learner.round.prefetch=true: {reason}; set it to null or false"
         )
-    return options | ({"prefetch": not reason} if options["prefetch"] is None else {})
+    if options["prefetch"] is None:
+        options["prefetch"] = not reason
+    return settings_of(RoundSettings, options, where="learner.round")
 
 
 @dataclass(frozen=True)
@@ -146,17 +143,15 @@ def measure_settings(config: DictConfig) -> MeasureSettings:
     return settings_of(MeasureSettings, {**config.measure, **lists}, where="measure")
 
 
-def check_training(config: DictConfig) -> MeasureSettings:
-    """Returns what is measured; InputError for what train.py cannot run, before
-    anything is built."""
+def check_training(config: DictConfig) -> None:
+    """InputError for what train.py cannot run, before anything is built."""
     settings_of(
-        TrainSettings,
-        {field.name: config[field.name] for field in fields(TrainSettings)},
+        TrainSettings, {part.name: config[part.name] for part in fields(TrainSettings)}
     )
+    measure_settings(config)
     processes_of(config)
     check_device("learner.device", config.learner.get("device", config.device))
     build_sim(config)
-    return measure_settings(config)
 
 
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:
@@ -172,17 +167,29 @@ def build_logger(config: DictConfig, folder: Path) -> RunLogger:
 def build_measure(
     config: DictConfig,
     ego: Ego,
+    *,
     ego_name: str,
     traffic: Traffic,
     prior: Prior,
     folder: Path,
 ) -> BeforeAfter:
-    """The before/after table: nominal and adversarial traffic, and a search, on the
-    scenes of `config.measure`.
+    """Returns the before/after table: nominal and adversarial traffic, and a search, on
+    the scenes of `config.measure`.
 
     Sources with splits are measured on their tune split; a path's scenes on
     `measure.path`, both as recorded; or without it on the first training scenes (see
     `split` in the rows).
+
+    Args:
+        config: of train.py.
+        ego: that is measured.
+        ego_name: in the rows.
+        traffic: that attacks it.
+        prior: of the nominal traffic and the search.
+        folder: of the run.
+
+    Returns:
+        What measures an ego.
     """
     options = measure_settings(config)
     data = config.data.copy()
@@ -191,31 +198,35 @@ def build_measure(
         if options.path:
             data.path = options.path
             data.split = None
-    apart = options.path or source_of(data).has_splits
-    scenes = load_scenes(
-        data, options.scenes, split="tune", scenes=None if apart else config.scenes
-    )
+    separate = options.path or source_of(data).has_splits
     nominal = built(
         load_choice("synthesizer", "nominal"), "synthesizer", kind=Traffic, prior=prior
     )
-    methods = [
-        Method("nominal", nominal),
-        *(Method(config.synthesizer.name, traffic, eta=eta) for eta in options.eta),
-    ]
-    setup = Setup(
-        scenes,
-        ego,
-        ego_name=ego_name,
-        sim=build_sim(config),
-        batch=config.batch,
-        device=config.device,
+    attacks = [Method(config.synthesizer.name, traffic, eta=eta) for eta in options.eta]
+    search = None
+    if options.budget:
+        search = build_search(SEARCH, config, prior, eta=max(options.eta))
+    return BeforeAfter(
+        Setup(
+            load_scenes(
+                data,
+                options.scenes,
+                split="tune",
+                scenes=None if separate else config.scenes,
+            ),
+            ego,
+            ego_name=ego_name,
+            sim=build_sim(config),
+            batch=config.batch,
+            device=config.device,
+        ),
+        [Method("nominal", nominal), *attacks],
+        seeds=options.seeds,
+        folder=folder,
+        processes=processes_of(config),
+        search=search,
+        budget=options.budget,
     )
-    given = (setup, methods, options.seeds, folder, processes_of(config))
-    if not options.budget:
-        return BeforeAfter(*given)
-
-    search = build_search(SEARCH, config, prior, eta=max(options.eta))
-    return BeforeAfter(*given, search, options.budget)
 
 
 class Progress:

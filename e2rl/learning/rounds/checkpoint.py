@@ -9,14 +9,13 @@ these files: a torn or altered one is noticed, and the one before it is used.
 """
 
 import io
-import random
 import shutil
 import sys
 from pathlib import Path
 
-import numpy as np
 import torch
 
+from e2rl.learning.generators import generator_states, restore_generators
 from e2rl.learning.rounds.evolution import Evolution
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.network import WEIGHTS
@@ -25,7 +24,7 @@ from e2rl.run.files import altered, misfit, read_regular, seal, written_whole
 from e2rl.run.parts import load_plain
 
 STATE = "state.pt"
-FORMAT = "e2rl-checkpoint/9"
+FORMAT = "e2rl-checkpoint/10"
 
 
 def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:
@@ -36,19 +35,16 @@ def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:
     with written_whole(target) as part:
         _write(part, run)
         shutil.rmtree(target, ignore_errors=True)
-    *older, newest = sorted(parent.glob("round-*"))
-    kept = [*older, newest][-max(1, keep_last) :]
-    for old in set(older) - set(kept):
+    folders = sorted(parent.glob("round-*"))
+    for old in folders[:-keep_last]:
         shutil.rmtree(old)
-    whole = [
-        load_plain(read_regular(each / STATE, within=each))
-        for each in kept
-        if altered(each) is None
+    states = [
+        load_plain(read_regular(whole / STATE, within=whole))
+        for whole in folders[-keep_last:]
+        if altered(whole) is None
     ]
-    first = [entry["round"] for state in whole for entry in state["memory"]]
-    run.memory.prune(
-        min(first, default=0)
-    )  # a file goes when no checkpoint names it any more
+    rounds = [entry["round"] for state in states for entry in state["memory"]]
+    run.memory.prune(min(rounds, default=0))  # files that no checkpoint names
     return target
 
 
@@ -74,8 +70,8 @@ def checkpoints(path: str | Path) -> list[Path]:
 
 def rounds_done(path: str | Path | None) -> int:
     """Rounds of the newest checkpoint that `path` names; 0 without one."""
-    found = checkpoints(path) if path else []
-    return int(found[-1].name.rpartition("-")[2]) if found else 0
+    folders = checkpoints(path) if path else []
+    return int(folders[-1].name.rpartition("-")[2]) if folders else 0
 
 
 def load_checkpoint(path: str | Path, run: Evolution) -> int:
@@ -96,7 +92,10 @@ def load_checkpoint(path: str | Path, run: Evolution) -> int:
             continue
         _restore(folder, state, run=run)
         return run.round
-    missing = f"{path}: holds no checkpoint; give a run's folder or one of its checkpoints/round-*"
+    missing = (
+        f"{path}: holds no checkpoint; "
+        "give a run's folder or one of its checkpoints/round-*"
+    )
     raise InputError(damages[0] if damages else missing)
 
 
@@ -117,7 +116,8 @@ def _whole(folder: Path, run: Evolution) -> dict:
         ) from error
     if written != FORMAT:
         raise InputError(
-            f"{file}: of another version of this program ({written}, not {FORMAT}); begin a new run"
+            f"{file}: of another version of this program ({written}, not {FORMAT}); "
+            "begin a new run"
         )
     if wrong := misfit(state, {"memory": [{"round": int, "crc32": int}]}):
         raise InputError(f"{file}: damaged ({wrong}); resume from an older checkpoint")
@@ -142,32 +142,7 @@ def _restore(folder: Path, state: dict, run: Evolution) -> None:
         RuntimeError,
         ArithmeticError,
     ) as error:
-        reason = f"its learner is of another kind or shape ({error}); resume with the configuration of its run"
-        raise InputError(f"{folder / STATE}: {reason}") from None
-
-
-def generator_states() -> dict:
-    """States of the global generators of torch, CUDA, numpy and python, as plain values
-    and tensors."""
-    state = np.random.get_state()
-    assert isinstance(state, tuple)  # the global generator is a Mersenne Twister
-    name, keys, position, has_gauss, cached = state
-    return {
-        "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "numpy": [name, keys.tolist(), position, has_gauss, cached],
-        "python": list(random.getstate()),
-    }
-
-
-def restore_generators(states: dict) -> None:
-    """Set the global generators to `generator_states`."""
-    torch.set_rng_state(states["torch"])
-    if torch.cuda.is_available() and states["cuda"]:
-        torch.cuda.set_rng_state_all(states["cuda"])
-    name, keys, position, has_gauss, cached = states["numpy"]
-    np.random.set_state(
-        (name, np.array(keys, dtype=np.uint32), position, has_gauss, cached)
-    )
-    version, internal, gauss = states["python"]
-    random.setstate((version, tuple(internal), gauss))
+        raise InputError(
+            f"{folder / STATE}: its learner is of another kind or shape ({error}); "
+            "resume with the configuration of its run"
+        ) from None

@@ -3,11 +3,10 @@ a run between them."""
 
 import copy
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from e2rl.learning.pretraining.driving import Episodes
 from e2rl.learning.rounds.attack import (
     ATTACK,
     Order,
@@ -16,6 +15,7 @@ from e2rl.learning.rounds.attack import (
     counted,
     make_traffic,
 )
+from e2rl.learning.rounds.episodes import Episodes
 from e2rl.learning.rounds.improvement import Improvement
 from e2rl.learning.rounds.memory import Memory
 from e2rl.learning.rounds.prefetch import Prefetch
@@ -29,6 +29,8 @@ from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
 from e2rl.run.settings import configured, setting
 from e2rl.traffic.pool import TrafficPool
+
+TIMES = ("collect", "steps_per_second")  # of an improvement's metrics
 
 
 @configured("learner/ppo_bc", "round")
@@ -44,62 +46,50 @@ class RoundSettings:
 
 @dataclass
 class RoundTraffic:
-    """The traffic of a round: the pool, which of the ordered attacks its first K rows
-    are (drawn [K] int64; the others were left out); attacked, contact: fractions of the
-    attacks with an adversary, and that hit the ego; spent: seconds; errored: rows that
-    could not be made."""
+    """The traffic of a round: the pool, and which of the ordered attacks its first K
+    rows are (drawn [K] int64; the others were left out); attacked, contact: fractions
+    of the attacks with an adversary, and that hit the ego; errored: rows that could not
+    be made; seconds: what it took."""
 
     pool: TrafficPool
     drawn: Tensor
     attacked: float
     contact: float
-    spent: dict[str, float]
     errored: list[dict]
+    seconds: dict[str, float]
 
 
+@dataclass(eq=False)
 class Evolution:
     """The state of a run: curriculum, improvement (which holds the ego) and the memory
     of D'.
 
-    choices: what the curriculum chose for the last round and what came of it
-    (e2rl/learning/rounds/scheduler.py); errored: the last round's rollouts that errored, each
-    with its reason.
-
     Args:
         synthesize: (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states
-            [S, T+1, N, 4], valid [S, T+1, N],
-            adversaries [S, N] bool, contact [S] bool}: closed-loop traffic against that
-            ego; contact: it was hit. Rows that cannot be made are left out, and
-            `errored` {position in S: why} names them.
+            [S, T+1, N, 4], valid [S, T+1, N], adversaries [S, N] bool, contact [S]
+            bool}: closed-loop traffic against that ego; contact: it was hit. Rows that
+            cannot be made are left out, and `errored` {position in S: why} names them.
         solvable: traffic -> bool [S]: the rows that enter D'; None: all.
-        memory: None: in a temporary folder.
         batch: scenes that are synthesized at once.
+
+    After a round, `episodes` are those that the ego drove; `choices` what the
+    curriculum chose and what came of it (e2rl/learning/rounds/scheduler.py); `errored`
+    the rollouts that errored, each with its reason.
     """
 
-    def __init__(
-        self,
-        curriculum: CurriculumScheduler,
-        improve: Improvement,
-        synthesize: Synthesize,
-        settings: RoundSettings,
-        seed: int = 0,
-        solvable: Solvable | None = None,
-        memory: Memory | None = None,
-        batch: int = 64,
-    ) -> None:
-        self.curriculum = curriculum
-        self.improve = improve
-        self.synthesize = synthesize
-        self.settings = settings
-        self.seed = seed
-        self.solvable = solvable
-        self.memory = memory or Memory(None, settings.memory)
-        self.batch = batch
-        self.episodes: Episodes | None = None
-        self.choices: list[Choice] = []
-        self.errored: list[dict] = []
-        self._next: Order | None = None  # of the coming round, if fixed already
-        self._prefetch: Prefetch | None = None  # what makes it, if begun already
+    curriculum: CurriculumScheduler
+    improve: Improvement
+    synthesize: Synthesize
+    settings: RoundSettings
+    memory: Memory
+    seed: int = 0
+    solvable: Solvable | None = None
+    batch: int = 64
+    episodes: Episodes = field(init=False)
+    choices: list[Choice] = field(init=False, default_factory=list)
+    errored: list[dict] = field(init=False, default_factory=list)
+    _next: Order | None = field(init=False, default=None)  # of the coming round
+    _prefetch: Prefetch | None = field(init=False, default=None)  # what makes it
 
     @property
     def ego(self) -> Ego:
@@ -127,24 +117,22 @@ class Evolution:
         if self.settings.prefetch:
             work = self._prefetch or self._begin(order)
             self._prefetch = None
-            spent = {
-                "synthesize": work.wait(),
-                "waiting": time.perf_counter() - begin,
-            }
+            seconds = {"synthesize": work.wait()}
+            seconds["waiting"] = time.perf_counter() - begin
         else:
             self._make(order)
-            spent = {"synthesize": time.perf_counter() - begin}
+            seconds = {"synthesize": time.perf_counter() - begin}
         newest = self.memory.take(order.number)
         pool = self.memory.pool()
-        if self.settings.nominal == "log" or not len(pool):
-            pool = pool + TrafficPool.recorded(order.scenes)  # the pool is never empty
+        if self.settings.nominal == "log" or not len(pool):  # it is never empty
+            pool = pool + TrafficPool.recorded(order.scenes)
         return RoundTraffic(
             pool,
             newest.traffic["entered"].nonzero()[:, 0],
             attacked=newest.traffic["attacked"].item(),
             contact=newest.traffic["contact"].item(),
-            spent=spent,
             errored=newest.errored,
+            seconds=seconds,
         )
 
     def prefetch(self) -> None:
@@ -159,13 +147,17 @@ class Evolution:
                 self._prefetch = self._begin(self._next)
 
     def learn(self, attack: RoundTraffic) -> dict[str, float]:
-        """Improve the ego in the traffic of the round; returns the metrics of learning."""
+        """Improve the ego in the traffic of the round; returns the metrics of learning,
+        named by group."""
         begin = time.perf_counter()
-        learned, self.episodes = self.improve(attack.pool, self.curriculum)
-        attack.spent["improve"] = time.perf_counter() - begin
-        timed = ("collect", "steps_per_second")
-        attack.spent |= {name: learned.pop(name) for name in timed if name in learned}
-        return learned
+        metrics, self.episodes = self.improve(attack.pool, self.curriculum)
+        return {
+            "time/improve": time.perf_counter() - begin,
+            **{
+                f"{'time' if name in TIMES else 'train'}/{name}": value
+                for name, value in metrics.items()
+            },
+        }
 
     def move_on(
         self, order: Order, attack: RoundTraffic, learned: dict[str, float]
@@ -173,42 +165,33 @@ class Evolution:
         """Move the curriculum by what became of the attacks; returns all metrics of the
         round, named by group (train/, curriculum/, synthesizer/, time/)."""
         curriculum = self.curriculum
-        episodes = self.episodes
-        state = self.curriculum.summary()
-        assert episodes is not None
+        state = curriculum.summary()
         outcomes = outcomes_of(
-            order.eta, drawn=attack.drawn, row=episodes.row, failed=episodes.failed
+            order.eta,
+            drawn=attack.drawn,
+            row=self.episodes.row,
+            failed=self.episodes.failed,
         )
-        curriculum.update(
-            episodes.scene_index,
-            episodes.failed,
-            episodes.adversarial,
-            episodes.survivable,
-        )
+        curriculum.update(self.episodes)
         curriculum.leave_out(order.scenes[outcomes.left_out])
-        self.choices = tally(order.number, outcomes)
         curriculum.advance(attack.contact)
+        self.choices = tally(order.number, outcomes)
+        self.errored = attack.errored
         not_made = sum(entry["during"] == ATTACK for entry in attack.errored)
-        attacked = {
+        attacks = {
             "scenes": float(len(order.scenes)),
             "eta": order.eta.mean().item(),
             "left_out": float(outcomes.left_out.sum() - not_made),
             "memory_rows": float(self.memory.rows),
-            **counted(attack.errored),
             "attacked": attack.attacked,
             "contact": attack.contact,
-        }
-        self.errored = attack.errored
-        groups = {
-            "curriculum": state,
-            "train": learned,
-            "synthesizer": attacked,
-            "time": attack.spent,
+            **counted(attack.errored),
         }
         return {
-            f"{group}/{name}": value
-            for group, values in groups.items()
-            for name, value in values.items()
+            **{f"curriculum/{name}": value for name, value in state.items()},
+            **learned,
+            **{f"synthesizer/{name}": value for name, value in attacks.items()},
+            **{f"time/{name}": value for name, value in attack.seconds.items()},
         }
 
     # --- their parts
@@ -228,8 +211,11 @@ class Evolution:
         )
 
     def _begin(self, order: Order) -> Prefetch:
-        name = f"round {order.number + 1}: synthesis beside learning failed, checkpoints remain (resume=RUN_DIR)"
-        return Prefetch(lambda: self._make(order), name)
+        return Prefetch(
+            lambda: self._make(order),
+            f"round {order.number + 1}: synthesis beside learning failed, "
+            "checkpoints remain (resume=RUN_DIR)",
+        )
 
     def _make(self, order: Order) -> None:
         """Write the traffic of an order into the memory's folder."""
@@ -245,34 +231,30 @@ class Evolution:
     def state_dict(self) -> dict:
         """Curriculum, improvement and the order of the coming round; the checkpoint
         adds weights, the memory's index and generators."""
-        state = {
-            "curriculum": self.curriculum.state_dict(),
-            "improvement": self.improve.state_dict(),
-            "next": None,
-        }
+        coming = None
         if self._next is not None:
-            order = self._next
-            ego = self._next.ego
+            coming = dict(vars(self._next))
+            ego = coming.pop("ego")
             assert isinstance(ego, ActorEgo)
-            weights = {
+            coming["weights"] = {
                 name: value.detach().cpu()
                 for name, value in ego.network.weights().items()
             }
-            given = {
-                name: getattr(order, name)
-                for name in ("number", "scenes", "eta", "seed")
-            }
-            state["next"] = given | {"weights": weights}
-        return state
+        return {
+            "curriculum": self.curriculum.state_dict(),
+            "improvement": self.improve.state_dict(),
+            "next": coming,
+        }
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
         self.curriculum.load_state_dict(state["curriculum"])
         self.improve.load_state_dict(state["improvement"])
-        self._next = self._prefetch = None
+        self._next = None
+        self._prefetch = None
         if state["next"] is not None:
-            given = dict(state["next"])
+            coming = dict(state["next"])
             ego = copy.deepcopy(self.ego)
             assert isinstance(ego, ActorEgo)
-            ego.network.set_weights(given.pop("weights"))
-            self._next = Order(ego=ego, **given)
+            ego.network.set_weights(coming.pop("weights"))
+            self._next = Order(ego=ego, **coming)

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from pathlib import Path
 
-from e2rl.learning.pretraining.driving import Episodes
+from e2rl.learning.rounds.episodes import Episodes
 from e2rl.learning.rounds.scheduler import CurriculumScheduler
 from e2rl.planners.ego import Ego
 from e2rl.run.config import Extension

@@ -2,8 +2,8 @@
 round's pool."""
 
 import copy
-import os
 import time
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +12,15 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
-from e2rl.learning.pretraining.driving import OUTCOME_KEYS, Episodes, finished_episodes
 from e2rl.learning.pretraining.imitation import recorded_demonstrations
+from e2rl.learning.rounds.episodes import OUTCOME_KEYS, Episodes, finished_episodes
 from e2rl.learning.rounds.improvement import Improvement
 from e2rl.learning.rounds.scheduler import CurriculumScheduler
-from e2rl.learning.rounds.teaching import Teacher
+from e2rl.learning.rounds.teaching import Teacher, TeachingSettings
 from e2rl.learning.rounds.update import Learner, UpdateSettings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
@@ -31,7 +30,7 @@ from e2rl.run.settings import configured, setting, settings_of
 from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.traffic.pool import TrafficPool
+from e2rl.traffic.pool import RowDraw, TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
 
 
@@ -46,41 +45,13 @@ class CollectSettings:
     iterations: int = setting(low=1)
 
 
-class RowDraw:
-    """Draws pool rows by probability [R], with a generator of its own."""
-
-    def __init__(self, probability: Tensor, seed: int | None = 0) -> None:
-        """seed: None, of the system's entropy, anew in every process that a copy draws
-        in until somebody seeds it."""
-        self.probability = probability
-        self.generator = torch.Generator()
-        self._process = os.getpid()
-        self._entropy = None
-        if seed is None:
-            self._entropy = self.generator.seed()
-        else:
-            self.generator.manual_seed(seed)
-
-    def __call__(self, count: int) -> Tensor:
-        """Rows [count]."""
-        if (
-            self._process != os.getpid()
-            and self._entropy == self.generator.initial_seed()
-        ):
-            self._process = os.getpid()
-            self._entropy = self.generator.seed()
-        return torch.multinomial(
-            self.probability, count, replacement=True, generator=self.generator
-        )
-
-
 def on_device(ego: ActorEgo, device: str) -> ActorEgo:
     """The ego itself, or a copy where it is on another device."""
     if ego.network.device == torch.device(device):
         return ego
-    found = copy.copy(ego)
-    found.network = ego.network.copied(device)
-    return found
+    moved = copy.copy(ego)
+    moved.network = ego.network.copied(device)
+    return moved
 
 
 def steps_of(data: TensorDictBase) -> int:
@@ -103,41 +74,48 @@ class PolicyImprovement(Improvement):
         *,
         seed: int = 0,
         device: str,
+        rounds: int,
         collect: Mapping[str, Any],
         ppo: Mapping[str, Any],
         teacher: Ego | Mapping[str, Any],
         teaching: Mapping[str, Any],
-        rounds: int,
     ) -> None:
-        """Settings: conf/learner/ppo_bc.yaml. Raises InputError if the ego is no actor,
-        the teacher no ScoringEgo, or a round shorter than an episode.
-
+        """
         Args:
-            teacher: with ppo.teaching > 0, a ScoringEgo that labels states of the
-                collected episodes, as `teaching`
-                says.
+            ego: an actor.
+            scenes: of the pools.
+            sim: settings of the simulator.
+            seed: of the draws of rows and of the demonstrations.
+            device: where the policy drives and learns.
             rounds: of the run, over which the learning rate falls.
+            collect: of CollectSettings.
+            ppo: of UpdateSettings.
+            teacher: with ppo.teaching > 0, a ScoringEgo that labels states, or how it
+                is built.
+            teaching: of TeachingSettings.
+
+        Raises:
+            InputError: the ego is no actor, the teacher no ScoringEgo, or a round
+                shorter than an episode.
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(
-                f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; tune a planner with `e2rl tune`"
+                f"learner=ppo_bc improves ego=actor, not {type(ego).__name__}; "
+                "tune a planner with `e2rl tune`"
             )
         self.settings = settings_of(CollectSettings, collect, where="learner.collect")
         update = settings_of(UpdateSettings, ppo, where="learner.ppo")
-        batch = self.settings.batch
         self.horizon = scenes.steps
-        hold = self.settings.hold
-        iterations = self.settings.iterations
-        if self.settings.steps * iterations * hold < self.horizon:
+        decisions = self.settings.steps * self.settings.iterations
+        if decisions * self.settings.hold < self.horizon:
             raise InputError(
-                f"learner.collect: {self.settings.steps} x {iterations} decisions of {hold} steps a round cannot hold "
-                f"an episode of {self.horizon} steps"
+                f"learner.collect: {decisions} decisions of {self.settings.hold} steps "
+                f"a round cannot hold an episode of {self.horizon} steps"
             )
         self.ego = ego
-        self._learning = on_device(ego, device)
-        self.learner = Learner(
-            self._learning.network, update, total=rounds * iterations
-        )
+        self.learning = on_device(ego, device)
+        network = self.learning.network
+        self.learner = Learner(network, update, total=rounds * self.settings.iterations)
         self.frames = 0
         placed = scenes.to(device)
         self.demonstrations: TensorDict | None = None
@@ -145,38 +123,35 @@ class PolicyImprovement(Improvement):
         if update.cloning > 0:
             self.demonstrations = recorded_demonstrations(scenes, sim, seed=seed)
         if update.teaching > 0:
-            planner = (
-                teacher
-                if isinstance(teacher, Ego)
-                else built(OmegaConf.create(dict(teacher)), "teacher", kind=Ego)
-            )
-            bounds = self._learning.network.low, self._learning.network.high
+            if not isinstance(teacher, Ego):
+                options = OmegaConf.create(dict(teacher))
+                teacher = built(options, "learner.teacher", kind=Ego)
             self.teacher = Teacher(
-                planner, placed, bounds=bounds, hold=hold, settings=teaching
+                teacher,
+                placed,
+                low=network.low,
+                high=network.high,
+                hold=self.settings.hold,
+                settings=settings_of(
+                    TeachingSettings, teaching, where="learner.teaching"
+                ),
             )
-        every = torch.arange(len(scenes))
-        self.draw = RowDraw(
-            torch.full((len(scenes),), 1 / len(scenes), dtype=torch.float64), seed
-        )
+        count = len(scenes)
+        self.draw = RowDraw(torch.full((count,), 1 / count, dtype=torch.float64), seed)
         self.synthesizer = AdversarialSynthesizer(
-            TrafficPool.recorded(every), self.draw
+            TrafficPool.recorded(torch.arange(count)), self.draw
         )
-        base = DrivingEnv(
+        self.env = DrivingEnv(
             placed,
             sim,
-            batch,
+            self.settings.batch,
             device,
             agents=self.teacher is not None,
-            hold=hold,
+            hold=self.settings.hold,
         )
-        self.env = TransformedEnv(base, Compose(self.synthesizer, RewardSum()))
-        self._collect_by(self._learning.network.actor, device)
-
-    def _collect_by(self, policy: TensorDictModuleBase, device: str) -> None:
-        """Collect batches [B, steps] of decisions of a policy from here on."""
         self._collector = Collector(
-            self.env,
-            policy,
+            TransformedEnv(self.env, Compose(self.synthesizer, RewardSum())),
+            network.actor,
             frames_per_batch=self.settings.batch * self.settings.steps,
             total_frames=-1,
             trust_policy=True,
@@ -191,18 +166,16 @@ class PolicyImprovement(Improvement):
     ) -> tuple[dict[str, float], Episodes]:
         """Reset every environment; `iterations` times: collect [B, steps] decisions,
         update. `frames` are steps of 0.1 s."""
-        self._learning.network.set_weights(
-            self.ego.network.weights()
-        )  # those of a checkpoint, in a resumed run
+        self.learning.network.set_weights(self.ego.network.weights())
         self.synthesizer.pool = pool
         self.draw.probability = pool.probabilities(
             curriculum.priority(), curriculum.fraction
         )
         self._collector.reset()
         outcomes = []
-        rows = []
-        collecting = 0.0
-        begun = self.frames
+        metrics = []
+        seconds = 0.0
+        frames = self.frames
         bar = Bar(
             range(self.settings.iterations),
             "collect and update",
@@ -212,58 +185,63 @@ class PolicyImprovement(Improvement):
         for _ in bar:
             begin = time.perf_counter()
             data = self.collected()
-            collecting += time.perf_counter() - begin
+            seconds += time.perf_counter() - begin
             self.frames += steps_of(data)
             outcomes.append(data.select(*OUTCOME_KEYS).cpu().clone())
-            labels, made = self._labels(data, pool.adversarial)
-            rows.append(self.learner.update(data, self.demonstrations, labels) | made)
+            watched = self._watch(data, pool.adversarial)
+            labels = None if self.teacher is None else self.teacher.labelled
+            row = self.learner.update(data, self.demonstrations, labels)
+            metrics.append(row | watched)
             bar.set_postfix(
                 reward=f"{data['next', 'reward'].mean().item():.3f}",
-                kl=f"{rows[-1]['kl']:.4f}",
+                kl=f"{row['kl']:.4f}",
             )
-        self.ego.network.set_weights(self._learning.network.weights())
+        self.ego.network.set_weights(self.learning.network.weights())
         episodes = finished_episodes(
-            outcomes, pool.adversarial, horizon=self.horizon, hold=self.settings.hold
+            outcomes,
+            pool.adversarial,
+            horizon=self.horizon,
+            hold=self.settings.hold,
         )
         if self.teacher is not None:
             episodes.survivable = self.teacher.survivable(len(pool))[episodes.row]
-        counts = {"frames": float(self.frames), "collect": collecting}
-        counts["steps_per_second"] = (self.frames - begun) / collecting
-        return _means(rows) | episodes.summary() | counts, episodes
+        return {
+            **means(metrics),
+            **episodes.summary(),
+            "frames": float(self.frames),
+            "collect": seconds,
+            "steps_per_second": (self.frames - frames) / seconds,
+        }, episodes
 
     def collected(self) -> TensorDictBase:
         """The next batch [B, steps] of decisions, by the present policy."""
         self._collector.update_policy_weights_()
         return next(self._batches)
 
-    def _labels(
-        self, data: TensorDictBase, adversarial: Tensor
-    ) -> tuple[TensorDictBase | None, dict[str, float]]:
-        """The teacher's labels so far, those in a batch included, and what these were."""
+    def _watch(self, data: TensorDictBase, adversarial: Tensor) -> dict[str, float]:
+        """Let the teacher label a batch; returns how many states there were."""
         if self.teacher is None:
-            return None, {}
+            return {}
         begin = time.perf_counter()
         count = -(-self.teacher.settings.states // self.settings.iterations)
-        made = self.teacher.watch(data, adversarial, self._learning, count)
-        return self.teacher.labelled, {
-            **made,
-            "label_seconds": time.perf_counter() - begin,
-        }
+        counts = self.teacher.watch(data, adversarial, self.learning, count)
+        return counts | {"label_seconds": time.perf_counter() - begin}
 
     def outcome(self, folder: Path) -> str:
         """How to evaluate the improved ego of a run's folder."""
-        return f"evaluate the policy with: python evaluate.py ego=actor ego.checkpoint={folder}"
+        return (
+            "evaluate the policy with: python evaluate.py ego=actor "
+            f"ego.checkpoint={folder}"
+        )
 
     def state_dict(self) -> dict:
         """Learner, draws and frames; the weights are the network's."""
-        state = {
+        return {
             "learner": self.learner.state_dict(),
             "frames": self.frames,
             "draws": self.draw.generator.get_state(),
+            "labels": {} if self.teacher is None else self.teacher.state_dict(),
         }
-        return state | (
-            {} if self.teacher is None else {"labels": self.teacher.state_dict()}
-        )
 
     def load_state_dict(self, state: dict) -> None:
         self.learner.load_state_dict(state["learner"])
@@ -273,8 +251,10 @@ class PolicyImprovement(Improvement):
         self.frames = state["frames"]
 
 
-def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The mean of each metric over the updates that have it."""
-    names = sorted({name for row in rows for name in row})
-    known = {name: [row[name] for row in rows if name in row] for name in names}
-    return {name: sum(values) / len(values) for name, values in known.items()}
+    columns = defaultdict(list)
+    for row in rows:
+        for name, value in row.items():
+            columns[name].append(value)
+    return {name: sum(values) / len(values) for name, values in columns.items()}

@@ -15,24 +15,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from e2rl.learning.rounds.episodes import Episodes
 from e2rl.run.config import Extension
 from e2rl.run.errors import InputError
 from e2rl.run.settings import check_range, configured
 
-Choice = dict[str, int | float]  # a row of the table, by COLUMNS
-COLUMNS = (
-    "round",
-    "eta",
-    "draws",
-    "left_out",
-    "episodes",
-    "failures",
-    "failure_rate",
-)
-TEMPERATURE = 2.0  # of the ranks of regret: at 2 the first tenth of the scenes has a quarter of the draws
-STALENESS = (
-    0.2  # fraction of the draws that goes by the rounds since a scene was last drawn
-)
+Choice = dict[str, int | float]  # a row of curriculum.csv
+TEMPERATURE = 2.0  # of ranks: the first tenth of the scenes has a quarter of the draws
+STALENESS = 0.2  # fraction of the draws by the rounds since a scene was last drawn
 SMOOTHING = 0.3  # weight of a round in a scene's moving failure rate
 BIN = 0.5  # intensities are counted under multiples of it
 
@@ -111,14 +101,12 @@ class CurriculumScheduler(Extension):
 
     Args:
         rounds: of the whole run.
-        prioritised, regret, solvable_only: see conf/curriculum/adaptive.yaml.
+        prioritised, solvable_only: see conf/curriculum/adaptive.yaml.
     """
 
     eta: float  # adversarial intensity of this round
     fraction: float  # of this round's episodes that are in adversarial traffic
-    lasting: tuple[
-        str, ...
-    ] = ()  # names of a subclass's attributes (numbers and tensors) that checkpoints hold
+    lasting: tuple[str, ...] = ()  # a subclass's attributes that checkpoints hold
 
     def __init__(
         self,
@@ -127,7 +115,6 @@ class CurriculumScheduler(Extension):
         seed: int = 0,
         *,
         prioritised: bool,
-        regret: bool,
         solvable_only: bool,
     ) -> None:
         if num_scenes < 1:
@@ -136,7 +123,6 @@ class CurriculumScheduler(Extension):
         self.round = 0
         self.prioritised = prioritised
         self.solvable_only = solvable_only
-        self._teacher_tells = regret
         self._generator = torch.Generator().manual_seed(seed)
         self._failing = torch.full((num_scenes,), torch.nan)
         self._survivable = torch.full((num_scenes,), torch.nan)
@@ -170,12 +156,11 @@ class CurriculumScheduler(Extension):
         count = len(self._failing)
         if not self.prioritised:
             return torch.full((count,), 1 / count)
-        weight = (1 / ranks(self.regret().nan_to_num(nan=torch.inf))) ** (
-            1 / TEMPERATURE
-        )
+        rank = ranks(self.regret().nan_to_num(nan=torch.inf))
+        weight = (1 / rank) ** (1 / TEMPERATURE)
         age = (self.round - self._drawn).float()
-        old = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
-        return (1 - STALENESS) * weight / weight.sum() + STALENESS * old
+        stale = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
+        return (1 - STALENESS) * weight / weight.sum() + STALENESS * stale
 
     def draw(self, count: int) -> Tensor:
         """Scenes [count] to synthesize for: each scene count // S times, the rest by
@@ -191,37 +176,29 @@ class CurriculumScheduler(Extension):
         self._drawn[chosen] = self.round
         return chosen
 
-    def update(
-        self,
-        scene_index: Tensor,
-        failed: Tensor,
-        adversarial: Tensor,
-        survivable: Tensor,
-    ) -> None:
-        """Update with episodes [E]: scene, whether the ego failed, whether the traffic
-        was adversarial, and the fraction of its row's critical moments that the teacher
-        would survive (NaN: unknown)."""
-        scene_index = scene_index.cpu()
-        adversarial = adversarial.cpu()
-        told = adversarial & ~survivable.isnan() & self._teacher_tells
-        for known, value, of in (
-            (self._failing, failed.float(), adversarial),
-            (self._survivable, survivable, told),
+    def update(self, episodes: Episodes) -> None:
+        """Learn from episodes how often the ego fails in the scenes' adversarial
+        traffic, and which fraction of its critical moments the teacher would
+        survive."""
+        attacked = episodes.adversarial
+        judged = attacked & ~episodes.survivable.isnan()
+        for average, values, rows in (
+            (self._failing, episodes.failed.float(), attacked),
+            (self._survivable, episodes.survivable, judged),
         ):
-            scenes, inverse = scene_index[of].unique(return_inverse=True)
-            total = torch.zeros(len(scenes)).index_add(0, inverse, value.cpu()[of])
+            scenes, inverse = episodes.scene_index[rows].unique(return_inverse=True)
+            total = torch.zeros(len(scenes)).index_add(0, inverse, values[rows])
             mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
-            before = known[scenes]
-            known[scenes] = torch.where(
+            before = average[scenes]
+            average[scenes] = torch.where(
                 before.isnan(), mean, before + SMOOTHING * (mean - before)
             )
 
-    def leave_out(self, scene_index: Tensor) -> None:
+    def leave_out(self, scenes: Tensor) -> None:
         """Mark scenes whose adversarial traffic was left out because no driver survives
         it. They count as solved until they are driven; otherwise they would come first
         in every draw."""
-        scene_index = scene_index.cpu()
-        self._failing[scene_index] = self._failing[scene_index].nan_to_num(nan=0.0)
+        self._failing[scenes] = self._failing[scenes].nan_to_num(nan=0.0)
 
     def advance(self, collision_rate: float | None = None) -> None:
         """Advance to the next round. collision_rate: the ego's in this round's
@@ -230,43 +207,41 @@ class CurriculumScheduler(Extension):
 
     def summary(self) -> dict[str, float]:
         """Metrics to log."""
-        regret = self.regret()
-        seen = ~self._failing.isnan()
-        result = {
+        driven = ~self._failing.isnan()
+        metrics = {
             "eta": self.eta,
             "fraction": self.fraction,
-            "scenes_seen": seen.float().mean().item(),
+            "scenes_seen": driven.float().mean().item(),
         }
-        return result | ({"regret": regret[seen].mean().item()} if seen.any() else {})
+        if driven.any():
+            metrics["regret"] = self.regret()[driven].mean().item()
+        return metrics
 
     def state_dict(self) -> dict:
         """All state."""
-        own = {name: getattr(self, name) for name in self.lasting}
-        scenes = {
+        return {
             "failing": self._failing,
             "survivable": self._survivable,
             "drawn": self._drawn,
-        }
-        return scenes | {
             "round": self.round,
             "generator": self._generator.get_state(),
-            "own": own,
+            "lasting": {name: getattr(self, name) for name in self.lasting},
         }
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`; raises InputError if the number of scenes differs."""
         if len(state["failing"]) != len(self._failing):
             raise InputError(
-                f"the checkpoint's curriculum holds {len(state['failing'])} scenes, the data {len(self._failing)}; "
-                "resume with the data of the run"
+                f"the checkpoint's curriculum holds {len(state['failing'])} scenes, "
+                f"the data {len(self._failing)}; resume with the data of the run"
             )
-        self._failing, self._survivable, self._drawn = (
-            state[key].clone() for key in ("failing", "survivable", "drawn")
-        )
+        self._failing = state["failing"].clone()
+        self._survivable = state["survivable"].clone()
+        self._drawn = state["drawn"].clone()
         self.round = state["round"]
         self._generator.set_state(state["generator"].cpu())
         for name in self.lasting:
-            setattr(self, name, state["own"][name])
+            setattr(self, name, state["lasting"][name])
 
 
 def ranks(value: Tensor) -> Tensor:

@@ -7,9 +7,7 @@ before a contact or a near miss, and of these only where, by the planner's costs
 policy's own plan is worse by far and the planner's is not a contact itself.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,7 +18,7 @@ from e2rl.planners.ego import Ego
 from e2rl.planners.ego_policy import ask
 from e2rl.planners.sampling import ScoringEgo, ranked_actions
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting, settings_of
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import touches
@@ -28,18 +26,13 @@ from e2rl.sim.prospects import time_to_contact
 from e2rl.sim.world import World
 from e2rl.traffic.e2.skeleton import first_after
 
-BATCH, GPU_BATCH = 32, 2048  # states that are labelled at once
-
-
-CANDIDATES = (
-    48  # soft labels: the teacher's cheapest candidates, of which the nearest ones draw
-)
+BATCH = 32  # states that are labelled at once
+GPU_BATCH = 2048
+CANDIDATES = 48  # soft labels: the teacher's cheapest, of which the nearest ones draw
 TEMPERATURE = 5.0  # of their weights softmax(-cost / TEMPERATURE)
 COSTLY = 60.0  # cost from which on a plan counts as one that ends in a contact
-NOTHING = (
-    torch.zeros(0, dtype=torch.int64),
-    torch.zeros(0, dtype=torch.bool),
-)  # rows of decisions, and which are survived
+NO_ROWS = torch.zeros(0, dtype=torch.int64)
+NO_FLAGS = torch.zeros(0, dtype=torch.bool)
 
 
 @configured("learner/ppo_bc", "teaching")
@@ -65,15 +58,13 @@ def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
     event = first_after(contact | (time_to_contact(data["observation"]) < near))[:, :-1]
     step = data["timestep"][..., 0]
     wait = step.gather(1, event.clamp(max=length - 1)) - step
-    same = (event < length) & (
-        event <= first_after(data["next", "done"][..., 0])[:, :-1]
-    )
-    return same & (wait * DT <= window)
+    end = first_after(data["next", "done"][..., 0])[:, :-1]
+    return (event < length) & (event <= end) & (wait * DT <= window)
 
 
 class Teacher:
-    """Labels states of collected batches; `labelled` [M] (e2rl.learning.pretraining.cloning) are
-    the newest ones of all rounds.
+    """Labels states of collected batches; `labelled` [M]
+    (e2rl/learning/pretraining/cloning.py) are the newest ones of all rounds.
 
     It knows of the others what it sees, so that a critical decision from which it would
     get away, where the policy would not, is one that the policy has to learn:
@@ -84,66 +75,86 @@ class Teacher:
         self,
         planner: Ego,
         scenes: SceneSet,
-        bounds: tuple[Tensor, Tensor],
+        *,
+        low: Tensor,
+        high: Tensor,
         hold: int,
-        settings: Mapping[str, Any],
+        settings: TeachingSettings,
     ) -> None:
-        """bounds: lowest and highest action [2]; hold: steps of a decision; settings:
-        of TeachingSettings. Raises InputError if the planner does not rank candidates.
+        """
+        Args:
+            planner: that labels.
+            scenes: of the states.
+            low: lowest action [2].
+            high: highest action [2].
+            hold: steps of a decision.
+            settings: which states are labelled.
+
+        Raises:
+            InputError: the planner does not rank candidates.
         """
         if not isinstance(planner, ScoringEgo):
             raise InputError(
-                f"learner.teacher={type(planner).__name__}: it cannot tell what its candidates cost; take an "
-                "ScoringEgo such as e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
+                f"learner.teacher={type(planner).__name__}: it cannot tell what its "
+                "candidates cost; take an ScoringEgo such as "
+                "e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
             )
-        self.settings = settings_of(
-            TeachingSettings, settings, where="learner.teaching"
-        )
+        self.settings = settings
         self.planner = planner
         self.scenes = scenes
-        self.bounds = bounds
+        self.low = low
+        self.high = high
         self.hold = hold
         self.labelled: TensorDict | None = None
-        self._looked_at = NOTHING
+        self._judged = NO_ROWS  # rows of the pool of decisions that were judged
+        self._survived = NO_FLAGS  # which of them the planner alone survives
 
     def survivable(self, rows: int) -> Tensor:
         """Of the decisions judged in each of the pool's rows, the fraction [R] that the
         planner survives and the policy's plan does not; NaN in rows without any. Then
         all counts are reset."""
-        row, away = self._looked_at
-        self._looked_at = NOTHING
-        return torch.bincount(row, away.float(), rows) / torch.bincount(
-            row, minlength=rows
-        )
+        survived = torch.bincount(self._judged, self._survived.float(), rows)
+        fraction = survived / torch.bincount(self._judged, minlength=rows)
+        self._judged = NO_ROWS
+        self._survived = NO_FLAGS
+        return fraction
 
     def watch(
         self, data: TensorDictBase, adversarial: Tensor, ego: Ego, count: int
     ) -> dict[str, float]:
-        """Look at up to `count` critical decisions, drawn evenly, of adversarial
-        episodes in a batch [B, T] that `ego` drove. adversarial [R] bool: of the pool's
-        rows. Returns how many there were, and the labels that they made."""
+        """Label critical decisions of adversarial episodes, drawn evenly.
+
+        Args:
+            data: a batch [B, T] that `ego` drove.
+            adversarial: of the pool's rows, [R] bool.
+            ego: whose plans are judged.
+            count: decisions looked at, at most.
+
+        Returns:
+            How many critical ones there were, and the labels that they made.
+        """
         attacked = adversarial.to(data.device)[data["traffic", "row"][..., 0]]
         places = (
             attacked & critical(data, self.settings.window, near=self.settings.near)
         ).nonzero()
-        row, column = places[
-            torch.randperm(len(places), device=places.device)[:count]
-        ].unbind(1)
-        frames = data.select("observation", "timestep", "scene_index", "agents")[
-            row, column
-        ]
-        if not len(frames):
+        order = torch.randperm(len(places), device=places.device)
+        row, column = places[order[:count]].unbind(1)
+        if not len(row):
             return {"critical": 0.0, "labels": 0.0}
-        size = GPU_BATCH if frames.device.type == "cuda" else BATCH
-        parts, away = zip(
-            *(self.labels(part, ego) for part in frames.split(size)), strict=True
-        )
-        known = [] if self.labelled is None else [self.labelled]
-        self.labelled = torch.cat([*known, *parts])[-self.settings.memory :]
-        rows, survived = self._looked_at
-        rows = torch.cat([rows, data["traffic", "row"][row, column, 0].cpu()])
-        self._looked_at = rows, torch.cat([survived, *(each.cpu() for each in away)])
-        return {"critical": float(len(places)), "labels": float(sum(map(len, parts)))}
+        frames = data.select("observation", "timestep", "scene_index", "agents")
+        size = GPU_BATCH if data.device.type == "cuda" else BATCH
+        labels = []
+        survived = [self._survived]
+        for part in frames[row, column].split(size):
+            label, escapes = self.labels(part, ego)
+            labels.append(label)
+            survived.append(escapes.cpu())
+        older = [] if self.labelled is None else [self.labelled]
+        self.labelled = torch.cat([*older, *labels])[-self.settings.memory :]
+        rows = data["traffic", "row"][row, column, 0].cpu()
+        self._judged = torch.cat([self._judged, rows])
+        self._survived = torch.cat(survived)
+        return {"critical": float(len(places)), "labels": float(sum(map(len, labels)))}
 
     def labels(self, frames: TensorDictBase, ego: Ego) -> tuple[TensorDict, Tensor]:
         """Labels [K] of the states frames [M] of a DrivingEnv with `agents=True` in
@@ -155,19 +166,17 @@ class Teacher:
         action, cost = ranked_actions(
             self.planner, world, count=CANDIDATES, hold=self.hold
         )
-        own = self.planner.rated(world, ask(ego, "plan", world=world)[:, None])[:, 0]
-        weight = torch.softmax(-cost / TEMPERATURE, -1)
-        found = {
+        plan = ask(ego, "plan", world=world)[:, None]
+        rated = self.planner.rated(world, plan)[:, 0]
+        best = cost[:, 0]
+        labels = {
             "observation": frames["observation"],
-            "action": clip_expert(action, *self.bounds),
-            "weight": weight,
+            "action": clip_expert(action, self.low, high=self.high),
+            "weight": torch.softmax(-cost / TEMPERATURE, -1),
         }
-        kept = (own - cost[:, 0] >= settings.regret) & (
-            cost[:, 0] < settings.survivable
-        )
-        return TensorDict(found, batch_size=frames.batch_size)[kept], (
-            own >= COSTLY
-        ) & (cost[:, 0] < COSTLY)
+        chosen = (rated - best >= settings.regret) & (best < settings.survivable)
+        escapes = (rated >= COSTLY) & (best < COSTLY)
+        return TensorDict(labels, batch_size=frames.batch_size)[chosen], escapes
 
     def state_dict(self) -> dict:
         """The labels, of plain tensors."""
@@ -175,7 +184,7 @@ class Teacher:
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
-        device = self.bounds[0].device
-        self.labelled = (
-            TensorDict(state, [len(state["weight"])]).to(device) if state else None
-        )
+        self.labelled = None
+        if state:
+            labels = TensorDict(state, [len(state["weight"])])
+            self.labelled = labels.to(self.low.device)

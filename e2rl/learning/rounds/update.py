@@ -24,7 +24,7 @@ from e2rl.planners.network import ActorCritic, ActorNetwork
 from e2rl.run.settings import configured, setting
 from e2rl.sim.prospects import TIMES, time_to_contact
 
-VALUE_MEMORY = 0.95  # weight of the past in the running mean and variance of the returns, per update
+VALUE_MEMORY = 0.95  # weight of the past in the returns' mean and variance, per update
 PRICED_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is measured
 PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
 CRITIC = 0.5  # weight of the critic's loss
@@ -72,9 +72,7 @@ class Learner:
         self.returns = PopArtValueNorm(
             shape=1, beta=VALUE_MEMORY, device=network.device
         )
-        self.peak = torch.zeros(
-            (), device=network.device
-        )  # running maximum of |advantage|
+        self.peak = torch.zeros((), device=network.device)  # of |advantage|, running
         self.ppo = ClipPPOLoss(
             *network.heads(),
             clip_epsilon=settings.clip,
@@ -99,58 +97,64 @@ class Learner:
         updated at the end, so they are equal in collection and update.
 
         Args:
-            demonstrations: [M] (e2rl.learning.pretraining.cloning) that are cloned.
-            labels: a teacher's labels [M].
+            demonstrations: [M] (e2rl/learning/pretraining/cloning.py), cloned.
+            labels: of a teacher, [M].
         """
         settings = self.settings
-        sums = defaultdict(list)
-        stopped = False
-        seen_before = bool(self.network.normaliser.count > 0)
-        if (
-            not seen_before
-        ):  # the last layer is still zero, so statistics change no probability
-            self.network.normaliser.observe(data["observation"].to(self.network.device))
+        normaliser = self.network.normaliser
+        observations = data["observation"].to(self.network.device)
+        normalised = bool(normaliser.count > 0)
+        if not normalised:  # the last layer is still zero: no probability changes
+            normaliser.observe(observations)
         warming = self.updates < settings.critic_warmup
-        flat = self._with_advantages(
+        frames = self._with_advantages(
             data, 0.0 if warming else settings.advantage_filter
         )
-        done = 0.0 if self.total is None else min(self.updates / self.total, 1.0)
-        self.optimiser.param_groups[0]["lr"] = rate = settings.learning_rate * (
-            1 - (1 - settings.final_lr) * done
-        )
-        storage = TensorStorage(flat, device="auto")
-        sampler = SamplerWithoutReplacement()
+        rate = self._learning_rate()
+        self.optimiser.param_groups[0]["lr"] = rate
         minibatches = ReplayBuffer(
-            storage=storage, sampler=sampler, batch_size=settings.minibatch
+            storage=TensorStorage(frames, device="auto"),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=settings.minibatch,
         )
+        columns = defaultdict(list)
+        stopped = False
         for _ in range(settings.epochs):
-            moved = []
+            divergence = []
             for minibatch in minibatches:  # every frame once
-                losses = self._step(
-                    minibatch, demonstrations, labels=labels, warming=warming
-                )
-                moved.append(losses["kl"])
+                if warming:
+                    losses = self._fit_critic(minibatch)
+                else:
+                    losses = self._step(minibatch, demonstrations, labels)
+                divergence.append(losses["kl"])
                 for name, value in losses.items():
-                    sums[name].append(value)
-            stopped = (
-                not warming and torch.stack(moved).mean().item() > settings.target_kl
-            )
+                    columns[name].append(value)
+            mean = torch.stack(divergence).mean().item()
+            stopped = not warming and mean > settings.target_kl
             if stopped:
                 break
-        if seen_before:
-            self.network.normaliser.observe(data["observation"].to(self.network.device))
+        if normalised:
+            normaliser.observe(observations)
         self.updates += 1
-        result = {
-            name: torch.stack(values).mean().item() for name, values in sums.items()
-        }
-        return result | {
+        deviation = self.network.network.std
+        return {
+            **{
+                name: torch.stack(values).mean().item()
+                for name, values in columns.items()
+            },
             "stopped_by_kl": float(stopped),
-            "std_acceleration": self.network.network.std[0].item(),
-            "std_yaw_rate": self.network.network.std[1].item(),
-            "steps": float(len(sums["kl"])),
+            "std_acceleration": deviation[0].item(),
+            "std_yaw_rate": deviation[1].item(),
+            "steps": float(len(columns["kl"])),
             "learning_rate": rate,
-            "frames_used": len(flat) / data.numel(),
+            "frames_used": len(frames) / data.numel(),
         }
+
+    def _learning_rate(self) -> float:
+        """Of this update: it falls linearly to final_lr of it."""
+        settings = self.settings
+        done = 0.0 if self.total is None else min(self.updates / self.total, 1.0)
+        return settings.learning_rate * (1 - (1 - settings.final_lr) * done)
 
     @torch.no_grad()
     def _with_advantages(self, data: TensorDictBase, least: float) -> TensorDict:
@@ -167,22 +171,19 @@ class Learner:
         advantage, target = self.advantages(data, inputs["seen"])
         self.returns.update(target)
         size = advantage.abs()
-        highest = advantage.abs().max()
-        self.peak = (
-            highest
-            if self.updates == 0
-            else torch.lerp(highest, self.peak, PEAK_MEMORY)
-        )
+        highest = size.max()
+        if self.updates:
+            highest = torch.lerp(highest, self.peak, PEAK_MEMORY)
+        self.peak = highest
         frames = data.select("action", "action_log_prob").update(inputs)
         frames["calm"] = time_to_contact(data["observation"]) > TIMES[-1]
-        frames["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp(
-            min=1e-6
-        )
+        deviation = advantage.std().clamp(min=1e-6)
+        frames["advantage"] = (advantage - advantage.mean()) / deviation
         frames["value_target"] = self.returns.normalize(target)
-        kept = (size >= least * self.peak)[..., 0]
-        return (
-            frames.reshape(-1) if least == 0 or not bool(kept.any()) else frames[kept]
-        )
+        instructive = (size >= least * self.peak)[..., 0]
+        if least == 0 or not bool(instructive.any()):
+            return frames.reshape(-1)
+        return frames[instructive]
 
     @torch.no_grad()
     def advantages(self, data: TensorDictBase, seen: Tensor) -> tuple[Tensor, Tensor]:
@@ -193,71 +194,86 @@ class Learner:
         batch's end and where an episode is cut off.
         """
         after = data["next"]
-        settings = self.settings
         value = self._value(seen)
         done = after["done"]
         terminated = after["terminated"]
         cut = done & ~terminated
         cut[:, -1] = True
         following = torch.cat([value[:, 1:], value[:, -1:]], 1)
-        following[cut] = self._value(
-            self.network.normaliser(after["observation"][cut[..., 0]])
-        )[..., 0]
-        rewards = after["reward"], done, terminated
+        last = self.network.normaliser(after["observation"][cut[..., 0]])
+        following[cut] = self._value(last)[..., 0]
         return generalized_advantage_estimate(
-            settings.gamma, settings.lmbda, value, following, *rewards
+            self.settings.gamma,
+            self.settings.lmbda,
+            state_value=value,
+            next_state_value=following,
+            reward=after["reward"],
+            done=done,
+            terminated=terminated,
         )
 
     def _value(self, seen: Tensor) -> Tensor:
         """Values [..., 1] in units of the reward."""
         return self.returns.denormalize(self.network.critic.module[1](seen))
 
+    def _fit_critic(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """One optimiser step of the critic alone; the losses and diagnostics."""
+        losses = self._ppo_losses(minibatch)
+        del losses["loss_entropy"]
+        return self._descend(losses["loss_critic"], losses)
+
     def _step(
         self,
         minibatch: TensorDictBase,
         demonstrations: TensorDictBase | None,
         labels: TensorDictBase | None,
-        warming: bool,
     ) -> dict[str, Tensor]:
-        """One optimiser step; the losses and diagnostics, detached."""
+        """One optimiser step; the losses and diagnostics."""
         settings = self.settings
-        out = self.ppo(minibatch)
-        total = out["loss_critic"]
-        if not warming:
-            total = total + out["loss_objective"] + out["loss_entropy"]
-        losses = {
-            "loss_objective": out["loss_objective"],
-            "loss_critic": out["loss_critic"],
-            "kl": out["kl_approx"],
-            "clip_fraction": out["clip_fraction"],
-            "entropy": out["entropy"],
-            "explained_variance": out["explained_variance"].mean(),
-        }
-        if settings.action_penalty > 0 and not warming:
-            losses["action_penalty"] = action_penalty(
-                self.network.network, minibatch[:PRICED_FRAMES]
-            )
-            total = total + settings.action_penalty * losses["action_penalty"]
-        if demonstrations is not None and settings.cloning > 0 and not warming:
+        network = self.network.network
+        losses = self._ppo_losses(minibatch)
+        total = losses["loss_critic"] + losses["loss_objective"]
+        total = total + losses.pop("loss_entropy")
+        if settings.action_penalty > 0:
+            penalty = action_penalty(network, minibatch[:PRICED_FRAMES])
+            losses["action_penalty"] = penalty
+            total = total + settings.action_penalty * penalty
+        if demonstrations is not None:
             shown = sampled(demonstrations, CLONED).to(self.network.device)
-            with self.network.network.noisy(*NOISE):
-                losses["loss_cloning"] = cloning_loss(self.network.actor, shown)
-            total = total + settings.cloning * losses["loss_cloning"]
-        if labels is not None and settings.teaching > 0 and not warming:
+            with network.noisy(*NOISE):
+                loss = cloning_loss(self.network.actor, shown)
+            losses["loss_cloning"] = loss
+            total = total + settings.cloning * loss
+        if labels is not None:
             drawn = sampled(labels, CLONED).to(self.network.device)
             both = torch.cat([mirrored_labels(drawn[::2]), drawn[1::2]])
-            losses["loss_teaching"] = teaching_loss(self.network.network, both)
+            losses["loss_teaching"] = teaching_loss(network, both)
             total = total + settings.teaching * losses["loss_teaching"]
+        return self._descend(total, losses)
+
+    def _ppo_losses(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """The losses of TorchRL's PPO and its diagnostics."""
+        losses = self.ppo(minibatch)
+        names = ("loss_objective", "loss_critic", "loss_entropy", "clip_fraction")
+        return {
+            **{name: losses[name] for name in (*names, "entropy")},
+            "kl": losses["kl_approx"],
+            "explained_variance": losses["explained_variance"].mean(),
+        }
+
+    def _descend(self, total: Tensor, losses: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A step down the gradient of `total`; the losses, detached."""
         take_step(self.optimiser, total, max_grad_norm=MAX_GRAD_NORM)
         return {name: value.detach().mean() for name, value in losses.items()}
 
     def state_dict(self) -> dict:
         """Optimiser, counter and running statistics; the weights are the network's."""
-        statistics = {"returns": self.returns.state_dict(), "peak": self.peak}
         return {
             "optimiser": self.optimiser.state_dict(),
+            "returns": self.returns.state_dict(),
+            "peak": self.peak,
             "updates": self.updates,
-        } | statistics
+        }
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
@@ -278,8 +294,5 @@ def action_penalty(network: ActorNetwork, frames: TensorDictBase) -> Tensor:
     """
     loc, _ = network.head(frames["seen"], frames["offset"])
     acceleration = network.middle[0] + network.reach[0] * loc[..., 0].tanh()
-    return (
-        (acceleration.abs() * frames["calm"]).sum()
-        / frames["calm"].sum().clamp(min=1)
-        / 4
-    )
+    calm = frames["calm"]
+    return (acceleration.abs() * calm).sum() / calm.sum().clamp(min=1) / 4

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from e2rl.learning.rounds import scheduler
+from e2rl.learning.rounds.episodes import Episodes
 from e2rl.learning.rounds.scheduler import Outcomes, outcomes_of, ranks, tally
 from e2rl.learning.rounds.schedules import AdaptiveCurriculum
 from e2rl.run.errors import InputError
@@ -16,14 +17,23 @@ def curriculum_of(num_scenes=6, **settings):
     return AdaptiveCurriculum(num_scenes, 10, **settings)
 
 
-def episodes(curriculum, scenes, failed, adversarial=True):
-    """Episodes in scenes, each failed or not."""
-    untold = torch.full((len(scenes),), torch.nan)
+def episodes(curriculum, scenes, failed, adversarial=True, survivable=math.nan):
+    """Learn from episodes in scenes, each failed or not."""
+    scene_index = torch.tensor(scenes)
+    count = len(scenes)
+    zero = torch.zeros(count)
     curriculum.update(
-        torch.tensor(scenes),
-        torch.tensor(failed),
-        torch.full((len(scenes),), adversarial),
-        untold,
+        Episodes(
+            torch.arange(count),
+            scene_index,
+            adversarial=torch.tensor(adversarial).expand(count),
+            contact=torch.tensor(failed),
+            off_road=zero.bool(),
+            returns=zero,
+            progress=zero,
+            survivable=torch.tensor(survivable).expand(count),
+            batch_size=[count],
+        )
     )
 
 
@@ -88,21 +98,17 @@ def test_a_drawn_scene_is_not_stale():
 
 
 def test_regret_is_what_a_teacher_would_have_survived_where_one_tells():
-    given = [torch.tensor([0, 0, 1, 2])] + [torch.tensor([True, False, True, True])]
-    told = [0.25, 0.75, torch.nan, 1.0]
-    adversarial = torch.tensor([True, True, True, False])
     curriculum = curriculum_of()
-    deaf = curriculum_of(regret=False)
-    for each in (curriculum, deaf):
-        each.update(*given, adversarial, torch.tensor(told))
-    assert curriculum.regret()[:3].nan_to_num(-1).tolist() == [0.5 * 0.5, 0.0, -1.0]
-    curriculum.update(
-        torch.tensor([1]),
-        torch.tensor([True]),
-        torch.tensor([True]),
-        torch.tensor([0.75]),
+    episodes(
+        curriculum,
+        [0, 0, 1, 2],
+        failed=[True, False, True, True],
+        adversarial=[True, True, True, False],
+        survivable=[0.25, 0.75, math.nan, 1.0],
     )
-    assert curriculum.regret()[1] == 0.75 and deaf.regret()[:2].tolist() == [0.25, 0.0]
+    assert curriculum.regret()[:3].nan_to_num(-1).tolist() == [0.5 * 0.5, 0.0, -1.0]
+    episodes(curriculum, [1], failed=[True], survivable=0.75)
+    assert curriculum.regret()[1] == 0.75
 
 
 def test_ranks_share_ties():

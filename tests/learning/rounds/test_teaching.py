@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from e2rl.learning.pretraining.cloning import clip_expert
-from e2rl.learning.rounds.teaching import Teacher, critical
+from e2rl.learning.rounds.teaching import Teacher, TeachingSettings, critical
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.planners.sampling import SamplingEgo, ranked_actions
@@ -21,7 +21,18 @@ ANY = {
     "regret": -1e9,
     "survivable": 1e9,
 }  # every state of an adversarial episode is labelled
-BOUNDS = torch.tensor([-8.0, -1.6]), torch.tensor([5.0, 1.6])
+
+
+def teacher_of(planner, scenes):
+    """A teacher with the settings of the file."""
+    return Teacher(
+        planner,
+        scenes,
+        low=torch.tensor([-8.0, -1.6]),
+        high=torch.tensor([5.0, 1.6]),
+        hold=2,
+        settings=TeachingSettings(),
+    )
 
 
 def timeline(contacts, dones, near=(), decisions=30):
@@ -131,7 +142,7 @@ def test_only_what_the_teacher_does_better_by_far_and_survives_is_labelled():
     scenes = small_scenes(3, steps=40)
     data, improve = collected(scenes, attacked(scenes, 3.0))
     start = data[:, 2]  # the leader is there from the first step on
-    strict = Teacher(SamplingEgo(), scenes, bounds=BOUNDS, hold=2, settings={})
+    strict = teacher_of(SamplingEgo(), scenes)
     assert len(strict.labels(start, Blind())[0]) == len(start)
     assert len(strict.labels(start, SamplingEgo())[0]) == 0
     hopeless = start.clone()
@@ -196,4 +207,4 @@ def test_nominal_episodes_are_not_labelled_and_the_newest_labels_stay():
 def test_what_cannot_teach_is_refused():
     scenes = small_scenes(1)
     with pytest.raises(InputError, match=r"learner\.teacher=.*ScoringEgo"):
-        Teacher(IDMEgo(), scenes, bounds=BOUNDS, hold=2, settings={})
+        teacher_of(IDMEgo(), scenes)

@@ -92,21 +92,20 @@ class PriorTraining(Supervised):
     ):
         """windows, test: to train on and held out. Raises InputError if the processes
         cannot share a batch evenly."""
-        super().__init__()
+        super().__init__(settings)
         if settings.batch % processes.count:
-            text = f"stage.batch={settings.batch}: {processes.count} processes share the windows of a step"
-            raise InputError(f"{text} evenly; choose a multiple of their number")
+            raise InputError(
+                f"stage.batch={settings.batch}: {processes.count} processes share the "
+                "windows of a step evenly; choose a multiple of their number"
+            )
         self.prior = prior
         self.windows = windows
         self.test = test
-        self.settings = settings
         self.processes = processes
         self.writes = processes.leader
         self.done = 0
         self.part = settings.batch // processes.count
-        self.routes: TensorDictBase | None = (
-            None  # scenes that the first turn trains the route choice on
-        )
+        self.routes: TensorDictBase | None = None  # scenes to train the route choice on
         self.accuracy = math.nan  # of the route choice
         self.device = next(prior.parameters()).device
         self.bf16 = has_bf16(self.device) if settings.bf16 is None else settings.bf16
@@ -114,21 +113,16 @@ class PriorTraining(Supervised):
             settings.seed + RANK_SEED * processes.rank
         )
         nodes = windows["nodes"][windows["present"]]
-        causal = windows["causal"]
         std = nodes.std(0)
         prior.denoiser.node_mean.copy_(nodes.mean(0))
         prior.denoiser.node_std.copy_(
             torch.where(std < 1e-6, CONSTANT_STD, std.clamp(min=MIN_STD))
         )
-        self.rows = [
-            rows
-            for rows in (causal.nonzero()[:, 0], (~causal).nonzero()[:, 0])
-            if len(rows)
-        ]
+        causal = windows["causal"]
+        kinds = (causal.nonzero()[:, 0], (~causal).nonzero()[:, 0])
+        self.rows = [rows for rows in kinds if len(rows)]
         loss: nn.Module = DenoisingLoss(prior.denoiser)
-        if (
-            processes.count > 1
-        ):  # the leader's first weights, and gradients averaged in `backward`
+        if processes.count > 1:  # the leader's first weights, and averaged gradients
             loss = DistributedDataParallel(loss, broadcast_buffers=False)
         self.loss = torch.compile(loss) if settings.compile else loss
         self.optimiser = torch.optim.AdamW(
@@ -138,53 +132,43 @@ class PriorTraining(Supervised):
             fused=True,
         )
         self.average = AveragedModel(prior.denoiser, multi_avg_fn=self._average)
-        self.average.update_parameters(
-            prior.denoiser
-        )  # the first call copies the initial weights
+        self.average.update_parameters(prior.denoiser)  # copies the initial weights
 
     def learning_rate(self) -> float:
         """Linear warm-up, then a cosine to 0."""
+        settings = self.settings
         warm = min(1.0, (self.done + 1) / WARM_UP)
-        return (
-            self.settings.learning_rate
-            * warm
-            * 0.5
-            * (1 + math.cos(self.done / self.settings.steps * math.pi))
-        )
+        cosine = 1 + math.cos(self.done / settings.steps * math.pi)
+        return settings.learning_rate * warm * 0.5 * cosine
 
     def turn(self) -> dict[str, float]:
         """Steps up to the next validation, and that; followers return no losses."""
+        settings = self.settings
         if self.routes is not None and not self.done:
             self.accuracy = train_route_choice(
-                self.prior, self.routes, settings=self.settings
+                self.prior, self.routes, settings=settings
             )
-        row = self.train(
-            min(self.done + self.settings.validate_every, self.settings.steps)
-        )
+        row = self.train(min(self.done + settings.validate_every, settings.steps))
         if not self.processes.leader:
             return row | {"held_out_loss": math.nan}
         with self.averaged() as prior:
-            loss = held_out_loss(prior, self.test, batch=self.settings.batch)
+            loss = held_out_loss(prior, self.test, batch=settings.batch)
         return row | {"step": float(self.done), "held_out_loss": loss}
 
     def train(self, until: int) -> dict[str, float]:
         """Train up to step `until`; returns the running means of the loss's terms."""
-        running: dict[str, float] = {}
+        means: dict[str, float] = {}
         self.prior.train()
-        for _ in (
-            bar := Bar(range(self.done, until), "steps", unit="step", leave=False)
-        ):
+        bar = Bar(range(self.done, until), "steps", unit="step", leave=False)
+        for _ in bar:
             batch = augment(self.windows[self.pick()].to(self.device), self.generator)
             terms = self.update(batch, draw(batch, self.generator))
             if self.done % 20 == 0:
-                for key, value in zip(
-                    ("action", "trajectory"),
-                    self.processes.mean(terms).tolist(),
-                    strict=True,
-                ):
-                    running[key] = 0.9 * running.get(key, value) + 0.1 * value
-                bar.set_postfix({key: f"{value:.3f}" for key, value in running.items()})
-        return running
+                values = self.processes.mean(terms).tolist()
+                for name, value in zip(("action", "trajectory"), values, strict=True):
+                    means[name] = 0.9 * means.get(name, value) + 0.1 * value
+                bar.set_postfix({name: f"{value:.3f}" for name, value in means.items()})
+        return means
 
     def pick(self) -> Tensor:
         """Indices [part] of a step's windows: a fraction CAUSAL of them with estimated
@@ -249,22 +233,21 @@ class PriorTraining(Supervised):
 
     def state_dict(self) -> dict:
         """All that later turns depend on. Collective: all processes must call it."""
-        own: dict[str, Any] = {"done": self.done, "accuracy": self.accuracy}
-        own["draws"] = self.processes.gather(self.generator.get_state().cpu())
-        return (
-            super().state_dict()
-            | own
-            | {name: part.state_dict() for name, part in self._stateful().items()}
-        )
+        return {
+            **super().state_dict(),
+            "done": self.done,
+            "accuracy": self.accuracy,
+            "draws": self.processes.gather(self.generator.get_state().cpu()),
+            **{name: part.state_dict() for name, part in self._stateful().items()},
+        }
 
     def _stateful(self) -> dict[str, Any]:
-        prior = self.prior
-        parts = {
-            "denoiser": prior.denoiser,
-            "route_choice": prior.route_choice,
+        return {
+            "denoiser": self.prior.denoiser,
+            "route_choice": self.prior.route_choice,
             "average": self.average,
+            "optimiser": self.optimiser,
         }
-        return parts | {"optimiser": self.optimiser}
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`. Raises InputError if the number of processes differs."""
@@ -272,7 +255,8 @@ class PriorTraining(Supervised):
         draws = state["draws"]
         if len(draws) != count:
             raise InputError(
-                f"the run was begun by {len(draws)} processes, this is {count}; resume with as many"
+                f"the run was begun by {len(draws)} processes, this is {count}; "
+                "resume with as many"
             )
         super().load_state_dict(state)
         for name, part in self._stateful().items():
@@ -301,17 +285,15 @@ def train_route_choice(
     )
     valid = scenes["route_valid"]
     label = scenes["route_log"]
-    use = (
-        scenes["valid"][:, : label.shape[1]]
-        & ~scenes["parked"][:, : label.shape[1]]
-        & (label >= 0)
-    )
+    vehicles = slice(label.shape[1])
+    use = scenes["valid"][:, vehicles] & ~scenes["parked"][:, vehicles] & (label >= 0)
     use &= valid.sum(-1) > 1
-    features, valid, label = (
-        value[use].to(device) for value in (features, valid, label)
-    )
+    features = features[use].to(device)
+    valid = valid[use].to(device)
+    label = label[use].to(device)
     if not len(label):
-        return float("nan")
+        return math.nan
+    net = prior.route_choice.net
     generator = torch.Generator().manual_seed(settings.seed)
     optimiser = torch.optim.AdamW(
         prior.route_choice.parameters(), 3e-3, weight_decay=0.05
@@ -319,60 +301,55 @@ def train_route_choice(
     for _ in Bar(range(settings.route_steps), "route choice"):
         pick = torch.randint(len(label), (512,), generator=generator).to(device)
         sample = features[pick]
-        sample = sample + 0.05 * torch.randn(sample.shape, generator=generator).to(
-            device
-        )
-        logits = prior.route_choice.net(sample)[..., 0].masked_fill(~valid[pick], -1e4)
+        noise = torch.randn(sample.shape, generator=generator).to(device)
+        logits = net(sample + 0.05 * noise)[..., 0].masked_fill(~valid[pick], -1e4)
         loss = F.cross_entropy(logits, label[pick])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     with torch.no_grad():
-        logits = prior.route_choice.net(features)[..., 0].masked_fill(
-            ~valid, -torch.inf
-        )
+        logits = net(features)[..., 0].masked_fill(~valid, -torch.inf)
     return (logits.argmax(-1) == label).float().mean().item()
 
 
 def held_out(scenes: SceneSet) -> Tensor:
     """[S] bool: scenes of held-out places (without places: of held-out logs). Raises
     InputError if all are."""
-    names = zip(scenes.location, scenes.scene_id, strict=True)
-    places = [location or scene_id.split("@")[0] for location, scene_id in names]
+    places = [
+        location or scene_id.split("@")[0]
+        for location, scene_id in zip(scenes.location, scenes.scene_id, strict=True)
+    ]
     chosen = set(sorted(set(places))[::HELD_OUT])
-    mask = torch.tensor([name in chosen for name in places])
+    mask = torch.tensor([place in chosen for place in places])
     if bool(mask.all()):
-        where = f"all {len(scenes)} scenes are of one place ({places[0]!r})"
         raise InputError(
-            f"{where}, so none can be held out for validation; train on logs of several places"
+            f"all {len(scenes)} scenes are of one place ({places[0]!r}), so none can be "
+            "held out for validation; train on logs of several places"
         )
     return mask
 
 
-def window_sets(scenes: SceneSet) -> tuple[TensorDictBase, TensorDictBase]:
-    """(training, held-out) windows. Raises InputError if either is empty or has no
-    moving vehicle."""
-    mask = held_out(scenes)
-    windows, test = (
-        make_windows(scenes.batch(part.nonzero()[:, 0])) for part in (~mask, mask)
-    )
-    for name, part in (("training", windows), ("held-out", test)):
-        if not len(part):
-            reason = "too few vehicles are recorded for a second on a known route"
-            raise InputError(
-                f"no {name} windows in {len(scenes)} scenes: {reason}; train on more or longer logs"
-            )
-        if not bool((part["weight"] > STANDING_WEIGHT).any()):
-            where = f"in the {len(part)} {name} windows of {len(scenes)} scenes"
-            raise InputError(
-                f"no vehicle moves {where}; train on logs with moving traffic"
-            )
-    return windows, test
+def windows_of(scenes: SceneSet, rows: Tensor, kind: str) -> TensorDictBase:
+    """Windows of scenes rows [S] bool. Raises InputError, which names their kind, if
+    there are none or no vehicle moves."""
+    windows = make_windows(scenes.batch(rows.nonzero()[:, 0]))
+    if not len(windows):
+        raise InputError(
+            f"no {kind} windows in {len(scenes)} scenes: too few vehicles are recorded "
+            "for a second on a known route; train on more or longer logs"
+        )
+    if not bool((windows["weight"] > STANDING_WEIGHT).any()):
+        raise InputError(
+            f"no vehicle moves in the {len(windows)} {kind} windows of {len(scenes)} "
+            "scenes; train on logs with moving traffic"
+        )
+    return windows
 
 
 def train_prior(
     prior: Prior,
     scenes: SceneSet,
+    *,
     settings: TrainingSettings,
     folder: Path,
     origin: dict,
@@ -380,24 +357,34 @@ def train_prior(
     logger: RunLogger | None = None,
     parts: Parts = NO_PARTS,
 ) -> Path | None:
-    """Train `prior` on scenes; returns the path of the checkpoint, None in processes
-    other than the leader. Raises InputError for too few scenes.
+    """Train a prior; returns the path of its checkpoint, None in processes other than
+    the leader.
 
     Args:
+        prior: that is trained, in place.
+        scenes: to train on; some of their places are held out.
+        settings: of the training.
         folder: for the checkpoint, which has the averaged weights of the lowest
             held-out loss.
         origin: data and command, for the checkpoint's header, which also has the
             results of the training.
+        processes: that train together.
+        logger: of the losses.
         parts: of the run, from which an interrupted training goes on exactly.
+
+    Raises:
+        InputError: too few scenes.
     """
     begin = time.perf_counter()
-    windows, test = window_sets(scenes)
+    validation = held_out(scenes)
+    windows = windows_of(scenes, ~validation, "training")
+    test = windows_of(scenes, validation, "held-out")
     run = PriorTraining(
         prior, windows, test=test, settings=settings, processes=processes
     )
-    run.routes = scenes.batch((~held_out(scenes)).nonzero()[:, 0])
-    validations = -(-settings.steps // settings.validate_every)
-    best = run.fit("prior", validations, parts, vars(settings), logger)
+    run.routes = scenes.batch((~validation).nonzero()[:, 0])
+    turns = -(-settings.steps // settings.validate_every)
+    best = run.fit("prior", turns, parts, logger=logger)
     if not processes.leader:
         return None
     results = {

@@ -1,43 +1,9 @@
-"""One drive per row of a pool, counted to its first failure; finished episodes without
-the bias towards short ones."""
+"""Finished episodes, without the bias towards short ones, and their means."""
 
 import torch
 from tensordict import TensorDict
 
-from e2rl.learning.pretraining.driving import PoolDriver, finished_episodes
-from e2rl.planners.idm_planner import IDMEgo
-from e2rl.sim.env import SimSettings
-from e2rl.traffic.pool import TrafficPool
-from tests.learning.small import brake_check, small_scenes
-
-
-def test_a_drive_counts_until_its_first_contact():
-    scenes = small_scenes(2, steps=40)
-    index = torch.arange(2)
-    attack = TrafficPool.stored(brake_check(scenes)(None, index, 7.0, 0), 7.0)
-    frames = PoolDriver(scenes, SimSettings(), batch=2).drive(
-        IDMEgo(hardest_braking=0.1, braking=0.1),
-        attack + TrafficPool.recorded(index),
-        torch.tensor([0, 2]),
-    )
-    alive = frames["alive"]
-    assert alive.sum(1)[0] < 40, "it ends by the contact"
-    assert alive[1].all()
-
-
-def test_disturbances_are_executed_but_not_intended():
-    scenes = small_scenes(2)
-    driver = PoolDriver(scenes, SimSettings(), batch=2)
-    pool = TrafficPool.recorded(torch.arange(2))
-    frames = driver.drive(
-        IDMEgo(),
-        pool,
-        torch.arange(2),
-        lambda action, step: action + torch.tensor([1.0, 0.0]),
-    )
-    assert torch.allclose(
-        frames["executed"][..., 0], frames["intended"][..., 0] + 1.0, atol=1e-3
-    )
+from e2rl.learning.rounds.episodes import finished_episodes
 
 
 def frames(lengths, total, fail=()):
@@ -82,22 +48,15 @@ def test_returns_outcomes_and_scenes_of_episodes_across_batches():
         torch.tensor([False, True, True, False]),
         horizon=10,
     )
-    assert episodes.row.tolist() == [0, 1, 2, 3] and episodes.scene_index.tolist() == [
-        10,
-        11,
-        12,
-        13,
-    ]
+    assert episodes.row.tolist() == [0, 1, 2, 3]
+    assert episodes.scene_index.tolist() == [10, 11, 12, 13]
     assert episodes.returns.tolist() == [10.0, 4.0, 10.0, 10.0]
     assert episodes.progress.tolist() == [20.0, 8.0, 20.0, 20.0]
     assert episodes.failed.tolist() == [False, True, False, False]
     summary = episodes.summary()
-    assert (
-        summary["contact"] == 0.25
-        and summary["contact_adversarial"] == 0.5
-        and summary["contact_nominal"] == 0.0
-    )
-    assert "acceleration" not in summary, "what was not measured is left out"
+    assert summary["contact"] == 0.25
+    assert summary["contact_adversarial"] == 0.5
+    assert summary["contact_nominal"] == 0.0
 
 
 def test_episodes_that_could_not_have_lasted_do_not_count():
@@ -118,14 +77,8 @@ def test_decisions_of_several_steps_are_told_from_steps():
     assert data["traffic", "row"][0, :, 0].tolist() == number
     data["next", "timestep"] = torch.tensor(steps)[None, :, None]
     adversarial = torch.zeros(3, dtype=torch.bool)
-    assert finished_episodes([data], adversarial, horizon=5, hold=2).row.tolist() == [
-        0,
-        1,
-        2,
-    ]
-    assert finished_episodes(
-        [data[:, :7]], adversarial, horizon=5, hold=2
-    ).row.tolist() == [0, 1]
-    assert finished_episodes(
-        [data[:, :5]], adversarial, horizon=5, hold=2
-    ).row.tolist() == [0], "the second might have lasted"
+    for frames_known, rows in ((8, [0, 1, 2]), (7, [0, 1]), (5, [0])):
+        episodes = finished_episodes(
+            [data[:, :frames_known]], adversarial, horizon=5, hold=2
+        )
+        assert episodes.row.tolist() == rows, "the next one might have lasted"
