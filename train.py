@@ -48,7 +48,7 @@ from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 from e2rl.traffic.fusing import prepare_fused
 
-MAY_CHANGE = ("rounds", "device", "threads", "launcher")  # when a run is resumed
+MAY_CHANGE = ("rounds", "device", "threads")  # when a run is resumed
 
 
 def train_round(run: Evolution) -> dict[str, float]:

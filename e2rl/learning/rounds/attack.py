@@ -3,7 +3,6 @@ it some driver avoids."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -13,7 +12,6 @@ from e2rl.metrics.contact import first_contact
 from e2rl.metrics.evasion import find_evasions
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
-from e2rl.run.processes import in_processes
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import SimSettings
 from e2rl.traffic.attempt import count_reasons, summary_of
@@ -79,21 +77,18 @@ def make_traffic(
     solvable: Solvable | None = None,
     nominal: bool = True,
     batch: int = 64,
-    processes: int = 1,
 ) -> tuple[dict[str, Tensor], list[dict]]:
     """Returns the traffic [R] of an order, and its rows that errored.
 
     The traffic is the attack without rows that no driver avoids, then the same scenes
-    at intensity 0; both without errored rows. Equal orders yield equal traffic, in
-    whichever processes.
+    at intensity 0; both without errored rows. Equal orders yield equal traffic.
 
     Args:
         order: what is to be made.
         synthesize: see `Evolution`.
         solvable: which attacked rows enter D'; None: all.
         nominal: make the scenes at intensity 0, too.
-        batch: scenes that one process makes at once.
-        processes: that make them.
+        batch: scenes that are made at once.
 
     Returns:
         Tensors scene_index [R], eta [R], states [R, T+1, N, 4], valid [R, T+1, N] and
@@ -106,10 +101,11 @@ def make_traffic(
         InputError: no attack could be made.
     """
     rows = torch.arange(len(order.scenes)).split(batch)
-    kinds = (True, False) if nominal else (True,)
-    jobs = [(part, attack) for attack in kinds for part in rows]
-    work = partial(_make_part, order, synthesize, solvable)
-    parts = list(in_processes(work, jobs, processes=processes, cost=lambda job: job[1]))
+    parts = [
+        _make_part(order, synthesize, part, solvable=solvable, attack=attack)
+        for attack in ((True, False) if nominal else (True,))
+        for part in rows
+    ]
     errored = [entry for part in parts for entry in part.pop("errored")]
     traffic = {
         name: torch.cat([part[name] for part in parts])
@@ -131,12 +127,13 @@ def make_traffic(
 def _make_part(
     order: Order,
     synthesize: Synthesize,
+    rows: Tensor,
+    *,
     solvable: Solvable | None,
-    job: tuple[Tensor, bool],
+    attack: bool,
 ) -> dict[str, Any]:
     """The traffic of an order's scenes rows [s], attacked or at intensity 0; FLAGS of
     them (entered [s], the others of the rows that were made); and the errored rest."""
-    rows, attack = job
     scenes = order.scenes[rows]
     eta = order.eta[rows] if attack else torch.zeros_like(order.eta[rows])
     made = synthesize(order.ego, scenes, eta, order.seed)
