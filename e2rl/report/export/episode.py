@@ -4,6 +4,7 @@ every exporter takes it."""
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,27 +21,26 @@ from e2rl.sim.rollout_file import ROLLOUTS, Failure, Rollout
 
 # Columns of rollouts.csv that go along (docs/reference/verdicts.md, metrics.md there).
 FACTS = (
-    *(
-        "dataset",
-        "split",
-        "location",
-        "scene_id",
-        "method",
-        "ego_policy",
-        "eta",
-        "seed",
-        "cfr",
-    ),
-    *(
-        "partner",
-        "contact_step",
-        "contact_type",
-        "approach",
-        "ego_manoeuvre",
-        "partner_manoeuvre",
-        "duty",
-    ),
-    *("counted", "at_fault", "preventable", "avoidable"),
+    "dataset",
+    "split",
+    "location",
+    "scene_id",
+    "method",
+    "ego_policy",
+    "eta",
+    "seed",
+    "cfr",
+    "partner",
+    "contact_step",
+    "contact_type",
+    "approach",
+    "ego_manoeuvre",
+    "partner_manoeuvre",
+    "duty",
+    "counted",
+    "at_fault",
+    "preventable",
+    "avoidable",
 )
 LONG = 7.0  # m: longer vehicles are trucks
 SAME = 0.01  # m: a map or a start that differs by more is another one
@@ -89,13 +89,19 @@ class Episode:
         length, width = self.rollout.size[row].tolist()
         return length, width
 
+    def kind(self, row: int) -> str:
+        """One of `recording.AGENT_TYPES`, or truck for a long vehicle."""
+        kind = str(self.rollout.agent_type[row])
+        truck = kind == "vehicle" and self.rollout.size[row, 0] > LONG
+        return "truck" if truck else kind
+
     def entries(self) -> dict[str, list[str]]:
         """By lane the lanes that lead into it."""
-        found: dict[str, list[str]] = {name: [] for name in self.lanes}
+        entries: dict[str, list[str]] = {name: [] for name in self.lanes}
         for name, lane in self.lanes.items():
             for other in lane.exits:
-                found[other].append(name)
-        return found
+                entries[other].append(name)
+        return entries
 
     def text(self) -> str:
         """The facts in one line."""
@@ -105,27 +111,34 @@ class Episode:
 def recorded_episode(
     run: Path, row: Mapping, recording: Recording, build: BuildSettings
 ) -> Episode:
-    """The episode of a row of rollouts.csv in the scene that a recording makes;
-    InputError where it is another one."""
+    """The episode of a row of rollouts.csv in the scene that a recording makes.
+
+    Args:
+        run: folder of the run.
+        row: of rollouts.csv.
+        recording: of the scene.
+        build: settings of scenes, those of the run.
+
+    Raises:
+        InputError: where the rollout was driven in another scene.
+    """
     bare = rollout_episode(run, row)
+    rollout = bare.rollout
     builder = SceneBuilder(recording, build)
     scene = builder.scene(recording)
     graph = builder.graph
-    rollout = bare.rollout
-    same = (
-        len(graph.points) == len(rollout.lane_points)
-        and len(scene["logged"]) == bare.steps + 1
-    )
-    origin = np.round(graph.points[0] - rollout.lane_points[0]) if same else np.zeros(2)
-    same = same and np.allclose(
-        graph.points - origin, rollout.lane_points, rtol=0, atol=SAME
-    )
-    if not same or not np.allclose(
-        scene["start"][0, :2].numpy(), rollout.states[0, 0, :2], rtol=0, atol=SAME
-    ):
+    close = partial(np.allclose, rtol=0, atol=SAME)
+    same = len(graph.points) == len(rollout.lane_points)
+    same &= len(scene["logged"]) == bare.steps + 1
+    if same:
+        origin = np.round(graph.points[0] - rollout.lane_points[0])
+        same = close(graph.points - origin, rollout.lane_points)
+        same &= close(scene["start"][0, :2].numpy(), rollout.states[0, 0, :2])
+    if not same:
         raise InputError(
-            f"{bare.path}: not driven in the scene {row['scene_id']!r} that the data make now; restore the data and "
-            "the `data` settings of the run, or pass --no-scene"
+            f"{bare.path}: not driven in the scene {row['scene_id']!r} that the data "
+            "make now; restore the data and the `data` settings of the run, or pass "
+            "--no-scene"
         )
     start = recording.current
     assert start is not None
@@ -155,35 +168,25 @@ def rollout_episode(run: Path, row: Mapping) -> Episode:
         str(index): Lane(points.astype(float), width)
         for index, (points, width) in enumerate(pairs)
     }
-    adversaries = np.flatnonzero(rollout.adversaries).tolist()
-    return Episode(
-        run / ROLLOUTS / rollout.name,
-        rollout,
-        facts=known_facts(row) | {"adversaries": adversaries},
-        lanes=lanes,
-    )
-
-
-def known_facts(row: Mapping) -> dict[str, Any]:
-    """The FACTS of a row that are known, as words and plain numbers."""
-    known = {name: row[name] for name in FACTS if name in row and cell(row[name]) != ""}
-    if known.get("partner", 0) < 0:  # nobody
-        del known["partner"]
-    return {
-        name: int(value) if isinstance(value, float) and value.is_integer() else value
-        for name, value in known.items()
-    }
+    facts: dict[str, Any] = {}  # those known, as words and plain numbers
+    for name in FACTS:
+        value = row.get(name, "")
+        if cell(value) != "" and not (name == "partner" and value < 0):
+            whole = isinstance(value, float) and value.is_integer()
+            facts[name] = int(value) if whole else value
+    facts["adversaries"] = np.flatnonzero(rollout.adversaries).tolist()
+    path = run / ROLLOUTS / rollout.name
+    return Episode(path, rollout, facts=facts, lanes=lanes)
 
 
 def _linked(graph: LaneGraph, name: str, lane: Lane) -> Lane:
     """A lane of a rollout with the links and the limit that the recording's map has."""
     recorded = graph.lanes[name]
+    limit = recorded.speed_limit
     return Lane(
         points=lane.points,
         width=lane.width,
-        speed_limit=recorded.speed_limit
-        if math.isfinite(recorded.speed_limit)
-        else 0.0,
+        speed_limit=limit if math.isfinite(limit) else 0.0,
         exits=list(graph.graph.successors(name)),
         left=[other for other in recorded.left if other in graph.lanes],
         right=[other for other in recorded.right if other in graph.lanes],

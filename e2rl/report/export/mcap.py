@@ -35,7 +35,8 @@ from e2rl.run.files import write_atomically
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.traffic.traffic import REPLAN_STEPS
 
-MAP, EGO = "map", "ego"  # frames
+MAP = "map"  # a frame
+EGO = "ego"  # a frame in it
 LIGHTS = {
     LIGHT_RED: drawing.CONTACT,
     LIGHT_YELLOW: drawing.VULNERABLE,
@@ -45,17 +46,19 @@ COLOURS = {
     "ego": drawing.EGO,
     "adversary": drawing.ADVERSARY,
     "traffic": drawing.BACKGROUND,
-}
-COLOURS |= {
     "pedestrian": drawing.VULNERABLE,
     "cyclist": drawing.VULNERABLE,
     "replayed": drawing.REPLAYED,
 }
-ALL, LINE_LIST = (
-    1,
-    2,
-)  # of foxglove.SceneEntityDeletion.Type and foxglove.LinePrimitive.Type
+ALL = 1  # of foxglove.SceneEntityDeletion.Type
+LINE_LIST = 2  # of foxglove.LinePrimitive.Type
 SECOND = 1_000_000_000  # ns
+KINDS: dict[str, Any] = {  # of messages, by topic
+    "/map": SceneUpdate,
+    "/traffic": SceneUpdate,
+    "/plans": SceneUpdate,
+    "/tf": FrameTransform,
+}
 Entity = dict[str, Any]  # of foxglove.SceneEntity
 
 
@@ -74,28 +77,20 @@ def content(episode: Episode) -> bytes:
     buffer = io.BytesIO()
     writer = Writer(buffer, compression=CompressionType.ZSTD)
     writer.start(profile="", library="e2rl")
-    kinds: dict[str, Any] = {
-        "/map": SceneUpdate,
-        "/traffic": SceneUpdate,
-        "/plans": SceneUpdate,
-        "/tf": FrameTransform,
-    }
     schemas = {
         kind: register_schema(writer, kind) for kind in (SceneUpdate, FrameTransform)
     }
     channels = {
         topic: writer.register_channel(topic, "protobuf", schemas[kind])
-        for topic, kind in kinds.items()
+        for topic, kind in KINDS.items()
     }
     for step, topic, fields in messages(episode):
         time = round(step * episode.rollout.dt * SECOND)
-        message = kinds[topic](**stamped(fields, time)).SerializeToString(
-            deterministic=True
-        )
-        writer.add_message(channels[topic], time, message, time, sequence=step)
-    writer.add_metadata(
-        "e2rl", {name: str(value) for name, value in episode.facts.items()}
-    )
+        message = KINDS[topic](**stamped(fields, time))
+        content = message.SerializeToString(deterministic=True)
+        writer.add_message(channels[topic], time, content, time, sequence=step)
+    facts = {name: str(value) for name, value in episode.facts.items()}
+    writer.add_metadata("e2rl", facts)
     writer.finish()
     return buffer.getvalue()
 
@@ -116,19 +111,25 @@ def messages(episode: Episode) -> Iterator[tuple[int, str, dict[str, Any]]]:
     """(step, topic, fields of the message) in the order of time."""
     rollout = episode.rollout
     borders = [np.concatenate([ring, ring[:1]]) for ring in rollout.polygons()]
-    road = [
-        lines("lanes", rollout.lanes(), colour=drawing.BACKGROUND),
-        lines("borders", borders, colour="black"),
-    ]
-    yield 0, "/map", {"entities": road}
+    lanes = lines("lanes", rollout.lanes(), colour=drawing.BACKGROUND)
+    edges = lines("borders", borders, colour="black")
+    yield 0, "/map", {"entities": [lanes, edges]}
     for step in range(episode.steps + 1):
         yield step, "/traffic", {"entities": list(traffic(episode, step))}
         number, rest = divmod(step, REPLAN_STEPS)
         if rollout.plans is not None and rest == 0 and number < len(rollout.plans):
             yield step, "/plans", {"entities": list(plans(episode, number))}
-        x, y, heading = rollout.states[step, 0, :3].tolist()
-        pose = placed(x, y, heading=heading, where="translation", turned="rotation")
-        yield step, "/tf", {"parent_frame_id": MAP, "child_frame_id": EGO} | pose
+        place, rotation = pose_of(rollout.states[step, 0])
+        yield (
+            step,
+            "/tf",
+            {
+                "parent_frame_id": MAP,
+                "child_frame_id": EGO,
+                "translation": place,
+                "rotation": rotation,
+            },
+        )
 
 
 def traffic(episode: Episode, step: int) -> Iterator[Entity]:
@@ -137,14 +138,12 @@ def traffic(episode: Episode, step: int) -> Iterator[Entity]:
     for row in np.flatnonzero(episode.rollout.valid[step]).tolist():
         yield agent(episode, step, row=row)
     if episode.lights:
-        lit = [
-            (episode.lanes[name].points[0], int(states[step]))
+        lights = [
+            (episode.lanes[name].points[0], LIGHTS[int(states[step])], 1.0)
             for name, states in episode.lights.items()
+            if int(states[step]) in LIGHTS
         ]
-        yield spheres(
-            "lights",
-            [(place, LIGHTS[state], 1.0) for place, state in lit if state in LIGHTS],
-        )
+        yield spheres("lights", lights)
     if episode.facts.get("contact_step") == step and "partner" in episode.facts:
         place = contact_point(episode.rollout, step, partner=episode.facts["partner"])
         yield spheres("contact", [(place, drawing.CONTACT, 1.5)])
@@ -158,47 +157,42 @@ def plans(episode: Episode, number: int) -> Iterator[Entity]:
     for row, path in zip(rollout.planners.tolist(), rollout.plans[number], strict=True):
         if rollout.valid[step, row] and np.isfinite(path).all():
             whole = np.concatenate([rollout.states[step, row, :2][None], path])
-            yield lines(
-                f"plan of {row}",
-                [whole],
-                colour=drawing.EGO if row == 0 else drawing.ADVERSARY,
-            )
+            colour = drawing.EGO if row == 0 else drawing.ADVERSARY
+            yield lines(f"plan of {row}", [whole], colour=colour)
 
 
 def agent(episode: Episode, step: int, row: int) -> Entity:
     """The box of an agent, with what it is."""
-    rollout, (length, width) = episode.rollout, episode.size(row)
-    x, y, heading, speed = rollout.states[step, row].tolist()
+    rollout = episode.rollout
+    length, width = episode.size(row)
     kind = str(rollout.agent_type[row])
     role = role_of(rollout, row)
     part = role if role in ("ego", "adversary") else kind
     height = HEIGHT[kind]
-    pose = placed(
-        x, y, heading=heading, where="position", turned="orientation", z=height / 2
-    )
+    place, rotation = pose_of(rollout.states[step, row], z=height / 2)
     cube = {
-        "pose": pose,
+        "pose": {"position": place, "orientation": rotation},
         "size": {"x": length, "y": width, "z": height},
         "color": rgba(COLOURS[role]),
     }
     pairs = [
         {"key": "part", "value": part},
-        {"key": "speed", "value": f"{speed:.2f} m/s"},
+        {"key": "speed", "value": f"{rollout.states[step, row, 3]:.2f} m/s"},
     ]
     return {"id": f"agent {row}", "frame_id": MAP, "cubes": [cube], "metadata": pairs}
 
 
 def spheres(name: str, parts: Sequence[tuple[np.ndarray, str, float]]) -> Entity:
     """Spheres at (place, colour, size), 2 m above the ground."""
-    made = [
+    spheres = [
         {
             "pose": {"position": {"x": float(x), "y": float(y), "z": 2.0}},
             "size": dict.fromkeys("xyz", size),
+            "color": rgba(colour),
         }
-        | {"color": rgba(colour)}
         for (x, y), colour, size in parts
     ]
-    return {"id": name, "frame_id": MAP, "spheres": made}
+    return {"id": name, "frame_id": MAP, "spheres": spheres}
 
 
 def lines(name: str, paths: Sequence[np.ndarray], colour: str) -> Entity:
@@ -209,27 +203,23 @@ def lines(name: str, paths: Sequence[np.ndarray], colour: str) -> Entity:
         for pair in pairwise(path)
         for x, y in pair
     ]
-    made = {
+    line = {
         "type": LINE_LIST,
         "thickness": 0.2,
         "points": pieces,
         "color": rgba(colour),
+        "pose": {"orientation": {"w": 1}},
     }
-    return {
-        "id": name,
-        "frame_id": MAP,
-        "lines": [made | {"pose": {"orientation": {"w": 1}}}],
-    }
+    return {"id": name, "frame_id": MAP, "lines": [line]}
 
 
-def placed(
-    x: float, y: float, heading: float, where: str, turned: str, z: float = 0.0
-) -> dict[str, Any]:
-    """A place and a rotation about the vertical, under these names."""
-    return {
-        where: {"x": x, "y": y, "z": z},
-        turned: {"z": math.sin(heading / 2), "w": math.cos(heading / 2)},
-    }
+def pose_of(
+    state: np.ndarray, z: float = 0.0
+) -> tuple[dict[str, float], dict[str, float]]:
+    """The place of a state, and its rotation about the vertical."""
+    x, y, heading = state[:3].tolist()
+    half = heading / 2
+    return {"x": x, "y": y, "z": z}, {"z": math.sin(half), "w": math.cos(half)}
 
 
 def rgba(colour: str) -> dict[str, float]:

@@ -28,16 +28,11 @@ def write_roads(episode: Episode, path: Path) -> None:
     """Write the lanes of an episode; userData of the header tells the scene's origin."""
     root = road_network(episode).get_element()
     header = root.find("header")
-    (west, south), (east, north) = (
-        edge(episode.rollout.lane_points, axis=0) for edge in (np.min, np.max)
-    )
-    for name, side in {
-        "north": north,
-        "south": south,
-        "east": east,
-        "west": west,
-    }.items():
-        header.set(name, f"{side:.3f}")
+    points = episode.rollout.lane_points
+    header.set("north", f"{points[:, 1].max():.3f}")
+    header.set("south", f"{points[:, 1].min():.3f}")
+    header.set("east", f"{points[:, 0].max():.3f}")
+    header.set("west", f"{points[:, 0].min():.3f}")
     if episode.origin is not None:
         origin = " ".join(f"{part:.0f}" for part in episode.origin)
         ElementTree.SubElement(header, "userData", {"code": "origin", "value": origin})
@@ -49,9 +44,8 @@ def write_roads(episode: Episode, path: Path) -> None:
 
 def road_network(episode: Episode) -> Any:
     """Returns the xodr.OpenDrive of an episode; roads are named after their lanes."""
-    network = xodr.OpenDrive(
-        episode.rollout.location or episode.rollout.scene_id, revMinor="7"
-    )
+    rollout = episode.rollout
+    network = xodr.OpenDrive(rollout.location or rollout.scene_id, revMinor="7")
     plan = road_plan(episode.lanes)
     number = {name: index for index, name in enumerate(plan.roads, 1)}
     for name in plan.roads:
@@ -86,24 +80,23 @@ def road(
     joined = np.concatenate(joined_places(places))
     pieces = geometries(joined[:, :2], joined[:, 2])
     plan_view = xodr.PlanView()
-    for geometry, x, y, heading in pieces:
-        plan_view.add_fixed_geometry(geometry, x, y, heading)
-    scale = sum(piece.length for piece, *_ in pieces) / sum(
-        span.end - span.begin for span in spans
-    )
-    starts = scale * np.cumsum([0.0] + [span.end - span.begin for span in spans[:-1]])
+    for piece, x, y, heading in pieces:
+        plan_view.add_fixed_geometry(piece, x, y, heading)
+    lengths = [span.end - span.begin for span in spans]
+    scale = sum(piece.length for piece, *_ in pieces) / sum(lengths)
+    starts = scale * np.cumsum([0.0, *lengths[:-1]])
     driving = xodr.Lane(a=lanes[spans[0].lane].width)
     section = xodr.LaneSection(0, xodr.Lane()).add_right_lane(driving)
     profile = xodr.Lanes().add_lanesection(section)
-    junction = next(
-        (index for index, names in enumerate(plan.junctions, 1) if name in names), -1
-    )
+    junctions = [
+        index for index, names in enumerate(plan.junctions, 1) if name in names
+    ]
     element = xodr.Road(
         number[name],
         plan_view,
         profile,
-        road_type=junction,
-        name=", ".join(s.lane for s in spans),
+        road_type=junctions[0] if junctions else -1,
+        name=", ".join(span.lane for span in spans),
     )
     for start, span in zip(starts.tolist(), spans, strict=True):
         lane = lanes[span.lane]
@@ -194,37 +187,25 @@ def geometries(
     """(geometry, x, y, heading) of clothoids through some of the points [P, 2] of a
     centreline, in the directions [P] that it has there: one clothoid, or, where that
     lies more than FIT beside the centreline, those of both halves."""
-    (x0, y0), (x1, y1) = points[0].tolist(), points[-1].tolist()
-    curve = Clothoid.G1Hermite(x0, y0, float(angle[0]), x1, y1, float(angle[-1]))
+    count = len(points)
+    x, y = points[0].tolist()
+    x_end, y_end = points[-1].tolist()
+    heading = float(angle[0])
+    curve = Clothoid.G1Hermite(x, y, heading, x_end, y_end, float(angle[-1]))
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-    if len(points) > 2 and length > SHORT:
-        drawn = np.array(curve.SampleXY(len(points))).T
-        beside = np.linalg.norm(
-            drawn - resample(points, length / (len(points) - 1))[: len(points)], axis=1
-        ).max()
-        if beside > FIT:
-            middle = len(points) // 2
-            return geometries(points[: middle + 1], angle[: middle + 1]) + geometries(
-                points[middle:], angle[middle:]
-            )
-    if (
-        curve.length > 1.5 * length
-    ):  # a tangent that is noise bends it back: straight on
-        return [
-            (
-                xodr.Line(float(np.hypot(x1 - x0, y1 - y0))),
-                x0,
-                y0,
-                float(np.arctan2(y1 - y0, x1 - x0)),
-            )
-        ]
-    if max(abs(curve.KappaStart), abs(curve.KappaEnd)) < 1e-6:
-        return [(xodr.Line(curve.length), x0, y0, float(angle[0]))]
-    return [
-        (
-            xodr.Spiral(curve.KappaStart, curve.KappaEnd, curve.length),
-            x0,
-            y0,
-            float(angle[0]),
-        )
-    ]
+    if count > 2 and length > SHORT:
+        centreline = resample(points, length / (count - 1))[:count]
+        offsets = np.array(curve.SampleXY(count)).T - centreline
+        if np.linalg.norm(offsets, axis=1).max() > FIT:
+            half = count // 2
+            return [
+                *geometries(points[: half + 1], angle[: half + 1]),
+                *geometries(points[half:], angle[half:]),
+            ]
+    piece: Any = xodr.Spiral(curve.KappaStart, curve.KappaEnd, curve.length)
+    if curve.length > 1.5 * length:  # a tangent that is noise bends it back
+        piece = xodr.Line(float(np.hypot(x_end - x, y_end - y)))
+        heading = float(np.arctan2(y_end - y, x_end - x))
+    elif max(abs(curve.KappaStart), abs(curve.KappaEnd)) < 1e-6:
+        piece = xodr.Line(curve.length)
+    return [(piece, x, y, heading)]

@@ -6,8 +6,8 @@ to a merge, such as a turn drawn in two pieces, is one connecting road. Where la
 or merge into each other directly, a piece of them is cut off and connects the rest.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import networkx as nx
@@ -55,191 +55,166 @@ def road_plan(lanes: dict[str, Lane]) -> RoadPlan:
     Args:
         lanes: by id, whose exits are ids of them.
     """
-    graph = lane_digraph(lanes)
-    chains = chains_of(graph)
-    chain_of = {name: chain for chain in chains for name in chain}
+    graph = LaneChains(lanes)
+    through = graph.through_chains()
     links = [
-        (chain_of[a], chain_of[b]) for a, b in graph.edges if is_junction(graph, a, b=b)
+        (before, after)
+        for before, after in graph.links
+        if before not in through and after not in through
     ]
-    length = {name: float(arc_length(lane.points)[-1]) for name, lane in lanes.items()}
-    short = [
-        chain for chain in chains if sum(length[name] for name in chain) <= LONGEST
-    ]
-    through = through_chains(graph, chain_of, links=links, short=short)
-    heads, tails = cut_ends(graph, links, through=through, length=length)
+    heads, tails = graph.cut_ends(links, through)
     plan = RoadPlan()
-    first, last = {}, {}  # roads of a chain
-    for chain in chains:
-        spans = [Span(name, 0.0, end=length[name]) for name in chain]
+    first: dict[Chain, str] = {}  # roads of a chain
+    last: dict[Chain, str] = {}
+    for chain in graph.chains:
+        spans = [Span(name, 0.0, end=graph.length[name]) for name in chain]
         if chain in through:
-            (before,) = graph.predecessors(chain[0])
-            (after,) = graph.successors(chain[-1])
             plan.roads[chain[0]] = spans
-            plan.connecting[chain[0]] = (before, after)
+            plan.connecting[chain[0]] = (graph.before(chain), graph.after(chain))
             continue
         if chain in heads:
             spans[0] = spans[0]._replace(begin=heads[chain].end)
         if chain in tails:
             spans[-1] = spans[-1]._replace(end=tails[chain].begin)
-        roads = [span.lane for span in spans if span.begin < span.end]
-        plan.roads |= {span.lane: [span] for span in spans if span.begin < span.end}
-        plan.plain += zip(roads, roads[1:], strict=False)
-        first[chain], last[chain] = roads[0], roads[-1]
-        if graph.has_edge(chain[-1], chain[0]) and not is_junction(
-            graph, chain[-1], b=chain[0]
-        ):  # a ring
-            plan.plain.append((chain[-1], chain[0]))
+        spans = [span for span in spans if span.begin < span.end]
+        plan.roads |= {span.lane: [span] for span in spans}
+        plan.plain += [(span.lane, other.lane) for span, other in pairwise(spans)]
+        first[chain] = spans[0].lane
+        last[chain] = spans[-1].lane
+        ring = (chain[-1], chain[0])
+        if ring in graph.lanes.edges and not graph.is_junction(*ring):
+            plan.plain.append(ring)
     for name, (before, after) in plan.connecting.items():
-        plan.connecting[name] = (last[chain_of[before]], first[chain_of[after]])
-    for before, after in links:
-        if before not in through and after not in through:
-            spans = [
-                ends[chain]
-                for ends, chain in ((tails, before), (heads, after))
-                if chain in ends
-            ]
-            name = (
-                spans[0].lane
-                if spans[0].lane not in plan.roads
-                else f"{before[-1]} to {after[0]}"
-            )
-            plan.roads[name] = spans
-            plan.connecting[name] = (last[before], first[after])
+        chain_before = graph.chain_of[before]
+        chain_after = graph.chain_of[after]
+        plan.connecting[name] = (last[chain_before], first[chain_after])
+    for chain_before, chain_after in links:
+        spans = [tails[chain_before]] if chain_before in tails else []
+        spans += [heads[chain_after]] if chain_after in heads else []
+        name = spans[0].lane
+        if name in plan.roads:
+            name = f"{chain_before[-1]} to {chain_after[0]}"
+        plan.roads[name] = spans
+        plan.connecting[name] = (last[chain_before], first[chain_after])
     plan.junctions = junctions_of(plan.connecting)
     return plan
 
 
 def lane_digraph(lanes: dict[str, Lane]) -> nx.DiGraph:
     """Returns the lanes and their exits."""
-    graph = nx.DiGraph()
-    graph.add_nodes_from(lanes)
-    graph.add_edges_from(
-        (name, other) for name, lane in lanes.items() for other in lane.exits
-    )
-    return graph
+    return nx.DiGraph({name: lane.exits for name, lane in lanes.items()})
 
 
-def is_junction(graph: nx.DiGraph, a: str, b: str) -> bool:
-    """Returns whether the link from a to b is one of several at an end."""
-    return graph.out_degree(a) > 1 or graph.in_degree(b) > 1
+class LaneChains:
+    """A lane graph and its chains, each as long as it can be; a ring without fork or
+    merge is one, too. `links` are the pairs of chains that meet in junctions, `length`
+    is in m by lane."""
 
-
-def chains_of(graph: nx.DiGraph) -> list[Chain]:
-    """Returns the lanes in chains, each as long as it can be; a ring without fork or
-    merge is one, too."""
-    alone = nx.DiGraph()
-    alone.add_nodes_from(graph)
-    alone.add_edges_from(
-        (a, b) for a, b in graph.edges if not is_junction(graph, a, b=b)
-    )
-    chains = []
-    for part in nx.weakly_connected_components(alone):
-        first = next(
-            (name for name in alone if name in part and not alone.in_degree(name)), None
+    def __init__(self, lanes: dict[str, Lane]) -> None:
+        self.lanes = lane_digraph(lanes)
+        self.length = {
+            name: float(arc_length(lane.points)[-1]) for name, lane in lanes.items()
+        }
+        alone = nx.DiGraph()
+        alone.add_nodes_from(self.lanes)
+        alone.add_edges_from(
+            edge for edge in self.lanes.edges if not self.is_junction(*edge)
         )
-        if first is None:  # a ring
-            first = next(name for name in alone if name in part)
-        chains.append(tuple(_walk(alone, first)))
-    return chains
+        self.chains: list[Chain] = []
+        for part in nx.weakly_connected_components(alone):
+            names = [name for name in alone if name in part]
+            first = min(names, key=alone.in_degree)  # of a ring any
+            self.chains.append(tuple(nx.dfs_preorder_nodes(alone, first)))
+        self.chain_of = {name: chain for chain in self.chains for name in chain}
+        self.links = [
+            (self.chain_of[before], self.chain_of[after])
+            for before, after in self.lanes.edges
+            if self.is_junction(before, after)
+        ]
 
+    def is_junction(self, before: str, after: str) -> bool:
+        """Whether the link is one of several at an end."""
+        return self.lanes.out_degree(before) > 1 or self.lanes.in_degree(after) > 1
 
-def _walk(alone: nx.DiGraph, first: str) -> Iterator[str]:
-    name: str | None = first
-    while name is not None:
-        yield name
-        name = next(alone.successors(name), None)
-        if name == first:
-            return
+    def before(self, chain: Chain) -> str:
+        """The first lane that leads to a chain."""
+        return next(self.lanes.predecessors(chain[0]))
 
+    def after(self, chain: Chain) -> str:
+        """The first lane that a chain leads to."""
+        return next(self.lanes.successors(chain[-1]))
 
-def through_chains(
-    graph: nx.DiGraph,
-    chain_of: dict[str, Chain],
-    links: list[tuple[Chain, Chain]],
-    short: list[Chain],
-) -> set[Chain]:
-    """Returns those `short` chains that are connecting roads as they are: from a lane
-    that forks to one that merges.
+    def through_chains(self) -> set[Chain]:
+        """Those chains, none too long, that are connecting roads as they are: from a
+        lane that forks to one that merges.
 
-    The lane before such a chain and the one after it stay whole at that end. So where
-    these two are linked directly, and neither could be cut, the chains from the one
-    before are no connecting roads.
-    """
-    through = {
-        chain
-        for chain in short
-        if graph.in_degree(chain[0]) == 1 == graph.out_degree(chain[-1])
-        and is_junction(graph, next(graph.predecessors(chain[0])), b=chain[0])
-        and is_junction(graph, chain[-1], b=next(graph.successors(chain[-1])))
-    }
-    while True:
-        whole_tails = {
-            chain_of[next(graph.predecessors(chain[0]))] for chain in through
-        }
-        whole_heads = {chain_of[next(graph.successors(chain[-1]))] for chain in through}
-        clashing = {
-            before
-            for before, after in links
-            if before in whole_tails and after in whole_heads
-        }
-        undone = {
+        The lane before such a chain and the one after it stay whole at that end. So
+        where these two are linked directly, and neither could be cut, the chains from
+        the one before are no connecting roads.
+        """
+        through = {
             chain
-            for chain in through
-            if chain_of[next(graph.predecessors(chain[0]))] in clashing
+            for chain in self.chains
+            if sum(self.length[name] for name in chain) <= LONGEST
+            and self.lanes.in_degree(chain[0]) == 1 == self.lanes.out_degree(chain[-1])
+            and self.is_junction(self.before(chain), chain[0])
+            and self.is_junction(chain[-1], self.after(chain))
         }
-        if not undone:
-            return through
-        through -= undone
+        while True:
+            whole_tails = {self.chain_of[self.before(chain)] for chain in through}
+            whole_heads = {self.chain_of[self.after(chain)] for chain in through}
+            clashing = {
+                before
+                for before, after in self.links
+                if before in whole_tails and after in whole_heads
+            }
+            undone = {
+                chain
+                for chain in through
+                if self.chain_of[self.before(chain)] in clashing
+            }
+            if not undone:
+                return through
+            through -= undone
 
+    def cut_ends(
+        self, links: list[tuple[Chain, Chain]], through: set[Chain]
+    ) -> tuple[dict[Chain, Span], dict[Chain, Span]]:
+        """The heads and the tails that are cut off chains, so that each of `links` has
+        a piece; `through` are connecting roads as they are.
 
-def cut_ends(
-    graph: nx.DiGraph,
-    links: list[tuple[Chain, Chain]],
-    through: set[Chain],
-    length: dict[str, float],
-) -> tuple[dict[Chain, Span], dict[Chain, Span]]:
-    """Returns the heads and the tails that are cut off chains, so that each link but
-    those of `through` has a piece.
+        A chain that leads to one lane loses its tail; of any other link the next chain
+        loses its head, or, where that has to stay whole, the chain before its tail. A
+        piece that serves one link is the whole lane where the chain has more.
+        """
+        whole_heads = {after for before, after in self.links if before in through}
+        tailed = [
+            self.lanes.out_degree(before[-1]) == 1 or after in whole_heads
+            for before, after in links
+        ]
+        heads: dict[Chain, Span] = {}
+        tails: dict[Chain, Span] = {}
+        for (_, after), tail in zip(links, tailed, strict=True):
+            if not tail:
+                alone = len(after) > 1 and self.lanes.in_degree(after[0]) == 1
+                heads[after] = Span(after[0], 0.0, end=self.cut(after[0], alone))
+        for (before, _), tail in zip(links, tailed, strict=True):
+            if tail:
+                lane = before[-1]
+                whole_head = (
+                    before in heads and heads[before].end == self.length[before[0]]
+                )
+                alone = (
+                    len(before) - whole_head > 1 and self.lanes.out_degree(lane) == 1
+                )
+                end = self.length[lane]
+                tails[before] = Span(lane, end - self.cut(lane, alone), end=end)
+        return heads, tails
 
-    A chain that leads to one lane loses its tail; of any other link the next chain
-    loses its head, or, where that has to stay whole, the chain before its tail. A piece
-    that serves one link is the whole lane where the chain has more.
-
-    Args:
-        graph: the lanes and their exits.
-        links: the pairs of chains that meet in junctions.
-        through: the chains that are connecting roads as they are.
-        length: m, by lane.
-    """
-    whole_heads = {after for before, after in links if before in through}
-    heads: dict[Chain, Span] = {}
-    tails: dict[Chain, Span] = {}
-    pairs = [
-        (before, after)
-        for before, after in links
-        if before not in through and after not in through
-    ]
-    cut_tails = {
-        pair: graph.out_degree(pair[0][-1]) == 1 or pair[1] in whole_heads
-        for pair in pairs
-    }
-    for _, after in (pair for pair in pairs if not cut_tails[pair]):
-        lane = after[0]
-        whole = (
-            len(after) > 1 and graph.in_degree(lane) == 1 and length[lane] <= LONGEST
-        )
-        heads[after] = Span(
-            lane, 0.0, end=length[lane] if whole else min(CUT, MOST_CUT * length[lane])
-        )
-    for before, _ in (pair for pair in pairs if cut_tails[pair]):
-        lane = before[-1]
-        rest = len(before) - (
-            before in heads and heads[before].end == length[before[0]]
-        )
-        whole = rest > 1 and graph.out_degree(lane) == 1 and length[lane] <= LONGEST
-        piece = length[lane] if whole else min(CUT, MOST_CUT * length[lane])
-        tails[before] = Span(lane, length[lane] - piece, end=length[lane])
-    return heads, tails
+    def cut(self, lane: str, alone: bool) -> float:
+        """Length [m] of a lane's piece; alone: it serves one link."""
+        length = self.length[lane]
+        return length if alone and length <= LONGEST else min(CUT, MOST_CUT * length)
 
 
 def junctions_of(connecting: dict[str, Link]) -> list[list[str]]:
@@ -247,10 +222,9 @@ def junctions_of(connecting: dict[str, Link]) -> list[list[str]]:
     other."""
     graph = nx.Graph()
     for road, (before, after) in connecting.items():
-        graph.add_edges_from(
-            [(("road", road), ("end", before)), (("road", road), ("start", after))]
-        )
-    parts = nx.connected_components(graph)
+        graph.add_edge(("road", road), ("end", before))
+        graph.add_edge(("road", road), ("start", after))
     return sorted(
-        sorted(name for kind, name in part if kind == "road") for part in parts
+        sorted(name for kind, name in part if kind == "road")
+        for part in nx.connected_components(graph)
     )

@@ -45,14 +45,16 @@ def write(
     summary = {}
     for episode in episodes:
         path = folder / f"sd_{episode.path.stem}.pkl"
-        made = description(episode)
-        write_atomically(path, pickle.dumps(made, PROTOCOL))
-        summary[path.name] = made["metadata"]
+        content = description(episode)
+        summary[path.name] = content["metadata"]
+        write_pickle(path, content)
         yield episode, path
-    write_atomically(folder / SUMMARY, pickle.dumps(summary, PROTOCOL))
-    write_atomically(
-        folder / MAPPING, pickle.dumps(dict.fromkeys(summary, ""), PROTOCOL)
-    )
+    write_pickle(folder / SUMMARY, summary)
+    write_pickle(folder / MAPPING, dict.fromkeys(summary, ""))
+
+
+def write_pickle(path: Path, content: dict[str, Any]) -> None:
+    write_atomically(path, pickle.dumps(content, PROTOCOL))
 
 
 def description(episode: Episode) -> dict[str, Any]:
@@ -60,10 +62,10 @@ def description(episode: Episode) -> dict[str, Any]:
     ego."""
     history = 0 if episode.scene is None else PAST
     frames = history + episode.steps + 1
-    known = {row: states for row, states in past_of(episode)}
+    past = dict(past_of(episode))
     scene_id = episode.path.stem
     tracks = {
-        str(row): track(episode, row, history=history, past=known.get(row))
+        str(row): track(episode, row, history=history, past=past.get(row))
         for row in episode.agents
     }
     objects = {name: object_summary(name, entry) for name, entry in tracks.items()}
@@ -101,34 +103,38 @@ def description(episode: Episode) -> dict[str, Any]:
 def track(
     episode: Episode, row: int, history: int, past: np.ndarray | None
 ) -> dict[str, Any]:
-    """The track of an agent, zero where it is absent. past [history, 4]: its states
-    before the start, None for none."""
-    rollout, (length, width) = episode.rollout, episode.size(row)
-    frames = history + episode.steps + 1
+    """The track of an agent, zero where it is absent.
+
+    Args:
+        episode: the rollout.
+        row: of the agent.
+        history: frames before the start.
+        past: [history, 4] its states in them; None: it was not there.
+    """
+    rollout = episode.rollout
+    length, width = episode.size(row)
     kind = str(rollout.agent_type[row])
+    frames = history + episode.steps + 1
     states = np.zeros((frames, 4))
     valid = np.zeros(frames, bool)
-    valid[history:] = rollout.valid[:, row]
-    states[history:][valid[history:]] = rollout.states[rollout.valid[:, row], row]
+    present = rollout.valid[:, row]
+    valid[history:] = present
+    states[history:][present] = rollout.states[present, row]
     if past is not None:
-        states[:history], valid[:history] = past, True
-    speed = states[:, 3:]
+        states[:history] = past
+        valid[:history] = True
+    heading = states[:, 2]
+    direction = np.stack([np.cos(heading), np.sin(heading)], -1)
     return {
         "type": kind.upper(),
         "state": {
-            "position": np.concatenate([states[:, :2], np.zeros((frames, 1))], 1),
-            "heading": states[:, 2],
-            "velocity": speed
-            * np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], -1),
+            "position": np.pad(states[:, :2], ((0, 0), (0, 1))),
+            "heading": heading,
+            "velocity": states[:, 3:] * direction,
             "valid": valid,
-            **{
-                name: side * valid
-                for name, side in (
-                    ("length", length),
-                    ("width", width),
-                    ("height", HEIGHT[kind]),
-                )
-            },
+            "length": length * valid,
+            "width": width * valid,
+            "height": HEIGHT[kind] * valid,
         },
         "metadata": {
             "type": kind.upper(),
@@ -145,9 +151,8 @@ def object_summary(name: str, entry: dict[str, Any]) -> dict[str, Any]:
     """What ScenarioNet's filters know of a track: how long it is there, and how far it
     moves."""
     valid = entry["state"]["valid"]
-    distance = np.linalg.norm(
-        np.diff(entry["state"]["position"][valid, :2], axis=0), axis=1
-    ).sum()
+    moves = np.diff(entry["state"]["position"][valid, :2], axis=0)
+    distance = np.linalg.norm(moves, axis=1).sum()
     first = int(valid.argmax())
     return {
         "type": entry["type"],
@@ -193,10 +198,9 @@ def number_summary(
 
 def light(episode: Episode, name: str, history: int) -> dict[str, Any]:
     """The light that lets into a lane; unknown before the recording begins."""
-    past = episode.light_past[name][-history:] if history else np.zeros(0, int)
-    states = np.concatenate(
-        [np.full(history - len(past), LIGHT_UNKNOWN), past, episode.lights[name]]
-    )
+    past = episode.light_past[name][-history:] if history else []
+    states = [LIGHT_UNKNOWN] * (history - len(past))
+    states += [*past, *episode.lights[name]]
     return {
         "type": "TRAFFIC_LIGHT",
         "lane": name,

@@ -141,11 +141,11 @@ def test_neighbours_are_mutual():
         "b": Lane(points + [0, 3], right=["c"]),
         "c": Lane(points - [0, 3]),
     }
-    assert beside(lanes, "a", side="left", other_side="right") is None
+    assert beside(lanes, "a", side="left") is None
     lanes["b"].right.insert(0, "a")
     assert (
-        beside(lanes, "a", side="left", other_side="right") == "b"
-        and beside(lanes, "b", side="right", other_side="left") == "a"
+        beside(lanes, "a", side="left") == "b"
+        and beside(lanes, "b", side="right") == "a"
     )
     assert side_by_side(lanes, ["a", "c", "b"]) == [["c"], ["a", "b"]]
 
