@@ -3,6 +3,7 @@
 
 import argparse
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -17,69 +18,61 @@ from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically, written_whole
 
-FORMATS = {  # modules of e2rl.report.export; what a module imports is in the extra of the format's name
+# Modules of e2rl.report.export; what they import is in the extra of the format's name.
+FORMATS = {
     "commonroad": "commonroad_writer",
     "openscenario": "openscenario",
     "scenarionet": "scenarionet_writer",
     "mcap": "mcap",
     "npz": "archive",
 }
-OPEN_EGO = (
-    "commonroad",
-    "openscenario",
-)  # formats in which the ego's place may be left open
+OPEN_EGO = ("commonroad", "openscenario")  # in which the ego's place may be left open
 LIST = "exported.csv"
 
 
-def chosen_rows(
-    run: Path, failures: int | None, every: bool, method: str | None
-) -> list[dict]:
-    """Rows of rollouts.csv: its failures, first those that count, at most `failures`;
-    or every rollout of it."""
-    rows = [
-        row for row in read_rows(run / TABLE) if row["errored"] != 1
-    ]  # which have no file
-    if method is not None:
-        known = dict.fromkeys(row["method"] for row in rows)
-        if method not in known:
+def chosen_rows(options: argparse.Namespace) -> list[dict]:
+    """Rows of rollouts.csv: one failure; its failures, first those that count, at most
+    so many; or every rollout of it."""
+    run = options.run
+    if options.failures is not None and options.failures < 1:
+        raise InputError(f"--failures {options.failures}: expected at least 1")
+    if options.failure:
+        return [failure_row(run, options.failure)]
+    # Rollouts that errored have no file.
+    rows = [row for row in read_rows(run / TABLE) if row["errored"] != 1]
+    if options.method is not None:
+        methods = dict.fromkeys(row["method"] for row in rows)
+        if options.method not in methods:
             raise InputError(
-                f"--method {method}: not in {run / TABLE}; choose among {', '.join(known)}"
+                f"--method {options.method}: not in {run / TABLE}; choose among "
+                f"{', '.join(methods)}"
             )
-        rows = [row for row in rows if row["method"] == method]
-    if every:
+        rows = [row for row in rows if row["method"] == options.method]
+    if options.all:
         return rows
-    found = sorted(
-        (row for row in rows if is_failure(row)), key=lambda row: row["counted"] != 1
-    )
-    if not found:
+    failures = list(filter(is_failure, rows))
+    if not failures:
         raise InputError(
-            f"{run / TABLE}: no rollout in which the ego hits a vehicle; raise eta, evaluate more scenes, or pass --all"
+            f"{run / TABLE}: no rollout in which the ego hits a vehicle; raise eta, "
+            "evaluate more scenes, or pass --all"
         )
-    return found[:failures]
+    failures.sort(key=lambda row: row["counted"] != 1)
+    return failures[: options.failures]
 
 
-def export(
-    episodes: Iterator[Episode],
-    write: Callable[..., Iterator],
-    out: Path,
-    open_ego: bool,
-) -> None:
-    """Write episodes by the `write` of a format into a new folder, with a list of the
-    files and their facts."""
+def export(write: Callable[[Path], Iterator[tuple[Episode, Path]]], out: Path) -> None:
+    """Write episodes into a new folder, with a list of the files and their facts."""
     if out.exists():
         raise InputError(
             f"{out}: is there already; remove it, or pass another folder with --out"
         )
-    columns = ("file", *FACTS, "adversaries")
+    lines = [["file", *FACTS, "adversaries"]]
     with written_whole(out) as folder:
-        lines = []
-        for episode, path in write(episodes, folder, open_ego):
-            facts = episode.facts | {
-                "adversaries": " ".join(map(str, episode.facts["adversaries"]))
-            }
-            facts["file"] = str(path.relative_to(folder))
-            lines.append([facts.get(column, "") for column in columns])
-        write_atomically(folder / LIST, csv_text([columns, *lines]))
+        for episode, path in write(folder):
+            facts = [episode.facts.get(name, "") for name in FACTS]
+            adversaries = " ".join(map(str, episode.facts["adversaries"]))
+            lines.append([str(path.relative_to(folder)), *facts, adversaries])
+        write_atomically(folder / LIST, csv_text(lines))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -133,32 +126,28 @@ def main(arguments: list[str] | None = None) -> None:
     )
     options = parser.parse_args(arguments)
     with ending():
-        out = options.out or own_folder(
-            options.run, "export", *filter(None, [options.failure]), options.to
-        )
+        name = [options.failure] if options.failure else []
+        out = options.out or own_folder(options.run, "export", *name, options.to)
         if options.open_ego and options.to not in OPEN_EGO:
-            others = " or ".join(OPEN_EGO)
             raise InputError(
-                f"--open-ego: {options.to} has no such form; leave it out, or pass --to {others}"
+                f"--open-ego: {options.to} has no such form; leave it out, or pass "
+                f"--to {' or '.join(OPEN_EGO)}"
             )
-        write = library(
+        module = library(
             f"e2rl.report.export.{FORMATS[options.to]}",
             f"--to {options.to}",
             extra=options.to,
-        ).write
-        if options.failures is not None and options.failures < 1:
-            raise InputError(f"--failures {options.failures}: expected at least 1")
-        given = (options.run, options.failures, options.all, options.method)
-        rows = (
-            [failure_row(options.run, options.failure)]
-            if options.failure
-            else chosen_rows(*given)
         )
-        episodes = episodes_of(
-            options.run, rows, plugins=options.plugin, scene=not options.no_scene
+        rows = chosen_rows(options)
+        episodes = tqdm(
+            episodes_of(
+                options.run, rows, plugins=options.plugin, scene=not options.no_scene
+            ),
+            "exporting",
+            total=len(rows),
+            unit="rollout",
+            leave=False,
+            disable=None,
         )
-        shown = tqdm(
-            episodes, "exporting", len(rows), unit="rollout", leave=False, disable=None
-        )
-        export(shown, write, out=out, open_ego=options.open_ego)
+        export(partial(module.write, episodes, open_ego=options.open_ego), out)
         print(f"{len(rows)} rollouts written to {out}")

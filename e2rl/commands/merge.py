@@ -10,6 +10,7 @@ import json
 import shlex
 import shutil
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import IO
 
@@ -21,12 +22,8 @@ from e2rl.run.run import PROVENANCE, assigned, changed, read_provenance
 from e2rl.run.trust import CONFIG
 from e2rl.sim.rollout_file import ROLLOUTS
 
-COPIED = (
-    f"{PARTS}/*.pt",
-    f"{ROLLOUTS}/*.npz",
-    "*.csv",
-    str(CONFIG),
-)  # a batch is done when its part is there
+# A batch is done when its part is there.
+COPIED = (f"{PARTS}/*.pt", f"{ROLLOUTS}/*.npz", "*.csv", str(CONFIG))
 OWN = ("shard=", "hydra.run.dir=")  # what the commands of shards differ in
 
 
@@ -34,16 +31,15 @@ def merge(runs: Sequence[Path], into: Path) -> int:
     """Copies the batches of shards that are done into a new run's folder; returns how
     many there are. Raises InputError where a folder is no run, `into` is there, or runs
     differ in scenes, inputs or settings."""
-    known = {run: read_provenance(run) for run in runs}
-    first = known[runs[0]]
-    for run in runs[1:]:
-        if names := [
-            name
-            for kind in ("inputs", "settings")
-            for name in changed(first[kind], known[run][kind])
-        ]:
+    begun = [read_provenance(run) for run in runs]
+    first = begun[0]
+    for run, other in zip(runs, begun, strict=True):
+        names = changed(first["inputs"], other["inputs"])
+        names += changed(first["settings"], other["settings"])
+        if names:
             raise InputError(
-                f"{run}: began with another {', '.join(names)} than {runs[0]}; merge the shards of one run"
+                f"{run}: began with another {', '.join(names)} than {runs[0]}; merge "
+                "the shards of one run"
             )
     if into.exists():
         raise InputError(f"{into}: is there already; name a new folder")
@@ -56,20 +52,17 @@ def merge(runs: Sequence[Path], into: Path) -> int:
             f"{runs[0] / PROVENANCE}: its command is none ({error}); restore it"
         ) from error
     with written_whole(into) as folder:
-        for run in runs:
-            for source in (
-                source for pattern in COPIED for source in sorted(run.glob(pattern))
-            ):
+        for run, pattern in product(runs, COPIED):
+            for source in sorted(run.glob(pattern)):
                 copy = folder / source.relative_to(run)
                 copy.parent.mkdir(exist_ok=True)
                 with opened(source, run) as content, copy.open("wb") as file:
                     shutil.copyfileobj(content, file)
-        versions = [each for run in runs for each in known[run]["versions"]]
-        versions = [
-            each
-            for number, each in enumerate(versions)
-            if each not in versions[:number]
-        ]
+        versions: list[dict] = []
+        for provenance in begun:
+            for version in provenance["versions"]:
+                if version not in versions:
+                    versions.append(version)
         whole = first | {"command": shlex.join(command), "versions": versions}
         write_atomically(folder / PROVENANCE, json.dumps(whole, indent=1))
         return len(list(folder.glob(COPIED[0])))

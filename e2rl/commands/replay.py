@@ -24,31 +24,26 @@ def chosen(run: Path, failures: int, modes: bool) -> Iterator[tuple[str, Failure
         yield "", Failure(rollout, score_rollouts(Rollouts.of([rollout]))[0][0])
         return
     rows = read_rows(run / TABLE)
-    found = [("", row) for row in found_failures(rows, failures)]
+    titled = [("", row) for row in found_failures(rows, failures)]
     if modes:
+        titled = []
         files = {rollout_name(row): row for row in rows}
-        known = read_modes(run / MODES_FILE)["modes"]
-        if lost := [
-            mode["typical"]["file"]
-            for mode in known
-            if mode["typical"]["file"] not in files
-        ]:
-            raise InputError(
-                f"{run / MODES_FILE}: {lost[0]} is not in {TABLE}; run evaluate.py again to rewrite both"
-            )
-        found = [
-            (
-                f"{mode['mode']}. {mode['name']} ({mode['count']} failures)",
-                files[mode["typical"]["file"]],
-            )
-            for mode in known
-            if mode["mode"] != OTHER
-        ]
-    if not found:
+        for mode in read_modes(run / MODES_FILE)["modes"]:
+            file = mode["typical"]["file"]
+            if file not in files:
+                raise InputError(
+                    f"{run / MODES_FILE}: {file} is not in {TABLE}; run evaluate.py "
+                    "again to rewrite both"
+                )
+            if mode["mode"] != OTHER:
+                title = f"{mode['mode']}. {mode['name']} ({mode['count']} failures)"
+                titled.append((title, files[file]))
+    if not titled:
         raise InputError(
-            f"{run / TABLE}: no rollout in which the ego hits a vehicle; raise eta or evaluate more scenes"
+            f"{run / TABLE}: no rollout in which the ego hits a vehicle; raise eta or "
+            "evaluate more scenes"
         )
-    for title, row in found:
+    for title, row in titled:
         yield title, Failure.read(run, row)
 
 
@@ -91,19 +86,18 @@ def main(arguments: list[str] | None = None) -> None:
     )
     options = parser.parse_args(arguments)
     with ending():
-        folder = options.out or own_folder(
-            options.run.parent if options.run.is_file() else options.run, "replays"
-        )
-        for title, shown in chosen(options.run, options.failures, modes=options.modes):
-            name = f"{shown.rollout.name.removesuffix('.npz')}.{options.to}"
+        run = options.run.parent if options.run.is_file() else options.run
+        folder = options.out or own_folder(run, "replays")
+        for title, failure in chosen(options.run, options.failures, options.modes):
+            name = f"{failure.rollout.name.removesuffix('.npz')}.{options.to}"
             path = folder / name if options.out else own_folder(folder, name)
-            save_animation(
-                path,
-                Replay(
-                    shown.rollout,
-                    shown.row,
-                    metres=options.metres,
-                    pixels=options.pixels,
-                ).frames(),
+            replay = Replay(
+                failure.rollout,
+                failure.row,
+                metres=options.metres,
+                pixels=options.pixels,
             )
-            print(*filter(None, [title]), path, sep="\n")
+            save_animation(path, replay.frames())
+            if title:
+                print(title)
+            print(path)

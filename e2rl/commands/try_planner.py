@@ -43,13 +43,13 @@ def planner_class(named: str) -> type[Ego]:
     if not place or not name:
         raise InputError(f"{where}: name a class, as MODULE:CLASS or FILE.py:CLASS")
     module = _imported(place, where)
-    known = {
-        key: value
+    planners = [
+        key
         for key, value in vars(module).items()
         if _is_planner(value) and _drives(value)
-    }
+    ]
     kind = vars(module).get(name)
-    near = get_close_matches(name, known, 1) or list(known)
+    near = get_close_matches(name, planners, 1) or planners
     if kind is None:
         advice = (
             f"it has {', '.join(near)}"
@@ -59,12 +59,14 @@ def planner_class(named: str) -> type[Ego]:
         raise InputError(f"{where}: {place} has no {name}; {advice}")
     if not _is_planner(kind):
         raise InputError(
-            f"{where}: {name} is no planner; make it a subclass of e2rl.planners.ego.Ego with `plan`"
+            f"{where}: {name} is no planner; make it a subclass of "
+            "e2rl.planners.ego.Ego with `plan`"
         )
     if not _drives(kind):
         advice = f"; name {', '.join(near)}" if near else ""
         raise InputError(
-            f"{where}: {name} overrides neither plan nor act, so that it does not drive{advice}"
+            f"{where}: {name} overrides neither plan nor act, so that it does not "
+            f"drive{advice}"
         )
     return kind
 
@@ -87,16 +89,17 @@ def _imported(place: str, where: str) -> ModuleType:
         loaded = import_module(module)
     except ModuleNotFoundError as error:
         if error.name and module.split(".")[0] == error.name.split(".")[0]:
-            mend = "start in the folder that holds it, put that on PYTHONPATH, or name the file as FILE.py:CLASS"
             raise InputError(
-                f"{where}: no module {module} in {folder}; {mend}"
+                f"{where}: no module {module} in {folder}; start in the folder that "
+                "holds it, put that on PYTHONPATH, or name the file as FILE.py:CLASS"
             ) from error
         raise InputError(
             f"{where}: {module} needs {error.name}, which is not installed; install it"
         ) from error
     except (Exception, SystemExit) as error:  # of outside code
         raise InputError(
-            f"{where}: {module} cannot be imported: {type(error).__name__}: {error}; mend that"
+            f"{where}: {module} cannot be imported: {type(error).__name__}: {error}; "
+            "mend that"
         ) from error
     file = Path(folder, *module.split(".")).with_suffix(".py")
     other = getattr(loaded, "__file__", None) or "a part of Python"
@@ -118,14 +121,15 @@ def _drives(kind: type[Ego]) -> bool:
 def check_arguments(kind: type[Ego], settings: Sequence[str], where: str) -> None:
     """Raises InputError where an argument of the class has neither a default nor a
     setting NAME=VALUE."""
-    given = {setting.partition("=")[0] for setting in settings}
-    parameters = list(inspect.signature(kind).parameters.values())
-    needed = [
-        each.name
-        for each in parameters
-        if each.kind in NAMED and each.default is each.empty
+    names = {setting.partition("=")[0] for setting in settings}
+    missing = [
+        parameter.name
+        for parameter in inspect.signature(kind).parameters.values()
+        if parameter.kind in NAMED
+        and parameter.default is parameter.empty
+        and parameter.name not in names
     ]
-    if missing := [name for name in needed if name not in given]:
+    if missing:
         mend = " ".join(f"--set {name}=VALUE" for name in missing)
         raise InputError(
             f"{where}: {kind.__name__} needs {', '.join(missing)}; give defaults, or add {mend}"
@@ -137,10 +141,11 @@ def overrides_of(options: argparse.Namespace) -> list[str]:
     planner or logs that are none."""
     kind = planner_class(options.planner)
     check_arguments(kind, options.settings, where=f"--planner {options.planner}")
-    logs = [each for each in options.logs if "=" not in each]
+    logs = [word for word in options.logs if "=" not in word]
     if len(logs) > 1:
         raise InputError(
-            f"{logs[1]}: name one folder or zip of logs, or leave it out for the bundled scenes"
+            f"{logs[1]}: name one folder or zip of logs, or leave it out for the "
+            "bundled scenes"
         )
     words = [
         "ego=class",
@@ -150,9 +155,11 @@ def overrides_of(options: argparse.Namespace) -> list[str]:
     if logs:
         data, _ = open_source(Path(logs[0]), options.data, workers=1)
         words += [f"data={data}", assigned("data.path", logs[0])]
-    words += [f"num_scenes={options.scenes}"] if options.scenes else []
-    words += [assigned("hydra.run.dir", options.out)] if options.out else []
-    return [*words, *(each for each in options.logs if "=" in each)]
+    if options.scenes:
+        words.append(f"num_scenes={options.scenes}")
+    if options.out:
+        words.append(assigned("hydra.run.dir", options.out))
+    return words + [word for word in options.logs if "=" in word]
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -57,89 +57,85 @@ def tune(run: Run) -> dict:
     """Do the trials that are left; returns what tuning.json holds."""
     config = run.config
     folder = run.folder
-    group = run.config.tuning.group
-    check_choice("tuning.group", group, choices=GROUPS)
-    given = {each.name: config.tuning[each.name] for each in fields(SearchSettings)}
-    settings = settings_of(SearchSettings, given, where="tuning")
+    tuning = config.tuning
+    check_choice("tuning.group", tuning.group, choices=GROUPS)
+    names = [field.name for field in fields(SearchSettings)]
+    settings = settings_of(
+        SearchSettings, {name: tuning[name] for name in names}, where="tuning"
+    )
     plan = begin(run)
     objective: Objective
     trials: PlannerTrials | AttackTrials
-    if group == "ego":
+    failures: list[Batch] = []
+    if tuning.group == "ego":
         objective = settings_of(
-            PlannerObjective, config.tuning.planner, where="tuning.planner"
+            PlannerObjective, tuning.planner, where="tuning.planner"
         )
-        trials = planner_trials(config, plan)
+        failures = tuned_failures(config, plan)
+        trials = planner_trials(config, plan, failures)
         ranges = plan.setup.ego.tuned
+        methods = [f"{method.name}@{method.eta:g}" for method in plan.methods]
     else:
-        objective = settings_of(
-            AttackObjective, config.tuning.attack, where="tuning.attack"
-        )
+        objective = settings_of(AttackObjective, tuning.attack, where="tuning.attack")
         trials, ranges = attack_trials(config, plan)
+        methods = [NOMINAL]
 
-    def told(rows: list[dict]) -> None:
+    def show(rows: list[dict]) -> None:
         save(rows, folder)
         print(line_of(rows, objective))
 
-    about = {name: resolved(config[name]) for name in ("ego", "prior", "sim")} | {
-        "rows": [f"{method.name}@{method.eta:g}" for method in plan.methods]
-        if group == "ego"
-        else [NOMINAL],
+    about = {name: resolved(config[name]) for name in ("ego", "prior", "sim")}
+    about |= {
+        "rows": methods,
         "seeds": list(plan.settings.seeds),
-        "failures": [
-            [list(task) for task in batch.tasks]
-            for batch in getattr(trials, "failures", ())
-        ],
+        "failures": [[list(task) for task in batch.tasks] for batch in failures],
         "scenes": plan.scenes.scene_id,
         "eta": list(plan.settings.eta),
     }
-    space = resolved(config.tuning.space) or ranges
-    file = (
-        folder / STUDY_FILE
-        if config.tuning.study is None
-        else Path(config.tuning.study)
-    )
     rows = search(
         trials,
-        flat(resolved(config[group])),
-        space=space,
+        flat(resolved(config[tuning.group])),
+        space=resolved(tuning.space) or ranges,
         settings=settings,
         objective=objective,
-        file=file,
+        file=Path(tuning.study or folder / STUDY_FILE),
         about=about,
-        told=told,
+        told=show,
     )
     result = save(rows, folder)
     best = "no trial keeps within the limits\n"
     if result["best"]:
         best = (
-            f"best of {len(rows)} trials, for conf/{group}:\n{yaml_of(result['best'])}"
+            f"best of {len(rows)} trials, for conf/{tuning.group}:\n"
+            f"{yaml_of(result['best'])}"
         )
     print(f"\n{best}written to {folder}")
     return result
 
 
-def planner_trials(config: DictConfig, plan: Evaluation) -> PlannerTrials:
+def tuned_failures(config: DictConfig, plan: Evaluation) -> list[Batch]:
+    """Returns the tries of `tuning.failures` that hit the planner."""
+    if config.tuning.failures is None:
+        return []
+    method = build_search(SEARCH, config, plan.prior, eta=max(plan.settings.eta))
+    return failures_of(
+        Path(config.tuning.failures) / TRIES_FILE,
+        plan.setup.ego_name,
+        method=method,
+        setup=plan.setup,
+    )
+
+
+def planner_trials(
+    config: DictConfig, plan: Evaluation, failures: list[Batch]
+) -> PlannerTrials:
     """Returns trials of the group `ego` against all of `config.methods`, and in the
-    tries of `tuning.failures`."""
+    tries `failures`."""
 
     def make(parameters: Parameters) -> Any:
-        return build_ego(
-            OmegaConf.create(
-                {
-                    "ego": with_changes(
-                        config.ego, parameters, where="tuning.space", group="ego"
-                    )
-                }
-            )
-        )
+        ego = with_changes(config.ego, parameters, where="tuning.space", group="ego")
+        return build_ego(OmegaConf.create({"ego": ego}))
 
-    failures: list[Batch] = []
-    if config.tuning.failures is not None:
-        method = build_search(SEARCH, config, plan.prior, eta=max(plan.settings.eta))
-        file = Path(config.tuning.failures) / TRIES_FILE
-        failures = failures_of(
-            file, plan.setup.ego_name, method=method, setup=plan.setup
-        )
     return PlannerTrials(
         plan.setup,
         plan.methods,
@@ -189,14 +185,13 @@ def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, M
 
 def flat(group: Mapping[str, Any], before: str = "") -> Parameters:
     """Returns {dotted name: value} of nested settings."""
-    found: Parameters = {}
+    settings: Parameters = {}
     for name, value in group.items():
-        found |= (
-            flat(value, f"{before}{name}.")
-            if isinstance(value, dict)
-            else {f"{before}{name}": value}
-        )
-    return found
+        if isinstance(value, dict):
+            settings |= flat(value, f"{before}{name}.")
+        else:
+            settings[f"{before}{name}"] = value
+    return settings
 
 
 def main() -> None:

@@ -88,7 +88,8 @@ def answer_lines(
         *touched_lines(rollouts, shown=report is not None),
     )
     if len(egos) == 1 and attacks <= 1 and len(driven) - attacks <= 1:
-        lines += wrapped(*sentences(*driven))
+        nominal = driven[1] if len(driven) > 1 else None
+        lines += wrapped(*sentences(driven[0], nominal))
     elif driven:
         lines += comparison(driven)
     if modes and driven:
@@ -121,7 +122,7 @@ def compared_answer(
         if (row["method"], row["eta"]) in earlier
     ]
     last = closing(after, folder)
-    lines = atlas_lines(*atlases) if atlases else []
+    lines = atlas_lines(before=atlases[0], after=atlases[1]) if atlases else []
     if pairs:
         last = [*wrapped(COUNTS, indent=""), *last]
         old, new = max(pairs, key=lambda pair: pair[1]["eta"])
@@ -195,10 +196,9 @@ def sentences(row: dict, nominal: dict | None = None) -> list[str]:
         text = f"Tries end in {hits} contacts. {verdict(row)}"
         tries = text if hits else "No try ends in a contact."
         return [tries, cost(row, nominal)] if nominal else [tries]
-    driven = [row, nominal] if nominal else [row]
     kind = "attacked rollouts" if row["eta"] else "rollouts"
     text = (
-        f"{row['ego']} was {outcome(*driven)} in {share(row, 'cfr')} {kind} "
+        f"{row['ego']} was {outcome(row, nominal or row)} in {share(row, 'cfr')} {kind} "
         f"{bracketed(rate(row, 'cfr'), split(row))}"
     )
     if not nominal:
@@ -434,7 +434,7 @@ def closing(
     Returns:
         Lines of the terminal's width, but for paths.
     """
-    lines = wrapped(*notes, measured(rows), indent="")
+    lines = wrapped(*[*notes, measured(rows)], indent="")
     if report:
         lines.append(f"Watch every failure: {report}")
     if folder:

@@ -85,34 +85,35 @@ def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str,
     """
     rollout = failure.rollout
     contact = failure.contact
-    like = failure
-    if contact is None and beside is not None:
-        like = beside
+    like = beside if contact is None and beside else failure
     assert like.contact is not None
-    partner = like.partner
     steps = min(like.contact + AFTER + 1, len(rollout.states))
-    rows = np.union1d(np.flatnonzero(rollout.valid[:steps].any(0)), partner)
-    driven = rollout.states[:steps], rollout.valid[:steps]
+    rows = np.union1d(np.flatnonzero(rollout.valid[:steps].any(0)), like.partner)
     tracks = [
         Track(
-            role_of(rollout, row), rollout.size[row], *(part[:, row] for part in driven)
+            role_of(rollout, row),
+            rollout.size[row],
+            states=rollout.states[:steps, row],
+            present=rollout.valid[:steps, row],
         )
         for row in rows.tolist()
     ]
     tracks += other_egos(rollout, steps)
-    other = int(np.searchsorted(rows, partner))
-    motion = np.stack([channels_of(track, tracks[other]) for track in tracks], 1)
+    partner = int(np.searchsorted(rows, like.partner))
+    motion = np.stack([channels_of(track, tracks[partner]) for track in tracks], 1)
     quanta = np.array(list(CHANNELS.values()))[:, None, None]
+    point = None
+    if contact is not None:
+        where = contact_point(rollout, contact, partner=like.partner)
+        point = where.round(2).tolist()
     return {
         "tracks": [
             [track.role, *(round(float(side), 2) for side in track.size)]
             for track in tracks
         ],
-        "partner": other,
+        "partner": partner,
         "contact": steps - 1 if contact is None else contact,
-        "point": None
-        if contact is None
-        else contact_point(rollout, contact, partner=partner).round(2).tolist(),
+        "point": point,
         "dt": rollout.dt,
         "motion": encode(second_difference(quantised(motion, quanta))),
         "plans": encoded_plans(rollout, rows) if rollout.plans is not None else None,
@@ -126,9 +127,10 @@ def replay_data(
     beside them; scenes share their map."""
     maps: dict[str, int] = {}
     replays = []
-    for one, beside in tqdm(pairs, "replays", count, leave=False, disable=None):
-        number = maps.setdefault(json.dumps(encoded_map(one.rollout)), len(maps))
-        replays.append(failure_replay(one, beside) | {"map": number})
+    for failure, beside in tqdm(pairs, "replays", count, leave=False, disable=None):
+        text = json.dumps(encoded_map(failure.rollout))
+        number = maps.setdefault(text, len(maps))
+        replays.append(failure_replay(failure, beside) | {"map": number})
     return {
         "maps": list(map(json.loads, maps)),
         "replays": replays,
@@ -155,14 +157,14 @@ def other_egos(rollout: Rollout, steps: int) -> list[Track]:
     has them."""
     ego = rollout.ego
     always = np.ones(steps, bool)
-    known = {
-        "driver": (rollout.driver, always),
-        "recorded": (rollout.logged[:, ego], rollout.logged_valid[:steps, ego]),
-        "evasion": (rollout.evasion, always),
-    }
+    recorded = rollout.logged_valid[:steps, ego]
     return [
         Track(role, rollout.size[ego], states=states[:steps], present=present)
-        for role, (states, present) in known.items()
+        for role, states, present in (
+            ("driver", rollout.driver, always),
+            ("recorded", rollout.logged[:, ego], recorded),
+            ("evasion", rollout.evasion, always),
+        )
         if states is not None
     ]
 
@@ -174,20 +176,15 @@ def channels_of(track: Track, partner: Track) -> np.ndarray:
     states[:, 2] = np.unwrap(states[:, 2])
     gap = np.zeros(len(states))
     if track.role in ("ego", "driver", "evasion", "recorded"):
-        boxes = (
-            states,
-            track.size,
-            held(partner.states, partner.present),
-            partner.size,
+        distance = separation(
+            torch.as_tensor(states, dtype=torch.float64),
+            torch.as_tensor(track.size, dtype=torch.float64),
+            second=torch.as_tensor(
+                held(partner.states, partner.present), dtype=torch.float64
+            ),
+            second_size=torch.as_tensor(partner.size, dtype=torch.float64),
         )
-        first, first_size, second, second_size = (
-            torch.as_tensor(box, dtype=torch.float64) for box in boxes
-        )
-        gap = (
-            separation(first, first_size, second=second, second_size=second_size)
-            .clamp(min=0)
-            .numpy()
-        )
+        gap = distance.clamp(min=0).numpy()
     return np.concatenate([states.T, [track.present, gap]])
 
 
@@ -205,17 +202,15 @@ def encoded_plans(rollout: Rollout, rows: np.ndarray) -> dict[str, Any]:
     K] as second differences in the quantum of x; `targets` [A, R], the track that an
     adversary aims at, -1 for none. Steps between plans: `every`, between points:
     `spacing`."""
-    assert (
-        rollout.planners is not None
-        and rollout.plans is not None
-        and rollout.targets is not None
-    )
-    known = np.isin(rollout.planners, rows)
-    points = rollout.plans[:, known].transpose(1, 0, 3, 2)
-    targets = rollout.targets[:, known].T
+    assert rollout.planners is not None
+    assert rollout.plans is not None
+    assert rollout.targets is not None
+    shown = np.isin(rollout.planners, rows)
+    points = rollout.plans[:, shown].transpose(1, 0, 3, 2)
+    targets = rollout.targets[:, shown].T
     aimed = np.where(np.isin(targets, rows), np.searchsorted(rows, targets), -1)
     return {
-        "agents": np.searchsorted(rows, rollout.planners[known]).tolist(),
+        "agents": np.searchsorted(rows, rollout.planners[shown]).tolist(),
         "every": REPLAN_STEPS,
         "spacing": POINT_STEPS,
         "points": encode(second_difference(quantised(points, CHANNELS["x"]))),

@@ -154,5 +154,5 @@ def scenes_text(rows: Iterable[dict], named: int, file: str = ERRORED_FILE) -> s
         word = "seed" if len(seeds) == 1 else "seeds"
         texts.append(f"{scene} ({word} {', '.join(seeds[:most])}{rest})")
     others = len(scenes) - len(texts)
-    more = f" and {plural(others, 'other scene')} in {file}" if others else ""
-    return ", ".join(texts) + more
+    rest = f" and {plural(others, 'other scene')} in {file}" if others else ""
+    return ", ".join(texts) + rest

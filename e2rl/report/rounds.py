@@ -3,7 +3,6 @@ and the curriculum's choices."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,20 +14,18 @@ from e2rl.report.videos import save_animation
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.rollouts import Rollouts
 
-METRES, PIXELS = 60.0, 360  # side of a video's picture
+METRES = 60.0  # side of a video's picture
+PIXELS = 360  # the same
 
 
 def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
     """A round in one line of at most 100 characters, errored rollouts apart."""
     hit = metrics.get("synthesizer/contact", float("nan"))
     left_out = metrics["synthesizer/left_out"]
-    found = {
-        name.rpartition("/errored_")[2]: count
+    reasons = ", ".join(
+        f"{count:.0f} {name.partition('/errored_')[2].replace('_', ' ')}"
         for name, count in metrics.items()
         if "/errored_" in name
-    }
-    reasons = ", ".join(
-        f"{count:.0f} {reason.replace('_', ' ')}" for reason, count in found.items()
     )
     errored = f", without a score: {reasons}" if reasons else ""
     left = f", {left_out:.0f} left out" if left_out else ""
@@ -58,11 +55,10 @@ def save_videos(
     Yields:
         The path of each video.
     """
-    for k, row in enumerate(hits(traffic, scenes)[:count].tolist()):
-        path = folder / "videos" / f"round-{number:03d}-{k + 1}.gif"
-        save_animation(
-            path, replay_of(traffic, row, scenes=scenes, method=method).frames()
-        )
+    for place, row in enumerate(hits(traffic, scenes)[:count].tolist(), 1):
+        path = folder / "videos" / f"round-{number:03d}-{place}.gif"
+        replay = replay_of(traffic, row, scenes=scenes, method=method)
+        save_animation(path, replay.frames())
         yield path
 
 
@@ -70,29 +66,45 @@ def hits(traffic: Mapping[str, Tensor], scenes: SceneSet) -> Tensor:
     """Rows [H] of traffic in which an attack ended in a contact of the ego, one of a
     scene."""
     scene = scenes.batch(traffic["scene_index"])
-    tracks = {name: traffic[name] for name in ("states", "valid")} | {
-        name: scene[name] for name in ("size", "agent_type")
+    tracks = {
+        "states": traffic["states"],
+        "valid": traffic["valid"],
+        "size": scene["size"],
+        "agent_type": scene["agent_type"],
     }
-    rows = (first_contact(tracks)["hit"] & traffic["adversaries"].any(1)).nonzero()[
-        :, 0
-    ]
-    places = traffic["scene_index"][rows]
-    first = [k for k in range(len(rows)) if places[k] not in places[:k]]
-    return rows[first]
+    hit = first_contact(tracks)["hit"] & traffic["adversaries"].any(1)
+    rows: dict[int, int] = {}  # of a scene
+    for row in hit.nonzero()[:, 0].tolist():
+        rows.setdefault(int(traffic["scene_index"][row]), row)
+    return torch.tensor(list(rows.values()), dtype=torch.int64)
 
 
 def replay_of(
     traffic: Mapping[str, Tensor], row: int, scenes: SceneSet, method: str
 ) -> Replay:
-    """The replay of one row of a round's traffic."""
-    shown = ("scene_index", "states", "valid", "adversaries")
-    own: dict[str, Any] = {name: traffic[name][row : row + 1] for name in shown}
-    index = own.pop("scene_index")
-    about = {"dataset": "", "split": "train", "method": method, "ego_policy": "actor"}
-    eta = traffic["eta"][row : row + 1].double().round(decimals=2)
-    names: dict[str, Any] = {name: [value] for name, value in about.items()}
+    """The replay of one row of a round's traffic.
+
+    Args:
+        traffic: of the memory.
+        row: of the traffic.
+        scenes: that it was driven in.
+        method: name of the attack.
+    """
+    only = slice(row, row + 1)
+    index = traffic["scene_index"][only]
     rollouts = Rollouts.in_scenes(
-        scenes, index, **own, seed=index, eta=eta, seconds=torch.zeros(1), **names
+        scenes,
+        index,
+        states=traffic["states"][only],
+        valid=traffic["valid"][only],
+        adversaries=traffic["adversaries"][only],
+        seed=index,
+        eta=traffic["eta"][only].double().round(decimals=2),
+        seconds=torch.zeros(1),
+        dataset=[""],
+        split=["train"],
+        method=[method],
+        ego_policy=["actor"],
     )
     rows, _ = score_rollouts(rollouts)
     return Replay(rollouts.rollout(0), rows[0], metres=METRES, pixels=PIXELS)

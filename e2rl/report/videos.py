@@ -18,14 +18,16 @@ from e2rl.run.files import write_atomically
 FRAME_MS = 100  # real time at 10 Hz
 LAST_MS = 1200  # the last frame of a GIF stays a little before the video starts again
 COLOURS = 160  # of the GIF's palette
-KEYS = (
+KEYS = (  # always in the palette
     drawing.EGO,
     drawing.ADVERSARY,
     drawing.BACKGROUND,
     drawing.VULNERABLE,
     drawing.INK,
-)  # always in the palette
-MP4 = (  # H.264 as all players take it; the file names the matrix of its colours, since players guess another
+)
+# H.264 as all players take it; the file names the matrix of its colours, since players
+# guess another.
+MP4 = (
     f"-y -v error -f rawvideo -pix_fmt rgb24 -s {{}}x{{}} -r {1000 / FRAME_MS:g} -i - -c:v libx264 -pix_fmt yuv420p"
     " -crf 20 -movflags +faststart -f mp4 -vf crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt709"
 )
@@ -50,29 +52,20 @@ def save_animation(
 def write_gif(frames: Sequence[Image.Image], path: Path, colours: int) -> None:
     """Write an endless GIF; all frames share a palette, from the first, middle and last
     one and the KEYS."""
-    swatch = np.tile(
-        np.repeat([[255 * part for part in to_rgb(each)] for each in KEYS], 8, 0),
-        (frames[0].width, 1, 1),
-    )
-    parts = [
-        *(np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)),
-        swatch.transpose(1, 0, 2),
-    ]
-    sample = Image.fromarray(np.concatenate(parts).astype(np.uint8))
-    palette = sample.quantize(
-        colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
-    )
-    first, *others = [
-        frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames
-    ]
-    duration = [FRAME_MS] * len(others) + [LAST_MS]
+    keys = np.repeat([[255 * part for part in to_rgb(key)] for key in KEYS], 8, 0)
+    swatch = np.repeat(keys[:, None], frames[0].width, 1)
+    samples = [np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)]
+    sample = Image.fromarray(np.concatenate([*samples, swatch]).astype(np.uint8))
+    plain = Image.Dither.NONE
+    palette = sample.quantize(colours, method=Image.Quantize.MEDIANCUT, dither=plain)
+    first, *others = [frame.quantize(palette=palette, dither=plain) for frame in frames]
     first.save(
         path,
         format="GIF",
         save_all=True,
         append_images=others,
         loop=0,
-        duration=duration,
+        duration=[FRAME_MS] * len(others) + [LAST_MS],
     )
 
 
@@ -103,21 +96,15 @@ def found_failures(rows: Sequence[dict], count: int) -> list[dict]:
     Adversarial rollouts (eta > 0) come first, then failures that count, then kinds of
     contact that are not among the chosen, then hits of adversaries.
     """
-    hits = sorted(
-        (row for row in rows if row["cfr"] == 1), key=lambda row: row["cfr_adv"] != 1
-    )
+    hits = [row for row in rows if row["cfr"] == 1]
     chosen: list[dict] = []
     while hits and len(chosen) < count:
         kinds = [row["contact_type"] for row in chosen]
-        chosen.append(
-            min(
-                hits,
-                key=lambda row: (
-                    row["eta"] <= 0,
-                    row["counted"] != 1,
-                    kinds.count(row["contact_type"]),
-                ),
-            )
-        )
+
+        def rank(row: dict) -> tuple:
+            same = kinds.count(row["contact_type"])  # noqa: B023 - called at once
+            return row["eta"] <= 0, row["counted"] != 1, same, row["cfr_adv"] != 1
+
+        chosen.append(min(hits, key=rank))
         hits = [row for row in hits if row["scene_id"] != chosen[-1]["scene_id"]]
     return chosen
