@@ -84,7 +84,9 @@ def tune(run: Run) -> dict:
         save(rows, folder)
         print(line_of(rows, objective))
 
-    about = {name: resolved(config[name]) for name in ("ego", "prior", "sim")}
+    about: dict[str, Any] = {
+        name: resolved(config[name]) for name in ("ego", "prior", "sim")
+    }
     about |= {
         "rows": methods,
         "seeds": list(plan.settings.seeds),

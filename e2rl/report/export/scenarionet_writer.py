@@ -198,9 +198,9 @@ def number_summary(
 
 def light(episode: Episode, name: str, history: int) -> dict[str, Any]:
     """The light that lets into a lane; unknown before the recording begins."""
-    past = episode.light_past[name][-history:] if history else []
+    past = episode.light_past[name][-history:].tolist() if history else []
     states = [LIGHT_UNKNOWN] * (history - len(past))
-    states += [*past, *episode.lights[name]]
+    states += [*past, *episode.lights[name].tolist()]
     return {
         "type": "TRAFFIC_LIGHT",
         "lane": name,
