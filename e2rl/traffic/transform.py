@@ -2,7 +2,6 @@
 every episode."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -10,17 +9,13 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.planners.ego import Ego
 from e2rl.planners.ego_errors import renumbered
-from e2rl.planners.ego_policy import answering, ask, from_outside
-from e2rl.planners.plausibility import checked_answer
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.run.errors import InputError
-from e2rl.scenes.recording import DT
-from e2rl.sim.dynamics import constant_velocity
 from e2rl.sim.env import DrivingEnv
-from e2rl.sim.world import World
 from e2rl.traffic.grouping import put_rows, take_rows
+from e2rl.traffic.lookahead import Lookahead
 from e2rl.traffic.pool import LIVE, TrafficPool
 from e2rl.traffic.traffic import (
     REPLAN_STEPS,
@@ -54,16 +49,20 @@ class AdversarialSynthesizer(Transform):
         traffic: Traffic | None = None,
         ego: Ego | None = None,
     ) -> None:
-        """draw: `env.set_seed` seeds its `generator`, if it has one; traffic: drives
-        LIVE rows; ego: the ego that a method with `queries_ego` queries."""
+        """Args:
+        pool: rows that episodes are drawn from.
+        draw: count -> pool rows [count]; `env.set_seed` seeds its `generator`, if it
+            has one.
+        traffic: drives LIVE rows.
+        ego: the ego that a method with `queries_ego` queries.
+        """
         super().__init__()
         self.pool = pool
         self.draw = draw
         self.traffic = traffic
         self.ego = ego
-        self.on_plan: Callable[[TrafficPlan], None] | None = (
-            None  # called with every new plan
-        )
+        # Called with every new plan.
+        self.on_plan: Callable[[TrafficPlan], None] | None = None
         nothing = torch.zeros(0, dtype=torch.int64)  # before the first reset
         self._drawn = nothing  # [B] pool row of each episode
         self._state: State = None
@@ -93,19 +92,15 @@ class AdversarialSynthesizer(Transform):
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=env.batch_size, device=env.device)
         mask = tensordict.get("_reset", None)
-        mask = (
-            torch.ones(env.batch_size, dtype=torch.bool)
-            if mask is None
-            else mask.view(env.batch_size).cpu()
-        )
-        rows = mask.nonzero()[:, 0]
+        if mask is None:
+            mask = torch.ones(env.batch_size, dtype=torch.bool)
+        rows = mask.view(env.batch_size).cpu().nonzero()[:, 0]
         if not len(self._drawn):
             self._drawn = torch.zeros(env.batch_size, dtype=torch.int64)
         self._drawn[rows] = self.draw(len(rows)).cpu()
         self._inject(rows)
-        tensordict["scene_index"] = self.pool.scene_index[self._drawn][:, None].to(
-            env.device
-        )
+        scene_index = self.pool.scene_index[self._drawn][:, None]
+        tensordict["scene_index"] = scene_index.to(env.device)
         return tensordict
 
     def _inject(self, rows: Tensor) -> None:
@@ -123,13 +118,12 @@ class AdversarialSynthesizer(Transform):
         if self.traffic is not None:
             self._begin(tensordict_reset["timestep"][:, 0] == 0)
         written = self._write(tensordict_reset)
-        known = tensordict is not None and ("traffic", "plan") in tensordict.keys(True)
-        if (
-            self.traffic is not None and not known
-        ):  # a collector would stack what the first reset returns
-            del written[
-                "traffic", "plan"
-            ]  # it is constant velocity, which is also the default without a plan
+        key = ("traffic", "plan")
+        first = tensordict is None or key not in tensordict.keys(True)
+        if self.traffic is not None and first:
+            # A collector would stack it; it is constant velocity, which is also the
+            # default without a plan.
+            del written[key]
         return written
 
     def _begin(self, first: Tensor) -> None:
@@ -139,18 +133,16 @@ class AdversarialSynthesizer(Transform):
         rows = first.nonzero()[:, 0]
         world = env.world()
         drawn = self._drawn[rows.cpu()]
-        seed, eta = (
-            getattr(self.pool, name)[drawn].to(env.device) for name in ("seed", "eta")
-        )
         begins = not len(self._planned_at)
         whole = begins or len(rows) == len(first)
-        decided = (
-            {"decisions": self.pool.decisions[drawn].to(env.device)}
-            if self._method.follows_decisions
-            else {}
-        )
+        options = {}
+        if self._method.follows_decisions:
+            options["decisions"] = self.pool.decisions[drawn].to(env.device)
         fresh = self._method.reset(
-            world.scene if whole else world.scene[rows], seed, eta, **decided
+            world.scene if whole else world.scene[rows],
+            self.pool.seed[drawn].to(env.device),
+            self.pool.eta[drawn].to(env.device),
+            **options,
         )
         self._state = fresh if whole else put_rows(self._state, rows, new=fresh)
         if begins:
@@ -178,30 +170,28 @@ class AdversarialSynthesizer(Transform):
         if ego_plan is None:
             if self._method.knowledge == "plan":
                 raise InputError(
-                    'the policy writes no ("ego", "plan"), which this traffic is told (synthesizer.knowledge=plan): '
-                    "drive with an EgoPolicy, write the plan, or set synthesizer.knowledge=predicted"
+                    'the policy writes no ("ego", "plan"), which this traffic is told '
+                    "(synthesizer.knowledge=plan): drive with an EgoPolicy, write the "
+                    "plan, or set synthesizer.knowledge=predicted"
                 )
             ego_plan = keep_velocity(world.states[:, 0])  # nobody is told it
+        planned_at = world.step[rows]
+        state = self._state
         whole = len(rows) == len(world.step)
-        state, now = (
-            (self._state, world)
-            if whole
-            else (take_rows(self._state, rows), take_rows(world, rows))
-        )
-        queries = (
-            {"react": Lookahead(self.ego, now)}
-            if self._method.queries_ego and self.ego is not None
-            else {}
-        )
+        if not whole:
+            state = take_rows(state, rows)
+            world = take_rows(world, rows)
+            ego_plan = ego_plan[rows]
+        options = {}
+        if self._method.queries_ego and self.ego is not None:
+            options["react"] = Lookahead(self.ego, world)
         with renumbered(rows):
-            state, plan = self._method.replan(
-                state, now, ego_plan if whole else ego_plan[rows], **queries
-            )
+            state, plan = self._method.replan(state, world, ego_plan, **options)
         self._state = state if whole else put_rows(self._state, rows, new=state)
         self._plan[rows] = plan.states.to(self._plan.dtype)
         if self.on_plan is not None:
             self.on_plan(plan)
-        self._planned_at[rows] = world.step[rows]
+        self._planned_at[rows] = planned_at
         self._env.write_traffic(rows, plan.states, plan.present)
 
     def _step(
@@ -217,10 +207,10 @@ class AdversarialSynthesizer(Transform):
             keys["plan"] = self._plan_from(tensordict["timestep"][:, 0])
             replayed = (self.pool.source[self._drawn] != LIVE).to(device)
             if bool(replayed.any()):
-                now = self._env.world().states[:, : self._plan.shape[1]]
-                keys["plan"] = torch.where(
-                    replayed[:, None, None, None], keep_velocity(now), keys["plan"]
-                )
+                states = self._env.world().states[:, : self._plan.shape[1]]
+                going_on = keep_velocity(states)
+                replayed = replayed[:, None, None, None]
+                keys["plan"] = torch.where(replayed, going_on, keys["plan"])
         tensordict["traffic"] = TensorDict(
             keys, batch_size=tensordict.batch_size, device=device
         )
@@ -230,9 +220,8 @@ class AdversarialSynthesizer(Transform):
         """States [B, V, H, 4] planned for the steps after `step` [B]; the last state is
         held."""
         age = (step - self._planned_at.clamp(min=0)).clamp(min=0)
-        ahead = (age[:, None] + torch.arange(HORIZON, device=age.device)).clamp(
-            max=HORIZON - 1
-        )
+        ahead = age[:, None] + torch.arange(HORIZON, device=age.device)
+        ahead = ahead.clamp(max=HORIZON - 1)
         if bool((age == age[0]).all()):  # as where all scenes are replanned together
             return self._plan.index_select(2, ahead[0])
         row = torch.arange(len(age), device=age.device)[:, None]
@@ -258,52 +247,3 @@ class AdversarialSynthesizer(Transform):
             row=row, shape=env.batch_size, device=env.device
         )
         return observation_spec
-
-
-@dataclass
-class Lookahead:
-    """The ego's reaction to a plan of the other vehicles: its own policy, a black box,
-    rolled out in scenes [B] against the plan; period: steps between two ego plans."""
-
-    ego: Ego
-    world: World
-    period: int = 10
-
-    @torch.no_grad()
-    def __call__(self, rows: Tensor, planned: Tensor) -> Tensor:
-        """The egos' states [G, HORIZON, 4] in scenes rows [G] against vehicles planned
-        [G, V, HORIZON, 4], but for row 0; agents without a plan keep their velocity."""
-        whole = len(rows) == len(self.world.step) and bool((rows.diff() > 0).all())
-        world = self.world if whole else replace(take_rows(self.world, rows), plan=None)
-        world = (
-            world.shown() if from_outside(self.ego) else world
-        )  # of now: it is asked about steps to come
-        states = world.states
-        vehicles = planned.shape[1]
-        pieces = []
-        ends = torch.arange(
-            self.period, HORIZON + self.period, self.period, device=states.device
-        )
-        moved = constant_velocity(states[:, vehicles:], DT * ends)
-        now = world
-        for number, after in enumerate(ends.tolist()):
-            with renumbered(rows), answering(now):
-                answer = ask(self.ego, "plan", world=now, scene=world.scene)
-                plan = checked_answer(
-                    answer,
-                    self.ego,
-                    method="plan",
-                    shape=(len(now.step), PLAN_STEPS, 4),
-                    begins=False,
-                )
-            pieces.append(plan[:, : self.period])
-            ego = pieces[-1][:, -1:]
-            others = planned[:, 1:, min(after, HORIZON) - 1]
-            place = (
-                None
-                if now.mission_s is None
-                else now.mission_s + DT * pieces[-1][..., 3].sum(1)
-            )
-            states = torch.cat([ego, others, moved[:, :, number]], 1)
-            now = replace(now, step=world.step + after, states=states, mission_s=place)
-        return torch.cat(pieces, 1)[:, :HORIZON]

@@ -21,9 +21,9 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.recording import LIGHT_GREEN
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.traffic.lookahead import Lookahead
 from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.rule_based import ConstantVelocity, LogReplay
-from e2rl.traffic.transform import Lookahead
 from tests.planners.planners import driven, world_of, worlds
 from tests.synthetic import make_scenes
 

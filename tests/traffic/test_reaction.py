@@ -5,8 +5,8 @@ import torch
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
+from e2rl.traffic.lookahead import Lookahead
 from e2rl.traffic.motion import constant_speed_states
-from e2rl.traffic.transform import Lookahead
 from tests.traffic.e2.traffic_scenes import EGO, scenes
 
 TIMES = DT * torch.arange(1, HORIZON + 1)

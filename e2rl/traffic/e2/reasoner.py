@@ -256,12 +256,12 @@ class LanguageReasoner:
     def __init__(self, settings: ReasonerSettings) -> None:
         where = "synthesizer.reasoner.kind=lm"
         openai = library("openai", where, extra="lm")
-        given: dict[str, Any] = {
-            "base_url": settings.base_url,
-            "timeout": settings.timeout,
-        }
         try:
-            self._client = openai.OpenAI(**given, max_retries=settings.retries)
+            self._client = openai.OpenAI(
+                base_url=settings.base_url,
+                timeout=settings.timeout,
+                max_retries=settings.retries,
+            )
         except openai.OpenAIError as error:
             reason = f"{str(error).splitlines()[0]} (for an endpoint without keys any OPENAI_API_KEY will do)"
             raise InputError(f"{where}: {reason}") from error
@@ -282,24 +282,20 @@ class LanguageReasoner:
         criteria = torch.stack(
             [rules.associated, rules.conflicting, rules.relevant], -1
         ).cpu()
-        described = [
+        descriptions = [
             describe(scene, world, conflicts=rules.conflicts, row=row)
             for row in range(len(world.step))
         ]
+        egos, others = zip(*descriptions, strict=True)
         with ThreadPoolExecutor(self.settings.workers) as pool:
-            for row, verdicts in enumerate(
-                pool.map(self._verdicts, *zip(*described, strict=True))
-            ):
+            answers = pool.map(self._verdicts, egos, others)
+            for row, verdicts in enumerate(answers):
                 if verdicts:
-                    criteria[row, list(verdicts)] = torch.tensor(
-                        list(verdicts.values())
-                    )
+                    values = torch.tensor(list(verdicts.values()))
+                    criteria[row, list(verdicts)] = values
         vehicles = rules.mask.shape[1]
-        mask = (
-            criteria.all(-1).to(rules.mask.device)
-            & world.valid[:, :vehicles]
-            & ~scene["parked"][:, :vehicles]
-        )
+        present = world.valid[:, :vehicles] & ~scene["parked"][:, :vehicles]
+        mask = criteria.all(-1).to(rules.mask.device) & present
         mask[:, 0] = False
         return replace(rules, mask=mask)
 

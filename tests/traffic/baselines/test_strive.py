@@ -8,7 +8,7 @@ import torch
 from e2rl.prior.sde import SamplerSettings
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.strive import blend, softmin
-from e2rl.traffic.transform import Lookahead
+from e2rl.traffic.lookahead import Lookahead
 from tests.prior.small import small_prior
 from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import EGO, begin, scenes
