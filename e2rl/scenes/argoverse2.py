@@ -12,10 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import hash_files
-from e2rl.scenes.log_files import bounded_memory, check_file
+from e2rl.scenes.log_files import (
+    bounded_memory,
+    check_file,
+)
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
     CYCLIST,
@@ -27,7 +31,10 @@ from e2rl.scenes.recording import (
     name_neighbours,
 )
 from e2rl.scenes.resampling import resample_uniform
-from e2rl.scenes.smoothing import signed_speed, speeds
+from e2rl.scenes.smoothing import (
+    signed_speed,
+    speeds,
+)
 from e2rl.scenes.source import Source
 
 FILES = ("scenario_*.parquet", "annotations*.feather")
@@ -191,13 +198,18 @@ def _check_table(path: Path) -> None:
 def _sensor_log(path: Path) -> Recording:
     """An annotated sensor log, still without a map. Boxes are given from the ego's pose
     at their time stamp."""
-    from av2.utils.io import read_city_SE3_ego, read_feather
+    from av2.utils.io import (
+        read_city_SE3_ego,
+        read_feather,
+    )
 
     table = read_feather(path)
     table = table[table["category"] != EGO_BOX]
     stamps, frame = np.unique(table["timestamp_ns"], return_inverse=True)
     names, first, track = np.unique(
-        table["track_uuid"].astype(str), return_index=True, return_inverse=True
+        table["track_uuid"].astype(str),
+        return_index=True,
+        return_inverse=True,
     )
     track = track + 1  # behind the ego's
     shape = (len(stamps), len(names) + 1)
@@ -222,7 +234,12 @@ def _sensor_log(path: Path) -> Recording:
     valid[frame, track] = True
     heights[frame, track] = position[:, 2]
     seconds = (stamps - stamps[0]) / 1e9
-    states, valid, resampled = resample_uniform(states, valid, seconds, heights)
+    states, valid, resampled = resample_uniform(
+        states,
+        valid,
+        seconds,
+        heights,
+    )
     states[..., 3] = speeds(states, valid)
     code = _files(path)[-1].stem.split("____")[-1].split("_")[0]
     sizes = table[["length_m", "width_m"]].to_numpy(float)[first]
@@ -241,11 +258,11 @@ def _sensor_log(path: Path) -> Recording:
     )
 
 
-def _types(kinds: list[str]) -> np.ndarray:
+def _types(kinds: list[str]) -> ndarray:
     return np.array([TYPES.get(kind.lower(), OTHER) for kind in kinds])
 
 
-def _forward(quaternions: np.ndarray) -> np.ndarray:
+def _forward(quaternions: ndarray) -> ndarray:
     """The x axis [K, 3] that unit quaternions [K, 4] turn to."""
     w, x, y, z = quaternions.T
     return np.stack(
@@ -253,11 +270,11 @@ def _forward(quaternions: np.ndarray) -> np.ndarray:
     )
 
 
-def _heading(axis: np.ndarray) -> np.ndarray:
+def _heading(axis: ndarray) -> ndarray:
     return np.arctan2(axis[..., 1], axis[..., 0])
 
 
-def _map(static_map: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
+def _map(static_map: Any) -> tuple[dict[str, Lane], list[ndarray]]:
     """Lanes for motor vehicles by segment id, and the drivable areas."""
     from av2.geometry.interpolate import compute_midpoint_line
     from av2.map.lane_segment import LaneType

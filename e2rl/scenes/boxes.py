@@ -26,23 +26,28 @@ def to_frame(points: Tensor, pose: Tensor) -> Tensor:
     delta = points - pose[..., :2]
     cos = pose[..., 2].cos()
     sin = pose[..., 2].sin()
-    return torch.stack(
-        [
-            cos * delta[..., 0] + sin * delta[..., 1],
-            cos * delta[..., 1] - sin * delta[..., 0],
-        ],
-        -1,
-    )
+    ahead = cos * delta[..., 0] + sin * delta[..., 1]
+    left = cos * delta[..., 1] - sin * delta[..., 0]
+    return torch.stack([ahead, left], -1)
 
 
 def separation(
-    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+    first: Tensor,
+    first_size: Tensor,
+    second: Tensor,
+    second_size: Tensor,
 ) -> Tensor:
-    """Largest gap [...] [m] over the four face normals (separating axis theorem),
-    differentiable.
+    """Returns the largest gap [...] [m] over the four face normals (separating axis
+    theorem), differentiable.
 
     Negative exactly where the interiors overlap (then minus the penetration depth);
     where positive, a lower bound of the distance.
+
+    Args:
+        first: poses [..., >= 3].
+        first_size: their sizes [..., 2] m.
+        second: other poses.
+        second_size: their sizes.
     """
     dx = second[..., 0] - first[..., 0]
     dy = second[..., 1] - first[..., 1]
@@ -52,7 +57,8 @@ def separation(
     sin_b = second[..., 2].sin()
     cos = (cos_a * cos_b + sin_a * sin_b).abs()
     sin = (sin_a * cos_b - cos_a * sin_b).abs()
-    (la, wa), (lb, wb) = (first_size / 2).unbind(-1), (second_size / 2).unbind(-1)
+    la, wa = (first_size / 2).unbind(-1)
+    lb, wb = (second_size / 2).unbind(-1)
     gap_first = torch.maximum(
         (dx * cos_a + dy * sin_a).abs() - (la + cos * lb + sin * wb),
         (dy * cos_a - dx * sin_a).abs() - (wa + sin * lb + cos * wb),
@@ -65,52 +71,94 @@ def separation(
 
 
 def overlap(
-    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+    first: Tensor,
+    first_size: Tensor,
+    second: Tensor,
+    second_size: Tensor,
 ) -> Tensor:
-    """Bool [...]: the interiors overlap. A broad phase by centre distance first, so
-    that only near pairs cost much.
+    """Returns whether the interiors overlap [...]. A broad phase by centre distance
+    first, so that only near pairs cost much.
 
     Picks the near pairs by index, which waits for the device; where that matters use
     `separation(...) < 0`.
+
+    Args:
+        first, first_size, second, second_size: see `separation`.
     """
     reach = (first_size.norm(dim=-1) + second_size.norm(dim=-1)) / 2
     near = (first[..., :2] - second[..., :2]).square().sum(-1) < reach.square()
-    boxes = (first, first_size, second, second_size)
     if torch.compiler.is_compiling():
-        return near & (separation(*boxes) < 0)
-    picked = [box.expand(*near.shape, box.shape[-1])[near] for box in boxes]
-    return near.masked_scatter(near, separation(*picked) < 0)
+        gap = separation(
+            first,
+            first_size,
+            second=second,
+            second_size=second_size,
+        )
+        return near & (gap < 0)
+
+    def picked(box: Tensor) -> Tensor:
+        return box.expand(*near.shape, box.shape[-1])[near]
+
+    gap = separation(
+        picked(first),
+        picked(first_size),
+        second=picked(second),
+        second_size=picked(second_size),
+    )
+    return near.masked_scatter(near, gap < 0)
 
 
 def distance(
-    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+    first: Tensor,
+    first_size: Tensor,
+    second: Tensor,
+    second_size: Tensor,
 ) -> Tensor:
-    """Distance [...] [m] between two boxes, 0 where they overlap; the nearest points
-    include a corner of one."""
-    return signed_distance(
-        first, first_size, second=second, second_size=second_size
-    ).clamp(min=0)
+    """Returns the distance [...] [m] between two boxes, 0 where they overlap; the
+    nearest points include a corner of one.
+
+    Args:
+        first, first_size, second, second_size: see `separation`.
+    """
+    signed = signed_distance(
+        first,
+        first_size,
+        second=second,
+        second_size=second_size,
+    )
+    return signed.clamp(min=0)
 
 
 def signed_distance(
-    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+    first: Tensor,
+    first_size: Tensor,
+    second: Tensor,
+    second_size: Tensor,
 ) -> Tensor:
-    """`distance`, with minus the penetration depth where the boxes overlap."""
+    """Returns `distance`, with minus the penetration depth where the boxes overlap.
 
-    def corner_gap(
-        box: Tensor, size: Tensor, other: Tensor, other_size: Tensor
-    ) -> Tensor:
-        local = (
-            to_frame(corners(other, other_size), box[..., None, :]).abs()
-            - size[..., None, :] / 2
-        )
-        return local.clamp(min=0).square().sum(-1).amin(-1)
-
-    apart = separation(first, first_size, second=second, second_size=second_size)
+    Args:
+        first, first_size, second, second_size: see `separation`.
+    """
+    apart = separation(
+        first,
+        first_size,
+        second=second,
+        second_size=second_size,
+    )
     squared = torch.minimum(
-        corner_gap(first, first_size, second, second_size),
-        corner_gap(second, second_size, first, first_size),
+        _corner_gap(first, first_size, corners(second, second_size)),
+        _corner_gap(second, second_size, corners(first, first_size)),
     )
-    return torch.where(
-        apart < 0, apart, squared.clamp(min=1e-12).sqrt() * (squared > 0)
-    )
+    gap = squared.clamp(min=1e-12).sqrt() * (squared > 0)
+    return torch.where(apart < 0, apart, gap)
+
+
+def _corner_gap(
+    pose: Tensor,
+    size: Tensor,
+    points: Tensor,
+) -> Tensor:
+    """The least squared distance [...] of corners [..., 4, 2] from a box."""
+    offset = to_frame(points, pose[..., None, :]).abs() - size[..., None, :] / 2
+    return offset.clamp(min=0).square().sum(-1).amin(-1)

@@ -3,7 +3,10 @@ on which map."""
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import (
+    dataclass,
+    replace,
+)
 
 import numpy as np
 import torch
@@ -12,19 +15,53 @@ from scipy.spatial import cKDTree
 from tensordict import TensorDict
 
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting
+from e2rl.run.settings import (
+    configured,
+    setting,
+)
 from e2rl.scenes import boxes
 from e2rl.scenes.drivable_area import DrivableArea
-from e2rl.scenes.headings import hold_headings, mend_headings
-from e2rl.scenes.lane_graph import LaneGraph, Route
+from e2rl.scenes.headings import (
+    hold_headings,
+    mend_headings,
+)
+from e2rl.scenes.lane_graph import (
+    LaneGraph,
+    Route,
+)
 from e2rl.scenes.levels import Levels
 from e2rl.scenes.limits import known_limits
 from e2rl.scenes.log_route import route_from_log
-from e2rl.scenes.paths import direction, part_of, stacked, wrap
-from e2rl.scenes.plausibility import check, extent, map_fit, motion
-from e2rl.scenes.recording import AGENT_WORDS, VEHICLE, Recording
-from e2rl.scenes.route import BEHIND, SPACING, project, project_track
-from e2rl.scenes.smoothing import PAST, causal_past, causal_state, drop_jumps, smooth
+from e2rl.scenes.paths import (
+    direction,
+    part_of,
+    stacked,
+    wrap,
+)
+from e2rl.scenes.plausibility import (
+    check,
+    extent,
+    map_fit,
+    motion,
+)
+from e2rl.scenes.recording import (
+    AGENT_WORDS,
+    VEHICLE,
+    Recording,
+)
+from e2rl.scenes.route import (
+    BEHIND,
+    SPACING,
+    project,
+    project_track,
+)
+from e2rl.scenes.smoothing import (
+    PAST,
+    causal_past,
+    causal_state,
+    drop_jumps,
+    smooth,
+)
 
 Arrays = dict[str, ndarray]
 STANDING = 0.5  # m/s
@@ -116,13 +153,28 @@ class SceneBuilder:
         past = slice(frame + 1)
         kinds = recording.agent_type
         held, _ = hold_headings(self.mended[past], self.valid[past], kinds)
-        agents = _Agents(recording, self.settings, states=self.states, valid=valid)
+        agents = _Agents(
+            recording,
+            self.settings,
+            states=self.states,
+            valid=valid,
+        )
         scene, origin = agents.at(frame, held)
         away = self.levels.lanes_elsewhere(agents.heights(frame))
         lights = {name: index for index, name in enumerate(recording.lights)}
-        routes = _Routes(self.graph, self.settings, origin=origin, lights=lights)
+        routes = _Routes(
+            self.graph,
+            self.settings,
+            origin=origin,
+            lights=lights,
+        )
         scene |= routes.of(scene, away)
-        scene |= _lights(recording, frame, origin=origin, steps=self.settings.steps)
+        scene |= _lights(
+            recording,
+            frame,
+            origin=origin,
+            steps=self.settings.steps,
+        )
         scene |= self._map(scene, origin)
         tensors = {
             key: torch.from_numpy(np.ascontiguousarray(value))
@@ -210,7 +262,10 @@ class _Agents:
         tracks = chosen[cars]
         past = np.zeros((settings.vehicles, PAST, 3))
         past[self.rows[cars]] = causal_past(
-            held[:, tracks], valid[:, tracks], frame=frame, speed=start[tracks, 3]
+            held[:, tracks],
+            valid[:, tracks],
+            frame=frame,
+            speed=start[tracks, 3],
         )
         padded = self._padded
         kinds = self.recording.agent_type[chosen]
@@ -261,7 +316,12 @@ class _Agents:
         vehicle = self.recording.agent_type == VEHICLE
         offset = states[..., :2] - states[:, [ego], :2]
         distance = np.linalg.norm(offset, axis=-1)
-        path_distance, moves = _approach(states, valid & vehicle, valid[:, ego], ego)
+        path_distance, moves = _approach(
+            states,
+            valid & vehicle,
+            valid[:, ego],
+            ego,
+        )
         present = valid[0] & vehicle
         start_distance = np.where(present, distance[0], np.inf)
         start_distance[ego] = path_distance[ego] = -1.0
@@ -288,7 +348,10 @@ class _Agents:
 
 
 def _approach(
-    states: ndarray, valid: ndarray, ego_valid: ndarray, ego: int
+    states: ndarray,
+    valid: ndarray,
+    ego_valid: ndarray,
+    ego: int,
 ) -> tuple[ndarray, ndarray]:
     """Returns how near the path of each vehicle comes to the ego's [A] m, at whatever
     times, and whether it moves [A].
@@ -353,7 +416,12 @@ class _Routes:
         standing: list[tuple[int, Route]] = []  # whose candidates, one by one
         for row in np.flatnonzero(scene["valid"][: len(poses)]).tolist():
             pose = poses[row] + [*self.origin, 0.0, 0.0]
-            routes = graph.candidates(pose, slots, vertices=vertices, away=away(row))
+            routes = graph.candidates(
+                pose,
+                slots,
+                vertices=vertices,
+                away=away(row),
+            )
             for slot, route in enumerate(routes):
                 self._write((row, slot), route)
             if abs(pose[3]) < STANDING:
@@ -396,7 +464,11 @@ class _Routes:
             self.arrays["route_light_s"][place][k] = s
 
 
-def _on_lane(graph: LaneGraph, routes: list[Route], position: ndarray) -> ndarray:
+def _on_lane(
+    graph: LaneGraph,
+    routes: list[Route],
+    position: ndarray,
+) -> ndarray:
     """Whether positions [R, 2] on the map lie within the lane of the route of each
     there [R]."""
     along, across, _ = project(
@@ -427,7 +499,10 @@ def _driven(scene: Arrays, routes: Arrays) -> ndarray:
     length = torch.from_numpy(routes["route_length"])[valid]
     closed = ~torch.from_numpy(routes["route_open"])[valid]
     s, d, heading = project_track(
-        track[..., :2].contiguous(), points, known=recorded, start=BEHIND
+        track[..., :2].contiguous(),
+        points,
+        known=recorded,
+        start=BEHIND,
     )
     beyond = (s - length[:, None]).clamp(min=0) * closed[:, None]
     weight = recorded.double()
@@ -437,7 +512,13 @@ def _driven(scene: Arrays, routes: Arrays) -> ndarray:
     return torch.where(mean.min(1).values < FIT, mean.argmin(1), -1).numpy()
 
 
-def _lights(recording: Recording, frame: int, *, origin: ndarray, steps: int) -> Arrays:
+def _lights(
+    recording: Recording,
+    frame: int,
+    *,
+    origin: ndarray,
+    steps: int,
+) -> Arrays:
     """Light states over the simulated steps (the last known one goes on) and the points
     where their lanes begin."""
     lanes = [recording.lanes[name] for name in recording.lights]
@@ -458,5 +539,13 @@ def ego_overlaps(scene: TensorDict) -> str:
     others[0] = False
     pose = scene["start"].double()
     size = scene["size"].double()
-    overlap = boxes.overlap(pose[:1], size[:1], second=pose, second_size=size) & others
+    overlap = (
+        boxes.overlap(
+            pose[:1],
+            size[:1],
+            second=pose,
+            second_size=size,
+        )
+        & others
+    )
     return AGENT_WORDS[int(scene["agent_type"][overlap].min())] if overlap.any() else ""

@@ -15,11 +15,20 @@ from functools import lru_cache
 from importlib.resources import files
 
 import numpy as np
+from numpy import ndarray
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_arrays
-from e2rl.scenes.recording import VEHICLE, Lane, Recording
-from e2rl.scenes.source import Source, default_of
+from e2rl.scenes.paths import wrap
+from e2rl.scenes.recording import (
+    VEHICLE,
+    Lane,
+    Recording,
+)
+from e2rl.scenes.source import (
+    Source,
+    default_of,
+)
 
 SHA256 = {  # of the archives of the splits, as tools/generate_scenes.py prints them
     "train": "1cea380fbf9246395a7a4514e7a1d8e2d7acd83b82ba34e6a01e6411e0aafb3d",
@@ -31,9 +40,8 @@ FORMAT = "e2rl-scenes/1"
 FRAMES = 111
 CURRENT = 10
 MILLI = 1e-3
-UNIT = np.array(
-    [MILLI, MILLI, 1e-4, MILLI]
-)  # m, m, rad, m/s per stored step of x, y, heading, speed
+# m, m, rad, m/s per stored step of x, y, heading, speed
+UNIT = np.array([MILLI, MILLI, 1e-4, MILLI])
 MEND = "restore the file from git, or write it again with tools/generate_scenes.py"
 
 
@@ -47,37 +55,43 @@ class SceneMap:
 
     name: str
     lanes: dict[str, Lane]
-    drivable: list[np.ndarray]
-    lights: dict[str, np.ndarray]
+    drivable: list[ndarray]
+    lights: dict[str, ndarray]
 
     def recording(
         self,
         scene_id: str,
+        *,
         first: int,
-        states: np.ndarray,
-        valid: np.ndarray,
-        size: np.ndarray,
+        states: ndarray,
+        valid: ndarray,
+        size: ndarray,
         ego: int,
     ) -> Recording:
-        """Returns a recording of vehicles on this map, whose first frame is frame
-        `first` of the lights."""
-        lights = {
-            lane: state[first : first + len(states)]
-            for lane, state in self.lights.items()
-        }
-        where = (scene_id, self.name, "bundled")
-        kind = np.full(len(size), VEHICLE)
+        """Returns a recording of vehicles on this map.
+
+        Args:
+            scene_id: of the recording.
+            first: frame of the lights at its first frame.
+            states: [F, A, 4] of the vehicles.
+            valid: [F, A] where they are recorded.
+            size: [A, 2] m.
+            ego: index of its track.
+        """
+        frames = slice(first, first + len(states))
         return Recording(
-            *where,
-            states,
-            valid,
-            size,
-            kind,
-            ego,
-            self.lanes,
-            self.drivable,
-            lights,
-            CURRENT,
+            scene_id=scene_id,
+            location=self.name,
+            dataset="bundled",
+            states=states,
+            valid=valid,
+            size=size,
+            agent_type=np.full(len(size), VEHICLE),
+            ego=ego,
+            lanes=self.lanes,
+            drivable=self.drivable,
+            lights={lane: state[frames] for lane, state in self.lights.items()},
+            current=CURRENT,
         )
 
 
@@ -104,22 +118,25 @@ def asset_bytes(split: str) -> bytes:
     its file missing or altered."""
     if split not in SPLITS:
         raise InputError(
-            f"split {split!r} of the bundled scenes: expected one of {', '.join(SPLITS)}"
+            f"split {split!r} of the bundled scenes: "
+            f"expected one of {', '.join(SPLITS)}"
         )
     path = files("e2rl") / "assets" / "scenes" / f"{split}.npz"
     if not path.is_file():
         raise InputError(
-            f"bundled scenes: {path} is missing; reinstall the package or restore the file from git"
+            f"bundled scenes: {path} is missing; "
+            "reinstall the package or restore the file from git"
         )
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != SHA256[split]:
         raise InputError(
-            f"bundled scenes: {path} is damaged: not what comes with the package; {MEND}"
+            f"bundled scenes: {path} is damaged: not what comes with the package; "
+            f"{MEND}"
         )
     return content
 
 
-def unpack(split: str) -> dict[str, np.ndarray]:
+def unpack(split: str) -> dict[str, ndarray]:
     """Returns the arrays of a split's archive; raises InputError where they are damaged
     or of another format."""
     try:
@@ -133,69 +150,68 @@ def unpack(split: str) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _split(values: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
+def _split(values: ndarray, counts: ndarray) -> list[ndarray]:
     return np.split(values, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
-def read_maps(arrays: dict[str, np.ndarray]) -> list[SceneMap]:
+def read_maps(arrays: dict[str, ndarray]) -> list[SceneMap]:
     """Returns the maps of an archive; what is parked there is among the tracks of
     recordings."""
     ids = [str(name) for name in arrays["lane_id"]]
-    centrelines = _split(arrays["lane_points"] * MILLI, arrays["lane_counts"])
-    rows = zip(
-        centrelines,
-        arrays["lane_width"] * MILLI,
-        arrays["lane_speed"] * MILLI,
-        strict=True,
+    lines = _split(arrays["lane_points"] * MILLI, arrays["lane_counts"])
+    widths = (arrays["lane_width"] * MILLI).tolist()
+    limits = (arrays["lane_speed"] * MILLI).tolist()
+    lanes = list(
+        map(
+            Lane,
+            lines,
+            widths,
+            limits,
+        )
     )
-    lanes = [
-        Lane(points, float(width), speed_limit=float(speed))
-        for points, width, speed in rows
-    ]
-    for kind in ("exits", "left", "right"):
-        for a, b in arrays[kind]:
-            getattr(lanes[a], kind).append(ids[b])
+    for side in ("exits", "left", "right"):
+        for lane, other in arrays[side]:
+            getattr(lanes[lane], side).append(ids[other])
     polygons = _split(arrays["polygon_points"] * MILLI, arrays["polygon_counts"])
-    own = {
+    parts = {
         key: _split(np.arange(arrays[f"map_{key}"].sum()), arrays[f"map_{key}"])
         for key in ("lanes", "polygons", "lights")
     }
+    lamps = [ids[lane] for lane in arrays["light_lane"]]
     return [
         SceneMap(
-            str(name),
-            {ids[k]: lanes[k] for k in own["lanes"][m]},
-            drivable=[polygons[k] for k in own["polygons"][m]],
+            name=str(name),
+            lanes={ids[k]: lanes[k] for k in parts["lanes"][index]},
+            drivable=[polygons[k] for k in parts["polygons"][index]],
             lights={
-                ids[arrays["light_lane"][k]]: arrays["light_states"][k]
-                for k in own["lights"][m]
+                lamps[k]: arrays["light_states"][k] for k in parts["lights"][index]
             },
         )
-        for m, name in enumerate(arrays["map_name"])
+        for index, name in enumerate(arrays["map_name"])
     ]
 
 
-def read_recordings(arrays: dict[str, np.ndarray]) -> list[Recording]:
+def read_recordings(arrays: dict[str, ndarray]) -> list[Recording]:
     """Returns the recordings of an archive."""
     maps = read_maps(arrays)
-    counts = arrays["scene_agents"]
     states = np.cumsum(np.cumsum(arrays["states"], axis=1), axis=1) * UNIT
-    states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    states[..., 2] = wrap(states[..., 2])
     states[~arrays["valid"]] = 0.0
-    scenes = [
-        arrays[key] for key in ("scene_id", "scene_map", "scene_first", "scene_ego")
-    ]
-    tracks = [
-        _split(values, counts)
-        for values in (states, arrays["valid"], arrays["size"] * MILLI)
-    ]
-    return [
-        maps[index].recording(
-            str(scene_id), first, states.swapaxes(0, 1), valid.T, size, int(ego)
+    size = arrays["size"] * MILLI
+    ends = np.cumsum(arrays["scene_agents"])
+    recordings = []
+    for scene, end in enumerate(ends):
+        rows = slice(end - arrays["scene_agents"][scene], end)
+        recording = maps[arrays["scene_map"][scene]].recording(
+            str(arrays["scene_id"][scene]),
+            first=arrays["scene_first"][scene],
+            states=states[rows].swapaxes(0, 1),
+            valid=arrays["valid"][rows].T,
+            size=size[rows],
+            ego=int(arrays["scene_ego"][scene]),
         )
-        for scene_id, index, first, ego, states, valid, size in zip(
-            *scenes, *tracks, strict=True
-        )
-    ]
+        recordings.append(recording)
+    return recordings
 
 
 @lru_cache(maxsize=1)

@@ -9,17 +9,30 @@ its own, which is chosen by its simulated steps.
 """
 
 import io
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from math import inf, isfinite
+from collections.abc import (
+    Iterator,
+    Sequence,
+)
+from dataclasses import (
+    dataclass,
+    replace,
+)
+from math import (
+    inf,
+    isfinite,
+)
 from types import SimpleNamespace
 from typing import Any
 from xml.parsers import expat
 
 import numpy as np
+from numpy import ndarray
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.log_files import LogFiles, bounded_memory
+from e2rl.scenes.log_files import (
+    LogFiles,
+    bounded_memory,
+)
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
     CYCLIST,
@@ -32,7 +45,11 @@ from e2rl.scenes.recording import (
     Recording,
     light_colour,
 )
-from e2rl.scenes.resampling import FRAME_STEPS, latest_frames, resample_uniform
+from e2rl.scenes.resampling import (
+    FRAME_STEPS,
+    latest_frames,
+    resample_uniform,
+)
 
 KINDS = {  # ObstacleTypes; others are OTHER
     VEHICLE: "car truck bus motorcycle taxi vehicle priorityVehicle parkedVehicle",
@@ -79,7 +96,9 @@ class CommonRoadSource(LogFiles):
 
 
 def read_scenario(
-    content: bytes, starts: Sequence[int] | None = None, steps: int = STEPS
+    content: bytes,
+    starts: Sequence[int] | None = None,
+    steps: int = STEPS,
 ) -> Recording:
     """Returns the recording in an XML file at 10 Hz, with an ego for each window that
     has a vehicle at its start.
@@ -100,7 +119,12 @@ def read_scenario(
     frames = recording.start_frames(starts, steps) or [HISTORY]
     for start in frames:
         span = slice(start, start + steps + 1) if len(frames) > 1 else slice(None)
-        recording.egos[start] = _ego(recording, start, span=span, started=started)
+        recording.egos[start] = _ego(
+            recording,
+            start,
+            span=span,
+            started=started,
+        )
     egos = [ego for ego in recording.egos.values() if ego >= 0]
     return replace(recording, ego=egos[0] if egos else -1)
 
@@ -212,7 +236,7 @@ def _states(obstacle: Any) -> list:
     return [obstacle.initial_state, *(trajectory.state_list if trajectory else ())]
 
 
-def _state(state: Any, middle: np.ndarray) -> list[float]:
+def _state(state: Any, middle: ndarray) -> list[float]:
     """x, y of the box's middle, heading and speed; middle [2] m: seen from its origin. Raises InputError where they are
     intervals."""
     if state.is_uncertain_position or state.is_uncertain_orientation:
@@ -230,15 +254,25 @@ def _state(state: Any, middle: np.ndarray) -> list[float]:
     return [x, y, state.orientation, float(speed)]
 
 
-def _box(shape: Any) -> tuple[np.ndarray, np.ndarray]:
+def _box(shape: Any) -> tuple[ndarray, ndarray]:
     """Length and width [2] of the box around a shape, and its middle [2] seen from the
     shape's origin."""
-    pose = SimpleNamespace(position=np.zeros(2), orientation=0.0, hitch=0.0)
+    pose = SimpleNamespace(
+        position=np.zeros(2),
+        orientation=0.0,
+        hitch=0.0,
+    )
     bounds = np.array(shape.compute_occupancy_for_state(pose).shapely_object.bounds)
     return bounds[2:] - bounds[:2], (bounds[:2] + bounds[2:]) / 2
 
 
-def _ego(recording: Recording, start: int, *, span: slice, started: list[int]) -> int:
+def _ego(
+    recording: Recording,
+    start: int,
+    *,
+    span: slice,
+    started: list[int],
+) -> int:
     """Returns the ego's track in a window; -1 where no vehicle is there at its start.
 
     One of `started`, tracks that begin where a planning problem does, else the vehicle
@@ -256,7 +290,7 @@ def _ego(recording: Recording, start: int, *, span: slice, started: list[int]) -
     return int(np.lexsort((speed.sum(0), moves, present))[-1])
 
 
-def _map(network: Any) -> tuple[dict[str, Lane], list[np.ndarray]]:
+def _map(network: Any) -> tuple[dict[str, Lane], list[ndarray]]:
     """Lanes for cars by lanelet id, and the polygons of what they could drive on."""
     lanes = {}
     drivable = []
@@ -293,12 +327,14 @@ def _speed_limit(network: Any, lanelet: Any) -> float:
 
 
 def _lights(
-    network: Any, lanes: dict[str, Lane], steps: np.ndarray
-) -> dict[str, np.ndarray]:
+    network: Any,
+    lanes: dict[str, Lane],
+    steps: ndarray,
+) -> dict[str, ndarray]:
     """Light states [F] at time steps [F], by the lanes that the light lets in: the
     successors of the lanelet at whose end it stands. A lanelet with several lights is
     left out, since each may be for another direction."""
-    lights: dict[str, np.ndarray] = {}
+    lights: dict[str, ndarray] = {}
     for lanelet in network.lanelets:
         if len(lanelet.traffic_lights) != 1:
             continue

@@ -6,6 +6,7 @@ stands or faster than it can be steered.
 """
 
 import numpy as np
+from numpy import ndarray
 from scipy.ndimage import (
     convolve1d,
     maximum_filter1d,
@@ -13,9 +14,19 @@ from scipy.ndimage import (
     minimum_filter1d,
 )
 
-from e2rl.scenes.paths import direction, wrap
-from e2rl.scenes.recording import DT, HIDDEN, PEDESTRIAN
-from e2rl.scenes.runs import last_valid, runs_of
+from e2rl.scenes.paths import (
+    direction,
+    wrap,
+)
+from e2rl.scenes.recording import (
+    DT,
+    HIDDEN,
+    PEDESTRIAN,
+)
+from e2rl.scenes.runs import (
+    last_valid,
+    runs_of,
+)
 from e2rl.scenes.smoothing import MAX_STEP
 
 HALF = 3  # frames before and after over which the direction of motion is taken
@@ -43,8 +54,10 @@ HELD = 0.1  # rad that a heading must turn while it stands to count as repaired
 
 
 def mend_headings(
-    states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray
-) -> tuple[np.ndarray, dict[str, int]]:
+    states: ndarray,
+    valid: ndarray,
+    agent_type: ndarray,
+) -> tuple[ndarray, dict[str, int]]:
     """Returns tracks whose headings are neither turned round nor spiked, and the count
     of mended tracks by a phrase.
 
@@ -69,8 +82,10 @@ def mend_headings(
 
 
 def hold_headings(
-    states: np.ndarray, valid: np.ndarray, agent_type: np.ndarray
-) -> tuple[np.ndarray, int]:
+    states: ndarray,
+    valid: ndarray,
+    agent_type: ndarray,
+) -> tuple[ndarray, int]:
     """Returns tracks whose headings do not change while they stand, and the number of
     tracks that this turns by HELD.
 
@@ -91,13 +106,18 @@ def hold_headings(
         standing = stands[frames, agent]
         track = states[frames, agent]
         heading = np.unwrap(track[:, 2])
-        held = _held(frames, heading, standing=standing, position=track[:, :2])
+        held = _held(
+            frames,
+            heading,
+            standing=standing,
+            position=track[:, :2],
+        )
         out[frames, agent, 2] = np.where(standing, wrap(held), track[:, 2])
         count += bool((np.abs(held - heading) > HELD).any())
     return out, count
 
 
-def standing_frames(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def standing_frames(position: ndarray, valid: ndarray) -> ndarray:
     """Returns whether tracks [F, A, 2] stand [F, A]: in WINDOW frames about then, or in
     all that there are on end, the line through their positions has a slope of at most
     STANDS."""
@@ -112,26 +132,41 @@ def standing_frames(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
     if len(valid) >= WINDOW:
         origin = np.where(valid[..., None], position, np.inf).min(0)
         place = np.where(valid[..., None], position - origin, 0.0)
-        velocity = convolve1d(place, _slope(WINDOW)[::-1], axis=0, mode="constant")
-        whole = minimum_filter1d(valid, WINDOW, axis=0, mode="constant")
+        velocity = convolve1d(
+            place,
+            _slope(WINDOW)[::-1],
+            axis=0,
+            mode="constant",
+        )
+        whole = minimum_filter1d(
+            valid,
+            WINDOW,
+            axis=0,
+            mode="constant",
+        )
         slow = whole & (np.linalg.norm(velocity, axis=-1) < STANDS)
-        standing |= maximum_filter1d(slow, WINDOW, axis=0, mode="constant")
+        standing |= maximum_filter1d(
+            slow,
+            WINDOW,
+            axis=0,
+            mode="constant",
+        )
     return standing
 
 
-def _slope(frames: int) -> np.ndarray:
+def _slope(frames: int) -> ndarray:
     """Weights [frames] of positions at DT that make the slope of their line."""
     time = (np.arange(frames) - (frames - 1) / 2) * DT
     return time / (time**2).sum()
 
 
 def _held(
-    frames: np.ndarray,
-    heading: np.ndarray,
+    frames: ndarray,
+    heading: ndarray,
     *,
-    standing: np.ndarray,
-    position: np.ndarray,
-) -> np.ndarray:
+    standing: ndarray,
+    position: ndarray,
+) -> ndarray:
     """The headings [K] of a track at its valid frames [K], held where it stands [K];
     heading [K]: without wraps."""
     held = heading.copy()
@@ -153,7 +188,7 @@ def _held(
     return held
 
 
-def _agreed(heading: np.ndarray) -> float:
+def _agreed(heading: ndarray) -> float:
     """The median of the headings [K] within CLUSTER of the one, the earliest, that most
     are near to."""
     ordered = np.sort(heading)
@@ -163,7 +198,7 @@ def _agreed(heading: np.ndarray) -> float:
     return float(np.median(heading[cluster]))
 
 
-def _motion(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _motion(states: ndarray, valid: ndarray) -> ndarray:
     """Mean velocities [F, A, 2] m/s over HALF frames to both sides, 0 where these have
     no one direction; the recorded ones of a frame that stands alone."""
     step = np.diff(states[..., :2], axis=0)
@@ -181,7 +216,7 @@ def _motion(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(count > 0, mean, states[..., 3:] * direction(states[..., 2]))
 
 
-def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _turned_round(states: ndarray, valid: ndarray) -> ndarray:
     """Which headings [F, A] are those of the back: the choice for each track that turns
     least and drives backwards least. Slow motion backwards alone turns nothing round:
     it is reversing."""
@@ -210,7 +245,7 @@ def _turned_round(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return turned
 
 
-def _flips_in_a_gap(heading: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _flips_in_a_gap(heading: ndarray, valid: ndarray) -> ndarray:
     """Whether a track [F, A] comes back from a gap turned by more than pi / 2 [A]."""
     last = last_valid(valid)[1:-1]
     turn = heading[1:] - heading[np.maximum(last, 0), np.arange(valid.shape[1])]
@@ -218,8 +253,10 @@ def _flips_in_a_gap(heading: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def _least_cost(
-    heading: np.ndarray, valid: np.ndarray, costs: np.ndarray
-) -> np.ndarray:
+    heading: ndarray,
+    valid: ndarray,
+    costs: ndarray,
+) -> ndarray:
     """Whether to turn each heading [F, A] round, at the least sum of turning from frame
     to frame [rad] and of the costs [F, A, 2] of the recorded heading and the turned one
     (Viterbi's algorithm). Turning in a gap costs less."""
@@ -246,7 +283,7 @@ def _least_cost(
     return chosen
 
 
-def _interpolate_spikes(states: np.ndarray, valid: np.ndarray) -> int:
+def _interpolate_spikes(states: ndarray, valid: ndarray) -> int:
     """Replace headings far from the median of their neighbours while a track moves, in
     place; returns of how many tracks."""
     least = min(height for _, height in SPIKES)
@@ -266,7 +303,7 @@ def _interpolate_spikes(states: np.ndarray, valid: np.ndarray) -> int:
     return count
 
 
-def _spikes(heading: np.ndarray) -> np.ndarray:
+def _spikes(heading: ndarray) -> ndarray:
     """Returns which headings [K] of frames without a long gap, and without wraps, are
     far from their median."""
     spike = np.zeros(len(heading), bool)

@@ -1,8 +1,14 @@
 """The lane graph of a recording (networkx), route candidates of a vehicle on it, and
 who drives against its lanes."""
 
-from dataclasses import dataclass, replace
-from heapq import heappop, heappush
+from dataclasses import (
+    dataclass,
+    replace,
+)
+from heapq import (
+    heappop,
+    heappush,
+)
 from typing import NamedTuple
 
 import networkx as nx
@@ -13,7 +19,11 @@ from scipy.ndimage import convolve1d
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from e2rl.scenes.links import adjacent, drivable_exits, plausible_width
+from e2rl.scenes.links import (
+    adjacent,
+    drivable_exits,
+    plausible_width,
+)
 from e2rl.scenes.paths import (
     arc_length,
     part_of,
@@ -24,7 +34,10 @@ from e2rl.scenes.paths import (
     wrap,
 )
 from e2rl.scenes.recording import Lane
-from e2rl.scenes.route import BEHIND, SPACING
+from e2rl.scenes.route import (
+    BEHIND,
+    SPACING,
+)
 
 START_RADIUS = 5.0  # m: lanes this close may be a vehicle's own
 START_ANGLE = 0.8  # rad from their direction
@@ -34,7 +47,7 @@ MAX_BRANCHES = 4
 AHEAD = 300.0  # m of route ahead of the vehicle
 REACH_TIME = 5.0  # s in which a fork is reached, from REACH_REST m on
 REACH_REST = 25.0
-REACHES = (40.0, 120.0)  # m: the least and the most within which forks count
+MIN_REACH, MAX_REACH = 40.0, 120.0  # m within which forks count
 BUCKET = 20.0  # m, in steps of which distances are rounded up: vehicles share searches
 SMOOTHING = 1.3  # vertices, standard deviation of the filter
 SMOOTHED_ENDS = 6  # vertices, odd extension beyond the ends
@@ -122,7 +135,10 @@ class LaneGraph:
         self._paths: dict[tuple[str, ...], LanePath] = {}
 
     def near_lanes(
-        self, position: ndarray, heading: float, away: ndarray | None = None
+        self,
+        position: ndarray,
+        heading: float,
+        away: ndarray | None = None,
     ) -> list[tuple[str, float]]:
         """(lane, arc length of its nearest point) of the lanes near a pose, best first,
         each once.
@@ -156,7 +172,12 @@ class LaneGraph:
         angle = tangent_angle(self.line[name])
         return abs(wrap(angle[-1] - angle[0]))
 
-    def branches(self, lane: str, begin: float, reach: float) -> list[list[str]]:
+    def branches(
+        self,
+        lane: str,
+        begin: float,
+        reach: float,
+    ) -> list[list[str]]:
         """Lane sequences for AHEAD m from arc length `begin` of `lane`, at most
         MAX_BRANCHES, the straightest first.
 
@@ -221,7 +242,12 @@ class LaneGraph:
             self._paths[key] = LanePath(line, arc_length(line), starts)
         return self._paths[key]
 
-    def route(self, lanes: list[str], begin: float, vertices: int) -> Route:
+    def route(
+        self,
+        lanes: list[str],
+        begin: float,
+        vertices: int,
+    ) -> Route:
         """The smoothed route along `lanes` from arc length `begin` of the first lane,
         `vertices` points long."""
         line, arc, starts = self.path(lanes)
@@ -242,7 +268,11 @@ class LaneGraph:
         )
 
     def candidates(
-        self, pose: ndarray, count: int, vertices: int, away: ndarray | None = None
+        self,
+        pose: ndarray,
+        count: int,
+        vertices: int,
+        away: ndarray | None = None,
     ) -> list[Route]:
         """Returns route candidates of a vehicle, those of the nearest lane first.
 
@@ -256,7 +286,8 @@ class LaneGraph:
             vertices: of a route.
             away: bool [P], points of the graph that are on another level.
         """
-        reach = float(np.clip(REACH_TIME * pose[3] + REACH_REST, *REACHES))
+        reach = REACH_TIME * pose[3] + REACH_REST
+        reach = float(np.clip(reach, MIN_REACH, MAX_REACH))
         routes: list[Route] = []
         points = np.empty((count, vertices, 2))
         for lane, s in self.near_lanes(pose[:2], pose[2], away=away):
@@ -309,7 +340,12 @@ def packed(rows: Tensor) -> tuple[Tensor, Tensor]:
     return index.masked_scatter(filled, rows.nonzero()[:, 1]), filled
 
 
-def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> Tensor:
+def against_lanes(
+    points: Tensor,
+    lane: Tensor,
+    xy: Tensor,
+    heading: Tensor,
+) -> Tensor:
     """Returns whether vehicles drive against their lanes: of those along which they
     drive, in either direction, the nearest runs against them.
 
@@ -347,6 +383,11 @@ def against_lanes(points: Tensor, lane: Tensor, xy: Tensor, heading: Tensor) -> 
     def nearest(chosen: Tensor) -> Tensor:
         least = torch.full_like(heading, torch.inf).flatten(0, 1)
         gaps = gap.masked_fill(~chosen, torch.inf)
-        return least.scatter_reduce(0, row, gaps, "amin").view_as(heading)
+        return least.scatter_reduce(
+            0,
+            row,
+            gaps,
+            "amin",
+        ).view_as(heading)
 
     return nearest(cosine < -ALONG) < nearest(cosine > ALONG)

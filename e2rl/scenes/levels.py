@@ -13,8 +13,15 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from e2rl.scenes.lane_graph import LaneGraph
-from e2rl.scenes.paths import arc_length, part_of
-from e2rl.scenes.recording import DT, VEHICLE, Recording
+from e2rl.scenes.paths import (
+    arc_length,
+    part_of,
+)
+from e2rl.scenes.recording import (
+    DT,
+    VEHICLE,
+    Recording,
+)
 
 LEVEL = 4.0  # m between levels: bridges leave as much to what passes below
 NEAR = 6.0  # m at most between ways that meet
@@ -34,7 +41,12 @@ class Levels:
     points of a LaneGraph, in the tracks' heights; NaN where it is unknown.
     """
 
-    def __init__(self, recording: Recording, graph: LaneGraph, valid: ndarray) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        graph: LaneGraph,
+        valid: ndarray,
+    ) -> None:
         """valid [F, A]: frames of the tracks that count."""
         self.recording = recording
         self.graph = graph
@@ -136,7 +148,11 @@ class Levels:
         return elsewhere
 
 
-def _pairs(tree: cKDTree, points: ndarray, radius: float) -> tuple[ndarray, ndarray]:
+def _pairs(
+    tree: cKDTree,
+    points: ndarray,
+    radius: float,
+) -> tuple[ndarray, ndarray]:
     """Indices [K] of points and of the points of a tree within `radius` m of them."""
     near = tree.query_ball_point(points, radius)
     return part_of(near), np.concatenate([*near, []]).astype(int)
@@ -172,7 +188,11 @@ def ego_climbs(recording: Recording, valid: ndarray) -> bool:
     return bool(high[recording.ego] > low[recording.ego] or np.median(change) == 0)
 
 
-def _reached(graph: LaneGraph, starts: dict[str, float], reach: float) -> list[str]:
+def _reached(
+    graph: LaneGraph,
+    starts: dict[str, float],
+    reach: float,
+) -> list[str]:
     """Lanes that begin at most `reach` m after places [m] on `starts`."""
     begin = {name: -place for name, place in starts.items()}
     waiting = list(starts)

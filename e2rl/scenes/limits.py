@@ -13,8 +13,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from e2rl.scenes.paths import arc_length, resample, tangent_angle, wrap
-from e2rl.scenes.recording import VEHICLE, Lane, Recording
+from e2rl.scenes.paths import (
+    arc_length,
+    resample,
+    tangent_angle,
+    wrap,
+)
+from e2rl.scenes.recording import (
+    VEHICLE,
+    Lane,
+    Recording,
+)
 
 HIGHEST = 45.0  # m/s, 162 km/h: no road's limit is higher
 HIGH = 22.0  # m/s, 79 km/h

@@ -16,7 +16,11 @@ import numpy as np
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
-from e2rl.scenes.paths import resample, tangent_angle, wrap
+from e2rl.scenes.paths import (
+    resample,
+    tangent_angle,
+    wrap,
+)
 from e2rl.scenes.recording import Lane
 
 JOIN_GAP = 1.5  # m between ends where a link is inferred
@@ -90,7 +94,11 @@ def ends_of(lanes: Iterable[Lane]) -> Ends:
     return Ends(columns[:2].T, columns[2:4].T, *columns[4:])
 
 
-def drivable(ends: Ends, lane: ndarray, other: ndarray) -> ndarray:
+def drivable(
+    ends: Ends,
+    lane: ndarray,
+    other: ndarray,
+) -> ndarray:
     """Whether a vehicle can drive from the end of lanes [Q] into others [Q], both
     indices.
 
@@ -109,7 +117,11 @@ def drivable(ends: Ends, lane: ndarray, other: ndarray) -> ndarray:
     return near & (turn < LINK_ANGLE) & _level(ends, lane, other)
 
 
-def _level(ends: Ends, lane: ndarray | int, other: ndarray) -> ndarray:
+def _level(
+    ends: Ends,
+    lane: ndarray | int,
+    other: ndarray,
+) -> ndarray:
     """Whether lanes [Q] end at the height at which others [Q] begin, as far as that is
     known."""
     return ~(np.abs(ends.low[other] - ends.high[lane]) >= JOIN_HEIGHT)
@@ -156,7 +168,11 @@ def drivable_exits(lanes: dict[str, Lane]) -> tuple[dict[str, list[str]], Counte
     return exits, +repairs
 
 
-def _followers(ends: Ends, tree: cKDTree, lane: int) -> ndarray:
+def _followers(
+    ends: Ends,
+    tree: cKDTree,
+    lane: int,
+) -> ndarray:
     """Indices of the lanes that follow one by geometry; tree: of their beginnings."""
     last = ends.last[lane]
     other = np.array(tree.query_ball_point(last, JOIN_GAP), int)
@@ -181,9 +197,18 @@ def adjacent(
     angle = {name: tangent_angle(line) for name, line in lines.items()}
 
     def lateral(name: str, other: str) -> float:
-        return _lateral(lines[name], angle[name], lines[other], angle[other])
+        return _lateral(
+            lines[name],
+            angle[name],
+            lines[other],
+            angle[other],
+        )
 
-    def nearest(name: str, recorded: list[str], side: int) -> list[str]:
+    def nearest(
+        name: str,
+        recorded: list[str],
+        side: int,
+    ) -> list[str]:
         others = [
             other
             for other in dict.fromkeys(recorded)
@@ -218,7 +243,10 @@ def adjacent(
 
 
 def _lateral(
-    line: ndarray, angle: ndarray, other: ndarray, other_angle: ndarray
+    line: ndarray,
+    angle: ndarray,
+    other: ndarray,
+    other_angle: ndarray,
 ) -> float:
     """Median distance [m], left positive, of a line [Q, 2] beside a line [P, 2] with
     points every 1 m; NaN where it runs nowhere beside it in the same direction."""

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import ClassVar
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import hash_files, open_regular, read_regular
+from e2rl.run.files import (
+    hash_files,
+    open_regular,
+    read_regular,
+)
 from e2rl.scenes.source import Source
 
-MAX_BYTES = (
-    1 << 26
-)  # of one log; the largest pickle of nuScenes v1.0-mini has 4 MB, the largest XML of NGSIM as well
+MAX_BYTES = 1 << 26  # of one log; the largest of nuScenes v1.0-mini and NGSIM have 4 MB
 MAX_MEMORY = 1 << 30  # bytes that reading one log may take
 PIECE = 4096  # bytes of a zip unpacked at a time: at most 7,000 times as many come out
 DAMAGED = (
@@ -31,9 +33,7 @@ class LogFiles(Source):
     subclass defines `read`."""
 
     ending: ClassVar[str]  # of a log's name, with the dot
-    ignored: ClassVar[
-        tuple[str, ...]
-    ] = ()  # names of files with that ending that are no logs
+    ignored: ClassVar[tuple[str, ...]] = ()  # files with that ending that are no logs
 
     def logs(self) -> list[str]:
         root = self.root()
@@ -42,25 +42,25 @@ class LogFiles(Source):
             names = [str(file.relative_to(root)) for file in files if not file.is_dir()]
         elif root.is_file() and zipfile.is_zipfile(root):
             with self.archive() as archive:
-                names = [
-                    name
-                    for name in sorted(archive.namelist())
-                    if name.endswith(self.ending)
-                ]
+                names = sorted(archive.namelist())
         else:
             raise InputError(f"data.path={root}: neither a folder nor a zip file")
-        names = [name for name in names if Path(name).name not in self.ignored]
-        if not names:
+        logs = [
+            name
+            for name in names
+            if name.endswith(self.ending) and Path(name).name not in self.ignored
+        ]
+        if not logs:
             raise InputError(
-                f"data.path={root}: holds no {self.ending} scenario; pass a folder or zip of {self.holds}"
+                f"data.path={root}: holds no {self.ending} scenario; "
+                f"pass a folder or zip of {self.holds}"
             )
-        return names
+        return logs
 
     def fingerprint(self) -> bytes:
         root = self.root()
-        return hash_files(
-            [root] if root.is_file() else [root / log for log in self.logs()]
-        )
+        files = [root] if root.is_file() else [root / log for log in self.logs()]
+        return hash_files(files)
 
     def archive(self) -> zipfile.ZipFile:
         """Returns the zip at `path`; raises InputError where its directory is damaged."""
@@ -82,7 +82,8 @@ class LogFiles(Source):
             return read_regular(root / log, MAX_BYTES)
         except OSError as error:
             raise InputError(
-                f"{log} in {root}: cannot be read: {error.strerror}; copy or export it again"
+                f"{log} in {root}: cannot be read: {error.strerror}; "
+                "copy or export it again"
             ) from error
 
 
@@ -111,16 +112,16 @@ def bounded_memory(most: int = MAX_MEMORY) -> Iterator[None]:
         yield
         return
     soft, hard = before = resource.getrlimit(resource.RLIMIT_DATA)
-    asked = pages * resource.getpagesize() + most
-    resource.setrlimit(
-        resource.RLIMIT_DATA,
-        (asked if soft == resource.RLIM_INFINITY else min(asked, soft), hard),
-    )
+    limit = pages * resource.getpagesize() + most
+    if soft != resource.RLIM_INFINITY:
+        limit = min(limit, soft)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
     try:
         yield
     except MemoryError as error:
         raise InputError(
-            f"takes more than the {most / 1e6:.0f} MB of memory of a log; cut it, or leave it out"
+            f"takes more than the {most / 1e6:.0f} MB of memory of a log; "
+            "cut it, or leave it out"
         ) from error
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, before)
@@ -132,12 +133,13 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
     try:
         if archive.getinfo(name).file_size > MAX_BYTES:
             raise ValueError(
-                f"it has more than the {MAX_BYTES / 1e6:.0f} MB of a log; cut it into scenarios"
+                f"it has more than the {MAX_BYTES / 1e6:.0f} MB of a log; "
+                "cut it into scenarios"
             )
         with archive.open(name) as stream:
             return b"".join(iter(lambda: stream.read(PIECE), b""))
     except DAMAGED as error:
-        where = f"{name} in {archive.filename}"
         raise InputError(
-            f"{where}: cannot be read: {error}; copy or export it again"
+            f"{name} in {archive.filename}: cannot be read: {error}; "
+            "copy or export it again"
         ) from error

@@ -3,16 +3,32 @@ changes, car parks)."""
 
 import numpy as np
 
-from e2rl.scenes.lane_graph import LaneGraph, Route, smooth_vertices
-from e2rl.scenes.paths import arc_length, direction, points_at, tangent_angle
-from e2rl.scenes.route import BEHIND, SPACING
+from e2rl.scenes.lane_graph import (
+    LaneGraph,
+    Route,
+    smooth_vertices,
+)
+from e2rl.scenes.paths import (
+    arc_length,
+    direction,
+    points_at,
+    tangent_angle,
+)
+from e2rl.scenes.route import (
+    BEHIND,
+    SPACING,
+)
 
 MARGIN = 10.0  # m after the recording that stay usable where no lane goes on
 JOIN = 10.0  # m over which the route passes from the recording to the lane that goes on
 STRIDE = 0.5  # m between the recorded points that are kept: standing vehicles jitter
 
 
-def route_from_log(graph: LaneGraph, track: np.ndarray, vertices: int) -> Route:
+def route_from_log(
+    graph: LaneGraph,
+    track: np.ndarray,
+    vertices: int,
+) -> Route:
     """The route along a recorded track [Q, 4], from BEHIND m before its start and on
     along the nearest lane at its end.
 

@@ -1,12 +1,21 @@
 """Polylines over their arc length, and angles."""
 
-from collections.abc import Iterable, Sized
+from collections.abc import (
+    Iterable,
+    Sized,
+)
 from typing import TypeVar
 
 import numpy as np
+from numpy import ndarray
 from torch import Tensor
 
-Angle = TypeVar("Angle", float, np.ndarray, Tensor)
+Angle = TypeVar(
+    "Angle",
+    float,
+    ndarray,
+    Tensor,
+)
 
 WHEELBASE = 0.6  # of the body's length, around its centre
 
@@ -16,31 +25,39 @@ def wrap(angle: Angle) -> Angle:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def direction(angle: np.ndarray) -> np.ndarray:
+def direction(angle: ndarray) -> ndarray:
     """Unit vectors [..., 2] of angles [...] rad."""
     return np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
-def stacked(lines: Iterable[np.ndarray]) -> np.ndarray:
+def stacked(lines: Iterable[ndarray]) -> ndarray:
     """Points [P, 2] of polylines, one after another."""
     return np.concatenate([np.zeros((0, 2)), *lines])
 
 
-def part_of(parts: Iterable[Sized]) -> np.ndarray:
+def part_of(parts: Iterable[Sized]) -> ndarray:
     """Index [P] of the part that each item belongs to, of parts one after another."""
     counts = [len(part) for part in parts]
     return np.repeat(np.arange(len(counts)), counts)
 
 
-def arc_length(points: np.ndarray) -> np.ndarray:
+def arc_length(points: ndarray) -> ndarray:
     """Cumulative length [..., P] of polylines [..., P, 2], starting at 0."""
     step = points[..., 1:, :] - points[..., :-1, :]
     arc = np.zeros(points.shape[:-1])
-    np.cumsum(np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2), axis=-1, out=arc[..., 1:])
+    np.cumsum(
+        np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2),
+        axis=-1,
+        out=arc[..., 1:],
+    )
     return arc
 
 
-def points_at(line: np.ndarray, arc: np.ndarray, at: np.ndarray) -> np.ndarray:
+def points_at(
+    line: ndarray,
+    arc: ndarray,
+    at: ndarray,
+) -> ndarray:
     """Points [Q, 2] of a polyline [P, 2] at arc lengths `at` [Q]; arc [P]: its own. It
     goes on straight at its end."""
     points = np.stack([np.interp(at, arc, line[:, axis]) for axis in range(2)], 1)
@@ -51,7 +68,7 @@ def points_at(line: np.ndarray, arc: np.ndarray, at: np.ndarray) -> np.ndarray:
     return points
 
 
-def resample(points: np.ndarray, spacing: float) -> np.ndarray:
+def resample(points: ndarray, spacing: float) -> ndarray:
     """Points [Q, 2] nearly every `spacing` m along points [P, 2]: the length is divided
     evenly."""
     arc = arc_length(points)
@@ -61,15 +78,22 @@ def resample(points: np.ndarray, spacing: float) -> np.ndarray:
     return points_at(points, arc, at=at)
 
 
-def tangent_angle(points: np.ndarray) -> np.ndarray:
+def tangent_angle(points: ndarray) -> ndarray:
     """Direction [P] rad of a polyline [P, 2] at its points."""
     x, y = np.gradient(points, axis=0).T
     return np.arctan2(y, x)
 
 
-def shift_left(points: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
+def shift_left(points: ndarray, distance: ndarray | float) -> ndarray:
     """Polyline [P, 2] shifted `distance` m (scalar or [P]) to its left."""
     tangent = np.gradient(points, axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-9)
+    tangent /= np.maximum(
+        np.linalg.norm(
+            tangent,
+            axis=-1,
+            keepdims=True,
+        ),
+        1e-9,
+    )
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], -1)
     return points + np.broadcast_to(distance, len(points))[:, None] * normal

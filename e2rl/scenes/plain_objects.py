@@ -6,42 +6,29 @@ arguments.
 """
 
 import re
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import (
+    Hashable,
+    Iterable,
+    Sequence,
+)
 from dataclasses import dataclass
 from math import prod
-from typing import Any, Literal
+from typing import (
+    Any,
+    Literal,
+)
 
 import numpy as np
 
-MAX_ITEMS = 20_000_000  # of an array, and of all that a reader meets who follows every reference
+# of an array, and of all that a reader meets who follows every reference
+MAX_ITEMS = 20_000_000
 DTYPE = re.compile(r"[?]|[biufc](1|2|4|8|16)|[SU][1-9]\d{0,4}|O[48]?")
 TEXTS = frozenset([str])
-KEYS = (
-    str,
-    int,
-    float,
-    bytes,
-    type(None),
-    np.str_,
-    np.integer,
-    np.floating,
-)  # hashed without recursion
+# types that are hashed without recursion
+KEYS = (str, int, float, bytes, type(None), np.str_, np.integer, np.floating)
 RECONSTRUCT = "numpy._core.multiarray._reconstruct"
-PLAIN = (
-    "set",
-    "frozenset",
-    "list",
-    "dict",
-    "tuple",
-    "int",
-    "float",
-    "bool",
-    "str",
-    "bytes",
-    "bytearray",
-    "complex",
-)
-NAMES = {f"builtins.{name}" for name in PLAIN} | {
+PLAIN = "set frozenset list dict tuple int float bool str bytes bytearray complex"
+NAMES = {f"builtins.{name}" for name in PLAIN.split()} | {
     "collections.defaultdict",
     "_codecs.encode",  # bytes in protocols 0 to 2
     "numpy.ndarray",
@@ -90,14 +77,24 @@ def called(path: str, arguments: tuple) -> Any:
         case "scalar", [np.dtype(kind=kind) as dtype, bytes() | str() as data] if (
             kind != "O"
         ):
-            return array_of(data, dtype, shape=(), order="C")[()]
+            return array_of(
+                data,
+                dtype,
+                shape=(),
+                order="C",
+            )[()]
         case "_frombuffer", [
             bytes() | bytearray() as data,
             np.dtype() as dtype,
             tuple(shape),
             "C" | "F" as order,
         ]:
-            return array_of(data, dtype, shape=shape, order=order)
+            return array_of(
+                data,
+                dtype,
+                shape=shape,
+                order=order,
+            )
         case "_frombuffer", [
             bytes() | bytearray() as data,
             np.dtype() as dtype,
@@ -105,7 +102,12 @@ def called(path: str, arguments: tuple) -> Any:
             "K",
             tuple(axes),
         ]:
-            return array_of(data, dtype, shape=shape, order="C").transpose(axes)
+            return array_of(
+                data,
+                dtype,
+                shape=shape,
+                order="C",
+            ).transpose(axes)
         case "encode", [str(text), "latin1" | "latin-1"]:
             return text.encode("latin-1")
         case "bytes" | "bytearray", []:
@@ -129,11 +131,8 @@ def dtype_of(name: str, state: Any) -> np.dtype:
     """A numpy type of plain elements; state: version, byte order, no parts and no
     fields, sizes, flags."""
     version, order, *parts = state
-    if (
-        version != 3
-        or order not in ("<", ">", "|", "=")
-        or parts[:3] != [None, None, None]
-    ):
+    plain = version == 3 and parts[:3] == [None, None, None]
+    if not plain or order not in ("<", ">", "|", "="):
         raise ValueError(
             f"holds arrays of other elements than numbers and text ({name})"
         )
@@ -141,10 +140,22 @@ def dtype_of(name: str, state: Any) -> np.dtype:
 
 
 def array_of(
-    data: Any, dtype: np.dtype, shape: tuple, order: Literal["C", "F"]
+    data: Any,
+    dtype: np.dtype,
+    shape: tuple,
+    order: Literal["C", "F"],
 ) -> np.ndarray:
-    """An array of exactly the bytes (or, of objects, the list) that the pickle holds
-    for it."""
+    """Returns an array of exactly what the pickle holds for it.
+
+    Args:
+        data: its bytes or, of objects, a list of them.
+        dtype: of its elements.
+        shape: of the array.
+        order: in which the bytes lie.
+
+    Raises:
+        ValueError: where these do not fit each other.
+    """
     if not isinstance(dtype, np.dtype) or type(shape) is not tuple or len(shape) > 8:
         raise ValueError("holds an array without type or shape")
     if not all(type(size) is int and 0 <= size <= MAX_ITEMS for size in shape):
@@ -168,11 +179,10 @@ def array_of(
     if dtype.kind == "b":  # a byte that is neither 0 nor 1 would miscount
         return (np.frombuffer(data, np.uint8) != 0).reshape(shape, order=order)
     flat = np.frombuffer(data, dtype)
-    if (
-        dtype.kind == "U"
-        and flat.view(np.dtype("u4").newbyteorder(dtype.byteorder)).max() > 0x10FFFF
-    ):
-        raise ValueError("holds text that is no Unicode")
-    return (flat if dtype.isnative else flat.astype(dtype.newbyteorder("="))).reshape(
-        shape, order=order
-    )
+    if dtype.kind == "U":
+        characters = flat.view(np.dtype("u4").newbyteorder(dtype.byteorder))
+        if characters.max() > 0x10FFFF:
+            raise ValueError("holds text that is no Unicode")
+    if not dtype.isnative:
+        flat = flat.astype(dtype.newbyteorder("="))
+    return flat.reshape(shape, order=order)

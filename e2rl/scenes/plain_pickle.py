@@ -32,20 +32,15 @@ from e2rl.scenes.plain_objects import (
     dtype_of,
 )
 
-MAX_OPCODES, MAX_CONTAINERS = (
-    5_000_000,
-    500_000,
-)  # the longest genuine log known has 150,000 and 80,000
+MAX_OPCODES = 5_000_000  # the longest genuine log known has 150,000
+MAX_CONTAINERS = 500_000  # and 80,000
 MAX_DEPTH = 64
 MAX_BITS = 64  # of a whole number
-HOLDING = frozenset(
-    [tuple, list, dict, set, frozenset, np.ndarray, Unbuilt]
-)  # types that hold or stand for others
+# types that hold or stand for others
+HOLDING = frozenset([tuple, list, dict, set, frozenset, np.ndarray, Unbuilt])
 LIBRARY: Any = pickle._Unpickler
-MOVED = {
-    "__builtin__": "builtins",
-    "numpy.core": "numpy._core",
-}  # modules under their old names
+# modules under their old names
+MOVED = {"__builtin__": "builtins", "numpy.core": "numpy._core"}
 
 
 def load_plain(content: bytes) -> Any:
@@ -56,11 +51,11 @@ def load_plain(content: bytes) -> Any:
     order; where it is the pickle's, they are not writeable.
     """
     machine = _Machine(BytesIO(content), encoding="latin-1")
-    made = machine.run()
+    data = machine.run()
     if machine.stack or machine.metastack:
         raise ValueError("is not one object")
-    machine.measure(made, 0)
-    return made
+    machine.measure(data, 0)
+    return data
 
 
 class _Machine(LIBRARY):
@@ -75,9 +70,8 @@ class _Machine(LIBRARY):
         self.stack: list[Any] = []
         self.append = self.stack.append
         self.containers = 0
-        self.shared: dict[
-            int, tuple[Any, int, int]
-        ] = {}  # by id: a container that is complete, its depth and items
+        # by id: a container that is complete, its depth and items
+        self.shared: dict[int, tuple[Any, int, int]] = {}
 
     def run(self) -> Any:
         """Returns what the program leaves at its end."""
@@ -107,9 +101,8 @@ class _Machine(LIBRARY):
         nests, and how many items it holds if all references are followed. What is
         shared was measured before, so the walk is over a tree."""
         kind = type(value)
-        known = self.shared.get(id(value))
-        if known is not None:
-            depth, items = known[1:]
+        if id(value) in self.shared:
+            _, depth, items = self.shared[id(value)]
         elif kind not in HOLDING:
             return 0, 1
         elif level >= MAX_DEPTH:
@@ -124,9 +117,9 @@ class _Machine(LIBRARY):
                 value = value.ravel().tolist() if value.dtype.kind == "O" else ()
             for part in () if HOLDING.isdisjoint(map(type, value)) else value:
                 if type(part) in HOLDING:
-                    below, more = self.measure(part, level + 1)
-                    depth = max(depth, below + 1)
-                    items = items + more - 1
+                    part_depth, part_items = self.measure(part, level + 1)
+                    depth = max(depth, part_depth + 1)
+                    items = items + part_items - 1
         if level + depth > MAX_DEPTH:
             raise ValueError(f"nests deeper than {MAX_DEPTH} levels")
         if items > MAX_ITEMS:
@@ -214,8 +207,12 @@ class _Machine(LIBRARY):
             target.value = dtype_of(target.dtype, state)
         else:
             _, shape, dtype, fortran, data = state
+            order = "F" if fortran else "C"
             target.value = array_of(
-                data, dtype, shape=shape, order="F" if fortran else "C"
+                data,
+                dtype,
+                shape=shape,
+                order=order,
             )
         self.append(target.value)
 
@@ -224,31 +221,34 @@ Handler = Callable[[_Machine], Any]
 
 
 def _handler(
-    name: str, before: Handler | None = None, after: Handler | None = None
+    name: str,
+    before: Handler | None = None,
+    after: Handler | None = None,
 ) -> Handler:
     """Returns the standard library's handler of an opcode, with a check before or after
     it."""
-    own = LIBRARY.dispatch[getattr(pickle, name)[0]]
+    handler = LIBRARY.dispatch[getattr(pickle, name)[0]]
 
     def handle(machine: _Machine) -> None:
         if before is not None:
             before(machine)
-        own(machine)
+        handler(machine)
         if after is not None:
             after(machine)
 
-    return own if before is after is None else handle
+    return handler if before is after is None else handle
 
 
 AS_THEY_ARE = (
-    "PROTO STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING "
-    "UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 "
-    "PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL"
+    "PROTO STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 FLOAT BINFLOAT STRING "
+    "BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 "
+    "BINBYTES SHORT_BINBYTES BINBYTES8 PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL "
+    "STACK_GLOBAL"
 )
 CONTAINERS = (
     "MARK EMPTY_LIST EMPTY_DICT EMPTY_SET EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 TUPLE LIST"
 )
-OWN: dict[str, Handler] = {
+BY_NAME: dict[str, Handler] = {
     **{name: _handler(name) for name in AS_THEY_ARE.split()},
     **{name: _handler(name, before=_Machine.counted) for name in CONTAINERS.split()},
     **{
@@ -272,4 +272,4 @@ OWN: dict[str, Handler] = {
     "REDUCE": _Machine.call,
     "BUILD": _Machine.build,
 }
-HANDLERS = {getattr(pickle, name): handler for name, handler in OWN.items()}
+HANDLERS = {getattr(pickle, name): handler for name, handler in BY_NAME.items()}

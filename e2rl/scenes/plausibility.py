@@ -7,7 +7,11 @@ measure it. LIMITS say what is plausible. The genuine logs measured (443 of Waym
 nuScenes, 239 bundled ones) stay far inside: their range stands beside each limit.
 """
 
-from math import inf, isnan, pi
+from math import (
+    inf,
+    isnan,
+    pi,
+)
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +20,16 @@ from scipy.spatial import cKDTree
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.lane_graph import LaneGraph
-from e2rl.scenes.paths import arc_length, wrap
-from e2rl.scenes.recording import DT, FEW_FRAMES, VEHICLE, Recording
+from e2rl.scenes.paths import (
+    arc_length,
+    wrap,
+)
+from e2rl.scenes.recording import (
+    DT,
+    FEW_FRAMES,
+    VEHICLE,
+    Recording,
+)
 
 FRAMES = 5  # between the two poses of a displacement: half a second
 MOVED = 1.0  # m of a displacement of a vehicle that moves
@@ -262,7 +274,10 @@ def displacements(recording: Recording) -> Displacements:
     chosen = recorded & drives & (recording.agent_type == VEHICLE)
     pose = states[spans[FRAMES // 2], :, :3]
     return Displacements(
-        moved[chosen], pose[chosen], speed[chosen], track=chosen.nonzero()[1]
+        moved[chosen],
+        pose[chosen],
+        speed[chosen],
+        track=chosen.nonzero()[1],
     )
 
 
@@ -290,7 +305,12 @@ def motion(recording: Recording) -> dict[str, float]:
         "ego_speed_ratio": _median(ratio[ego]),
         "ego_direction": _median(turned[far & ego]),
         "twins": _together(recording, np.unique(track[far])),
-        **_worst(distance[far], turned[far], ratio=ratio[far], track=track[far]),
+        **_worst(
+            distance[far],
+            turned[far],
+            ratio=ratio[far],
+            track=track[far],
+        ),
     }
 
 
@@ -306,12 +326,20 @@ def _together(recording: Recording, tracks: ndarray) -> float:
             if tree.count_neighbors(tree, TWIN) > CROWD + len(index):
                 return inf
             pairs.append(index[tree.query_pairs(TWIN, output_type="ndarray")])
-    count = np.unique(np.concatenate(pairs), axis=0, return_counts=True)[1]
+    count = np.unique(
+        np.concatenate(pairs),
+        axis=0,
+        return_counts=True,
+    )[1]
     return float(count.max(initial=0) * FRAMES * DT)
 
 
 def _worst(
-    distance: ndarray, turned: ndarray, *, ratio: ndarray, track: ndarray
+    distance: ndarray,
+    turned: ndarray,
+    *,
+    ratio: ndarray,
+    track: ndarray,
 ) -> dict[str, float]:
     """The largest deviations of one vehicle, of those that drive DRIVEN m: of its
     heading and of its speeds."""
@@ -347,7 +375,11 @@ def map_fit(recording: Recording, graph: LaneGraph) -> dict[str, float]:
     ego = recording.states[recording.valid[:, recording.ego], recording.ego, :2]
     driven = displacements(recording)
     pose = driven.pose[np.linalg.norm(driven.moved, axis=-1) > MOVED]
-    near = graph.tree.query(pose[:, :2], k=LANES, distance_upper_bound=LANE_RADIUS)[1]
+    near = graph.tree.query(
+        pose[:, :2],
+        k=LANES,
+        distance_upper_bound=LANE_RADIUS,
+    )[1]
     exists = near < len(graph.points)
     turn = graph.heading[np.where(exists, near, 0)] - pose[:, 2:]
     on = (exists & (np.abs(wrap(turn)) < LANE_ANGLE)).any(-1)
@@ -392,7 +424,11 @@ def lane_spacing(graph: LaneGraph) -> float:
     return _median(np.array(nearest))
 
 
-def _adjoin(apart: ndarray, room: ndarray, same: ndarray) -> ndarray:
+def _adjoin(
+    apart: ndarray,
+    room: ndarray,
+    same: ndarray,
+) -> ndarray:
     """Whether parallel lanes [Q] `apart` m from each other share a border.
 
     Their recorded widths say so, which make them `room` m apart. Where these are

@@ -6,17 +6,26 @@ ones and those with pauses in pieces.
 """
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import (
+    Iterator,
+    Mapping,
+)
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import (
+    Any,
+    NamedTuple,
+)
 
 import numpy as np
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import hash_files
-from e2rl.scenes.log_files import bounded_memory, check_file
+from e2rl.scenes.log_files import (
+    bounded_memory,
+    check_file,
+)
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
     CYCLIST,
@@ -30,7 +39,10 @@ from e2rl.scenes.recording import (
     light_colour,
     name_neighbours,
 )
-from e2rl.scenes.resampling import latest_frames, resample_uniform
+from e2rl.scenes.resampling import (
+    latest_frames,
+    resample_uniform,
+)
 from e2rl.scenes.smoothing import speeds
 from e2rl.scenes.source import Source
 
@@ -163,7 +175,11 @@ def _check_files(folder: Path) -> None:
             packed = (pa.ipc.open_file(source).schema.metadata or {}).get(b"metadata")
         if packed is None:
             continue
-        metadata = msgpack.unpackb(packed, raw=False, strict_map_key=False)
+        metadata = msgpack.unpackb(
+            packed,
+            raw=False,
+            strict_map_key=False,
+        )
         for key, value in _texts(metadata):
             if "class" in key and "." in value and not value.startswith(OWN):
                 raise InputError(
@@ -208,8 +224,20 @@ def _frames(scene: Any) -> list[Frame]:
     return frames
 
 
-def _box(kind: int, pose: Any, size: Any) -> Box:
-    return Box(kind, pose.x, pose.y, pose.z, pose.yaw, size.length, size.width)
+def _box(
+    kind: int,
+    pose: Any,
+    size: Any,
+) -> Box:
+    return Box(
+        kind,
+        pose.x,
+        pose.y,
+        pose.z,
+        pose.yaw,
+        size.length,
+        size.width,
+    )
 
 
 def _pieces(frames: list[Frame]) -> Iterator[list[Frame]]:
@@ -251,7 +279,12 @@ def _recording(scene_id: str, frames: list[Frame]) -> Recording:
     seconds = np.array([frame.time for frame in frames])
     seconds -= seconds[0]
     recorded = valid
-    states, valid, resampled = resample_uniform(states, valid, seconds, heights)
+    states, valid, resampled = resample_uniform(
+        states,
+        valid,
+        seconds,
+        heights,
+    )
     states[..., 3] = speeds(states, valid)
     sizes = [
         np.median(boxes[recorded[:, column], column, 5:], axis=0)

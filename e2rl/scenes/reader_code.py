@@ -30,19 +30,15 @@ def code_hash(kind: type) -> str | None:
     Args:
         kind: a class; its bases from the standard library do not count.
     """
-    names = dict.fromkeys(
-        each.__module__ for each in kind.__mro__ if not _is_standard(each.__module__)
-    )
     files: dict[str, Path | None] = {}
-    for name in names:
+    for name in _modules(kind):
         files[name] = _loaded_file(name)
         if not _is_own(name):
             files |= _imported_files(name, files[name])
-    if not all(file and file.is_file() for file in files.values()):
-        return None
     digest = hashlib.sha256()
     for name, file in sorted(files.items()):
-        assert file is not None
+        if file is None or not file.is_file():
+            return None
         digest.update(name.encode() + hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 
@@ -55,29 +51,27 @@ def failed_line(kind: type, trace: TracebackType | None) -> str:
         kind: the class that was called, to whose folder the code belongs.
         trace: of the exception.
     """
-    names = [
-        each.__module__ for each in kind.__mro__ if not _is_standard(each.__module__)
-    ]
-    files = [(name, _loaded_file(name)) for name in names if not _is_own(name)]
-    folders = [_folder(name, file) for name, file in files if file]
-    known = {str(file) for _, file in files}
+    names = [name for name in _modules(kind) if not _is_own(name)]
+    files = {name: file for name in names if (file := _loaded_file(name))}
+    folders = [_folder(name, file) for name, file in files.items()]
+    paths = set(map(str, files.values()))
     line = ""
     while trace is not None:
-        name = trace.tb_frame.f_code.co_filename
-        trace_line = trace.tb_lineno
-        path = Path(name)
-        beside = any(
-            path.is_relative_to(folder) and not _is_installed(path, folder)
-            for folder in folders
-        )
+        code = trace.tb_frame.f_code.co_filename
         module = trace.tb_frame.f_globals.get("__name__", "")
-        interactive = (
-            name.startswith("<") and not _is_own(module) and not _is_standard(module)
-        )
-        if (beside and not _is_own(module)) or name in known or interactive:
-            line = f"{name}:{trace_line}"
+        beside = any(_is_inside(Path(code), folder) for folder in folders)
+        interactive = code.startswith("<") and not _is_standard(module)
+        if code in paths or ((beside or interactive) and not _is_own(module)):
+            line = f"{code}:{trace.tb_lineno}"
         trace = trace.tb_next
     return line
+
+
+def _modules(kind: type) -> list[str]:
+    """Returns the modules that define a class and its bases, without the standard
+    library's."""
+    names = dict.fromkeys(base.__module__ for base in kind.__mro__)
+    return [name for name in names if not _is_standard(name)]
 
 
 def _is_own(module: str) -> bool:
@@ -88,10 +82,11 @@ def _is_standard(module: str) -> bool:
     return module.partition(".")[0] in sys.stdlib_module_names and module != "__main__"
 
 
-def _is_installed(path: Path, folder: Path) -> bool:
-    """Returns whether a file below a folder belongs to a library that is installed
-    there."""
-    return bool(INSTALLED & set(path.relative_to(folder).parts))
+def _is_inside(path: Path, folder: Path) -> bool:
+    """Returns whether a file lies below a folder, and in no library installed there."""
+    if not path.is_relative_to(folder):
+        return False
+    return INSTALLED.isdisjoint(path.relative_to(folder).parts)
 
 
 def _loaded_file(module: str) -> Path | None:
@@ -114,7 +109,7 @@ def _imported_files(module: str, file: Path | None) -> dict[str, Path | None]:
     if file is None:
         return {}
     folder = _folder(module, file)
-    found: dict[str, Path | None] = {module: file}
+    files: dict[str, Path | None] = {module: file}
     waiting = [(module, file)]
     while waiting:
         name, path = waiting.pop()
@@ -122,11 +117,11 @@ def _imported_files(module: str, file: Path | None) -> dict[str, Path | None]:
             continue
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         for imported, place in _located(_imports(path, package)):
-            inside = place.is_relative_to(folder) and not _is_installed(place, folder)
-            if imported not in found and inside and not _is_own(imported):
-                found[imported] = place
+            inside = _is_inside(place, folder) and not _is_own(imported)
+            if inside and imported not in files:
+                files[imported] = place
                 waiting.append((imported, place))
-    return found
+    return files
 
 
 def _imports(file: Path, package: str) -> Iterator[str]:
@@ -162,9 +157,8 @@ def _located(names: Iterator[str]) -> Iterator[tuple[str, Path]]:
         folders = None
         for depth in range(len(parts)):
             part = ".".join(parts[: depth + 1])
-            spec = getattr(
-                sys.modules.get(part), "__spec__", None
-            ) or PathFinder.find_spec(part, folders)
+            loaded = getattr(sys.modules.get(part), "__spec__", None)
+            spec = loaded or PathFinder.find_spec(part, folders)
             if spec is None:
                 break
             if spec.has_location and spec.origin:

@@ -2,12 +2,21 @@
 host, in numpy."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import (
+    Iterator,
+    Mapping,
+    Sequence,
+)
+from dataclasses import (
+    dataclass,
+    field,
+    replace,
+)
 from itertools import chain
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from e2rl.run.errors import InputError
 
@@ -38,13 +47,13 @@ class Lane:
     levels of bridges apart).
     """
 
-    points: np.ndarray
+    points: ndarray
     width: float = 0.0
     speed_limit: float = 0.0
     exits: list[str] = field(default_factory=list)
     left: list[str] = field(default_factory=list)
     right: list[str] = field(default_factory=list)
-    heights: np.ndarray | None = None
+    heights: ndarray | None = None
 
 
 def light_colour(name: object, otherwise: int = LIGHT_UNKNOWN) -> int:
@@ -73,7 +82,7 @@ FIELDS: tuple[tuple[str, Any, str], ...] = (  # name, classes, in words
     ("drivable", list | tuple, "a list of arrays"),
     ("repairs", Mapping, "a Counter"),
     ("egos", Mapping, "a dict of frames and tracks"),
-    ("heights", np.ndarray | None, "an array [frames, agents], or None"),
+    ("heights", ndarray | None, "an array [frames, agents], or None"),
     ("towed", list | tuple, "a tuple of tracks"),
     ("coupled", list | tuple, "a tuple of tracks"),
 )
@@ -118,18 +127,18 @@ class Recording:
     scene_id: str
     location: str
     dataset: str
-    states: np.ndarray
-    valid: np.ndarray
-    size: np.ndarray
-    agent_type: np.ndarray
+    states: ndarray
+    valid: ndarray
+    size: ndarray
+    agent_type: ndarray
     ego: int
     lanes: dict[str, Lane]
-    drivable: list[np.ndarray] = field(default_factory=list)
-    lights: dict[str, np.ndarray] = field(default_factory=dict)
+    drivable: list[ndarray] = field(default_factory=list)
+    lights: dict[str, ndarray] = field(default_factory=dict)
     current: int | None = HISTORY
     repairs: Counter[str] = field(default_factory=Counter)
     egos: dict[int, int] = field(default_factory=dict)
-    heights: np.ndarray | None = None
+    heights: ndarray | None = None
     towed: tuple[int, ...] = ()
     coupled: tuple[int, ...] = ()
 
@@ -220,7 +229,7 @@ class Recording:
         another kind, type or shape."""
         for name, value, fits, expected in chain(self._fields(), self._map_fields()):
             if not fits:
-                array = isinstance(value, np.ndarray)
+                array = isinstance(value, ndarray)
                 text = " ".join(ascii(value).split())[:40] if not array else ""
                 kind = (
                     f"{value.dtype} {list(value.shape)}"
@@ -235,7 +244,7 @@ class Recording:
 
     def _fields(self) -> Iterator[Field]:
         valid = self.valid
-        is_valid = isinstance(valid, np.ndarray) and valid.ndim == 2
+        is_valid = isinstance(valid, ndarray) and valid.ndim == 2
         is_valid = is_valid and valid.dtype == bool
         yield "valid", valid, is_valid, "a bool array [frames, agents]"
         frames, agents = valid.shape
@@ -273,10 +282,10 @@ class Recording:
             yield "lanes", {name: lane}, is_lane, "a Lane by a text each"
             at = f"lanes[{name!r}]."
             points = lane.points
-            yield f"{at}points", points, isinstance(points, np.ndarray), "an array"
+            yield f"{at}points", points, isinstance(points, ndarray), "an array"
             heights = lane.heights
             if heights is not None:
-                is_array = isinstance(heights, np.ndarray)
+                is_array = isinstance(heights, ndarray)
                 yield f"{at}heights", heights, is_array, "an array"
                 fits = _is_array(heights, NUMBERS, points.shape[:1])
                 count = len(points) if points.ndim else 0
@@ -292,7 +301,7 @@ class Recording:
                 are_ids = are_ids and all(isinstance(other, str) for other in value)
                 yield f"{at}{part}", value, are_ids, IDS
         for ring in self.drivable:
-            is_array = isinstance(ring, np.ndarray)
+            is_array = isinstance(ring, ndarray)
             yield "drivable", ring, is_array, "a list of arrays [points, 2]"
         states = f"an integer array of {len(self.valid)} states, by the id of a lane"
         for name, light in self.lights.items():
@@ -359,16 +368,20 @@ class Recording:
         return None
 
 
-def _is_array(value: object, kinds: str, shape: tuple[int, ...]) -> bool:
+def _is_array(
+    value: object,
+    kinds: str,
+    shape: tuple[int, ...],
+) -> bool:
     """Returns whether a value is an array of kinds of numbers and of a shape."""
     return (
-        isinstance(value, np.ndarray)
+        isinstance(value, ndarray)
         and value.dtype.kind in kinds
         and value.shape == shape
     )
 
 
-def _are_points(points: np.ndarray) -> bool:
+def _are_points(points: ndarray) -> bool:
     """Whether an array is of finite points [P, 2 or more]."""
     if points.ndim != 2 or points.shape[1] < 2 or points.dtype.kind not in NUMBERS:
         return False

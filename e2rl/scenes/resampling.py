@@ -3,11 +3,21 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy import ndarray
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.paths import direction, wrap
-from e2rl.scenes.recording import DT, FEW_FRAMES
-from e2rl.scenes.runs import first_valid, last_valid
+from e2rl.scenes.paths import (
+    direction,
+    wrap,
+)
+from e2rl.scenes.recording import (
+    DT,
+    FEW_FRAMES,
+)
+from e2rl.scenes.runs import (
+    first_valid,
+    last_valid,
+)
 from e2rl.scenes.smoothing import TOP_SPEED
 
 FRAME_STEPS = (0.005, 1.25)  # s, median step of a log: 200 to 0.8 Hz
@@ -24,16 +34,16 @@ class Tracks(NamedTuple):
     """Tracks at 10 Hz: states [G, A, 4], 0 where they are not valid [G, A]; heights
     [G, A] m, None where the log knows none."""
 
-    states: np.ndarray
-    valid: np.ndarray
-    heights: np.ndarray | None
+    states: ndarray
+    valid: ndarray
+    heights: ndarray | None
 
 
 def resample_uniform(
-    states: np.ndarray,
-    valid: np.ndarray,
-    ts: np.ndarray,
-    heights: np.ndarray | None = None,
+    states: ndarray,
+    valid: ndarray,
+    ts: ndarray,
+    heights: ndarray | None = None,
 ) -> Tracks:
     """Returns tracks on a grid of DT from ts[0] on.
 
@@ -70,7 +80,12 @@ def resample_uniform(
     earliest = first_valid(valid)
     before = latest[np.searchsorted(ts, grid + ON_GRID, side="right")]
     after = earliest[np.searchsorted(ts, grid - ON_GRID)]
-    between = _bridged(before, after, ts=ts, gaps=gaps)
+    between = _bridged(
+        before,
+        after,
+        ts=ts,
+        gaps=gaps,
+    )
     frame = latest_frames(ts, len(grid))
     offset = (grid - ts[frame])[:, None]
     near = (np.abs(offset) <= NEAR) & valid[frame]
@@ -78,10 +93,25 @@ def resample_uniform(
     frame = frame[:, None]
     low = np.minimum(inner, frame)
     high = np.maximum(inner, frame)
-    inner = np.where(_bridged(low, high, ts=ts, gaps=gaps), inner, frame)
+    inner = np.where(
+        _bridged(
+            low,
+            high,
+            ts=ts,
+            gaps=gaps,
+        ),
+        inner,
+        frame,
+    )
     before = np.where(between, before, np.minimum(inner, frame))
     after = np.where(between, after, np.maximum(inner, frame))
-    out = _interpolate(states, ts, grid=grid, before=before, after=after)
+    out = _interpolate(
+        states,
+        ts,
+        grid=grid,
+        before=before,
+        after=after,
+    )
     alone = near & ~between & (before == after)
     speed = np.clip(out[..., 3], -TOP_SPEED, TOP_SPEED)
     distance = np.where(alone, speed * offset, 0.0)
@@ -92,7 +122,7 @@ def resample_uniform(
     return Tracks(np.ascontiguousarray(out[..., :4]), recorded, heights=resampled)
 
 
-def latest_frames(ts: np.ndarray, count: int) -> np.ndarray:
+def latest_frames(ts: ndarray, count: int) -> ndarray:
     """Returns the log's frames [count] that hold at the grid times 0, DT, ...: the
     nearest within NEAR, else the last before.
 
@@ -105,7 +135,7 @@ def latest_frames(ts: np.ndarray, count: int) -> np.ndarray:
     return np.where((ahead <= NEAR) & (ahead < grid - ts[before] - 1e-6), after, before)
 
 
-def _check_stamps(ts: np.ndarray) -> None:
+def _check_stamps(ts: ndarray) -> None:
     if len(ts) < 2:
         raise InputError(FEW_FRAMES)
     step = np.diff(ts)
@@ -119,8 +149,10 @@ def _check_stamps(ts: np.ndarray) -> None:
 
 
 def _filled_heights(
-    heights: np.ndarray, valid: np.ndarray, ts: np.ndarray
-) -> np.ndarray | None:
+    heights: ndarray,
+    valid: ndarray,
+    ts: ndarray,
+) -> ndarray | None:
     """Heights [F, A] m where tracks are valid [F, A], each unknown one as the nearest
     in time; None where the log knows none."""
     finite = valid & np.isfinite(heights)
@@ -138,8 +170,10 @@ def _filled_heights(
 
 
 def _merge_equal_stamps(
-    states: np.ndarray, valid: np.ndarray, ts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    states: ndarray,
+    valid: ndarray,
+    ts: ndarray,
+) -> tuple[ndarray, ndarray, ndarray]:
     """States, valid and time stamps without repeated stamps; of a track the last valid
     frame at a stamp is kept."""
     repeated = np.flatnonzero(np.diff(ts) == 0)
@@ -155,7 +189,7 @@ def _merge_equal_stamps(
     return states, np.delete(valid, repeated, axis=0), np.delete(ts, repeated)
 
 
-def _longest_gaps(valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _longest_gaps(valid: ndarray, ts: ndarray) -> tuple[ndarray, ndarray]:
     """The longest times [s] between two frames of each track [A] that are bridged.
 
     First, where the whole log has no frame between them, which says nothing: MAX_GAP.
@@ -175,12 +209,12 @@ def _longest_gaps(valid: np.ndarray, ts: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _bridged(
-    before: np.ndarray,
-    after: np.ndarray,
+    before: ndarray,
+    after: ndarray,
     *,
-    ts: np.ndarray,
-    gaps: tuple[np.ndarray, np.ndarray],
-) -> np.ndarray:
+    ts: ndarray,
+    gaps: tuple[ndarray, ndarray],
+) -> ndarray:
     """Whether two successive valid frames [G, A] of a track are near enough to
     interpolate between them; gaps: see `_longest_gaps`."""
     exists = (before >= 0) & (after < len(ts))
@@ -191,13 +225,13 @@ def _bridged(
 
 
 def _interpolate(
-    states: np.ndarray,
-    ts: np.ndarray,
+    states: ndarray,
+    ts: ndarray,
     *,
-    grid: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-) -> np.ndarray:
+    grid: ndarray,
+    before: ndarray,
+    after: ndarray,
+) -> ndarray:
     """States [G, A, C] at the times grid [G] on the lines through two frames [G, A]
     each, that may be one.
 

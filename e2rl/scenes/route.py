@@ -5,12 +5,19 @@ Routes are smoothed, so chords are a little shorter than SPACING; projection and
 interpolation share the index scale.
 """
 
-from collections.abc import Callable
+from collections.abc import (
+    Callable,
+    Sequence,
+)
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from e2rl.run.fused import fused, is_on
+from e2rl.run.fused import (
+    fused,
+    is_on,
+)
 
 SPACING = 2.0  # m of arc length between vertices
 WINDOW = 20.0  # m on either side of an expected arc length
@@ -28,37 +35,34 @@ def _take(route: Tensor, index: Tensor) -> Tensor:
 
 
 def nearest_vertex(
-    points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = WINDOW
+    points: Tensor,
+    route: Tensor,
+    hint: Tensor | None = None,
+    window: float = WINDOW,
 ) -> Tensor:
-    """Index [..., K] of the vertex of route [..., P, 2] nearest to points [..., K, 2].
+    """Returns the index [..., K] of the vertex of a route nearest to points.
 
-    hint [..., K]: expected arc length; only vertices within `window` m of it count, for
-    routes that cross themselves.
+    Args:
+        points: [..., K, 2] m.
+        route: [..., P, 2] m.
+        hint: [..., K] m, expected arc length, for routes that cross themselves.
+        window: m around it within which vertices count.
     """
     count = route.shape[-2]
     if hint is None:
-        if (
-            torch.compiler.is_compiling()
-        ):  # the compiler makes a vector loop of a minimum, but not of argmin
-            x, y = (
-                (points[..., None, axis] - route[..., None, :, axis]).square()
-                for axis in range(2)
-            )
-            return first_least(x + y)
-        squared = (route**2).sum(-1)[..., None, :] - 2 * points @ route.transpose(
-            -1, -2
-        )
-        return squared.argmin(-1)
-    near = hint.clamp(
-        0, SPACING * (count - 1)
-    )  # beyond the ends, the end is what is near
+        # the compiler makes a vector loop of a minimum, but not of argmin
+        if torch.compiler.is_compiling():
+            dx = points[..., None, 0] - route[..., None, :, 0]
+            dy = points[..., None, 1] - route[..., None, :, 1]
+            return first_least(dx.square() + dy.square())
+        product = 2 * points @ route.transpose(-1, -2)
+        return ((route**2).sum(-1)[..., None, :] - product).argmin(-1)
+    near = hint.clamp(0, SPACING * (count - 1))  # beyond an end, that is what is near
     width = min(int(2 * window / SPACING) + 1, count)
     first = ((near - window) / SPACING).ceil().clamp(0, count - width).long()
     index = first[..., None] + torch.arange(width, device=first.device)
-    gap = (
-        _take(route, index.flatten(-2)).unflatten(-2, index.shape[-2:])
-        - points[..., None, :]
-    )
+    vertices = _take(route, index.flatten(-2)).unflatten(-2, index.shape[-2:])
+    gap = vertices - points[..., None, :]
     outside = (SPACING * index - near[..., None]).abs() > window
     squared = gap.square().sum(-1).masked_fill(outside, torch.inf)
     return first + first_least(squared)
@@ -68,50 +72,77 @@ def first_least(values: Tensor) -> Tensor:
     """`values.argmin(-1)`, by minima while it is compiled."""
     if not torch.compiler.is_compiling():
         return values.argmin(-1)
-    order = torch.arange(values.shape[-1], dtype=values.dtype, device=values.device)
-    return (
-        torch.where(values == values.amin(-1, keepdim=True), order, values.shape[-1])
-        .amin(-1)
-        .long()
+    order = torch.arange(
+        values.shape[-1],
+        dtype=values.dtype,
+        device=values.device,
     )
+    least = values == values.amin(-1, keepdim=True)
+    return torch.where(least, order, values.shape[-1]).amin(-1).long()
 
 
 def project(
-    points: Tensor, route: Tensor, hint: Tensor | None = None, window: float = WINDOW
+    points: Tensor,
+    route: Tensor,
+    hint: Tensor | None = None,
+    window: float = WINDOW,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Frenet coordinates of points [..., K, 2] on route [..., P, 2]: arc length s [m],
-    offset d [m] (left positive) and the route's heading [rad] at s; each [..., K].
+    """Returns Frenet coordinates of points on a route, which goes on straight beyond
+    its ends.
 
-    hint, window: see `nearest_vertex`. Leading dims broadcast. Beyond the ends the
-    route goes on straight.
+    Args:
+        points: [..., K, 2] m; leading dims broadcast.
+        route: [..., P, 2] m.
+        hint, window: see `nearest_vertex`.
+
+    Returns:
+        Arc length s [m], offset d [m] (left positive) and the route's heading [rad] at
+        s, each [..., K].
     """
     lead = route.shape[:-2]
-    if (
-        is_on()
-        and hint is None
-        and torch.broadcast_shapes(points.shape[:-2], lead) == lead
-    ):
+    whole = torch.broadcast_shapes(points.shape[:-2], lead) == lead
+    if is_on() and hint is None and whole:
         rows = points.expand(*lead, *points.shape[-2:]).flatten(0, -3)
-        return tuple(
-            value.view(*lead, points.shape[-2])
-            for value in project_rows(rows, route.flatten(0, -3))
-        )
-    return _project(points, route, hint=hint, window=window)
+        pose = project_rows(rows, route.flatten(0, -3))
+        return tuple(value.view(*lead, points.shape[-2]) for value in pose)
+    return _project(
+        points,
+        route,
+        hint=hint,
+        window=window,
+    )
 
 
 def _project(
-    points: Tensor, route: Tensor, hint: Tensor | None, window: float
+    points: Tensor,
+    route: Tensor,
+    hint: Tensor | None,
+    window: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    vertex = nearest_vertex(points, route, hint=hint, window=window)
+    vertex = nearest_vertex(
+        points,
+        route,
+        hint=hint,
+        window=window,
+    )
+    last = route.shape[-2] - 2
     return onto_segments(
-        points, vertex, last=route.shape[-2] - 2, take=lambda index: _take(route, index)
+        points,
+        vertex,
+        last,
+        take=lambda index: _take(route, index),
     )
 
 
 @fused("R K 2", "R P 2!")
 def project_rows(points: Tensor, route: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`project` of points [R, K, 2] on routes [R, P, 2]."""
-    return _project(points, route, hint=None, window=WINDOW)
+    return _project(
+        points,
+        route,
+        hint=None,
+        window=WINDOW,
+    )
 
 
 def project_track(
@@ -140,28 +171,30 @@ def project_track(
     """
     if known is not None:
         points = _filled(points, known)
-    s, d, heading = project(points, route)
+    pose = project(points, route)
+    s = pose[0]
     moved = points.diff(dim=1).norm(dim=-1)
-    lost = ((s.diff(dim=1).abs() - moved) > WINDOW).any(1)
+    jumps = ((s.diff(dim=1).abs() - moved) > WINDOW).any(1)
     if start is not None and points.shape[1]:
         away = (s[:, 0] - start).abs() > WINDOW
-        lost = lost | (away if known is None else away & known[:, 0])
-    rows = lost.nonzero()[:, 0]
+        jumps = jumps | (away if known is None else away & known[:, 0])
+    rows = jumps.nonzero()[:, 0]
     if not len(rows):
-        return s, d, heading
-    place = torch.full_like(s[rows, 0], start) if start is not None else s[rows, 0]
-    if start is not None and known is not None:
-        place = torch.where(known[rows, 0], place, s[rows, 0])
-    poses = []
+        return pose
+    place = s[rows, 0]
+    if start is not None:
+        begins = torch.full_like(place, start)
+        place = begins if known is None else torch.where(known[rows, 0], begins, place)
+    steps = []
     for frame in range(points.shape[1]):
         hint = place if frame == 0 else place + moved[rows, frame - 1]
-        pose = project(points[rows, frame : frame + 1], route[rows], hint=hint[:, None])
-        place = pose[0][:, 0]
-        poses.append(torch.stack(pose, -1))
-    fresh = torch.cat(poses, 1).unbind(-1)
+        step = project(points[rows, frame : frame + 1], route[rows], hint[:, None])
+        place = step[0][:, 0]
+        steps.append(torch.stack(step, -1))
+    followed = torch.cat(steps, 1).unbind(-1)
     s, d, heading = (
-        old.index_copy(0, rows, new)
-        for old, new in zip((s, d, heading), fresh, strict=True)
+        value.index_copy(0, rows, change)
+        for value, change in zip(pose, followed, strict=True)
     )
     return s, d, heading
 
@@ -177,64 +210,91 @@ def _filled(points: Tensor, known: Tensor) -> Tensor:
 
 
 def onto_segments(
-    points: Tensor, vertex: Tensor, last: int, take: Callable[[Tensor], Tensor]
+    points: Tensor,
+    vertex: Tensor,
+    last: int,
+    take: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`project` of points [..., 2] whose nearest vertices [...] are known.
+    """Returns `project` of points whose nearest vertices are known, onto the two
+    segments that meet there.
 
-    They are projected onto the two segments that meet at the vertex. last: index of the
-    last segment; take: a function from indices [2, ...] to vertices [2, ..., 2].
+    Args:
+        points: [..., 2] m.
+        vertex: [...] index of the nearest one.
+        last: index of the last segment.
+        take: a function from indices [2, ...] to vertices [2, ..., 2].
     """
-    start = torch.stack([vertex - 1, vertex]).clamp(0, last)
-    a = take(start)
-    along, length, unit = segment(a, take(start + 1))
+    index = torch.stack([vertex - 1, vertex]).clamp(0, last)
+    segments = segment(take(index), take(index + 1))
     s, d, second = onto_nearer(
-        points, start, last=last, a=a, along=along, length=length, unit=unit
+        points,
+        index,
+        last,
+        segments=segments,
     )
-    x, y = torch.where(second[..., None], unit[1], unit[0]).unbind(-1)
+    unit = torch.where(second[..., None], segments.unit[1], segments.unit[0])
+    x, y = unit.unbind(-1)
     return s, d, torch.atan2(y, x)
 
 
-def segment(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """From a to b [..., 2]: the difference, its length [...] (at least 1e-6), its
-    direction."""
-    along = b - a
+class Segment(NamedTuple):
+    """From one vertex [..., 2] to the next: where it starts, the difference [..., 2],
+    its length [...] (at least 1e-6), its direction [..., 2]."""
+
+    start: Tensor
+    along: Tensor
+    length: Tensor
+    unit: Tensor
+
+
+def segment(start: Tensor, end: Tensor) -> Segment:
+    """Returns the segment between two vertices [..., 2]."""
+    along = end - start
     length = along.norm(dim=-1).clamp(min=1e-6)
-    return along, length, along / length[..., None]
+    return Segment(
+        start,
+        along,
+        length,
+        unit=along / length[..., None],
+    )
 
 
 def onto_nearer(
     points: Tensor,
-    start: Tensor,
+    index: Tensor,
     last: int,
-    a: Tensor,
-    along: Tensor,
-    length: Tensor,
-    unit: Tensor,
+    segments: Segment,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Arc length, offset [...] of points [..., 2] on the nearer of two segments, and
-    whether that is the second; it is the first where both are equally near.
+    """Returns where points lie on the nearer of two segments; the first where both are
+    equally near.
 
-    start [2, ...], a [2, ..., 2]: index and position of the vertex where each segment
-    begins; last: index of the last segment; along, length, unit [2, ...]: see
-    `segment`.
+    Args:
+        points: [..., 2] m.
+        index: [2, ...] of the vertex where each segment begins.
+        last: index of the last segment.
+        segments: both, [2, ...].
+
+    Returns:
+        Arc length and offset [...] m, and whether it is the second.
     """
-    offset = points - a
-    t = (offset * unit).sum(-1) / length
-    low = torch.where(start == 0, -torch.inf, 0.0)
-    high = torch.where(start == last, torch.inf, 1.0)
+    offset = points - segments.start
+    t = (offset * segments.unit).sum(-1) / segments.length
+    low = torch.where(index == 0, -torch.inf, 0.0)
+    high = torch.where(index == last, torch.inf, 1.0)
     t = torch.maximum(torch.minimum(t, high), low)
-    gap = (offset - t[..., None] * along).norm(dim=-1)
+    gap = (offset - t[..., None] * segments.along).norm(dim=-1)
+    unit = segments.unit
     d = unit[..., 0] * offset[..., 1] - unit[..., 1] * offset[..., 0]
+    d = torch.where(d < 0, -gap, gap)
+    s = SPACING * (index + t)
     second = gap[1] < gap[0]
-    s, d = (
-        torch.where(second, x[1], x[0])
-        for x in (SPACING * (start + t), torch.where(d < 0, -gap, gap))
-    )
-    return s, d, second
+    return torch.where(second, s[1], s[0]), torch.where(second, d[1], d[0]), second
 
 
 def interpolate(
-    route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | None = None
+    route: Tensor,
+    s: Tensor,
+    tangents: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Point [..., K, 2], heading [rad], curvature [1/m] (each [..., K]) of route [...,
     P, 2] at arc length s [..., K].
@@ -244,9 +304,8 @@ def interpolate(
     tangents: those of the route, for many more points than it has vertices.
     """
     if is_on() and tangents is None and route.shape[:-2] == s.shape[:-1]:
-        xy, heading, curvature = interpolate_rows(
-            route.flatten(0, -3), s.flatten(0, -2)
-        )
+        rows = s.flatten(0, -2)
+        xy, heading, curvature = interpolate_rows(route.flatten(0, -3), rows)
         return xy.view(*s.shape, 2), heading.view(s.shape), curvature.view(s.shape)
     return _interpolate(route, s, tangents=tangents)
 
@@ -258,7 +317,9 @@ def interpolate_rows(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _interpolate(
-    route: Tensor, s: Tensor, tangents: tuple[Tensor, Tensor] | None
+    route: Tensor,
+    s: Tensor,
+    tangents: tuple[Tensor, Tensor] | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     last = route.shape[-2] - 2
     u = s / SPACING
@@ -266,10 +327,9 @@ def _interpolate(
     t = u - i
     if tangents is None:
         four = torch.cat([i - 1, i, i + 1, i + 2], -1).clamp(0, last + 1)
-        before, a, b, after = (
-            _take(route, four).unflatten(-2, (4, i.shape[-1])).unbind(-3)
-        )
-        angle, turn = _tangent(before, a, b=b, after=after)
+        vertices = _take(route, four).unflatten(-2, (4, i.shape[-1])).unbind(-3)
+        _, a, b, _ = vertices
+        angle, turn = _tangent(vertices)
     else:
         a = _take(route, i)
         b = _take(route, i + 1)
@@ -287,17 +347,14 @@ def tangents(route: Tensor) -> tuple[Tensor, Tensor]:
     and its turn to the next."""
     before = torch.cat([route[..., :1, :], route[..., :-2, :]], -2)
     after = torch.cat([route[..., 2:, :], route[..., -1:, :]], -2)
-    return _tangent(before, route[..., :-1, :], b=route[..., 1:, :], after=after)
+    return _tangent((before, route[..., :-1, :], route[..., 1:, :], after))
 
 
-def _tangent(
-    before: Tensor, a: Tensor, b: Tensor, after: Tensor
-) -> tuple[Tensor, Tensor]:
-    """`tangents` of segments from a to b [..., 2] and the vertices before and after
-    them."""
+def _tangent(vertices: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """`tangents` of segments; vertices [..., 2]: before them, both ends, after them."""
+    before, a, b, after = vertices
     first = b - before
     second = after - a
     cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-    return torch.atan2(first[..., 1], first[..., 0]), torch.atan2(
-        cross, (first * second).sum(-1)
-    )
+    turn = torch.atan2(cross, (first * second).sum(-1))
+    return torch.atan2(first[..., 1], first[..., 0]), turn

@@ -3,24 +3,25 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy import ndarray
 
 
 class Runs(NamedTuple):
     """Runs [R]: of which track, from which frame on, before which frame."""
 
-    agent: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
+    agent: ndarray
+    start: ndarray
+    end: ndarray
 
 
-def runs_of(valid: np.ndarray) -> Runs:
+def runs_of(valid: ndarray) -> Runs:
     """Returns the runs of tracks that are valid [F, A], track by track."""
     edge = np.diff(np.pad(valid.T, ((0, 0), (1, 1))).astype(np.int8))
     agent, start = np.nonzero(edge == 1)
     return Runs(agent, start, end=np.nonzero(edge == -1)[1])
 
 
-def last_valid(valid: np.ndarray) -> np.ndarray:
+def last_valid(valid: ndarray) -> ndarray:
     """Returns the last valid frame of each track before frames 0 .. F [F + 1, A], -1
     for none."""
     frame = np.where(valid, np.arange(len(valid))[:, None], -1)
@@ -28,7 +29,7 @@ def last_valid(valid: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(padded, axis=0)
 
 
-def first_valid(valid: np.ndarray) -> np.ndarray:
+def first_valid(valid: ndarray) -> ndarray:
     """Returns the first valid frame of each track from frames 0 .. F on [F + 1, A], F
     for none."""
     return len(valid) - 1 - last_valid(valid[::-1])[::-1]

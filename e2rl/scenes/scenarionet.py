@@ -7,8 +7,14 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import (
+    Iterable,
+    Iterator,
+)
+from dataclasses import (
+    dataclass,
+    replace,
+)
 from functools import cached_property
 from pathlib import Path
 
@@ -16,8 +22,14 @@ import numpy as np
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_regular
-from e2rl.scenes.log_files import MAX_BYTES, LogFiles
-from e2rl.scenes.paths import tangent_angle, wrap
+from e2rl.scenes.log_files import (
+    MAX_BYTES,
+    LogFiles,
+)
+from e2rl.scenes.paths import (
+    tangent_angle,
+    wrap,
+)
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
@@ -28,7 +40,10 @@ from e2rl.scenes.recording import (
     Recording,
     light_colour,
 )
-from e2rl.scenes.resampling import latest_frames, resample_uniform
+from e2rl.scenes.resampling import (
+    latest_frames,
+    resample_uniform,
+)
 from e2rl.scenes.smoothing import signed_speed
 
 TYPES = {name.upper(): index for index, name in enumerate(AGENT_TYPES)}
@@ -140,7 +155,12 @@ def recording_of(data: dict, location: str = "") -> Recording:
         )
     # of the grid, whose size they give
     check({"states": (ts.max() - ts.min()) / DT * len(ids)}, scene_id)
-    states, valid, heights = resample_uniform(log.states, log.valid, ts, log.heights)
+    states, valid, heights = resample_uniform(
+        log.states,
+        log.valid,
+        ts,
+        log.heights,
+    )
     seconds = ts - ts[0]
     current = metadata.get("current_time_index")
     if current is not None:

@@ -29,13 +29,24 @@ the scene's origin, in m; angles in rad.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import (
+    Iterator,
+    Mapping,
+    Sequence,
+)
+from dataclasses import (
+    dataclass,
+    field,
+    replace,
+)
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import (
+    TensorDict,
+    TensorDictBase,
+)
 from torch import Tensor
 
 from e2rl.run.errors import InputError
@@ -51,17 +62,18 @@ KEYS_BY_DIMS = {  # number of dims of one scene: keys
 }
 KEYS = {key: dims for dims, keys in KEYS_BY_DIMS.items() for key in keys.split()}
 PART = 64  # scenes at once, where all of a set are gone through
-LARGE = (
-    4096  # numbers of a scene's tensor above which `copy_into` copies scene by scene
-)
+LARGE = 4096  # numbers of a tensor above which `copy_into` copies scene by scene
 RAGGED = {  # keys whose first dims differ between scenes: the value that pads them
-    **dict.fromkeys(
-        ("light_state", "light_points", "lane_points", "lane_width", "drivable_points"),
-        0,
-    ),
-    **dict.fromkeys(
-        ("lane_index", "lane_exits", "lane_left", "lane_right", "drivable_index"), -1
-    ),
+    "light_state": 0,
+    "light_points": 0,
+    "lane_points": 0,
+    "lane_width": 0,
+    "drivable_points": 0,
+    "lane_index": -1,
+    "lane_exits": -1,
+    "lane_left": -1,
+    "lane_right": -1,
+    "drivable_index": -1,
 }
 
 
@@ -70,11 +82,11 @@ def validate(scene: TensorDictBase, name: str) -> None:
     dims."""
     for key, dims in KEYS.items():
         value = scene[key]
-        if value.ndim != dims or (
-            value.is_floating_point() and not torch.isfinite(value).all()
-        ):
+        finite = not value.is_floating_point() or torch.isfinite(value).all()
+        if value.ndim != dims or not finite:
             raise InputError(
-                f"scene {name!r}: {key} has not {dims} dims, or holds NaN or infinite values"
+                f"scene {name!r}: {key} has not {dims} dims, "
+                "or holds NaN or infinite values"
             )
     if not scene["valid"][0] or scene["route_log"][0] < 0:
         raise InputError(f"scene {name!r}: the ego is absent or has no route")
@@ -95,11 +107,9 @@ def unpadded(value: np.ndarray, fill: float) -> np.ndarray:
     """Returns an array without the rows at the end of each axis that hold nothing but
     `fill`."""
     for axis in range(value.ndim):
-        used = (value != fill).any(
-            axis=tuple(other for other in range(value.ndim) if other != axis)
-        )
-        kept = int(np.flatnonzero(used)[-1]) + 1 if used.any() else 0
-        value = value[(slice(None),) * axis + (slice(kept),)]
+        others = tuple(other for other in range(value.ndim) if other != axis)
+        used = np.flatnonzero((value != fill).any(axis=others))
+        value = value.take(np.arange(used[-1] + 1 if len(used) else 0), axis)
     return value
 
 
@@ -141,11 +151,8 @@ class SceneSet:
     def hashes(self) -> list[str]:
         """Returns the `content_hash` of each scene, of what is used: what a file says
         of itself may be forged."""
-        columns = {
-            key: value.cpu().numpy()
-            for key, value in self.scenes.items()
-            if key != "scene_index"
-        }
+        columns = {key: value.cpu().numpy() for key, value in self.scenes.items()}
+        columns.pop("scene_index", None)
         return [
             content_hash({key: value[row] for key, value in columns.items()})
             for row in range(len(self))
@@ -166,30 +173,38 @@ class SceneSet:
             return which
         if which in self.scene_id:
             return self.scene_id.index(which)
-        example = f"or the id of a scene, such as {self.scene_id[0]}"
         raise InputError(
-            f"scene={which}: expected an index below {len(self)} {example}"
+            f"scene={which}: expected an index below {len(self)} or the id of a scene, "
+            f"such as {self.scene_id[0]}"
         )
 
-    def copy_into(self, batch: TensorDict, rows: Tensor, indices: Tensor) -> None:
+    def copy_into(
+        self,
+        batch: TensorDict,
+        rows: Tensor,
+        indices: Tensor,
+    ) -> None:
         """Overwrites rows [b] (ascending) of a batch of scenes by the scenes at
         `indices` [b], in place."""
         whole = len(rows) == len(batch)
         for key, source in self.scenes.items():
             target = batch[key]
             indices = indices.to(source.device)
-            there = source.device == target.device
-            if whole and there:  # a second copy would cost more pages than the first
-                torch.index_select(source, 0, indices, out=target)
-            elif (
-                there and not source.is_cuda and source[0].numel() > LARGE
-            ):  # scene by scene, without a copy between
+            near = source.device == target.device
+            large = source[0].numel() > LARGE and not source.is_cuda
+            if whole and near:  # a second copy would cost more pages than the first
+                torch.index_select(
+                    source,
+                    0,
+                    indices,
+                    out=target,
+                )
+            elif near and large:  # scene by scene, without a copy between
                 for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
                     target[row].copy_(source[index])
             else:
-                target.index_copy_(
-                    0, rows, source.index_select(0, indices).to(target.device)
-                )
+                values = source.index_select(0, indices).to(target.device)
+                target.index_copy_(0, rows, values)
 
     def first(self, count: int | None) -> "SceneSet":
         """Returns the first `count` scenes (all for None)."""
@@ -198,23 +213,20 @@ class SceneSet:
     def chosen(self, indices: Sequence[int]) -> "SceneSet":
         """Returns the scenes at `indices`, which keep their noise; the first ones are
         not copied."""
-        count = len(indices)
-        if list(indices) == list(range(len(self))):
+        rows = list(indices)
+        count = len(rows)
+        if rows == list(range(len(self))):
             return self
-        scenes = (
-            self.scenes[:count]
-            if list(indices) == list(range(count))
-            else self.batch(indices)
-        )
+        is_first = rows == list(range(count))
+        scenes = self.scenes[:count] if is_first else self.batch(rows)
         scenes["scene_index"] = torch.arange(count, device=scenes["scene_index"].device)
-        columns = {
-            name: getattr(self, name) for name in ("scene_id", "location", "number")
-        }
-        chosen: dict[str, Any] = {
-            name: [column[index] for index in indices]
-            for name, column in columns.items()
-        }
-        return replace(self, scenes=scenes, **chosen)
+        return replace(
+            self,
+            scenes=scenes,
+            scene_id=[self.scene_id[row] for row in rows],
+            location=[self.location[row] for row in rows],
+            number=[self.number[row] for row in rows],
+        )
 
     def to(self, device: torch.device | str) -> "SceneSet":
         """Returns the same scenes on a device."""

@@ -13,25 +13,43 @@ import re
 import struct
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import (
+    Callable,
+    Iterator,
+    Mapping,
+)
+from dataclasses import (
+    dataclass,
+    field,
+)
 from math import prod
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
+from tempfile import (
+    TemporaryDirectory,
+    TemporaryFile,
+)
 from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 from tensordict import TensorDict
 from tqdm import tqdm
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import locked, write_atomically
-from e2rl.scenes.scene import RAGGED, SceneSet
+from e2rl.run.files import (
+    locked,
+    write_atomically,
+)
+from e2rl.scenes.scene import (
+    RAGGED,
+    SceneSet,
+)
 
 FORMAT = b"e2rl-scenes-cache/3"
 END = struct.Struct(f"<Q{len(FORMAT)}s32s")
 ALIGN = 64  # bytes of which the place of every array is a multiple
+DAMAGED = (ValueError, TypeError, LookupError, AttributeError, struct.error, OSError)
 NAME = re.compile(r"scenes-[0-9a-f]{64}\.map")  # of a file of the cache
 
 
@@ -48,14 +66,18 @@ class Index:
     dropped: dict[str, int] = field(default_factory=Counter)
 
     def add(
-        self, scene_id: str, location: str, scene: Mapping[str, np.ndarray]
+        self,
+        scene_id: str,
+        location: str,
+        scene: Mapping[str, ndarray],
     ) -> None:
         """Adds a scene; raises InputError where it does not fit to those before it."""
         for key, value in scene.items():
             kind, largest = self.layout.setdefault(key, (value.dtype.str, value.shape))
             if largest != value.shape and key not in RAGGED:
                 raise InputError(
-                    f"scenes of different {key} shapes cannot be one set; build them with equal settings"
+                    f"scenes of different {key} shapes cannot be one set; "
+                    "build them with equal settings"
                 )
             self.layout[key] = kind, tuple(map(max, largest, value.shape))
         self.scene_id.append(scene_id)
@@ -64,31 +86,32 @@ class Index:
     def places(self) -> tuple[dict[str, slice], int]:
         """Returns the bytes of a file that each key's array has, and how many all have,
         at least one."""
-        found = {}
+        places = {}
         begin = 0
         for key, (kind, shape) in self.layout.items():
             size = len(self.scene_id) * prod(shape) * np.dtype(kind).itemsize
-            found[key] = slice(begin, begin + size)
+            places[key] = slice(begin, begin + size)
             begin += -(-size // ALIGN) * ALIGN
-        return found, max(begin, 1)
+        return places, max(begin, 1)
 
-    def arrays(self, content: np.ndarray) -> dict[str, np.ndarray]:
+    def arrays(self, content: ndarray) -> dict[str, ndarray]:
         """Returns each key's array [S, ...] in the bytes of a file."""
-        layout = self.layout
-        count = len(self.scene_id)
-        places = self.places()[0]
+        places, _ = self.places()
         return {
-            key: content[places[key]].view(kind).reshape(count, *shape)
-            for key, (kind, shape) in layout.items()
+            key: content[places[key]].view(kind).reshape(len(self.scene_id), *shape)
+            for key, (kind, shape) in self.layout.items()
         }
 
 
-Build = Callable[
-    [Index], Iterator[Mapping[str, np.ndarray]]
-]  # yields a set's scenes when they are in its index
+# yields a set's scenes when they are in its index
+Build = Callable[[Index], Iterator[Mapping[str, ndarray]]]
 
 
-def cached(path: Path, build: Build, gigabytes: float) -> SceneSet:
+def cached(
+    path: Path,
+    build: Build,
+    gigabytes: float,
+) -> SceneSet:
     """Returns the scenes in a cache file; where it is not there or damaged, it is
     built.
 
@@ -96,25 +119,27 @@ def cached(path: Path, build: Build, gigabytes: float) -> SceneSet:
     the file, which has a NAME, cannot be written. gigabytes: see `make_room`.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(
+            parents=True,
+            exist_ok=True,
+        )
         with locked(path):
-            found = read(path)
-            if found is None:
-                for left in path.parent.glob(
-                    f".{path.name}.*.part"
-                ):  # of a process that was killed while it built
-                    left.unlink(missing_ok=True)
+            scenes = read(path)
+            if scenes is None:
+                # of a process that was killed while it built
+                for rest in path.parent.glob(f".{path.name}.*.part"):
+                    rest.unlink(missing_ok=True)
                 write_atomically(path, lambda part: write(part, build))
                 make_room(path, gigabytes)
-                found = read(path)
-            if found is None:
+                scenes = read(path)
+            if scenes is None:
                 raise OSError("what was written is not what is read")
             os.utime(path)
-            return found
+            return scenes
     except OSError as error:
-        mend = "free space, or pass another, writable folder"
         raise InputError(
-            f"data.cache={path.parent}: cannot be made or written ({error}); {mend}"
+            f"data.cache={path.parent}: cannot be made or written ({error}); "
+            "free space, or pass another, writable folder"
         ) from error
 
 
@@ -122,10 +147,11 @@ def uncached(build: Build) -> SceneSet:
     """Returns the scenes that `build` yields, in a file that is removed at once and
     lives as long as it is mapped."""
     with TemporaryDirectory() as folder:
-        write(Path(folder) / "scenes", build)
-        found = read(Path(folder) / "scenes")
-    assert found is not None
-    return found
+        path = Path(folder) / "scenes"
+        write(path, build)
+        scenes = read(path)
+    assert scenes is not None
+    return scenes
 
 
 def read(path: Path) -> SceneSet | None:
@@ -138,36 +164,26 @@ def read(path: Path) -> SceneSet | None:
         return None
     try:
         content = np.asarray(np.memmap(path, np.uint8, "c"))
+        body = content[: -END.size]
         length, name, digest = END.unpack(content[-END.size :].tobytes())
-        if (
-            name != FORMAT
-            or hashlib.sha256(content.data[: -END.size]).digest() != digest
-        ):
+        if name != FORMAT or hashlib.sha256(body.data).digest() != digest:
             raise ValueError("its content is not what was written")
-        index = Index(**json.loads(content[: -END.size][-length:].tobytes()))
-        scenes = {
-            key: torch.from_numpy(value) for key, value in index.arrays(content).items()
-        }
-    except (
-        ValueError,
-        TypeError,
-        LookupError,
-        AttributeError,
-        struct.error,
-        OSError,
-    ) as error:
+        index = Index(**json.loads(body[-length:].tobytes()))
+        arrays = index.arrays(content)
+        scenes = {key: torch.from_numpy(value) for key, value in arrays.items()}
+    except DAMAGED as error:
         tqdm.write(f"rebuilding the damaged cache file {path}: {error}", sys.stderr)
         return None
     count = len(index.scene_id)
-    rows = TensorDict(scenes | {"scene_index": torch.arange(count)}, [count])
-    about = (
-        index.scene_id,
-        index.location,
-        index.dataset,
-        index.split,
-        dict(index.dropped),
+    scenes["scene_index"] = torch.arange(count)
+    return SceneSet(
+        scenes=TensorDict(scenes, [count]),
+        scene_id=index.scene_id,
+        location=index.location,
+        dataset=index.dataset,
+        split=index.split,
+        dropped=dict(index.dropped),
     )
-    return SceneSet(rows, *about)
 
 
 def write(path: Path, build: Build) -> None:
@@ -181,30 +197,27 @@ def write(path: Path, build: Build) -> None:
             for key, (kind, _) in index.layout.items():
                 waiting.write(scene[key].astype(kind, copy=False).tobytes())
         waiting.seek(0)
-        size = index.places()[1]
+        _, size = index.places()
         with path.open("wb") as file:
             file.truncate(size)
-            if hasattr(
-                os, "posix_fallocate"
-            ):  # so that a full disk is an error here, and no crash of the mapping
+            # so that a full disk is an error here, and no crash of the mapping
+            if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)
         content = np.memmap(path, np.uint8, "r+")
         arrays = index.arrays(content)
-        for number, own in enumerate(shapes):
-            for (key, rows), shape in zip(arrays.items(), own, strict=True):
+        for number, scene_shapes in enumerate(shapes):
+            for (key, rows), shape in zip(arrays.items(), scene_shapes, strict=True):
                 if shape != rows.shape[1:]:
                     rows[number] = RAGGED[key]
-                value = np.ndarray(
-                    shape, rows.dtype, waiting.read(prod(shape) * rows.itemsize)
-                )
+                data = waiting.read(prod(shape) * rows.itemsize)
                 place: tuple[Any, ...] = (number, *map(slice, shape))
-                rows[place] = value
+                rows[place] = ndarray(shape, rows.dtype, data)
         content.flush()
-    about = json.dumps(vars(index)).encode()
+    text = json.dumps(vars(index)).encode()
     digest = hashlib.sha256(content.data)
-    digest.update(about)
+    digest.update(text)
     with path.open("ab") as file:
-        file.write(about + END.pack(len(about), FORMAT, digest.digest()))
+        file.write(text + END.pack(len(text), FORMAT, digest.digest()))
 
 
 def make_room(path: Path, gigabytes: float) -> None:
@@ -213,17 +226,18 @@ def make_room(path: Path, gigabytes: float) -> None:
 
     Whoever has mapped a file keeps what is in it.
     """
-    known = [
-        (file.stat(), file)
+    files = [
+        (file.stat().st_mtime, file.stat().st_size, file)
         for file in path.parent.iterdir()
         if NAME.fullmatch(file.name)
     ]
-    total = sum(about.st_size for about, _ in known)
-    for about, file in sorted(known, key=lambda entry: entry[0].st_mtime):
+    total = sum(size for _, size, _ in files)
+    for _, size, file in sorted(files):
         if total > gigabytes * 1e9 and file != path:
             file.unlink(missing_ok=True)
-            total -= about.st_size
+            total -= size
             tqdm.write(
-                f"data.cache_gb={gigabytes:g}: removed {file}, which was not used for longest",
+                f"data.cache_gb={gigabytes:g}: removed {file}, "
+                "which was not used for longest",
                 sys.stderr,
             )

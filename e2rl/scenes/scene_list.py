@@ -20,7 +20,10 @@ import hashlib
 import io
 import json
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import (
+    Callable,
+    Sequence,
+)
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -28,7 +31,11 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import CsvReader, csv_text, read_regular
+from e2rl.run.files import (
+    CsvReader,
+    csv_text,
+    read_regular,
+)
 from e2rl.scenes.scene import SceneSet
 
 SCENES = "scenes.csv"  # of a run's folder
@@ -49,21 +56,25 @@ def scene_hashes(scenes: SceneSet) -> list[str]:
     """SHA-256 of each scene [S]: of its tensors, id, place and data set. The other
     scenes of the set, to whose size some tensors are padded, do not matter; the
     recording, the builder and the sizes in data.build do."""
-    about = zip(scenes.scene_id, scenes.location, scenes.hashes(), strict=True)
-    return [
-        hashlib.sha256(json.dumps([*names, scenes.dataset]).encode()).hexdigest()
-        for names in about
-    ]
+    names = zip(
+        scenes.scene_id,
+        scenes.location,
+        scenes.hashes(),
+        strict=True,
+    )
+    texts = [json.dumps([*row, scenes.dataset]) for row in names]
+    return [hashlib.sha256(text.encode()).hexdigest() for text in texts]
 
 
 def listed(scenes: SceneSet) -> tuple[str, str]:
     """Returns the list of scenes as the content of a file, and the hash of their data's
     files."""
+    hashes = scene_hashes(scenes)
     lines = zip(
         scenes.scene_id,
         scenes.location,
         scenes.number,
-        scene_hashes(scenes),
+        hashes,
         strict=True,
     )
     return csv_text([COLUMNS, *lines]), scenes.files
@@ -78,31 +89,38 @@ def read_list(path: str | Path) -> list[Listed]:
         rows = CsvReader(content)
         if "scene_id" not in (rows.fieldnames or ()):
             raise InputError(
-                f"scenes={file}: no column scene_id; give the {SCENES} of a run, or a table with one"
+                f"scenes={file}: no column scene_id; give the {SCENES} of a run, "
+                "or a table with one"
             )
-        found = dict.fromkeys(_line(file, rows.line_num, row=row) for row in rows)
+        lines = list(
+            dict.fromkeys(
+                _line(row, f"scenes={file}, line {rows.line_num}") for row in rows
+            )
+        )
+    except InputError:
+        raise
     except (OSError, ValueError, csv.Error) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(
             f"scenes={file}: cannot be read ({error}); give the {SCENES} of a run"
         ) from error
-    if not found:
+    if not lines:
         raise InputError(f"scenes={file}: names no scene; add a line for each")
-    return list(found)
+    return lines
 
 
-def _line(file: Path, number: int, row: dict[str, str | None]) -> Listed:
-    name, noise, sha256 = (row.get(key) for key in ("scene_id", "number", "sha256"))
-    if not name:
+def _line(row: dict[str, str | None], place: str) -> Listed:
+    number = row.get("number")
+    if not row.get("scene_id"):
+        raise InputError(f"{place}: no scene_id; name a scene, or remove the line")
+    if number and not (number.isascii() and number.isdigit() and int(number) < LARGEST):
         raise InputError(
-            f"scenes={file}, line {number}: no scene_id; name a scene, or remove the line"
+            f"{place}: number {number}: expected a whole number of at least 0"
         )
-    if noise and not (noise.isascii() and noise.isdigit() and int(noise) < LARGEST):
-        raise InputError(
-            f"scenes={file}, line {number}: number {noise}: expected a whole number of at least 0"
-        )
-    return Listed(name, int(noise) if noise else None, sha256=sha256 or None)
+    return Listed(
+        str(row["scene_id"]),
+        number=int(number) if number else None,
+        sha256=row.get("sha256") or None,
+    )
 
 
 def listed_scenes(
@@ -111,70 +129,71 @@ def listed_scenes(
     most: int | None = None,
     files: str = "",
 ) -> SceneSet:
-    """The scenes of a list, at most its first `most`, in its order. load: the first so
-    many scenes of the data, or all.
+    """Returns the scenes of a list, in its order.
 
-    files: SHA-256 of the data files that the list was made of, if it is known; where
-    the data's are the same, scenes that differ from the listed ones are told on stderr
-    and taken. Raises InputError for those of other files, and for scenes that are not
-    there.
+    Args:
+        path: of the list, or of the folder of the run that wrote it.
+        load: returns the first so many scenes of the data, or all.
+        most: how many scenes at most.
+        files: SHA-256 of the data files that the list was made of, if it is known.
+            Where the data's are the same, scenes that differ from the listed ones are
+            told on stderr and taken.
+
+    Raises:
+        InputError: scenes that are not there, or differ and are of other files.
     """
-    listed = read_list(path)[:most]
-    numbers = [
-        line.number for line in listed if line.number is not None and line.sha256
-    ]
-    if (
-        len(numbers) == len(listed)
-    ):  # perhaps all among the first scenes of the data, in which case no more are built
+    lines = read_list(path)[:most]
+    numbers = [line.number for line in lines if line.number is not None and line.sha256]
+    if len(numbers) == len(lines):  # perhaps all are among the first, and no more built
         scenes = load(max(numbers) + 1)
         hashes = scene_hashes(scenes)
-        if {line.sha256 for line in listed} <= set(hashes):
-            return _taken(scenes, listed, hashes=hashes)
+        if {line.sha256 for line in lines} <= set(hashes):
+            return _taken(scenes, lines, hashes)
     scenes = load(None)
     hashes = scene_hashes(scenes)
-    known = set(scenes.scene_id)
-    count = f"of {len(listed)} scenes are not"
-    if missing := [line.scene_id for line in listed if line.scene_id not in known]:
-        mend = f"whose first is {scenes.scene_id[0]}; pass the data that the list is of (data=, data.path=)"
+    count = f"of {len(lines)} scenes are not"
+    places = _places(scenes.scene_id)
+    if missing := [line for line in lines if line.scene_id not in places]:
         raise InputError(
-            f"scenes={path}: {len(missing)} {count} in the data ({_some(missing)}), {mend}"
+            f"scenes={path}: {len(missing)} {count} in the data ({_some(missing)}), "
+            f"whose first is {scenes.scene_id[0]}; pass the data that the list is of "
+            "(data=, data.path=)"
         )
-    if other := [
-        line.scene_id for line in listed if line.sha256 and line.sha256 not in hashes
-    ]:
+    same = set(hashes)
+    if other := [line for line in lines if line.sha256 and line.sha256 not in same]:
         message = f"scenes={path}: {len(other)} {count} those listed ({_some(other)})"
         if not files or files != scenes.files:
-            cause = "the data, data.build or e2rl's version are others"
             raise InputError(
-                f"{message}: {cause}; restore them, or leave the column sha256 out to run these"
+                f"{message}: the data, data.build or e2rl's version are others; "
+                "restore them, or leave the column sha256 out to run these"
             )
-        tqdm.write(
-            f"{message}, though the data files are: another version or machine",
-            sys.stderr,
-        )
-    return _taken(scenes, listed, hashes=hashes)
+        message += ", though the data files are: another version or machine"
+        tqdm.write(message, sys.stderr)
+    return _taken(scenes, lines, hashes)
 
 
 def _taken(
-    scenes: SceneSet, listed: Sequence[Listed], hashes: Sequence[str]
+    scenes: SceneSet,
+    lines: Sequence[Listed],
+    hashes: Sequence[str],
 ) -> SceneSet:
     """The scenes of the lines: those of the same hash, else of the same id."""
-    by_hash = {value: index for index, value in reversed(list(enumerate(hashes)))}
-    by_name = {
-        name: index for index, name in reversed(list(enumerate(scenes.scene_id)))
-    }
-    keep = [
-        by_hash.get(line.sha256 or "", by_name.get(line.scene_id, -1))
-        for line in listed
+    same = _places(hashes)
+    named = _places(scenes.scene_id)
+    rows = [same.get(line.sha256 or "", named.get(line.scene_id, -1)) for line in lines]
+    chosen = scenes.chosen(rows)
+    numbers = [
+        default if line.number is None else line.number
+        for line, default in zip(lines, chosen.number, strict=True)
     ]
-    chosen = scenes.chosen(keep)
-    own = zip(chosen.number, listed, strict=True)
-    return replace(
-        chosen,
-        number=[number if line.number is None else line.number for number, line in own],
-    )
+    return replace(chosen, number=numbers)
 
 
-def _some(names: Collection[str]) -> str:
-    shown = list(names)[:SHOWN]
-    return ", ".join(shown) + (", .." if len(names) > len(shown) else "")
+def _places(values: Sequence[str]) -> dict[str, int]:
+    """The index of each value, of equal ones the first."""
+    return {value: index for index, value in reversed(list(enumerate(values)))}
+
+
+def _some(lines: Sequence[Listed]) -> str:
+    shown = ", ".join(line.scene_id for line in lines[:SHOWN])
+    return shown + (", .." if len(lines) > SHOWN else "")

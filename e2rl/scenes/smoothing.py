@@ -4,12 +4,19 @@ at a frame."""
 from functools import lru_cache
 
 import numpy as np
+from numpy import ndarray
 from scipy.ndimage import convolve1d
 from scipy.signal import savgol_coeffs
 
-from e2rl.scenes.paths import direction, wrap
+from e2rl.scenes.paths import (
+    direction,
+    wrap,
+)
 from e2rl.scenes.recording import DT
-from e2rl.scenes.runs import Runs, runs_of
+from e2rl.scenes.runs import (
+    Runs,
+    runs_of,
+)
 
 WINDOW, ORDER = 15, 2  # Savitzky-Golay: frames, polynomial order
 CAUSAL_WINDOW = 11  # frames: the current one and 1 s of history
@@ -21,18 +28,18 @@ LATELY = 5  # frames over which it is measured
 REVERSED = 0.5  # m: what drives less far backwards does not reverse
 AT_REST = 0.1  # m/s on average, of what has halted or not moved off
 REST_FRAMES = 3  # frames before or after over which that is measured
-ACCELERATIONS = (-6.0, 4.0)  # m/s^2 at a start
+MIN_ACCEL, MAX_ACCEL = -6.0, 4.0  # m/s^2 at a start
 MAX_YAW_RATE = 1.0  # rad/s at a start
 
 
-def signed_speed(velocity: np.ndarray, heading: np.ndarray) -> np.ndarray:
+def signed_speed(velocity: ndarray, heading: ndarray) -> ndarray:
     """Speeds [...] m/s of velocities [..., 2], negative where these point backwards of
     a heading [...] rad."""
     along = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
     return np.where(along < 0, -1.0, 1.0) * np.linalg.norm(velocity, axis=-1)
 
 
-def speeds(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def speeds(states: ndarray, valid: ndarray) -> ndarray:
     """Signed speeds [F, A] m/s of tracks [F, A, 4] at 10 Hz, from the mean of the
     velocities to the frames before and after, where these are recorded; 0 for a track
     of one frame."""
@@ -46,7 +53,7 @@ def speeds(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return signed_speed(total / np.maximum(count, 1), states[..., 2])
 
 
-def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def drop_jumps(states: ndarray, valid: ndarray) -> ndarray:
     """valid [F, A] without the frames that jumps (over MAX_STEP in a frame) divide from
     a track's longest run.
 
@@ -62,7 +69,11 @@ def drop_jumps(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return valid
 
 
-def _consistent(track: np.ndarray, valid: np.ndarray, run: np.ndarray) -> np.ndarray:
+def _consistent(
+    track: ndarray,
+    valid: ndarray,
+    run: ndarray,
+) -> ndarray:
     """Frames [F] of one track [F, 2] in its longest run (run [F]: number of jumps so
     far) and the runs that fit it."""
     count = np.bincount(run[valid])
@@ -78,13 +89,13 @@ def _consistent(track: np.ndarray, valid: np.ndarray, run: np.ndarray) -> np.nda
             if not len(frames):
                 continue
             change = track[frames[inner]] - track[edge]
-            if np.hypot(*change) <= MAX_STEP * abs(frames[inner] - edge):
+            if np.hypot(change[0], change[1]) <= MAX_STEP * abs(frames[inner] - edge):
                 keep[frames] = True
                 edge = frames[outer]
     return keep
 
 
-def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def smooth(states: ndarray, valid: ndarray) -> ndarray:
     """Tracks [F, A, 4] with smoothed positions, and the signed speed along the heading
     from their derivative.
 
@@ -99,13 +110,30 @@ def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
     windows = np.minimum(WINDOW, (runs.end - runs.start - 1) // 2 * 2 + 1)
     for window in np.unique(windows[windows > ORDER]).tolist():
         chosen = Runs._make(part[windows == window] for part in runs)
-        _fit_runs(position, chosen, window=window, order=0, into=out[..., :2])
-        _fit_runs(position, chosen, window=window, order=1, into=velocity)
+        _fit_runs(
+            position,
+            chosen,
+            window=window,
+            order=0,
+            into=out[..., :2],
+        )
+        _fit_runs(
+            position,
+            chosen,
+            window=window,
+            order=1,
+            into=velocity,
+        )
     unit = direction(states[..., 2])
     along = (velocity * unit).sum(-1)
     fitted = ~np.isnan(along)
     along = np.where(fitted, along, states[..., 3])
-    around = _mean_velocity(position, valid, back=LATELY // 2, ahead=LATELY // 2)
+    around = _mean_velocity(
+        position,
+        valid,
+        back=LATELY // 2,
+        ahead=LATELY // 2,
+    )
     speed = _signed(along, ~fitted | ((around * unit).sum(-1) < -REVERSES))
     _stop_short_reversing(speed, valid)
     out[..., 3] = np.where(_at_rest(position, valid), 0.0, speed)
@@ -113,14 +141,24 @@ def smooth(states: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def _fit_runs(
-    track: np.ndarray, runs: Runs, *, window: int, order: int, into: np.ndarray
+    track: ndarray,
+    runs: Runs,
+    *,
+    window: int,
+    order: int,
+    into: ndarray,
 ) -> None:
     """Write the fit (order 0) or its slope (order 1) of runs of a track [F, A, 2] into
     an array like it."""
     agent, start, end = runs
     half = window // 2
     centre, weights = polynomial_weights(window, order)
-    middle = convolve1d(track[:, agent], centre, axis=0, mode="constant")
+    middle = convolve1d(
+        track[:, agent],
+        centre,
+        axis=0,
+        mode="constant",
+    )
     frame = np.arange(len(track))[:, None]
     row, run = np.nonzero((frame >= start + half) & (frame < end - half))
     into[row, agent[run]] = middle[row, run]
@@ -131,23 +169,38 @@ def _fit_runs(
 
 
 @lru_cache
-def polynomial_weights(window: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+def polynomial_weights(window: int, order: int) -> tuple[ndarray, ndarray]:
     """Of the polynomial that fits `window` samples at DT best, the value (order 0) or
     slope (order 1): at the middle sample, for a convolution [window], and at all
     samples [window, window]: row k times the samples is that at k."""
     time = np.arange(window)[:, None] - window // 2
     power = np.arange(ORDER + 1)
     basis = power * time ** np.maximum(power - 1, 0) / DT if order else time**power
-    return savgol_coeffs(window, ORDER, order, DT), basis @ np.linalg.pinv(time**power)
+    return savgol_coeffs(
+        window,
+        ORDER,
+        order,
+        DT,
+    ), basis @ np.linalg.pinv(time**power)
 
 
-def _at_rest(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def _at_rest(position: ndarray, valid: ndarray) -> ndarray:
     """Returns where tracks [F, A, 2] m have halted, or have not yet moved off, bool [F,
     A]: a polynomial that is fitted across a hard stop goes on for half a second."""
     recorded = valid[1:] & valid[:-1]
     beyond = np.zeros_like(valid[:1])
-    after = _mean_velocity(position, valid, back=0, ahead=REST_FRAMES)
-    before = _mean_velocity(position, valid, back=REST_FRAMES, ahead=0)
+    after = _mean_velocity(
+        position,
+        valid,
+        back=0,
+        ahead=REST_FRAMES,
+    )
+    before = _mean_velocity(
+        position,
+        valid,
+        back=REST_FRAMES,
+        ahead=0,
+    )
     halted = np.linalg.norm(after, axis=-1) < AT_REST
     waits = np.linalg.norm(before, axis=-1) < AT_REST
     halted &= np.concatenate([recorded, beyond])
@@ -155,7 +208,7 @@ def _at_rest(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return halted | waits
 
 
-def _stop_short_reversing(speed: np.ndarray, valid: np.ndarray) -> None:
+def _stop_short_reversing(speed: ndarray, valid: ndarray) -> None:
     """Set speeds [F, A] to 0, in place, where a track drives backwards for less than
     REVERSED m: it is noise."""
     for agent, first, last in np.transpose(runs_of(valid & (speed < 0))):
@@ -164,8 +217,12 @@ def _stop_short_reversing(speed: np.ndarray, valid: np.ndarray) -> None:
 
 
 def _mean_velocity(
-    position: np.ndarray, valid: np.ndarray, *, back: int, ahead: int
-) -> np.ndarray:
+    position: ndarray,
+    valid: ndarray,
+    *,
+    back: int,
+    ahead: int,
+) -> ndarray:
     """Mean velocities [F, A, 2] m/s of tracks [F, A, 2] from `back` frames before to
     `ahead` frames after, of what is recorded there; 0 where nothing is."""
     recorded = (valid[1:] & valid[:-1])[..., None]
@@ -181,7 +238,7 @@ def _mean_velocity(
     return (total[last] - total[first]) / seconds
 
 
-def _signed(along: np.ndarray, backwards: np.ndarray) -> np.ndarray:
+def _signed(along: ndarray, backwards: ndarray) -> ndarray:
     """Speeds m/s along headings, at most TOP_SPEED: what is slower than REVERSES or not
     `backwards` reverses not."""
     speed = np.clip(along, -TOP_SPEED, TOP_SPEED)
@@ -189,8 +246,10 @@ def _signed(along: np.ndarray, backwards: np.ndarray) -> np.ndarray:
 
 
 def causal_state(
-    states: np.ndarray, valid: np.ndarray, frame: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    states: ndarray,
+    valid: ndarray,
+    frame: int,
+) -> tuple[ndarray, ndarray, ndarray]:
     """State [A, 4] with a signed speed, acceleration [A] and yaw rate [A] at `frame`
     from the frames up to it only.
 
@@ -209,13 +268,28 @@ def causal_state(
     turn = np.where(recorded > 0, tracks[..., 2] - present[:, 2], 0.0)
     turn = np.unwrap(turn, axis=0)[..., None]
     basis = np.stack([np.ones_like(time), time, time**2], 1)
-    position = _fit(basis, recorded, value=shift, quadratic=count >= 5)
-    heading = _fit(basis, recorded, value=turn, quadratic=np.zeros(len(count), bool))
+    position = _fit(
+        basis,
+        recorded,
+        value=shift,
+        quadratic=count >= 5,
+    )
+    heading = _fit(
+        basis,
+        recorded,
+        value=turn,
+        quadratic=np.zeros(len(count), bool),
+    )
     unit = direction(present[:, 2])
-    mean = _mean_velocity(tracks[..., :2], recorded > 0, back=LATELY - 1, ahead=0)[-1]
+    mean = _mean_velocity(
+        tracks[..., :2],
+        recorded > 0,
+        back=LATELY - 1,
+        ahead=0,
+    )[-1]
     backwards = (mean * unit).sum(-1) < -REVERSES
     speed = _signed((position[:, 1] * unit).sum(-1), backwards)
-    accel = np.clip(2 * (position[:, 2] * unit).sum(-1), *ACCELERATIONS)
+    accel = np.clip(2 * (position[:, 2] * unit).sum(-1), MIN_ACCEL, MAX_ACCEL)
     single = count < 2
     speed = np.where(single, _signed(present[:, 3], single), speed)
     accel = np.where(single | (np.abs(speed) < 0.1), 0.0, accel)
@@ -225,8 +299,11 @@ def causal_state(
 
 
 def causal_past(
-    states: np.ndarray, valid: np.ndarray, frame: int, speed: np.ndarray
-) -> np.ndarray:
+    states: ndarray,
+    valid: ndarray,
+    frame: int,
+    speed: ndarray,
+) -> ndarray:
     """Returns the recorded poses of agents 0.1 s, 0.2 s, ... before `frame`.
 
     Before the contiguous frames that end at `frame`, an agent counts as having driven
@@ -260,12 +337,29 @@ def causal_past(
 
 
 def _fit(
-    basis: np.ndarray, weight: np.ndarray, *, value: np.ndarray, quadratic: np.ndarray
-) -> np.ndarray:
+    basis: ndarray,
+    weight: ndarray,
+    *,
+    value: ndarray,
+    quadratic: ndarray,
+) -> ndarray:
     """Weighted least squares coefficients [A, 3, C] of value [W, A, C] on basis [W, 3];
     without the quadratic term where `quadratic` [A] is False."""
-    gram = np.einsum("wi,wa,wj->aij", basis, weight, basis)
+    gram = np.einsum(
+        "wi,wa,wj->aij",
+        basis,
+        weight,
+        basis,
+    )
     drop = np.where(quadratic, 0.0, 1e9)
     gram += 1e-9 * np.eye(3) + drop[:, None, None] * np.diag([0.0, 0.0, 1.0])
     value = np.nan_to_num(value)
-    return np.linalg.solve(gram, np.einsum("wi,wa,wac->aic", basis, weight, value))
+    return np.linalg.solve(
+        gram,
+        np.einsum(
+            "wi,wa,wac->aic",
+            basis,
+            weight,
+            value,
+        ),
+    )

@@ -9,17 +9,45 @@ keyed by content and by the code of the class, and the count of what is left out
 import hashlib
 import json
 import sys
-from abc import ABC, abstractmethod
-from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from abc import (
+    ABC,
+    abstractmethod,
+)
+from collections import (
+    Counter,
+    deque,
+)
+from collections.abc import (
+    Generator,
+    Iterable,
+    Iterator,
+    Mapping,
+)
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import (
+    closing,
+    contextmanager,
+    nullcontext,
+)
+from dataclasses import (
+    asdict,
+    dataclass,
+    field,
+    replace,
+)
 from functools import partial
-from itertools import chain, count, islice
+from itertools import (
+    chain,
+    count,
+    islice,
+)
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import (
+    Any,
+    ClassVar,
+    NamedTuple,
+)
 
 import numpy as np
 from hydra.utils import get_class
@@ -29,7 +57,11 @@ from e2rl.run.config import Extension
 from e2rl.run.errors import InputError
 from e2rl.run.extras import how_to_install
 from e2rl.run.files import cache_folder
-from e2rl.run.processes import interrupts_held, without_main, worker_pool
+from e2rl.run.processes import (
+    interrupts_held,
+    without_main,
+    worker_pool,
+)
 from e2rl.run.settings import (
     check_range,
     check_settings,
@@ -38,30 +70,45 @@ from e2rl.run.settings import (
     settings_of,
 )
 from e2rl.run.terminal import Bar
-from e2rl.scenes.builder import BuildSettings, SceneBuilder, ego_overlaps
-from e2rl.scenes.reader_code import code_hash, failed_line
-from e2rl.scenes.recording import MAX_NAME, Recording
-from e2rl.scenes.scene import SceneSet, validate
-from e2rl.scenes.scene_cache import Index, cached, uncached
+from e2rl.scenes.builder import (
+    BuildSettings,
+    SceneBuilder,
+    ego_overlaps,
+)
+from e2rl.scenes.reader_code import (
+    code_hash,
+    failed_line,
+)
+from e2rl.scenes.recording import (
+    MAX_NAME,
+    Recording,
+)
+from e2rl.scenes.scene import (
+    SceneSet,
+    validate,
+)
+from e2rl.scenes.scene_cache import (
+    Index,
+    cached,
+    uncached,
+)
 from e2rl.scenes.scene_list import listed_scenes
 from e2rl.scenes.trailers import couple
-from e2rl.scenes.versions import MARK, RECORDED, check_versions, version_of
+from e2rl.scenes.versions import (
+    MARK,
+    RECORDED,
+    check_versions,
+    version_of,
+)
 
 OVERLAP = "ego overlaps a vehicle at the start"  # why scenes are left out
 TOO_SHORT = "too short for a start frame"
 NO_EGO = "nobody to be the ego at the start"
-NO_VERSION = (
-    "without such a version"  # or it is invalid, where the log itself makes scenes, too
-)
-VERSION = 14  # of the scene builder: raise it when the same recording would make another scene
+NO_VERSION = "without such a version"  # or it is invalid, and the log itself is not
+VERSION = 14  # of the builder: raise it when a recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
 FEW = 16  # scenes that are built here before processes would have started
-NO_MATTER = (
-    "path",
-    "cache",
-    "cache_gb",
-    "workers",
-)  # settings that do not change the scenes
+NO_MATTER = {"path", "cache", "cache_gb", "workers"}  # to the scenes
 
 
 class Row(NamedTuple):
@@ -80,7 +127,11 @@ class Row(NamedTuple):
     repairs: Counter[str] = Counter()  # never changed in place
 
 
-def default_of(key: str, file: str = "data/source", **rule: Any) -> Any:
+def default_of(
+    key: str,
+    file: str = "data/source",
+    **rule: Any,
+) -> Any:
     """Returns a dataclass field whose default is that of conf/<file>.yaml; rule: see
     `setting`."""
     return field(
@@ -109,14 +160,12 @@ class Source(Extension, ABC):
     workers: int = default_of("workers")
     build: BuildSettings = field(default_factory=BuildSettings)
 
-    code: ClassVar[str | None] = (
-        None  # hash of the code that defines the class, as it was when it was imported
-    )
+    # hash of the code that defines the class, as it was when it was imported
+    code: ClassVar[str | None] = None
     has_splits: ClassVar[bool] = False  # whether `split` chooses among the recordings
     holds: ClassVar[str] = "recorded logs"  # what `path` holds, for messages
-    mend: ClassVar[str] = (
-        ""  # what to do with a damaged log; "": any error of `read` but InputError is the class's own
-    )
+    # what to do with a damaged log; "": any other error of `read` is the class's own
+    mend: ClassVar[str] = ""
     extra: ClassVar[str] = ""  # of e2rl, with the library that `read` imports
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -158,7 +207,8 @@ class Source(Extension, ABC):
         path = Path(self.path).expanduser()
         if not path.exists():
             raise InputError(
-                f"data.path={self.path}: no such file or folder; pass one that holds {self.holds}"
+                f"data.path={self.path}: no such file or folder; "
+                f"pass one that holds {self.holds}"
             )
         return path
 
@@ -175,74 +225,53 @@ class Source(Extension, ABC):
         For the first `most`, no more logs are built than they take, unless the cache
         has all.
         """
-        if (
-            type(self).__module__ == "__mp_main__"
-        ):  # a worker that imports its script anew would wait for its parent
+        # a worker that imports its script anew would wait for its parent
+        if type(self).__module__ == "__mp_main__":
             raise InputError(
-                'a script that defines its own source needs `if __name__ == "__main__":` around its calls'
+                'a script that defines its own source needs `if __name__ == "__main__":` '
+                "around its calls"
             )
-        content = self._called("fingerprint", self.fingerprint)
+        with self._errors_of("fingerprint"):
+            content = self.fingerprint()
         if content is None or self.code is None:
             return uncached(partial(self._built, most))
         folder = Path(self.cache) if self.cache else cache_folder()
-        every = folder / self._file(content, None)
-        if most is None or every.exists():
-            scenes = cached(
-                every, partial(self._built, None), gigabytes=self.cache_gb
-            ).first(most)
-        else:
-            scenes = cached(
-                folder / self._file(content, most),
-                partial(self._built, most),
-                gigabytes=self.cache_gb,
-            )
-        return replace(scenes, files=hashlib.sha256(content).hexdigest())
+        count = None if (folder / self._file(content, None)).exists() else most
+        scenes = cached(
+            folder / self._file(content, count),
+            partial(self._built, count),
+            gigabytes=self.cache_gb,
+        )
+        return replace(scenes.first(most), files=hashlib.sha256(content).hexdigest())
 
     def log_names(self) -> list[str]:
         """Returns `logs`, checked; raises InputError where it fails, or returns
         anything else than a list of texts."""
-        names = self._called("logs", self.logs)
-        if not isinstance(names, list | tuple) or not all(
-            isinstance(name, str) for name in names
-        ):
-            wrong = (
-                type(names).__name__
-                if not isinstance(names, list | tuple)
-                else "other than texts"
-            )
-            raise InputError(
-                f"{type(self).__name__}.logs returns {wrong}; return a list of the names of logs"
-            )
-        return list(names)
-
-    def _called(self, name: str, method: Callable[[], Any]) -> Any:
-        """Returns what a method of the class does; InputError, with the line, where a
-        user's code raises."""
-        try:
-            return method()
-        except InputError:
-            raise
-        except Exception as error:
-            line = failed_line(type(self), error.__traceback__)
-            if not line:
-                raise
-            raise InputError(
-                f"{type(self).__name__}.{name} failed at {line}: {_cause(error)}; mend it there"
-            ) from error
+        with self._errors_of("logs"):
+            names = self.logs()
+        is_list = isinstance(names, list | tuple)
+        if is_list and all(isinstance(name, str) for name in names):
+            return list(names)
+        raise InputError(
+            f"{type(self).__name__}.logs returns "
+            f"{'other than texts' if is_list else type(names).__name__}; "
+            "return a list of the names of logs"
+        )
 
     def _file(self, content: bytes, most: int | None) -> str:
         """Returns the name of the cache file of the first `most` scenes."""
-        settings = asdict(self) | {
-            "split": self.split_name,
-            "source": type(self).__qualname__,
-        }
         settings = {
-            key: value for key, value in settings.items() if key not in NO_MATTER
+            key: value for key, value in asdict(self).items() if key not in NO_MATTER
         }
-        about = json.dumps(
-            [VERSION, self.code, settings, most], sort_keys=True, default=str
+        settings["split"] = self.split_name
+        settings["source"] = type(self).__qualname__
+        key = [VERSION, self.code, settings, most]
+        text = json.dumps(
+            key,
+            sort_keys=True,
+            default=str,
         ).encode()
-        return f"scenes-{hashlib.sha256(about + content).hexdigest()}.map"
+        return f"scenes-{hashlib.sha256(text + content).hexdigest()}.map"
 
     def _windows(self, log: str) -> Iterator[list[Recording]]:
         """Yields the recordings that one log makes, those of the same tracks and map
@@ -251,19 +280,19 @@ class Source(Extension, ABC):
             for recording in self._read(log):
                 recording.validate_names().validate_fields()
                 if len(self.versions) > 1:  # all are of one place, or else of one log
-                    recording = replace(
-                        recording, location=recording.location or recording.scene_id
-                    )
-                for version in filter(
-                    None, (version_of(recording, name) for name in self.versions)
-                ):
-                    yield list(couple(version).windows(self.starts, self.build.steps))
+                    place = recording.location or recording.scene_id
+                    recording = replace(recording, location=place)
+                for name in self.versions:
+                    version = version_of(recording, name)
+                    if version is not None:
+                        windows = couple(version).windows(self.starts, self.build.steps)
+                        yield list(windows)
 
     def _read(self, log: str) -> Iterator[Recording]:
         """Yields `read`; raises InputError where that is anything else than recordings."""
         recordings = self.read(log)
-        mend = "yield e2rl.scenes.recording.Recording objects"
         name = f"{type(self).__name__}.read"
+        mend = "yield e2rl.scenes.recording.Recording objects"
         if not isinstance(recordings, Iterable):
             raise InputError(f"{name} returns {type(recordings).__name__}; {mend}")
         for recording in recordings:
@@ -275,32 +304,37 @@ class Source(Extension, ABC):
     def named(self, log: str) -> Iterator[None]:
         """What `read` raises in the block is an InputError that names the log."""
         try:
-            yield
+            with self._errors_of("read", mend=self.mend):
+                yield
         except InputError as error:
-            raise InputError(_naming(log, error)) from error
-        except ImportError as error:
-            if not self.extra:
-                raise
-            mend = how_to_install(self.extra)
-            raise InputError(
-                f"{log}: a library of its reader cannot be imported ({error}); {mend}"
-            ) from error
-        except (
-            Exception,
-            SystemExit,
-        ) as error:  # damaged files raise anything, and so do mistakes in a class
+            raise InputError(_naming(log, error)) from (error.__cause__ or error)
+
+    @contextmanager
+    def _errors_of(self, method: str, mend: str = "") -> Iterator[None]:
+        """What a method of the class raises in the block is an InputError, with the
+        line of a user's code; with `mend`, the log is to blame for it."""
+        try:
+            yield
+        except InputError:
+            raise
+        except (Exception, SystemExit) as error:  # damaged files, too, raise anything
             line = failed_line(type(self), error.__traceback__)
-            if self.mend:
+            cause = f"{type(error).__name__} {str(error).partition(chr(10))[0]}"
+            missing = isinstance(error, ImportError) and method == "read"
+            if missing and self.extra:
+                message = (
+                    f"a library of its reader cannot be imported ({error}); "
+                    f"{how_to_install(self.extra)}"
+                )
+            elif mend and not missing:
                 at = f" at {line}" if line else ""
-                raise InputError(
-                    f"{log}: is none of {self.holds}: {_cause(error)}{at}; {self.mend}"
-                ) from error
-            if not line:
+                message = f"is none of {self.holds}: {cause}{at}; {mend}"
+            elif line and not missing:
+                name = f"{type(self).__name__}.{method}"
+                message = f"{name} failed at {line}: {cause}; mend it there"
+            else:
                 raise
-            name = f"{type(self).__name__}.read"
-            raise InputError(
-                f"{log}: {name} failed at {line}: {_cause(error)}; mend it there"
-            ) from error
+            raise InputError(message) from error
 
     def _rows_of(self, log: str) -> list[Row]:
         """Returns what the recordings of one log make."""
@@ -314,11 +348,12 @@ class Source(Extension, ABC):
             if isinstance(error.__cause__, ImportError):  # no log can be read
                 raise
             return [Row(log, reason=str(error))]
-        short = f"{TOO_SHORT} and half of data.build.steps={self.build.steps}, which may be set lower"
+        steps = f"half of data.build.steps={self.build.steps}, which may be set lower"
+        reason = f"{TOO_SHORT} and {steps}" if RECORDED in self.versions else NO_VERSION
         return rows or [
             Row(
                 log,
-                reason=short if RECORDED in self.versions else NO_VERSION,
+                reason=reason,
                 usual=True,
             )
         ]
@@ -327,9 +362,12 @@ class Source(Extension, ABC):
         """Yields what recordings of the same tracks and map make."""
         builder = None
         for window in windows:
-            row = Row(window.scene_id, window.location, dataset=window.dataset)
+            row = Row(window.scene_id, window.location, window.dataset)
             if len(windows) > 1 and not window.has_ego():
-                yield row._replace(reason=NO_EGO, usual=True)
+                yield row._replace(
+                    reason=NO_EGO,
+                    usual=True,
+                )
                 continue
             try:
                 if builder is None:
@@ -338,21 +376,24 @@ class Source(Extension, ABC):
                 scene = builder.scene(window)
                 validate(scene, window.scene_id)
             except InputError as error:
-                beside = RECORDED in self.versions and any(
-                    f"{MARK}{name}" in row.scene_id for name in self.versions
-                )
+                marks = [f"{MARK}{name}" for name in self.versions]
+                is_version = any(mark in row.scene_id for mark in marks)
+                usual = is_version and RECORDED in self.versions
+                reason = NO_VERSION if usual else _naming(log, error)
                 yield row._replace(
-                    reason=NO_VERSION if beside else _naming(log, error), usual=beside
+                    reason=reason,
+                    usual=usual,
                 )
                 continue
             if overlapped := ego_overlaps(scene):
+                reason = OVERLAP.replace("a vehicle", overlapped)
                 yield row._replace(
-                    reason=OVERLAP.replace("a vehicle", overlapped), usual=True
+                    reason=reason,
+                    usual=True,
                 )
             else:
-                yield row._replace(
-                    scene={key: value.numpy() for key, value in scene.items()}
-                )
+                arrays = {key: value.numpy() for key, value in scene.items()}
+                yield row._replace(scene=arrays)
 
     def rows(self, most: int | None = None) -> Generator[Row]:
         """Yields what the logs make, in their order, of which `most` scenes are asked
@@ -363,33 +404,39 @@ class Source(Extension, ABC):
         of all but the first name their log.
         """
         logs = self.log_names()
-        show = partial(Bar, desc="building scenes", total=len(logs), unit="log")
-        known: set[str] = set()
+        taken: set[str] = set()
         with closing(self._rows_of_logs(logs, most)) as rows_of_logs:
-            for log, rows in zip(logs, show(rows_of_logs), strict=False):
-                yield from _told_apart(log, rows, known=known)
+            bar = Bar(
+                rows_of_logs,
+                desc="building scenes",
+                total=len(logs),
+                unit="log",
+            )
+            for log, rows in zip(logs, bar, strict=False):
+                yield from _told_apart(log, rows, taken)
 
     def _rows_of_logs(self, logs: list[str], most: int | None) -> Generator[list[Row]]:
         """Yields what each log makes; most: see `rows`."""
         if min(self.workers, len(logs)) <= 1 or (most is not None and most <= FEW):
             yield from map(self._rows_of, logs)
             return
-        own = (
-            type(self).__module__ == "__main__"
-        )  # then the workers need the script that defines it
+        # the workers need the script that defines the class
+        in_script = type(self).__module__ == "__main__"
+        coming = iter(logs)
+        waiting: deque[Future[list[Row]]] = deque()
         try:
             with worker_pool(self.workers, "spawn") as pool:
-                coming = iter(logs)
-                waiting: deque[Future[list[Row]]] = deque()
                 for _ in logs:
-                    with interrupts_held(), nullcontext() if own else without_main():
+                    script = nullcontext() if in_script else without_main()
+                    with interrupts_held(), script:
                         ahead = islice(coming, AHEAD * self.workers - len(waiting))
                         waiting.extend(pool.submit(self._rows_of, log) for log in ahead)
                     yield waiting.popleft().result()
         except BrokenProcessPool as error:
             raise InputError(
-                f"data.workers={self.workers}: a process that builds scenes was killed, perhaps for lack of memory, or "
-                'did not start, as in a script without `if __name__ == "__main__":`; set data.workers=1'
+                f"data.workers={self.workers}: a process that builds scenes was killed, "
+                "perhaps for lack of memory, or did not start, as in a script without "
+                '`if __name__ == "__main__":`; set data.workers=1'
             ) from error
 
     def _built(self, most: int | None, index: Index) -> Iterator[dict[str, np.ndarray]]:
@@ -418,12 +465,11 @@ class Source(Extension, ABC):
                         f"{row.reason} (data.skip_invalid=true leaves such scenes out)"
                     )
         if not index.scene_id:
-            left_out = ", ".join(
-                f"{count} {reason}" for reason, count in index.dropped.items()
-            )
-            data = self.path or f"split {self.split_name}"
+            dropped = index.dropped.items()
+            left_out = ", ".join(f"{count} {reason}" for reason, count in dropped)
             raise InputError(
-                f"no valid scene in {data} ({left_out}); see the messages above, or pass other data"
+                f"no valid scene in {self.path or f'split {self.split_name}'} "
+                f"({left_out}); see the messages above, or pass other data"
             )
 
 
@@ -435,17 +481,20 @@ def load_scenes(
     scenes: str | Path | None = None,
     files: str = "",
 ) -> SceneSet:
-    """Returns at most `num_scenes` scenes of a source, or of the source that a `data`
-    group (conf/data/*.yaml) names. Raises InputError for a source that cannot be built,
-    for a missing or empty path, for a scene of the list that is not there and, unless
-    data.skip_invalid, for an invalid scene.
+    """Returns the scenes of a source.
 
     Args:
+        data: the source, or a `data` group (conf/data/*.yaml) that names one.
+        num_scenes: how many scenes at most.
         split: overrides the source's own where `Source.has_splits`.
         starts: overrides the source's start frames.
         scenes: a list (e2rl/scenes/scene_list.py), of which all or the first
             `num_scenes` are taken.
         files: see `listed_scenes`.
+
+    Raises:
+        InputError: a source that cannot be built, a missing or empty path, a scene of
+            the list that is not there and, unless data.skip_invalid, an invalid scene.
     """
     if num_scenes is not None:
         check_range("num_scenes", num_scenes, low=1)
@@ -455,65 +504,56 @@ def load_scenes(
     if starts is not None:
         source = replace(source, starts=tuple(starts))
     if scenes is not None:
-        return listed_scenes(scenes, source.load, most=num_scenes, files=files)
+        return listed_scenes(
+            scenes,
+            source.load,
+            most=num_scenes,
+            files=files,
+        )
     return source.load(num_scenes)
 
 
 def source_of(data: Mapping) -> Source:
     """Returns the source that the `_target_` of a `data` group names, with the other
     keys as its settings."""
-    target = str(data.get("_target_"))
+    settings = dict(data)
+    target = str(settings.pop("_target_", None))
     try:
         kind = get_class(target)
     except Exception as error:  # importing a module raises anything
-        reason = error.__cause__ or error
         raise InputError(
-            f"data={target}: cannot be built: {reason}; name a subclass of Source as _target_"
+            f"data={target}: cannot be built: {error.__cause__ or error}; "
+            "name a subclass of Source as _target_"
         ) from error
     if not issubclass(kind, Source):
         raise InputError(
-            f"data={target}: is no e2rl.scenes.source.Source; subclass it, and define logs() and read()"
+            f"data={target}: is no e2rl.scenes.source.Source; "
+            "subclass it, and define logs() and read()"
         )
-    return settings_of(
-        kind,
-        {key: value for key, value in data.items() if key != "_target_"},
-        where="data",
-    )
+    return settings_of(kind, settings, where="data")
 
 
-def _told_apart(log: str, rows: list[Row], known: set[str]) -> Iterator[Row]:
+def _told_apart(
+    log: str,
+    rows: list[Row],
+    taken: set[str],
+) -> Iterator[Row]:
     """Yields the rows of a log with ids that no earlier scene has: ID:FILE or
-    ID:FILE@START where theirs are taken.
-
-    Args:
-        log: its name.
-        rows: what it makes.
-        known: ids of the scenes so far, to which theirs are added.
-    """
+    ID:FILE@START where theirs are `taken`, to which they are added."""
+    file = Path(log)
     scene_ids = [row.scene_id for row in rows if row.scene is not None]
-    mark = "" if known.isdisjoint(scene_ids) else f":{Path(log).stem}"
+    mark = "" if taken.isdisjoint(scene_ids) else f":{file.stem}"
     for row in rows:
         if row.scene is not None:
-            marks = chain(
-                [mark, f":{Path(log).with_suffix('')}"],
-                map(f"{mark}:{{}}".format, count(2)),
-            )
-            scene_id = next(
-                filter(
-                    partial(_is_free, known=known),
-                    (_marked(row.scene_id, each) for each in marks),
-                )
-            )
-            known.add(scene_id)
+            numbered = (f"{mark}:{number}" for number in count(2))
+            for suffix in chain([mark, f":{file.with_suffix('')}"], numbered):
+                scene_id = _marked(row.scene_id, suffix)
+                printable = scene_id.isprintable() and len(scene_id) <= MAX_NAME
+                if printable and scene_id not in taken:
+                    break
+            taken.add(scene_id)
             row = row._replace(scene_id=scene_id)
         yield row
-
-
-def _is_free(scene_id: str, known: set[str]) -> bool:
-    """Returns whether an id can be a scene's, and none of `known` is."""
-    return (
-        scene_id not in known and scene_id.isprintable() and len(scene_id) <= MAX_NAME
-    )
 
 
 def _marked(scene_id: str, mark: str) -> str:
@@ -521,11 +561,6 @@ def _marked(scene_id: str, mark: str) -> str:
     frame of a window."""
     name, at, start = scene_id.rpartition("@")
     return f"{name}{mark}{at}{start}" if at else f"{scene_id}{mark}"
-
-
-def _cause(error: BaseException) -> str:
-    """Returns the type and the first line of an exception."""
-    return f"{type(error).__name__} {str(error).partition(chr(10))[0]}"
 
 
 def _naming(log: str, error: InputError) -> str:

@@ -132,9 +132,10 @@ def small_set() -> tuple[Place, Recording]:
     valid = rng.random((FRAMES, 3)) < 0.8
     valid[:, 1] = True
     states = np.where(valid[..., None], states, 0.0)
-    return scene_map, scene_map.recording(
-        "x", 7, states, valid, np.full((3, 2), 2.5), 1
+    recording = scene_map.recording(
+        "x", first=7, states=states, valid=valid, size=np.full((3, 2), 2.5), ego=1
     )
+    return scene_map, recording
 
 
 def test_round_trip():

@@ -114,10 +114,13 @@ def cut_windows(
         known = known[:, rows]
         tracks = np.where(known[..., None], traffic[:, rows], 0.0)
         scene_id = f"{scene_map.name}_{first:04d}"
-        kept.append(
-            (
-                scene_map.recording(scene_id, first, tracks, known, bodies[rows], 0),
-                first,
-            )
+        recording = scene_map.recording(
+            scene_id,
+            first=first,
+            states=tracks,
+            valid=known,
+            size=bodies[rows],
+            ego=0,
         )
+        kept.append((recording, first))
     return kept, refused
