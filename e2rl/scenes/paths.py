@@ -25,7 +25,7 @@ def wrap(angle: Angle) -> Angle:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def direction(angle: ndarray) -> ndarray:
+def direction(angle: ndarray | float) -> ndarray:
     """Unit vectors [..., 2] of angles [...] rad."""
     return np.stack([np.cos(angle), np.sin(angle)], -1)
 

@@ -207,12 +207,11 @@ class _Machine(LIBRARY):
             target.value = dtype_of(target.dtype, state)
         else:
             _, shape, dtype, fortran, data = state
-            order = "F" if fortran else "C"
             target.value = array_of(
                 data,
                 dtype,
                 shape=shape,
-                order=order,
+                order="F" if fortran else "C",
             )
         self.append(target.value)
 

@@ -199,7 +199,7 @@ def _joined(
     size = recording.size.astype(float)
     recorded = valid[:, pair]
     pulled = recorded[:, :1]
-    both = recorded.all(1)
+    both = np.asarray(recorded.all(1))
     front, rear = _ends(states[:, pair], size[pair, 0])
     chord = front[:, 0] - rear[:, 1]
     distance = np.linalg.norm(chord, axis=-1)

@@ -14,7 +14,12 @@ ALL = np.arange(FRAMES)
 
 
 def track(
-    position, heading, speed, kind: str = "VEHICLE", valid=None, size=(4.5, 1.9)
+    position,
+    heading,
+    speed,
+    kind: str = "VEHICLE",
+    valid=None,
+    size=(4.5, 1.9),
 ) -> dict:
     """A track through position [F, 2] m with heading [F] rad and speed [F] m/s (scalars
     broadcast)."""
@@ -37,7 +42,12 @@ def track(
     }
 
 
-def straight(x: float, y: float, speed: float, **options) -> dict:
+def straight(
+    x: float,
+    y: float,
+    speed: float,
+    **options,
+) -> dict:
     """A track along +x at constant speed, at (x, y) at frame 0."""
     return track(
         np.stack([x + 0.1 * speed * ALL, np.full(FRAMES, y)], 1),
@@ -47,7 +57,13 @@ def straight(x: float, y: float, speed: float, **options) -> dict:
     )
 
 
-def lane(points, exits=(), speed_kmh: float = 50.0, width: float = 3.6, **more) -> dict:
+def lane(
+    points,
+    exits=(),
+    speed_kmh: float = 50.0,
+    width: float = 3.6,
+    **more,
+) -> dict:
     """A lane of constant width along points [P, 2]."""
     points = np.asarray(points, float)
     polyline = np.concatenate([points, np.zeros((len(points), 1))], 1)
@@ -80,14 +96,22 @@ def fork(connected: bool = True) -> dict:
 
 
 def description(
-    tracks: dict | None = None, lanes: dict | None = None, **metadata
+    tracks: dict | None = None,
+    lanes: dict | None = None,
+    **metadata,
 ) -> dict:
     """A scenario of tracks (default: the ego at 8 m/s on `in`, a car ahead on `near`, a
     pedestrian) on the fork."""
     tracks = tracks or {
         "ego": straight(20, 0, speed=8),
         "7": straight(50, 3.5, speed=6),
-        "p": straight(40, -6, speed=1, kind="PEDESTRIAN", size=(0.6, 0.6)),
+        "p": straight(
+            40,
+            -6,
+            speed=1,
+            kind="PEDESTRIAN",
+            size=(0.6, 0.6),
+        ),
     }
     return {
         "id": "fork",
@@ -114,14 +138,21 @@ def numbered(scenes: list[dict]) -> list[dict]:
 
 def write_folder(folder: Path, scenes: list) -> Path:
     """Pickle scenes (dicts, or bytes as they are) into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(
+        parents=True,
+        exist_ok=True,
+    )
     for index, scene in enumerate(scenes):
         content = scene if isinstance(scene, bytes) else pickle.dumps(scene)
         (folder / f"sd_{index:02d}.pkl").write_bytes(content)
     return folder
 
 
-def write_zip(path: Path, scenes: list[dict], method: int = zipfile.ZIP_LZMA) -> Path:
+def write_zip(
+    path: Path,
+    scenes: list[dict],
+    method: int = zipfile.ZIP_LZMA,
+) -> Path:
     """The same in a zip."""
     with zipfile.ZipFile(path, "w", method) as archive:
         for index, scene in enumerate(scenes):
@@ -149,12 +180,18 @@ def recordings_in(
     """What a source makes of one log."""
     source = kind("nowhere", **settings)
     vars(source).update(
-        logs=lambda: [log], content=lambda _: content, locations={Path(log).stem: place}
+        logs=lambda: [log],
+        content=lambda _: content,
+        locations={Path(log).stem: place},
     )
     return list(source.recordings())
 
 
-def data_config(path, cache, **options) -> dict:
+def data_config(
+    path,
+    cache,
+    **options,
+) -> dict:
     """The scenarionet group with small fields."""
     group = {
         "_target_": "e2rl.scenes.scenarionet.ScenarioNetSource",

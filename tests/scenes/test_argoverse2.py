@@ -11,7 +11,11 @@ import torch
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.drivable_area import off_road
-from e2rl.scenes.recording import OTHER, PEDESTRIAN, VEHICLE
+from e2rl.scenes.recording import (
+    OTHER,
+    PEDESTRIAN,
+    VEHICLE,
+)
 
 pytest.importorskip("av2", reason="data=argoverse2 needs the extra argoverse2")
 import pandas as pd  # noqa: E402
@@ -20,7 +24,12 @@ from av2.datasets.motion_forecasting.scenario_serialization import (
     serialize_argoverse_scenario_parquet,
 )  # noqa: E402
 
-from e2rl.scenes.argoverse2 import AHEAD, EGO_SIZE, MAX_ROWS, Argoverse2Source
+from e2rl.scenes.argoverse2 import (
+    AHEAD,
+    EGO_SIZE,
+    MAX_ROWS,
+    Argoverse2Source,
+)
 
 RECORDED = Path(__file__).parents[3] / "shared" / "data" / "av2"
 FRAMES = 110
@@ -60,16 +69,49 @@ def segment(
 
 def write_map(folder: Path, name: str) -> None:
     segments = [
-        segment(1, (0, 100), y=0, successors=[2], left=3),
+        segment(
+            1,
+            (0, 100),
+            y=0,
+            successors=[2],
+            left=3,
+        ),
         segment(2, (100, 400), y=0),
-        segment(3, (0, 100), y=3.6, left=4, right=1),
-        segment(4, (100, 0), y=7.2, left=3),  # oncoming
-        segment(5, (0, 100), y=-3.6, kind="BIKE"),
+        segment(
+            3,
+            (0, 100),
+            y=3.6,
+            left=4,
+            right=1,
+        ),
+        segment(
+            4,
+            (100, 0),
+            y=7.2,
+            left=3,
+        ),  # oncoming
+        segment(
+            5,
+            (0, 100),
+            y=-3.6,
+            kind="BIKE",
+        ),
     ]
-    area = {"id": 9, "area_boundary": points((0, -6), (400, -6), (400, 9), (0, 9))}
+    area = {
+        "id": 9,
+        "area_boundary": points(
+            (0, -6),
+            (400, -6),
+            (400, 9),
+            (0, 9),
+        ),
+    }
     parts = {"drivable_areas": {"9": area}, "pedestrian_crossings": {}}
     parts["lane_segments"] = {str(part["id"]): part for part in segments}
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(
+        parents=True,
+        exist_ok=True,
+    )
     (folder / f"log_map_archive_{name}.json").write_text(json.dumps(parts))
 
 
@@ -83,12 +125,19 @@ def track(
 ) -> schema.Track:
     states = [
         schema.ObjectState(
-            frame < 50, frame, (x + 0.1 * speed * frame, y), 0.0, (speed, 0.0)
+            frame < 50,
+            frame,
+            (x + 0.1 * speed * frame, y),
+            0.0,
+            (speed, 0.0),
         )
         for frame in frames
     ]
     return schema.Track(
-        name, states, schema.ObjectType(kind), schema.TrackCategory.SCORED_TRACK
+        name,
+        states,
+        schema.ObjectType(kind),
+        schema.TrackCategory.SCORED_TRACK,
     )
 
 
@@ -96,14 +145,45 @@ def write_scenario(root: Path, tracks: list[schema.Track] | None = None) -> Path
     """A scenario `made` in its folder: the ego at 8 m/s on segment 1, a bus beside it,
     and a pedestrian for 2 s."""
     tracks = tracks or [
-        track("7", "bus", x=40, y=3.6, speed=6),
-        track("AV", "vehicle", x=20, y=0, speed=8),
-        track("p", "pedestrian", x=30, y=-5, speed=1, frames=range(20)),
-        track("c", "construction", x=60, y=-5, speed=0),
+        track(
+            "7",
+            "bus",
+            x=40,
+            y=3.6,
+            speed=6,
+        ),
+        track(
+            "AV",
+            "vehicle",
+            x=20,
+            y=0,
+            speed=8,
+        ),
+        track(
+            "p",
+            "pedestrian",
+            x=30,
+            y=-5,
+            speed=1,
+            frames=range(20),
+        ),
+        track(
+            "c",
+            "construction",
+            x=60,
+            y=-5,
+            speed=0,
+        ),
     ]
     stamps = np.linspace(315e15, 315e15 + 1e9 * TIMES[-1], FRAMES)
     scenario = schema.ArgoverseScenario(
-        "made", stamps, tracks, "7", "austin", None, None
+        "made",
+        stamps,
+        tracks,
+        "7",
+        "austin",
+        None,
+        None,
     )
     write_map(root / "made", "made")
     serialize_argoverse_scenario_parquet(
@@ -130,7 +210,11 @@ def write_sensor_log(root: Path, turn: float = 0.6) -> Path:
     stands = (np.array([50.0, 30.0]) - place) @ back.T
 
     def boxes(
-        name: str, category: str, at: np.ndarray, yaw: float, size: tuple[float, float]
+        name: str,
+        category: str,
+        at: np.ndarray,
+        yaw: float,
+        size: tuple[float, float],
     ) -> pd.DataFrame:
         half = {"qw": np.cos(yaw / 2), "qx": 0.0, "qy": 0.0, "qz": np.sin(yaw / 2)}
         columns = {
@@ -148,10 +232,26 @@ def write_sensor_log(root: Path, turn: float = 0.6) -> Path:
 
     tables = [
         boxes(
-            "car", "REGULAR_VEHICLE", np.tile([10.0, 3.5], (FRAMES, 1)), 0.0, (4.4, 1.8)
+            "car",
+            "REGULAR_VEHICLE",
+            np.tile([10.0, 3.5], (FRAMES, 1)),
+            0.0,
+            (4.4, 1.8),
         ),
-        boxes("person", "PEDESTRIAN", stands, -turn, (0.6, 0.5)),
-        boxes("ego", "EGO_VEHICLE", np.zeros((FRAMES, 2)), 0.0, EGO_SIZE),
+        boxes(
+            "person",
+            "PEDESTRIAN",
+            stands,
+            -turn,
+            (0.6, 0.5),
+        ),
+        boxes(
+            "ego",
+            "EGO_VEHICLE",
+            np.zeros((FRAMES, 2)),
+            0.0,
+            EGO_SIZE,
+        ),
     ]
     write_map(root / "log" / "map", "log____PIT_city_1")
     pd.DataFrame(poses).to_feather(root / "log" / "city_SE3_egovehicle.feather")
@@ -168,10 +268,8 @@ def test_a_scenario_arrives(tmp_path):
     kinds = dict(
         zip(["7", "AV", "c", "p"], recording.agent_type.tolist(), strict=True)
     )  # tracks in order of name
-    assert (
-        kinds == {"7": VEHICLE, "AV": VEHICLE, "c": OTHER, "p": PEDESTRIAN}
-        and recording.ego == 1
-    )
+    assert kinds == {"7": VEHICLE, "AV": VEHICLE, "c": OTHER, "p": PEDESTRIAN}
+    assert recording.ego == 1
     assert (recording.scene_id, recording.location, recording.dataset) == (
         "made",
         "austin",
@@ -182,21 +280,19 @@ def test_a_scenario_arrives(tmp_path):
     assert np.allclose(
         recording.states[:, 1], np.stack([20 + 8 * TIMES, zeros, zeros, zeros + 8], 1)
     )
-    assert recording.size[1].tolist() == list(EGO_SIZE) and recording.size[0, 0] > 10
+    assert recording.size[1].tolist() == list(EGO_SIZE)
+    assert recording.size[0, 0] > 10
 
 
 def test_the_map_arrives(tmp_path):
     (recording,) = Argoverse2Source(str(write_scenario(tmp_path))).recordings()
     lanes = recording.lanes
     assert set(lanes) == {"1", "2", "3", "4"}  # no bike lane
-    assert np.allclose(
-        lanes["4"].points[[0, -1]], [[100, 7.2], [0, 7.2]]
-    ) and np.isclose(lanes["4"].width, 3.6)
-    assert (
-        lanes["1"].exits == ["2"]
-        and lanes["1"].left == ["3"]
-        and lanes["3"].right == ["1"]
-    )
+    assert np.allclose(lanes["4"].points[[0, -1]], [[100, 7.2], [0, 7.2]])
+    assert np.isclose(lanes["4"].width, 3.6)
+    assert lanes["1"].exits == ["2"]
+    assert lanes["1"].left == ["3"]
+    assert lanes["3"].right == ["1"]
     assert lanes["3"].left == [] == lanes["4"].left  # oncoming
     (ring,) = recording.drivable
     assert {tuple(point) for point in ring} == {(0, -6), (400, -6), (400, 9), (0, 9)}
@@ -208,16 +304,13 @@ def test_boxes_of_a_sensor_log_stand_where_the_vehicle_saw_them(tmp_path):
     ahead = np.array([np.cos(turn), np.sin(turn)])
     left = np.array([-np.sin(turn), np.cos(turn)])
     axle = np.array([20.0, 0.0]) + 8 * TIMES[:, None] * ahead
-    assert (
-        recording.ego == 0
-        and recording.location == "pittsburgh"
-        and recording.states.shape[1] == 3
-    )
+    assert recording.ego == 0
+    assert recording.location == "pittsburgh"
+    assert recording.states.shape[1] == 3
     assert np.allclose(recording.states[:, 0, :2], axle + AHEAD * ahead)
     assert np.allclose(recording.states[:, 1, :2], axle + 10 * ahead + 3.5 * left)
-    assert np.allclose(recording.states[:, :2, 2], turn) and np.allclose(
-        recording.states[:, :2, 3], 8
-    )
+    assert np.allclose(recording.states[:, :2, 2], turn)
+    assert np.allclose(recording.states[:, :2, 3], 8)
     assert np.allclose(recording.states[:, 2], [50, 30, 0, 0], atol=1e-6)
     assert recording.size.tolist() == [list(EGO_SIZE), [4.4, 1.8], [0.6, 0.5]]
     assert recording.agent_type.tolist() == [VEHICLE, VEHICLE, PEDESTRIAN]
@@ -279,19 +372,28 @@ def pipe(folder: Path) -> None:
     ],
 )
 def test_what_would_cost_much_or_is_of_another_type_is_refused(
-    tmp_path, change, message
+    tmp_path,
+    change,
+    message,
 ):
     change(write_scenario(tmp_path) / "made")
     with pytest.raises(InputError, match=rf"made/scenario_made\.parquet: .*{message}"):
-        Argoverse2Source(str(tmp_path), cache=str(tmp_path / "cache"), workers=1).load()
+        Argoverse2Source(
+            str(tmp_path),
+            cache=str(tmp_path / "cache"),
+            workers=1,
+        ).load()
 
 
 def test_a_folder_of_both_kinds_makes_scenes(tmp_path):
     write_sensor_log(write_scenario(tmp_path), turn=0.0)
     scenes = Argoverse2Source(
-        str(tmp_path), cache=str(tmp_path / "cache"), workers=1
+        str(tmp_path),
+        cache=str(tmp_path / "cache"),
+        workers=1,
     ).load()
-    assert scenes.scene_id == ["log", "made"] and scenes.dropped == {}
+    assert scenes.scene_id == ["log", "made"]
+    assert scenes.dropped == {}
     assert scenes.scenes["logged_valid"][:, :, 0].all()
 
 
@@ -300,7 +402,8 @@ def test_a_folder_of_both_kinds_makes_scenes(tmp_path):
 )
 def test_recorded_logs_make_scenes_in_which_the_ego_keeps_to_the_road():
     rows = list(Argoverse2Source(str(RECORDED), workers=1).rows())
-    assert len(rows) == 7 and not [row.reason for row in rows if row.reason]
+    assert len(rows) == 7
+    assert not [row.reason for row in rows if row.reason]
     for row in rows:
         scene = {name: torch.from_numpy(value) for name, value in row.scene.items()}
         driven = scene["logged"][scene["logged_valid"][:, 0], 0, :2]

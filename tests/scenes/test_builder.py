@@ -8,7 +8,12 @@ import pytest
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.builder import BuildSettings, SceneBuilder, build_scene, ego_overlaps
+from e2rl.scenes.builder import (
+    BuildSettings,
+    SceneBuilder,
+    build_scene,
+    ego_overlaps,
+)
 from e2rl.scenes.recording import PEDESTRIAN, VEHICLE
 from e2rl.scenes.route import project
 from e2rl.scenes.scenarionet import ScenarioNetSource, recording_of
@@ -34,11 +39,20 @@ RECORDED = {
 }
 
 
-def recorded(tracks=None, lanes=None, **metadata):
+def recorded(
+    tracks=None,
+    lanes=None,
+    **metadata,
+):
     return recording_of(description(tracks, lanes, **metadata))
 
 
-def build(tracks=None, lanes=None, settings: BuildSettings = SETTINGS, **metadata):
+def build(
+    tracks=None,
+    lanes=None,
+    settings: BuildSettings = SETTINGS,
+    **metadata,
+):
     return build_scene(recorded(tracks, lanes, **metadata), settings)
 
 
@@ -77,18 +91,18 @@ def test_a_scene_keeps_the_schema_and_its_frame():
     scene = build()
     validate(scene, "made")
     assert set(scene.keys()) == set(KEYS)
-    assert scene["start"].shape == (48, 4) and scene["logged"].shape == (81, 48, 4)
-    assert scene["valid"].sum() == 3 and scene["valid"][[0, 1, 32]].all()
+    assert scene["start"].shape == (48, 4)
+    assert scene["logged"].shape == (81, 48, 4)
+    assert scene["valid"].sum() == 3
+    assert scene["valid"][[0, 1, 32]].all()
     assert scene["agent_type"][[0, 1, 32]].tolist() == [VEHICLE, VEHICLE, PEDESTRIAN]
     assert scene["start"][0].tolist() == pytest.approx(
         [0, 0, 0, 8], abs=1e-4
     )  # origin: the ego's rounded position
     assert scene["start"][1].tolist() == pytest.approx([28, 3.5, 0, 6], abs=1e-4)
     way = 0.8 * torch.arange(81)
-    assert (
-        scene["logged"][:, 0, 0].allclose(way, atol=1e-4)
-        and scene["logged_valid"][:, [0, 1, 32]].all()
-    )
+    assert scene["logged"][:, 0, 0].allclose(way, atol=1e-4)
+    assert scene["logged_valid"][:, [0, 1, 32]].all()
     assert scene["lane_points"][:, 0].min() == -28.0
     assert scene["size"][32].tolist() == pytest.approx([0.6, 0.6])
 
@@ -121,9 +135,8 @@ def test_the_start_of_what_stands_sees_nothing_of_the_future():
     ego = straight(20, 0, speed=8)
     scene = build({"ego": ego, "7": parked})
     changed = build({"ego": ego, "7": other})
-    assert torch.equal(scene["start"], changed["start"]) and torch.equal(
-        scene["past"], changed["past"]
-    )
+    assert torch.equal(scene["start"], changed["start"])
+    assert torch.equal(scene["past"], changed["past"])
     assert len(scene["logged"][:, 1, 2].unique()) == 1, "it never turns"
 
 
@@ -151,10 +164,8 @@ def test_headings_are_mended_counted_and_drop_nobody():
         == 1
     )
     assert scene["start"][0].tolist() == pytest.approx([0, 0, 0, 8], abs=1e-4)
-    assert (
-        scene["logged_valid"][:, :5].all()
-        and scene["logged"][:, :5, 2].abs().max() < 0.1
-    )
+    assert scene["logged_valid"][:, :5].all()
+    assert scene["logged"][:, :5, 2].abs().max() < 0.1
     row = {float(x): row for row, x in enumerate(scene["start"][:5, 0].round())}
     assert scene["logged"][:, row[60.0], 3].allclose(torch.tensor(-2.0), atol=1e-4)
     assert scene["start"][row[60.0], 3] == pytest.approx(-2.0, abs=1e-4)
@@ -164,10 +175,8 @@ def test_the_log_ends_where_the_recording_does():
     tracks = description()["tracks"]
     tracks["7"]["state"]["valid"] = (ALL < 40) | (ALL > 60)
     scene = build(tracks, current_time_index=30)
-    assert (
-        scene["logged_valid"][:, 0].sum() == 61
-        and scene["logged_valid"][:, 1].sum() == 40
-    )
+    assert scene["logged_valid"][:, 0].sum() == 61
+    assert scene["logged_valid"][:, 1].sum() == 40
     assert not scene["logged"][~scene["logged_valid"]].any()
 
 
@@ -175,29 +184,46 @@ def test_the_nearest_take_part_the_ego_first():
     cars = {
         f"c{k}": straight(40 + 8.0 * k, 0 if k % 2 else 3.5, speed=8) for k in range(6)
     }
-    late = straight(48, 3.5, speed=8, valid=ALL > 30)
+    late = straight(
+        48,
+        3.5,
+        speed=8,
+        valid=ALL > 30,
+    )
     people = {
-        f"p{k}": straight(30, -5 - k, speed=8, kind="PEDESTRIAN", valid=5 * k < ALL)
+        f"p{k}": straight(
+            30,
+            -5 - k,
+            speed=8,
+            kind="PEDESTRIAN",
+            valid=5 * k < ALL,
+        )
         for k in range(4)
     }
     scene = build(
         cars | {"late": late, "ego": straight(20, 0, speed=8)} | people,
-        settings=BuildSettings(field_cells=64, vehicles=4, others=3),
+        settings=BuildSettings(
+            field_cells=64,
+            vehicles=4,
+            others=3,
+        ),
     )
     assert scene["start"][:4, 0].tolist() == pytest.approx([0, 20, 28, 36], abs=0.01)
     assert (scene["start"][4:, 1] * scene["valid"][4:]).tolist() == pytest.approx(
         [-5, -6, 0], abs=0.01
     )
-    assert scene["logged_valid"][:, 4:].any(0).all() and scene["valid"].tolist() == [
-        True
-    ] * 6 + [False]
+    assert scene["logged_valid"][:, 4:].any(0).all()
+    assert scene["valid"].tolist() == [True] * 6 + [False]
 
 
 def crossing(start_y: float, **options) -> dict:
     """A car that crosses the ego's path at x = 60 at 6 m/s."""
     y = start_y + 0.6 * ALL
     return track(
-        np.stack([np.full(FRAMES, 60.0), y], 1), np.pi / 2, speed=6.0, **options
+        np.stack([np.full(FRAMES, 60.0), y], 1),
+        np.pi / 2,
+        speed=6.0,
+        **options,
     )
 
 
@@ -205,13 +231,18 @@ def test_cars_that_stand_leave_their_rows_to_those_that_move():
     """Those farthest from the ego's path first; where the rows suffice, nobody is left
     out."""
     stands = {f"p{k}": straight(24 + 6.0 * k, -8 - k, speed=0) for k in range(6)}
-    settings = BuildSettings(field_cells=64, vehicles=6, others=0)
+    settings = BuildSettings(
+        field_cells=64,
+        vehicles=6,
+        others=0,
+    )
     scene = build(
         {"ego": straight(20, 0, speed=8), "x": crossing(-40)} | stands,
         settings=settings,
     )
     moving = scene["valid"] & (scene["start"][:, 3] > 1)
-    assert moving.sum() == 2 and scene["valid"].all()
+    assert moving.sum() == 2
+    assert scene["valid"].all()
     assert sorted(scene["start"][~moving, 1].tolist()) == pytest.approx(
         [-11, -10, -9, -8]
     )
@@ -227,22 +258,32 @@ def test_cars_that_stand_leave_their_rows_to_those_that_move():
 def test_who_appears_later_and_comes_near_is_replayed_and_counted():
     late = {
         "x": crossing(-30, valid=ALL > 30),
-        "far": straight(0, 60, speed=8, valid=ALL > 30),
+        "far": straight(
+            0,
+            60,
+            speed=8,
+            valid=ALL > 30,
+        ),
     }
     scene = build(
         {"ego": straight(20, 0, speed=8), "7": straight(50, 3.5, speed=6)} | late
     )
-    assert scene["valid"].sum() == 2 and scene["left_out"] == 1
+    assert scene["valid"].sum() == 2
+    assert scene["left_out"] == 1
     assert scene["logged_valid"].any(0).nonzero()[:, 0].tolist() == [0, 1, 2]
-    assert (
-        scene["logged_valid"][:, 2].nonzero()[0] == 21 and scene["route_log"][2] == -1
-    )
-    assert not scene["start"][2].any() and not scene["parked"][2]
+    assert scene["logged_valid"][:, 2].nonzero()[0] == 21
+    assert scene["route_log"][2] == -1
+    assert not scene["start"][2].any()
+    assert not scene["parked"][2]
     crowded = build(
         {"ego": straight(20, 0, speed=8)} | late,
-        settings=BuildSettings(field_cells=64, vehicles=2),
+        settings=BuildSettings(
+            field_cells=64,
+            vehicles=2,
+        ),
     )
-    assert crowded["left_out"] == 1 and crowded["logged_valid"][:, 1].any()
+    assert crowded["left_out"] == 1
+    assert crowded["logged_valid"][:, 1].any()
 
 
 def test_the_way_driven_is_found_and_is_the_mission():
@@ -256,7 +297,8 @@ def test_the_way_driven_is_found_and_is_the_mission():
     assert scene["route_valid"][0].sum() == 3  # on, left, and the lane beside
     mission = mission_of(scene[None])
     _, offset, _ = project(scene["logged"][:, 0, :2], mission.points[0])
-    assert offset.abs().max() < 0.4 and torch.isinf(mission.end).all()
+    assert offset.abs().max() < 0.4
+    assert torch.isinf(mission.end).all()
     follower = scene["route_log"][1]
     assert (
         scene["route_points"][1, follower, 40:, 1].abs().max() < 0.1
@@ -276,7 +318,8 @@ def test_a_mission_without_lane_is_the_recorded_way_and_ends_with_what_is_known(
     track = scene["logged"][:, 0, :2]
     points = scene["route_points"][0, slot]
     s, offset, _ = project(track, points)
-    assert offset.abs().max() < 0.15 and s[0].item() == pytest.approx(20, abs=0.1)
+    assert offset.abs().max() < 0.15
+    assert s[0].item() == pytest.approx(20, abs=0.1)
     assert scene["route_open"][0, slot]
     beyond = (
         scene["route_length"][0, slot].item() - s[-1].item()
@@ -290,9 +333,8 @@ def test_limits_and_lights_lie_on_the_route():
     full["dynamic_map_states"] = {"left": {"state": {"object_state": states}}}
     scene = build_scene(recording_of(full), SETTINGS)
     turning = int((scene["route_light"][0, :, 0] == 0).nonzero())
-    assert (
-        scene["route_valid"][0, turning] and (scene["route_light"][0] == 0).sum() == 1
-    )
+    assert scene["route_valid"][0, turning]
+    assert (scene["route_light"][0] == 0).sum() == 1
     assert scene["route_light_s"][0, turning, 0].item() == pytest.approx(
         20 + 52, abs=0.5
     )  # the ego is at x = 48
@@ -319,11 +361,15 @@ def test_only_vehicles_that_stand_beside_the_lanes_are_parked():
     parked = {
         round(y): bool(p)
         for y, p, v in zip(
-            scene["start"][:, 1].tolist(), scene["parked"], scene["valid"], strict=True
+            scene["start"][:, 1].tolist(),
+            scene["parked"],
+            scene["valid"],
+            strict=True,
         )
         if v
     }
-    assert parked == {0: False, -6: True, 9: False} and scene["parked"].sum() == 1
+    assert parked == {0: False, -6: True, 9: False}
+    assert scene["parked"].sum() == 1
 
 
 def test_overlap_with_the_ego_is_seen_and_only_that():
@@ -348,8 +394,19 @@ def test_overlap_with_the_ego_is_seen_and_only_that():
         ("TRAFFIC_CONE", "an object"),
     ):
         other = {
-            "p": straight(21, 0, speed=8, kind=kind, size=(0.5, 0.5)),
-            "far": straight(60, 0, speed=8, kind=kind),
+            "p": straight(
+                21,
+                0,
+                speed=8,
+                kind=kind,
+                size=(0.5, 0.5),
+            ),
+            "far": straight(
+                60,
+                0,
+                speed=8,
+                kind=kind,
+            ),
         }
         assert ego_overlaps(build({"ego": straight(20, 0, speed=8)} | other)) == word
 
@@ -365,7 +422,8 @@ def test_overlap_with_the_ego_is_seen_and_only_that():
         ),
         (
             lambda r: [
-                setattr(each, "points", each.points[:1]) for each in r.lanes.values()
+                setattr(map_lane, "points", map_lane.points[:1])
+                for map_lane in r.lanes.values()
             ],
             "no lane is at least",
         ),
@@ -378,7 +436,10 @@ def test_recordings_that_make_no_scene_say_why(change, message):
         build_scene(recording, SETTINGS)
 
 
-@pytest.fixture(scope="module", params=RECORDED)
+@pytest.fixture(
+    scope="module",
+    params=RECORDED,
+)
 def recorded_scenes(request):
     path, stride = RECORDED[request.param]
     if not path.exists():
@@ -400,24 +461,23 @@ def test_recorded_scenes_keep_the_schema_and_their_parked_cars_stay(recorded_sce
     parked = moved = 0
     for index, scene in enumerate(recorded_scenes):
         validate(scene, str(index))
-        assert (
-            torch.isfinite(scene["logged"]).all()
-            and (scene["logged"][..., 3].abs() <= TOP_SPEED).all()
-        )
+        assert torch.isfinite(scene["logged"]).all()
+        assert (scene["logged"][..., 3].abs() <= TOP_SPEED).all()
         assert scene["start"][0, 3] >= 0, "no ego of these logs reverses"
         stay = scene["parked"] & scene["valid"]
-        seen = scene["logged_valid"][:, stay] & scene["logged_valid"][:1, stay]
+        visible = scene["logged_valid"][:, stay] & scene["logged_valid"][:1, stay]
         way = (scene["logged"][:, stay, :2] - scene["logged"][:1, stay, :2]).norm(
             dim=-1
         )
         parked += int(stay.sum())
-        moved += int((way.masked_fill(~seen, 0).amax(0) > 2.0).sum())
-    assert parked > 10 and moved <= 0.02 * parked
+        moved += int((way.masked_fill(~visible, 0).amax(0) > 2.0).sum())
+    assert parked > 10
+    assert moved <= 0.02 * parked
 
 
 def test_recorded_vehicles_find_the_way_they_drove(recorded_scenes):
-    found = [
+    driven = [
         (scene["route_log"] >= 0)[scene["valid"][:32] & ~scene["parked"][:32]]
         for scene in recorded_scenes
     ]
-    assert torch.cat(found).float().mean() > 0.93
+    assert torch.cat(driven).float().mean() > 0.93

@@ -18,8 +18,16 @@ from e2rl.scenes.bundled import (
     read_recordings,
     unpack,
 )
-from e2rl.scenes.paths import WHEELBASE, arc_length, wrap
-from e2rl.scenes.recording import DT, Lane, Recording
+from e2rl.scenes.paths import (
+    WHEELBASE,
+    arc_length,
+    wrap,
+)
+from e2rl.scenes.recording import (
+    DT,
+    Lane,
+    Recording,
+)
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
@@ -42,29 +50,24 @@ def test_splits_share_no_place_and_are_small(sets):
         split: {recording.location for recording in part}
         for split, part in sets.items()
     }
-    assert sum(map(len, sets.values())) >= 180 and sum(map(len, nets.values())) >= 60
-    assert (
-        not nets["train"] & nets["test"]
-        and not nets["train"] & nets["tune"]
-        and not nets["tune"] & nets["test"]
-    )
+    assert sum(map(len, sets.values())) >= 180
+    assert sum(map(len, nets.values())) >= 60
+    assert not nets["train"] & nets["test"]
+    assert not nets["train"] & nets["tune"]
+    assert not nets["tune"] & nets["test"]
     assert 0.5 < len(nets["train"]) / sum(map(len, nets.values())) < 0.7
     ids = [recording.scene_id for part in sets.values() for recording in part]
-    assert (
-        len(set(ids)) == len(ids)
-        and sum(len(asset_bytes(split)) for split in SPLITS) < 10e6
-    )
+    assert len(set(ids)) == len(ids)
+    assert sum(len(asset_bytes(split)) for split in SPLITS) < 10e6
 
 
 def test_traffic_is_physical_and_the_ego_drives(recordings):
     for recording in recordings:
         states = recording.states
         valid = recording.valid
-        assert (
-            len(states) == FRAMES
-            and recording.current == CURRENT
-            and valid[:, recording.ego].all()
-        )
+        assert len(states) == FRAMES
+        assert recording.current == CURRENT
+        assert valid[:, recording.ego].all()
         assert arc_length(states[CURRENT : CURRENT + 81, recording.ego, :2])[-1] > 20.0
         inner = valid[2:] & valid[1:-1] & valid[:-2]
         velocity = (states[2:, :, :2] - states[:-2, :, :2]) / (2 * DT)
@@ -93,7 +96,8 @@ def test_lane_ends_meet():
         for scene_map in read_maps(unpack(split)):
             for name, lane in scene_map.lanes.items():
                 assert arc_length(lane.points)[-1] >= 1.0, (scene_map.name, name)
-                assert 2.5 <= lane.width <= 6.0 and 2.0 < lane.speed_limit < 40.0
+                assert 2.5 <= lane.width <= 6.0
+                assert 2.0 < lane.speed_limit < 40.0
                 for other in lane.exits:
                     gap = np.linalg.norm(
                         scene_map.lanes[other].points[0] - lane.points[-1]
@@ -115,7 +119,10 @@ def small_set() -> tuple[Place, Recording]:
         ),
         "b": Lane(np.eye(2), 3.5, speed_limit=8.0),
         "c": Lane(
-            np.array([[0.0, 3.4], [50.0, 5.0]]), 3.4, speed_limit=13.9, right=["a"]
+            np.array([[0.0, 3.4], [50.0, 5.0]]),
+            3.4,
+            speed_limit=13.9,
+            right=["a"],
         ),
     }
     lights = {"b": rng.integers(0, 4, 200).astype(np.int8)}
@@ -133,27 +140,29 @@ def small_set() -> tuple[Place, Recording]:
     valid[:, 1] = True
     states = np.where(valid[..., None], states, 0.0)
     recording = scene_map.recording(
-        "x", first=7, states=states, valid=valid, size=np.full((3, 2), 2.5), ego=1
+        "x",
+        first=7,
+        states=states,
+        valid=valid,
+        size=np.full((3, 2), 2.5),
+        ego=1,
     )
     return scene_map, recording
 
 
 def test_round_trip():
-    scene_map, made = small_set()
-    (read,) = read_recordings(pack([scene_map], [(made, 7)]))
-    assert (
-        (read.valid == made.valid).all()
-        and read.ego == 1
-        and read.scene_id == "x"
-        and read.location == "here"
-    )
-    error = np.abs(read.states - made.states)
+    scene_map, packed = small_set()
+    (read,) = read_recordings(pack([scene_map], [(packed, 7)]))
+    assert (read.valid == packed.valid).all()
+    assert read.ego == 1
+    assert read.scene_id == "x"
+    assert read.location == "here"
+    error = np.abs(read.states - packed.states)
     error[..., 2] = np.minimum(error[..., 2], 2 * np.pi - error[..., 2])
     assert error.max() <= 5.1e-4
-    assert (
-        read.lights["b"] == made.lights["b"]
-    ).all() and read.lanes.keys() == made.lanes.keys()
-    for name, lane in made.lanes.items():
+    assert (read.lights["b"] == packed.lights["b"]).all()
+    assert read.lanes.keys() == packed.lanes.keys()
+    for name, lane in packed.lanes.items():
         other = read.lanes[name]
         assert np.abs(other.points - lane.points).max() <= 5.1e-4
         assert (other.exits, other.left, other.right) == (

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, OTHER, PEDESTRIAN, VEHICLE
+from e2rl.scenes.recording import (
+    LIGHT_GREEN,
+    LIGHT_RED,
+    OTHER,
+    PEDESTRIAN,
+    VEHICLE,
+)
 
 pytest.importorskip("commonroad", reason="data=commonroad needs the extra commonroad")
 from e2rl.scenes.commonroad import CommonRoadSource, read_scenario
@@ -31,7 +37,12 @@ def exact(name: str, value: float) -> str:
 
 
 def state(
-    name: str, step: int, x: float, y: float, heading: float = 0.0, speed: float = 8.0
+    name: str,
+    step: int,
+    x: float,
+    y: float,
+    heading: float = 0.0,
+    speed: float = 8.0,
 ) -> str:
     position = f"<position><point><x>{x}</x><y>{y}</y></point></position>"
     values = (
@@ -52,7 +63,14 @@ def obstacle(
 ) -> str:
     """A dynamic obstacle that drives along +x from (x, y)."""
     states = [
-        state("state", step, x + speed * dt * step, y, 0.0, speed)
+        state(
+            "state",
+            step,
+            x + speed * dt * step,
+            y,
+            0.0,
+            speed,
+        )
         for step in range(1, steps)
     ]
     shape = f"<rectangle><length>{size[0]}</length><width>{size[1]}</width></rectangle>"
@@ -85,21 +103,39 @@ SIGN = """<trafficSign id="60"><trafficSignElement><trafficSignID>274</trafficSi
 ONCOMING = '<adjacentLeft ref="{}" drivingDir="opposite"/>'
 ROAD = [
     lanelet(
-        1, (0, 100), 0, '<successor ref="2"/><adjacentLeft ref="3" drivingDir="same"/>'
+        1,
+        (0, 100),
+        0,
+        '<successor ref="2"/><adjacentLeft ref="3" drivingDir="same"/>',
     ).replace(
         "<laneletType>",
         '<trafficSignRef ref="60"/><trafficLightRef ref="50"/><laneletType>',
         1,
     ),
-    lanelet(2, (100, 400), 0, '<predecessor ref="1"/>'),
+    lanelet(
+        2,
+        (100, 400),
+        0,
+        '<predecessor ref="1"/>',
+    ),
     lanelet(
         3,
         (0, 100),
         3.6,
         '<adjacentLeft ref="4" drivingDir="opposite"/><adjacentRight ref="1" drivingDir="same"/>',
     ),
-    lanelet(4, (100, 0), 7.2, '<adjacentLeft ref="3" drivingDir="opposite"/>'),
-    lanelet(5, (0, 100), -4.0, kind="sidewalk"),
+    lanelet(
+        4,
+        (100, 0),
+        7.2,
+        '<adjacentLeft ref="3" drivingDir="opposite"/>',
+    ),
+    lanelet(
+        5,
+        (0, 100),
+        -4.0,
+        kind="sidewalk",
+    ),
 ]
 
 
@@ -111,9 +147,31 @@ def scenario(
 ) -> bytes:
     """A scenario of format 2020a: a car on lanelet 1, a faster one on 3, a pedestrian."""
     moving = obstacles or [
-        obstacle(10, 0, 6, steps, dt),
-        obstacle(11, 3.6, 8, steps, dt, kind="truck", size=(8.0, 2.5)),
-        obstacle(12, -5, 1, steps // 2, dt, kind="pedestrian", size=(0.5, 0.5)),
+        obstacle(
+            10,
+            0,
+            6,
+            steps,
+            dt,
+        ),
+        obstacle(
+            11,
+            3.6,
+            8,
+            steps,
+            dt,
+            kind="truck",
+            size=(8.0, 2.5),
+        ),
+        obstacle(
+            12,
+            -5,
+            1,
+            steps // 2,
+            dt,
+            kind="pedestrian",
+            size=(0.5, 0.5),
+        ),
     ]
     parked = (
         '<staticObstacle id="20"><type>unknown</type><shape><rectangle><length>2</length><width>1</width>'
@@ -134,9 +192,14 @@ GOAL = "<goalState><time><intervalStart>40</intervalStart><intervalEnd>50</inter
 
 
 def begin(x: float, y: float) -> str:
-    return state("initialState", 0, x, y).replace(
-        "</initialState>", exact("yawRate", 0) + exact("slipAngle", 0)
-    ) + ("</initialState>")
+    return state(
+        "initialState",
+        0,
+        x,
+        y,
+    ).replace("</initialState>", exact("yawRate", 0) + exact("slipAngle", 0)) + (
+        "</initialState>"
+    )
 
 
 def test_tracks_map_and_lights_arrive():
@@ -156,17 +219,16 @@ def test_tracks_map_and_lights_arrive():
     assert np.allclose(recording.states[:, 3], [70, -4, 0, 0])
     lanes = recording.lanes
     assert set(lanes) == {"1", "2", "3", "4"}  # no sidewalk
-    assert np.allclose(lanes["1"].points, [[0, 0], [100, 0]]) and np.isclose(
-        lanes["1"].width, 3.6
-    )
-    assert (
-        lanes["1"].exits == ["2"]
-        and lanes["1"].left == ["3"]
-        and lanes["3"].right == ["1"]
-    )
+    assert np.allclose(lanes["1"].points, [[0, 0], [100, 0]])
+    assert np.isclose(lanes["1"].width, 3.6)
+    assert lanes["1"].exits == ["2"]
+    assert lanes["1"].left == ["3"]
+    assert lanes["3"].right == ["1"]
     assert lanes["3"].left == [] == lanes["4"].left  # oncoming
-    assert lanes["1"].speed_limit == 13.5 and lanes["2"].speed_limit == 0
-    assert len(recording.drivable) == 4 and recording.drivable[0].shape == (4, 2)
+    assert lanes["1"].speed_limit == 13.5
+    assert lanes["2"].speed_limit == 0
+    assert len(recording.drivable) == 4
+    assert recording.drivable[0].shape == (4, 2)
     assert recording.lights.keys() == {"2"}  # behind the stop line
     assert (
         recording.lights["2"].tolist()
@@ -176,8 +238,14 @@ def test_tracks_map_and_lights_arrive():
 
 @pytest.mark.parametrize(("dt", "steps"), [(0.2, 46), (0.04, 226), (0.1, 91)])
 def test_every_time_step_makes_the_same_recording_at_10_hz(dt, steps):
-    recording = read_scenario(scenario(dt=dt, steps=steps))
-    assert recording.states.shape[0] == 91 and recording.valid[:, 0].all()
+    recording = read_scenario(
+        scenario(
+            dt=dt,
+            steps=steps,
+        )
+    )
+    assert recording.states.shape[0] == 91
+    assert recording.valid[:, 0].all()
     assert np.allclose(recording.states[:, 0, 0], 20 + 0.6 * np.arange(91))
 
 
@@ -188,16 +256,61 @@ def test_the_ego_is_who_starts_where_the_planning_problem_does_else_who_moves_lo
     )  # nobody near: both move, 1 is faster
     assert read_scenario(scenario()).ego == 1
     shorter = [
-        obstacle(10, 0, 6, 91, 0.1),
-        obstacle(11, 3.6, 20, 60, 0.1),
-        obstacle(12, -5, 9, 91, 0.1, "bicycle"),
+        obstacle(
+            10,
+            0,
+            6,
+            91,
+            0.1,
+        ),
+        obstacle(
+            11,
+            3.6,
+            20,
+            60,
+            0.1,
+        ),
+        obstacle(
+            12,
+            -5,
+            9,
+            91,
+            0.1,
+            "bicycle",
+        ),
     ]
     assert read_scenario(scenario(shorter)).ego == 0
-    gone = [obstacle(10, 0, 6, 5, 0.1), obstacle(11, 3.6, 1, 60, 0.1)]
+    gone = [
+        obstacle(
+            10,
+            0,
+            6,
+            5,
+            0.1,
+        ),
+        obstacle(
+            11,
+            3.6,
+            1,
+            60,
+            0.1,
+        ),
+    ]
     assert read_scenario(scenario(gone)).ego == 1  # who is there at the start frame
     with pytest.raises(InputError, match="no ego"):
         read_scenario(
-            scenario([obstacle(12, -5, 1, 91, 0.1, kind="pedestrian")])
+            scenario(
+                [
+                    obstacle(
+                        12,
+                        -5,
+                        1,
+                        91,
+                        0.1,
+                        kind="pedestrian",
+                    )
+                ]
+            )
         ).validate_log()
 
 
@@ -205,8 +318,19 @@ def test_every_window_of_a_long_scenario_has_an_ego_that_is_there():
     """Cars come and go; in the third window nobody has come yet, in the last one nobody
     moves but the bicycle."""
 
-    def present(number: int, begin: int, end: int, speed: float = 6.0) -> str:
-        text = obstacle(number, 0, speed, end - begin, 0.1)
+    def present(
+        number: int,
+        begin: int,
+        end: int,
+        speed: float = 6.0,
+    ) -> str:
+        text = obstacle(
+            number,
+            0,
+            speed,
+            end - begin,
+            0.1,
+        )
         return re.sub(
             r"<time><exact>(\d+)",
             lambda found: f"<time><exact>{int(found[1]) + begin}",
@@ -216,7 +340,12 @@ def test_every_window_of_a_long_scenario_has_an_ego_that_is_there():
     cars = [
         present(10, 0, 150),
         present(11, 5, 90),
-        present(12, 80, 190, 9.0),
+        present(
+            12,
+            80,
+            190,
+            9.0,
+        ),
         present(13, 250, 400),
     ]
     (*windows,) = recordings_in(CommonRoadSource, scenario(cars), "made.xml")
@@ -253,7 +382,10 @@ def turned(text: bytes, angle: bytes) -> bytes:
     """With another first orientation, in which commonroad-io would turn round and
     round."""
     return re.sub(
-        rb"<orientation><exact>[^<]*", b"<orientation><exact>" + angle, text, count=1
+        rb"<orientation><exact>[^<]*",
+        b"<orientation><exact>" + angle,
+        text,
+        count=1,
     )
 
 

@@ -4,7 +4,11 @@ inside everywhere."""
 import numpy as np
 import pytest
 import torch
-from shapely import contains_xy, distance, points
+from shapely import (
+    contains_xy,
+    distance,
+    points,
+)
 from shapely.geometry import LineString, Polygon
 from shapely.ops import unary_union
 
@@ -21,7 +25,12 @@ def bent(seed: int) -> np.ndarray:
     return line - line.mean(0) + generator.uniform(-15, 15, 2)
 
 
-def compare(lines, widths, rings, cells: int = 121) -> None:
+def compare(
+    lines,
+    widths,
+    rings,
+    cells: int = 121,
+) -> None:
     dense = [resample(line, 1.0) for line in lines]
     field, origin = DrivableArea(dense, np.array(widths), polygons=rings).field(
         np.zeros(2), np.array([3.3, -2.7]), cells
@@ -39,15 +48,16 @@ def compare(lines, widths, rings, cells: int = 121) -> None:
     beyond = distance(points(x, y), area)
     inside = contains_xy(area, x, y)
     depth = distance(points(x, y), area.boundary)
-    found = field.astype(float).ravel()
+    values = field.astype(float).ravel()
     near = ~inside & (beyond < 5)
-    assert near.sum() > 100 and inside.sum() > 100
-    assert np.abs(found - beyond)[near].max() < 0.15
-    assert (found[inside & (depth > 0.15)] < 0).all() and (
-        found[inside] > -depth[inside] - 0.15
-    ).all()
-    assert (found[~inside & (beyond > 0.15)] > 0).all() and found.max() <= FAR
-    assert (found[beyond > FAR + 0.2] == FAR).all()
+    assert near.sum() > 100
+    assert inside.sum() > 100
+    assert np.abs(values - beyond)[near].max() < 0.15
+    assert (values[inside & (depth > 0.15)] < 0).all()
+    assert (values[inside] > -depth[inside] - 0.15).all()
+    assert (values[~inside & (beyond > 0.15)] > 0).all()
+    assert values.max() <= FAR
+    assert (values[beyond > FAR + 0.2] == FAR).all()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -105,7 +115,12 @@ def test_points_may_name_the_row_of_their_field():
     row = torch.tensor([2, 0, 2, 1])
     points = 12 * torch.rand(4, 7, 2)
     assert torch.equal(
-        off_road(points, field, origin=origin, row=row),
+        off_road(
+            points,
+            field,
+            origin=origin,
+            row=row,
+        ),
         off_road(points, field[row], origin=origin[row]),
     )
 

@@ -6,7 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from e2rl.scenes.headings import hold_headings, mend_headings, standing_frames
+from e2rl.scenes.headings import (
+    hold_headings,
+    mend_headings,
+    standing_frames,
+)
 from e2rl.scenes.paths import wrap
 from e2rl.scenes.recording import PEDESTRIAN, VEHICLE
 
@@ -18,7 +22,9 @@ SPIKES = "heading spikes"
 
 
 def driven(
-    speed: np.ndarray | float, curvature: float = 0.0, heading: float = 2.9
+    speed: np.ndarray | float,
+    curvature: float = 0.0,
+    heading: float = 2.9,
 ) -> np.ndarray:
     """States [F, 1, 4] at a signed speed [F] along an arc."""
     speed = np.broadcast_to(np.asarray(speed, float), (FRAMES,))
@@ -47,11 +53,13 @@ def turned_by(
 
 
 def assert_same(
-    mended: np.ndarray, states: np.ndarray, valid: np.ndarray | None = None
+    mended: np.ndarray,
+    states: np.ndarray,
+    valid: np.ndarray | None = None,
 ) -> None:
-    known = np.ones(FRAMES, bool) if valid is None else valid[:, 0]
-    assert np.abs(wrap(mended[known, 0, 2] - states[known, 0, 2])).max() < 0.03
-    assert np.allclose(mended[known, 0, 3], states[known, 0, 3])
+    recorded = np.ones(FRAMES, bool) if valid is None else valid[:, 0]
+    assert np.abs(wrap(mended[recorded, 0, 2] - states[recorded, 0, 2])).max() < 0.03
+    assert np.allclose(mended[recorded, 0, 3], states[recorded, 0, 3])
 
 
 MOTIONS = {
@@ -70,18 +78,27 @@ EVERY = np.ones((FRAMES, 1), bool)
 def test_true_headings_are_left_as_they_are(name):
     states = MOTIONS[name]
     mended, counts = mend_headings(states, EVERY, agent_type=TYPES)
-    assert not counts and np.array_equal(mended, states)
+    assert not counts
+    assert np.array_equal(mended, states)
     held, count = hold_headings(mended, EVERY, agent_type=TYPES)
-    assert count == 0 and np.abs(wrap(held[..., 2] - states[..., 2])).max() < 0.03
+    assert count == 0
+    assert np.abs(wrap(held[..., 2] - states[..., 2])).max() < 0.03
 
 
 @pytest.mark.parametrize("name", MOTIONS)
-@settings(max_examples=30, deadline=None)
+@settings(
+    max_examples=30,
+    deadline=None,
+)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_single_frames_turned_round_are_turned_back(name, seed):
     rng = np.random.default_rng(seed)
     states = MOTIONS[name]
-    flipped = rng.choice(FRAMES, size=rng.integers(1, 15), replace=False)
+    flipped = rng.choice(
+        FRAMES,
+        size=rng.integers(1, 15),
+        replace=False,
+    )
     valid = EVERY.copy()
     valid[rng.integers(FRAMES, size=9)] = False
     mended, counts = mend_headings(
@@ -118,7 +135,8 @@ def test_a_tracker_that_turns_whoever_reverses_is_not_believed():
     mended, counts = mend_headings(
         turned_by(states, np.pi, frames=states[:, 0, 3] < 0), EVERY, agent_type=TYPES
     )
-    assert counts == {TURNED: 1} and mended[-1, 0, 3] == -2.5
+    assert counts == {TURNED: 1}
+    assert mended[-1, 0, 3] == -2.5
     assert_same(mended, states)
 
 
@@ -130,8 +148,8 @@ def test_spikes_are_interpolated(frames, angle):
         turned_by(states, angle, frames=np.array(frames)), EVERY, agent_type=TYPES
     )
     assert counts[SPIKES] == 1
-    known = np.setdiff1d(np.arange(FRAMES), [90])
-    assert np.abs(wrap(mended[known, 0, 2] - states[known, 0, 2])).max() < 0.03
+    recorded = np.setdiff1d(np.arange(FRAMES), [90])
+    assert np.abs(wrap(mended[recorded, 0, 2] - states[recorded, 0, 2])).max() < 0.03
 
 
 def test_who_turns_while_hidden_has_no_spike():
@@ -167,7 +185,8 @@ def test_a_log_whose_headings_are_all_turned_round_is_not_mended():
     mended, counts = mend_headings(
         states, np.ones((FRAMES, 4), bool), agent_type=np.repeat(TYPES, 4)
     )
-    assert np.array_equal(mended, states) and not counts
+    assert np.array_equal(mended, states)
+    assert not counts
 
 
 SPINS = {
@@ -188,11 +207,9 @@ def test_what_stands_keeps_its_heading(name, jitter):
     mended, _ = mend_headings(states, EVERY, agent_type=TYPES)
     held, count = hold_headings(mended, EVERY, agent_type=TYPES)
     axis = wrap(2 * (held[:, 0, 2] - 2.9)) / 2
-    assert (
-        count == (name != "flips")
-        and np.ptp(held[:, 0, 2]) < 1e-9
-        and np.abs(axis).max() < 0.16
-    )
+    assert count == (name != "flips")
+    assert np.ptp(held[:, 0, 2]) < 1e-9
+    assert np.abs(axis).max() < 0.16
 
 
 @pytest.mark.parametrize("name", ["spin", "slow turn"])
@@ -202,7 +219,8 @@ def test_whoever_stops_keeps_the_heading_with_which_it_came(name):
     held, count = hold_headings(
         mend_headings(states, EVERY, agent_type=TYPES)[0], EVERY, agent_type=TYPES
     )
-    assert count == 1 and np.abs(wrap(held[..., 2] - 2.9)).max() < 0.1
+    assert count == 1
+    assert np.abs(wrap(held[..., 2] - 2.9)).max() < 0.1
 
 
 def test_whoever_creeps_round_a_corner_does_not_stand():

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from e2rl.scenes.lane_cover import FAR, INSIDE, MARGIN, LaneCover
+from e2rl.scenes.lane_cover import (
+    FAR,
+    INSIDE,
+    MARGIN,
+    LaneCover,
+)
 from e2rl.scenes.paths import resample
 
 
@@ -28,7 +33,10 @@ def lanes(seed: int) -> tuple[list[np.ndarray], np.ndarray]:
 
 
 def searched(
-    lines: list[np.ndarray], widths: np.ndarray, corner: np.ndarray, cells: int
+    lines: list[np.ndarray],
+    widths: np.ndarray,
+    corner: np.ndarray,
+    cells: int,
 ) -> np.ndarray:
     cell = corner + np.stack(
         np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"), -1
@@ -37,7 +45,11 @@ def searched(
     widths = np.round(widths, 1)
     for width in np.unique(widths)[::-1]:
         points = np.concatenate(
-            [line for line, own in zip(lines, widths, strict=True) if own == width]
+            [
+                line
+                for line, lane_width in zip(lines, widths, strict=True)
+                if lane_width == width
+            ]
         )
         away = (
             np.sqrt(((cell[:, :, None] - points) ** 2).sum(-1)).min(-1)
@@ -59,18 +71,24 @@ def test_it_is_what_a_search_finds_in_all_scenes_of_a_log(seed):
         ([912.0, -407.0], [-31.6, -38.2]),
         ([0.0, 0.0], [720, -400]),
     ):
-        found = cover.beyond(np.array(origin), np.array(corner), 83)
+        covered = cover.beyond(np.array(origin), np.array(corner), 83)
         assert (
             np.abs(
-                found - searched(lines, widths, corner=np.add(origin, corner), cells=83)
+                covered
+                - searched(
+                    lines,
+                    widths,
+                    corner=np.add(origin, corner),
+                    cells=83,
+                )
             ).max()
             < 1e-9
         )
         assert np.array_equal(
-            found,
+            covered,
             LaneCover(lines, widths).beyond(np.array(origin), np.array(corner), 83),
         )
-        assert (found < -INSIDE).any() and (found == FAR).any() or not any(origin)
+        assert (covered < -INSIDE).any() and (covered == FAR).any() or not any(origin)
 
 
 def test_without_lanes_all_is_far():

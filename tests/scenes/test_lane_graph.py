@@ -36,11 +36,15 @@ def lanes(**more) -> dict[str, Lane]:
 
 
 def ways(
-    graph: LaneGraph, x: float, speed: float = 8.0, y: float = 0.0, heading: float = 0.0
+    graph: LaneGraph,
+    x: float,
+    speed: float = 8.0,
+    y: float = 0.0,
+    heading: float = 0.0,
 ) -> list[tuple]:
     """Lanes of the candidates of a vehicle."""
-    found = graph.candidates(np.array([x, y, heading, speed]), 6, vertices=150)
-    return [tuple(name for name, _ in route.lanes) for route in found]
+    routes = graph.candidates(np.array([x, y, heading, speed]), 6, vertices=150)
+    return [tuple(name for name, _ in route.lanes) for route in routes]
 
 
 @pytest.mark.parametrize("x", [40.0, 60.0, 95.0])
@@ -51,19 +55,23 @@ def test_every_branch_is_a_candidate_from_anywhere_on_the_lane(x):
 def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
     graph = LaneGraph(lanes())
     on, left = graph.candidates(np.array([60.0, 0.5, 0.05, 8.0]), 6, vertices=150)
-    assert on.vehicle_s == left.vehicle_s == 20.0 and on.length == 298.0 and not on.open
-    assert np.allclose(on.points[:, 1], 0, atol=1e-6) and np.allclose(
-        np.diff(on.points[:, 0]), SPACING, atol=1e-6
-    )
+    assert on.vehicle_s == left.vehicle_s == 20.0
+    assert on.length == 298.0
+    assert not on.open
+    assert np.allclose(on.points[:, 1], 0, atol=1e-6)
+    assert np.allclose(np.diff(on.points[:, 0]), SPACING, atol=1e-6)
     true = LineString([(40, 0), (100, 0), *LEFT])
     inside = left.points[: int(left.length / SPACING) + 1]
     assert max(true.distance(Point(*point)) for point in inside) < 0.25
-    assert [name for name, _ in left.lanes] == ["in", "left"] and abs(
-        left.lanes[1][1] - 60.0
-    ) < 0.5
-    assert on.limit[10] == 14.0 and on.limit[40] == 20.0 and left.limit[40] == 10.0
+    assert [name for name, _ in left.lanes] == ["in", "left"]
+    assert abs(left.lanes[1][1] - 60.0) < 0.5
+    assert on.limit[10] == 14.0
+    assert on.limit[40] == 20.0
+    assert left.limit[40] == 10.0
     late = graph.candidates(np.array([250.0, 0.0, 0.0, 8.0]), 6, vertices=150)
-    assert len(late) == 1 and late[0].open and abs(late[0].length - 170.0) < 0.5
+    assert len(late) == 1
+    assert late[0].open
+    assert abs(late[0].length - 170.0) < 0.5
     assert np.allclose(
         late[0].points[-1], [230 + 298, 0], atol=1e-6
     )  # beyond the end it goes on straight
@@ -77,7 +85,8 @@ def test_the_map_does_not_end_where_a_long_lane_began_far_behind():
     (route,) = LaneGraph(long).candidates(
         np.array([-5.0, 0.0, 0.0, 8.0]), 6, vertices=150
     )
-    assert not route.open and route.length == 298.0
+    assert not route.open
+    assert route.length == 298.0
 
 
 def test_twice_the_same_way_is_one_candidate_and_neighbours_are_more():
@@ -101,15 +110,19 @@ def test_a_roundabout_is_left_and_a_ring_does_not_end():
     (route,) = LaneGraph(ring).candidates(
         np.array([15.0, 0.5, np.pi / 2, 5.0]), 6, vertices=150
     )
-    assert (
-        not route.open
-        and np.abs(np.linalg.norm(route.points[:-8], axis=1) - 15).max() < 0.3
-    )
+    assert not route.open
+    assert np.abs(np.linalg.norm(route.points[:-8], axis=1) - 15).max() < 0.3
     ring["r1"].exits.append("out")
     ring["out"] = Lane(np.array([[-15.0, 0], [-16, -20], [-16, -320]]))
     ends = [
         way[-1]
-        for way in ways(LaneGraph(ring), 15.0, y=0.5, heading=np.pi / 2, speed=5.0)
+        for way in ways(
+            LaneGraph(ring),
+            15.0,
+            y=0.5,
+            heading=np.pi / 2,
+            speed=5.0,
+        )
     ]
     assert ends == ["out", "out"] or ends == ["out"]
 
@@ -122,9 +135,8 @@ def test_a_lane_that_begins_before_the_last_one_ends_does_not_turn_the_route_bac
     (route,) = LaneGraph(overlapping).candidates(
         np.array([60.0, 0.0, 0.0, 8.0]), 1, vertices=150
     )
-    assert (np.diff(route.points[:, 0]) > 1.5).all() and np.abs(
-        np.diff(route.points[:, 1])
-    ).max() < 0.3
+    assert (np.diff(route.points[:, 0]) > 1.5).all()
+    assert np.abs(np.diff(route.points[:, 1])).max() < 0.3
 
 
 def lane_change() -> np.ndarray:
@@ -144,38 +156,28 @@ def test_a_recorded_way_goes_on_along_the_lane_at_its_end():
     )
     route = route_from_log(graph, lane_change(), vertices=150)
     line = LineString(route.points)
-    assert (
-        route.vehicle_s == 20.0
-        and max(line.distance(Point(*point)) for point in lane_change()[:, :2]) < 0.1
-    )
-    assert (
-        route.open
-        and abs(route.length - 200.0) < 3.0
-        and np.allclose(route.points[60:, 1], 3.5, atol=1e-3)
-    )
-    assert (
-        [name for name, _ in route.lanes] == ["in", "beside"]
-        and route.limit[5] == 14.0
-        and route.limit[60] == 9.0
-    )
+    assert route.vehicle_s == 20.0
+    assert max(line.distance(Point(*point)) for point in lane_change()[:, :2]) < 0.1
+    assert route.open
+    assert abs(route.length - 200.0) < 3.0
+    assert np.allclose(route.points[60:, 1], 3.5, atol=1e-3)
+    assert [name for name, _ in route.lanes] == ["in", "beside"]
+    assert route.limit[5] == 14.0
+    assert route.limit[60] == 9.0
 
 
 def test_a_recorded_way_off_the_map_ends_soon_after_the_recording():
     track = lane_change() + [0, 100, 0, 0]
     route = route_from_log(LaneGraph(lanes()), track, vertices=150)
     way = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1).sum()
-    assert (
-        route.open
-        and abs(route.length - (20 + way + MARGIN)) < 0.5
-        and route.lanes == []
-    )
+    assert route.open
+    assert abs(route.length - (20 + way + MARGIN)) < 0.5
+    assert route.lanes == []
     standing = np.tile([5.0, 100.0, 0.3, 0.0], (81, 1))
     route = route_from_log(LaneGraph(lanes()), standing, vertices=150)
-    assert (
-        route.open
-        and abs(route.length - 30.0) < 1e-6
-        and np.isfinite(route.points).all()
-    )
+    assert route.open
+    assert abs(route.length - 30.0) < 1e-6
+    assert np.isfinite(route.points).all()
     assert np.allclose(route.points[10], [5, 100], atol=0.01)
 
 
@@ -188,9 +190,12 @@ AHEAD = torch.tensor([[[0.0, math.pi, math.pi / 2]]])
 
 
 def against(y):
-    return against_lanes(ROAD, LANE, xy=torch.tensor([[[20.0, y]]]), heading=AHEAD)[
-        0, 0
-    ].tolist()
+    return against_lanes(
+        ROAD,
+        LANE,
+        xy=torch.tensor([[[20.0, y]]]),
+        heading=AHEAD,
+    )[0, 0].tolist()
 
 
 def test_a_vehicle_is_against_the_lanes_where_none_runs_with_it():
@@ -212,9 +217,12 @@ def test_a_lane_that_crosses_is_no_lane_to_drive_along():
     ] * torch.tensor([1.0, 1.0])
     points = torch.cat([ROAD, slope], 1)
     lane = torch.cat([LANE, torch.full((1, 21), 2)], 1)
-    assert against_lanes(points, lane, xy=torch.tensor([[[20.0, 3.4]]]), heading=AHEAD)[
-        0, 0
-    ].tolist() == [True, False, False]
+    assert against_lanes(
+        points,
+        lane,
+        xy=torch.tensor([[[20.0, 3.4]]]),
+        heading=AHEAD,
+    )[0, 0].tolist() == [True, False, False]
 
 
 def test_the_gap_between_two_lanes_in_the_list_is_no_lane():

@@ -6,15 +6,31 @@ import warnings
 import numpy as np
 import pytest
 
-from e2rl.scenes.builder import OTHER_LEVEL, BuildSettings, SceneBuilder, build_scene
+from e2rl.scenes.builder import (
+    OTHER_LEVEL,
+    BuildSettings,
+    SceneBuilder,
+    build_scene,
+)
 from e2rl.scenes.scenarionet import recording_of
-from tests.scenes.descriptions import ALL, description, lane, straight, track
+from tests.scenes.descriptions import (
+    ALL,
+    description,
+    lane,
+    straight,
+    track,
+)
 
 SETTINGS = BuildSettings(field_cells=32)
 MAST = 50.0  # m, x of the road that crosses
 
 
-def crossing(y: float, speed: float, height: float, **options) -> dict:
+def crossing(
+    y: float,
+    speed: float,
+    height: float,
+    **options,
+) -> dict:
     """A vehicle towards +y at x = MAST, at `y` m at frame 0, at a height."""
     car = track(
         np.stack([np.full(len(ALL), MAST), y + 0.1 * speed * ALL], 1),
@@ -39,7 +55,11 @@ def lanes(height: float, known: bool = True) -> dict:
 
 
 def built(
-    height: float, *, y: float = -40.0, known: bool = True, lift: float = 0.0
+    height: float,
+    *,
+    y: float = -40.0,
+    known: bool = True,
+    lift: float = 0.0,
 ) -> tuple[int, int]:
     """How many agents are present at the start beside the ego, and how many are left
     out as on another level."""
@@ -48,8 +68,8 @@ def built(
         "beside": straight(-20, 3.5, speed=8),
         "crossing": crossing(y, 10.0, height=height),
     }
-    for each in tracks.values():
-        each["state"]["position"][:, 2] += lift
+    for item in tracks.values():
+        item["state"]["position"][:, 2] += lift
     roads = lanes(height, known)
     recording = recording_of(description(tracks, roads))
     builder = SceneBuilder(recording, SETTINGS)
@@ -85,7 +105,8 @@ def test_heights_of_tracks_suffice_and_without_any_nobody_is_left_out():
             lanes(7.0),
         )
     )
-    assert recording.heights is None and not SceneBuilder(recording, SETTINGS).repairs
+    assert recording.heights is None
+    assert not SceneBuilder(recording, SETTINGS).repairs
 
 
 def test_a_hill_is_no_bridge():
@@ -93,14 +114,12 @@ def test_a_hill_is_no_bridge():
     roads = {"up": lane([[-100, 0], [0, 0], [100, 0], [300, 0]])}
     roads["up"]["polyline"][:, 2] = [-10, 0, 10, 30]
     tracks = {"ego": straight(0, 0, speed=8), "ahead": straight(100, 0, speed=8)}
-    for each in tracks.values():
-        each["state"]["position"][:, 2] = 0.1 * each["state"]["position"][:, 0]
+    for item in tracks.values():
+        item["state"]["position"][:, 2] = 0.1 * item["state"]["position"][:, 0]
     recording = recording_of(description(tracks, roads))
     builder = SceneBuilder(recording, SETTINGS)
-    assert (
-        builder.scene(recording)["valid"].sum() == 2
-        and not builder.repairs[OTHER_LEVEL]
-    )
+    assert builder.scene(recording)["valid"].sum() == 2
+    assert not builder.repairs[OTHER_LEVEL]
 
 
 @pytest.mark.parametrize(("height", "limit"), [(0.0, 50.0), (7.0, 90.0)])
@@ -117,8 +136,8 @@ def test_a_vehicle_is_on_the_lane_of_its_level_where_two_lie_one_above_the_other
         "above": straight(30, 0, speed=8),
         "under": straight(-30, 0, speed=8),
     }
-    for name, own in (("ego", height), ("above", 7.0), ("under", 0.0)):
-        tracks[name]["state"]["position"][:, 2] = own
+    for name, own_height in (("ego", height), ("above", 7.0), ("under", 0.0)):
+        tracks[name]["state"]["position"][:, 2] = own_height
     scene = build_scene(recording_of(description(tracks, roads)), SETTINGS)
     assert scene["valid"].sum() == 2, "one of the others is on the ego's level"
     limits = scene["route_limit"][scene["route_valid"]]
@@ -135,7 +154,7 @@ def test_headings_in_the_place_of_heights_are_none():
     roads["west"]["polyline"][:, 2] = 3.1
     roads["north"]["polyline"][:, 2] = 1.6
     recording = recording_of(description({"ego": straight(0, 0, speed=8)}, roads))
-    assert [each.heights for each in recording.lanes.values()] == [None, None]
+    assert [item.heights for item in recording.lanes.values()] == [None, None]
 
 
 def test_an_ego_whose_height_is_always_0_tells_nothing_of_those_ahead_uphill():
@@ -158,9 +177,9 @@ def test_a_flat_map_below_tracks_with_heights_takes_no_lane_from_who_is_on_a_hil
     roads = {"road": lane([[-100, 0], [0, 0], [300, 0]])}
     tracks = {"ego": straight(0, 0, speed=8), "hill": straight(100, 0, speed=8)}
     tracks |= {f"flat{k}": straight(-20.0 * k, 0, speed=8) for k in range(1, 5)}
-    for each in tracks.values():
-        x = each["state"]["position"][:, 0]
-        each["state"]["position"][:, 2] = 0.1 * np.maximum(x - 50.0, 0.0)
+    for item in tracks.values():
+        x = item["state"]["position"][:, 0]
+        item["state"]["position"][:, 2] = 0.1 * np.maximum(x - 50.0, 0.0)
     recording = recording_of(description(tracks, roads))
     levels = SceneBuilder(recording, SETTINGS).levels
     assert np.isnan(levels.lane_height).all()

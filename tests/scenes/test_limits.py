@@ -5,7 +5,11 @@ import numpy as np
 import pytest
 
 from e2rl.scenes.limits import known_limits
-from e2rl.scenes.recording import VEHICLE, Lane, Recording
+from e2rl.scenes.recording import (
+    VEHICLE,
+    Lane,
+    Recording,
+)
 
 ARC = np.linspace(-np.pi / 2, 0, 16)
 
@@ -39,8 +43,8 @@ def limits(
             for k, (points, limit) in enumerate(lanes)
         },
     )
-    known, repairs = known_limits(recording)
-    return [round(3.6 * lane.speed_limit, 1) for lane in known.values()], list(
+    limited, repairs = known_limits(recording)
+    return [round(3.6 * lane.speed_limit, 1) for lane in limited.values()], list(
         repairs.values()
     )
 
@@ -51,7 +55,12 @@ def test_a_limit_beyond_any_is_none_and_others_of_the_map_stay(value):
 
 
 def test_the_one_high_limit_of_a_map_that_stands_on_turns_of_an_intersection_is_none():
-    assert limits((STRAIGHT, 0), (bend(10), 100), (STRAIGHT, 100), speed=9) == (
+    assert limits(
+        (STRAIGHT, 0),
+        (bend(10), 100),
+        (STRAIGHT, 100),
+        speed=9,
+    ) == (
         [0.0, 0.0, 0.0],
         [2],
     )
@@ -96,7 +105,12 @@ def test_connectors_of_an_intersection_lead_straight_on_too(turns):
 
 def test_a_map_with_several_limits_knows_them():
     """Converters give the turns of an intersection the limit of their road."""
-    assert limits((STRAIGHT, 90), (bend(10), 90), (STRAIGHT, 50), speed=9) == (
+    assert limits(
+        (STRAIGHT, 90),
+        (bend(10), 90),
+        (STRAIGHT, 50),
+        speed=9,
+    ) == (
         [90.0, 90.0, 50.0],
         [],
     )

@@ -10,7 +10,12 @@ from e2rl.scenes.links import drivable_exits
 from e2rl.scenes.recording import Lane
 
 
-def flat(begin, end, height: float | None = None, **more) -> Lane:
+def flat(
+    begin,
+    end,
+    height: float | None = None,
+    **more,
+) -> Lane:
     """A straight lane at one height."""
     return Lane(
         np.array([begin, end], float),
@@ -33,7 +38,7 @@ def pieces(exits: dict[str, list[str]], count: int = 5) -> dict[str, Lane]:
 
 
 def test_connectivity_is_inferred_from_geometry_and_heights():
-    found, _ = drivable_exits(
+    followers, _ = drivable_exits(
         {
             "a": flat([0, 0], [50, 0], height=5.0),
             "b": flat([50.5, 0.3], [90, 0], height=5.5),
@@ -43,7 +48,9 @@ def test_connectivity_is_inferred_from_geometry_and_heights():
             "side": flat([50, 0], [50, 50], height=5.0),
         }
     )
-    assert found["a"] == ["b"] and found["bridge"] == [] and found["back"] == []
+    assert followers["a"] == ["b"]
+    assert followers["bridge"] == []
+    assert followers["back"] == []
     no_heights, _ = drivable_exits(
         {
             "a": Lane(np.array([[0.0, 0], [50, 0]])),
@@ -100,7 +107,8 @@ def test_a_map_with_bad_or_missing_links_is_connected_as_its_geometry_is(
     exits, repairs
 ):
     graph = LaneGraph(pieces(exits))
-    assert set(graph.graph.edges) == CONNECTED and graph.repairs == repairs
+    assert set(graph.graph.edges) == CONNECTED
+    assert graph.repairs == repairs
 
 
 def test_a_lane_with_a_recorded_link_gets_no_other():
@@ -111,7 +119,8 @@ def test_a_lane_with_a_recorded_link_gets_no_other():
     )
     lanes["drive"] = flat([41, 0.3], [60, 5])
     graph = LaneGraph(lanes)
-    assert set(graph.graph.edges) == CONNECTED and not graph.repairs
+    assert set(graph.graph.edges) == CONNECTED
+    assert not graph.repairs
 
 
 @pytest.mark.parametrize(
@@ -129,9 +138,19 @@ def test_a_lane_with_a_recorded_link_gets_no_other():
         ([40, 0], [80, 0], 6, False),  # on the bridge above
     ],
 )
-def test_a_link_is_kept_where_a_vehicle_can_drive_it(begin, end, height, drivable):
+def test_a_link_is_kept_where_a_vehicle_can_drive_it(
+    begin,
+    end,
+    height,
+    drivable,
+):
     lanes = {
-        "a": flat([0, 0], [40, 0], height=0.0, exits=["b"]),
+        "a": flat(
+            [0, 0],
+            [40, 0],
+            height=0.0,
+            exits=["b"],
+        ),
         "b": flat(begin, end, height=float(height)),
     }
     graph = LaneGraph(lanes)
@@ -151,5 +170,6 @@ def test_the_neighbour_is_the_adjacent_lane_in_whatever_order_they_are_named():
     lanes["right"].left = ["far"]  # 10.5 m away, with two lanes between
     graph = LaneGraph(lanes)
     assert (graph.lanes["own"].left, graph.lanes["own"].right) == (["left"], ["right"])
-    assert graph.lanes["left"].left == ["far"] and graph.lanes["right"].left == []
+    assert graph.lanes["left"].left == ["far"]
+    assert graph.lanes["right"].left == []
     assert graph.repairs[links.NOT_ADJACENT] == 3

@@ -9,7 +9,11 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import (
+    example,
+    given,
+    settings,
+)
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -21,10 +25,10 @@ from tests.scenes.descriptions import Malicious
 
 
 def objects(parts: list) -> np.ndarray:
-    made = np.empty(len(parts), object)
+    array_of_parts = np.empty(len(parts), object)
     for index, part in enumerate(parts):
-        made[index] = part
-    return made
+        array_of_parts[index] = part
+    return array_of_parts
 
 
 ARRAYS = arrays.arrays(
@@ -39,7 +43,12 @@ ARRAYS = arrays.arrays(
             )
         ),
     ),
-    arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+    arrays.array_shapes(
+        min_dims=0,
+        max_dims=3,
+        min_side=0,
+        max_side=4,
+    ),
 )
 LEAVES = st.one_of(
     *(
@@ -95,7 +104,10 @@ def same(ours, theirs) -> bool:
     return ours == theirs or repr(ours) == repr(theirs)  # NaN
 
 
-@settings(max_examples=150, deadline=None)
+@settings(
+    max_examples=150,
+    deadline=None,
+)
 @given(PLAIN, st.integers(0, 5))
 @example(np.asfortranarray(np.arange(6).reshape(2, 3)), 2)
 @example(np.moveaxis(np.arange(24).reshape(2, 3, 4), 0, 1), 5)
@@ -263,7 +275,8 @@ def test_arrays_of_both_numpys_are_read(protocol):
     old = (
         old[:2] + old[11:] if old[2:3] == b"\x95" else old
     )  # without the frame, whose length changed
-    assert old != new and b"numpy._core" not in old
+    assert old != new
+    assert b"numpy._core" not in old
     for content in (new, old):
         assert all(
             np.array_equal(value, held[key])
@@ -281,8 +294,9 @@ def test_limits_stop_long_programs(monkeypatch):
 
 
 def test_bytes_that_are_no_truth_values_count_as_true():
-    found = load_plain(array(b"K\x03\x85", b"b1", data=b"C\x03\x00\x01\x07") + b".")
-    assert found.tolist() == [False, True, True] and found.view(np.uint8).tolist() == [
+    flags = load_plain(array(b"K\x03\x85", b"b1", data=b"C\x03\x00\x01\x07") + b".")
+    assert flags.tolist() == [False, True, True]
+    assert flags.view(np.uint8).tolist() == [
         0,
         1,
         1,

@@ -21,7 +21,12 @@ from e2rl.scenes.plausibility import (
 )
 from e2rl.scenes.recording import VEHICLE, Lane
 
-SMALL = BuildSettings(steps=20, vehicles=4, others=2, field_cells=32)
+SMALL = BuildSettings(
+    steps=20,
+    vehicles=4,
+    others=2,
+    field_cells=32,
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +34,11 @@ def genuine():
     return read_recordings(unpack("tune"))[0]
 
 
-def scaled(recording, factor, *parts):
+def scaled(
+    recording,
+    factor,
+    *parts,
+):
     """Parts of a recording in units that are `factor` times smaller."""
     if "positions" in parts:
         recording.states[..., :2] *= factor
@@ -113,7 +122,12 @@ MUTATIONS = {
     ),
     "feet": (lambda r: scaled(r, 3.28, *ALL), "median length of vehicles"),
     "positions and map in feet": (
-        lambda r: scaled(r, 3.28, "positions", "map"),
+        lambda r: scaled(
+            r,
+            3.28,
+            "positions",
+            "map",
+        ),
         "is what the recorded speeds make",
     ),
     "one vehicle in degrees": (
@@ -146,14 +160,13 @@ def test_what_is_no_traffic_in_metres_on_its_map_is_refused_with_the_reason(
 def test_vehicles_with_trailers_do_not_tell_the_usual_size(genuine, part):
     """They are long, and an ego that is one may be alone."""
     recording = copy.deepcopy(genuine)
-    others = [each for each in range(len(recording.size)) if each != recording.ego]
+    others = [track for track in range(len(recording.size)) if track != recording.ego]
     recording.size[recording.ego] = (18.0, 2.5)
     recording.valid[:, others] = False
     assert motion(recording)["vehicle_length"] == 18.0
     setattr(recording, part, (recording.ego,))
-    assert np.isnan(motion(recording)["vehicle_length"]) and np.isnan(
-        motion(recording)["vehicle_width"]
-    )
+    assert np.isnan(motion(recording)["vehicle_length"])
+    assert np.isnan(motion(recording)["vehicle_width"])
     build_scene(recording, SMALL)
 
 
@@ -213,12 +226,12 @@ def test_genuine_recordings_stay_well_inside_the_limits():
             | motion(recording)
             | map_fit(recording, LaneGraph(recording.lanes))
         )
-        assert measures.keys() == LIMITS.keys() and measures[
-            "speed_ratio"
-        ] == pytest.approx(1, abs=0.05)
+        assert measures.keys() == LIMITS.keys()
+        assert measures["speed_ratio"] == pytest.approx(1, abs=0.05)
         for name, value in measures.items():
             low, high, *_ = LIMITS[name]
-            assert not value < low and not value > high, name
+            assert not value < low, name
+            assert not value > high, name
             if name not in (
                 "speed_ratio",
                 "ego_speed_ratio",
@@ -245,10 +258,9 @@ def test_a_slow_vehicle_may_drive_backwards_and_a_short_way_tells_nothing(genuin
             0 * frames + speed,
         ]
         recording.states[:, agent] = np.stack(states, 1)
-        found = motion(recording)
-        assert found[name] == pytest.approx(
-            0.0 if speed == 2.5 else np.pi
-        ) and np.isnan(found[other])
+        measured = motion(recording)
+        assert measured[name] == pytest.approx(0.0 if speed == 2.5 else np.pi)
+        assert np.isnan(measured[other])
     recording.valid[10:, agent] = False  # 6 m
     assert np.isnan(motion(recording)["track_direction"])
 
@@ -264,11 +276,20 @@ def test_the_same_traffic_elsewhere_and_turned_is_as_plausible(genuine):
     ours = motion(recording) | map_fit(recording, LaneGraph(recording.lanes))
     theirs = motion(genuine) | map_fit(genuine, LaneGraph(genuine.lanes))
     for name, value in theirs.items():
-        assert ours[name] == pytest.approx(value, rel=0.05, abs=0.02, nan_ok=True), name
+        assert ours[name] == pytest.approx(
+            value,
+            rel=0.05,
+            abs=0.02,
+            nan_ok=True,
+        ), name
 
 
 def apart(
-    distance: float, *, oncoming: bool = False, width: float = 0.0, named: bool = False
+    distance: float,
+    *,
+    oncoming: bool = False,
+    width: float = 0.0,
+    named: bool = False,
 ) -> float:
     """The spacing of two lanes of 400 m `distance` m from each other."""
     ends = (
@@ -286,8 +307,13 @@ def apart(
 
 
 def test_roads_and_carriageways_apart_tell_no_unit():
-    assert np.isnan(apart(12.0, oncoming=True)) and np.isnan(
-        apart(12.0, oncoming=True, width=3.7)
+    assert np.isnan(apart(12.0, oncoming=True))
+    assert np.isnan(
+        apart(
+            12.0,
+            oncoming=True,
+            width=3.7,
+        )
     )
     assert np.isnan(apart(15.0, width=3.5)), "two streets in one direction"
 
@@ -297,10 +323,16 @@ def test_lanes_that_adjoin_tell_the_unit(foot):
     """A map in feet is seen where its lanes are named, or are as wide as they lie
     apart, or run beside each other."""
     assert apart(3.5 * foot) == pytest.approx(3.5 * foot)
-    assert apart(3.5 * foot, width=3.5 * foot, oncoming=True) == pytest.approx(
-        3.5 * foot
-    )
-    assert apart(3.5 * foot, width=3.5, named=True) == pytest.approx(3.5 * foot)
+    assert apart(
+        3.5 * foot,
+        width=3.5 * foot,
+        oncoming=True,
+    ) == pytest.approx(3.5 * foot)
+    assert apart(
+        3.5 * foot,
+        width=3.5,
+        named=True,
+    ) == pytest.approx(3.5 * foot)
 
 
 @pytest.mark.parametrize("apart", [3.0, 4.5])

@@ -3,7 +3,11 @@ more."""
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import (
+    assume,
+    given,
+    settings,
+)
 from hypothesis import strategies as st
 
 from e2rl.run.errors import InputError
@@ -27,7 +31,8 @@ def test_gapped_time_stamps_are_resampled_linearly():
     out, recorded, _ = resample_uniform(
         states, np.ones((37, 1), bool), ts=stamps + 1.6e9
     )
-    assert recorded.all() and np.allclose(out[..., :3], full[..., :3], atol=1e-5)
+    assert recorded.all()
+    assert np.allclose(out[..., :3], full[..., :3], atol=1e-5)
 
 
 def test_resampling_turns_the_short_way_and_respects_validity():
@@ -46,16 +51,14 @@ def test_long_gaps_are_not_invented_and_other_rates_are_brought_to_ten_hertz():
     states = driven()
     valid = np.ones((40, 1), bool)
     _, recorded, _ = resample_uniform(states, valid, ts=stamps)
-    assert (
-        len(recorded) == 50
-        and not recorded[20:30].any()
-        and recorded[:20].all()
-        and recorded[30:].all()
-    )
+    assert len(recorded) == 50
+    assert not recorded[20:30].any()
+    assert recorded[:20].all()
+    assert recorded[30:].all()
     out, recorded, _ = resample_uniform(states, valid, ts=TIME / 2)
-    assert (
-        len(out) == 20 and np.allclose(out, states[::2], atol=1e-6) and recorded.all()
-    )
+    assert len(out) == 20
+    assert np.allclose(out, states[::2], atol=1e-6)
+    assert recorded.all()
 
 
 RATES = [
@@ -90,13 +93,20 @@ def circle(seconds: np.ndarray) -> np.ndarray:
     return np.stack([*columns, np.full(len(seconds), 6.0)], -1)[:, None]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(
+    max_examples=150,
+    deadline=None,
+)
 @given(
     rate=st.sampled_from(RATES),
     jitter=st.floats(0, 0.45),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_at_every_rate_a_track_is_what_was_recorded_and_no_more(rate, jitter, seed):
+def test_at_every_rate_a_track_is_what_was_recorded_and_no_more(
+    rate,
+    jitter,
+    seed,
+):
     """Each valid frame lies on the motion, near recorded frames; each span recorded
     without a gap is covered."""
     rng = np.random.default_rng(seed)
@@ -180,7 +190,8 @@ def test_frames_of_one_time_stamp_are_one():
     expected, *_ = resample_uniform(
         circle(np.unique(seconds)), np.ones((40, 1), bool), ts=np.unique(seconds)
     )
-    assert recorded.all() and np.allclose(out, expected)
+    assert recorded.all()
+    assert np.allclose(out, expected)
 
 
 @pytest.mark.parametrize("speed", [0.0, 6.0, -6.0])
@@ -212,16 +223,19 @@ def test_a_height_that_is_unknown_is_the_nearest_of_its_track_and_others_stay():
 
     def resampled(heights: np.ndarray) -> np.ndarray | None:
         states = np.zeros((40, 3, 4))
-        return resample_uniform(states, valid, ts=TIME, heights=heights).heights
+        return resample_uniform(
+            states,
+            valid,
+            ts=TIME,
+            heights=heights,
+        ).heights
 
     out = resampled(heights)
     expected = TIME.copy()
     expected[[0, 1, 9, 10]] = TIME[[2, 2, 8, 11]]
-    assert (
-        np.allclose(out[:, 0], expected)
-        and (out[:, 1] == 8).all()
-        and np.isnan(out[:, 2]).all()
-    )
+    assert np.allclose(out[:, 0], expected)
+    assert (out[:, 1] == 8).all()
+    assert np.isnan(out[:, 2]).all()
     assert resampled(np.full((40, 3), np.nan)) is None
     assert resampled(np.where(valid, 1.0, heights)) is None
 
@@ -240,7 +254,8 @@ def test_a_light_holds_from_its_frame_on(rate):
     seconds = np.arange(int(6 * rate)) / rate
     frames = latest_frames(seconds, 50)
     late = 0.1 * np.arange(50) - seconds[frames]
-    assert (late >= -0.02 - 1e-9).all() and (late < 1 / rate + 1e-6).all()
+    assert (late >= -0.02 - 1e-9).all()
+    assert (late < 1 / rate + 1e-6).all()
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,10 @@ def test_what_is_no_regular_file_is_named_or_passed_over(tmp_path):
     os.mkfifo(folder / "pipe.pkl")
     (folder / "nothing.pkl").symlink_to(folder / "nowhere")
     source = ScenarioNetSource(
-        str(folder), cache=str(tmp_path / "cache"), workers=1, skip_invalid=True
+        str(folder),
+        cache=str(tmp_path / "cache"),
+        workers=1,
+        skip_invalid=True,
     )
     assert source.logs() == ["nothing.pkl", "pipe.pkl", "sd_00.pkl"]
     for log in source.logs()[:2]:
@@ -90,7 +93,11 @@ def test_what_is_no_regular_file_is_named_or_passed_over(tmp_path):
     ("method", "claimed"),
     [(zipfile.ZIP_LZMA, 1000), (zipfile.ZIP_BZIP2, 1000), (zipfile.ZIP_DEFLATED, None)],
 )
-def test_a_bomb_is_not_unpacked(tmp_path, method, claimed):
+def test_a_bomb_is_not_unpacked(
+    tmp_path,
+    method,
+    claimed,
+):
     """Neither where the zip says how much would come out, nor where it lies."""
     path = tmp_path / "bomb.zip"
     size = 3 * MAX_BYTES
@@ -130,9 +137,25 @@ def test_a_damaged_zip_is_named(tmp_path):
 def test_tracks_types_sizes_and_the_map_arrive():
     tracks = {
         "ego": straight(20, 0, speed=8),
-        5: straight(40, 0, speed=6, size=(1.7, 4.1)),
-        "cone": straight(60, 0, speed=0, kind="TRAFFIC_CONE"),
-        "p": straight(0, 9, speed=1, kind="PEDESTRIAN", size=(0.5, 0.6)),
+        5: straight(
+            40,
+            0,
+            speed=6,
+            size=(1.7, 4.1),
+        ),
+        "cone": straight(
+            60,
+            0,
+            speed=0,
+            kind="TRAFFIC_CONE",
+        ),
+        "p": straight(
+            0,
+            9,
+            speed=1,
+            kind="PEDESTRIAN",
+            size=(0.5, 0.6),
+        ),
     }
     tracks["p"]["state"]["valid"] = np.where(ALL < 30, 1.0, 0.0)[
         :, None
@@ -140,13 +163,14 @@ def test_tracks_types_sizes_and_the_map_arrive():
     tracks["p"]["state"]["length"] = tracks["p"]["state"]["length"][:, None]
     tracks["p"]["state"]["position"][30:] = np.nan
     (recording,) = read(description(tracks))
-    assert recording.validate_log() is recording and (
+    assert recording.validate_log() is recording
+    assert (
         recording.scene_id,
         recording.location,
     ) == ("fork", "place")
-    assert (
-        recording.dataset == "made" and recording.current == 10 and recording.ego == 0
-    )
+    assert recording.dataset == "made"
+    assert recording.current == 10
+    assert recording.ego == 0
     assert recording.agent_type.tolist() == [VEHICLE, VEHICLE, OTHER, PEDESTRIAN]
     assert recording.size.tolist() == [
         [4.5, 1.9],
@@ -154,10 +178,8 @@ def test_tracks_types_sizes_and_the_map_arrive():
         [4.5, 1.9],
         [0.5, 0.6],
     ]  # a car is longer than wide
-    assert (
-        recording.valid.sum(0).tolist() == [91, 91, 91, 30]
-        and np.isfinite(recording.states).all()
-    )
+    assert recording.valid.sum(0).tolist() == [91, 91, 91, 30]
+    assert np.isfinite(recording.states).all()
     assert np.allclose(
         recording.states[:, 0],
         np.stack([20 + 0.8 * ALL, 0 * ALL, 0 * ALL, 0 * ALL + 8], 1),
@@ -168,10 +190,8 @@ def test_tracks_types_sizes_and_the_map_arrive():
         "left",
         "near",
     }  # no bike lane, no single point
-    assert (
-        recording.lanes["in"].exits == ["on", "left"]
-        and recording.lanes["in"].width == 3.6
-    )
+    assert recording.lanes["in"].exits == ["on", "left"]
+    assert recording.lanes["in"].width == 3.6
     assert np.isclose(recording.lanes["on"].speed_limit, 20.0)
 
 
@@ -186,13 +206,10 @@ def test_lane_polygons_are_drivable_and_neighbours_named():
     assert [ring.tolist() for ring in recording.drivable] == [
         [[0, -2], [100, -2], [100, 2]]
     ]
-    assert recording.lanes["in"].left == ["near"] and recording.lanes["in"].right == [
-        "bike"
-    ]
-    assert (
-        recording.lanes["in"].heights is None
-        and recording.lanes["on"].heights is not None
-    )
+    assert recording.lanes["in"].left == ["near"]
+    assert recording.lanes["in"].right == ["bike"]
+    assert recording.lanes["in"].heights is None
+    assert recording.lanes["on"].heights is not None
 
 
 def test_lights_keep_their_last_known_state():
@@ -222,9 +239,8 @@ def test_lights_keep_their_last_known_state():
         LIGHT_GREEN,
     ]
     assert recording.lights["on"][:6].tolist() == names
-    assert (recording.lights["left"] == LIGHT_RED).all() and (
-        recording.lights["near"] == LIGHT_UNKNOWN
-    ).all()
+    assert (recording.lights["left"] == LIGHT_RED).all()
+    assert (recording.lights["near"] == LIGHT_UNKNOWN).all()
     assert all(len(light) == FRAMES for light in recording.lights.values())
 
 
@@ -278,10 +294,8 @@ def test_a_light_that_flashes_binds_nobody_and_arrows_are_their_colours(name, co
     """After a solid red, which does not go on."""
     states = {"on": {"state": {"object_state": ["LANE_STATE_STOP", name]}}}
     (recording,) = read(description() | {"dynamic_map_states": states})
-    assert (
-        recording.lights["on"][0] == LIGHT_RED
-        and (recording.lights["on"][1:] == colour).all()
-    )
+    assert recording.lights["on"][0] == LIGHT_RED
+    assert (recording.lights["on"][1:] == colour).all()
 
 
 def test_skipped_time_stamps_move_start_frame_and_lights():
@@ -294,16 +308,12 @@ def test_skipped_time_stamps_move_start_frame_and_lights():
         }
     }
     (recording,) = read(scene)
-    assert (
-        len(recording.states) == 93
-        and recording.current == 12
-        and recording.valid[:, 0].all()
-    )
+    assert len(recording.states) == 93
+    assert recording.current == 12
+    assert recording.valid[:, 0].all()
     assert np.allclose(recording.states[:, 0, 0], 20 + 0.8 * np.arange(93), atol=1e-6)
-    assert (
-        np.flatnonzero(np.diff(recording.lights["on"])).tolist() == [6]
-        and len(recording.lights["on"]) == 93
-    )
+    assert np.flatnonzero(np.diff(recording.lights["on"])).tolist() == [6]
+    assert len(recording.lights["on"]) == 93
 
 
 def test_start_frames():
@@ -313,7 +323,8 @@ def test_start_frames():
         "fork@50",
     ]
     (recording,) = read(description(current_time_index=12))
-    assert recording.current == 12 and recording.scene_id == "fork"
+    assert recording.current == 12
+    assert recording.scene_id == "fork"
     long = description()
     del long["metadata"]["current_time_index"]
     assert [r.current for r in read(long)] == [10]
@@ -333,7 +344,10 @@ def test_start_frames():
 
 def long_description(**metadata) -> dict:
     """27.3 s, in which the ego waits three times where it began."""
-    scene = description(ts=np.arange(273) * 0.1, **metadata)
+    scene = description(
+        ts=np.arange(273) * 0.1,
+        **metadata,
+    )
     for agent in scene["tracks"].values():
         agent["state"] = {
             key: np.concatenate([value] * 3) for key, value in agent["state"].items()
@@ -349,7 +363,8 @@ def test_a_start_frame_with_too_little_past_or_future_is_moved_and_that_is_count
     named, start
 ):
     (recording,) = read(long_description(current_time_index=named))
-    assert recording.current == start and recording.scene_id == "fork"
+    assert recording.current == start
+    assert recording.scene_id == "fork"
     assert sum(recording.repairs.values()) == (named != start)
 
 
@@ -382,10 +397,8 @@ def test_sizes_are_read_wherever_converters_write_them(form):
                 else {"size": [length, width]}
             )
     (recording,) = read(scene)
-    assert (
-        recording.size.tolist() == [[4.5, 1.9], [4.5, 1.9], [0.6, 0.6]]
-        and not recording.repairs
-    )
+    assert recording.size.tolist() == [[4.5, 1.9], [4.5, 1.9], [0.6, 0.6]]
+    assert not recording.repairs
 
 
 @pytest.mark.parametrize("value", [None, 0.0, np.nan])
@@ -397,7 +410,12 @@ def test_a_size_that_is_missing_or_not_positive_is_the_usual_one_of_the_type(val
         "PEDESTRIAN": (0.7, 0.7),
     }
     others = {
-        kind: straight(50 + 10 * number, -6, speed=0, kind=kind)
+        kind: straight(
+            50 + 10 * number,
+            -6,
+            speed=0,
+            kind=kind,
+        )
         for number, kind in enumerate(kinds)
     }
     for agent in others.values():
@@ -438,7 +456,8 @@ def test_a_size_that_is_missing_or_not_positive_is_the_usual_one_of_the_type(val
         ),
         (
             lambda s: s.update(
-                id=["x"] * 200, metadata=s["metadata"] | {"scenario_id": "y"}
+                id=["x"] * 200,
+                metadata=s["metadata"] | {"scenario_id": "y"},
             ),
             "it has no id",
         ),

@@ -28,11 +28,9 @@ def test_the_set_is_sliced():
         split="test",
         dropped={"invalid": 1},
     )
-    assert (
-        len(whole) == 2
-        and whole.batch([1, 0, 1])["scene_index"].tolist() == [1, 0, 1]
-        and whole.steps == 80
-    )
+    assert len(whole) == 2
+    assert whole.batch([1, 0, 1])["scene_index"].tolist() == [1, 0, 1]
+    assert whole.steps == 80
     assert [part["scene_index"].tolist() for part in whole.parts(1)] == [[0], [1]]
     assert [whole.index(which) for which in (0, 1, "a", "b")] == [0, 1, 0, 1]
     for which in (2, -1, "c"):
@@ -41,9 +39,10 @@ def test_the_set_is_sliced():
             match=f"scene={which}: expected an index below 2 or the id of a scene",
         ):
             whole.index(which)
-    one, other = whole.hashes()
+    first, other = whole.hashes()
     several["start"][1, 0, 3] += 1e-3
-    assert one == other and whole.hashes()[0] == one != whole.hashes()[1]
+    assert first == other
+    assert whole.hashes()[0] == first != whole.hashes()[1]
 
 
 @pytest.mark.parametrize(

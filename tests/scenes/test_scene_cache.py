@@ -19,7 +19,12 @@ from e2rl.scenes.scene import RAGGED
 from e2rl.scenes.scene_cache import cached, uncached
 
 KINDS = st.sampled_from(("<f4", "<f2", "<i8", "|b1")).map(np.dtype)
-SHAPES = arrays.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=4)
+SHAPES = arrays.array_shapes(
+    min_dims=1,
+    max_dims=3,
+    min_side=0,
+    max_side=4,
+)
 SCENES = st.tuples(KINDS, SHAPES).flatmap(
     lambda like: st.lists(
         st.fixed_dictionaries(
@@ -38,12 +43,16 @@ def yielding(scenes, index):
     index.dataset = "made"
     index.split = "test"
     index.dropped["invalid"] = 2
-    for number, made in enumerate(scenes):
-        index.add(f"scene-{number}", f"place-{number}", made)
-        yield made
+    for number, stored in enumerate(scenes):
+        index.add(f"scene-{number}", f"place-{number}", stored)
+        yield stored
 
 
-def build(index, seed: int = 0, count: int = 5):
+def build(
+    index,
+    seed: int = 0,
+    count: int = 5,
+):
     """Scenes with random content, of which each has one lane more than the last."""
     draw = np.random.default_rng(seed)
     rows = [
@@ -68,28 +77,35 @@ def same(one, other) -> None:
     assert all(
         vars(one)[key] == vars(other)[key] for key in vars(one) if key != "scenes"
     )
-    assert one.hashes() == other.hashes() and one.scenes.keys() == other.scenes.keys()
+    assert one.hashes() == other.hashes()
+    assert one.scenes.keys() == other.scenes.keys()
     assert all(
         torch.equal(value, other.scenes[key]) for key, value in one.scenes.items()
     )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(
+    max_examples=100,
+    deadline=None,
+)
 @given(SCENES)
 def test_scenes_come_back_bit_for_bit_and_padded(scenes):
-    found = uncached(partial(yielding, scenes))
+    result = uncached(partial(yielding, scenes))
     assert (
-        found.scenes["scene_index"].tolist() == list(range(len(scenes))) == found.number
+        result.scenes["scene_index"].tolist()
+        == list(range(len(scenes)))
+        == result.number
     )
-    for made, row in zip(scenes, found.scenes, strict=True):
-        for key, value in made.items():
+    for stored, row in zip(scenes, result.scenes, strict=True):
+        for key, value in stored.items():
             inner = row[key].numpy()[tuple(map(slice, value.shape))]
-            assert inner.tobytes() == value.tobytes() and inner.dtype == value.dtype
+            assert inner.tobytes() == value.tobytes()
+            assert inner.dtype == value.dtype
             assert (row[key] == RAGGED.get(key, 0)).sum() >= row[
                 key
             ].numel() - value.size
-    assert found.scenes["lane_exits"].shape[1:] == tuple(
-        np.max([made["lane_exits"].shape for made in scenes], 0)
+    assert result.scenes["lane_exits"].shape[1:] == tuple(
+        np.max([stored["lane_exits"].shape for stored in scenes], 0)
     )
 
 
@@ -121,7 +137,9 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_rebuilt_and_a_set_in_use_survives_it(
-    tmp_path, capsys, damage
+    tmp_path,
+    capsys,
+    damage,
 ):
     path = file_of(tmp_path)
     first = cached(path, build, gigabytes=1)
@@ -130,7 +148,8 @@ def test_a_damaged_file_is_rebuilt_and_a_set_in_use_survives_it(
     path.write_bytes(DAMAGES[damage](content))
     same(cached(path, build, gigabytes=1), first)
     assert "rebuilding the damaged cache file" in capsys.readouterr().err
-    assert path.read_bytes() == content and list(tmp_path.iterdir()) == [path]
+    assert path.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_scene_s_hash_is_of_what_is_used_not_of_what_its_file_says(tmp_path):
@@ -143,7 +162,8 @@ def test_a_scene_s_hash_is_of_what_is_used_not_of_what_its_file_says(tmp_path):
         content + cache.END.pack(length, cache.FORMAT, hashlib.sha256(content).digest())
     )
     forged = cached(path, never, gigabytes=1).hashes()
-    assert forged[0] != first[0] and forged[1:] == first[1:]
+    assert forged[0] != first[0]
+    assert forged[1:] == first[1:]
 
 
 @pytest.mark.parametrize(
@@ -168,42 +188,38 @@ def test_a_file_of_other_arrays_than_numbers_is_refused(tmp_path, change):
 
 
 def test_batches_are_copies_in_the_order_asked_for():
-    found = uncached(build)
+    result = uncached(build)
     for wanted in ([0], [1, 0], [4, 1, 4], [2, 3, 0, 1, 4]):
-        batch = found.batch(wanted)
+        batch = result.batch(wanted)
         assert batch["scene_index"].tolist() == wanted
-        assert torch.equal(batch["lane_points"], found.scenes["lane_points"][wanted])
-    batch = found.batch([0, 0, 0])
-    found.copy_into(batch, torch.tensor([0, 2]), torch.tensor([4, 1]))
-    assert batch["scene_index"].tolist() == [4, 0, 1] and torch.equal(
-        batch["logged"], found.batch([4, 0, 1])["logged"]
-    )
-    found.copy_into(batch, torch.arange(3), torch.tensor([2, 3, 2]))
-    assert torch.equal(batch["lane_points"], found.scenes["lane_points"][[2, 3, 2]])
-    found.batch([0])["logged"].fill_(7.0)
-    assert not (found.scenes["logged"][0] == 7.0).any()
+        assert torch.equal(batch["lane_points"], result.scenes["lane_points"][wanted])
+    batch = result.batch([0, 0, 0])
+    result.copy_into(batch, torch.tensor([0, 2]), torch.tensor([4, 1]))
+    assert batch["scene_index"].tolist() == [4, 0, 1]
+    assert torch.equal(batch["logged"], result.batch([4, 0, 1])["logged"])
+    result.copy_into(batch, torch.arange(3), torch.tensor([2, 3, 2]))
+    assert torch.equal(batch["lane_points"], result.scenes["lane_points"][[2, 3, 2]])
+    result.batch([0])["logged"].fill_(7.0)
+    assert not (result.scenes["logged"][0] == 7.0).any()
 
 
 def test_chosen_scenes_keep_names_noise_and_hashes():
     every = uncached(build)
     some = every.chosen([3, 1, 2]).chosen([2, 0])
-    assert (
-        some.scene_id == ["scene-2", "scene-3"]
-        and some.number == [2, 3]
-        and some.location[1] == "place-3"
-    )
+    assert some.scene_id == ["scene-2", "scene-3"]
+    assert some.number == [2, 3]
+    assert some.location[1] == "place-3"
     assert (
         some.batch([1, 0])["scene_index"].tolist()
         == [1, 0]
         == some.scenes["scene_index"].flip(0).tolist()
     )
     assert torch.equal(some.scenes["logged"], every.scenes["logged"][2:4])
-    assert some.hashes() == every.hashes()[2:4] and len(set(every.hashes())) == 5
+    assert some.hashes() == every.hashes()[2:4]
+    assert len(set(every.hashes())) == 5
     first = every.first(2)
-    assert (
-        first.scene_id == every.scene_id[:2]
-        and every.first(9) is every.first(None) is every
-    )
+    assert first.scene_id == every.scene_id[:2]
+    assert every.first(9) is every.first(None) is every
     assert (
         first.scenes["logged"].data_ptr() == every.scenes["logged"].data_ptr()
     )  # not copied
@@ -251,7 +267,6 @@ def _counted(folder, _: int) -> list[str]:
 
 def test_of_several_processes_one_builds(tmp_path):
     with multiprocessing.get_context("fork").Pool(4) as pool:
-        found = pool.map(partial(_counted, tmp_path), range(8), chunksize=1)
-    assert len(list(tmp_path.glob("built-*"))) == 1 and all(
-        hashes == found[0] for hashes in found
-    )
+        result = pool.map(partial(_counted, tmp_path), range(8), chunksize=1)
+    assert len(list(tmp_path.glob("built-*"))) == 1
+    assert all(hashes == result[0] for hashes in result)

@@ -40,7 +40,13 @@ def scenes_of(count=4):
         for k in range(count):
             scene = {
                 key: value.numpy()
-                for key, value in make_scenes(1, speed=8 + k, **SMALL).scenes[0].items()
+                for key, value in make_scenes(
+                    1,
+                    speed=8 + k,
+                    **SMALL,
+                )
+                .scenes[0]
+                .items()
             }
             del scene["scene_index"]
             for key, value in (
@@ -65,7 +71,11 @@ def test_a_hash_is_of_the_scene_alone_and_of_all_of_it():
     hashes = scene_hashes(scenes)
     assert len(set(hashes)) == 4
     alone = SceneSet(
-        make_scenes(1, speed=8, **SMALL).scenes,
+        make_scenes(
+            1,
+            speed=8,
+            **SMALL,
+        ).scenes,
         ["s0"],
         location=["place"],
         dataset="made",
@@ -76,9 +86,8 @@ def test_a_hash_is_of_the_scene_alone_and_of_all_of_it():
         scenes.scenes["lane_points"].shape[1]
         == alone.scenes["lane_points"].shape[1] + 9
     ), "the first is padded"
-    assert scene_hashes(alone) == hashes[:1] and scene_hashes(
-        scenes.chosen([2, 1])
-    ) == [hashes[2], hashes[1]]
+    assert scene_hashes(alone) == hashes[:1]
+    assert scene_hashes(scenes.chosen([2, 1])) == [hashes[2], hashes[1]]
     for key, value in scenes.scenes.items():
         if key != "scene_index" and value[1].numel():
             changed = scenes_of()
@@ -99,13 +108,15 @@ def test_what_a_run_lists_is_what_another_takes(tmp_path):
     """Its scenes in its order, with their noise, wherever they stand in the data."""
     scenes = scenes_of()
     some = scenes.chosen([3, 1])
-    assert some.number == [3, 1] and some.scenes["scene_index"].tolist() == [0, 1]
+    assert some.number == [3, 1]
+    assert some.scenes["scene_index"].tolist() == [0, 1]
     (tmp_path / SCENES).write_text(listed(some)[0])
     for data in (scenes, scenes.chosen([2, 1, 0, 3])):
-        found = listed_scenes(tmp_path, data.first)
-        assert found.scene_id == ["s3", "s1"] and found.number == [3, 1]
-        assert torch.equal(found.scenes["logged"], some.scenes["logged"])
-        assert found.scenes["scene_index"].tolist() == [0, 1]
+        taken = listed_scenes(tmp_path, data.first)
+        assert taken.scene_id == ["s3", "s1"]
+        assert taken.number == [3, 1]
+        assert torch.equal(taken.scenes["logged"], some.scenes["logged"])
+        assert taken.scenes["scene_index"].tolist() == [0, 1]
     assert listed_scenes(tmp_path, scenes.first, most=1).scene_id == ["s3"]
 
 
@@ -114,8 +125,9 @@ def test_a_list_by_hand_names_scenes_only(tmp_path):
     twice is taken once."""
     scenes = scenes_of()
     file = written(tmp_path, "\ufeffmethod,scene_id\ne2,s2\r\ne2,s0\nnominal,s2\n")
-    found = listed_scenes(file, scenes.first)
-    assert found.scene_id == ["s2", "s0"] and found.number == [2, 0]
+    taken = listed_scenes(file, scenes.first)
+    assert taken.scene_id == ["s2", "s0"]
+    assert taken.number == [2, 0]
     assert read_list(written(tmp_path, "scene_id,number\na,7\n")) == [Listed("a", 7)]
 
 
@@ -131,8 +143,8 @@ def test_other_scenes_of_the_same_name_are_refused_unless_their_files_are_the_sa
             InputError, match=r"1 of 4 scenes are not those listed \(s1\): .*sha256"
         ):
             listed_scenes(tmp_path, moved.first, files=files)
-    found = listed_scenes(tmp_path, moved.first, files="f" * 64)
-    assert found.scene_id == scenes.scene_id
+    taken = listed_scenes(tmp_path, moved.first, files="f" * 64)
+    assert taken.scene_id == scenes.scene_id
     assert (
         "1 of 4 scenes are not those listed (s1), though the data files are"
         in capsys.readouterr().err
@@ -154,6 +166,10 @@ def test_other_scenes_of_the_same_name_are_refused_unless_their_files_are_the_sa
         ('scene_id\n"a', "cannot be read"),
     ],
 )
-def test_what_is_no_list_is_named(tmp_path, content, what):
+def test_what_is_no_list_is_named(
+    tmp_path,
+    content,
+    what,
+):
     with pytest.raises(InputError, match=what):
         read_list(written(tmp_path, content))

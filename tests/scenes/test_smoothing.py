@@ -15,7 +15,9 @@ TIME = np.arange(40) * 0.1
 
 
 def accelerating(
-    heading: float = 0.7, speed: float = 4.0, accel: float = 1.5
+    heading: float = 0.7,
+    speed: float = 4.0,
+    accel: float = 1.5,
 ) -> np.ndarray:
     """States [40, 1, 4] under constant acceleration along a heading, with a false
     recorded speed."""
@@ -34,9 +36,8 @@ def test_constant_acceleration_is_estimated_exactly():
     valid = np.ones((40, 1), bool)
     start, accel, yaw_rate = causal_state(states, valid, frame=20)
     assert np.allclose(start[0, :3], states[20, 0, :3], atol=1e-6)
-    assert np.isclose(start[0, 3], 4.0 + 1.5 * 2.0, atol=1e-5) and np.isclose(
-        accel[0], 1.5, atol=1e-4
-    )
+    assert np.isclose(start[0, 3], 4.0 + 1.5 * 2.0, atol=1e-5)
+    assert np.isclose(accel[0], 1.5, atol=1e-4)
     assert abs(yaw_rate[0]) < 1e-9
 
 
@@ -48,9 +49,9 @@ def test_a_steady_turn_is_estimated():
     )[:, None]
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
     start, _, yaw_rate = causal_state(states, np.ones((40, 1), bool), frame=20)
-    assert np.isclose(yaw_rate[0], 0.3, atol=1e-4) and np.isclose(
-        start[0, 3], 6.0, atol=0.1
-    )  # the fit is a chord's
+    # the fit is a chord's
+    assert np.isclose(yaw_rate[0], 0.3, atol=1e-4)
+    assert np.isclose(start[0, 3], 6.0, atol=0.1)
 
 
 def test_the_start_state_is_blind_to_the_future_and_to_gaps_before():
@@ -69,20 +70,34 @@ def test_the_past_is_seen_from_the_present_and_blind_to_the_future_and_to_gaps_b
     valid = np.ones((40, 1), bool)
     speed = np.array([7.0])
     back = np.arange(1, 11) * 0.1
-    past = causal_past(states, valid, frame=20, speed=speed)
-    assert past.shape == (1, 10, 3)
-    assert np.allclose(past[0, :, 0], -7.0 * back + 1.5 * back**2 / 2) and np.allclose(
-        past[0, :, 1:], 0
+    past = causal_past(
+        states,
+        valid,
+        frame=20,
+        speed=speed,
     )
+    assert past.shape == (1, 10, 3)
+    assert np.allclose(past[0, :, 0], -7.0 * back + 1.5 * back**2 / 2)
+    assert np.allclose(past[0, :, 1:], 0)
     states[21:], valid[21:], states[:15] = np.nan, False, 1e6
     valid[14] = False
-    short = causal_past(states, valid, frame=20, speed=speed)
-    assert np.allclose(short[0, :5], past[0, :5])
-    assert np.allclose(np.diff(short[0, 4:, 0]), -0.7) and np.allclose(
-        short[0, :, 1:], 0
+    short = causal_past(
+        states,
+        valid,
+        frame=20,
+        speed=speed,
     )
+    assert np.allclose(short[0, :5], past[0, :5])
+    assert np.allclose(np.diff(short[0, 4:, 0]), -0.7)
+    assert np.allclose(short[0, :, 1:], 0)
     assert np.allclose(
-        causal_past(states, valid, frame=0, speed=speed)[0, :, 0], -7.0 * back
+        causal_past(
+            states,
+            valid,
+            frame=0,
+            speed=speed,
+        )[0, :, 0],
+        -7.0 * back,
     ), "straight on where nothing is recorded"
 
 
@@ -92,14 +107,16 @@ def test_a_turn_shows_in_the_past():
         [10 * np.sin(angle), -10 * np.cos(angle), angle, np.zeros(20)], -1
     )[:, None]
     states[..., 2] = (states[..., 2] + np.pi) % (2 * np.pi) - np.pi
-    past = causal_past(states, np.ones((20, 1), bool), frame=19, speed=np.array([1.0]))[
-        0
-    ]
+    past = causal_past(
+        states,
+        np.ones((20, 1), bool),
+        frame=19,
+        speed=np.array([1.0]),
+    )[0]
     turned = -np.arange(1, 11) * 0.5 / 19
     assert np.allclose(past[:, 2], turned)
-    assert np.allclose(past[:, 0], 10 * np.sin(turned)) and np.allclose(
-        past[:, 1], 10 * (1 - np.cos(turned))
-    )
+    assert np.allclose(past[:, 0], 10 * np.sin(turned))
+    assert np.allclose(past[:, 1], 10 * (1 - np.cos(turned)))
 
 
 def test_smoothing_keeps_quadratics_and_takes_speed_along_the_heading():
@@ -115,9 +132,8 @@ def test_smoothing_works_run_by_run_and_removes_noise():
     valid[18:22] = False
     states[20:, :, :2] += 500.0
     out = smooth(states, valid)
-    assert np.allclose(out[:18], smooth(states[:18], valid[:18])) and np.allclose(
-        out[22:, 0, 3], 4 + 1.5 * TIME[22:]
-    )
+    assert np.allclose(out[:18], smooth(states[:18], valid[:18]))
+    assert np.allclose(out[22:, 0, 3], 4 + 1.5 * TIME[22:])
     noise = np.random.default_rng(0).normal(0, 0.05, (40, 1, 2))
     noisy = accelerating()
     noisy[..., :2] += noise
@@ -130,8 +146,9 @@ def test_a_glitch_costs_its_own_frames_only():
     valid = np.ones((40, 1), bool)
     states[10, 0, 0] += 30.0  # one frame elsewhere
     states[25:27, 0, 2] += np.pi  # two frames turned round
-    kept = drop_jumps(states, valid)
-    assert np.flatnonzero(~kept[:, 0]).tolist() == [10] and valid.all()
+    plausible = drop_jumps(states, valid)
+    assert np.flatnonzero(~plausible[:, 0]).tolist() == [10]
+    assert valid.all()
 
 
 def test_the_longer_side_of_a_lasting_jump_is_kept():
@@ -146,13 +163,15 @@ def test_the_longer_side_of_a_lasting_jump_is_kept():
 
 
 def test_speeds_are_signed_along_the_heading():
-    back = accelerating(speed=-3.0, accel=-0.5)
+    back = accelerating(
+        speed=-3.0,
+        accel=-0.5,
+    )
     valid = np.ones((40, 1), bool)
     assert np.allclose(smooth(back, valid)[:, 0, 3], -3.0 - 0.5 * TIME, atol=1e-9)
     start, accel, _ = causal_state(back, valid, frame=20)
-    assert np.isclose(start[0, 3], -4.0, atol=1e-5) and np.isclose(
-        accel[0], -0.5, atol=1e-4
-    )
+    assert np.isclose(start[0, 3], -4.0, atol=1e-5)
+    assert np.isclose(accel[0], -0.5, atol=1e-4)
 
 
 @pytest.mark.parametrize("accel", [-8.0, -3.0, 0.0])

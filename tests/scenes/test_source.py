@@ -58,26 +58,22 @@ def bad_scenes() -> dict[str, dict | bytes]:
 
 
 def same(a, b) -> None:
-    assert (
-        a.scene_id == b.scene_id and a.location == b.location and a.dropped == b.dropped
-    )
-    assert (a.dataset, a.split) == (b.dataset, b.split) and set(a.scenes.keys()) == set(
-        b.scenes.keys()
-    )
+    assert a.scene_id == b.scene_id
+    assert a.location == b.location
+    assert a.dropped == b.dropped
+    assert (a.dataset, a.split) == (b.dataset, b.split)
+    assert set(a.scenes.keys()) == set(b.scenes.keys())
     for key, value in a.scenes.items():
-        assert (
-            torch.equal(value, b.scenes[key]) and value.dtype == b.scenes[key].dtype
-        ), key
+        assert torch.equal(value, b.scenes[key]), key
+        assert value.dtype == b.scenes[key].dtype, key
 
 
 def test_folder_zip_cache_and_workers_give_identical_scenes(tmp_path, monkeypatch):
     folder = write_folder(tmp_path / "x", scenes_of(3))
     first = load_scenes(data_config(folder, tmp_path / "a"))
-    assert (
-        first.scene_id == ["scene-0", "scene-1", "scene-2"]
-        and first.dataset == "made"
-        and first.split == "x"
-    )
+    assert first.scene_id == ["scene-0", "scene-1", "scene-2"]
+    assert first.dataset == "made"
+    assert first.split == "x"
     zipped = write_zip(tmp_path / "x.zip", scenes_of(3))
     same(first, load_scenes(data_config(zipped, tmp_path / "b")))
     same(first, load_scenes(data_config(folder, tmp_path / "c", workers=2)))
@@ -124,27 +120,27 @@ def test_mirror_images_are_scenes_of_the_same_place(tmp_path):
     turned = description(
         {"ego": straight(20, 0, speed=8), "7": straight(50, 3.5, speed=6)}
     ) | {"id": "turned"}
-    found = load_scenes(
+    loaded = load_scenes(
         data_config(
             write_folder(tmp_path / "x", [turned]),
             tmp_path / "cache",
             versions=("recorded", "mirrored"),
         )
     )
-    assert found.scene_id == ["turned", "turned~mirrored"] and found.location == [
+    assert loaded.scene_id == ["turned", "turned~mirrored"]
+    assert loaded.location == [
         "turned",
         "turned",
     ]
-    scene, other = found.scenes
+    scene, other = loaded.scenes
     sign = torch.tensor([1.0, -1.0, -1.0, 1.0])
     assert torch.allclose(scene["start"] * sign, other["start"], atol=1e-5)
     assert torch.allclose(scene["logged"] * sign, other["logged"], atol=1e-5)
     assert torch.allclose(
         scene["lane_points"] * sign[:2], other["lane_points"], atol=1e-5
     )
-    assert torch.equal(scene["field"], other["field"].flip(1)) and torch.equal(
-        scene["valid"], other["valid"]
-    )
+    assert torch.equal(scene["field"], other["field"].flip(1))
+    assert torch.equal(scene["valid"], other["valid"])
     cut = load_scenes(
         data_config(
             tmp_path / "x", tmp_path / "cache", versions=("recorded", "mirrored")
@@ -166,14 +162,16 @@ def test_the_first_invalid_scene_stops_the_load_and_leaves_nothing(tmp_path, rea
         InputError, match=rf"(?s)sd_01\.pkl.*{reason}.*data\.skip_invalid=true"
     ) as caught:
         load_scenes(data_config(folder, tmp_path / "cache"))
-    assert "\n" not in str(caught.value) and not list((tmp_path / "cache").iterdir())
+    assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "cache").iterdir())
 
 
 def test_invalid_scenes_are_skipped_and_counted_on_request(tmp_path):
     folder = write_folder(tmp_path / "x", [*bad_scenes().values(), *scenes_of(2)])
     config = data_config(folder, tmp_path / "cache", skip_invalid=True)
-    found = load_scenes(config)
-    assert found.scene_id == ["scene-0", "scene-1"] and found.dropped == {"invalid": 5}
+    loaded = load_scenes(config)
+    assert loaded.scene_id == ["scene-0", "scene-1"]
+    assert loaded.dropped == {"invalid": 5}
     assert load_scenes(config).dropped == {"invalid": 5}  # from the cache too
     for name in ("sd_05.pkl", "sd_06.pkl"):
         (folder / name).unlink()
@@ -186,8 +184,9 @@ def test_overlaps_with_the_ego_and_logs_too_short_are_dropped_and_counted(tmp_pa
         {"ego": straight(20, 0, speed=8), "7": straight(23, 0.5, speed=8)}
     )
     folder = write_folder(tmp_path / "x", [close, *scenes_of(1)])
-    found = load_scenes(data_config(folder, tmp_path / "cache"))
-    assert len(found) == 1 and found.dropped == {source.OVERLAP: 1}
+    loaded = load_scenes(data_config(folder, tmp_path / "cache"))
+    assert len(loaded) == 1
+    assert loaded.dropped == {source.OVERLAP: 1}
     with pytest.raises(
         InputError, match=f"no valid scene in .*x .2 {source.TOO_SHORT}"
     ):
@@ -203,13 +202,22 @@ def test_what_overlaps_the_ego_is_counted_by_its_kind(tmp_path):
     }
     close = [
         description(
-            {"ego": ego, "7": straight(29, 0.5, speed=0, kind=kind, size=(0.6, 0.6))}
+            {
+                "ego": ego,
+                "7": straight(
+                    29,
+                    0.5,
+                    speed=0,
+                    kind=kind,
+                    size=(0.6, 0.6),
+                ),
+            }
         )
         for kind in kinds
     ]
     folder = write_folder(tmp_path / "x", [*close, *scenes_of(1)])
-    found = load_scenes(data_config(folder, tmp_path / "cache"))
-    assert found.dropped == {
+    loaded = load_scenes(data_config(folder, tmp_path / "cache"))
+    assert loaded.dropped == {
         f"ego overlaps {word} at the start": 1 for word in kinds.values()
     }
 
@@ -293,18 +301,21 @@ def test_an_outside_source_is_named_by_its_class_and_takes_part_in_all(
         "cache": str(tmp_path / "cache"),
         "build": {"field_cells": 32, "steps": 80},
     }
-    found = load_scenes(config)
-    assert (
-        found.scene_id == ["a.txt@10", "a.txt@101", "b.txt@10", "b.txt@101"]
-        and found.dataset == "speeds"
-    )
-    assert found.scenes["start"][:, 0, 3].tolist() == pytest.approx(
+    loaded = load_scenes(config)
+    assert loaded.scene_id == ["a.txt@10", "a.txt@101", "b.txt@10", "b.txt@101"]
+    assert loaded.dataset == "speeds"
+    assert loaded.scenes["start"][:, 0, 3].tolist() == pytest.approx(
         [5, 5, 9, 9], abs=1e-4
     )
-    assert (found.scenes["lane_width"] == 3.0).all() and found.split == tmp_path.name
-    same(found, load_scenes(config))
+    assert (loaded.scenes["lane_width"] == 3.0).all()
+    assert loaded.split == tmp_path.name
+    same(loaded, load_scenes(config))
     assert len(list((tmp_path / "cache").iterdir())) == 1
-    assert load_scenes(config, split="train", starts=[20]).scene_id == [
+    assert load_scenes(
+        config,
+        split="train",
+        starts=[20],
+    ).scene_id == [
         "a.txt@20",
         "b.txt@20",
     ]
@@ -325,14 +336,22 @@ def test_a_log_of_one_frame_is_told_so(tmp_path):
     class Short(SpeedSource):
         def read(self, log):
             whole = next(SpeedSource.read(self, log))
-            yield replace(whole, states=whole.states[:1], valid=whole.valid[:1])
+            yield replace(
+                whole,
+                states=whole.states[:1],
+                valid=whole.valid[:1],
+            )
 
     (tmp_path / "a.txt").write_text("5.0")
     with pytest.raises(
         InputError,
         match=r"^a\.txt: scene 'a\.txt': fewer than two frames .*; leave it out",
     ):
-        Short(str(tmp_path), cache=str(tmp_path), workers=1).load()
+        Short(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
 
 
 @pytest.mark.parametrize("what", ["scene_id", "location", "dataset"])
@@ -340,7 +359,9 @@ def test_a_log_of_one_frame_is_told_so(tmp_path):
     "name", ["a\ud800", "a\x1b[2J", "a\nb", "a\u202eb", "x" * 129, 7, None]
 )
 def test_names_that_no_file_table_or_terminal_can_hold_are_refused_whatever_the_source(
-    tmp_path, what, name
+    tmp_path,
+    what,
+    name,
 ):
     class Named(Mended):
         def read(self, log):
@@ -351,8 +372,13 @@ def test_names_that_no_file_table_or_terminal_can_hold_are_refused_whatever_the_
         InputError,
         match=rf"^a\.txt: its {what} .* is no line of 128 printable characters",
     ) as caught:
-        Named(str(tmp_path), cache=str(tmp_path), workers=1).load()
-    assert str(caught.value).isprintable() and str(caught.value).isascii()
+        Named(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
+    assert str(caught.value).isprintable()
+    assert str(caught.value).isascii()
 
 
 @pytest.mark.parametrize("part", ["lane", "ring"])
@@ -366,22 +392,28 @@ def test_names_that_no_file_table_or_terminal_can_hold_are_refused_whatever_the_
     ],
 )
 def test_maps_of_other_points_than_numbers_are_refused_whatever_the_source(
-    tmp_path, part, points
+    tmp_path,
+    part,
+    points,
 ):
     class Drawn(Mended):
         def read(self, log):
-            made = next(SpeedSource.read(self, log))
+            steady = next(SpeedSource.read(self, log))
             yield (
-                replace(made, lanes={"road": Lane(points)})
+                replace(steady, lanes={"road": Lane(points)})
                 if part == "lane"
-                else replace(made, drivable=[points])
+                else replace(steady, drivable=[points])
             )
 
     (tmp_path / "a.txt").write_text("5.0")
     with pytest.raises(
         InputError, match=r"^a\.txt: scene .* is not a list of finite points"
     ):
-        Drawn(str(tmp_path), cache=str(tmp_path), workers=1).load()
+        Drawn(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
 
 
 class Torn(SpeedSource):
@@ -401,10 +433,18 @@ def test_what_reading_a_log_raises_is_told_where_the_source_knows_what_to_do(tmp
         InputError,
         match=r"^a\.txt: Torn\.read failed at .*test_source\.py:\d+: ZeroDivisionError of a",
     ):
-        Torn(str(tmp_path), cache=str(tmp_path), workers=1).load()
-    told = r"a\.txt: is none of text files: ZeroDivisionError of a file at .*; write it again \(data\.skip_invalid"
-    with pytest.raises(InputError, match=told):
-        Mended(str(tmp_path), cache=str(tmp_path), workers=1).load()
+        Torn(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
+    text = r"a\.txt: is none of text files: ZeroDivisionError of a file at .*; write it again \(data\.skip_invalid"
+    with pytest.raises(InputError, match=text):
+        Mended(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
 
 
 class Unread(Mended):
@@ -421,7 +461,12 @@ def test_a_library_that_is_missing_ends_the_load_whatever_may_be_skipped(tmp_pat
         InputError,
         match=r"a\.txt: a library of its reader .* pip install -e '.*\[files\]'",
     ):
-        Unread(str(tmp_path), cache=str(tmp_path), workers=1, skip_invalid=True).load()
+        Unread(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+            skip_invalid=True,
+        ).load()
 
 
 WRONG = {  # a field of a recording of 200 frames and one car: what a mistaken reader may yield, and what is said
@@ -466,7 +511,9 @@ WRONG = {  # a field of a recording of 200 frames and one car: what a mistaken r
     [(name, value) for name, (values, _) in WRONG.items() for value in values],
 )
 def test_a_field_of_another_kind_type_or_shape_is_named_with_its_log(
-    tmp_path, name, value
+    tmp_path,
+    name,
+    value,
 ):
     class Wrong(SpeedSource):
         def read(self, log):
@@ -477,7 +524,11 @@ def test_a_field_of_another_kind_type_or_shape_is_named_with_its_log(
         InputError,
         match=rf"^a\.txt: scene 'a\.txt': its {name}.* is .*expected ({WRONG[name][1]})",
     ):
-        Wrong(str(tmp_path), cache=str(tmp_path), workers=1).load()
+        Wrong(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
 
 
 @pytest.mark.parametrize(
@@ -492,7 +543,11 @@ def test_a_field_of_another_kind_type_or_shape_is_named_with_its_log(
         ("heights", np.array(["low", "low"])),
     ],
 )
-def test_a_field_of_a_lane_is_named_with_its_log(tmp_path, part, value):
+def test_a_field_of_a_lane_is_named_with_its_log(
+    tmp_path,
+    part,
+    value,
+):
     class Wrong(SpeedSource):
         def read(self, log):
             yield replace(
@@ -508,7 +563,11 @@ def test_a_field_of_a_lane_is_named_with_its_log(tmp_path, part, value):
     with pytest.raises(
         InputError, match=rf"^a\.txt: scene 'a\.txt': its lanes\['a'\]\.{part} is "
     ):
-        Wrong(str(tmp_path), cache=str(tmp_path), workers=1).load()
+        Wrong(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
 
 
 @pytest.mark.parametrize(
@@ -522,19 +581,30 @@ def test_a_field_of_a_lane_is_named_with_its_log(tmp_path, part, value):
     ],
 )
 def test_methods_of_a_reader_that_return_anything_else_are_named(
-    tmp_path, method, result, message
+    tmp_path,
+    method,
+    result,
+    message,
 ):
     (tmp_path / "a.txt").write_text("5.0")
     wrong = type("Wrong", (SpeedSource,), {method: lambda *_: result})
     with pytest.raises(InputError, match=message):
-        wrong(str(tmp_path), cache=str(tmp_path), workers=1).load()
+        wrong(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
 
 
 @pytest.mark.parametrize(
     "error", [KeyError("x"), SystemExit(3), RecursionError(), IndexError("of a list")]
 )
 @pytest.mark.parametrize("method", ["read", "logs", "fingerprint"])
-def test_what_a_reader_raises_has_the_line_that_raised_it(tmp_path, method, error):
+def test_what_a_reader_raises_has_the_line_that_raised_it(
+    tmp_path,
+    method,
+    error,
+):
     if isinstance(error, SystemExit) and method != "read":
         pytest.skip("only reading is done in processes that must not end")
 
@@ -547,7 +617,11 @@ def test_what_a_reader_raises_has_the_line_that_raised_it(tmp_path, method, erro
         InputError,
         match=rf"Wrong\.{method} failed at .*test_source\.py:\d+: {type(error).__name__}",
     ):
-        wrong(str(tmp_path), cache=str(tmp_path), workers=1).load()
+        wrong(
+            str(tmp_path),
+            cache=str(tmp_path),
+            workers=1,
+        ).load()
 
 
 READER = """
@@ -569,7 +643,9 @@ class Reader(SpeedSource):
     "edited", ["reader.py", "direct.py", "deep/table.py", "deep/__init__.py"]
 )
 def test_an_edited_reader_or_what_it_imports_invalidates_its_cache(
-    tmp_path, monkeypatch, edited
+    tmp_path,
+    monkeypatch,
+    edited,
 ):
     package = tmp_path / "code" / "my_reader"
     logs = tmp_path / "logs"
@@ -606,15 +682,11 @@ def test_an_edited_reader_or_what_it_imports_invalidates_its_cache(
 
     assert speed() == pytest.approx(5.0, abs=1e-3)
     contents["beside.py"] = "nobody imports this"
-    assert (
-        speed() == pytest.approx(5.0, abs=1e-3)
-        and len(list((tmp_path / "c").glob("*.map"))) == 1
-    )
+    assert speed() == pytest.approx(5.0, abs=1e-3)
+    assert len(list((tmp_path / "c").glob("*.map"))) == 1
     contents[edited] += "\n# another line\n"
-    assert (
-        speed() == pytest.approx(5.0, abs=1e-3)
-        and len(list((tmp_path / "c").glob("*.map"))) == 2
-    )
+    assert speed() == pytest.approx(5.0, abs=1e-3)
+    assert len(list((tmp_path / "c").glob("*.map"))) == 2
     contents["deep/table.py"] = "SPEED = 9.0"
     assert speed() == pytest.approx(9.0, abs=1e-3)
 
@@ -622,9 +694,16 @@ def test_an_edited_reader_or_what_it_imports_invalidates_its_cache(
 def test_a_reader_in_no_file_is_not_cached(tmp_path):
     (tmp_path / "a.txt").write_text("5.0")
     typed = type("Typed", (SpeedSource,), {"__module__": "nowhere"})
+    assert typed.code is None
     assert (
-        typed.code is None
-        and len(typed(str(tmp_path), cache=str(tmp_path / "c"), workers=1).load()) == 2
+        len(
+            typed(
+                str(tmp_path),
+                cache=str(tmp_path / "c"),
+                workers=1,
+            ).load()
+        )
+        == 2
     )
     assert not (tmp_path / "c").exists()
 
@@ -633,12 +712,13 @@ def test_split_chooses_only_where_a_source_has_splits(tmp_path):
     bundled = BundledSource(
         cache=str(tmp_path / "cache"),
         workers=1,
-        build=BuildSettings(field_cells=32, steps=20),
+        build=BuildSettings(
+            field_cells=32,
+            steps=20,
+        ),
     )
-    assert (
-        load_scenes(bundled, 1).split == "test"
-        and load_scenes(bundled, 1, split="tune").split == "tune"
-    )
+    assert load_scenes(bundled, 1).split == "test"
+    assert load_scenes(bundled, 1, split="tune").split == "tune"
     folder = write_folder(tmp_path / "x", scenes_of(1))
     assert (
         load_scenes(data_config(folder, tmp_path / "cache"), split="tune").split == "x"

@@ -6,7 +6,11 @@ import pytest
 
 from e2rl.scenes.builder import BuildSettings, build_scene
 from e2rl.scenes.recording import Lane, Recording
-from e2rl.scenes.trailers import JOINED, TURNING, couple
+from e2rl.scenes.trailers import (
+    JOINED,
+    TURNING,
+    couple,
+)
 
 FRAMES = 91
 TIME = 0.1 * np.arange(FRAMES)
@@ -35,14 +39,22 @@ def recording(*tracks: np.ndarray, sizes: list[tuple[float, float]]) -> Recordin
     )
 
 
-def driving(x: float, y: float, speed) -> np.ndarray:
+def driving(
+    x: float,
+    y: float,
+    speed,
+) -> np.ndarray:
     """A track [F, 4] along +x at a speed, or at speeds [F]."""
     speed = np.broadcast_to(speed, FRAMES)
     way = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * 0.1)])
     return np.stack([x + way, np.full(FRAMES, y), np.zeros(FRAMES), speed], 1)
 
 
-def on_a_circle(behind: float, radius: float, speed: float = 8.0) -> np.ndarray:
+def on_a_circle(
+    behind: float,
+    radius: float,
+    speed: float = 8.0,
+) -> np.ndarray:
     """A track [F, 4] to the left on a circle around (0, radius), so many metres behind
     the first."""
     angle = (speed * TIME - behind) / radius
@@ -67,31 +79,29 @@ def test_a_trailer_is_one_vehicle_with_its_tractor(gap, speed):
         driving(1 - gap, 3.5, speed=speed),
         sizes=[(6, 2.4), (12, 2.6)],
     )
-    found = couple(log)
-    assert found.repairs == {JOINED: 1} and found.valid.any(0).tolist() == [
+    coupled = couple(log)
+    assert coupled.repairs == {JOINED: 1}
+    assert coupled.valid.any(0).tolist() == [
         True,
         True,
         False,
     ]
-    assert found.size[1].tolist() == pytest.approx([18 + gap, 2.6])
+    assert coupled.size[1].tolist() == pytest.approx([18 + gap, 2.6])
     middle = (log.states[:, 1, 0] + 3 + log.states[:, 2, 0] - 6) / 2
-    assert found.states[:, 1, 0] == pytest.approx(middle) and found.states[
-        :, 1, 3
-    ] == pytest.approx(log.states[:, 1, 3])
-    assert build_scene(found, BuildSettings(field_cells=32))["valid"].sum() == 2
+    assert coupled.states[:, 1, 0] == pytest.approx(middle)
+    assert coupled.states[:, 1, 3] == pytest.approx(log.states[:, 1, 3])
+    assert build_scene(coupled, BuildSettings(field_cells=32))["valid"].sum() == 2
 
 
 def test_a_road_train_is_one_vehicle_and_stays_where_it_is_while_one_part_is_hidden():
     tracks = [driving(10 - behind, 3.5, speed=15.0) for behind in (0.0, 8.5, 17.0)]
     log = recording(*tracks, sizes=[(6, 2.4), (10, 2.5), (6, 2.5)])
     log.valid[40:50, 3] = log.valid[60:70, 1] = False
-    found = couple(log)
-    assert (
-        found.repairs == {JOINED: 2}
-        and found.valid[:, 1].all()
-        and not found.valid[:, 2:].any()
-    )
-    assert np.diff(found.states[:, 1, 0]) == pytest.approx(np.full(FRAMES - 1, 1.5))
+    coupled = couple(log)
+    assert coupled.repairs == {JOINED: 2}
+    assert coupled.valid[:, 1].all()
+    assert not coupled.valid[:, 2:].any()
+    assert np.diff(coupled.states[:, 1, 0]) == pytest.approx(np.full(FRAMES - 1, 1.5))
 
 
 @pytest.mark.parametrize("part", [1, 2])
@@ -104,9 +114,9 @@ def test_a_long_box_stays_on_its_bend_while_one_part_is_hidden(part):
     )
     log.valid[40:55, part] = log.valid[62:64, part] = False
     expected = couple(whole).states[:, 1]
-    found = couple(log).states[:, 1]
-    assert np.abs(found[:, 2] - expected[:, 2]).max() < 0.01
-    assert np.linalg.norm(found[:, :2] - expected[:, :2], axis=-1).max() < 0.05
+    coupled = couple(log).states[:, 1]
+    assert np.abs(coupled[:, 2] - expected[:, 2]).max() < 0.01
+    assert np.linalg.norm(coupled[:, :2] - expected[:, :2], axis=-1).max() < 0.05
 
 
 def test_a_trailer_that_is_lost_from_sight_comes_in_line_within_two_seconds():
@@ -115,23 +125,24 @@ def test_a_trailer_that_is_lost_from_sight_comes_in_line_within_two_seconds():
     )
     log.valid[50:, 2] = False
     angle = couple(log).states[:, 1, 2] - log.states[:, 1, 2]
-    assert (
-        angle[49] < -0.05
-        and np.abs(np.diff(angle)).max() < 0.01
-        and np.allclose(angle[69:], 0)
-    )
+    assert angle[49] < -0.05
+    assert np.abs(np.diff(angle)).max() < 0.01
+    assert np.allclose(angle[69:], 0)
 
 
 def test_a_trailer_that_turns_is_shown_by_a_replay_alone_and_counted():
     log = recording(
         on_a_circle(0, 15), on_a_circle(9.3, 15), sizes=[(6, 2.4), (12, 2.6)]
     )
-    found = couple(log)
-    assert found.repairs == {TURNING: 1} and found.towed == (2,)
-    scene = build_scene(found, BuildSettings(field_cells=32))
-    assert scene["valid"].sum() == 2 and scene["logged_valid"].any(0).sum() >= 2
-    own = couple(Recording(**{**vars(log), "ego": 1}))
-    assert not own.valid[:, 2].any() and own.repairs == {TURNING: 1}
+    coupled = couple(log)
+    assert coupled.repairs == {TURNING: 1}
+    assert coupled.towed == (2,)
+    scene = build_scene(coupled, BuildSettings(field_cells=32))
+    assert scene["valid"].sum() == 2
+    assert scene["logged_valid"].any(0).sum() >= 2
+    ego_pulls = couple(Recording(**{**vars(log), "ego": 1}))
+    assert not ego_pulls.valid[:, 2].any()
+    assert ego_pulls.repairs == {TURNING: 1}
 
 
 @pytest.mark.parametrize(
@@ -145,7 +156,8 @@ def test_vehicles_that_follow_each_other_are_two(speed, distance):
         driving(10 - 4.5 - distance, 3.5, speed=speed),
         sizes=[(4.5, 1.9)] * 2,
     )
-    assert not couple(log).repairs and couple(log).valid.all()
+    assert not couple(log).repairs
+    assert couple(log).valid.all()
 
 
 def test_who_comes_nearer_is_no_trailer():

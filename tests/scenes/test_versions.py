@@ -10,7 +10,11 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.builder import BuildSettings, build_scene
 from e2rl.scenes.bundled import BundledSource
 from e2rl.scenes.lane_graph import LaneGraph
-from e2rl.scenes.recording import VEHICLE, Lane, Recording
+from e2rl.scenes.recording import (
+    VEHICLE,
+    Lane,
+    Recording,
+)
 from e2rl.scenes.scene import validate
 from e2rl.scenes.versions import (
     BESIDE,
@@ -59,27 +63,27 @@ def equal(a: object, b: object) -> bool:
 
 def differing(a: object, b: object) -> set[str]:
     return {
-        each.name
-        for each in fields(a)
-        if not equal(getattr(a, each.name), getattr(b, each.name))
+        item.name
+        for item in fields(a)
+        if not equal(getattr(a, item.name), getattr(b, item.name))
     }
 
 
 def spread(recording: Recording) -> np.ndarray:
     """The largest distance of each track from its first place, m."""
-    found = []
-    for track, there in zip(
+    result = []
+    for track, recorded in zip(
         recording.states.swapaxes(0, 1), recording.valid.T, strict=True
     ):
-        xy = track[there, :2]
-        found.append(np.linalg.norm(xy - xy[:1], axis=1).max() if len(xy) else np.inf)
-    return np.array(found)
+        xy = track[recorded, :2]
+        result.append(np.linalg.norm(xy - xy[:1], axis=1).max() if len(xy) else np.inf)
+    return np.array(result)
 
 
 @pytest.mark.parametrize("name", VERSIONS)
 def test_a_version_is_a_scene_and_differs_where_it_says(recordings, name):
-    made = [version_of(each, name) for each in recordings]
-    for log, other in zip(recordings, made, strict=True):
+    changed = [version_of(item, name) for item in recordings]
+    for log, other in zip(recordings, changed, strict=True):
         assert other.scene_id == f"{log.scene_id}~{name}"
         assert differing(log, other) <= CHANGED[name] | {"scene_id"}
         validate(build_scene(other, BuildSettings()), other.scene_id)
@@ -87,7 +91,7 @@ def test_a_version_is_a_scene_and_differs_where_it_says(recordings, name):
             "drawn from the log's own number"
         )
     assert any(
-        differing(a, b) - {"scene_id"} for a, b in zip(recordings, made, strict=True)
+        differing(a, b) - {"scene_id"} for a, b in zip(recordings, changed, strict=True)
     )
 
 
@@ -98,7 +102,7 @@ def test_of_a_lane_only_what_is_left_out_is_missing(recordings, name):
             log.lanes.values(), version_of(log, name).lanes.values(), strict=True
         ):
             assert differing(lane, other) <= OF_LANES[name]
-            assert not any(getattr(other, each) for each in OF_LANES[name])
+            assert not any(getattr(other, item) for item in OF_LANES[name])
 
 
 def test_a_mirror_in_a_mirror_is_the_log(recordings):
@@ -116,18 +120,16 @@ def test_without_parked_vehicles_everybody_stays_who_moves_or_waits_on_a_lane(
         other = version_of(log, "unparked")
         gone = []
         assert equal(other.states[:, other.ego], log.states[:, log.ego])
-        kept = {track.tobytes() for track in other.states.swapaxes(0, 1)}
+        rest = {track.tobytes() for track in other.states.swapaxes(0, 1)}
         beside = LaneGraph(log.lanes).tree.query(
             log.states[log.valid.argmax(0), np.arange(len(log.size)), :2]
         )[0]
         for k, far in enumerate(spread(log)):
-            if log.states[:, k].tobytes() not in kept:
+            if log.states[:, k].tobytes() not in rest:
                 gone.append(k)
-                assert (
-                    log.agent_type[k] == VEHICLE
-                    and far <= MOVES * 1.5
-                    and beside[k] > BESIDE - MOVES
-                )
+                assert log.agent_type[k] == VEHICLE
+                assert far <= MOVES * 1.5
+                assert beside[k] > BESIDE - MOVES
         assert len(other.size) + len(gone) == len(log.size)
         left += len(gone)
     assert left > 0
@@ -140,12 +142,12 @@ def test_headings_are_off_by_as_much_all_along_a_track_and_the_ego_s_are_not(
         version_of(log, "turned").states[..., 2] - log.states[..., 2]
         for log in recordings
     ]
-    assert all(np.ptp(each, axis=0).max() < 1e-9 for each in off)
+    assert all(np.ptp(item, axis=0).max() < 1e-9 for item in off)
     assert not any(
-        each[:, log.ego].any() for each, log in zip(off, recordings, strict=True)
+        item[:, log.ego].any() for item, log in zip(off, recordings, strict=True)
     )
     drawn = np.concatenate(
-        [np.delete(each[0], log.ego) for each, log in zip(off, recordings, strict=True)]
+        [np.delete(item[0], log.ego) for item, log in zip(off, recordings, strict=True)]
     )
     assert 0.8 * HEADING_NOISE < drawn.std() < 1.2 * HEADING_NOISE
 
@@ -165,7 +167,7 @@ def test_maps_are_shifted_and_cropped_by_as_much_as_they_say(recordings):
 
 
 def test_another_ego_is_the_one_that_drives_farthest_and_there_must_be_one(recordings):
-    found = 0
+    result = 0
     for log in recordings:
         driven = np.linalg.norm(log.states[-1, :, :2] - log.states[0, :, :2], axis=-1)
         able = (
@@ -175,34 +177,38 @@ def test_another_ego_is_the_one_that_drives_farthest_and_there_must_be_one(recor
         )
         if able.any() and driven[able].max() > MOVES:
             other = version_of(log, "other_ego").ego
-            found += 1
-            assert able[other] and driven[other] == driven[able].max()
-    assert found > 0
+            result += 1
+            assert able[other]
+            assert driven[other] == driven[able].max()
+    assert result > 0
     alone = replace(log, valid=log.valid & (np.arange(len(driven)) == log.ego))
-    assert (
-        version_of(alone, "other_ego") is None
-        and version_of(alone, "other_ego+unlit") is None
-    )
+    assert version_of(alone, "other_ego") is None
+    assert version_of(alone, "other_ego+unlit") is None
 
 
 def test_a_log_without_a_version_makes_the_scenes_of_the_others(monkeypatch, tmp_path):
-    known = VERSIONS["other_ego"]
-    asked = []
+    original = VERSIONS["other_ego"]
+    calls = []
 
     def some(log):
-        asked.append(log.scene_id)
-        return None if len(asked) % 2 else known(log)
+        calls.append(log.scene_id)
+        return None if len(calls) % 2 else original(log)
 
     recorded = e2rl.load_scenes("bundled", num_scenes=6)
     monkeypatch.setitem(VERSIONS, "other_ego", some)
-    given = {
+    settings = {
         "versions": ["recorded", "other_ego"],
         "cache": str(tmp_path),
         "workers": 1,
     }
-    both = e2rl.load_scenes("bundled", num_scenes=9, **given)
+    both = e2rl.load_scenes(
+        "bundled",
+        num_scenes=9,
+        **settings,
+    )
     others = [name for name in both.scene_id if name.endswith("~other_ego")]
-    assert len(others) >= 2 and len(both) - len(others) > len(others)
+    assert len(others) >= 2
+    assert len(both) - len(others) > len(others)
     assert (
         recorded.scene_id[:3]
         == [name for name in both.scene_id if name not in others][:3]
@@ -217,13 +223,22 @@ def test_an_invalid_version_beside_the_log_is_left_out_and_alone_is_told(
         "shifted",
         lambda log: replace(log, states=log.states + [1e5, 0, 0, 0]),
     )
-    given = {"cache": str(tmp_path), "workers": 1}
+    settings = {"cache": str(tmp_path), "workers": 1}
     both = e2rl.load_scenes(
-        "bundled", num_scenes=3, versions=["recorded", "shifted"], **given
+        "bundled",
+        num_scenes=3,
+        versions=["recorded", "shifted"],
+        **settings,
     )
-    assert len(both) == 3 and not any("~" in name for name in both.scene_id)
+    assert len(both) == 3
+    assert not any("~" in name for name in both.scene_id)
     with pytest.raises(InputError, match="plausible"):
-        e2rl.load_scenes("bundled", num_scenes=3, versions=["shifted"], **given)
+        e2rl.load_scenes(
+            "bundled",
+            num_scenes=3,
+            versions=["shifted"],
+            **settings,
+        )
 
 
 @pytest.mark.parametrize(
@@ -237,7 +252,11 @@ def test_an_invalid_version_beside_the_log_is_left_out_and_alone_is_told(
 )
 def test_versions_that_are_none_are_named(versions, message):
     with pytest.raises(InputError, match=message):
-        e2rl.load_scenes("bundled", num_scenes=1, versions=versions)
+        e2rl.load_scenes(
+            "bundled",
+            num_scenes=1,
+            versions=versions,
+        )
 
 
 def test_heights_go_with_their_tracks(recordings):
@@ -248,6 +267,6 @@ def test_heights_go_with_their_tracks(recordings):
         np.arange(recording.valid.shape[1], dtype=float), recording.valid.shape
     )
     whole = replace(recording, heights=number.copy())
-    kept = VERSIONS["unparked"](whole)
-    assert kept.heights.shape == kept.valid.shape
-    assert np.array_equal(whole.states[:, kept.heights[0].astype(int)], kept.states)
+    rest = VERSIONS["unparked"](whole)
+    assert rest.heights.shape == rest.valid.shape
+    assert np.array_equal(whole.states[:, rest.heights[0].astype(int)], rest.states)
