@@ -28,11 +28,11 @@ RADIUS = TILE / 2 * CELL * np.sqrt(2) + 1e-5  # m from there to its corners
 
 class NearPoints(NamedTuple):
     """Rows [R], one for each tile [R, 2] and reach, those of the most points first:
-    `count` [R] points from `begin` [R] on in `point` [K]."""
+    `length` [R] points from `begin` [R] on in `point` [K]."""
 
     tile: ndarray
     begin: ndarray
-    count: ndarray
+    length: ndarray
     point: ndarray
 
 
@@ -68,9 +68,9 @@ class LaneCover:
         x, y = (corner + cell * CELL).T.reshape(2, -1, TILE)
         px, py = (self.points - origin).T
         squared = np.full((len(i), TILE, TILE), np.inf)
-        for k in range(near.count.max(initial=0)):
+        for k in range(near.length.max(initial=0)):
             # the first rows have more than k points
-            rows = slice(np.searchsorted(-near.count, -k))
+            rows = slice(np.searchsorted(-near.length, -k))
             point = near.point[near.begin[rows] + k]
             dx = x[i[rows]] - px[point, None]
             dy = y[j[rows]] - py[point, None]
@@ -79,10 +79,10 @@ class LaneCover:
         field = np.full((*size, TILE, TILE), FAR)
         row_reach = self.reach[near.point[near.begin]]
         for reach in np.unique(row_reach)[::-1]:
-            rows = np.flatnonzero(row_reach == reach)
-            old = field[i[rows], j[rows]]
-            lower = np.minimum(old, np.sqrt(squared[rows]) - reach)
-            field[i[rows], j[rows]] = np.where(old > -INSIDE, lower, old)
+            band = np.flatnonzero(row_reach == reach)
+            old = field[i[band], j[band]]
+            lower = np.minimum(old, np.sqrt(squared[band]) - reach)
+            field[i[band], j[band]] = np.where(old > -INSIDE, lower, old)
         whole = field.swapaxes(1, 2).reshape(size * TILE)
         return whole[lead[0] : lead[0] + cells, lead[1] : lead[1] + cells]
 

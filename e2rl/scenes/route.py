@@ -9,7 +9,6 @@ from collections.abc import (
     Callable,
     Sequence,
 )
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -225,70 +224,23 @@ def onto_segments(
         take: a function from indices [2, ...] to vertices [2, ..., 2].
     """
     index = torch.stack([vertex - 1, vertex]).clamp(0, last)
-    segments = segment(take(index), take(index + 1))
-    s, d, second = onto_nearer(
-        points,
-        index,
-        last,
-        segments=segments,
-    )
-    unit = torch.where(second[..., None], segments.unit[1], segments.unit[0])
-    x, y = unit.unbind(-1)
-    return s, d, torch.atan2(y, x)
-
-
-class Segment(NamedTuple):
-    """From one vertex [..., 2] to the next: where it starts, the difference [..., 2],
-    its length [...] (at least 1e-6), its direction [..., 2]."""
-
-    start: Tensor
-    along: Tensor
-    length: Tensor
-    unit: Tensor
-
-
-def segment(start: Tensor, end: Tensor) -> Segment:
-    """Returns the segment between two vertices [..., 2]."""
-    along = end - start
+    start = take(index)
+    along = take(index + 1) - start
     length = along.norm(dim=-1).clamp(min=1e-6)
-    return Segment(
-        start,
-        along,
-        length,
-        unit=along / length[..., None],
-    )
-
-
-def onto_nearer(
-    points: Tensor,
-    index: Tensor,
-    last: int,
-    segments: Segment,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns where points lie on the nearer of two segments; the first where both are
-    equally near.
-
-    Args:
-        points: [..., 2] m.
-        index: [2, ...] of the vertex where each segment begins.
-        last: index of the last segment.
-        segments: both, [2, ...].
-
-    Returns:
-        Arc length and offset [...] m, and whether it is the second.
-    """
-    offset = points - segments.start
-    t = (offset * segments.unit).sum(-1) / segments.length
+    unit = along / length[..., None]
+    offset = points - start
+    t = (offset * unit).sum(-1) / length
     low = torch.where(index == 0, -torch.inf, 0.0)
     high = torch.where(index == last, torch.inf, 1.0)
     t = torch.maximum(torch.minimum(t, high), low)
-    gap = (offset - t[..., None] * segments.along).norm(dim=-1)
-    unit = segments.unit
+    gap = (offset - t[..., None] * along).norm(dim=-1)
     d = unit[..., 0] * offset[..., 1] - unit[..., 1] * offset[..., 0]
     d = torch.where(d < 0, -gap, gap)
     s = SPACING * (index + t)
-    second = gap[1] < gap[0]
-    return torch.where(second, s[1], s[0]), torch.where(second, d[1], d[0]), second
+    second = gap[1] < gap[0]  # the first, where both are equally near
+    x, y = torch.where(second[..., None], unit[1], unit[0]).unbind(-1)
+    s = torch.where(second, s[1], s[0])
+    return s, torch.where(second, d[1], d[0]), torch.atan2(y, x)
 
 
 def interpolate(
