@@ -32,7 +32,12 @@ class ObservingEgo(Ego):
         OBSERVATION_SIZE]."""
 
     @torch.no_grad()
-    def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
+    def act(
+        self,
+        world: World,
+        observation: Tensor,
+        plan: Tensor,
+    ) -> Tensor:
         """The action [B, 2] at the observation; the plan is ignored."""
         return self.decide(observation)
 
@@ -73,7 +78,11 @@ class ObservingEgo(Ego):
         return torch.cat(parts, 1)
 
 
-def others_at(world: World, expected: Tensor, step: int) -> Agents:
+def others_at(
+    world: World,
+    expected: Tensor,
+    step: int,
+) -> Agents:
     """All agents but the ego `step` steps from now, by their expected states [B, N,
     PLAN_STEPS + 1, 4]."""
     if step == 0:

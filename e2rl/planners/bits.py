@@ -70,10 +70,17 @@ class BitsEgo(ScoringEgo):
             distance=torch.minimum(distance, stop[:, None]),
             side=side,
         )
-        return drive_controls(controls, start, path=path)
+        return drive_controls(
+            controls,
+            start,
+            path=path,
+        )
 
     def drawn(
-        self, logits: Tensor, residual: Tensor, speed: Tensor
+        self,
+        logits: Tensor,
+        residual: Tensor,
+        speed: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Distances and sides [B, goals] m of goals drawn without replacement (the
         Gumbel-max trick).

@@ -52,7 +52,11 @@ def reach(speed: Tensor) -> Tensor:
     return PLAN_SECONDS * speed + FASTEST * PLAN_SECONDS**2 / 2
 
 
-def place(speed: Tensor, cell: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+def place(
+    speed: Tensor,
+    cell: Tensor,
+    residual: Tensor,
+) -> tuple[Tensor, Tensor]:
     """Distances and sides [B, K] m of the goals at `cell` [B, K] with residual [B, K,
     2], in cells from the cell's centre; speed [B] m/s. No distance is negative."""
     along = cell.div(SIDES, rounding_mode="floor") + 0.5 + residual[..., 0]
@@ -60,7 +64,11 @@ def place(speed: Tensor, cell: Tensor, residual: Tensor) -> tuple[Tensor, Tensor
     return (along * reach(speed)[:, None] / DISTANCES).clamp(min=0), across * SIDE
 
 
-def cell_of(speed: Tensor, distance: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+def cell_of(
+    speed: Tensor,
+    distance: Tensor,
+    side: Tensor,
+) -> tuple[Tensor, Tensor]:
     """The cells [W] of goals distance, side [W] m, and their residuals [W, 2]: the
     inverse of `place`. A goal off the grid counts to the nearest cell."""
     along = distance / reach(speed) * DISTANCES - 0.5
@@ -110,7 +118,15 @@ class BitsNetwork(nn.Module):
         self.encoder = nn.Sequential(layers, nn.SiLU(), nn.Dropout(dropout))
         self.goal_head = perceptron([hidden, hidden, 3 * CELLS], last_gain=0.0)
         inputs = hidden + GOAL_FEATURES
-        self.policy = perceptron([inputs, hidden, hidden, KNOTS + 2], last_gain=0.0)
+        self.policy = perceptron(
+            [
+                inputs,
+                hidden,
+                hidden,
+                KNOTS + 2,
+            ],
+            last_gain=0.0,
+        )
 
     def encode(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
         """Codes [B, hidden] of observations [B, D]; noise [B, D] is added to the
@@ -154,9 +170,17 @@ class BitsNetwork(nn.Module):
         code = code[:, None].expand(-1, distance.shape[1], -1)
         out = self.policy(torch.cat([code, torch.stack(features, -1)], -1))
         return Controls(
-            between(out[..., :KNOTS], ACCELERATION, start=0.0),
+            between(
+                out[..., :KNOTS],
+                ACCELERATION,
+                start=0.0,
+            ),
             side + AROUND * out[..., KNOTS].tanh(),
-            time=between(out[..., -1], TIME, start=START_TIME),
+            time=between(
+                out[..., -1],
+                TIME,
+                start=START_TIME,
+            ),
         )
 
     @property
@@ -168,20 +192,38 @@ class BitsNetwork(nn.Module):
 def perceptron(sizes: Sequence[int], last_gain: float) -> nn.Sequential:
     """Layers of these sizes with SiLU between; orthogonal weights, the last layer's
     scaled by last_gain."""
-    layers: list[nn.Module] = []
-    for fan_in, fan_out in zip(sizes[:-2], sizes[1:-1], strict=True):
-        layers += [linear(fan_in, fan_out, gain=2**0.5), nn.SiLU()]
-    return nn.Sequential(*layers, linear(sizes[-2], sizes[-1], gain=last_gain))
+    layers = nn.Sequential()
+    for fan_in, fan_out in zip(
+        sizes[:-2],
+        sizes[1:-1],
+        strict=True,
+    ):
+        layers.extend([linear(fan_in, fan_out, gain=2**0.5), nn.SiLU()])
+    return layers.append(
+        linear(
+            sizes[-2],
+            sizes[-1],
+            gain=last_gain,
+        )
+    )
 
 
-def between(value: Tensor, bounds: tuple[float, float], start: float) -> Tensor:
+def between(
+    value: Tensor,
+    bounds: tuple[float, float],
+    start: float,
+) -> Tensor:
     """Values squashed into the bounds by a sigmoid; 0 becomes `start`."""
     low, high = bounds
     fraction = (start - low) / (high - low)
     return low + (high - low) * (value + math.log(fraction / (1 - fraction))).sigmoid()
 
 
-def drive_controls(controls: Controls, start: Tensor, path: RoutePath) -> Candidates:
+def drive_controls(
+    controls: Controls,
+    start: Tensor,
+    path: RoutePath,
+) -> Candidates:
     """The Candidates [B, K] that Controls make of states start [B, 4] on their paths,
     by the unicycle."""
     held = controls.acceleration.repeat_interleave(PLAN_STEPS // KNOTS, -1)
@@ -196,7 +238,11 @@ def drive_controls(controls: Controls, start: Tensor, path: RoutePath) -> Candid
     )
 
 
-def save_bits(network: BitsNetwork, path: Path, origin: dict[str, Any]) -> None:
+def save_bits(
+    network: BitsNetwork,
+    path: Path,
+    origin: dict[str, Any],
+) -> None:
     """Write a network to a safetensors file; origin: what made it (data, command,
     settings), kept in the header."""
     header = {

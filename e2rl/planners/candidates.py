@@ -32,7 +32,11 @@ class Candidates(NamedTuple):
 
 
 def speed_profiles(
-    speed: Tensor, accelerations: Tensor, *, caps: Tensor, braking: float
+    speed: Tensor,
+    accelerations: Tensor,
+    *,
+    caps: Tensor,
+    braking: float,
 ) -> Tensor:
     """Returns speeds [B, L, PLAN_STEPS + 1] every DT.
 
@@ -47,11 +51,22 @@ def speed_profiles(
     rate = torch.where(node < FIRST, accelerations[:, :1], accelerations[:, 1:])
     start = speed[:, None, None].expand(-1, len(accelerations), 1)
     wanted = torch.cat([start, dynamics.bounded_speed(start, rate * PLAN_DT)], -1)
-    return upsample(capped(wanted, caps, slope=braking * PLAN_DT))
+    return upsample(
+        capped(
+            wanted,
+            caps,
+            slope=braking * PLAN_DT,
+        )
+    )
 
 
 def drive(
-    start: Tensor, path: RoutePath, *, speed: Tensor, shift: Tensor, time: Tensor
+    start: Tensor,
+    path: RoutePath,
+    *,
+    speed: Tensor,
+    shift: Tensor,
+    time: Tensor,
 ) -> Candidates:
     """Returns the C = L S Candidates of L speed profiles on S lateral moves each.
 
@@ -67,8 +82,8 @@ def drive(
         time: [B, L, S] s, or what broadcasts to it.
     """
     profiles = speed.shape[:2]
-    shift = shift.expand(*profiles, shift.shape[-1])
-    time = time.expand(*profiles, time.shape[-1])
+    shift = shift.expand((*profiles, shift.shape[-1]))
+    time = time.expand((*profiles, time.shape[-1]))
     speed = speed[:, :, None]
     mean = (speed[..., 1:] + speed[..., :-1]) / 2
     accel = speed.diff(dim=-1) / DT
@@ -92,17 +107,36 @@ def drive(
     grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt()
     bound = torch.minimum(grip / mean.clamp(min=1e-3), dynamics.yaw_rate_bound(mean))
     bound = bound.clamp(max=MAX_YAW_RATE)
-    yaw_rate = steer(turned.expand_as(shift), aim, bound=bound * DT) / DT
+    yaw_rate = (
+        steer(
+            turned.expand_as(shift),
+            aim,
+            bound=bound * DT,
+        )
+        / DT
+    )
     actions = torch.stack([accel.expand_as(yaw_rate), yaw_rate], -1).flatten(1, 2)
     states = dynamics.rollout(start[:, None].expand(-1, actions.shape[1], 4), actions)
-    return Candidates(states, along[..., -1].flatten(1), shift=shift.flatten(1))
+    return Candidates(
+        states,
+        along[..., -1].flatten(1),
+        shift=shift.flatten(1),
+    )
 
 
-def steer(heading: Tensor, aim: Tensor, bound: Tensor) -> Tensor:
+def steer(
+    heading: Tensor,
+    aim: Tensor,
+    bound: Tensor,
+) -> Tensor:
     """Turns [..., T] rad of each step from heading [...] to aim [..., T] rad, within
     bound [..., T], which broadcasts. What a bound withholds is made up later."""
     turns = []
-    for target, most in zip(aim.unbind(-1), bound.unbind(-1), strict=True):
+    for target, most in zip(
+        aim.unbind(-1),
+        bound.unbind(-1),
+        strict=True,
+    ):
         turn = torch.clamp(target - heading, -most, most)
         heading = heading + turn
         turns.append(turn)

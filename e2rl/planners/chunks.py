@@ -23,17 +23,28 @@ PLANNER_KEYS = (
 )  # of a scene, that paths and scores read
 
 
-def take(world: World, rows: Tensor, keys: tuple[str, ...] = PLANNER_KEYS) -> World:
+def take(
+    world: World,
+    rows: Tensor,
+    keys: tuple[str, ...] = PLANNER_KEYS,
+) -> World:
     """Scenes rows [b] of a World with these keys of the scene, without plans and
     routes."""
     agents = {key: getattr(world, key)[rows] for key in AGENT_KEYS}
     place = None if world.mission_s is None else world.mission_s[rows]
     scene = world.scene.select(*keys)[rows]
-    return World(scene, world.step[rows], **agents, mission_s=place)
+    return World(
+        scene,
+        world.step[rows],
+        **agents,
+        mission_s=place,
+    )
 
 
 def chunks(
-    world: World, size: int, keys: tuple[str, ...] = PLANNER_KEYS
+    world: World,
+    size: int,
+    keys: tuple[str, ...] = PLANNER_KEYS,
 ) -> Iterator[World]:
     """A World in parts of `size` scenes by `take`."""
     for rows in torch.arange(len(world.step), device=world.step.device).split(size):

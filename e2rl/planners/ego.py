@@ -38,7 +38,12 @@ class Ego(Extension):
     tuned: ClassVar[Mapping[str, tuple]] = {}
 
     def __init__(self, replan_every: int = 5) -> None:
-        check_range("ego.replan_every", replan_every, low=1, high=PLAN_STEPS)
+        check_range(
+            "ego.replan_every",
+            replan_every,
+            low=1,
+            high=PLAN_STEPS,
+        )
         self.replan_every = replan_every
 
     def reset(self, world: World) -> None:  # noqa: B027 - most egos have no memory
@@ -61,14 +66,23 @@ class Ego(Extension):
         times = DT * torch.arange(1, PLAN_STEPS + 1, device=world.states.device)
         return dynamics.constant_velocity(world.states[:, 0], times)
 
-    def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
+    def act(
+        self,
+        world: World,
+        observation: Tensor,
+        plan: Tensor,
+    ) -> Tensor:
         """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) for the next step; by
         default it tracks the plan.
 
         observation [B, D]: the environment's; plan [B, 1 + PLAN_STEPS, 4]: states of
         the last plan, now and at the coming steps.
         """
-        return track(world.states[:, 0], plan[:, 0], following=plan[:, 1])
+        return track(
+            world.states[:, 0],
+            plan[:, 0],
+            following=plan[:, 1],
+        )
 
 
 def return_length(speed: Tensor) -> Tensor:
@@ -76,7 +90,11 @@ def return_length(speed: Tensor) -> Tensor:
     return (RETURN_TIME * speed).clamp(min=RETURN_LENGTH)
 
 
-def track(state: Tensor, planned: Tensor, following: Tensor) -> Tensor:
+def track(
+    state: Tensor,
+    planned: Tensor,
+    following: Tensor,
+) -> Tensor:
     """Action [..., 2] with which a vehicle at state [..., 4] tracks a plan: `planned`
     now, `following` one step later.
 

@@ -117,13 +117,22 @@ class EgoPlanner(TensorDictModuleBase):
         replans where due."""
         if bool((world.step == 0).any()):
             self._visible = without_future(self.scene) if self._outside else None
-            ask(self.ego, "reset", world, scene=self._visible)
+            ask(
+                self.ego,
+                "reset",
+                world,
+                scene=self._visible,
+            )
         age = world.step - self._planned_at
         due = (age >= self.ego.replan_every) | (age < 0) | (world.step == 0)
         if bool(due.any()):
             state = world.states[:, 0]
             shape = (len(state), PLAN_STEPS, 4)
-            fresh = self._answer("plan", world, shape=shape).to(state)
+            fresh = self._answer(
+                "plan",
+                world,
+                shape=shape,
+            ).to(state)
             self._refuse(plan_faults(state, fresh), due)
             fresh = torch.cat([world.states[:, :1], fresh], 1)
             self._plan = torch.where(due[:, None, None], fresh, self._plan)
@@ -142,7 +151,13 @@ class EgoPlanner(TensorDictModuleBase):
         inputs: tuple[Tensor, ...] = (),
     ) -> Tensor:
         return checked_answer(
-            ask(self.ego, method, world, inputs=inputs, scene=self._visible),
+            ask(
+                self.ego,
+                method,
+                world,
+                inputs=inputs,
+                scene=self._visible,
+            ),
             self.ego,
             method=method,
             shape=shape,
@@ -169,7 +184,12 @@ class EgoPolicy(EgoPlanner):
         with answering(world):
             plan = self.plan(world)
             inputs = (tensordict["observation"], plan)
-            action = self._answer("act", world, shape=(len(plan), 2), inputs=inputs)
+            action = self._answer(
+                "act",
+                world,
+                shape=(len(plan), 2),
+                inputs=inputs,
+            )
             faults = action_faults(world.states[:, 0], plan[:, 1:], action)
             self._refuse(faults, world.step >= 0)
         tensordict["action"] = action.clamp(self.bounds.low, self.bounds.high)

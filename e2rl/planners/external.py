@@ -74,7 +74,11 @@ class ExternalEgo(Ego):
         content = scene_messages(world, self._new_scenes(world)) + plan_message(world)
         replies = self._ask(content, len(world.step))
         state = world.states[:, 0].cpu().float()
-        return plans_of(state, replies, steps=self.replan_every).to(world.states)
+        return plans_of(
+            state,
+            replies,
+            steps=self.replan_every,
+        ).to(world.states)
 
     def _new_scenes(self, world: World) -> list[int]:
         """Rows of the scenes that begin. A planner may have a memory, so it is asked
@@ -158,7 +162,11 @@ class ExternalEgo(Ego):
         raise PlannerDied(why, dict.fromkeys(range(count), why))
 
 
-def plans_of(state: Tensor, replies: list[Reply], steps: int) -> Tensor:
+def plans_of(
+    state: Tensor,
+    replies: list[Reply],
+    steps: int,
+) -> Tensor:
     """Plans [B, PLAN_STEPS, 4] from state [B, 4] by replies of at least `steps` steps;
     actions are held for so long. Raises PlannerError with the rows that have none."""
     failed: dict[int, str] = {}

@@ -25,7 +25,12 @@ class Prediction:
 
 
 def collision_hazard(
-    ego: Tensor, ego_size: Tensor, others: Prediction, *, slope: float, growth: float
+    ego: Tensor,
+    ego_size: Tensor,
+    others: Prediction,
+    *,
+    slope: float,
+    growth: float,
 ) -> Tensor:
     """Returns -log(1 - P) [B, C] of profiles.
 
@@ -53,7 +58,14 @@ def collision_hazard(
     j, t = (apart < cut.square()).nonzero(as_tuple=True)
     near = profiles_near(ego, others.poses, cut, j, t, scene[j])
     pair, profile = near.nonzero(as_tuple=True)
-    pairs = torch.stack([j[pair], t[pair], profile, scene[j[pair]]])
+    pairs = torch.stack(
+        [
+            j[pair],
+            t[pair],
+            profile,
+            scene[j[pair]],
+        ]
+    )
     hazard = ego.new_zeros(batch * count)
     ego_poses = ego.flatten(0, 2)
     poses = others.poses.flatten(0, 1)
@@ -72,7 +84,12 @@ def collision_hazard(
 
 @fused("B C T 3!", "J T 3!", "J T", "S:int64", "S:int64", "S:int64")
 def profiles_near(
-    ego: Tensor, other: Tensor, cut: Tensor, j: Tensor, t: Tensor, b: Tensor
+    ego: Tensor,
+    other: Tensor,
+    cut: Tensor,
+    j: Tensor,
+    t: Tensor,
+    b: Tensor,
 ) -> Tensor:
     """Returns 1 where profiles [S, C] are within the cut of others, else 0.
 
@@ -90,7 +107,11 @@ def profiles_near(
 
 @fused("Q 3", "Q 2", "Q 3", "Q 2", "Q")
 def hazard_of(
-    ego: Tensor, ego_size: Tensor, other: Tensor, size: Tensor, weight: Tensor
+    ego: Tensor,
+    ego_size: Tensor,
+    other: Tensor,
+    size: Tensor,
+    weight: Tensor,
 ) -> Tensor:
     """Returns -log(1 - p) [Q] of pairs of boxes.
 
@@ -99,7 +120,12 @@ def hazard_of(
         ego_size, size: [Q, 2] m.
         weight: [Q], w_t in 1/m.
     """
-    gap = circle_gap(ego, ego_size, second=other, second_size=size)
+    gap = circle_gap(
+        ego,
+        ego_size,
+        second=other,
+        second_size=size,
+    )
     return -torch.tanh(gap.clamp(min=0) * weight).clamp(min=CERTAIN).log()
 
 
@@ -117,8 +143,24 @@ def circles(pose: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     length, width = (value.expand(pose.shape[:-1]) for value in size.unbind(-1))
     along = (length - width) / 2 + width / 4
     across = width / 4
-    x = torch.stack([torch.zeros_like(along), along, along, -along, -along])
-    y = torch.stack([torch.zeros_like(across), across, -across, across, -across])
+    x = torch.stack(
+        [
+            torch.zeros_like(along),
+            along,
+            along,
+            -along,
+            -along,
+        ]
+    )
+    y = torch.stack(
+        [
+            torch.zeros_like(across),
+            across,
+            -across,
+            across,
+            -across,
+        ]
+    )
     cos = pose[..., 2].cos()
     sin = pose[..., 2].sin()
     radius = torch.stack([width / 2, *[width / 4] * 4])
@@ -126,7 +168,10 @@ def circles(pose: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def circle_gap(
-    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+    first: Tensor,
+    first_size: Tensor,
+    second: Tensor,
+    second_size: Tensor,
 ) -> Tensor:
     """Returns the smallest distance [...] m between the circles of two boxes; negative
     where circles overlap.

@@ -48,7 +48,11 @@ class IDMEgo(Ego):
         leading = leader.speed[:, 0, 0].clamp(min=0)
         light = path.stop_distance(self.braking) + self.standstill_gap
         leading = torch.where(light < gap, 0.0, leading)
-        desired = path.desired_speed(self.desired_speed, path.s, limits=self.use_limits)
+        desired = path.desired_speed(
+            self.desired_speed,
+            path.s,
+            limits=self.use_limits,
+        )
         accel = idm_acceleration(
             speed,
             desired,
@@ -72,6 +76,11 @@ class IDMEgo(Ego):
         accel = torch.minimum(accel, (allowed - speed) / REACTION)
         accel = accel.clamp(-self.hardest_braking, self.acceleration)
         change = (accel * DT)[:, None].expand(-1, PLAN_STEPS)
-        future = bounded_speed(speed[:, None], change, low=0.0, high=MAX_SPEED)
+        future = bounded_speed(
+            speed[:, None],
+            change,
+            low=0.0,
+            high=MAX_SPEED,
+        )
         future = torch.minimum(future, torch.maximum(desired, speed)[:, None])
         return path.drive(torch.cat([speed[:, None], future], 1))

@@ -87,7 +87,11 @@ class LaneGraphEgo(Ego):
             growth=self.risk_growth,
         )
         distance = driven[..., -1] + EARLIER * driven.mean(-1)
-        best = self.choose(hazard, distance, matched=matched(path))
+        best = self.choose(
+            hazard,
+            distance,
+            matched=matched(path),
+        )
         chosen = speed[torch.arange(len(best), device=best.device), best]
         return path.drive(upsample(chosen))
 
@@ -103,18 +107,43 @@ class LaneGraphEgo(Ego):
         caps = path.speed_caps(self.max_speed)
         top = caps.amax(1).clamp(min=0).sqrt()
         reach = FIRST_HALF * slope
-        aims = targets(start, top, reach=reach, count=self.speeds)
-        first = approach(start[:, None], aims, slope=slope, steps=FIRST_HALF)
+        aims = targets(
+            start,
+            top,
+            reach=reach,
+            count=self.speeds,
+        )
+        first = approach(
+            start[:, None],
+            aims,
+            slope=slope,
+            steps=FIRST_HALF,
+        )
         middle = first[..., -1]
         reach = SECOND_HALF * slope
-        aims = targets(middle, top[:, None], reach=reach, count=self.speeds)
-        second = approach(middle[..., None], aims, slope=slope, steps=SECOND_HALF)
+        aims = targets(
+            middle,
+            top[:, None],
+            reach=reach,
+            count=self.speeds,
+        )
+        second = approach(
+            middle[..., None],
+            aims,
+            slope=slope,
+            steps=SECOND_HALF,
+        )
         first = first[:, :, None].expand(-1, -1, self.speeds, -1)
         begin = start[:, None, None, None].expand(*first.shape[:3], 1)
         wanted = torch.cat([begin, first, second], -1).flatten(1, 2)
         return capped(wanted, caps, slope=slope)
 
-    def choose(self, hazard: Tensor, driven: Tensor, matched: Tensor) -> Tensor:
+    def choose(
+        self,
+        hazard: Tensor,
+        driven: Tensor,
+        matched: Tensor,
+    ) -> Tensor:
         """Profile [B] by hazard [B, C] = -log(1 - probability of collision) and
         distance [B, C]: the longest below max_risk (the shortest for an ego off its
         route with agents around), if none the least hazardous, or with
@@ -132,7 +161,9 @@ class LaneGraphEgo(Ego):
 
 
 def predict(
-    world: World, speed_factors: Sequence[float], acceleration: float
+    world: World,
+    speed_factors: Sequence[float],
+    acceleration: float,
 ) -> Prediction:
     """The Prediction of the agents within INTERACTION_DISTANCE of the ego, NODES steps
     of PLAN_DT.
@@ -160,7 +191,9 @@ def predict(
     agent = torch.cat([agent, rest_agent])
     followers = len(path.s)
     driven = ahead(
-        states[batch, agent, 3], speed_factors, acceleration=acceleration
+        states[batch, agent, 3],
+        speed_factors,
+        acceleration=acceleration,
     ).flatten(1)
     rest = straight_on(states[rest_batch, rest_agent], driven[followers:])
     poses = torch.cat([path.at(driven[:followers]), rest])
@@ -178,7 +211,11 @@ def matched(path: RoutePath) -> Tensor:
     return (path.d.abs() < MATCH_DISTANCE) & aligned
 
 
-def ahead(speed: Tensor, factors: Sequence[float], acceleration: float) -> Tensor:
+def ahead(
+    speed: Tensor,
+    factors: Sequence[float],
+    acceleration: float,
+) -> Tensor:
     """Metres [J, F, NODES + 1] driven from speed [J] while it approaches each factor
     times speed."""
     start = speed[:, None, None]

@@ -119,8 +119,16 @@ class ActorNetwork(nn.Module):
         self.noise: Tensor | None = None  # [D], set by `noisy`
         low = torch.tensor(architecture.low)
         high = torch.tensor(architecture.high)
-        self.register_buffer("middle", (high + low) / 2, persistent=False)
-        self.register_buffer("reach", (high - low) / 2, persistent=False)
+        self.register_buffer(
+            "middle",
+            (high + low) / 2,
+            persistent=False,
+        )
+        self.register_buffer(
+            "reach",
+            (high - low) / 2,
+            persistent=False,
+        )
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """loc, scale [..., 2] from observation [..., D]."""
@@ -198,7 +206,10 @@ class ActorCritic(nn.Module):
         self.normaliser = Normaliser(OBSERVATION_SIZE, LEAST_SCALE)
         self.network = ActorNetwork(self.normaliser, architecture, initial_std)
         trunk = Trunk(
-            architecture.hidden, architecture.agent_units, out=1, last_gain=1.0
+            architecture.hidden,
+            architecture.agent_units,
+            out=1,
+            last_gain=1.0,
         )
         values = nn.Sequential(self.normaliser, trunk)
         self.to(self.device)
@@ -231,7 +242,11 @@ class ActorCritic(nn.Module):
             out_keys=["action"],
             distribution_class=TanhNormal,
             distribution_kwargs={"low": self.low, "high": self.high},
-            spec=Bounded(self.low, self.high, device=self.device),
+            spec=Bounded(
+                self.low,
+                self.high,
+                device=self.device,
+            ),
             return_log_prob=True,
         )
 

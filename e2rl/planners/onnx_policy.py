@@ -57,7 +57,11 @@ class OnnxPolicy:
         self._open()
 
     def _open(self) -> None:
-        onnxruntime = library("onnxruntime", self.where, extra="onnx")
+        onnxruntime = library(
+            "onnxruntime",
+            self.where,
+            extra="onnx",
+        )
         bound_memory()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
@@ -66,7 +70,9 @@ class OnnxPolicy:
         options.add_session_config_entry("session.use_env_allocators", "1")
         try:
             self.session = onnxruntime.InferenceSession(
-                self.content, options, providers=["CPUExecutionProvider"]
+                self.content,
+                options,
+                providers=["CPUExecutionProvider"],
             )
         except Exception as error:  # onnxruntime's are of many kinds
             reason = " ".join(str(error).split())[:200]
@@ -135,7 +141,11 @@ def _varint(message: memoryview, position: int) -> tuple[int, int]:
     raise ValueError(NO_ONNX)
 
 
-def _length(message: memoryview, position: int, wire: int) -> tuple[int, int]:
+def _length(
+    message: memoryview,
+    position: int,
+    wire: int,
+) -> tuple[int, int]:
     """The bytes of a field's content, and where they begin."""
     if wire == VARINT:
         return 0, _varint(message, position)[1]

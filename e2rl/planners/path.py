@@ -33,12 +33,19 @@ class RoutePath:
     """
 
     def __init__(
-        self, state: Tensor, route: Tensor, place: Tensor | None = None
+        self,
+        state: Tensor,
+        route: Tensor,
+        place: Tensor | None = None,
     ) -> None:
         """state [..., 4], route [..., P, 2]; place [...]: arc length [m] near which the
         vehicles are, where known."""
         hint = None if place is None else place[..., None]
-        s, d, heading = project(state[..., None, :2], route, hint=hint)
+        s, d, heading = project(
+            state[..., None, :2],
+            route,
+            hint=hint,
+        )
         self.route = route
         self.s = s[..., 0]
         self.d = d[..., 0]
@@ -85,7 +92,11 @@ class RoutePath:
 
 
 def fading(
-    d: Tensor, turned: Tensor, *, length: Tensor, ahead: Tensor
+    d: Tensor,
+    turned: Tensor,
+    *,
+    length: Tensor,
+    ahead: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Returns the offset [m] and its slope of the critically damped return
     (`RoutePath`), both of the shape that the arguments broadcast to.
@@ -135,9 +146,22 @@ class MissionPath(RoutePath):
         grid = SPACING * torch.arange(count, device=self.s.device, dtype=self.s.dtype)
         place = self.s[:, None] + grid
         curvature = interpolate(self.mission.points, place)[2]
-        bend = avg_pool1d(curvature, 3, stride=1, padding=1).abs().clamp(min=1e-4)
+        bend = (
+            avg_pool1d(
+                curvature,
+                3,
+                stride=1,
+                padding=1,
+            )
+            .abs()
+            .clamp(min=1e-4)
+        )
         speed = torch.sqrt(LATERAL_ACCELERATION / bend).clamp(max=1e3)
-        limit = self.desired_speed(desired, place, limits=limits)
+        limit = self.desired_speed(
+            desired,
+            place,
+            limits=limits,
+        )
         squared = torch.minimum(speed, limit) ** 2
         potential = (squared + 2 * braking * grid).flip(-1).cummin(-1).values.flip(-1)
         if lights:
@@ -146,7 +170,10 @@ class MissionPath(RoutePath):
         return potential - 2 * braking * grid
 
     def desired_speed(
-        self, desired: float, place: Tensor, limits: bool = True
+        self,
+        desired: float,
+        place: Tensor,
+        limits: bool = True,
     ) -> Tensor:
         """Speed limits [B, ...] m/s at places [B, ...] m; `desired` m/s where none is
         known."""
@@ -160,7 +187,9 @@ class MissionPath(RoutePath):
         """
         scene = self.world.scene
         lights = light_state_at(
-            scene["light_state"], self.mission.light, step=self.world.step
+            scene["light_state"],
+            self.mission.light,
+            step=self.world.step,
         )
         line = stop_line_distance(
             lights,

@@ -78,13 +78,23 @@ class PDMClosedEgo(Ego):
         return drive(
             start,
             path,
-            speed=self.speeds(world, path, offset=offset, fraction=fraction),
+            speed=self.speeds(
+                world,
+                path,
+                offset=offset,
+                fraction=fraction,
+            ),
             shift=shift,
             time=torch.full_like(shift, self.shift_time),
         ).states
 
     def speeds(
-        self, world: World, path: MissionPath, *, offset: Tensor, fraction: Tensor
+        self,
+        world: World,
+        path: MissionPath,
+        *,
+        offset: Tensor,
+        fraction: Tensor,
     ) -> Tensor:
         """Returns speeds [B, P, PLAN_STEPS + 1] m/s by IDM behind leaders and before
         red lights.
@@ -143,7 +153,11 @@ class PDMClosedEgo(Ego):
         return torch.stack(speeds, -1)
 
 
-def others_of(world: World, count: int, steps: int) -> Others:
+def others_of(
+    world: World,
+    count: int,
+    steps: int,
+) -> Others:
     """The `count` agents that come nearest, at steps 0 up to `steps`."""
     agents, present = nearest(world, count)
     row = torch.arange(len(agents), device=agents.device)[:, None]

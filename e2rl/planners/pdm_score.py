@@ -61,7 +61,11 @@ class Drives(NamedTuple):
     loose: Tensor  # [B, P, T] bool
 
 
-def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tensor]:
+def score(
+    world: World,
+    proposals: Tensor,
+    others: Others,
+) -> tuple[Tensor, Tensor]:
     """nuPlan's score [B, P] in [0, 1] of proposals [B, P, PLAN_STEPS, 4] over the
     SCORED_STEPS, and the s [B, P] to their first collision at fault, inf without;
     others: at steps 0 to SCORED_STEPS.
@@ -74,9 +78,17 @@ def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tens
     start = world.states[:, None, None, 0].expand_as(proposals[:, :, :1])
     states = torch.cat([start, proposals[:, :, :SCORED_STEPS]], 2)
     size = world.scene["size"][:, 0]
-    ego = Drives(states, size, loose=in_several_lanes(world, states))
+    ego = Drives(
+        states,
+        size,
+        loose=in_several_lanes(world, states),
+    )
     contacts = contacts_of(ego, others)
-    fault = at_fault(ego, others, touch=contacts[..., 0])
+    fault = at_fault(
+        ego,
+        others,
+        touch=contacts[..., 0],
+    )
     hit = fault & ~others.objects[:, None, :, None]
     object_factor = torch.where(fault.any((2, 3)), OBJECT_HIT, 1.0)
     factor = torch.where(hit.any((2, 3)), 0.0, object_factor) * on_road(world, states)
@@ -90,12 +102,20 @@ def score(world: World, proposals: Tensor, others: Others) -> tuple[Tensor, Tens
     return factor * weighted / (PROGRESS + TIME_TO_COLLISION + COMFORT), collides
 
 
-def progress(world: World, states: Tensor, factor: Tensor) -> Tensor:
+def progress(
+    world: World,
+    states: Tensor,
+    factor: Tensor,
+) -> Tensor:
     """Metres along the mission of states [B, P, T, 4], times factor [B, P], as a
     fraction [B, P] of the most."""
     path = MissionPath(world)
     length = states[..., :2].diff(dim=2).norm(dim=-1).sum(-1)
-    s = project(states[:, :, -1, :2], path.route, hint=path.s[:, None] + length)[0]
+    s = project(
+        states[:, :, -1, :2],
+        path.route,
+        hint=path.s[:, None] + length,
+    )[0]
     distance = (s - path.s[:, None]).clamp(min=0) * factor
     farthest = distance.amax(1, keepdim=True)
     relative = distance / farthest.clamp(min=LEAST_PROGRESS)
@@ -119,14 +139,22 @@ def first(events: Tensor) -> tuple[Tensor, ...]:
     return (events & (events.cumsum(-1) == 1)).nonzero(as_tuple=True)
 
 
-def angle_at_axle(states: Tensor, size: Tensor, centre: Tensor) -> Tensor:
+def angle_at_axle(
+    states: Tensor,
+    size: Tensor,
+    centre: Tensor,
+) -> Tensor:
     """Angle [Q] in [0, pi] at the rear axle of states [Q, 4] of size [Q, 2], from their
     heading to centres [Q, 2]."""
     ahead, beside = to_frame(centre, states).unbind(-1)
     return torch.atan2(beside, ahead + REAR_AXLE * size[:, 0]).abs()
 
 
-def at_fault(ego: Drives, others: Others, touch: Tensor) -> Tensor:
+def at_fault(
+    ego: Drives,
+    others: Others,
+    touch: Tensor,
+) -> Tensor:
     """Bool [B, P, M, T]: collisions at the ego's fault, at the step at which it first
     touches an agent; touch [B, P, M, T] bool.
 
@@ -146,7 +174,14 @@ def at_fault(ego: Drives, others: Others, touch: Tensor) -> Tensor:
         second=other,
         second_size=others.size[scene, agent],
     )
-    behind = angle_at_axle(state, size, centre=other[:, :2]) > BEHIND
+    behind = (
+        angle_at_axle(
+            state,
+            size,
+            centre=other[:, :2],
+        )
+        > BEHIND
+    )
     moves = state[:, 3] > STANDS
     stands = other[:, 3].abs() <= STANDS
     drives_into = ~behind & (front | ego.loose[scene, proposal, step])
@@ -155,7 +190,11 @@ def at_fault(ego: Drives, others: Others, touch: Tensor) -> Tensor:
     return fault
 
 
-def runs_into(ego: Drives, others: Others, touch: Tensor) -> Tensor:
+def runs_into(
+    ego: Drives,
+    others: Others,
+    touch: Tensor,
+) -> Tensor:
     """Bool [B, P]: at constant velocities the ego would touch an agent within a second
     that is ahead of it, or, while it is in several lanes, not behind it. What it would
     first touch elsewhere does not count later. touch [B, P, M, T, L] bool."""
@@ -166,7 +205,11 @@ def runs_into(ego: Drives, others: Others, touch: Tensor) -> Tensor:
     time = ego.states.new_tensor(LOOKS)[event % len(LOOKS)]
     other = constant_velocity(others.states[scene, agent, step], time[:, None])[:, 0]
     state = ego.states[scene, proposal, step]
-    angle = angle_at_axle(state, ego.size[scene], centre=other[:, :2])
+    angle = angle_at_axle(
+        state,
+        ego.size[scene],
+        centre=other[:, :2],
+    )
     beside = ego.loose[scene, proposal, step] & (angle <= BEHIND)
     counts = (angle < AHEAD) | beside
     result = torch.zeros_like(ego.loose[..., 0])
@@ -181,7 +224,11 @@ def in_several_lanes(world: World, states: Tensor) -> Tensor:
     xy = states[..., :2]
     driven = pad(xy.diff(dim=2).norm(dim=-1).cumsum(-1), (1, 0))
     hint = (path.s[:, None, None] + driven).flatten(1, 2)
-    offset = project(xy.flatten(1, 2), path.route, hint=hint)[1].view(driven.shape)
+    offset = project(
+        xy.flatten(1, 2),
+        path.route,
+        hint=hint,
+    )[1].view(driven.shape)
     half_width = world.scene["size"][:, 0, 1, None, None] / 2
     return offset.abs() + half_width > LANE_WIDTH / 2
 
@@ -190,7 +237,9 @@ def on_road(world: World, states: Tensor) -> Tensor:
     """Bool [B, P]: no corner of states [B, P, T, 4] leaves the drivable area."""
     boxes = corners(states, world.scene["size"][:, 0][:, None, None])
     beyond = off_road(
-        boxes.flatten(1, 3), world.scene["field"], origin=world.scene["field_origin"]
+        boxes.flatten(1, 3),
+        world.scene["field"],
+        origin=world.scene["field_origin"],
     )
     return beyond.view(*states.shape[:2], -1).amax(-1) <= 0
 
@@ -209,8 +258,17 @@ def comfortable(world: World, states: Tensor) -> Tensor:
     longitudinal = _filtered(accel)
     jerk = _filtered(_filtered(accel, window=8), derivative=1)
     total_jerk = _filtered(_filtered(accel.abs(), window=8), derivative=1)
-    yaw_rate = _filtered(turned, window=5, derivative=1)
-    yaw_acceleration = _filtered(turned, window=5, order=3, derivative=2)
+    yaw_rate = _filtered(
+        turned,
+        window=5,
+        derivative=1,
+    )
+    yaw_acceleration = _filtered(
+        turned,
+        window=5,
+        order=3,
+        derivative=2,
+    )
     bounded = longitudinal > MIN_ACCELERATION
     bounded &= longitudinal < MAX_ACCELERATION
     bounded &= jerk.abs() < LONGITUDINAL_JERK
@@ -221,15 +279,38 @@ def comfortable(world: World, states: Tensor) -> Tensor:
 
 
 def _filtered(
-    values: Tensor, window: int = SCORED_STEPS + 1, order: int = 2, derivative: int = 0
+    values: Tensor,
+    window: int = SCORED_STEPS + 1,
+    order: int = 2,
+    derivative: int = 0,
 ) -> Tensor:
-    return values @ savitzky_golay(window, order, derivative=derivative).to(values).mT
+    return (
+        values
+        @ savitzky_golay(
+            window,
+            order,
+            derivative=derivative,
+        )
+        .to(values)
+        .mT
+    )
 
 
 @cache
-def savitzky_golay(window: int, order: int, derivative: int) -> Tensor:
+def savitzky_golay(
+    window: int,
+    order: int,
+    derivative: int,
+) -> Tensor:
     """The filter of SCORED_STEPS + 1 values at steps of DT as a matrix [SCORED_STEPS +
     1, SCORED_STEPS + 1]."""
     unit = np.eye(SCORED_STEPS + 1)
-    matrix = savgol_filter(unit, window, order, deriv=derivative, delta=DT, axis=0)
+    matrix = savgol_filter(
+        unit,
+        window,
+        order,
+        deriv=derivative,
+        delta=DT,
+        axis=0,
+    )
     return torch.from_numpy(matrix)

@@ -78,7 +78,10 @@ class PlannerLink:
             close(None, self._process)
             raise
         self.close = Finalize(
-            self, close, (self._socket, self._process), exitpriority=10
+            self,
+            close,
+            (self._socket, self._process),
+            exitpriority=10,
         )
         self._greet(replan_every, deadline)
 
@@ -173,7 +176,13 @@ def start(command: str, address: str) -> Process:
         if shutil.which(words[0]) is None:
             raise FileNotFoundError(f"no program {words[0]}")
         return subprocess.Popen(
-            [sys.executable, "-I", "-S", guard.__file__, *words],
+            [
+                sys.executable,
+                "-I",
+                "-S",
+                guard.__file__,
+                *words,
+            ],
             stdin=subprocess.PIPE,
             stdout=STDERR,
             start_new_session=True,

@@ -45,7 +45,11 @@ def scene_messages(world: World, rows: list[int]) -> bytes:
     return b"".join(_scene(world, mission, row=row) for row in rows)
 
 
-def _scene(world: World, mission: Mission, row: int) -> bytes:
+def _scene(
+    world: World,
+    mission: Mission,
+    row: int,
+) -> bytes:
     scene = world.scene[row]
     on_lane = scene["lane_index"] >= 0  # others are padding
     lane = scene["lane_index"][on_lane]
@@ -84,7 +88,9 @@ def plan_message(world: World) -> bytes:
     row = torch.arange(count, device=world.step.device)
     lights = torch.arange(scene["light_state"].shape[-1], device=row.device)
     light_state = light_state_at(
-        scene["light_state"], lights.expand(count, -1), step=world.step
+        scene["light_state"],
+        lights.expand(count, -1),
+        step=world.step,
     )
     records = _words(
         torch.arange(agents, device=row.device).expand(count, -1)[..., None],
@@ -94,7 +100,12 @@ def plan_message(world: World) -> bytes:
         world.accel[..., None],
         world.turn_rate[..., None],
     )  # [B, N, AGENT_WORDS]
-    counts = [row, world.step, world.valid.sum(1), torch.full_like(row, len(lights))]
+    counts = [
+        row,
+        world.step,
+        world.valid.sum(1),
+        torch.full_like(row, len(lights)),
+    ]
     head = _words(torch.stack(counts, -1), light_state)
     body = torch.cat([head, records.flatten(1)], 1)
     present = world.valid.repeat_interleave(AGENT_WORDS, 1)

@@ -43,7 +43,9 @@ def plan_faults(state: Tensor, plan: Tensor) -> Iterator[tuple[Tensor, str]]:
 
 
 def action_faults(
-    state: Tensor, plan: Tensor, action: Tensor
+    state: Tensor,
+    plan: Tensor,
+    action: Tensor,
 ) -> Iterator[tuple[Tensor, str]]:
     """The same of actions [B, 2], by which egos at state [B, 4] drive a plan."""
     wild = (action.abs() > LARGEST).any(1)
@@ -51,7 +53,11 @@ def action_faults(
     yield wild, WILD
 
 
-def drivable(state: Tensor, plan: Tensor, length: Tensor | int = PLAN_STEPS) -> Tensor:
+def drivable(
+    state: Tensor,
+    plan: Tensor,
+    length: Tensor | int = PLAN_STEPS,
+) -> Tensor:
     """Bool [B]: the first `length` [B] states of a plan [B, H, 4] that begins at state
     [B, 4] are finite and no faster than FASTEST, in their speeds and from pose to
     pose."""
@@ -91,7 +97,12 @@ def finite(values: Tensor, name: str) -> Tensor:
 
 
 def checked_answer(
-    answer: Any, ego: Ego, *, method: str, shape: tuple[int, ...], begins: bool
+    answer: Any,
+    ego: Ego,
+    *,
+    method: str,
+    shape: tuple[int, ...],
+    begins: bool,
 ) -> Tensor:
     """Returns what a method of an ego returned.
 

@@ -88,7 +88,11 @@ def within_time(work: Callable[[], Any], where: str) -> Any:
     return result.result()
 
 
-def probe(policy: Policy, where: str, count: int) -> None:
+def probe(
+    policy: Policy,
+    where: str,
+    count: int,
+) -> None:
     """Raises InputError where a policy does not map observations of a batch of `count`
     to actions."""
     try:
@@ -149,7 +153,11 @@ def write_policy(policy: nn.Module, file: Path) -> None:
             f"{file}: no kind of policy; name it {ONNX}, or {TORCHSCRIPT} for TorchScript"
         )
     if file.suffix == ONNX:
-        library("onnxscript", str(file), extra="onnx")
+        library(
+            "onnxscript",
+            str(file),
+            extra="onnx",
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         write_atomically(file, partial(writers[file.suffix], policy.eval()))

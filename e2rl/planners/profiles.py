@@ -11,7 +11,13 @@ PLAN_DT = 0.2  # s between nodes of a profile
 NODES = 25  # nodes after the first, which is now: 5 s
 
 
-def targets(start: Tensor, top: Tensor, *, reach: float, count: int) -> Tensor:
+def targets(
+    start: Tensor,
+    top: Tensor,
+    *,
+    reach: float,
+    count: int,
+) -> Tensor:
     """Returns target speeds [..., count], evenly from max(0, start - reach) to min(top,
     start + reach).
 
@@ -27,7 +33,13 @@ def targets(start: Tensor, top: Tensor, *, reach: float, count: int) -> Tensor:
     return low[..., None] + fraction * (high - low)[..., None]
 
 
-def approach(start: Tensor, target: Tensor, *, slope: float, steps: int) -> Tensor:
+def approach(
+    start: Tensor,
+    target: Tensor,
+    *,
+    slope: float,
+    steps: int,
+) -> Tensor:
     """Returns speeds [..., steps] moving from start [...] to target [...] by at most
     `slope` a step, then holding.
 
@@ -42,7 +54,11 @@ def approach(start: Tensor, target: Tensor, *, slope: float, steps: int) -> Tens
     return start[..., None] + change.sign() * torch.minimum(change.abs(), reach)
 
 
-def capped(wanted: Tensor, caps: Tensor, slope: float) -> Tensor:
+def capped(
+    wanted: Tensor,
+    caps: Tensor,
+    slope: float,
+) -> Tensor:
     """Speeds [B, C, NODES + 1] that follow wanted [B, C, NODES + 1] under the squared
     caps [B, K] of the path, braking by at most `slope` a node.
 

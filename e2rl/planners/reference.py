@@ -82,15 +82,25 @@ def reference_rows(observation: Tensor) -> Tensor:
     least = (-speed / REACTION).clamp(
         min=-HARDEST_BRAKING
     )  # no braking at standstill, as in recordings
-    most = torch.minimum(wanted, _capped(route, speed)).clamp(max=DRIVER.acceleration)
+    most = torch.minimum(wanted, speed_cap_acceleration(route, speed)).clamp(
+        max=DRIVER.acceleration
+    )
     uncapped = torch.full_like(desired, UNCAPPED)[..., None]
     behind = _following(speed[..., None], uncapped, leaders)
     bound = torch.where(leaders.binding, behind, torch.inf).amin(-1)
     rooms = observation[..., ROOMS].unflatten(-1, (len(ACCELERATIONS), len(OFFSETS)))
     room = WIDEST * rooms[..., MILD, OFFSETS.index(0.0)].amin(-1)
     accel = torch.maximum(most, least)
-    yaw_rate = speed * _pursuit(path, speed)
-    return torch.stack([accel, yaw_rate, torch.maximum(bound, least), room], -1)
+    yaw_rate = speed * pursuit_curvature(path, speed)
+    return torch.stack(
+        [
+            accel,
+            yaw_rate,
+            torch.maximum(bound, least),
+            room,
+        ],
+        -1,
+    )
 
 
 class Leaders(NamedTuple):
@@ -104,7 +114,11 @@ class Leaders(NamedTuple):
     binding: Tensor
 
 
-def _following(speed: Tensor, desired: Tensor, leaders: Leaders) -> Tensor:
+def _following(
+    speed: Tensor,
+    desired: Tensor,
+    leaders: Leaders,
+) -> Tensor:
     """Acceleration [..., K] of the ACC model (Kesting, Treiber and Helbing 2010) behind
     K leaders, at speed and desired speed [..., 1] m/s.
 
@@ -115,7 +129,12 @@ def _following(speed: Tensor, desired: Tensor, leaders: Leaders) -> Tensor:
     gap = leaders.gap
     leading = leaders.speed
     idm = idm_acceleration(
-        speed, desired, gap=gap, leader_speed=leading, driver=DRIVER, improved=True
+        speed,
+        desired,
+        gap=gap,
+        leader_speed=leading,
+        driver=DRIVER,
+        improved=True,
     )
     space = gap.clamp(0.5, 1e3)
     steady = leaders.acceleration.clamp(-HARDEST_BRAKING, DRIVER.acceleration)
@@ -128,7 +147,7 @@ def _following(speed: Tensor, desired: Tensor, leaders: Leaders) -> Tensor:
     return torch.where((idm < least) & gap.isfinite(), mixed, idm)
 
 
-def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
+def pursuit_curvature(path: Tensor, speed: Tensor) -> Tensor:
     """Curvature [...] 1/m of the circle through the ego and the point of path [..., K,
     2] PURSUIT_TIME ahead."""
     ahead = path.new_tensor(LOOK_AHEAD)
@@ -145,7 +164,7 @@ def _pursuit(path: Tensor, speed: Tensor) -> Tensor:
     return 2 * aim[..., 1] / aim.square().sum(-1).clamp(min=1.0)
 
 
-def _capped(route: Tensor, speed: Tensor) -> Tensor:
+def speed_cap_acceleration(route: Tensor, speed: Tensor) -> Tensor:
     """Acceleration [...] that reaches the speed cap by limits and curves ahead within
     REACTION."""
     curvature = route[..., 3].abs() / 10
@@ -174,7 +193,7 @@ def _leaders(observation: Tensor, path: Tensor) -> Leaders:
     inside = apart < across * length + aligned.abs() * width + half_width + GATE_MARGIN
     leads = inside & (along > 0) & (agents[..., 0] > 0)
     gap = along - aligned.abs() * length - across * width - half_length
-    line = _halts(observation, ego[..., 0] * SPEED)
+    line = stop_lines(observation, ego[..., 0] * SPEED)
     halt = line - half_length - LINE_GAP + STANDSTILL_GAP
     still = torch.zeros_like(halt)
     speed = (agents[..., 7] * SPEED * aligned).clamp(min=0)
@@ -209,7 +228,7 @@ def _on_path(position: Tensor, path: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return along, apart, direction
 
 
-def _halts(observation: Tensor, speed: Tensor) -> Tensor:
+def stop_lines(observation: Tensor, speed: Tensor) -> Tensor:
     """Metres [..., 2] to the stop lines that bind: red if twice BRAKING halts before
     it, yellow if BRAKING does."""
     light = observation[..., LIGHTS].unflatten(-1, (2, 4))

@@ -118,7 +118,13 @@ class ScoringEgo(Weights, Ego):
             hold=self.hold,
             turn=self.turn,
         )
-        return score(world, candidates, others=others, steps=steps, weights=self)
+        return score(
+            world,
+            candidates,
+            others=others,
+            steps=steps,
+            weights=self,
+        )
 
     def plan(self, world: World) -> Tensor:
         """The states [B, PLAN_STEPS, 4] of the candidate that costs least."""
@@ -157,8 +163,19 @@ class ScoringEgo(Weights, Ego):
         start = world.states[:, None, :1, :2].expand_as(xy[:, :, :1])
         length = torch.cat([start, xy], 2).diff(dim=2).norm(dim=-1).sum(-1)
         hint = path.s[:, None] + length
-        end, shift, _ = project(xy[:, :, -1], path.route, hint=hint)
-        return self.costs(world, Candidates(states, end - path.s[:, None], shift=shift))
+        end, shift, _ = project(
+            xy[:, :, -1],
+            path.route,
+            hint=hint,
+        )
+        return self.costs(
+            world,
+            Candidates(
+                states,
+                end - path.s[:, None],
+                shift=shift,
+            ),
+        )
 
     def _parts(self, world: World) -> Iterator[World]:
         size = GPU_CHUNK if world.step.is_cuda else self.CHUNK
@@ -166,7 +183,10 @@ class ScoringEgo(Weights, Ego):
 
 
 def ranked_actions(
-    ego: ScoringEgo, world: World, count: int, hold: int
+    ego: ScoringEgo,
+    world: World,
+    count: int,
+    hold: int,
 ) -> tuple[Tensor, Tensor]:
     """Returns actions [B, C, 2] (m/s^2, rad/s) of the cheapest candidates and their
     costs [B, C].
@@ -211,4 +231,10 @@ class SamplingEgo(ScoringEgo):
         count = len(SHIFTS)
         times = [self.swift] * count + [self.calm] * count + [self.swift]
         time = start.new_tensor(times)
-        return drive(start, path, speed=speed, shift=shift[:, None], time=time)
+        return drive(
+            start,
+            path,
+            speed=speed,
+            shift=shift[:, None],
+            time=time,
+        )

@@ -114,7 +114,15 @@ def forecast(
     x = state[..., 0:1] + (steps * middle.cos()).cumsum(-1)
     y = state[..., 1:2] + (steps * middle.sin()).cumsum(-1)
     return Forecast(
-        torch.stack([x, y, heading[..., 1:], speed[..., 1:]], -1),
+        torch.stack(
+            [
+                x,
+                y,
+                heading[..., 1:],
+                speed[..., 1:],
+            ],
+            -1,
+        ),
         world.scene["size"][row, index],
         present=present,
     )
@@ -138,8 +146,18 @@ def score(
         weights: what costs how much.
     """
     states = candidates.states[:, :, steps - 1]
-    cost = contact_cost(states, world, others, times=steps * DT, weights=weights)
-    beyond = beyond_border(states[:, :, ::ROAD_STRIDE], world, border=weights.border)
+    cost = contact_cost(
+        states,
+        world,
+        others,
+        times=steps * DT,
+        weights=weights,
+    )
+    beyond = beyond_border(
+        states[:, :, ::ROAD_STRIDE],
+        world,
+        border=weights.border,
+    )
     cost = cost + weights.off_road * beyond
     cost = cost + weights.comfort * discomfort(candidates.states, world)
     cost = cost + weights.lateral_offset * candidates.shift.abs()
@@ -147,7 +165,12 @@ def score(
 
 
 def contact_cost(
-    ego: Tensor, world: World, others: Forecast, *, times: Tensor, weights: Weights
+    ego: Tensor,
+    world: World,
+    others: Forecast,
+    *,
+    times: Tensor,
+    weights: Weights,
 ) -> Tensor:
     """Returns costs [B, C] of candidates near others: the worst moment with each agent,
     summed over agents.
@@ -241,14 +264,26 @@ def pair_cost(pairs: Pairs, weights: Weights) -> tuple[Tensor, Tensor]:
     return cost * torch.where(behind, weights.rear, 1.0), hit & ~behind
 
 
-def beyond_border(states: Tensor, world: World, border: float) -> Tensor:
+def beyond_border(
+    states: Tensor,
+    world: World,
+    border: float,
+) -> Tensor:
     """Metres [B, C], summed over T, by which centres [B, C, T, 4] come nearer to the
     drivable border than `border`, or leave it; only what exceeds the ego's present
     place counts."""
     field = world.scene["field"]
     origin = world.scene["field_origin"]
-    present = off_road(world.states[:, :1, :2], field, origin=origin).clamp(min=-border)
-    distance = off_road(states[..., :2], field, origin=origin)
+    present = off_road(
+        world.states[:, :1, :2],
+        field,
+        origin=origin,
+    ).clamp(min=-border)
+    distance = off_road(
+        states[..., :2],
+        field,
+        origin=origin,
+    )
     return (distance - present[..., None]).clamp(0, FARTHEST).sum(-1)
 
 

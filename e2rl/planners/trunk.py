@@ -75,7 +75,11 @@ class Largest(torch.autograd.Function):
 
 
 @fused("B K U", "B U", "B U")
-def shared(values: Tensor, largest: Tensor, grad: Tensor) -> Tensor:
+def shared(
+    values: Tensor,
+    largest: Tensor,
+    grad: Tensor,
+) -> Tensor:
     """The gradient of `Largest`: grad [B, U] is shared equally among the values [B, K,
     U] that are the largest."""
     ties = torch.where(values == largest[:, None], 1.0, 0.0)
@@ -87,7 +91,11 @@ class Trunk(nn.Module):
     layer's (`last`) scaled."""
 
     def __init__(
-        self, hidden: Sequence[int], agent_units: int, out: int, last_gain: float
+        self,
+        hidden: Sequence[int],
+        agent_units: int,
+        out: int,
+        last_gain: float,
     ) -> None:
         """hidden: units of the layers of the whole scene, one at least; agent_units: of
         both layers of an agent."""
@@ -95,16 +103,19 @@ class Trunk(nn.Module):
         first, *later = hidden
         self.agent = nn.Sequential(
             *_layer(PER_AGENT, agent_units),
-            *_layer(agent_units, agent_units, norm=False),
+            *_layer(
+                agent_units,
+                agent_units,
+                norm=False,
+            ),
         )
         rest_size = OBSERVATION_SIZE - PER_AGENT * NEAREST
         self.rest = nn.Sequential(*_layer(rest_size, first))
-        joint: list[nn.Module] = []
+        self.joint = nn.Sequential()
         size = first + agent_units
         for units in later:
-            joint += _layer(size, units)
+            self.joint.extend(_layer(size, units))
             size = units
-        self.joint = nn.Sequential(*joint)
         self.last = linear(size, out, gain=last_gain)
 
     def forward(self, normalised: Tensor) -> Tensor:
@@ -118,12 +129,20 @@ class Trunk(nn.Module):
         return self.last(self.joint(torch.cat([rest, largest], -1)))
 
 
-def _layer(fan_in: int, fan_out: int, norm: bool = True) -> list[nn.Module]:
+def _layer(
+    fan_in: int,
+    fan_out: int,
+    norm: bool = True,
+) -> list[nn.Module]:
     normalised = [nn.LayerNorm(fan_out)] if norm else []
     return [linear(fan_in, fan_out, gain=2**0.5), *normalised, nn.SiLU()]
 
 
-def linear(fan_in: int, fan_out: int, gain: float) -> nn.Linear:
+def linear(
+    fan_in: int,
+    fan_out: int,
+    gain: float,
+) -> nn.Linear:
     """A layer of orthogonal weights, scaled by gain, without bias at first."""
     layer = nn.Linear(fan_in, fan_out)
     nn.init.orthogonal_(layer.weight, gain)

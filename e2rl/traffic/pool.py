@@ -72,7 +72,11 @@ class TrafficPool:
     @staticmethod
     def recorded(scene_index: Tensor) -> "TrafficPool":
         """Rows that replay the recordings of scenes [R]."""
-        return _rows(scene_index, RECORDED, eta=torch.zeros(len(scene_index)))
+        return _rows(
+            scene_index,
+            RECORDED,
+            eta=torch.zeros(len(scene_index)),
+        )
 
     @staticmethod
     def live(
@@ -93,7 +97,13 @@ class TrafficPool:
         Returns:
             A pool of R rows.
         """
-        return _rows(scene_index, LIVE, eta=eta, seed=seed, decisions=decisions)
+        return _rows(
+            scene_index,
+            LIVE,
+            eta=eta,
+            seed=seed,
+            decisions=decisions,
+        )
 
     @staticmethod
     def stored(traffic: Mapping[str, Tensor], eta: Tensor | float) -> "TrafficPool":

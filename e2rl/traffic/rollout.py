@@ -79,7 +79,12 @@ def roll_out(
         agents=True,
         observed=type(ego).act is not Ego.act,
     )
-    synthesizer = AdversarialSynthesizer(pool, torch.arange, traffic=traffic, ego=ego)
+    synthesizer = AdversarialSynthesizer(
+        pool,
+        torch.arange,
+        traffic=traffic,
+        ego=ego,
+    )
     log = PlanLog()
     synthesizer.on_plan = log
     env = TransformedEnv(base, synthesizer)
@@ -104,7 +109,9 @@ def roll_out(
 
 
 def _driven(
-    steps: TensorDictBase, scene: TensorDictBase, log: PlanLog
+    steps: TensorDictBase,
+    scene: TensorDictBase,
+    log: PlanLog,
 ) -> dict[str, Tensor]:
     """Fields of Rollouts from the frames [B, T] of a rollout."""
     agents = steps["next", "agents"]
@@ -129,16 +136,27 @@ def _driven(
     }
 
 
-def limits(points: Tensor, recorded: Tensor, mission: Mission) -> Tensor:
+def limits(
+    points: Tensor,
+    recorded: Tensor,
+    mission: Mission,
+) -> Tensor:
     """Speed limit [B, K] [m/s] along missions at the places of egos at points [B, K,
     2], the last one where they are not recorded [B, K]; 0 unknown."""
-    s, _, _ = project_track(points, mission.points, known=recorded, start=BEHIND)
+    s, _, _ = project_track(
+        points,
+        mission.points,
+        known=recorded,
+        start=BEHIND,
+    )
     index = (s / SPACING).long().clamp(0, mission.limit.shape[1] - 1)
     return mission.limit.gather(1, index)
 
 
 def red_lights(
-    tracks: dict[str, Tensor], scene: TensorDictBase, route: Tensor
+    tracks: dict[str, Tensor],
+    scene: TensorDictBase,
+    route: Tensor,
 ) -> Tensor:
     """Step [B, N] int64 at which each vehicle last crossed a stop line of its route [B,
     V] at red, -1 for never."""
@@ -193,7 +211,10 @@ def synthesize_traffic(
     nothing = dict(zip(SYNTHESIZED, empty, strict=True))
 
     def synthesize(
-        ego: Ego, scene_index: Tensor, eta: Tensor | float, seed: int
+        ego: Ego,
+        scene_index: Tensor,
+        eta: Tensor | float,
+        seed: int,
     ) -> dict[str, Any]:
         etas = torch.as_tensor(eta, dtype=torch.float32).expand(len(scene_index))
 

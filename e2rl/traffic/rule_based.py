@@ -41,27 +41,27 @@ from e2rl.traffic.traffic import (
     steps_ahead,
 )
 
-PLACE = ("s", "d", "d1")  # of a lane state: where a vehicle is on its route
-
 
 class LogReplay(Traffic):
     """The smoothed recording; a vehicle is absent in gaps of its track and after its
     end."""
 
     def replan(
-        self, state: State, world: World, ego_plan: Tensor
+        self,
+        state: State,
+        world: World,
+        ego_plan: Tensor,
     ) -> tuple[State, TrafficPlan]:
         """Recorded states and presence of the coming steps."""
         logged = world.scene["logged"]
-        valid = world.scene["logged_valid"]
         vehicles = world.scene["route_log"].shape[1]
         step = steps_ahead(world)
         row = torch.arange(len(step), device=step.device)[:, None]
-        at = step.clamp(max=logged.shape[1] - 1)
-        known = valid[row, at, :vehicles] & (step < logged.shape[1])[..., None]
-        return state, TrafficPlan(
-            logged[row, at, :vehicles].transpose(1, 2), known.transpose(1, 2)
-        )
+        index = step.clamp(max=logged.shape[1] - 1)
+        recorded = world.scene["logged_valid"][row, index, :vehicles]
+        present = recorded & (step < logged.shape[1])[..., None]
+        states = logged[row, index, :vehicles].transpose(1, 2)
+        return state, TrafficPlan(states, present.transpose(1, 2))
 
 
 class ConstantVelocity(Traffic):
@@ -69,7 +69,10 @@ class ConstantVelocity(Traffic):
     parked, and no vehicle leaves."""
 
     def replan(
-        self, state: State, world: World, ego_plan: Tensor
+        self,
+        state: State,
+        world: World,
+        ego_plan: Tensor,
     ) -> tuple[State, TrafficPlan]:
         """States at the coming steps, from the start frame on."""
         scene = world.scene
@@ -107,29 +110,29 @@ class IDM(Traffic):
 
     def __post_init__(self) -> None:
         self.bounds = self.prior.bounds
-        settings = (
+        self.driver = IDMParameters(
             self.headway,
             self.standstill_gap,
-            self.acceleration,
-            self.braking,
-            self.exponent,
+            acceleration=self.acceleration,
+            braking=self.braking,
+            exponent=self.exponent,
         )
-        self.driver = IDMParameters(*settings)
 
     @torch.no_grad()
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> IDMState:
         """Start states on each vehicle's nearest route candidate; the ego's route is
         its mission."""
-        mission = scenes["route_log"][:, :1]
-        routed = route_scene(
-            scenes,
-            torch.cat([mission, torch.zeros_like(scenes["route_log"][:, 1:])], 1),
-        )
+        route = torch.zeros_like(scenes["route_log"])
+        route[:, 0] = scenes["route_log"][:, 0]
+        routed = route_scene(scenes, route)
         return IDMState(routed, start_state(scenes, routed))
 
     @torch.no_grad()
     def replan(
-        self, state: IDMState, world: World, ego_plan: Tensor
+        self,
+        state: IDMState,
+        world: World,
+        ego_plan: Tensor,
     ) -> tuple[IDMState, TrafficPlan]:
         """One acceleration for the whole plan, under the bounds of the executed part."""
         routed = state.routed
@@ -153,10 +156,18 @@ class IDM(Traffic):
 
         motion = bounded(
             self.bounds,
-            _driven(decode(x, lane, routed.points), lane, frozen=frozen),
+            _driven(
+                decode(x, lane, routed.points),
+                lane,
+                frozen=frozen,
+            ),
             capped=capped,
             state=lane,
-            obstacles=Obstacles(world.states, routed.size, present=world.valid),
+            obstacles=Obstacles(
+                world.states,
+                routed.size,
+                present=world.valid,
+            ),
         )
         plan = TrafficPlan(
             motion.states(),
@@ -167,57 +178,52 @@ class IDM(Traffic):
             routed, motion.map(lambda value: value[..., REPLAN_STEPS - 1])
         ), plan
 
-    def _wanted(self, routed: RoutedScene, lane: LaneState, world: World) -> Tensor:
+    def _wanted(
+        self,
+        routed: RoutedScene,
+        lane: LaneState,
+        world: World,
+    ) -> Tensor:
         """IDM acceleration [B, V] behind the leader or the light, whichever brakes
         harder."""
         vehicles = lane.v.shape[1]
-        length = routed.size[:, :vehicles, 0]
-        now = world.states[:, :, None]
-        gap, speed, _ = leaders(
+        leader = leaders(
             lane.s,
             routed.points,
-            agents=now,
+            agents=world.states[:, :, None],
             size=routed.size,
             present=world.valid,
             d=lane.d,
         )
-        gap = gap[..., 0]
-        speed = speed[..., 0]
+        gap = leader.gap[..., 0]
         gap = torch.where(gap < FREE_GAP, gap, torch.inf)
-        at = (lane.s / SPACING).round().long().clamp(0, routed.limit.shape[-1] - 1)
-        limit = routed.limit.gather(-1, at[..., None])[..., 0]
-        desired = torch.where(
-            limit > 0,
-            limit,
-            world.scene["start"][:, :vehicles, 3].clamp(min=self.speed),
-        )
-        light = light_state_at(routed.light_state, routed.light, step=world.step)
-        brake = 2 * self.braking
+        last = routed.limit.shape[-1] - 1
+        index = (lane.s / SPACING).round().long().clamp(0, last)
+        limit = routed.limit.gather(-1, index[..., None])[..., 0]
+        start_speed = world.scene["start"][:, :vehicles, 3].clamp(min=self.speed)
+        desired = torch.where(limit > 0, limit, start_speed)
         line = stop_line_distance(
-            light,
+            light_state_at(routed.light_state, routed.light, step=world.step),
             routed.light_s - lane.s[..., None],
             speed=lane.v,
-            red_braking=brake,
-            yellow_braking=brake,
+            red_braking=2 * self.braking,
+            yellow_braking=2 * self.braking,
         )
-        line = line - length / 2 - STOP_GAP + self.standstill_gap
-        behind = idm_acceleration(
-            lane.v,
-            desired,
-            gap=gap.clamp(min=0.1),
-            leader_speed=speed.clamp(min=0),
-            driver=self.driver,
-            improved=True,
-        )
-        halting = idm_acceleration(
-            lane.v,
-            desired,
-            gap=line.clamp(min=0.1),
-            leader_speed=torch.zeros_like(line),
-            driver=self.driver,
-            improved=True,
-        )
-        return torch.minimum(behind, halting)
+        half = routed.size[:, :vehicles, 0] / 2
+        line = line - half - STOP_GAP + self.standstill_gap
+
+        def behind(gap: Tensor, speed: Tensor) -> Tensor:
+            return idm_acceleration(
+                lane.v,
+                desired,
+                gap=gap.clamp(min=0.1),
+                leader_speed=speed.clamp(min=0),
+                driver=self.driver,
+                improved=True,
+            )
+
+        following = behind(gap, leader.speed[..., 0])
+        return torch.minimum(following, behind(line, torch.zeros_like(line)))
 
 
 def located(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
@@ -230,32 +236,42 @@ def located(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
         yaw_rate=torch.zeros_like(accel),
         points=routed.points[:, :1],
     )
-    others = world.states[:, 1 : lane.v.shape[1]]
-    there = locate(
-        others,
-        lane.a[:, 1:],
-        yaw_rate=(lane.kappa * lane.v)[:, 1:],
+    others = lane.map(lambda value: value[:, 1:])
+    located_others = locate(
+        world.states[:, 1 : lane.v.shape[1]],
+        others.a,
+        yaw_rate=others.kappa * others.v,
         points=routed.points[:, 1:],
-        hint=lane.s[:, 1:],
+        hint=others.s,
     )
-    rest = {name: value[:, 1:] for name, value in vars(lane).items()} | {
-        name: getattr(there, name) for name in PLACE
-    }
+    others = replace(
+        others, s=located_others.s, d=located_others.d, d1=located_others.d1
+    )
     return LaneState(
         **{
             name: torch.cat([getattr(ego, name), value], 1)
-            for name, value in rest.items()
+            for name, value in vars(others).items()
         }
     )
 
 
-def _driven(motion: LaneState, lane: LaneState, frozen: Tensor) -> LaneState:
+def _driven(
+    motion: LaneState,
+    lane: LaneState,
+    frozen: Tensor,
+) -> LaneState:
     """The motion [B, V, HORIZON] `as_driven`, with frozen [B, V] vehicles at
     standstill, once they do not reverse."""
     still = lane.map(lambda value: value[..., None].expand(*value.shape, HORIZON))
     zero = torch.zeros_like(still.v)
-    motion = select(frozen, replace(still, v=zero, a=zero), other=motion)
-    on_lane = torch.ones_like(frozen)  # who has none keeps straight on
+    motion = select(
+        frozen,
+        replace(still, v=zero, a=zero),
+        other=motion,
+    )
+    on_lane = torch.ones_like(frozen)  # a vehicle without a lane keeps straight on
     return select(
-        frozen & (lane.v >= 0), motion, other=as_driven(motion, lane, on_lane=on_lane)
+        frozen & (lane.v >= 0),
+        motion,
+        other=as_driven(motion, lane, on_lane=on_lane),
     )

@@ -53,20 +53,38 @@ class Baseline(NominalTraffic):
         super().__post_init__()
         self.yielding = YieldingSettings()
 
-    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> BaselineState:
+    def reset(
+        self,
+        scenes: TensorDictBase,
+        seed: Tensor,
+        eta: Tensor,
+    ) -> BaselineState:
         """Returns the states of scenes [B] with routes drawn from the prior and no
         adversary."""
         nominal = super().reset(scenes, seed, eta)
         nobody = torch.zeros_like(nominal.routed.parked)
         zero = torch.zeros_like(nominal.routed.length)
-        return BaselineState(**vars(nominal), eta=eta, adversary=nobody, path_kl=zero)
+        return BaselineState(
+            **vars(nominal),
+            eta=eta,
+            adversary=nobody,
+            path_kl=zero,
+        )
 
     def replan(
-        self, state: State, world: World, ego_plan: Tensor, react: React | None = None
+        self,
+        state: State,
+        world: World,
+        ego_plan: Tensor,
+        react: React | None = None,
     ) -> tuple[State, TrafficPlan]:
         """Returns states and plans of the coming HORIZON steps (`Traffic.replan`)."""
         state, plan = super().replan(state, world, ego_plan, react)
-        return state, replace(plan, adversary=state.adversary, path_kl=state.path_kl)
+        return state, replace(
+            plan,
+            adversary=state.adversary,
+            path_kl=state.path_kl,
+        )
 
     def noise(self, state: State) -> Tensor:
         """Returns standard normal noise [K, B, V, samples, SIZE] of the next replan."""
@@ -74,7 +92,11 @@ class Baseline(NominalTraffic):
         if self.samples == 1:
             return first
         shape = (self.samples - 1, self.prior.sampler.steps, first.shape[2], SIZE)
-        further = noise_of(state.seed, FURTHER + state.replans, shape=shape)
+        further = noise_of(
+            state.seed,
+            FURTHER + state.replans,
+            shape=shape,
+        )
         return torch.cat([first, further.permute(2, 0, 3, 1, 4)], 3)
 
     def strength(self, state: State) -> Tensor:
@@ -84,7 +106,10 @@ class Baseline(NominalTraffic):
     def replan_group(self, now: Replan) -> tuple[BaselineState, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
         context = self.encode(
-            now.state, now.world, ego_plan=now.ego_plan, known=now.before
+            now.state,
+            now.world,
+            ego_plan=now.ego_plan,
+            known=now.before,
         )
         if not bool((self.strength(now.state) > 0).any()):
             sample = self.prior.sample(context, now.noise[..., 0, :])
@@ -107,7 +132,11 @@ class Baseline(NominalTraffic):
 
 
 def replay_others(
-    state: Own, plan: TrafficPlan, *, world: World, driven: Tensor
+    state: Own,
+    plan: TrafficPlan,
+    *,
+    world: World,
+    driven: Tensor,
 ) -> tuple[Own, TrafficPlan]:
     """Returns state and plan with every vehicle that is not driven on its recording,
     from which the prior sees it.

@@ -35,7 +35,12 @@ class CAT(OpenLoop):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("synthesizer.tracks", self.tracks, low=1, high=self.samples)
+        check_range(
+            "synthesizer.tracks",
+            self.tracks,
+            low=1,
+            high=self.samples,
+        )
         self.queries_ego = self.knowledge == "plan"
 
     def replan(
@@ -49,9 +54,19 @@ class CAT(OpenLoop):
         have never been adversaries: who has left its recording does not return to it."""
         state, plan = super().replan(state, world, ego_plan, react)
         driven = state.held | state.released | (self.strength(state) <= 0)[:, None]
-        return replay_others(state, plan, world=world, driven=driven)
+        return replay_others(
+            state,
+            plan,
+            world=world,
+            driven=driven,
+        )
 
-    def scenario(self, replan: Replan, context: Context, nominal: Tensor) -> Scenario:
+    def scenario(
+        self,
+        replan: Replan,
+        context: Context,
+        nominal: Tensor,
+    ) -> Scenario:
         """The nominal sample with the future of greatest overlap in its vehicle's row,
         which alone is held."""
         state = replan.state
@@ -60,7 +75,11 @@ class CAT(OpenLoop):
         first, others = replan.noise.split([1, self.samples - 1], 3)
         x0, futures = self.futures(torch.cat([first, self.spread * others], 3), context)
         size = replan.world.scene["size"][:, :vehicles]
-        value = overlap_value(futures, self.recent_tracks(replan, futures), size=size)
+        value = overlap_value(
+            futures,
+            self.recent_tracks(replan, futures),
+            size=size,
+        )
         number = torch.arange(self.samples, device=value.device)[:, None]
         tried = number < self.strength(state).round().clamp(min=1)
         value = value * context.active * tried[..., None]
@@ -105,7 +124,11 @@ class CAT(OpenLoop):
         return torch.stack([replan.react(states) for states in nominal])
 
 
-def overlap_value(futures: Tensor, tracks: Tensor, size: Tensor) -> Tensor:
+def overlap_value(
+    futures: Tensor,
+    tracks: Tensor,
+    size: Tensor,
+) -> Tensor:
     """Returns DECAY^step of the first contact of futures [S, B, V, H, 4] with each of
     the ego's tracks [W, B, H, 4] (0 without one), mean over the tracks: [S, B, V]. size
     [B, V, 2]."""

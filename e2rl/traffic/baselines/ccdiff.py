@@ -62,7 +62,12 @@ class CCDiff(MeanGuided):
 
     tuned = {"gain": (0.1, 40.0, "log"), "step_size": (0.03, 3.0, "log")}
 
-    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> CCDiffState:
+    def reset(
+        self,
+        scenes: TensorDictBase,
+        seed: Tensor,
+        eta: Tensor,
+    ) -> CCDiffState:
         """Returns states of scenes [B] with their top vehicles, whose routes are the
         prior's; others' are recorded."""
         state = super().reset(scenes, seed, eta)
@@ -92,7 +97,12 @@ class CCDiff(MeanGuided):
         """Returns states and plans (`Traffic.replan`); who is not among the top
         replays."""
         state, plan = super().replan(state, world, ego_plan, react)
-        return replay_others(state, plan, world=world, driven=state.top)
+        return replay_others(
+            state,
+            plan,
+            world=world,
+            driven=state.top,
+        )
 
     def attackers(self, state: CCDiffState, view: View) -> Tensor:
         """The top vehicles."""
@@ -104,7 +114,11 @@ class CCDiff(MeanGuided):
         others = torch.ones_like(view.routed.conflict)
         others[:, :, 0] = False
         collision = overlap_term(
-            states, view, margin=self.margin, weights=even(states), left_out=others
+            states,
+            view,
+            margin=self.margin,
+            weights=even(states),
+            left_out=others,
         )
         off_road = off_road_term(states, view, weights=discounts(states))
         return self.off_road * off_road - self.collision * collision
@@ -143,7 +157,11 @@ def risk(states: Tensor, size: Tensor) -> Tensor:
     return (FAR - time.amax(-1).clamp(0, FAR)) / FAR
 
 
-def ranked(scene: TensorDictBase, count: int, draw: Tensor) -> Tensor:
+def ranked(
+    scene: TensorDictBase,
+    count: int,
+    draw: Tensor,
+) -> Tensor:
     """Bool [B, V]: the `count` vehicles, parked ones and the ego apart, that stand in
     the most of the TOP cliques of each step; draw [B, V] in [0, 1) orders equals and
     those in none."""
@@ -161,15 +179,17 @@ def ranked(scene: TensorDictBase, count: int, draw: Tensor) -> Tensor:
     weights = weight.cpu().numpy()
     score = torch.zeros(len(states), vehicles)
     for scene_row, step in np.ndindex(adjacency.shape[:2]):
-        for clique in _top_cliques(
-            adjacency[scene_row, step], weights[scene_row, step]
-        ):
+        for clique in top_cliques(adjacency[scene_row, step], weights[scene_row, step]):
             score[scene_row, list(clique)] += 1
     moving[:, 0] = False
-    return smallest(moving, draw - score.to(draw.device), count=count)
+    return smallest(
+        moving,
+        draw - score.to(draw.device),
+        count=count,
+    )
 
 
-def _top_cliques(adjacency: np.ndarray, weight: np.ndarray) -> list[tuple[int, ...]]:
+def top_cliques(adjacency: np.ndarray, weight: np.ndarray) -> list[tuple[int, ...]]:
     """The maximal cliques of SMALLEST or more of greatest total weight; adjacency,
     weight [V, V]."""
     large = [clique for clique in cliques_in(adjacency) if len(clique) >= SMALLEST]

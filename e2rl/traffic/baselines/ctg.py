@@ -46,7 +46,12 @@ class CTG(MeanGuided):
         """Weighted collision, off-road and speeding terms."""
         states = view.with_ego(motion)
         weights = discounts(states)
-        collision = overlap_term(states, view, margin=self.margin, weights=weights)
+        collision = overlap_term(
+            states,
+            view,
+            margin=self.margin,
+            weights=weights,
+        )
         off_road = off_road_term(states, view, weights=weights)
         total = self.collision * collision + self.off_road * off_road
         return total + self.speed * speeding_term(motion, view)
@@ -71,7 +76,12 @@ class CTGAdv(MeanGuided):
         off_road = off_road_term(states, view, weights=discounts(states))
         return self.approach * approach + self.off_road * off_road
 
-    def chosen(self, motion: LaneState, view: View, guided: Tensor) -> Tensor:
+    def chosen(
+        self,
+        motion: LaneState,
+        view: View,
+        guided: Tensor,
+    ) -> Tensor:
         """Sample [B] in which some vehicle comes nearest to the ego."""
         loss = self.loss(motion, view).masked_fill(~guided, torch.inf)
         return loss.amin(-1).argmin(0)

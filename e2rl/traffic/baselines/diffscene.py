@@ -47,7 +47,12 @@ class DiffScene(OpenLoop):
 
     tuned = {"gain": (0.2, 20.0, "log"), "step_size": (0.2, 20.0, "log")}
 
-    def scenario(self, replan: Replan, context: Context, nominal: Tensor) -> Scenario:
+    def scenario(
+        self,
+        replan: Replan,
+        context: Context,
+        nominal: Tensor,
+    ) -> Scenario:
         """The guided joint sample of least loss; the adversary alone is held."""
         strength = self.strength(replan.state)
         view = View.of(replan, context, strength)
@@ -81,7 +86,12 @@ class DiffScene(OpenLoop):
         functionality = corridor_term(states, view)
         attack = self.safety * safety + self.functionality * functionality
         lawful = off_route_term(motion, view)
-        lawful = lawful + comfort_term(motion, low=LOW, high=HIGH, jerk=JERK)
+        lawful = lawful + comfort_term(
+            motion,
+            low=LOW,
+            high=HIGH,
+            jerk=JERK,
+        )
         lawful = lawful + off_road_term(states, view, weights=even(states))
         lawful = lawful + speeding_term(motion, view)
         total = view.strength[:, None] * attack + self.constraint * lawful

@@ -52,7 +52,12 @@ class MeanGuidance:
     past: Past = None  # of the step, where the sampler is of second order
 
     def __call__(
-        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+        self,
+        x: Tensor,
+        level: Tensor,
+        k: int,
+        context: Context,
+        denoise: Denoise,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """See `prior.Control`."""
         with torch.no_grad():
@@ -64,7 +69,12 @@ class MeanGuidance:
         past = None if k == sampler.steps else self.past
         low = sampler.levels(schedule, x.device)[sampler.steps - k + 1]
         zero = torch.zeros_like(level)
-        step = partial(sampler.on(schedule).step, high=level, low=low, noise=zero)
+        step = partial(
+            sampler.on(schedule).step,
+            high=level,
+            low=low,
+            noise=zero,
+        )
         mean, variance = step(x=x, x0=x0, past=past)
         none = None if past is None else (zero, past[1])
         per_x0, _ = step(x=zero, x0=zero + 1, past=none)  # a step is affine in x0
@@ -99,7 +109,12 @@ class CleanGuidance:
     clip: float
 
     def __call__(
-        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+        self,
+        x: Tensor,
+        level: Tensor,
+        k: int,
+        context: Context,
+        denoise: Denoise,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """See `prior.Control`."""
         with torch.enable_grad():
@@ -140,7 +155,12 @@ def guided_samples(
     """
     count = replan.noise.shape[3]
     samples = tiled(context, count)
-    motion = partial(motion_of, prior, context=samples, batch=len(context.active))
+    motion = partial(
+        motion_of,
+        prior,
+        context=samples,
+        batch=len(context.active),
+    )
     objective = control(lambda x: loss(motion(x)).sum())
     sample = prior.sample(samples, folded(replan.noise), objective)
     return Samples(sample.x0, sample.kl, motion=motion(sample.x0))
@@ -182,7 +202,12 @@ class Guided(Baseline):
         state = replace(state, adversary=view.adversary, path_kl=kl)
         return state, pick(samples.x0, index)
 
-    def chosen(self, motion: LaneState, view: View, guided: Tensor) -> Tensor:
+    def chosen(
+        self,
+        motion: LaneState,
+        view: View,
+        guided: Tensor,
+    ) -> Tensor:
         """Sample [B] of each scene that is driven: that of least loss over the guided
         vehicles."""
         loss = torch.where(guided, self.loss(motion, view), 0.0)
@@ -199,7 +224,10 @@ class Guided(Baseline):
 
     @abstractmethod
     def guidance(
-        self, objective: Objective, guided: Tensor, strength: Tensor
+        self,
+        objective: Objective,
+        guided: Tensor,
+        strength: Tensor,
     ) -> Control:
         """The control of `Prior.sample`; guided [S * B, V] bool, strength [S * B]."""
 
@@ -223,7 +251,10 @@ class MeanGuided(Guided):
             )
 
     def guidance(
-        self, objective: Objective, guided: Tensor, strength: Tensor
+        self,
+        objective: Objective,
+        guided: Tensor,
+        strength: Tensor,
     ) -> MeanGuidance:
         """The control of `Prior.sample`."""
         return MeanGuidance(

@@ -115,7 +115,12 @@ def overlap_term(
         return (1 - distance / (radii + margin)).clamp(min=0)
 
     return pair_term(
-        states, view, cost=cost, reach=margin, weights=weights, left_out=left_out
+        states,
+        view,
+        cost=cost,
+        reach=margin,
+        weights=weights,
+        left_out=left_out,
     )
 
 
@@ -145,12 +150,20 @@ def gaussian_overlap(pairs: Pairs) -> Tensor:
     return 10 * torch.exp(-0.5 * (gap.square().sum(-1) - 1.5**2))
 
 
-def off_road_term(states: Tensor, view: View, weights: Tensor) -> Tensor:
+def off_road_term(
+    states: Tensor,
+    view: View,
+    weights: Tensor,
+) -> Tensor:
     """Metres beyond the drivable border, mean over a box's corners, over its diagonal."""
     points = corners(states, view.size[:, :, None])  # [S, B, V, T, 4, 2]
     by_scene = points.transpose(0, 1).contiguous()
     field = view.scene["field"]
-    beyond = off_road(by_scene, field, origin=view.scene["field_origin"])
+    beyond = off_road(
+        by_scene,
+        field,
+        origin=view.scene["field_origin"],
+    )
     distance = beyond.transpose(0, 1).clamp(0, MAX_OFF_ROAD).mean(-1)
     cost = distance / view.size.norm(dim=-1)[..., None]
     return (cost * weights).sum(-1)
@@ -185,7 +198,13 @@ def off_route_term(motion: LaneState, view: View) -> Tensor:
     return cost.mean(-1) * view.routed.has_lane
 
 
-def comfort_term(motion: LaneState, *, low: float, high: float, jerk: float) -> Tensor:
+def comfort_term(
+    motion: LaneState,
+    *,
+    low: float,
+    high: float,
+    jerk: float,
+) -> Tensor:
     """Returns the squared excess of acceleration over [low, high] and of |jerk| over
     `jerk`, mean over time.
 

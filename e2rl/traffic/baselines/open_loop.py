@@ -57,7 +57,12 @@ class OpenLoop(Baseline):
     """A scenario is generated every EVERY replans, as long as a plan lasts; until then
     it is driven."""
 
-    def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> OpenLoopState:
+    def reset(
+        self,
+        scenes: TensorDictBase,
+        seed: Tensor,
+        eta: Tensor,
+    ) -> OpenLoopState:
         """States of scenes [B] in which no vehicle is held."""
         state = super().reset(scenes, seed, eta)
         nobody = torch.zeros_like(state.adversary)
@@ -95,17 +100,31 @@ class OpenLoop(Baseline):
             adversary=torch.where(due, scenario.adversary, state.adversary),
             path_kl=state.path_kl + torch.where(due, scenario.path_kl, 0.0),
             x=torch.where(due[..., None], scenario.x, state.x),
-            origin=select(due.expand_as(held), state.lane, other=state.origin),
+            origin=select(
+                due.expand_as(held),
+                state.lane,
+                other=state.origin,
+            ),
         )
         return state, torch.where(due[..., None], scenario.x, x0)
 
     @abstractmethod
-    def scenario(self, replan: Replan, context: Context, nominal: Tensor) -> Scenario:
+    def scenario(
+        self,
+        replan: Replan,
+        context: Context,
+        nominal: Tensor,
+    ) -> Scenario:
         """The scenario of a group; nominal [G, V, SIZE]: its nominal joint sample."""
 
 
 def later(
-    x: Tensor, origin: LaneState, *, lane: LaneState, age: Tensor, has_lane: Tensor
+    x: Tensor,
+    origin: LaneState,
+    *,
+    lane: LaneState,
+    age: Tensor,
+    has_lane: Tensor,
 ) -> Tensor:
     """Returns a plan [B, V, SIZE] as seen some replans later.
 

@@ -49,7 +49,11 @@ class SafeSimOpt(Guided):
     def attackers(self, state: BaselineState, view: View) -> Tensor:
         """Those nearest to the ego, within `reach`."""
         distance = view.distance_to_ego()
-        return smallest(distance <= self.reach, distance, count=self.adversaries)
+        return smallest(
+            distance <= self.reach,
+            distance,
+            count=self.adversaries,
+        )
 
     def loss(self, motion: LaneState, view: View) -> Tensor:
         """Route and Gaussian terms of all; collision and TTC terms of adversaries, by
@@ -61,7 +65,12 @@ class SafeSimOpt(Guided):
         attack = attack + self.ttc * ttc_term(states)
         return calm + view.strength[:, None] * view.adversary * attack
 
-    def chosen(self, motion: LaneState, view: View, guided: Tensor) -> Tensor:
+    def chosen(
+        self,
+        motion: LaneState,
+        view: View,
+        guided: Tensor,
+    ) -> Tensor:
         """Sample [B, V] of each vehicle: the least Gaussian term, for adversaries the
         least collision term."""
         states = view.with_ego(motion)
@@ -69,11 +78,17 @@ class SafeSimOpt(Guided):
         return torch.where(view.adversary, collision_term(states), calm).argmin(0)
 
     def guidance(
-        self, objective: Objective, guided: Tensor, strength: Tensor
+        self,
+        objective: Objective,
+        guided: Tensor,
+        strength: Tensor,
     ) -> CleanGuidance:
         """The strength is in the loss."""
         return CleanGuidance(
-            objective, guided=guided, step_size=self.step_size, clip=self.clip
+            objective,
+            guided=guided,
+            step_size=self.step_size,
+            clip=self.clip,
         )
 
 

@@ -57,7 +57,12 @@ class Strive(OpenLoop):
         super().__post_init__()
         self.queries_ego = self.knowledge == "plan"
 
-    def scenario(self, replan: Replan, context: Context, nominal: Tensor) -> Scenario:
+    def scenario(
+        self,
+        replan: Replan,
+        context: Context,
+        nominal: Tensor,
+    ) -> Scenario:
         """The optimised scenario, in which all vehicles are held; the nominal sample
         where it has no solution."""
         first = replan.noise[0, :, :, 0].contiguous()
@@ -66,7 +71,12 @@ class Strive(OpenLoop):
         weight = softmin(view.with_ego(motion), view).sum(-1)  # of each vehicle
         holds = (view.strength > 0) & (weight.sum(-1) > 0)
         if self.solution:
-            holds = holds & self.solvable(first, motion, view=view, context=context)
+            holds = holds & self.solvable(
+                first,
+                motion,
+                view=view,
+                context=context,
+            )
         held = holds[:, None] & context.active
         vehicle = torch.arange(weight.shape[1], device=weight.device)
         return Scenario(
@@ -91,10 +101,18 @@ class Strive(OpenLoop):
 
     def motion(self, x0: Tensor, context: Context) -> LaneState:
         """Planned motion of x0 [B, V, SIZE], fields [1, B, V, T]."""
-        return motion_of(self.prior, x0, context=context, batch=len(x0))
+        return motion_of(
+            self.prior,
+            x0,
+            context=context,
+            batch=len(x0),
+        )
 
     def attacked(
-        self, first: Tensor, replan: Replan, context: Context
+        self,
+        first: Tensor,
+        replan: Replan,
+        context: Context,
     ) -> tuple[Tensor, View]:
         """x0 [B, V, SIZE] of optimised latents that begin at `first`, and the View with
         the ego as it last drove."""
@@ -114,7 +132,12 @@ class Strive(OpenLoop):
 
         def loss(latent: Tensor) -> Tensor:
             motion = self.motion(decoded(latent), informed)
-            return self.loss(motion, latent, first=first, view=view)
+            return self.loss(
+                motion,
+                latent,
+                first=first,
+                view=view,
+            )
 
         latent = self.optimised(first, loss)
         with torch.no_grad():
@@ -132,7 +155,12 @@ class Strive(OpenLoop):
         return variable.detach()
 
     def loss(
-        self, motion: LaneState, latent: Tensor, *, first: Tensor, view: View
+        self,
+        motion: LaneState,
+        latent: Tensor,
+        *,
+        first: Tensor,
+        view: View,
     ) -> Tensor:
         """Returns STRIVE's objective [B], with weights between bystander and attacker.
 
@@ -151,11 +179,19 @@ class Strive(OpenLoop):
 
         def bump(left_out: Tensor) -> Tensor:
             return overlap_term(
-                states, view, margin=0.0, weights=even(states), left_out=left_out
+                states,
+                view,
+                margin=0.0,
+                weights=even(states),
+                left_out=left_out,
             )[0]
 
-        off_road = off_road_term(states, view, weights=even(states))[0]
         bumps = bump(with_ego) + (1 - fraction) * bump(~with_ego)
+        off_road = off_road_term(
+            states,
+            view,
+            weights=even(states),
+        )[0]
         calm = COLLISION * (bumps + off_road)
         energy = blend(PRIOR, fraction) * 0.5 * latent.square().sum(-1)
         moved = blend(START, fraction) * (latent - first).square().sum(-1)
@@ -163,7 +199,12 @@ class Strive(OpenLoop):
         return view.strength * attack + (calm * view.active).sum(-1)
 
     def solvable(
-        self, first: Tensor, planned: LaneState, *, view: View, context: Context
+        self,
+        first: Tensor,
+        planned: LaneState,
+        *,
+        view: View,
+        context: Context,
     ) -> Tensor:
         """Returns bool [B]: the ego has a motion that touches nobody: that which it
         drives already, or one that an optimisation of its own latent finds.
@@ -187,7 +228,12 @@ class Strive(OpenLoop):
         return solved
 
     def evaded(
-        self, first: Tensor, others: Tensor, *, view: View, context: Context
+        self,
+        first: Tensor,
+        others: Tensor,
+        *,
+        view: View,
+        context: Context,
     ) -> Tensor:
         """Returns bool [B]: the ego's own latent, optimised, finds a motion that
         touches nobody.
@@ -210,7 +256,12 @@ class Strive(OpenLoop):
         def loss(ego: Tensor) -> Tensor:
             states = torch.cat([driven(ego), others[None, :, 1:]], 2)
             weights = even(states)
-            bump = overlap_term(states, view, margin=CLEARANCE, weights=weights)
+            bump = overlap_term(
+                states,
+                view,
+                margin=CLEARANCE,
+                weights=weights,
+            )
             bump = bump + off_road_term(states, view, weights=weights)
             energy = SOLUTION_PRIOR * 0.5 * ego.square().sum(-1)
             return SOLUTION_COLLISION * bump[0, :, 0] + energy
@@ -220,7 +271,11 @@ class Strive(OpenLoop):
             return ~touched(ego, others, view)
 
 
-def touched(ego: Tensor, others: Tensor, view: View) -> Tensor:
+def touched(
+    ego: Tensor,
+    others: Tensor,
+    view: View,
+) -> Tensor:
     """Bool [B]: the ego's states [B, 1, T, 4] overlap some of the others' [B, V, T, 4],
     whose row 0 does not count."""
     touches = overlap(

@@ -38,7 +38,12 @@ class View:
     adversary: Tensor
 
     @classmethod
-    def of(cls, replan: Replan, context: Context, strength: Tensor) -> "View":
+    def of(
+        cls,
+        replan: Replan,
+        context: Context,
+        strength: Tensor,
+    ) -> "View":
         """The View of a group at a replan, without an adversary."""
         world = replan.world
         vehicles = context.active.shape[1]
