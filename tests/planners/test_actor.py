@@ -151,6 +151,10 @@ def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise(
     )
 
 
+def test_normalised_numbers_are_clipped_at_5_standard_deviations():
+    assert Normaliser(1)(torch.tensor([[100.0], [-100.0]])).tolist() == [[5.0], [-5.0]]
+
+
 def test_file_round_trip(tmp_path):
     first = wild(ActorEgo(hidden=(8,), slack=0.3, room=3.0))
     first.network.normaliser.observe(

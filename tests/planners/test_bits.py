@@ -5,9 +5,13 @@ import torch
 
 from e2rl.planners.bits import BitsEgo
 from e2rl.planners.bits_network import (
+    ACCELERATION,
     CELLS,
     PLAN_SECONDS,
     SIDES,
+    TIME,
+    BitsNetwork,
+    between,
     cell_of,
     load_bits,
     needed_acceleration,
@@ -107,6 +111,36 @@ def test_cells_and_places_are_inverses():
         and cell.min() >= 0
         and cell.max() < CELLS
     )
+
+
+def test_the_grid_ends_where_2_5_metres_a_square_second_lead_in_5_seconds():
+    assert reach(torch.tensor(10.0)).item() == pytest.approx(50 + 2.5 * 25 / 2)
+
+
+def test_untrained_a_plan_keeps_its_speed_and_comes_over_in_1_4_seconds():
+    side = torch.tensor([[1.0]])
+    controls = (
+        BitsNetwork()
+        .eval()
+        .controls(
+            torch.zeros(1, 64),
+            speed=torch.tensor([10.0]),
+            offset=torch.zeros(1),
+            distance=torch.tensor([[50.0]]),
+            side=side,
+        )
+    )
+    assert controls.acceleration.abs().max() < 1e-5
+    assert controls.time.item() == pytest.approx(1.4)
+    assert torch.equal(controls.shift, side)
+
+
+def test_controls_stay_within_the_simulator_s_bounds():
+    extremes = torch.tensor([-100.0, 100.0])
+    accelerations = between(extremes, ACCELERATION, start=0.0)
+    torch.testing.assert_close(accelerations, torch.tensor([-8.0, 5.0]))
+    times = between(extremes, TIME, start=1.4)
+    torch.testing.assert_close(times, torch.tensor([0.5, 4.0]))
 
 
 def test_the_needed_acceleration_drives_the_distance():

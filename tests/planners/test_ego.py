@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.planners.bits import BitsEgo
-from e2rl.planners.ego import PLAN_STEPS, Ego, track
+from e2rl.planners.ego import PLAN_STEPS, Ego, return_length, track
 from e2rl.planners.ego_errors import Undrivable
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
@@ -57,6 +57,19 @@ def test_deviations_are_made_good():
     for k in range(50):
         state = dynamics.step(state, track(state, plan[k], following=plan[k + 1]))
     assert (state - plan[50])[:2].abs().max() < 0.05 and state[2].abs() < 0.02
+
+
+def test_a_lateral_error_fades_over_0_7_seconds_and_1_5_metres_at_least():
+    lengths = return_length(torch.tensor([0.0, 2.0, 10.0]))
+    torch.testing.assert_close(lengths, torch.tensor([1.5, 1.5, 7.0]))
+
+
+def test_a_metre_behind_its_plan_the_ego_drives_a_metre_a_second_faster():
+    state = torch.tensor([0.0, 0.0, 0.0, 10.0])
+    planned = torch.tensor([1.0, 0.0, 0.0, 10.0])
+    following = torch.tensor([2.0, 0.0, 0.0, 10.0])
+    action = track(state, planned, following=following)
+    torch.testing.assert_close(action, torch.tensor([10.0, 0.0]))
 
 
 def make_env(scenes, batch):

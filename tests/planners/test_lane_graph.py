@@ -1,9 +1,40 @@
 """Lane-graph planner: which profile it takes, hazards in closed form."""
 
+import math
+
+import pytest
 import torch
 
 from e2rl.planners.hazard import Prediction, circle_gap, circles, collision_hazard
-from e2rl.planners.lane_graph_planner import LaneGraphEgo
+from e2rl.planners.lane_graph_planner import LaneGraphEgo, matched, predict
+from e2rl.planners.path import MissionPath, RoutePath
+from tests.planners.planners import world_of
+
+
+def test_vehicles_within_70_metres_are_looked_at():
+    _, world = world_of(vehicles=[(0, 0, 10), (69, 0, 9), (71, 0, 9)], num_vrus=0)
+    assert len(predict(world, [1.0], 2.0).scene) == 1
+
+
+@pytest.mark.parametrize(
+    ("offset", "degrees", "expected"),
+    [(1.9, 0, True), (2.1, 0, False), (0.0, 19, True), (0.0, 21, False)],
+)
+def test_a_vehicle_is_on_a_route_within_2_metres_and_20_degrees(
+    offset, degrees, expected
+):
+    route = torch.stack([2.0 * torch.arange(50), torch.zeros(50)], -1)[None]
+    state = torch.tensor([[20.0, offset, math.radians(degrees), 10.0]])
+    assert matched(RoutePath(state, route)).item() == expected
+
+
+def test_a_profile_turns_to_its_second_target_after_12_nodes():
+    """Of 4 m/s^2, 0.8 m/s a node: from 18 m/s down to 8.4 and up again."""
+    _, world = world_of(vehicles=[(0, 0, 18.0)], num_vrus=0, limit=0.0)
+    ego = LaneGraphEgo()
+    profile = ego.profiles(world, MissionPath(world))[0, ego.speeds - 1]
+    assert profile.argmin().item() == 12
+    assert profile.min().item() == pytest.approx(18.0 - 12 * 0.8, abs=1e-4)
 
 
 def test_off_its_route_it_prefers_the_shortest():

@@ -6,18 +6,17 @@ import math
 import pytest
 import torch
 
+from e2rl.planners import pdm_closed
 from e2rl.planners.chunks import take
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.pdm_closed import FRACTIONS, OFFSETS, PDMClosedEgo, others_of
 from e2rl.planners.pdm_score import (
-    COMFORT,
-    PROGRESS,
     SCORED_STEPS,
-    TIME_TO_COLLISION,
     Drives,
     Others,
     at_fault,
     comfortable,
+    in_several_lanes,
     runs_into,
     score,
 )
@@ -29,6 +28,9 @@ from tests.synthetic import make_scenes
 
 EGO = PDMClosedEgo()
 SIZE = torch.tensor([[4.8, 2.0]])  # m, of the ego
+PROGRESS = 5  # nuPlan's weights
+TIME_TO_COLLISION = 5
+COMFORT = 2
 COUNT = len(FRACTIONS) * len(OFFSETS)
 
 
@@ -178,6 +180,66 @@ def test_the_time_to_collision_looks_30_degrees_to_each_side_in_one_lane(
     for loose, clear in ((False, expected), (True, 0)):
         ego = Drives(states, SIZE, loose=torch.full((1, 1, 1), loose))
         assert runs_into(ego, other, touch=touch).item() == (not clear)
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(149, True), (151, False)])
+def test_in_several_lanes_the_time_to_collision_looks_150_degrees_to_each_side(
+    degrees, expected
+):
+    angle = math.radians(degrees)
+    axle = -1.461 / 5.176 * 4.8
+    place = (axle + 8 * math.cos(angle), 8 * math.sin(angle), 0.0, 5.0)
+    ego = Drives(
+        torch.tensor([0.0, 0.0, 0.0, 10.0])[None, None, None],
+        SIZE,
+        loose=torch.ones(1, 1, 1, dtype=torch.bool),
+    )
+    touch = torch.zeros(1, 1, 1, 1, 4, dtype=torch.bool)
+    touch[..., 0] = True
+    assert runs_into(ego, others_at(place), touch=touch).item() == expected
+
+
+@pytest.mark.parametrize(("offset", "expected"), [(0.7, False), (0.8, True)])
+def test_who_reaches_beyond_a_lane_of_3_5_metres_is_in_several(offset, expected):
+    _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
+    world.scene["size"][0, 0, 1] = 2.0
+    states = world.states[:, :1, None].clone()
+    states[..., 1] = offset
+    assert in_several_lanes(world, states).item() == expected
+
+
+@pytest.mark.parametrize(("seconds", "brakes"), [(1.9, True), (2.1, False)])
+def test_it_brakes_for_a_collision_within_two_seconds(monkeypatch, seconds, brakes):
+    _, world = world_of(vehicles=[(0, 0, 4.0)], num_vrus=0)
+    found = (torch.zeros(1, COUNT), torch.full((1, COUNT), seconds))
+    monkeypatch.setattr(pdm_closed, "score", lambda *_: found)
+    accel = (EGO.plan(world)[0, 0, 3] - 4.0) / DT
+    assert (accel.item() < -7.9) == brakes
+
+
+def test_the_free_road_term_of_its_idm_has_the_exponent_10():
+    """1.5 m/s^2 at most; the whole limit of 15 m/s is the fifth proposal's."""
+    _, world = world_of(vehicles=[(0, 0, 12.0)], num_vrus=0, limit=15.0)
+    accel = (EGO.proposals(world)[0, 4, 0, 3] - 12.0) / DT
+    assert accel.item() == pytest.approx(1.5 * (1 - 0.8**10), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("accel", "yaw_rate", "expected"),
+    [
+        (2.35, 0.0, True),
+        (2.45, 0.0, False),
+        (0.0, 0.93, True),
+        (0.0, 0.97, False),
+    ],
+)
+def test_comfort_ends_at_nuplan_s_bounds(accel, yaw_rate, expected):
+    _, world = world_of(vehicles=[(0, 0, 5.0)], num_vrus=0)
+    world.accel[:, 0] = accel
+    actions = torch.tensor([accel, yaw_rate]).expand(SCORED_STEPS, 2)
+    states = dynamics.rollout(world.states[0, 0], actions)[None, None]
+    states = torch.cat([world.states[:, None, :1], states], 2)
+    assert comfortable(world, states).item() == expected
 
 
 def test_comfort_has_the_published_windows_and_bounds():

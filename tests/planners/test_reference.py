@@ -1,14 +1,24 @@
 """The reference follower: executed actions are read back, it keeps its lane, its
 distance and red lights."""
 
+import math
+
+import pytest
 import torch
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego_policy import EgoPolicy
-from e2rl.planners.reference import AGENTS, follow
+from e2rl.planners.reference import (
+    AGENTS,
+    LIGHTS,
+    follow,
+    pursuit_curvature,
+    speed_cap_acceleration,
+    stop_lines,
+)
 from e2rl.planners.trunk import Largest, Trunk
 from e2rl.sim.env import DrivingEnv, SimSettings
-from e2rl.sim.observation import NEAREST, OBSERVATION_SIZE, PER_AGENT
+from e2rl.sim.observation import LOOK_AHEAD, NEAREST, OBSERVATION_SIZE, PER_AGENT
 from tests.synthetic import make_scenes
 
 
@@ -99,3 +109,35 @@ def test_the_gradient_of_the_largest_is_shared_among_equals():
         for f in (Largest.apply, lambda x: x.amax(1))
     )
     torch.testing.assert_close(own, other)
+
+
+@pytest.mark.parametrize(("speed", "reach"), [(1.0, 6.0), (10.0, 15.0), (30.0, 30.0)])
+def test_it_pursues_the_path_a_second_and_a_half_ahead(speed, reach):
+    """6 to 30 m; to a point d m away and 1 m beside, the curvature is 2 / d^2."""
+    path = torch.tensor([[x, 1.0] for x in LOOK_AHEAD])[None]
+    curvature = pursuit_curvature(path, torch.tensor([speed])).item()
+    assert curvature == pytest.approx(2 / (reach**2 + 1), rel=1e-4)
+
+
+def test_curves_are_driven_with_2_5_metres_a_square_second_reached_in_half_a_second():
+    """5 m/s in a curve of 10 m."""
+    route = torch.zeros(1, len(LOOK_AHEAD), 5)
+    route[..., 3] = 10 * 0.1
+    route[..., 4] = 10.0
+    accel = speed_cap_acceleration(route, torch.tensor([10.0])).item()
+    assert accel == pytest.approx((5.0 - 10.0) / 0.5, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("colour", "speed", "binds"),
+    [(0, 13.9, True), (0, 14.4, False), (1, 9.9, True), (1, 10.1, False)],
+)
+def test_red_binds_up_to_5_and_yellow_up_to_2_5_metres_a_square_second(
+    colour, speed, binds
+):
+    """At 20 m from the line."""
+    observation = torch.zeros(1, OBSERVATION_SIZE)
+    observation[0, LIGHTS.start + colour] = 1.0
+    observation[0, LIGHTS.start + 3] = math.exp(-20 / 30)
+    distance = stop_lines(observation, torch.tensor([speed]))[0, 0].item()
+    assert distance == (pytest.approx(20.0, rel=1e-4) if binds else math.inf)

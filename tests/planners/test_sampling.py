@@ -7,7 +7,7 @@ from e2rl.planners.candidates import drive, speed_profiles, steer
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import PROFILES, SHIFTS, SamplingEgo
-from e2rl.planners.scoring import Pairs, forecast, nearest, pair_cost
+from e2rl.planners.scoring import Pairs, discomfort, forecast, nearest, pair_cost
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
@@ -192,6 +192,49 @@ def test_pair_costs_order_situations():
     assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0
     assert cost(10.0, 0.0, 0.0) > cost(10.0, 0.0, 8.0) == 0
     assert cost(0.0, 2.2, 10.0) > cost(0.0, 2.6, 10.0) > cost(0.0, 3.1, 10.0) == 0
+
+
+def cost_of(x, y, ego_speed, other_speed=0.0):
+    """Of a vehicle of 4 x 2 m beside or ahead of another, by the file's weights: 200
+    for a contact, 30 for nearness, 1.5 s of headway; margin 1 m."""
+    size = torch.tensor([[4.0, 2.0]])
+    pairs = Pairs(
+        torch.tensor([[0.0, 0.0, 0.0, ego_speed]]),
+        ego_size=size,
+        other=torch.tensor([[x, y, 0.0, other_speed]]),
+        other_size=size,
+        margin=torch.tensor([1.0]),
+    )
+    return pair_cost(pairs, SamplingEgo())[0].item()
+
+
+@pytest.mark.parametrize(
+    ("speed", "severity"), [(10.0, 2.0), (1.0, 1.01 * 0.75), (0.0, 0.5)]
+)
+def test_a_contact_costs_by_the_relative_velocity_and_half_of_who_stands(
+    speed, severity
+):
+    """Twice as much at 10 m/s; from 2 m/s on it is the ego's own doing in full."""
+    assert cost_of(3.9, 0.0, speed) == pytest.approx(200 * severity + 30, rel=1e-4)
+
+
+@pytest.mark.parametrize(("gap", "touches"), [(0.14, True), (0.16, False)])
+def test_a_gap_of_15_centimetres_counts_as_a_contact(gap, touches):
+    assert (cost_of(0.0, 2.0 + gap, 10.0, 10.0) > 100) == touches
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(0.29, 26.0), (0.31, 0.0)])
+def test_who_has_30_centimetres_beside_the_ego_is_not_ahead(gap, expected):
+    """2 m ahead of 15 m of headway that are missing."""
+    assert cost_of(6.0, 2.0 + gap, 10.0) == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_first_change_of_acceleration_costs_a_tenth_of_a_second_of_it():
+    _, world = world_of(num_vehicles=1)
+    world.accel[:, 0] = -2.0
+    x = torch.arange(1, PLAN_STEPS + 1.0)
+    states = torch.stack([x, 0 * x, 0 * x, 0 * x + 10.0], -1)[None, None]
+    assert discomfort(states, world).item() == pytest.approx(0.2)
 
 
 def test_the_ranked_begin_with_the_plan_and_are_driven_differently():

@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from e2rl.traffic.baselines import cat
-from e2rl.traffic.baselines.cat import DECAY, overlap_value
+from e2rl.traffic.baselines.cat import overlap_value
 from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import scenes
 
+DECAY = 0.99  # of a contact's worth, a step
 SIZE = torch.tensor([[[4.0, 2.0], [4.0, 2.0]]])
 
 

@@ -1,9 +1,10 @@
 """CCDiff's risk against closed forms, and who is ranked first."""
 
+import numpy as np
 import pytest
 import torch
 
-from e2rl.traffic.baselines.ccdiff import ranked, recent_states, risk
+from e2rl.traffic.baselines.ccdiff import ranked, recent_states, risk, top_cliques
 from tests.traffic.e2.crossing import make_world
 
 SIZE = torch.tensor([[4.0, 2.0], [4.0, 2.0]])
@@ -73,3 +74,39 @@ def test_those_in_cliques_come_first_and_chance_fills_up():
     ]  # the least draw
     scene["parked"][:, 1] = True
     assert not ranked(scene, 8, draw=draw)[0, [0, 1, 5, 6, 7]].any()
+
+
+def cliques_of(*groups):
+    """The top cliques of a graph of groups of vehicles, each heavier than the last."""
+    adjacency = np.zeros((12, 12), np.uint8)
+    weight = np.zeros((12, 12))
+    for number, group in enumerate(groups):
+        pairs = np.ix_(group, group)
+        adjacency[pairs] = 1
+        weight[pairs] = 1.0 + number
+    np.fill_diagonal(adjacency, 0)
+    return top_cliques(adjacency, weight)
+
+
+def test_pairs_are_no_cliques_that_count():
+    assert cliques_of([0, 1]) == []
+    assert cliques_of([0, 1, 2]) == [(0, 1, 2)]
+
+
+def test_the_three_heaviest_cliques_count():
+    groups = [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]]
+    assert cliques_of(*groups) == [(9, 10, 11), (6, 7, 8), (3, 4, 5)]
+
+
+@pytest.mark.parametrize(("gap", "counts"), [(89.0, True), (111.0, False)])
+def test_three_who_meet_within_10_seconds_are_a_clique(gap, counts):
+    """A risk above a half: the ego stands, one comes at 10 m/s, a third at 20 m/s."""
+    vehicles = [
+        (0, 0, 0.0, 0.0),
+        (-gap - 4.5, 0, 0.0, 10.0),
+        (-2 * gap - 9.0, 0, 0.0, 20.0),
+        (0, 300, 0.0, 10.0),
+    ]
+    draw = torch.tensor([[0.5, 0.5, 0.5, 0.1, 0.5, 0.5, 0.5, 0.5]])
+    first = ranked(scene_of(vehicles), 2, draw=draw)[0].nonzero()[:, 0].tolist()
+    assert (first == [1, 2]) == counts

@@ -1,12 +1,14 @@
 """Losses against closed forms and a pair by pair computation."""
 
 import math
+from dataclasses import replace
 from itertools import permutations, product
 
 import pytest
 import torch
 
 from e2rl.prior.lane_relative import LaneState
+from e2rl.traffic.baselines.diffscene import corridor_term
 from e2rl.traffic.baselines.losses import (
     Pairs,
     approach_term,
@@ -15,8 +17,10 @@ from e2rl.traffic.baselines.losses import (
     disk_gap,
     gaussian_overlap,
     off_road_term,
+    off_route_term,
     overlap_term,
 )
+from e2rl.traffic.baselines.safe_sim_opt import collision_term, gaussian_term
 from tests.traffic.baselines.attacks import baseline, first_replan
 from tests.traffic.e2.traffic_scenes import scenes
 
@@ -96,6 +100,9 @@ def test_leaving_the_road_costs_and_the_gradient_leads_back():
     states.requires_grad_(True)
     cost = off_road_term(states, view, weights=weights)
     assert (cost[0, 0, :6] > 0).all()
+    far = states.detach() + torch.tensor([0.0, 500.0, 0.0, 0.0])
+    most = off_road_term(far, view, weights=weights)[0, 0, :6]
+    torch.testing.assert_close(most, 5.0 / view.size[0, :6].norm(dim=-1))
     (gradient,) = torch.autograd.grad(cost.sum(), states)
     assert (gradient[0, 0, 1:6, 0, 1] > 0).all()
 
@@ -107,3 +114,71 @@ def test_discounts_sum_to_one_and_comfort_is_free_within_its_bounds():
     motion.a = accel
     value = comfort_term(motion, low=-3.5, high=2.0, jerk=2.0)[0, 0]
     assert value[0] == 0 and value[1].item() == pytest.approx(2.5**2)
+
+
+def test_a_discount_is_a_tenth_a_step():
+    weights = discounts(torch.zeros(10, 4))
+    assert (weights[1] / weights[0]).item() == pytest.approx(0.9**5)
+
+
+def test_metres_off_the_route_cost_from_1_metre_and_fivefold_from_2_5_metres():
+    _, view = first_replan(baseline("ctg"), scenes(1).scenes)
+    offset = torch.tensor([0.9, 2.5, 3.5])[:, None, None, None].expand(
+        -1, *view.valid.shape, 2
+    )
+    motion = LaneState(*([torch.zeros_like(offset)] * 10))
+    motion.d = offset
+    cost = off_route_term(motion, view)[:, view.routed.has_lane]
+    expected = torch.tensor([0.0, 1.5, 2.5 + 4.0])[:, None].expand_as(cost)
+    torch.testing.assert_close(cost, expected)
+
+
+def test_a_far_adversary_costs_safe_sim_30_metres():
+    states = torch.zeros(1, 1, 2, 4, 4)
+    states[0, 0, 1, :, 0] = 1000.0
+    assert collision_term(states)[0, 0, 1].item() == pytest.approx(30.0)
+
+
+@pytest.mark.parametrize(("moment", "costs"), [(3, True), (4, False)])
+def test_safe_sim_s_gaussian_counts_for_2_seconds(moment, costs):
+    """Moments are half a second apart, the fourth 2 s ahead."""
+    _, view = first_replan(baseline("safe_sim_opt"), scenes(1).scenes)
+    states = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
+    states[..., 0] += 1000.0 * torch.arange(states.shape[2])[:, None]
+    states[:, :, 2, moment, :2] = states[:, :, 1, moment, :2]
+    assert bool(gaussian_term(states, view)[0, 0, 1] > 0) == costs
+
+
+@pytest.mark.parametrize(("offset", "cost"), [(0.9, 0.0), (1.5, 0.5), (-2.0, 1.0)])
+def test_diffscene_s_adversary_obstructs_the_ego_s_route_within_1_metre(offset, cost):
+    _, view = first_replan(baseline("diffscene"), scenes(1).scenes)
+    adversary = torch.zeros_like(view.active)
+    adversary[:, 2] = True
+    states = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
+    states[:, :, 2] = view.states[:, :1, None]
+    states[:, :, 2, :, 1] += offset
+    term = corridor_term(states, replace(view, adversary=adversary))
+    assert term[0, 0, 2].item() == pytest.approx(cost, abs=1e-3)
+    assert term[0, 0, 1].item() == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "free"),
+    [
+        ("low", -3.4, True),
+        ("low", -3.6, False),
+        ("high", 1.9, True),
+        ("high", 2.1, False),
+    ],
+)
+def test_diffscene_lets_accelerations_from_minus_3_5_to_2_pass(name, value, free):
+    on = baseline("diffscene", safety=0.0, functionality=0.0)
+    _, view = first_replan(on, scenes(1).scenes)
+    adversary = torch.zeros_like(view.active)
+    adversary[:, 2] = True
+    view = replace(view, adversary=adversary)
+    still = view.lane.map(lambda field: field[None, ..., None].repeat(1, 1, 1, 10))
+    still.a = torch.zeros_like(still.a)
+    rough = replace(still, a=torch.full_like(still.a, value))
+    difference = (on.loss(rough, view) - on.loss(still, view)).sum()
+    assert (difference.item() == 0) == free

@@ -86,3 +86,35 @@ def test_an_ego_that_is_boxed_in_has_no_solution():
         solved = on.solvable(first, motion, view=view, context=context)
         found.append(solved.tolist())
     assert found == [[True], [False]]
+
+
+def test_nobody_is_attacked_before_2_seconds():
+    """Moments are half a second apart, the fourth 2 s ahead."""
+    on = baseline("strive")
+    _, view = first_replan(on, scenes(1).scenes)
+    weight = softmin(view.states[None, :, :, None].repeat(1, 1, 1, 10, 1), view)
+    assert (weight[..., :3] == 0).all()
+    assert (weight[0, 2, 3:] > 0).all()
+
+
+def test_the_objective_weighs_latents_by_who_attacks():
+    """The energy of a latent by 1 for bystanders and 0.005 for the attacker, half of
+    it; the distance to the first latent by 0.5 and 0.05; leaving the road by 20."""
+    on = baseline("strive")
+    _, view = first_replan(on, scenes(1).scenes)
+    view = replace(view, strength=torch.zeros(1))
+    motion = view.lane.map(lambda field: field[None, ..., None].repeat(1, 1, 1, 10))
+    fraction = softmin(view.with_ego(motion), view).sum(-1)[view.active]
+    latent = torch.zeros(*view.active.shape, 12)
+    first = latent.clone()
+    latent[..., 0] = 2.0
+    first[..., 0] = -1.0
+    energy = (1.0 - 0.995 * fraction) * 0.5 * 4.0
+    moved = (0.5 - 0.45 * fraction) * 9.0
+    value = on.loss(motion, latent, first=first, view=view)
+    calm = on.loss(motion, 0 * latent, first=0 * latent, view=view)
+    torch.testing.assert_close(value - calm, (energy + moved).sum()[None])
+    away = replace(motion, y=motion.y + 500.0)
+    cost = (20 * 5.0 / view.size.norm(dim=-1))[view.active].sum()
+    far = on.loss(away, 0 * latent, first=0 * latent, view=view)
+    torch.testing.assert_close(far, cost[None])
