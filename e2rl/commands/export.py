@@ -126,8 +126,10 @@ def main(arguments: list[str] | None = None) -> None:
     )
     options = parser.parse_args(arguments)
     with ending():
-        name = [options.failure] if options.failure else []
-        out = options.out or own_folder(options.run, "export", *name, options.to)
+        part = "export"
+        if options.failure:
+            part = f"export/{options.failure}"
+        out = options.out or own_folder(options.run, part, options.to)
         if options.open_ego and options.to not in OPEN_EGO:
             raise InputError(
                 f"--open-ego: {options.to} has no such form; leave it out, or pass "

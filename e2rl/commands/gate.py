@@ -63,6 +63,7 @@ def main(arguments: list[str] | None = None) -> None:
             write_atomically(options.junit, xml)
         if options.json is not None:
             write_json(options.json, results)
-        print(*(result["reason"] for result in results), *events, sep="\n")
+        for line in [*(result["reason"] for result in results), *events]:
+            print(line)
     outcomes = {result["outcome"] for result in results}
     sys.exit(next(status for name, status in STATUS.items() if name in outcomes))

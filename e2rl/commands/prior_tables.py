@@ -50,7 +50,8 @@ def prior_tables(run: Run) -> None:
     rows = record(scored, run.folder, summarise)
     answer = write_results(run, plan, rows=rows)
     print_tables(metric_tables(spread))
-    print("", *answer, sep="\n")
+    print()
+    print("\n".join(answer))
 
 
 def main() -> None:

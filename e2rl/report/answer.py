@@ -7,7 +7,7 @@ computes nothing.
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from tabulate import tabulate
@@ -82,14 +82,13 @@ def answer_lines(
     driven.sort(key=lambda row: not row["eta"])  # attacks before nominal traffic
     attacks = sum(1 for row in driven if row["eta"])
     egos = {row["ego"] for row in driven}
-    lines = wrapped(
-        *map(row_headline, driven[:HEADLINES]),
-        *errored_lines(rollouts),
-        *touched_lines(rollouts, shown=report is not None),
-    )
+    texts = list(map(row_headline, driven[:HEADLINES]))
+    texts += errored_lines(rollouts)
+    texts += touched_lines(rollouts, shown=report is not None)
+    lines = paragraphs(texts)
     if len(egos) == 1 and attacks <= 1 and len(driven) - attacks <= 1:
         nominal = driven[1] if len(driven) > 1 else None
-        lines += wrapped(*sentences(driven[0], nominal))
+        lines += paragraphs(sentences(driven[0], nominal))
     elif driven:
         lines += comparison(driven)
     if modes and driven:
@@ -124,14 +123,13 @@ def compared_answer(
     last = closing(after, folder)
     lines = atlas_lines(before=atlases[0], after=atlases[1]) if atlases else []
     if pairs:
-        last = [*wrapped(COUNTS, indent=""), *last]
+        last = wrapped(COUNTS) + last
         old, new = max(pairs, key=lambda pair: pair[1]["eta"])
         lines += wrapped(
             f"After training, {new['ego']} was {outcome(old, new)} in "
             f"{share(new, 'cfr')} rollouts {under(new)} "
             f"{bracketed(rate(new, 'cfr'), split(new))}; before it in "
             f"{share(old, 'cfr')} {bracketed(rate(old, 'cfr'), split(old))}.",
-            indent="",
         )
         metrics = CHANGES | {
             title: name
@@ -171,7 +169,6 @@ def atlas_lines(before: Mapping, after: Mapping) -> list[str]:
         f"A search finds preventable failures in {failed[0]} before training, in "
         f"{plural(before['cells'], 'way')}, and in {failed[1]} after it, in "
         f"{plural(after['cells'], 'way')}: {gone} are gone, {added} are new.",
-        indent="",
     )
     rows = [
         [", ".join(filter(None, cell)), str(old.get(cell, 0)), str(new.get(cell, 0))]
@@ -323,7 +320,8 @@ def comparison(rows: Sequence[dict]) -> list[str]:
     then most contacts. Egos: in each traffic, the strongest first, the one with the
     fewest first. Unknown rates come last."""
     egos = list(dict.fromkeys(row["ego"] for row in rows))
-    cells, labels = by_ego(rows, egos)
+    cells = by_ego(rows, egos)
+    labels = [label for _, label in cells]
     several = len(egos) > 1
 
     def rank(key: tuple[str, str]) -> tuple:
@@ -356,7 +354,7 @@ def comparison(rows: Sequence[dict]) -> list[str]:
     shown = ("cfr", *KINDS.values(), "real", "counted_per_km")
     for key in ranked[:MOST_ROWS]:
         table.append([*key, *(cell(cells[key], name) for name in shown)])
-    lines = [*wrapped(lead, indent="")]
+    lines = wrapped(lead)
     lines += columns(table if several else [line[1:] for line in table])
     if len(ranked) > MOST_ROWS:
         lines.append(f"... and {len(ranked) - MOST_ROWS} more in tables.md")
@@ -366,7 +364,7 @@ def comparison(rows: Sequence[dict]) -> list[str]:
             f" Rates per 1,000 km are without {plural(without, 'rollout')} in which "
         )
         text += "a planner raised."
-    return [*lines, *wrapped(text, indent="")]
+    return lines + wrapped(text)
 
 
 # --- weaknesses, and what was measured
@@ -402,7 +400,6 @@ def weaknesses(modes: Mapping) -> list[str]:
         return wrapped(
             f"No weakness stands out: {counted} failures that count are each of "
             "another kind.",
-            indent="",
         )
     order = "most failures that count first"
     lines = [
@@ -434,7 +431,7 @@ def closing(
     Returns:
         Lines of the terminal's width, but for paths.
     """
-    lines = wrapped(*[*notes, measured(rows)], indent="")
+    lines = paragraphs([*notes, measured(rows)], indent="")
     if report:
         lines.append(f"Watch every failure: {report}")
     if folder:
@@ -531,17 +528,16 @@ def per_cent(fraction: float) -> str:
     return f"{100 * fraction:.{decimals}f}%"
 
 
-def wrapped(*texts: str, indent: str = "  ") -> list[str]:
-    """The texts in lines of the terminal's width, the second and later ones of each
-    indented."""
-    width = terminal_width()
-    return [
-        line
-        for text in texts
-        for line in textwrap.wrap(
-            text.strip(), width, subsequent_indent=indent, break_on_hyphens=False
-        )
-    ]
+def wrapped(text: str, indent: str = "") -> list[str]:
+    """The text in lines of the terminal's width, the second and later ones indented."""
+    return textwrap.wrap(
+        text.strip(), terminal_width(), subsequent_indent=indent, break_on_hyphens=False
+    )
+
+
+def paragraphs(texts: Iterable[str], indent: str = "  ") -> list[str]:
+    """The lines of several texts."""
+    return [line for text in texts for line in wrapped(text, indent)]
 
 
 def columns(table: Sequence[Sequence[str]]) -> list[str]:
@@ -554,25 +550,23 @@ def columns(table: Sequence[Sequence[str]]) -> list[str]:
     width = terminal_width()
     head, *rows = table
     sizes = [
-        max(map(len, (*cells, *title.split())), default=0)
-        for title, *cells in zip(*table, strict=True)
+        max(map(len, [*title.split(), *(row[column] for row in rows)]), default=0)
+        for column, title in enumerate(head)
     ]
     room = width - sum(sizes[1:]) - 2 * (len(sizes) - 1)
     sizes[0] = min(sizes[0], max(width // 3, room))
     lines: list[str] = []
     for group in column_groups(sizes, width):
+        body: list[list[str]] = []
         heads = [textwrap.wrap(head[column], sizes[column]) for column in group]
         height = max(map(len, heads))
-        padded = [[""] * (height - len(title)) + title for title in heads]
-        body = [[row[column] for column in group] for row in rows]
-        for line in body:
-            if len(line[0]) > sizes[0]:
-                line[0] = f"{line[0][: sizes[0] - 1]}…"
+        for line in range(-height, 0):
+            body.append([title[line] if -line <= len(title) else "" for title in heads])
+        for row in rows:
+            body.append([row[column] for column in group])
+            if len(row[0]) > sizes[0]:
+                body[-1][0] = f"{row[0][: sizes[0] - 1]}…"
         align = ["left"] + ["right"] * (len(group) - 1)
-        lines += tabulate(
-            [*zip(*padded, strict=True), *body],
-            tablefmt="plain",
-            disable_numparse=True,
-            colalign=align,
-        ).splitlines()
+        text = tabulate(body, tablefmt="plain", disable_numparse=True, colalign=align)
+        lines += text.splitlines()
     return lines

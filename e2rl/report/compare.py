@@ -12,7 +12,7 @@ from e2rl.evaluation.headline import headline
 from e2rl.evaluation.rollout_files import cell, json_text
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import Row, is_failure, mode_name
-from e2rl.report.answer import FEW, wrapped
+from e2rl.report.answer import FEW, paragraphs
 from e2rl.report.failure_tracks import replay_data
 from e2rl.report.headline import (
     errored_lines,
@@ -89,12 +89,8 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
     write_atomically(path, page(FOLDER / PAGE, title, scripts, content))
     write_beside(path, ".json", content=json_text(about))
     write_beside(path, ".csv", content=pair_list(rows))
-    return wrapped(
-        f"{title}:",
-        *lines,
-        f"Watch both: {path}",
-        f"All pairs: {path.with_suffix('.csv')} and .json",
-    )
+    pages = f"All pairs: {path.with_suffix('.csv')} and .json"
+    return paragraphs([f"{title}:", *lines, f"Watch both: {path}", pages])
 
 
 def pair_list(rows: Sequence[Mapping]) -> str:

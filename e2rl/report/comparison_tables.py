@@ -92,7 +92,7 @@ def planner_tables(
         settings: for the captions.
         table: of the catalogue, whose metrics are the columns.
     """
-    cells, _ = by_ego(closed_loop(rows), names)
+    cells = by_ego(closed_loop(rows), names)
     group = list(cells.values())
     drives = [f"{ego} under {traffic}" for ego, traffic in cells]
     text = f"{group[0]['dataset']}/{group[0]['split']}. "
@@ -173,17 +173,14 @@ def save_compared(folder: Path, tables: Sequence[Table], name: str = METHODS) ->
 # --- egos side by side
 
 
-def by_ego(
-    rows: Sequence[dict], names: Sequence[str]
-) -> tuple[dict[tuple[str, str], dict], list[str]]:
-    """({(ego, traffic): row}, names of traffic and intensity) of the closed-loop rows
-    of the egos `names`."""
+def by_ego(rows: Sequence[dict], names: Sequence[str]) -> dict[tuple[str, str], dict]:
+    """{(ego, traffic and intensity): row} of the closed-loop rows of the egos `names`."""
     cells: dict[tuple[str, str], dict] = {}
     for name in names:
         group = [row for row in rows if row["ego"] == name and row.get("stage") is None]
         for label, row in zip(column_names(group), group, strict=True):
             cells[name, label] = row
-    return cells, list(dict.fromkeys(label for _, label in cells))
+    return cells
 
 
 def relative_cell(change: Mapping) -> str:
@@ -216,7 +213,7 @@ def guard_table(
     Returns:
         Each guard with its limit, what was measured, and whether it is met.
     """
-    row = by_ego(rows, [after])[0][after, "nominal"]
+    row = by_ego(rows, [after])[after, "nominal"]
 
     def change(metric: str, ego: str, most: float) -> list[str]:
         paired = row["paired"][f"ego {ego}"][metric]

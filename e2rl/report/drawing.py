@@ -156,8 +156,15 @@ def vehicle(state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
 def agent(
     kind: str, state: np.ndarray, size: np.ndarray, colour: Colour
 ) -> list[Shape]:
-    """An agent of one of the kinds of `recording.AGENT_TYPES`: a pedestrian as a disc,
-    a cyclist as a slim box with a disc, and all others as vehicles of a colour."""
+    """A pedestrian as a disc, a cyclist as a slim box with a disc, and all others as
+    vehicles.
+
+    Args:
+        kind: one of `recording.AGENT_TYPES`.
+        state: x, y [m], heading [rad], ...
+        size: length and width [m].
+        colour: of vehicles.
+    """
     if kind not in ("pedestrian", "cyclist"):
         return vehicle(state, size, colour=colour)
     bicycle = Shape(
@@ -186,6 +193,15 @@ def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:
 def disc(
     centre: np.ndarray, radius: float, fill: Colour, edge: Colour, width: float = 0.1
 ) -> Shape:
+    """A circle.
+
+    Args:
+        centre: [2] m.
+        radius: m.
+        fill: its colour.
+        edge: its edge's colour.
+        width: of the edge, m.
+    """
     return Shape(centre + radius * np.array(CIRCLE), fill, edge=edge, width=width)
 
 

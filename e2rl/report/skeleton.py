@@ -34,7 +34,8 @@ HEAD = 62  # above them
 FOOT = 34  # below them
 NODES = 10  # of the matrix at most
 MARGIN = 30.0  # m around the coalition
-SIDES = (60.0, 140.0)  # m: a map's least and greatest side
+SMALLEST = 60.0  # m, side of a map
+LARGEST = 140.0  # m, side of a map
 CANDIDATE = drawing.VULNERABLE
 FEASIBLE = "#2e8b57"
 ON_TOP = 10  # drawing order of edges, arrows and names, above the map
@@ -271,8 +272,8 @@ class SkeletonPicture:
         for agent in self.members:
             start = self.chosen[agent, :2]
             end = self.chosen[self.target[agent], :2]
-            ends = np.stack([start, end], 1)
-            axes.plot(*ends, color=drawing.INK, linewidth=4, zorder=ON_TOP)
+            x, y = np.stack([start, end], 1)
+            axes.plot(x, y, color=drawing.INK, linewidth=4, zorder=ON_TOP)
             tip = start + 0.8 * (end - start)
             axes.annotate("", tip, start, arrowprops=head, zorder=ON_TOP)
 
@@ -285,7 +286,7 @@ class SkeletonPicture:
         rollout = self.rollout
         drivers = [0, *self.members]
         points = np.concatenate([self.chosen[drivers, :2], self.risky[drivers, :2]])
-        side = float(np.clip(np.ptp(points, axis=0).max() + MARGIN, *SIDES))
+        side = float(np.clip(np.ptp(points, axis=0).max() + MARGIN, SMALLEST, LARGEST))
         agents = np.flatnonzero(rollout.valid[self.step, : len(states)]).tolist()
         agents.sort(
             key=lambda agent: (self.colour(agent) != drawing.BACKGROUND, -agent)

@@ -68,7 +68,9 @@ class Table:
         stand beneath, beside the first column again."""
         width = terminal_width()
         lines = [self.head, *self.rows]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        widths = [
+            max(len(line[column]) for line in lines) for column in range(len(self.head))
+        ]
         grids = [
             grid([[line[column] for column in columns] for line in lines], "simple")
             for columns in column_groups(widths, width)

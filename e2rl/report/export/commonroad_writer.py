@@ -177,7 +177,7 @@ def side_by_side(lanes: dict[str, Lane], names: Iterable[str]) -> list[list[str]
         near = {beside(lanes, name, side=side) for side in OPPOSITE}
         touching = [group for group in groups if near & set(group)]
         groups = [group for group in groups if group not in touching]
-        groups.append([*chain(*touching), name])
+        groups.append([*chain.from_iterable(touching), name])
     return groups
 
 
@@ -266,7 +266,9 @@ class Signals:
             entering = dict.fromkeys(self.plan.connecting[road][0] for road in junction)
             groups = side_by_side(lanes, entering)
             exits = [lanes[name].exits for name in entering]
-            lit = any(other in self.episode.lights for other in chain(*exits))
+            lit = any(
+                other in self.episode.lights for other in chain.from_iterable(exits)
+            )
             forks = any(len(others) > 1 for others in exits)
             if not lit and (len(groups) < 2 or not forks):
                 continue

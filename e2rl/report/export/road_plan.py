@@ -81,9 +81,11 @@ def road_plan(lanes: dict[str, Lane]) -> RoadPlan:
         plan.plain += [(span.lane, other.lane) for span, other in pairwise(spans)]
         first[chain] = spans[0].lane
         last[chain] = spans[-1].lane
-        ring = (chain[-1], chain[0])
-        if ring in graph.lanes.edges and not graph.is_junction(*ring):
-            plan.plain.append(ring)
+        end = chain[-1]
+        start = chain[0]
+        ring = graph.lanes.has_edge(end, start)
+        if ring and not graph.is_junction(end, start):
+            plan.plain.append((end, start))
     for name, (before, after) in plan.connecting.items():
         chain_before = graph.chain_of[before]
         chain_after = graph.chain_of[after]
@@ -118,7 +120,9 @@ class LaneChains:
         alone = nx.DiGraph()
         alone.add_nodes_from(self.lanes)
         alone.add_edges_from(
-            edge for edge in self.lanes.edges if not self.is_junction(*edge)
+            (before, after)
+            for before, after in self.lanes.edges
+            if not self.is_junction(before, after)
         )
         self.chains: list[Chain] = []
         for part in nx.weakly_connected_components(alone):
