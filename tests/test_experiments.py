@@ -65,26 +65,6 @@ def test_the_dial_has_a_row_and_a_picture_for_every_eta(evaluated):
     }
 
 
-def test_the_curves_have_a_line_for_every_method_and_eta(evaluated):
-    """Differences are to nominal traffic alone; the tables have a row for each."""
-    run = evaluated("experiment=curves", "methods=[nominal,ctg_adv,cat]", "eta=[1,2]")
-    lines = (run / "curves.csv").read_text().splitlines()[1:]
-    points = [
-        ("nominal", "0"),
-        ("ctg_adv", "1"),
-        ("ctg_adv", "2"),
-        ("cat", "1"),
-        ("cat", "2"),
-    ]
-    assert [
-        (line.split(",")[0], f"{float(line.split(',')[2]):g}") for line in lines
-    ] == points
-    rows = read_metrics(run / "metrics.json")
-    assert [list(row["paired"]) for row in rows] == [[], *[["nominal"]] * 4]
-    assert (run / "curves.png").exists() and not (run / "rollouts").exists()
-    assert "Difference of each method to nominal" in (run / "methods.md").read_text()
-
-
 def test_nuplan_s_scores_are_a_table_of_their_own(evaluated):
     """The recorded ego in its own recording drives all of its way, hits nobody, and is
     within 1 m of the road."""
