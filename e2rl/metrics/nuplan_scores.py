@@ -15,13 +15,15 @@ import numpy as np
 import torch
 from scipy.signal import savgol_filter
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from e2rl.metrics.catalogue import Batch, rate
 from e2rl.metrics.geometry import edge_parts_inside, velocity
 from e2rl.metrics.off_road import (
-    has_lines,
+    Points,
+    Segments,
+    has_map,
     inside_polygon,
-    line_segments,
     near_lane,
     near_segments,
 )
@@ -30,30 +32,25 @@ from e2rl.scenes.boxes import corners, overlap, to_frame
 from e2rl.scenes.recording import CYCLIST, DT, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.sim.dynamics import wrap
 
-REAR_AXLE = (
-    1.461 / 5.176
-)  # of the length: nuPlan's vehicle, from its centre back to the rear axle
+REAR_AXLE = 1.461 / 5.176  # of the length of nuPlan's vehicle, behind its centre
 STOPPED = 0.05  # m/s: an ego or a track that is no faster stands at a collision
-AHEAD = math.radians(
-    30
-)  # angle at the rear axle between the heading and another's centre
+# Angles at the rear axle between the heading and another's centre.
+AHEAD = math.radians(30)
 BEHIND = math.radians(150)
-ALLOWED = {
+ALLOWED = {  # at-fault collisions that leave a score above 0
     (PEDESTRIAN, CYCLIST): 0,
     (VEHICLE,): 0,
     (OTHER,): 1,
-}  # at-fault collisions that leave a score above 0
+}
 MAX_OUTSIDE = 0.3  # m that a corner may lie outside the drivable area
 ENDS_MEET = 0.5  # m between the end of a lane and the start of one that follows it
-WINDOW, AGAINST, FAR_AGAINST = (
-    1.0,
-    2.0,
-    6.0,
-)  # s, and metres against the lane's direction in it: score 0.5, 0
+AGAINST_TIME = 1.0  # s in which metres against the lane's direction are counted
+AGAINST = 2.0  # m: score 0.5
+FAR_AGAINST = 6.0  # m: score 0
 LEAST_TTC = 0.95  # s
 MOVING = 0.005  # m/s: an ego that is slower has no time to collision
 MIN_PROGRESS = 0.2  # of the recorded distance
-PROGRESS_FLOOR = 2.0  # m: shorter distances count as this; minus this, driven backwards, is no progress at all
+PROGRESS_FLOOR = 2.0  # m: shorter distances count as this; as far back is no progress
 MAX_OVERSPEED = 2.23  # m/s above the limit, throughout the rollout: score 0
 COMFORT = {  # bounds, which are excluded: m/s^2, rad/s, rad/s^2, m/s^3, m/s^3
     "longitudinal": (-4.05, 2.40),
@@ -75,8 +72,6 @@ MULTIPLIERS = (
     "ego_is_making_progress",
 )
 term = partial(rate, tables="nuplan")
-
-
 SCORES = (
     term("nuplan_score", "nuPlan's closed-loop score"),
     term("no_ego_at_fault_collisions", "nuPlan: no collision at fault"),
@@ -100,29 +95,28 @@ def nuplan_columns(batch: Batch) -> Batch:
     [B] in [0, 1]."""
     batch = batch | {"track_speed": track_speed(batch)}
     places = places_of(batch)
-    fault, new = at_fault(batch, places)
+    contacts = contacts_of(batch, places)
     progress = expert_progress(batch)
-    found = {
-        "no_ego_at_fault_collisions": collision_score(fault, batch["agent_type"]),
+    ego = batch["states"][:, :, 0]
+    scores = {
+        "no_ego_at_fault_collisions": collision_score(
+            contacts.at_fault, batch["agent_type"]
+        ),
         "drivable_area_compliance": drivable_area(batch),
         "driving_direction_compliance": driving_direction(batch),
         "ego_is_making_progress": (progress >= MIN_PROGRESS).to(progress),
-        "time_to_collision_within_bound": time_to_collision(
-            batch, places, fault=fault, new=new
-        ),
+        "time_to_collision_within_bound": time_to_collision(batch, places, contacts),
         "ego_progress_along_expert_route": progress,
         "speed_limit_compliance": speed_limit(batch),
-        "ego_is_comfortable": comfort(batch["states"][:, :, 0], batch["size"][:, 0, 0]),
+        "ego_is_comfortable": comfort(ego, batch["size"][:, 0, 0]),
     }
-    mean = sum(weight * found[name] for name, weight in WEIGHTS.items()) / sum(
-        WEIGHTS.values()
-    )
-    found["nuplan_score"] = mean * torch.stack(
-        [found[name] for name in MULTIPLIERS]
-    ).prod(0)
+    mean = sum(weight * scores[name] for name, weight in WEIGHTS.items())
+    mean = mean / sum(WEIGHTS.values())
+    multipliers = torch.stack([scores[name] for name in MULTIPLIERS])
+    scores["nuplan_score"] = mean * multipliers.prod(0)
     unknown = batch["start_overlap"] | ~batch["valid"][..., 0].all(1)
     return {
-        name: value.masked_fill(unknown, torch.nan) for name, value in found.items()
+        name: value.masked_fill(unknown, torch.nan) for name, value in scores.items()
     }
 
 
@@ -134,7 +128,7 @@ def track_speed(batch: Batch) -> Tensor:
 
 
 class Places(NamedTuple):
-    """Of the ego at each step, bool [B, T+1]."""
+    """Where the ego is at each step, bool [B, T+1]."""
 
     loose: Tensor  # its corners are not in one lane, or in lanes that follow each other
     crossing: Tensor  # its rear axle is in several lanes
@@ -145,29 +139,27 @@ def places_of(batch: Batch) -> Places:
     centreline."""
     states = batch["states"][:, :, 0]
     size = batch["size"][:, None, 0]
-    points = torch.cat(
-        [corners(states, size), rear_axle(states, size)[..., None, :]], -2
-    )  # [B, T+1, 5, 2]
-    each = points[0, ..., 0].numel()
+    axle = rear_axle(states, size)[..., None, :]
+    points = torch.cat([corners(states, size), axle], -2)  # [B, T+1, 5, 2]
+    count = points[0, ..., 0].numel()
     point, lane, _ = lanes_at(points.flatten(1, 2), batch)
-    used = torch.zeros_like(batch["lane_width"], dtype=torch.bool)
-    used[point // each, lane] = True  # a few of hundreds
-    chosen = used.byte().argsort(dim=1, descending=True, stable=True)[
-        :, : max(1, int(used.sum(1).amax()))
-    ]
-    slot = used.long().cumsum(1) - 1
-    inside = states.new_zeros(len(states) * each, chosen.shape[1])
-    inside[point, slot[point // each, lane]] = 1.0
-    inside = inside.view(*points.shape[:-1], -1)  # [B, T+1, 5, M] of the chosen lanes
-    together = connected(
-        corners_inside=inside[..., :4, :], follows=linked(batch, chosen)
-    )
+    # Of hundreds of lanes only the few that the ego touches.
+    is_used = torch.zeros_like(batch["lane_width"], dtype=torch.bool)
+    is_used[point // count, lane] = True
+    most = max(1, int(is_used.sum(1).amax()))
+    order = is_used.byte().argsort(dim=1, descending=True, stable=True)
+    lanes = order[:, :most]
+    slot = (is_used.long().cumsum(1) - 1)[point // count, lane]
+    inside = states.new_zeros(len(states) * count, most)
+    inside[point, slot] = 1.0
+    inside = inside.view(*points.shape[:-1], most)
+    together = connected(inside[..., :4, :], follows=linked(batch, lanes))
     return Places(loose=~together, crossing=inside[..., 4, :].sum(-1) > 1)
 
 
 def connected(corners_inside: Tensor, follows: Tensor) -> Tensor:
-    """Whether the corners of the ego lie in one lane, or in lanes that follow each
-    other as the ego drives.
+    """Whether [B, T+1] the corners of the ego lie in one lane, or in lanes that follow
+    each other as the ego drives.
 
     Some lane X is, or is followed by, a lane of each front corner, and is, or follows,
     a lane of each rear corner; and the rear corners' own lanes are one, or one follows
@@ -178,16 +170,13 @@ def connected(corners_inside: Tensor, follows: Tensor) -> Tensor:
             right, front right) is in a lane.
         follows: [B, M, M], 1 at [j, i] where lane j is lane i, or begins where lane i
             ends.
-
-    Returns:
-        Bool [B, T+1].
     """
     front_left, rear_left, rear_right, front_right = corners_inside.unbind(-2)
-    after_left_rear = rear_left @ follows.mT
-    after_right_rear = rear_right @ follows.mT
+    after_left = rear_left @ follows.mT
+    after_right = rear_right @ follows.mT
     front = (front_left @ follows) * (front_right @ follows)
-    lane = (front * after_left_rear * after_right_rear).sum(-1) > 0
-    rear = (after_left_rear * rear_right + after_right_rear * rear_left).sum(-1) > 0
+    lane = (front * after_left * after_right).sum(-1) > 0
+    rear = (after_left * rear_right + after_right * rear_left).sum(-1) > 0
     return lane & rear
 
 
@@ -201,45 +190,38 @@ def rear_axle(states: Tensor, size: Tensor) -> Tensor:
 def lanes_at(points: Tensor, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     """(point in B * K, lane, direction [., 2]) of all pairs of a point [B, K, 2] and a
     segment of a lane in whose strip it lies, between the lane's ends."""
-    owner, lane, ends = line_segments(batch["lane_points"], batch["lane_index"])
+    lanes = Segments.lanes(batch)
     rollout = torch.arange(len(points)).repeat_interleave(points.shape[1])
     points = points.flatten(0, 1)
-    point, near = near_segments(
-        points,
-        rollout,
-        owner=owner,
-        ends=ends,
-        reach=batch["lane_width"][owner, lane] / 2,
-    )
-    along = torch.nn.functional.normalize(ends[near, 1] - ends[near, 0], dim=-1)
-    begins = torch.ones(
-        len(lane) + 1, dtype=torch.bool
-    )  # the last row: after the end of the last lane
-    begins[1:-1] = (lane.diff() != 0) | (owner.diff() != 0)
-    before, after = (
-        (along * (points[point] - ends[near, end])).sum(-1) for end in (0, 1)
-    )
-    within = ~(begins[near] & (before < 0)) & ~(begins[near + 1] & (after > 0))
-    return point[within], lane[near[within]], along[within]
+    half_width = batch["lane_width"][lanes.rollout, lanes.line] / 2
+    point, segment = near_segments(Points(points, rollout), lanes, half_width)
+    start, end = lanes.ends[segment].unbind(1)
+    direction = normalize(end - start, dim=-1)
+    begins = torch.ones(len(lanes.line) + 1, dtype=torch.bool)  # a lane, or after all
+    begins[1:-1] = (lanes.line.diff() != 0) | (lanes.rollout.diff() != 0)
+    before_start = (direction * (points[point] - start)).sum(-1) < 0
+    after_end = (direction * (points[point] - end)).sum(-1) > 0
+    beyond = (begins[segment] & before_start) | (begins[segment + 1] & after_end)
+    return point[~beyond], lanes.line[segment[~beyond]], direction[~beyond]
 
 
-def linked(batch: Batch, chosen: Tensor) -> Tensor:
-    """1 at [B, j, i] where the chosen lane j [B, M] is lane i, or begins where lane i
+def linked(batch: Batch, lanes: Tensor) -> Tensor:
+    """1 at [B, j, i] where lane j of lanes [B, M] is lane i, or begins where lane i
     ends, else 0."""
     index = batch["lane_index"]
     count = batch["lane_width"].shape[1]
-    at = torch.arange(index.shape[1]).expand(index.shape)
-    slot = index.masked_fill(index < 0, count)
-    ends = []
-    for reduce in ("amin", "amax"):
-        place = torch.zeros(len(index), count + 1, dtype=torch.int64)
-        place = place.scatter_reduce(1, slot, at, reduce, include_self=False).gather(
-            1, chosen
-        )
-        ends.append(batch["lane_points"].gather(1, place[..., None].expand(-1, -1, 2)))
-    first, last = ends
-    follows = torch.cdist(first, last) < ENDS_MEET
-    return (follows | torch.eye(chosen.shape[1], dtype=torch.bool)).to(first)
+    rows = torch.arange(len(index))[:, None]
+    position = torch.arange(index.shape[1]).expand(index.shape)
+    lane = index.masked_fill(index < 0, count)
+
+    def end_points(reduce: str) -> Tensor:
+        ends = torch.zeros(len(index), count + 1, dtype=torch.int64)
+        ends = ends.scatter_reduce(1, lane, position, reduce, include_self=False)
+        return batch["lane_points"][rows, ends.gather(1, lanes)]
+
+    first = end_points("amin")
+    follows = torch.cdist(first, end_points("amax")) < ENDS_MEET
+    return (follows | torch.eye(lanes.shape[1], dtype=torch.bool)).to(first)
 
 
 def angle_at(axle: Tensor, heading: Tensor, centre: Tensor) -> Tensor:
@@ -249,39 +231,44 @@ def angle_at(axle: Tensor, heading: Tensor, centre: Tensor) -> Tensor:
     return wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading).abs()
 
 
-def at_fault(batch: Batch, places: Places) -> tuple[Tensor, Tensor]:
-    """Bool [B, T+1, N] each: collisions at the ego's fault, and all, at the step at
-    which an agent first meets the ego.
+class Contacts(NamedTuple):
+    """Steps at which an agent first meets the ego, bool [B, T+1, N]."""
 
-    The ego is at fault if it moves and the other stands, as objects always do, if its
-    front bumper meets the other, or if the other, not behind it, meets it beside while
-    the ego is not in one lane.
-    """
+    at_fault: Tensor
+    first: Tensor
+
+
+def contacts_of(batch: Batch, places: Places) -> Contacts:
+    """The ego is at fault if it moves and the other stands, as objects always do, if
+    its front bumper meets the other, or if the other, not behind it, meets it beside
+    while the ego is not in one lane."""
     touching = batch["area"] > 0
-    new = touching & (touching.long().cumsum(1) == 1)
-    row, step, agent = new.nonzero(as_tuple=True)
+    first = touching & (touching.long().cumsum(1) == 1)
+    index = first.nonzero(as_tuple=True)
+    row, step, agent = index
     ego = batch["states"][row, step, 0]
-    other = batch["states"][row, step, agent]
     size = batch["size"][row, 0]
-    other_size = batch["size"][row, agent]
-    behind = angle_at(rear_axle(ego, size), ego[:, 2], centre=other[:, :2]) > BEHIND
-    front = edge_parts_inside(ego, size, other=other, other_size=other_size)[:, 3] > 0
+    other = batch["states"][index]
+    angle = angle_at(rear_axle(ego, size), ego[:, 2], centre=other[:, :2])
+    parts = edge_parts_inside(
+        ego, size, other=other, other_size=batch["size"][row, agent]
+    )
+    front = parts[:, 3] > 0
     moves = ego[:, 3].abs() > STOPPED
-    stands = batch["track_speed"][row, step, agent] <= STOPPED
-    guilty = moves & (stands | (~behind & (front | places.loose[row, step])))
-    fault = torch.zeros_like(new)
-    fault[row, step, agent] = guilty
-    return fault, new
+    stands = batch["track_speed"][index] <= STOPPED
+    beside = (angle <= BEHIND) & (front | places.loose[row, step])
+    at_fault = torch.zeros_like(first)
+    at_fault[index] = moves & (stands | beside)
+    return Contacts(at_fault, first)
 
 
-def collision_score(fault: Tensor, agent_type: Tensor) -> Tensor:
-    """Product [B] over kinds of agents of max(0, 1 - collisions / (allowed + 1)); fault
-    [B, T+1, N]."""
-    score = torch.ones(len(fault), dtype=torch.float64)
+def collision_score(at_fault: Tensor, agent_type: Tensor) -> Tensor:
+    """Product [B] over kinds of agents of max(0, 1 - collisions / (allowed + 1));
+    at_fault [B, T+1, N]."""
+    score = torch.ones(len(at_fault), dtype=torch.float64)
     for kinds, allowed in ALLOWED.items():
-        number = (fault & torch.isin(agent_type, torch.tensor(kinds))[:, None]).sum(
-            (1, 2)
-        )
+        is_kind = torch.isin(agent_type, torch.tensor(kinds))[:, None]
+        number = (at_fault & is_kind).sum((1, 2))
         score *= (1 - number / (allowed + 1)).clamp(min=0)
     return score
 
@@ -290,57 +277,37 @@ def drivable_area(batch: Batch) -> Tensor:
     """1 [B] where all corners stay within MAX_OUTSIDE of a lane's strip or a drivable
     polygon, else 0; NaN without a map."""
     states = batch["states"][:, :, 0]
-    size = batch["size"][:, None, 0]
-    where = corners(states, size)
-    points = where.flatten(0, 2)
-    rollout = torch.arange(len(states)).repeat_interleave(where[0, ..., 0].numel())
-    inside = near_lane(
-        points,
-        rollout,
-        lane_points=batch["lane_points"],
-        lane_index=batch["lane_index"],
-        lane_width=batch["lane_width"],
-        margin=MAX_OUTSIDE,
-    )
-    polygons = batch["drivable_points"], batch["drivable_index"]
-    rest = (~inside).nonzero()[:, 0]
-    inside[rest] = inside_polygon(points[rest], rollout[rest], *polygons)
-    owner, _, ends = line_segments(*polygons, closed=True)
-    near, _ = near_segments(
-        points,
-        rollout,
-        owner=owner,
-        ends=ends,
-        reach=ends.new_full(owner.shape, MAX_OUTSIDE),
-    )
-    inside[near] = True
-    mapped = has_lines(batch["lane_index"]) | has_lines(batch["drivable_index"])
-    return (
-        inside.view(len(states), -1).all(1).to(states).masked_fill(~mapped, torch.nan)
-    )
+    xy = corners(states, batch["size"][:, None, 0])
+    rollout = torch.arange(len(states)).repeat_interleave(xy[0, ..., 0].numel())
+    points = Points(xy.flatten(0, 2), rollout)
+    polygons = Segments.polygons(batch)
+    inside = near_lane(points, batch, margin=MAX_OUTSIDE)
+    others, index = points.outside(inside)
+    inside[index] = inside_polygon(others, polygons)
+    near_border, _ = near_segments(points, polygons, MAX_OUTSIDE)
+    inside[near_border] = True
+    result = inside.view(len(states), -1).all(1).to(states)
+    return result.masked_fill(~has_map(batch), torch.nan)
 
 
 def driving_direction(batch: Batch) -> Tensor:
     """1, 0.5 or 0 [B] as the ego's centre moves at most AGAINST, FAR_AGAINST or more
-    metres against the direction of its lane within WINDOW; of several lanes the one
-    that it follows best, and nothing outside all."""
+    metres against the direction of its lane within AGAINST_TIME; of several lanes the
+    one that it follows best, and nothing outside all."""
     centre = batch["states"][:, :, 0, :2]
-    moved = torch.nn.functional.pad(centre.diff(dim=1), (0, 0, 1, 0)).flatten(0, 1)
-    point, _, along = lanes_at(centre, batch)
+    moved = pad(centre.diff(dim=1), (0, 0, 1, 0)).flatten(0, 1)
+    point, _, direction = lanes_at(centre, batch)
+    along = (moved[point] * direction).sum(-1)
     best = moved.new_full((len(moved),), -torch.inf)
-    best = best.scatter_reduce(0, point, (moved[point] * along).sum(-1), "amax")
-    way = best.masked_fill(best.isinf(), 0.0).view(centre.shape[:2]).cumsum(1)
-    steps = round(WINDOW / DT) + 1  # of the devkit's sums
-    before = torch.nn.functional.pad(way, (steps, 0))[:, :-steps]
-    against = -(way - before).amin(1)
-    return torch.where(
-        against < AGAINST, 1.0, torch.where(against < FAR_AGAINST, 0.5, 0.0)
-    ).to(centre)
+    best = best.scatter_reduce(0, point, along, "amax")
+    driven = best.masked_fill(best.isinf(), 0.0).view(centre.shape[:2]).cumsum(1)
+    steps = round(AGAINST_TIME / DT) + 1  # of the devkit's sums
+    against = -(driven - pad(driven, (steps, 0))[:, :-steps]).amin(1)
+    half = torch.where(against < FAR_AGAINST, 0.5, 0.0)
+    return torch.where(against < AGAINST, 1.0, half).to(centre)
 
 
-def time_to_collision(
-    batch: Batch, places: Places, fault: Tensor, new: Tensor
-) -> Tensor:
+def time_to_collision(batch: Batch, places: Places, contacts: Contacts) -> Tensor:
     """1 [B] where nothing would be met within LEAST_TTC at constant velocities, from
     any step; else 0.
 
@@ -351,34 +318,28 @@ def time_to_collision(
     size = batch["size"]
     speed = batch["track_speed"]
     ego = states[:, :, :1]
-    length = size[:, None, :1]
-    angle = angle_at(rear_axle(ego, length), ego[..., 2], centre=states[..., :2])
+    axle = rear_axle(ego, size[:, None, :1])
+    angle = angle_at(axle, ego[..., 2], centre=states[..., :2])
     beside = (places.loose | places.crossing)[..., None] & (angle <= BEHIND)
-    counted = (
-        batch["valid"]
-        & ~(new.cumsum(1) > 0)
-        & ((angle < AHEAD) | beside)
-        & (speed[..., :1] > MOVING)
-    )
+    met = contacts.first.cumsum(1) > 0
+    counted = batch["valid"] & ~met & ((angle < AHEAD) | beside)
+    counted &= speed[..., :1] > MOVING
     counted[..., 0] = False
-    reach = (size[:, :1] + size).norm(dim=-1)[:, None] + (
-        speed[..., :1] + speed
-    ) * LEAST_TTC
+    reach = (size[:, :1] + size).norm(dim=-1)[:, None]
+    reach = reach + (speed[..., :1] + speed) * LEAST_TTC
     counted &= (states[..., :2] - ego[..., :2]).norm(dim=-1) < reach
-    row, step, agent = counted.nonzero(as_tuple=True)
+    index = counted.nonzero(as_tuple=True)
+    row, step, agent = index
     seconds = torch.arange(DT, LEAST_TTC, DT, dtype=states.dtype)[:, None]  # [K, 1]
     touches = overlap(
-        first=projected(states[row, step, 0], speed[row, step, 0], seconds=seconds),
-        first_size=size[row, 0],
-        second=projected(
-            states[row, step, agent], speed[row, step, agent], seconds=seconds
-        ),
+        projected(states[row, step, 0], speed[row, step, 0], seconds=seconds),
+        size[row, 0],
+        second=projected(states[index], speed[index], seconds=seconds),
         second_size=size[row, agent],
     )
-    meets = torch.zeros(len(states), dtype=torch.bool).index_fill(
-        0, row[touches.any(0)], True
-    )
-    return (~meets & ~fault.any((1, 2))).to(states)
+    meets = torch.zeros(len(states), dtype=torch.bool)
+    meets[row[touches.any(0)]] = True
+    return (~meets & ~contacts.at_fault.any((1, 2))).to(states)
 
 
 def projected(states: Tensor, speed: Tensor, seconds: Tensor) -> Tensor:
@@ -401,14 +362,15 @@ def expert_progress(batch: Batch) -> Tensor:
     """
     last = torch.full_like(batch["stop"], batch["states"].shape[1] - 1)
     path, count = ego_path(batch["states"], batch["valid"], stop=last)
-    recorded, known = ego_path(batch["logged"], batch["logged_valid"], stop=last)
+    recorded, recorded_count = ego_path(
+        batch["logged"], batch["logged_valid"], stop=last
+    )
     fraction = route_completion(
         path, count, logged=batch["logged"], logged_valid=batch["logged_valid"]
     )
-    pieces = torch.arange(1, recorded.shape[1]) < known[:, None]
-    distance = (
-        (recorded[:, 1:, :2] - recorded[:, :-1, :2]).norm(dim=-1).mul(pieces).sum(-1)
-    )
+    pieces = torch.arange(1, recorded.shape[1]) < recorded_count[:, None]
+    length = (recorded[:, 1:, :2] - recorded[:, :-1, :2]).norm(dim=-1)
+    distance = length.mul(pieces).sum(-1)
     driven = fraction.nan_to_num(0.0) * distance
     ratio = driven.clamp(min=PROGRESS_FLOOR) / distance.clamp(min=PROGRESS_FLOOR)
     end = path[torch.arange(len(path)), (count - 1).clamp(min=0)]
@@ -436,20 +398,20 @@ def comfort(ego: Tensor, length: Tensor) -> Tensor:
     (w^2 + dw/dt) more along the vehicle, at yaw rate w. Each is smoothed, then
     differentiated, by the devkit's Savitzky-Golay windows, and rounded as there.
     """
-    turns = wrap(ego[..., 2].diff(dim=1))
-    rear_axle = held_back(ego[..., 3].diff(dim=1) / DT)
-    yaw_rate = held_back(turns / DT)
-    yaw_accel = torch.nn.functional.pad(yaw_rate.diff(dim=1) / DT, (1, 0))
-    centre = rear_axle + REAR_AXLE * length[:, None] * (yaw_rate.square() + yaw_accel)
-    heading = torch.nn.functional.pad(turns.cumsum(1), (1, 0)).numpy()
-    longitudinal = smoothed(centre.numpy(), window=8, order=2)
-    total = smoothed(rear_axle.abs().numpy(), window=8, order=2)
+    turn = wrap(ego[..., 2].diff(dim=1))
+    accel = held_back(ego[..., 3].diff(dim=1) / DT)
+    yaw_rate = held_back(turn / DT)
+    yaw_accel = pad(yaw_rate.diff(dim=1) / DT, (1, 0))
+    centre = accel + REAR_AXLE * length[:, None] * (yaw_rate.square() + yaw_accel)
+    heading = pad(turn.cumsum(1), (1, 0))
+    longitudinal = smoothed(centre, window=8)
+    total = smoothed(accel.abs(), window=8)
     motion = {
         "longitudinal": longitudinal,
-        "yaw_rate": smoothed(heading, window=5, order=2, deriv=1),
+        "yaw_rate": smoothed(heading, window=5, deriv=1),
         "yaw_accel": smoothed(heading, window=5, order=3, deriv=2),
-        "longitudinal_jerk": smoothed(longitudinal, window=15, order=2, deriv=1),
-        "jerk": smoothed(total, window=15, order=2, deriv=1),
+        "longitudinal_jerk": smoothed(longitudinal, window=15, deriv=1),
+        "jerk": smoothed(total, window=15, deriv=1),
     }
     within = [
         (low < motion[name]) & (motion[name] < high)
@@ -464,8 +426,17 @@ def held_back(change: Tensor) -> Tensor:
     return torch.cat([change[:, :1], change], 1)
 
 
-def smoothed(values: np.ndarray, window: int, order: int, deriv: int = 0) -> np.ndarray:
-    """A Savitzky-Golay filter of values [B, T+1] at steps of DT, or its derivative, to
-    eight decimals."""
+def smoothed(
+    values: Tensor | np.ndarray, *, window: int, order: int = 2, deriv: int = 0
+) -> np.ndarray:
+    """A Savitzky-Golay filter, to eight decimals.
+
+    Args:
+        values: [B, T+1] at steps of DT.
+        window: in steps.
+        order: of its polynomials.
+        deriv: which derivative.
+    """
+    values = np.asarray(values)
     length = min(window, values.shape[-1])
-    return savgol_filter(values, length, order, deriv=deriv, delta=DT, axis=-1).round(8)
+    return savgol_filter(values, length, order, deriv=deriv, delta=DT).round(8)

@@ -6,6 +6,8 @@ them, or within half the lane's width + 1.0 m of its centreline. Distances are e
 from point to segment; a grid of buckets keeps the work near the number of points.
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -15,148 +17,145 @@ from e2rl.metrics.geometry import candidates, from_segment
 from e2rl.scenes.drivable_area import SEAM
 
 MARGIN = 1.0  # m beyond half the lane width
-LANE_CELL = 8.0  # m, grid of the lanes' segments
+CELL = 8.0  # m, grid of segments
 ROW = 4.0  # m, rows of the polygons' edges
 
 
-def line_segments(
-    points: Tensor, index: Tensor, closed: bool = False
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(rollout [m], line [m], ends [m, 2, 2]) of consecutive points [B, M, 2] with the
-    same line index [B, M] >= 0.
+class Points(NamedTuple):
+    """n points of rollouts."""
 
-    A line's points are adjacent rows. With `closed` a last segment joins each line's
-    last point to its first.
-    """
-    known = index >= 0
-    same_line = known[:, 1:] & (index[:, 1:] == index[:, :-1])
-    rollout, point = same_line.nonzero(as_tuple=True)
-    line = index[rollout, point]
-    ends = torch.stack([points[rollout, point], points[rollout, point + 1]], 1)
-    if closed and index.shape[1]:
-        edge = torch.ones_like(known[:, :1])
-        first = known & torch.cat([edge, ~same_line], 1)
-        last = known & torch.cat([~same_line, edge], 1)
-        ring, start = first.nonzero(as_tuple=True)
-        stop = last.nonzero(as_tuple=True)[1]
-        rollout = torch.cat([rollout, ring])
-        line = torch.cat([line, index[ring, start]])
-        ends = torch.cat(
-            [ends, torch.stack([points[ring, stop], points[ring, start]], 1)]
-        )
-    return rollout, line, ends
+    xy: Tensor  # [n, 2]
+    rollout: Tensor  # [n] int64
+
+    def outside(self, mask: Tensor) -> tuple["Points", Tensor]:
+        """The points where mask [n] is false, and their indices."""
+        index = (~mask).nonzero()[:, 0]
+        return Points(self.xy[index], self.rollout[index]), index
 
 
-def near_lane(
-    points: Tensor,
-    rollout: Tensor,
-    lane_points: Tensor,
-    lane_index: Tensor,
-    lane_width: Tensor,
-    margin: float = MARGIN,
-) -> Tensor:
-    """Bool [n]: points [n, 2] of rollouts [n] within width / 2 + margin of a lane's
-    centreline.
+class Segments(NamedTuple):
+    """m segments of lines of rollouts."""
 
-    lane_points [B, M, 2], lane_index [B, M] (-1 padding), lane_width [B, L].
-    """
-    owner, lane, ends = line_segments(lane_points, lane_index)
-    point, _ = near_segments(
-        points,
-        rollout,
-        owner=owner,
-        ends=ends,
-        reach=lane_width[owner, lane] / 2 + margin,
-    )
-    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, point, True)
+    rollout: Tensor  # [m] int64
+    line: Tensor  # [m] int64
+    ends: Tensor  # [m, 2, 2]
+
+    @classmethod
+    def of(cls, points: Tensor, index: Tensor, closed: bool = False) -> "Segments":
+        """Segments of consecutive points [B, M, 2] with the same line index [B, M] >= 0.
+
+        A line's points are adjacent rows. With `closed` a last segment joins each
+        line's last point to its first.
+        """
+        is_point = index >= 0
+        joined = is_point[:, 1:] & (index[:, 1:] == index[:, :-1])
+        rollout, begin = joined.nonzero(as_tuple=True)
+        end = begin + 1
+        if closed and index.shape[1]:
+            edge = torch.ones_like(is_point[:, :1])
+            first = is_point & torch.cat([edge, ~joined], 1)
+            last = is_point & torch.cat([~joined, edge], 1)
+            ring, start = first.nonzero(as_tuple=True)
+            rollout = torch.cat([rollout, ring])
+            begin = torch.cat([begin, last.nonzero(as_tuple=True)[1]])
+            end = torch.cat([end, start])
+        ends = torch.stack([points[rollout, begin], points[rollout, end]], 1)
+        return cls(rollout, index[rollout, begin], ends)
+
+    @classmethod
+    def lanes(cls, batch: Batch) -> "Segments":
+        """Of the centrelines of a batch."""
+        return cls.of(batch["lane_points"], batch["lane_index"])
+
+    @classmethod
+    def polygons(cls, batch: Batch) -> "Segments":
+        """Of the borders of the drivable polygons of a batch."""
+        return cls.of(batch["drivable_points"], batch["drivable_index"], closed=True)
 
 
 def near_segments(
-    points: Tensor, rollout: Tensor, owner: Tensor, ends: Tensor, reach: Tensor
+    points: Points, segments: Segments, reach: Tensor | float
 ) -> tuple[Tensor, Tensor]:
-    """(point, segment) of all pairs of a point [n, 2] of rollouts [n] and a segment [m,
-    2, 2] of rollouts `owner` [m] that is at most reach [m] m away."""
-    low = ends.amin(1) - reach[:, None]
-    high = ends.amax(1) + reach[:, None]
+    """Indices (point, segment) of all pairs of a rollout that are at most reach m (a
+    number, or [m] of each segment) apart."""
+    reach = torch.as_tensor(reach, dtype=points.xy.dtype).expand(len(segments.line))
     point, segment = candidates(
-        points, rollout, low=low, high=high, item_group=owner, cell=LANE_CELL
+        points.xy,
+        points.rollout,
+        low=segments.ends.amin(1) - reach[:, None],
+        high=segments.ends.amax(1) + reach[:, None],
+        item_group=segments.rollout,
+        cell=CELL,
     )
-    start = ends[segment, 0]
-    along = (ends[:, 1] - ends[:, 0])[segment]
-    near = (
-        from_segment(points[point], start, along=along).square().sum(-1)
-        <= reach[segment].square()
-    )
+    start, end = segments.ends[segment].unbind(1)
+    offset = from_segment(points.xy[point], start, along=end - start)
+    near = offset.square().sum(-1) <= reach[segment].square()
     return point[near], segment[near]
 
 
-def inside_polygon(
-    points: Tensor, rollout: Tensor, polygon_points: Tensor, polygon_index: Tensor
-) -> Tensor:
-    """Bool [n]: points [n, 2] of rollouts [n] inside a polygon, by the parity of edges
-    crossed on a ray towards +x.
+def near_lane(points: Points, batch: Batch, margin: float = MARGIN) -> Tensor:
+    """Bool [n]: points within width / 2 + margin of a lane's centreline."""
+    lanes = Segments.lanes(batch)
+    reach = batch["lane_width"][lanes.rollout, lanes.line] / 2 + margin
+    point, _ = near_segments(points, lanes, reach)
+    return is_among(point, points)
 
-    polygon_points [B, D, 2], polygon_index [B, D] (-1 padding); polygons may overlap.
-    """
-    owner, polygon, ends = line_segments(polygon_points, polygon_index, closed=True)
-    y = ends[..., 1]
+
+def inside_polygon(points: Points, polygons: Segments) -> Tensor:
+    """Bool [n]: points inside a polygon, by the parity of edges crossed on a ray
+    towards +x; polygons may overlap."""
+    height = polygons.ends[..., 1]
     point, edge = candidates(
-        points[:, 1:],
-        rollout,
-        low=y.amin(1)[:, None],
-        high=y.amax(1)[:, None],
-        item_group=owner,
+        points.xy[:, 1:],
+        points.rollout,
+        low=height.amin(1)[:, None],
+        high=height.amax(1)[:, None],
+        item_group=polygons.rollout,
         cell=ROW,
     )
-    x, height = points[point].unbind(-1)
-    (x0, y0), (x1, y1) = ends[edge, 0].unbind(-1), ends[edge, 1].unbind(-1)
-    straddles = (y0 > height) != (y1 > height)
+    x, y = points.xy[point].unbind(-1)
+    begin, end = polygons.ends[edge].unbind(1)
+    x0, y0 = begin.unbind(-1)
+    x1, y1 = end.unbind(-1)
+    straddles = (y0 > y) != (y1 > y)
     rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
-    crossed = straddles & (x < x0 + (height - y0) / rise * (x1 - x0))
-    polygons = max(int(polygon_index.amax()) + 1, 1) if polygon_index.numel() else 1
-    key, count = (point * polygons + polygon[edge])[crossed].unique(return_counts=True)
-    return torch.zeros(len(points), dtype=torch.bool).index_fill(
-        0, key[count % 2 == 1] // polygons, True
-    )
+    crossed = straddles & (x < x0 + (y - y0) / rise * (x1 - x0))
+    pairs = torch.stack([point, polygons.line[edge]], 1)[crossed]
+    pairs, count = pairs.unique(dim=0, return_counts=True)
+    return is_among(pairs[count % 2 == 1, 0], points)
 
 
-def in_seam(
-    points: Tensor, rollout: Tensor, polygon_points: Tensor, polygon_index: Tensor
-) -> Tensor:
-    """Bool [n]: points [n, 2] of rollouts [n] within SEAM of the borders of two
-    polygons or more.
-
-    polygon_points [B, D, 2], polygon_index [B, D] (-1 padding). Many maps draw polygons
-    that adjoin with a gap.
-    """
-    owner, polygon, ends = line_segments(polygon_points, polygon_index, closed=True)
-    point, segment = near_segments(
-        points, rollout, owner=owner, ends=ends, reach=ends.new_full(owner.shape, SEAM)
-    )
-    pairs = torch.stack([point, polygon[segment]], 1).unique(dim=0)
-    return torch.bincount(pairs[:, 0], minlength=len(points)) > 1
+def in_seam(points: Points, polygons: Segments) -> Tensor:
+    """Bool [n]: points within SEAM of the borders of two polygons or more. Many maps
+    draw polygons that adjoin with a gap."""
+    point, segment = near_segments(points, polygons, SEAM)
+    pairs = torch.stack([point, polygons.line[segment]], 1).unique(dim=0)
+    return torch.bincount(pairs[:, 0], minlength=len(points.xy)) > 1
 
 
-def has_lines(index: Tensor) -> Tensor:
-    """Bool [B]: some line of index [B, M] has at least two points."""
-    return ((index[:, 1:] >= 0) & (index[:, 1:] == index[:, :-1])).any(-1)
+def is_among(index: Tensor, points: Points) -> Tensor:
+    """Bool [n]: points whose index is among these."""
+    mask = torch.zeros(len(points.xy), dtype=torch.bool)
+    return mask.index_fill(0, index, True)
 
 
-def on_road(points: Tensor, rollout: Tensor, batch: Batch) -> Tensor:
-    """Bool [n]: points [n, 2] of rollouts [n] int64 are on the road of the batch's
-    maps."""
-    polygons = batch["drivable_points"], batch["drivable_index"]
-    near = near_lane(
-        points,
-        rollout,
-        lane_points=batch["lane_points"],
-        lane_index=batch["lane_index"],
-        lane_width=batch["lane_width"],
-    )
+def on_road(points: Points, batch: Batch) -> Tensor:
+    """Bool [n]: points are on the road of the batch's maps."""
+    result = near_lane(points, batch)
+    polygons = Segments.polygons(batch)
     for holds in (inside_polygon, in_seam):
-        rest = (~near).nonzero()[:, 0]
-        near[rest] = holds(points[rest], rollout[rest], *polygons)
-    return near
+        others, index = points.outside(result)
+        result[index] = holds(others, polygons)
+    return result
+
+
+def has_map(batch: Batch) -> Tensor:
+    """Bool [B]: some lane or polygon has at least two points."""
+
+    def has_line(index: Tensor) -> Tensor:
+        return ((index[:, 1:] >= 0) & (index[:, 1:] == index[:, :-1])).any(-1)
+
+    return has_line(batch["lane_index"]) | has_line(batch["drivable_index"])
 
 
 @columns(
@@ -180,37 +179,31 @@ def off_road_columns(batch: Batch) -> Batch:
     """
     states = batch["states"]
     stop = batch["stop"]
-    counted = batch["traffic"] & batch["valid"][:, 0]
-    looked_at = counted.clone()
-    looked_at[:, 0] = True
-    steps = torch.arange(states.shape[1], device=states.device)
-    asked = batch["valid"] & looked_at[:, None] & (steps <= stop[:, None])[..., None]
-    index = asked.nonzero(as_tuple=True)
-    road_here = torch.zeros_like(asked)
-    road_here[index] = on_road(states[index][:, :2], index[0], batch=batch)
-    ego_off = (asked & ~road_here)[..., 0]
-    seen = (
-        asked
-        & counted[:, None]
-        & road_here[:, :1]
-        & steps_until(stop, states.shape[1])[..., None]
-    )
-    mapped = has_lines(batch["lane_index"]) | has_lines(batch["drivable_index"])
-    number = seen.sum((1, 2)) * mapped
-    off = (seen & ~road_here).sum((1, 2)).to(states.dtype)
-    unknown, beside = (
-        number == 0,
-        ~road_here[:, 0, 0],
-    )  # the ego is beside the road, or not there, at the start
+    steps = torch.arange(states.shape[1])
+    until_stop = (steps <= stop[:, None])[..., None]
+    traffic = batch["traffic"] & batch["valid"][:, 0]
+    vehicles = traffic.clone()
+    vehicles[:, 0] = True
+    present = batch["valid"] & vehicles[:, None] & until_stop
+    index = present.nonzero(as_tuple=True)
+    is_on_road = torch.zeros_like(present)
+    is_on_road[index] = on_road(Points(states[index][:, :2], index[0]), batch)
+    starts_on_road = is_on_road[:, 0]
+    counted = present & (traffic & starts_on_road)[:, None]
+    counted = counted & steps_until(stop, states.shape[1])[..., None]
+
+    unmapped = ~has_map(batch)
+    number = counted.sum((1, 2)) * ~unmapped
+    off = (counted & ~is_on_road).sum((1, 2)).to(states.dtype)
+    left_out = (traffic & ~starts_on_road).sum(-1).to(states.dtype)
+    ego_off = (present & ~is_on_road)[..., 0].any(1).to(states.dtype)
+    unknown = number == 0
     return {
         "aor_step": (off / number.clamp(min=1)).masked_fill(unknown, torch.nan),
         "aor_any": (off > 0).to(states.dtype).masked_fill(unknown, torch.nan),
-        "aor_left_out": (counted & ~road_here[:, 0])
-        .sum(-1)
-        .to(states.dtype)
-        .masked_fill(~mapped, torch.nan),
+        "aor_left_out": left_out.masked_fill(unmapped, torch.nan),
         "aor_vehicle_steps": number,
-        "ego_off_road": ego_off.any(1)
-        .to(states.dtype)
-        .masked_fill(beside | ~mapped, torch.nan),
+        "ego_off_road": ego_off.masked_fill(
+            ~starts_on_road[:, 0] | unmapped, torch.nan
+        ),
     }

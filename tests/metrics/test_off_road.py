@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from e2rl.metrics.off_road import in_seam, inside_polygon, near_lane
+from e2rl.metrics.off_road import Points, Segments, in_seam, inside_polygon, near_lane
 from tests.metrics.random_rollouts import random_map
 from tests.metrics.test_contact import course, row
 
@@ -40,14 +40,9 @@ def parts(road, name, rollout, minimum):
 
 
 def test_distance_to_lanes_is_shapely_s():
-    road, (points, rollout) = doubles(4, 1), random_points(6000, 4, seed=2)
-    near = near_lane(
-        points,
-        rollout,
-        lane_points=road["lane_points"],
-        lane_index=road["lane_index"],
-        lane_width=road["lane_width"],
-    ).numpy()
+    road = doubles(4, 1)
+    points, rollout = random_points(6000, 4, seed=2)
+    near = near_lane(Points(points, rollout), road).numpy()
     for index in range(4):
         chosen = (rollout == index).numpy()
         expected = np.zeros(chosen.sum(), bool)
@@ -60,13 +55,10 @@ def test_distance_to_lanes_is_shapely_s():
 
 
 def test_inside_overlapping_polygons_is_shapely_s():
-    road, (points, rollout) = doubles(5, 3), random_points(6000, 5, seed=4)
-    inside = inside_polygon(
-        points,
-        rollout,
-        polygon_points=road["drivable_points"],
-        polygon_index=road["drivable_index"],
-    ).numpy()
+    road = doubles(5, 3)
+    points, rollout = random_points(6000, 5, seed=4)
+    polygons = Segments.polygons(road)
+    inside = inside_polygon(Points(points, rollout), polygons).numpy()
     for index in range(5):
         chosen = (rollout == index).numpy()
         where = shapely.points(points[chosen].numpy())
@@ -115,8 +107,6 @@ def test_a_seam_between_polygons_is_theirs_and_an_outer_border_is_none(gap, on):
         [[10.0 + gap / 2, 5.0], [-0.1, 5.0], [5.0, 10.1]], dtype=torch.float64
     )
     assert in_seam(
-        points,
-        torch.zeros(3, dtype=torch.long),
-        polygon_points=polygons,
-        polygon_index=index,
+        Points(points, torch.zeros(3, dtype=torch.long)),
+        Segments.of(polygons, index, closed=True),
     ).tolist() == [on, False, False]
