@@ -205,3 +205,25 @@ def test_speeds_just_above_and_below_the_thresholds():
         window[0, :, 0, 3] = 10 + gain * 0.1 * (steps - WINDOW + LATE).clamp(min=0)
         found = manoeuvre(window, torch.tensor([WINDOW]), lanes=window[..., 2])
         assert MANOEUVRES[found.item()] == word
+
+
+def word_of(speed):
+    """The manoeuvre of a vehicle with these speeds [21], straight on along its lane."""
+    window = torch.zeros(1, 21, 2, 4, dtype=torch.float64)
+    window[0, :, :, 3] = speed[:, None]
+    index = manoeuvre(window, torch.tensor([20]), lanes=window[..., 2])
+    return MANOEUVRES[index[0, 0].item()]
+
+
+@pytest.mark.parametrize(("speed", "word"), [(0.49, "stands"), (0.51, "keeps speed")])
+def test_a_vehicle_stands_below_half_a_metre_a_second(speed, word):
+    assert word_of(torch.full((21,), speed)) == word
+
+
+@pytest.mark.parametrize(("first", "word"), [(8, "keeps speed"), (12, "brakes")])
+def test_the_acceleration_is_that_of_the_last_second(first, word):
+    """10 steps are left of the 21: who brakes within two steps before or in it."""
+    speed = torch.full((21,), 10.0)
+    speed[first:] = 9.5
+    speed[first + 1 :] = 8.0
+    assert word_of(speed) == word

@@ -11,7 +11,7 @@ from tests.metrics.test_contact import course, row
 
 
 def test_without_anybody_or_with_whom_the_ego_follows_nobody_is_near():
-    assert row(course(0, 0, heading=0, speed=5))["margin"] == -FARTHEST
+    assert row(course(0, 0, heading=0, speed=5))["margin"] == -30.0
     assert (
         row(course(0, 0, heading=0, speed=5), course(20, 0, heading=0, speed=5))[
             "margin"
@@ -56,3 +56,25 @@ def test_a_contact_has_the_share_of_its_speed_that_the_driver_has_lost_before_it
     batch = {"states": states, "driver": driver, "before": step, "stop": step + 1}
     found = contact_margin(batch | {"preventable": torch.tensor([0, 0, 0, 1])})
     torch.testing.assert_close(found, torch.tensor([0.4, 0.0, 0.0, PREVENTED]))
+
+
+@pytest.mark.parametrize(("speed", "counts"), [(5.9, False), (6.1, True)])
+def test_a_pair_counts_from_a_relative_speed_of_a_metre_a_second_on(speed, counts):
+    """Beside the ego at 5 m/s, 2 m between the sides, and faster."""
+    found = row(course(0, 0, heading=0, speed=5), course(1, 4, heading=0, speed=speed))
+    assert (found["margin"] > -FARTHEST) is counts
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(29.0, -29.0), (31.0, -30.0)])
+def test_nobody_is_farther_than_30_m(gap, expected):
+    """A vehicle that passes by so far beside."""
+    found = row(
+        course(0, 0, heading=0, speed=10),
+        course(60, gap + 2.0, heading=math.pi, speed=10),
+    )
+    assert found["margin"] == pytest.approx(expected, abs=0.2)
+
+
+def test_a_preventable_contact_has_twice_the_most_that_others_have():
+    found = row(course(0, 0, heading=0, speed=10), course(60, 0, heading=0, speed=0))
+    assert found["margin"] == 2.0

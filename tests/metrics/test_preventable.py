@@ -13,6 +13,8 @@ from e2rl.metrics.preventable import (
     along_path,
     contacts,
     driven_length,
+    follows,
+    last_direction,
     poses,
     preventions,
     redrive,
@@ -232,3 +234,77 @@ def test_the_order_of_the_others_does_not_matter():
     )
     for name, result in preventions(case).items():
         assert other[name].avoided.item() == result.avoided.item()
+
+
+def later_contact(steps):
+    """The human driver's Prevention where the partner is put onto the driver, who has
+    braked for it, so many steps after the ego's contact."""
+    case = collision(track(14.0), track(0.0, start=(45.0, 0.0)))
+    driver = human(case).states
+    states = case.states.clone()
+    later = int(case.stop) + steps
+    states[0, later:, 1, :2] = driver[0, later:, :2] + torch.tensor([0.0, 1.0])
+    return human(case._replace(states=states))
+
+
+@pytest.mark.parametrize(("steps", "avoided"), [(30, False), (31, True)])
+def test_the_driver_must_touch_nobody_for_three_seconds_after_the_contact(
+    steps, avoided
+):
+    assert later_contact(steps).avoided.item() is avoided
+
+
+@pytest.mark.parametrize(("nearer", "avoided"), [(14, False), (15, True)])
+def test_the_partner_and_the_fifteen_nearest_others_are_there(nearer, avoided):
+    """One that is put onto the driver after the ego's contact, and others that pass
+    beside, nearer to the ego."""
+    case = collision(
+        track(14.0),
+        track(0.0, start=(45.0, 0.0)),
+        *(track(14.0, start=(0.0, 4.0 + 0.1 * k)) for k in range(nearer)),
+        track(0.0, start=(-200.0, 0.0)),
+    )
+    driver = human(case).states
+    states = case.states.clone()
+    later = int(case.stop) + 20
+    states[0, later:, -1, :2] = driver[0, later:, :2] + torch.tensor([0.0, 1.0])
+    result = human(case._replace(states=states))
+    assert result.avoided.item() is avoided
+
+
+def test_a_chain_has_two_followers():
+    """Two brake in time one behind the other; the third, which tailgates, is not
+    looked at."""
+    case = collision(
+        track(14.0),
+        cut_in(14.0, 14.0, other_speed=6.0),
+        follower(20.0),
+        follower(35.3),
+        follower(44.8),
+    )
+    result = human(case)
+    assert result.followers.item() == 2
+    assert result.avoided.item()
+
+
+@pytest.mark.parametrize(("way", "reverses"), [(0.019, False), (0.021, True)])
+def test_two_centimetres_in_a_step_tell_the_direction_of_motion(way, reverses):
+    states = torch.zeros(1, 3, 4, dtype=torch.float64)
+    states[0, 1:, 0] = -way
+    direction = last_direction(states, torch.tensor([2]))
+    assert (direction.abs() > 3).item() is reverses
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(59, True), (61, False)])
+def test_a_follower_drives_within_60_degrees_of_its_leader(degrees, expected):
+    behind = others(track(5.0, math.radians(degrees), start=(-4.0, 0.0)))
+    step = torch.tensor([0])
+    found = follows(track(5.0), behind, step=step, index=step)
+    assert found.item() is expected
+
+
+def test_a_path_goes_on_straight_beyond_its_end():
+    standing = track(0.0)
+    crossing = others(track(0.0, math.pi / 2, start=(75.0, 0.0)))
+    along = along_path(standing, SIZE[:, 1], others=crossing)
+    assert along.rear[0, 0, 0].item() == pytest.approx(74.0)

@@ -6,7 +6,10 @@ import math
 import pytest
 import torch
 
+from e2rl.metrics.contact import FRONT, SIDE
 from e2rl.metrics.score import score_rollouts
+from e2rl.metrics.sideways import lanes_along, moved_into, moved_within
+from tests.metrics.pairs import LENGTH, WIDTH, lane, pair, straight
 from tests.metrics.test_contact import course, scene
 from tests.metrics.test_failure_features import drive
 
@@ -319,3 +322,94 @@ def test_a_u_turn_into_the_lane_of_who_comes_is_at_fault_until_its_nose_has_been
     assert row["cfr"] == 1
     assert row["at_fault"] == 1
     assert row["duty"] == "none"
+
+
+def beside_each_other(ego_offset, partner_offset, steps=10):
+    """`moved_within` of two vehicles side by side on lanes along +x, which move towards
+    each other by these offsets and overlap by 1 mm at the end."""
+    share = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
+    gap = ego_offset + partner_offset - 1e-3
+    zero = torch.zeros_like(share)
+    ego = torch.stack([zero, ego_offset * share, zero, zero + 1], -1)
+    y = WIDTH + gap - partner_offset * share
+    partner = torch.stack([zero, y, zero, zero + 1], -1)
+    states = torch.stack([ego, partner], 1)[None]
+    size = torch.tensor([LENGTH, WIDTH], dtype=torch.float64).expand(1, 2, 2)
+    return moved_within(states, size, lanes=torch.zeros_like(states[..., 0])).tolist()
+
+
+@pytest.mark.parametrize(("offset", "moved"), [(0.19, False), (0.21, True)])
+def test_a_fifth_of_a_metre_is_a_movement(offset, moved):
+    assert beside_each_other(offset, 0.0) == [[moved, False]]
+
+
+@pytest.mark.parametrize(("share", "moved"), [(0.48, False), (0.52, True)])
+def test_who_moves_half_as_far_as_the_other_moved_too(share, moved):
+    assert beside_each_other(share * 1.0, 1.0) == [[moved, True]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "first", "moved"),
+    [
+        (FRONT, 10, True),
+        (FRONT, 12, False),
+        (SIDE, 20, True),
+        (SIDE, 22, False),
+    ],
+)
+def test_a_movement_is_of_the_last_second_or_of_two_at_the_ego_s_side(
+    kind, first, moved
+):
+    """The ego moves over `first` steps before the contact and is beside the other's
+    strip no longer after that step."""
+    stop = 60
+    ego = straight(0, 0, heading=EAST, speed=10)
+    ego[stop - first + 1 :, 1] = 0.5
+    partner = straight(0, WIDTH + 0.4, heading=EAST, speed=10)
+    lines = lane(*((float(x), 0.0) for x in range(-10, 110, 2)))
+    found = moved_into(pair(ego, partner, stop, kind=kind, lanes=lines))
+    assert found.tolist() == [[moved, False]]
+
+
+@pytest.mark.parametrize(("steps", "moved"), [(39, True), (41, False)])
+def test_a_lane_is_remembered_for_four_seconds(steps, moved):
+    """The ego leaves its lane and drives on at an angle to it, where no lane is: it
+    moves across the lane, and after it is forgotten not across its own direction."""
+    stop = 60
+    heading = math.radians(20)
+    ego = straight(0, 0, heading=heading, speed=5, at=stop)
+    partner = straight(1.0, WIDTH + 0.3, heading=EAST, speed=0)
+    last = ego[stop - steps, 0].item()
+    lines = lane(*((last - 3.8 - d, ego[stop - steps, 1].item()) for d in (4, 2, 0)))
+    found = moved_into(pair(ego, partner, stop, kind=SIDE, lanes=lines))
+    assert found[0, 0].item() is moved
+
+
+def lane_of(angle=0.0, offset=0.0, lanes=None):
+    """Heading of the lane of a vehicle at the origin that drives at an angle to a lane
+    along +x, `offset` m beside it; None without one."""
+    ego = straight(0, offset, heading=angle, speed=0)
+    lines = lanes or lane(*((float(x), 0.0) for x in range(-10, 12, 1)))
+    moments = pair(ego, ego, 5, lanes=lines).states[:, :1]
+    heading, known = lanes_along(pair(ego, ego, 5, lanes=lines), moments)
+    return heading[0, 0, 0].item() if known[0, 0, 0] else None
+
+
+@pytest.mark.parametrize(("offset", "expected"), [(3.95, 0.0), (4.05, None)])
+def test_a_lane_is_a_vehicle_s_within_4_m(offset, expected):
+    assert lane_of(offset=offset) == expected
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(44, 0.0), (46, None)])
+def test_a_lane_is_a_vehicle_s_within_45_degrees(degrees, expected):
+    assert lane_of(angle=math.radians(degrees)) == expected
+
+
+@pytest.mark.parametrize(("beside", "expected"), [(1.5, 0.0), (1.7, 0.4)])
+def test_a_radian_weighs_as_much_as_4_m(beside, expected):
+    """A lane through the vehicle at 0.4 rad, which is as good as one 1.6 m beside."""
+    slanted = [(s * math.cos(0.4), s * math.sin(0.4)) for s in range(-4, 5)]
+    parallel = [(float(x), beside) for x in range(-4, 5)]
+    points = torch.tensor([slanted + parallel], dtype=torch.float64)
+    index = torch.tensor([[0] * 9 + [1] * 9])
+    assert lane_of(lanes=(points, index)) == pytest.approx(expected)
