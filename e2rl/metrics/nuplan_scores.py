@@ -110,8 +110,8 @@ def nuplan_columns(batch: Batch) -> Batch:
         "speed_limit_compliance": speed_limit(batch),
         "ego_is_comfortable": comfort(ego, batch["size"][:, 0, 0]),
     }
-    mean = sum(weight * scores[name] for name, weight in WEIGHTS.items())
-    mean = mean / sum(WEIGHTS.values())
+    total = sum(weight * scores[name] for name, weight in WEIGHTS.items())
+    mean = total / sum(WEIGHTS.values())
     multipliers = torch.stack([scores[name] for name in MULTIPLIERS])
     scores["nuplan_score"] = mean * multipliers.prod(0)
     unknown = batch["start_overlap"] | ~batch["valid"][..., 0].all(1)
