@@ -117,3 +117,43 @@ def test_the_clock_starts_at_the_competent_driver_s_risk_and_runs_while_it_lasts
     begins = 0.0 if ahead < 30 else -1.0
     assert float(since[0, 1]) == (before + 0.5 if before >= 0 else begins)
     assert float(since[0, 2]) == -1.0, "it is in the next lane"
+
+
+def test_the_worth_of_a_plan_is_the_share_of_drivers_whom_it_hits_less_for_later_ones():
+    """A car that stands 38 m ahead is hit by the driver who does not react alone, of
+    weight 0.05, after some 4 s of 5.1; a tenth is lost at the end of the horizon."""
+    foresight = standing(38.0)()
+    time = float(foresight.time)
+    assert time == pytest.approx(3.9, abs=0.2)
+    assert float(foresight.worth) == pytest.approx(0.05 * (1 - 0.1 * time / 5.1))
+
+
+def test_all_but_the_competent_driver_run_into_what_only_that_one_prevents():
+    need = float(HumanDriver().stopping_gap(torch.tensor(SPEED)))
+    foresight = standing(1.02 * need)()
+    late = 1 - 0.1 * float(foresight.time) / 5.1
+    assert float(foresight.worth) == pytest.approx(
+        (0.4 + 0.3 + 0.15 + 0.1 + 0.05) * late
+    )
+
+
+@pytest.mark.parametrize(("lap", "counts"), [(0.7, True), (0.9, False)])
+def test_a_contact_is_the_ego_s_front_if_they_lapped_by_less_than_0_8_m(lap, counts):
+    """A car comes from the next lane into the ego's, its rear so far behind the ego's
+    front."""
+    path = torch.zeros(1, STEPS, 4)
+    path[0, :, 0] = SPEED * 0.1 * torch.arange(STEPS)
+    path[..., 3] = SPEED
+    tracks = torch.zeros(1, 1, STEPS, 4)
+    tracks[..., 0] = path[..., 0] + 4.0 - lap
+    tracks[..., 1] = torch.where(torch.arange(STEPS) < 10, 4.0, 0.0)
+    tracks[..., 3] = SPEED
+    foresight = foresee(
+        path,
+        SIZE,
+        tracks=tracks,
+        sizes=SIZE,
+        since=torch.tensor([-1.0]),
+        settled=torch.tensor([True]),
+    )
+    assert bool(foresight.worth > 0) == counts

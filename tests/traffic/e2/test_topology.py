@@ -178,3 +178,34 @@ def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypa
     assert len(order) > 3 and result.candidates[0].nonzero()[:, 0].tolist() == sorted(
         order[:3]
     )
+
+
+def candidates_of(pairs, vehicles, monkeypatch):
+    """Candidates where just these pairs are at risk, of vehicles 10 m apart in a row
+    from the ego on."""
+    weight = torch.zeros(vehicles, vehicles)
+    for i, j in pairs:
+        weight[i, j] = weight[j, i] = 0.9
+    monkeypatch.setattr(
+        topology, "pair_weights", lambda states, *_, **__: weight.expand(1, 1, -1, -1)
+    )
+    states = torch.zeros(1, 1, vehicles, 4)
+    states[..., 0] = 10.0 * torch.arange(vehicles)
+    result = topological_candidates(
+        states,
+        torch.ones(1, 1, vehicles, dtype=torch.bool),
+        size=torch.tensor([4.0, 2.0]).expand(1, vehicles, 2),
+        settings=TopologySettings(top_cliques=100, candidates=100),
+    )
+    return result.candidates[0].nonzero()[:, 0].tolist()
+
+
+def test_a_queue_counts_up_to_three_vehicles_from_the_ego(monkeypatch):
+    """Cliques need a member within two edges: 2 and 3 are one, 3 and 4 are none."""
+    queue = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
+    assert candidates_of(queue, 6, monkeypatch) == [1, 2, 3]
+
+
+def test_graphs_have_the_ego_and_the_23_vehicles_nearest_to_it(monkeypatch):
+    star = [(0, vehicle) for vehicle in range(1, 30)]
+    assert candidates_of(star, 30, monkeypatch) == list(range(1, 24))
