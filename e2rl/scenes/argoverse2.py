@@ -266,7 +266,12 @@ def _forward(quaternions: ndarray) -> ndarray:
     """The x axis [K, 3] that unit quaternions [K, 4] turn to."""
     w, x, y, z = quaternions.T
     return np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y + w * z),
+            2 * (x * z - w * y),
+        ],
+        -1,
     )
 
 

@@ -86,7 +86,8 @@ def overlap(
         first, first_size, second, second_size: see `separation`.
     """
     reach = (first_size.norm(dim=-1) + second_size.norm(dim=-1)) / 2
-    near = (first[..., :2] - second[..., :2]).square().sum(-1) < reach.square()
+    offset = first[..., :2] - second[..., :2]
+    near = offset.square().sum(-1) < reach.square()
     if torch.compiler.is_compiling():
         gap = separation(
             first,

@@ -111,7 +111,8 @@ def _lower(
     dense = _dense(ring)
     tree = cKDTree(dense)
     cell = np.stack(np.meshgrid(x, y, indexing="ij"), -1)
-    least = tree.query(cell[::TILE, ::TILE] + (TILE - CELL) / 2)[0] - RADIUS - DENSE / 2
+    middle = cell[::TILE, ::TILE] + (TILE - CELL) / 2
+    least = tree.query(middle)[0] - RADIUS - DENSE / 2
     least = least.repeat(TILE, 0).repeat(TILE, 1)[: len(x), : len(y)]
     inside = np.zeros(beyond.shape, bool)
     box = _near(
@@ -132,7 +133,8 @@ def _lower(
 def _dense(ring: ndarray) -> ndarray:
     """A closed ring [P, 2] with points at most DENSE apart."""
     side = np.concatenate([ring[1:], ring[:1]]) - ring
-    count = np.maximum(np.ceil(np.sqrt(np.vecdot(side, side)) / DENSE), 1).astype(int)
+    length = np.sqrt(np.vecdot(side, side))
+    count = np.maximum(np.ceil(length / DENSE), 1).astype(int)
     first = np.repeat(np.cumsum(count) - count, count)
     share = (np.arange(count.sum()) - first) / np.repeat(count, count)
     return np.repeat(ring, count, 0) + share[:, None] * np.repeat(side, count, 0)

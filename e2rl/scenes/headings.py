@@ -72,7 +72,8 @@ def mend_headings(
     states = np.where(valid[..., None], states, 0.0)
     rides = valid & (agent_type != PEDESTRIAN)
     turned = _turned_round(states, rides)
-    states[..., 2] = np.where(turned, wrap(states[..., 2] + np.pi), states[..., 2])
+    opposite = wrap(states[..., 2] + np.pi)
+    states[..., 2] = np.where(turned, opposite, states[..., 2])
     states[..., 3] = np.where(turned, -states[..., 3], states[..., 3])
     counts = {
         "headings turned round": int(turned.any(0).sum()),
@@ -228,7 +229,8 @@ def _turned_round(states: ndarray, valid: ndarray) -> ndarray:
     fast = valid & (speed > BACKWARDS)
     slow = valid & (speed > MOVES) & ~fast
     flips = np.abs(wrap(np.diff(heading, axis=0))) > np.pi / 2
-    odd = (flips & valid[1:] & valid[:-1]).any(0) | (fast & backwards).any(0)
+    odd = (flips & valid[1:] & valid[:-1]).any(0)
+    odd |= (fast & backwards).any(0)
     agents = np.flatnonzero(odd | _flips_in_a_gap(heading, valid))
     slow_cost = np.minimum(SLOW_COST, SLOW / np.maximum(slow.sum(0), 1))
     cost = fast * FAST_COST + slow * slow_cost
@@ -249,7 +251,8 @@ def _flips_in_a_gap(heading: ndarray, valid: ndarray) -> ndarray:
     """Whether a track [F, A] comes back from a gap turned by more than pi / 2 [A]."""
     last = last_valid(valid)[1:-1]
     turn = heading[1:] - heading[np.maximum(last, 0), np.arange(valid.shape[1])]
-    return (valid[1:] & (last >= 0) & (np.abs(wrap(turn)) > np.pi / 2)).any(0)
+    returns = valid[1:] & (last >= 0)
+    return (returns & (np.abs(wrap(turn)) > np.pi / 2)).any(0)
 
 
 def _least_cost(

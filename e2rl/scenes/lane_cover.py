@@ -107,7 +107,10 @@ class LaneCover:
         x, y = (middle[tile] - self.points[point]).T
         keep = np.ones(len(tile), bool)
         step = np.diff(self.points, axis=0) * (np.diff(self.reach) == 0)[:, None]
-        for side in (np.pad(step, ((0, 1), (0, 0))), np.pad(-step, ((1, 0), (0, 0)))):
+        none = np.zeros((min(len(self.points), 1), 2))
+        after = np.concatenate([step, none])
+        before = np.concatenate([none, -step])
+        for side in (after, before):
             bound = (side**2).sum(1) / 2 + HALF * np.abs(side).sum(1) + 1e-9
             keep &= side[point, 0] * x + side[point, 1] * y <= bound[point]
         tile = tile[keep]

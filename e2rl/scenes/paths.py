@@ -63,7 +63,8 @@ def points_at(
     points = np.stack([np.interp(at, arc, line[:, axis]) for axis in range(2)], 1)
     beyond = at > arc[-1]
     if beyond.any():
-        unit = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+        last = line[-1] - line[-2]
+        unit = last / np.linalg.norm(last)
         points[beyond] = line[-1] + (at[beyond] - arc[-1])[:, None] * unit
     return points
 

@@ -151,7 +151,8 @@ class _Machine(LIBRARY):
     def set_items(self, parts: list[Any]) -> None:
         if len(parts) % 2:
             raise ValueError("sets an item without a value")
-        self.growing(dict).update(zip(as_keys(parts[::2]), parts[1::2], strict=True))
+        keys = as_keys(parts[::2])
+        self.growing(dict).update(zip(keys, parts[1::2], strict=True))
 
     def append_item(self) -> None:
         part = self.stack.pop()

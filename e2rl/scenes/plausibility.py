@@ -289,7 +289,8 @@ def motion(recording: Recording) -> dict[str, float]:
     ego = track == recording.ego
     ratio = (speed * FRAMES * DT + 0.05) / (distance + 0.05)
     far = distance > MOVED
-    turned = np.abs(wrap(np.arctan2(moved[:, 1], moved[:, 0]) - pose[:, 2]))
+    course = np.arctan2(moved[:, 1], moved[:, 0])
+    turned = np.abs(wrap(course - pose[:, 2]))
     slow = distance < BACKWARDS * FRAMES * DT  # it may reverse
     turned = np.where(slow, np.minimum(turned, pi - turned), turned)
     single = recording.valid.any(0) & (recording.agent_type == VEHICLE)

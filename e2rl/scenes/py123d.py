@@ -347,7 +347,8 @@ def _lane(segment: Any, has_z: bool) -> Lane:
     """A lane without its links; its width is that of its area over its length."""
     line = segment.centerline_3d if has_z else segment.centerline_2d
     points = np.asarray(line.array, float)
-    length = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).sum()
+    step = np.diff(points[:, :2], axis=0)
+    length = np.linalg.norm(step, axis=1).sum()
     return Lane(
         points=points[:, :2],
         width=float(segment.shapely_polygon.area / length) if length > 0 else 0.0,

@@ -245,6 +245,7 @@ def _interpolate(
     weight = np.where(span > 0, share, 0.0)
     out = first + weight[..., None] * (last - first)
     turn = wrap(last[..., 2] - first[..., 2])
-    turning = np.where(np.abs(turn) > FLIP, np.round(np.clip(weight, 0, 1)), weight)
+    nearer = np.round(np.clip(weight, 0, 1))
+    turning = np.where(np.abs(turn) > FLIP, nearer, weight)
     out[..., 2] = first[..., 2] + turning * turn
     return out

@@ -16,7 +16,8 @@ class Runs(NamedTuple):
 
 def runs_of(valid: ndarray) -> Runs:
     """Returns the runs of tracks that are valid [F, A], track by track."""
-    edge = np.diff(np.pad(valid.T, ((0, 0), (1, 1))).astype(np.int8))
+    padded = np.pad(valid.T, ((0, 0), (1, 1)))
+    edge = np.diff(padded.astype(np.int8))
     agent, start = np.nonzero(edge == 1)
     return Runs(agent, start, end=np.nonzero(edge == -1)[1])
 

@@ -144,8 +144,10 @@ def _behind(
         return True
     unit = direction(heading)
     along = (offset * unit).sum(-1)[in_line]
-    across = (offset[:, 1] * unit[:, 0] - offset[:, 0] * unit[:, 1])[in_line]
-    return bool(np.median(np.abs(across)) < ASIDE and np.median(along) < OVERLAP)
+    across = offset[:, 1] * unit[:, 0] - offset[:, 0] * unit[:, 1]
+    return bool(
+        np.median(np.abs(across[in_line])) < ASIDE and np.median(along) < OVERLAP
+    )
 
 
 def _ends(states: ndarray, length: ndarray) -> tuple[ndarray, ndarray]:
@@ -206,7 +208,8 @@ def _joined(
     length = float(np.median(distance[both]))
     alone = np.where(pulled, states[:, tractor], states[:, trailer])
     angles = [_angle_to_chord(chord, states[:, track, 2], both) for track in pair]
-    unit = direction(alone[:, 2] + np.where(pulled[:, 0], angles[0], angles[1]))
+    angle = np.where(pulled[:, 0], angles[0], angles[1])
+    unit = direction(alone[:, 2] + angle)
     unit = np.where(both[:, None], chord / np.maximum(distance, 1e-6)[:, None], unit)
     half = unit * length / 2
     middle = np.where(pulled, front[:, 0] - half, rear[:, 1] + half)

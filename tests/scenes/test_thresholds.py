@@ -3,10 +3,11 @@ moves by a fifth fails here."""
 
 import numpy as np
 import pytest
+import torch
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.headings import hold_headings, mend_headings, standing_frames
-from e2rl.scenes.lane_graph import LaneGraph
+from e2rl.scenes.lane_graph import LaneGraph, against_lanes
 from e2rl.scenes.limits import known_limits
 from e2rl.scenes.links import adjacent, drivable_exits, plausible_width
 from e2rl.scenes.paths import resample
@@ -244,12 +245,21 @@ def test_a_trailer_is_close_in_line_steady_and_drives(inside, outside):
 # --- limits
 
 
-def placeholder(limit: float, fastest: float, other: float = 0.0) -> bool:
-    """Whether a limit [m/s] of two tight bends is one; other: a limit of a road."""
-    angle = np.linspace(0.0, np.pi / 2, 30)
-    bend = 15.0 * np.stack([np.cos(angle), np.sin(angle)], 1)
-    lanes = {"bend": Lane(bend, speed_limit=limit)}
-    lanes["road"] = Lane(np.array([[0.0, 0.0], [9.0, 0.0]]), speed_limit=other)
+def placeholder(
+    limit: float,
+    fastest: float,
+    *,
+    other: float = 0.0,
+    radius: float = 15.0,
+    road: float = 9.0,
+) -> bool:
+    """Whether a limit [m/s] of a bend is none; other: that of a straight road."""
+    angle = np.linspace(0.0, np.pi / 2, 200)
+    bend = radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+    lanes = {
+        "bend": Lane(bend, speed_limit=limit),
+        "road": Lane(np.array([[0.0, 0.0], [road, 0.0]]), speed_limit=other),
+    }
     states = driving(fastest)
     recording = Recording(
         scene_id="limits",
@@ -265,14 +275,27 @@ def placeholder(limit: float, fastest: float, other: float = 0.0) -> bool:
     return known_limits(recording)[0]["bend"].speed_limit == 0.0
 
 
+def alike(**changes: float) -> dict[str, float]:
+    return {"limit": 25.0, "fastest": 5.0, **changes}
+
+
 @pytest.mark.parametrize(
     ("none", "limit"),
     [
-        ({"limit": 46.0, "fastest": 60.0}, {"limit": 44.0, "fastest": 60.0}),
-        ({"limit": 22.5, "fastest": 5.0}, {"limit": 21.5, "fastest": 5.0}),
+        (alike(limit=46.0, fastest=60.0), alike(limit=44.0, fastest=60.0)),
+        (alike(limit=22.5), alike(limit=21.5)),
+        (alike(other=25.45), alike(other=25.55)),
+        (alike(radius=40.0, fastest=14.7), alike(radius=40.0, fastest=15.3)),
+        (alike(radius=900.0, limit=36.5), alike(radius=900.0, limit=35.5)),
+        (alike(radius=60.0), alike(radius=67.0)),
+        (alike(radius=20.5, fastest=20.0), alike(radius=22.0, fastest=20.0)),
         (
-            {"limit": 25.0, "fastest": 5.0, "other": 25.4},
-            {"limit": 25.0, "fastest": 5.0, "other": 25.6},
+            alike(radius=40.0, other=25.0, road=220.0),
+            alike(radius=40.0, other=25.0, road=290.0),
+        ),
+        (
+            alike(fastest=20.0, other=25.0, road=400.0),
+            alike(fastest=20.0, other=25.0, road=510.0),
         ),
     ],
 )
@@ -397,3 +420,36 @@ def test_forks_count_as_far_as_they_are_reached(speed, fork, ways):
     lanes["in"] = Lane(np.array([[0.0, 0.0], [fork, 0.0]]), 3.6, exits=["on", "left"])
     pose = np.array([0.0, 0.0, 0.0, speed])
     assert len(LaneGraph(lanes).candidates(pose, 6, 150)) == ways
+
+
+def tree(name: str, begin: np.ndarray, angle: float, forks: int) -> dict[str, Lane]:
+    """A lane of 30 m that forks again and again."""
+    end = begin + 30 * np.array([np.cos(angle), np.sin(angle)])
+    exits = [f"{name}l", f"{name}r"] if forks else []
+    lanes = {name: Lane(np.stack([begin, end]), 3.6, exits=exits)}
+    for other, turn in zip(exits, (0.3, -0.3), strict=False):
+        lanes |= tree(other, end, angle + turn, forks - 1)
+    return lanes
+
+
+def test_branches_are_four_at_most():
+    graph = LaneGraph(tree("a", np.zeros(2), 0.0, forks=3))
+    assert len(graph.branches("a", 0.0, 100.0)) == 4
+
+
+def test_a_route_leads_300_m_ahead():
+    points = 50.0 * np.arange(11)[:, None] * EAST
+    lanes = {
+        str(k): Lane(points[k : k + 2], 3.6, exits=[str(k + 1)]) for k in range(10)
+    }
+    (branch,) = LaneGraph(lanes).branches("0", 0.0, 100.0)
+    assert len(branch) == 6
+
+
+@pytest.mark.parametrize(("lateral", "against"), [(2.4, True), (2.6, False)])
+def test_a_vehicle_is_on_a_lane_within_two_and_a_half_metres(lateral, against):
+    points = torch.stack([torch.arange(20.0), torch.zeros(20)], -1)[None]
+    xy = torch.tensor([[[5.0, lateral]]])
+    heading = torch.full((1, 1, 1), torch.pi)
+    lane = torch.zeros(1, 20, dtype=torch.long)
+    assert against_lanes(points, lane, xy, heading).item() == against
