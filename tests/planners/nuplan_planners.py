@@ -49,13 +49,24 @@ class Straight(AbstractPlanner):
         ego, _ = current_input.history.current_state
         return self.straight(ego, ego.dynamic_car_state.center_velocity_2d.x)
 
-    def straight(self, ego, speed, told=None):
+    def straight(
+        self,
+        ego,
+        speed,
+        told=None,
+    ):
         """At a speed; told: the speed that its states tell."""
         return InterpolatedTrajectory(
             [self.ahead(ego, speed, told, seconds) for seconds in (0.0, self.seconds)]
         )
 
-    def ahead(self, ego, speed, told, seconds):
+    def ahead(
+        self,
+        ego,
+        speed,
+        told,
+        seconds,
+    ):
         pose = ego.rear_axle
         way = speed * seconds
         pose = StateSE2(
@@ -115,7 +126,13 @@ class Centred(Straight):
             [self.later(ego, nearest, speed, step / 10) for step in range(81)]
         )
 
-    def later(self, ego, begin, speed, seconds):
+    def later(
+        self,
+        ego,
+        begin,
+        speed,
+        seconds,
+    ):
         way = speed * seconds + self.acceleration * seconds**2 / 2
         zero = StateVector2D(0.0, 0.0)
         pose = StateSE2(

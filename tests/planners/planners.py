@@ -58,7 +58,11 @@ def command_of(path: Path = EXAMPLE) -> str:
 
 
 def wrong_planner(
-    folder: Path, bad: float, act: str = "pass", read: str = "pass", reply: str = "pass"
+    folder: Path,
+    bad: float,
+    act: str = "pass",
+    read: str = "pass",
+    reply: str = "pass",
 ) -> str:
     """The command of a planner that does what the statements say where the ego of a
     scene is at y = bad: when it plans for the scene, when it reads the batch, or

@@ -32,18 +32,27 @@ def test_its_plan_comes_true(vehicles, true):
     the action leads; alone on the road the whole plan is, with the actions held as in
     it."""
     env = DrivingEnv(
-        make_scenes(2, num_vehicles=vehicles, num_vrus=2 * (vehicles > 1)),
+        make_scenes(
+            2,
+            num_vehicles=vehicles,
+            num_vrus=2 * (vehicles > 1),
+        ),
         SimSettings(),
         2,
     )
-    ego = wild(ActorEgo(hidden=(16,), room=None), 0.1)
+    ego = wild(
+        ActorEgo(
+            hidden=(16,),
+            room=None,
+        ),
+        0.1,
+    )
     td = env.reset()
     for step in range(15):
         if step % true == 0:
             plan = ego.plan(env.world())
-            assert plan.shape == (2, PLAN_STEPS, 4) and torch.equal(
-                plan, ego.plan(env.world())
-            )
+            assert plan.shape == (2, PLAN_STEPS, 4)
+            assert torch.equal(plan, ego.plan(env.world()))
         if step % min(true, 5) == 0:
             action = ego.act(env.world(), td["observation"], plan)
         td = env.step(td.set("action", action))["next"].exclude("reward")
@@ -67,11 +76,16 @@ def test_plans_expect_the_others_plans():
     )
     world.plan[..., 3] = 0.0
     halting = ego.plan(world)
-    assert (going_on[:, -1, 3] > 8).all() and (halting[:, -1, 3] < 3).all()
+    assert (going_on[:, -1, 3] > 8).all()
+    assert (halting[:, -1, 3] < 3).all()
 
 
 def test_the_network_can_override_the_reference():
-    ego = ActorEgo(hidden=(8,), slack=None, room=None)
+    ego = ActorEgo(
+        hidden=(8,),
+        slack=None,
+        room=None,
+    )
     env = DrivingEnv(make_scenes(2), SimSettings(), 2)
     observation = env.reset()["observation"]
     assert torch.allclose(
@@ -94,10 +108,22 @@ def test_nothing_learned_accelerates_into_a_vehicle_that_is_followed_or_a_pedest
     follows = make_scenes(2, vehicles=[(0.0, 0, 10.0), (18.0, 0, 6.0)])
     oncoming = make_scenes(2, vehicles=[(0.0, 0, 10.0), (18.0, 0, 6.0)])
     oncoming.scenes["start"][:, 1, 2] = torch.pi
-    walks = make_scenes(2, num_vehicles=1, num_vrus=1)
+    walks = make_scenes(
+        2,
+        num_vehicles=1,
+        num_vrus=1,
+    )
     walks.scenes["start"][:, 32, :3] = torch.tensor([18.0, 0.0, torch.pi / 2])
-    bounded = ActorEgo(hidden=(8,), slack=0.5, room=None)
-    free = ActorEgo(hidden=(8,), slack=None, room=None)
+    bounded = ActorEgo(
+        hidden=(8,),
+        slack=0.5,
+        room=None,
+    )
+    free = ActorEgo(
+        hidden=(8,),
+        slack=None,
+        room=None,
+    )
 
     def accelerations(scenes, push):
         observation = DrivingEnv(scenes, SimSettings(), 2).reset()["observation"]
@@ -109,19 +135,24 @@ def test_nothing_learned_accelerates_into_a_vehicle_that_is_followed_or_a_pedest
 
     for scenes in (follows, walks):
         own, unbound, reference = accelerations(scenes, 8.0)
-        assert (
-            (unbound > 4.9).all()
-            and torch.allclose(own, reference[:, 2] + 0.5, atol=1e-3)
-            and (own < -1.0).all()
-        )
+        assert (unbound > 4.9).all()
+        assert torch.allclose(own, reference[:, 2] + 0.5, atol=1e-3)
+        assert (own < -1.0).all()
         own, unbound, reference = accelerations(scenes, -8.0)
-        assert torch.equal(own, unbound) and (own < reference[:, 0] - 0.5).all()
+        assert torch.equal(own, unbound)
+        assert (own < reference[:, 0] - 0.5).all()
     own, _, _ = accelerations(oncoming, 8.0)
     assert (own > 4.9).all()
 
 
 def test_with_room_ahead_the_reference_drives_and_without_it_the_network():
-    ego = wild(ActorEgo(hidden=(8,), slack=None, room=2.0))
+    ego = wild(
+        ActorEgo(
+            hidden=(8,),
+            slack=None,
+            room=2.0,
+        )
+    )
     alone = copy.deepcopy(ego)
     alone.network.network.room = None
     observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
@@ -156,7 +187,13 @@ def test_normalised_numbers_are_clipped_at_5_standard_deviations():
 
 
 def test_file_round_trip(tmp_path):
-    first = wild(ActorEgo(hidden=(8,), slack=0.3, room=3.0))
+    first = wild(
+        ActorEgo(
+            hidden=(8,),
+            slack=0.3,
+            room=3.0,
+        )
+    )
     first.network.normaliser.observe(
         torch.randn(10, first.network.normaliser.mean.shape[0])
     )
@@ -167,7 +204,10 @@ def test_file_round_trip(tmp_path):
     assert (
         find_weights(tmp_path) == find_weights(folder) == folder / "actor.safetensors"
     )
-    second = ActorEgo(hidden=(8,), checkpoint=str(tmp_path))
+    second = ActorEgo(
+        hidden=(8,),
+        checkpoint=str(tmp_path),
+    )
     assert second.network.architecture == first.network.architecture
     seen = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()
     for ask in (
@@ -178,7 +218,10 @@ def test_file_round_trip(tmp_path):
 
 
 def test_the_network_can_let_go_of_the_reference():
-    network = ActorEgo(hidden=(8,), room=None).network.network
+    network = ActorEgo(
+        hidden=(8,),
+        room=None,
+    ).network.network
     observation = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()["observation"]
     with torch.no_grad():
         network.trunk.last.bias[:] = torch.tensor([0.3, -0.2, -1.0, -1.0])
@@ -195,7 +238,11 @@ def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatc
     with pytest.raises(
         InputError, match=r"bounds .*5\.0, .* not .*2\.0.*set sim\.max_"
     ):
-        ActorEgo(hidden=(8,), max_acceleration=2.0, checkpoint=str(file))
+        ActorEgo(
+            hidden=(8,),
+            max_acceleration=2.0,
+            checkpoint=str(file),
+        )
     bounds = (
         {"room": 0.0},
         {"room": float("nan")},
@@ -215,14 +262,25 @@ def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatc
         monkeypatch.setattr(Architecture, "header", lambda self, text=changed: text)
         network.save(file)
         with pytest.raises(InputError, match="another version"):
-            ActorEgo(hidden=(8,), checkpoint=str(file))
+            ActorEgo(
+                hidden=(8,),
+                checkpoint=str(file),
+            )
     file.write_bytes(b"no weights")
     with pytest.raises(InputError, match="damaged"):
-        ActorEgo(hidden=(8,), checkpoint=str(file))
+        ActorEgo(
+            hidden=(8,),
+            checkpoint=str(file),
+        )
 
 
 def test_noise_is_the_networks_alone_and_ends_with_the_block():
-    ego = wild(ActorEgo(hidden=(8,), room=None))
+    ego = wild(
+        ActorEgo(
+            hidden=(8,),
+            room=None,
+        )
+    )
     env = DrivingEnv(make_scenes(2), SimSettings(), 2)
     observation = env.reset()["observation"]
     network = ego.network.network

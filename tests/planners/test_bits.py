@@ -46,11 +46,15 @@ def test_plans_the_cheapest_candidate():
     candidates = ego.candidates(world)
     plan = ego.plan(world)
     costs = ego.costs(world, candidates)
-    assert candidates.states.shape == (3, 40, PLAN_STEPS, 4) and costs.std(1).min() > 1
+    assert candidates.states.shape == (3, 40, PLAN_STEPS, 4)
+    assert costs.std(1).min() > 1
     for k in range(3):
         assert torch.equal(plan[k], candidates.states[k, costs[k].argmin()])
     torch.testing.assert_close(
-        ego.rated(world, plan[:, None])[:, 0], costs.amin(1), atol=8.0, rtol=0
+        ego.rated(world, plan[:, None])[:, 0],
+        costs.amin(1),
+        atol=8.0,
+        rtol=0,
     )
 
 
@@ -67,11 +71,22 @@ def test_a_moved_scene_gets_the_moved_candidates():
         [shift[0] - y, shift[1] + x, dynamics.wrap(heading + torch.pi / 2), speed], -1
     )
     torch.testing.assert_close(
-        second.states[..., :2], moved[..., :2], atol=2e-2, rtol=0
+        second.states[..., :2],
+        moved[..., :2],
+        atol=2e-2,
+        rtol=0,
     )
-    torch.testing.assert_close(second.states[..., 3], speed, atol=1e-2, rtol=0)
     torch.testing.assert_close(
-        ego.costs(there, second), ego.costs(here, first), atol=0.5, rtol=1e-2
+        second.states[..., 3],
+        speed,
+        atol=1e-2,
+        rtol=0,
+    )
+    torch.testing.assert_close(
+        ego.costs(there, second),
+        ego.costs(here, first),
+        atol=0.5,
+        rtol=1e-2,
     )
 
 
@@ -85,7 +100,8 @@ def test_a_file_gives_the_network_back_and_another_is_refused(tmp_path):
         again.goals(again.encode(seen)),
         strict=True,
     ):
-        assert torch.equal(one, other) and not other.requires_grad
+        assert torch.equal(one, other)
+        assert not other.requires_grad
     network.architecture["cells"] = 9
     save_bits(network, tmp_path / "bits.safetensors", origin={})
     for where, why in (
@@ -103,14 +119,22 @@ def test_cells_and_places_are_inverses():
     side = 10 * torch.rand(1000, generator=generator) - 5
     cell, residual = cell_of(speed, way, side=side)
     again = place(speed, cell[:, None], residual=residual[:, None])
-    torch.testing.assert_close(again[0][:, 0], way, atol=1e-3, rtol=0)
-    torch.testing.assert_close(again[1][:, 0], side, atol=1e-4, rtol=0)
-    on_grid = (way < reach(speed)) & (side.abs() < SIDES / 2)
-    assert (
-        (residual[on_grid].abs() <= 0.5001).all()
-        and cell.min() >= 0
-        and cell.max() < CELLS
+    torch.testing.assert_close(
+        again[0][:, 0],
+        way,
+        atol=1e-3,
+        rtol=0,
     )
+    torch.testing.assert_close(
+        again[1][:, 0],
+        side,
+        atol=1e-4,
+        rtol=0,
+    )
+    on_grid = (way < reach(speed)) & (side.abs() < SIDES / 2)
+    assert (residual[on_grid].abs() <= 0.5001).all()
+    assert cell.min() >= 0
+    assert cell.max() < CELLS
 
 
 def test_the_grid_ends_where_2_5_metres_a_square_second_lead_in_5_seconds():

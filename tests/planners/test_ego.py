@@ -41,7 +41,10 @@ def test_a_drivable_plan_is_followed_without_error():
     generator = torch.Generator().manual_seed(0)
     start = torch.tensor([0.0, 0.0, 0.5, 12.0], dtype=torch.float64)
     actions = torch.randn(
-        50, 2, generator=generator, dtype=torch.float64
+        50,
+        2,
+        generator=generator,
+        dtype=torch.float64,
     ) * torch.tensor([2.0, 0.2])
     plan = torch.cat([start[None], dynamics.rollout(start, actions)])
     state = start
@@ -56,7 +59,8 @@ def test_deviations_are_made_good():
     state = torch.tensor([-0.8, 1.0, 0.1, 9.0])
     for k in range(50):
         state = dynamics.step(state, track(state, plan[k], following=plan[k + 1]))
-    assert (state - plan[50])[:2].abs().max() < 0.05 and state[2].abs() < 0.02
+    assert (state - plan[50])[:2].abs().max() < 0.05
+    assert state[2].abs() < 0.02
 
 
 def test_a_lateral_error_fades_over_0_7_seconds_and_1_5_metres_at_least():
@@ -79,7 +83,14 @@ def make_env(scenes, batch):
 @pytest.mark.parametrize(("kind", "atol"), [(Cruise, 1e-3), (IDMEgo, 0.05)])
 def test_what_a_policy_writes_as_its_plan_is_what_it_then_drives(kind, atol):
     """It plans once in each interval; in between, its plan is the rest of the last one."""
-    env = make_env(make_scenes(2, num_vehicles=1, limit=12.0), 2)
+    env = make_env(
+        make_scenes(
+            2,
+            num_vehicles=1,
+            limit=12.0,
+        ),
+        2,
+    )
     ego = kind(replan_every=5)
     made = []
     plan = ego.plan
@@ -87,7 +98,8 @@ def test_what_a_policy_writes_as_its_plan_is_what_it_then_drives(kind, atol):
     data = env.rollout(30, EgoPolicy(ego, env))
     told = data["ego", "plan"]
     driven = data["next", "agents", "states"][:, :, 0]
-    assert len(made) == 6 and told.shape[2] == PLAN_STEPS
+    assert len(made) == 6
+    assert told.shape[2] == PLAN_STEPS
     for step in range(30):
         fresh = made[step // 5]
         age = step % 5
@@ -114,7 +126,8 @@ def test_a_reset_in_between_makes_a_new_plan_there():
         70, EgoPolicy(Cruise(replan_every=5), env), break_when_any_done=False
     )
     done = data["next", "done"]
-    assert done.any() and not done.all(0).any()
+    assert done.any()
+    assert not done.all(0).any()
     assert data["action"].abs().max() < 1e-3
 
 
@@ -213,7 +226,12 @@ def test_a_plan_that_goes_backwards_is_told_that_egos_do_not_reverse(signed, spe
 class Braking(Ego):
     """A policy: it has no plan."""
 
-    def act(self, world, observation, plan):
+    def act(
+        self,
+        world,
+        observation,
+        plan,
+    ):
         return torch.tensor([-2.0, 0.0]).expand(len(plan), 2)
 
 
@@ -242,7 +260,8 @@ def test_replayed_log_is_tracked():
 def test_a_file_of_the_configuration_builds_its_ego(name):
     ego = built(load_choice("ego", name), "ego", kind=Ego)
     plan = ego.plan(world_of(num_scenes=2)[1])
-    assert plan.shape == (2, PLAN_STEPS, 4) and torch.isfinite(plan).all()
+    assert plan.shape == (2, PLAN_STEPS, 4)
+    assert torch.isfinite(plan).all()
     with pytest.raises(InputError, match=r"ego\.replan_every=0"):
         type(ego)(replan_every=0)
 
@@ -255,7 +274,12 @@ class Straight(Ego):
             world.states[:, 0], 0.1 * torch.arange(1, PLAN_STEPS + 1)
         )
 
-    def act(self, world, observation, plan):
+    def act(
+        self,
+        world,
+        observation,
+        plan,
+    ):
         return super().act(world, observation, plan)
 
 
@@ -278,7 +302,12 @@ class Meddler(Straight):
         )
         return self.meddle(super().plan(world), *told.values())
 
-    def act(self, world, observation, plan):
+    def act(
+        self,
+        world,
+        observation,
+        plan,
+    ):
         told = observation, plan, world.states, world.valid, *world.scene.values()
         return self.meddle(super().act(world, observation, plan), *told)
 
@@ -294,7 +323,11 @@ class Meddler(Straight):
 
 
 def test_code_from_outside_moves_nobody():
-    scenes = make_scenes(2, num_vehicles=3, red_light_x=60.0)
+    scenes = make_scenes(
+        2,
+        num_vehicles=3,
+        red_light_x=60.0,
+    )
     data = [
         env.rollout(20, EgoPolicy(ego(), env))
         for ego in (Straight, Meddler)
@@ -308,7 +341,13 @@ def test_code_from_outside_moves_nobody():
 def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic):
     """Everything that a planner is told, in rollouts and by traffic that asks it
     beforehand, is of the present."""
-    first = make_scenes(2, num_vehicles=3, num_vrus=2, red_light_x=60.0, steps=40)
+    first = make_scenes(
+        2,
+        num_vehicles=3,
+        num_vrus=2,
+        red_light_x=60.0,
+        steps=40,
+    )
     told = []
     first.scenes["valid"][:, 2] = first.scenes["logged_valid"][:, :, 2] = False
     second = replace(first, scenes=first.scenes.clone())
@@ -338,13 +377,19 @@ def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic
         Lookahead(ego, replace(world, plan=planned))(torch.arange(2), planned)
         told[-1] += ego.told
     for one, other in zip(*told, strict=True):
-        assert len(told[0]) == 8 and one.pop("plan") is one.pop("route") is None
+        assert len(told[0]) == 8
+        assert one.pop("plan") is one.pop("route") is None
         assert not [key for key in one if not torch.equal(one[key], other[key])]
 
 
 def test_an_action_that_no_vehicle_can_take_is_refused_by_its_row():
     class Wild(Straight):
-        def act(self, world, observation, plan):
+        def act(
+            self,
+            world,
+            observation,
+            plan,
+        ):
             return torch.tensor([[1.0, 0.1], [1e30, 0.0]])
 
     env = make_env(make_scenes(2), 2)
@@ -355,7 +400,10 @@ def test_an_action_that_no_vehicle_can_take_is_refused_by_its_row():
 
 @pytest.mark.parametrize("kind", [IDMEgo, LaneGraphEgo, SamplingEgo, BitsEgo])
 def test_a_planner_of_the_package_needs_no_future(kind):
-    env, world = world_of(num_scenes=2, red_light_x=60.0)
+    env, world = world_of(
+        num_scenes=2,
+        red_light_x=60.0,
+    )
     env.rollout(7, EgoPolicy(kind(), env))
     assert torch.equal(kind().plan(env.world()), kind().plan(env.world().shown()))
 
@@ -374,7 +422,12 @@ def test_scenes_of_a_batch_do_not_mix(kind):
     together = ego.plan(worlds(scenes)[1])
     for k in (0, 1, 2, count - 1):
         alone = ego.plan(worlds(scenes.chosen([k]))[1])[0]
-        torch.testing.assert_close(alone, together[k], atol=1e-3, rtol=0)
+        torch.testing.assert_close(
+            alone,
+            together[k],
+            atol=1e-3,
+            rtol=0,
+        )
     assert not torch.allclose(together[1, :, 3], together[2, :, 3])
 
 
@@ -384,35 +437,46 @@ def test_a_red_light_is_halted_at_and_without_one_it_drives_on(kind):
         48.3 if kind is IDMEgo else 47.8
     )  # the line is at 50 m, the front 2.25 m ahead of the centre
     for light, low, high in ((50.0, 35.0, halts_by), (None, 55.0, 1e3)):
-        _, state = driven(kind(), num_vehicles=1, num_vrus=0, red_light_x=light)
-        assert low < state[0] < high and (state[3] < 2.5) == (light is not None)
+        _, state = driven(
+            kind(),
+            num_vehicles=1,
+            num_vrus=0,
+            red_light_x=light,
+        )
+        assert low < state[0] < high
+        assert (state[3] < 2.5) == (light is not None)
 
 
 @pytest.mark.parametrize("kind", [LaneGraphEgo, SamplingEgo])
 def test_a_free_road_is_driven_at_the_limit_and_behind_a_wall_it_halts(kind):
     for limit, speed in ((0.0, 20.0), (12.0, 12.0)):
-        data, state = driven(kind(), num_vehicles=1, num_vrus=0, limit=limit)
-        assert (
-            abs(state[3] - speed) < 0.3
-            and data["next", "agents", "states"][0, :, 0, 1].abs().max() < 0.05
+        data, state = driven(
+            kind(),
+            num_vehicles=1,
+            num_vrus=0,
+            limit=limit,
         )
+        assert abs(state[3] - speed) < 0.3
+        assert data["next", "agents", "states"][0, :, 0, 1].abs().max() < 0.05
     data, state = driven(
-        kind(), vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0), (50.0, 1, 0.0)], num_vrus=0
+        kind(),
+        vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0), (50.0, 1, 0.0)],
+        num_vrus=0,
     )
-    assert (
-        not data["next", "terminated"].any() and state[3] < 2.0 and 20 < state[0] < 46
-    )
+    assert not data["next", "terminated"].any()
+    assert state[3] < 2.0
+    assert 20 < state[0] < 46
 
 
 def test_idm_settles_behind_a_slower_leader_and_returns_to_its_lane():
     data, state = driven(
-        IDMEgo(), vehicles=[(0.0, 0, 9.0), (30.0, 0, 6.0), (30.0, 1, 0.0)], limit=10.0
+        IDMEgo(),
+        vehicles=[(0.0, 0, 9.0), (30.0, 0, 6.0), (30.0, 1, 0.0)],
+        limit=10.0,
     )
-    assert (
-        not data["next", "done"][:, :-1].any()
-        and state[3] < 7.0
-        and 8 < 30.0 + 8 * 6.0 - state[0] - 4.5 < 20
-    )
+    assert not data["next", "done"][:, :-1].any()
+    assert state[3] < 7.0
+    assert 8 < 30.0 + 8 * 6.0 - state[0] - 4.5 < 20
     scenes = make_scenes(1, num_vehicles=1)
     scenes.scenes["start"][0, 0, 1:3] = torch.tensor([0.8, -0.1])
     env = worlds(scenes)[0]

@@ -34,7 +34,9 @@ from tests.planners.planners import SameLaw, command_of, wrong_planner
 from tests.run.test_endings import alive
 from tests.synthetic import make_scenes
 
-BAD = 2  # the scene in which planners of these tests go wrong: its ego is at y = 3.5, in all others at 0
+# The scene in which planners of these tests go wrong: its ego is at y = 3.5, in all
+# others at 0.
+BAD = 2
 ROAD = [(0.0, 0, 10.0), (25.0, 0, 6.0), (60.0, 1, 4.0)]
 linux = pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
 
@@ -49,8 +51,19 @@ def scene_set(count=4, **about):
     return found
 
 
-def run(ego, folder=None, processes=1, batch=4):
-    setup = Setup(scene_set(), ego, ego_name="external", sim=SimSettings(), batch=batch)
+def run(
+    ego,
+    folder=None,
+    processes=1,
+    batch=4,
+):
+    setup = Setup(
+        scene_set(),
+        ego,
+        ego_name="external",
+        sim=SimSettings(),
+        batch=batch,
+    )
     return run_protocol(
         setup,
         [Method("replay", LogReplay())],
@@ -73,7 +86,8 @@ def test_it_drives_as_the_same_law_inside(replan_every, red_light_x):
     assert torch.allclose(inside, outside, atol=1e-3)
     speed = outside[:, -1, 0, 3]
     behind = torch.arange(4) != BAD
-    assert (speed[behind] < 9).all() and (speed[BAD] > 10) == (red_light_x is None)
+    assert (speed[behind] < 9).all()
+    assert (speed[BAD] > 10) == (red_light_x is None)
 
 
 def test_one_that_runs_serves_several_connections():
@@ -82,15 +96,22 @@ def test_one_that_runs_serves_several_connections():
         port = free.getsockname()[1]
     planner = subprocess.Popen([*command_of().split(), f"127.0.0.1:{port}"])
     try:
-        (row,) = run(ExternalEgo(address=f"127.0.0.1:{port}"), processes=2, batch=2)
+        (row,) = run(
+            ExternalEgo(address=f"127.0.0.1:{port}"),
+            processes=2,
+            batch=2,
+        )
         (inside,) = run(SameLaw())
     finally:
         planner.kill()
         planner.wait()
     assert row["metrics"]["progress"] == pytest.approx(
-        inside["metrics"]["progress"], abs=1e-3, nan_ok=True
+        inside["metrics"]["progress"],
+        abs=1e-3,
+        nan_ok=True,
     )
-    assert row["n_rollouts"] == 4 and row["errored"] == {}
+    assert row["n_rollouts"] == 4
+    assert row["errored"] == {}
 
 
 TRAJECTORY = "return reply(self, 4, scene + struct.pack('<I{0}f', {1}, *[{2}] * {0}))"
@@ -129,11 +150,9 @@ def test_what_goes_wrong_in_a_scene_costs_that_scene(tmp_path, name):
     )
     (row,) = run(ego, tmp_path)
     (entry,) = json.loads((tmp_path / ERRORED_FILE).read_text())
-    assert (
-        row["errored"] == {f"raised {reason}": 1}
-        and row["n_rollouts"] == 4
-        and entry["raised_by"] == "ego"
-    )
+    assert row["errored"] == {f"raised {reason}": 1}
+    assert row["n_rollouts"] == 4
+    assert entry["raised_by"] == "ego"
     assert row["metrics"]["errored"]["mean"] == 0.25
     assert entry["scene_id"] == scene_set().scene_id[BAD]
     assert re.search(detail, entry["detail"]), entry["detail"]
@@ -142,15 +161,11 @@ def test_what_goes_wrong_in_a_scene_costs_that_scene(tmp_path, name):
 def test_it_is_restarted_as_often_as_allowed(tmp_path):
     command = wrong_planner(tmp_path, 3.5, act="os._exit(3)")
     (row,) = run(ExternalEgo(command, restarts=1))
-    assert (
-        row["metrics"]["errored"]["mean"] == 0.25
-        and len(list((tmp_path / "marks").iterdir())) == 2
-    )
+    assert row["metrics"]["errored"]["mean"] == 0.25
+    assert len(list((tmp_path / "marks").iterdir())) == 2
     (row,) = run(ExternalEgo(command, restarts=0), tmp_path)
-    assert (
-        row["errored"] == {"raised PlannerDied": 4}
-        and row["metrics"]["errored"]["mean"] == 1.0
-    )
+    assert row["errored"] == {"raised PlannerDied": 4}
+    assert row["metrics"]["errored"]["mean"] == 1.0
     details = [
         entry["detail"] for entry in json.loads((tmp_path / ERRORED_FILE).read_text())
     ]
@@ -181,7 +196,11 @@ def started_command(ego):
         os.setsid()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         with ending(lambda: "do it again"):
-            run(ego, processes=2, batch=2)
+            run(
+                ego,
+                processes=2,
+                batch=2,
+            )
 
     running = multiprocessing.get_context("fork").Process(target=command)
     running.start()
@@ -195,7 +214,8 @@ def pids_in(folder, count):
     while len(list(folder.iterdir())) < count and time.monotonic() - begin < 30:
         time.sleep(0.02)
     pids = [int(mark.name) for mark in folder.iterdir()]
-    assert len(pids) == count and all(map(alive, pids))
+    assert len(pids) == count
+    assert all(map(alive, pids))
     time.sleep(0.2)
     return pids
 
@@ -312,19 +332,17 @@ def test_messages_hold_the_world_field_by_field():
         ],
         1,
     ).tolist()
-    assert (
-        take("f8i", lanes) == [(3.5, *exits[lane]) for lane in range(lanes)]
-        and lanes == 2
-    )
-    assert take("2f", lights) == [(45.0, 0.0)] and take.args[1] == [len(content)]
+    assert take("f8i", lanes) == [(3.5, *exits[lane]) for lane in range(lanes)]
+    assert lanes == 2
+    assert take("2f", lights) == [(45.0, 0.0)]
+    assert take.args[1] == [len(content)]
     content = plan_message(world)
     take = partial(_take, content, [8])
     assert take("I", 1) == [(3,)]
     for row in range(3):
         ((number, step, agents, lights),) = take("4I", 1)
-        assert (number, step, agents, lights) == (row, 0, 4, 1) and take("I", 1) == [
-            (1,)
-        ]
+        assert (number, step, agents, lights) == (row, 0, 4, 1)
+        assert take("I", 1) == [(1,)]
         present = scenes["valid"][row].nonzero()[:, 0].tolist()
         for agent, record in zip(present, take("2I8f", agents), strict=True):
             state, size = (
@@ -341,7 +359,12 @@ def test_messages_hold_the_world_field_by_field():
     assert take.args[1] == [len(content)]
 
 
-def _take(content, at, form, count):
+def _take(
+    content,
+    at,
+    form,
+    count,
+):
     """The next `count` records of a message; at: [position]."""
     size = count * struct.calcsize("<" + form)
     found = list(struct.iter_unpack("<" + form, content[at[0] : at[0] + size]))

@@ -12,7 +12,10 @@ from tests.planners.planners import world_of
 
 
 def test_vehicles_within_70_metres_are_looked_at():
-    _, world = world_of(vehicles=[(0, 0, 10), (69, 0, 9), (71, 0, 9)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 10), (69, 0, 9), (71, 0, 9)],
+        num_vrus=0,
+    )
     assert len(predict(world, [1.0], 2.0).scene) == 1
 
 
@@ -30,7 +33,11 @@ def test_a_vehicle_is_on_a_route_within_2_metres_and_20_degrees(
 
 def test_a_profile_turns_to_its_second_target_after_12_nodes():
     """Of 4 m/s^2, 0.8 m/s a node: from 18 m/s down to 8.4 and up again."""
-    _, world = world_of(vehicles=[(0, 0, 18.0)], num_vrus=0, limit=0.0)
+    _, world = world_of(
+        vehicles=[(0, 0, 18.0)],
+        num_vrus=0,
+        limit=0.0,
+    )
     ego = LaneGraphEgo()
     profile = ego.profiles(world, MissionPath(world))[0, ego.speeds - 1]
     assert profile.argmin().item() == 12
@@ -87,7 +94,6 @@ def test_hazard_equals_its_definition():
 
 def test_circles_lie_in_their_box():
     x, y, radius = circles(torch.zeros(1, 3), torch.tensor([[4.0, 2.0]]))
-    assert (x.abs() + radius <= 2.0 + 1e-6).all() and (
-        y.abs() + radius <= 1.0 + 1e-6
-    ).all()
+    assert (x.abs() + radius <= 2.0 + 1e-6).all()
+    assert (y.abs() + radius <= 1.0 + 1e-6).all()
     assert torch.allclose((x.abs() + radius).max(), torch.tensor(2.0))

@@ -89,7 +89,9 @@ def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_softly_to_its_path(
     speed = 10.0 + acceleration * seconds
     assert torch.allclose(states[..., 3], speed.expand(2, -1), atol=0.05)
     left = states[..., 1] / beside[:, None]
-    assert left.max() < 1.001 and left.min() > -0.05 and left[:, 40:].abs().max() < 0.05
+    assert left.max() < 1.001
+    assert left.min() > -0.05
+    assert left[:, 40:].abs().max() < 0.05
     sharpest = (
         states[..., 2].diff(dim=1).abs() / (DT * speed[1:]) / beside[:, None].abs()
     )  # 1/m, a metre beside
@@ -121,7 +123,8 @@ def test_it_sees_the_ego_and_everybody_else_where_they_are(
             heading,
             -REAR * one["yaw_rate"],
         )
-        assert one["rear"] == pytest.approx(back, abs=2e-3) and one["size"] == [
+        assert one["rear"] == pytest.approx(back, abs=2e-3)
+        assert one["size"] == [
             4.5,
             2.0,
         ]
@@ -156,7 +159,8 @@ def test_its_history_is_what_was_driven_and_before_that_steady(
     ).states[0, :, 0]
     first, *_, last = written(tmp_path)
     for one in (first, last):
-        assert len(one["egos"]) == len(one["before"]) == 21 and one["interval"] == DT
+        assert len(one["egos"]) == len(one["before"]) == 21
+        assert one["interval"] == DT
         assert {
             later - earlier
             for earlier, later in zip(one["times"], one["times"][1:], strict=False)
@@ -193,17 +197,19 @@ def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(nuplan, tmp_path
     mission = mission_of(scenes)
     assert len(seen) == len(scenes) == 48
     for row, one in enumerate(seen):
-        assert one["on"] and set(one["on"]) <= set(one["near"]) and one["drivable"]
+        assert one["on"]
+        assert set(one["on"]) <= set(one["near"])
+        assert one["drivable"]
         route = [lane["id"] for block in one["route"] for lane in block]
-        assert set(route) & set(one["near"]) and all(one["linked"]), row
+        assert set(route) & set(one["near"]), row
+        assert all(one["linked"]), row
         assert (torch.tensor(one["goal"][:2]) - mission.points[row]).norm(
             dim=-1
         ).min() < 1e-3
     limits = {lane["limit"] for one in seen for block in one["route"] for lane in block}
     given = mission.limit[mission.limit > 0].unique().tolist()
-    assert limits - {None} and all(
-        min(abs(limit - k) for k in given) < 1e-4 for limit in limits - {None}
-    )
+    assert limits - {None}
+    assert all(min(abs(limit - k) for k in given) < 1e-4 for limit in limits - {None})
 
 
 def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(nuplan, tmp_path):
@@ -244,12 +250,10 @@ def test_lanes_side_by_side_are_a_roadblock(nuplan, tmp_path):
         None,
     )
     for lane in (left, right):
-        assert lane["limit"] == 12.0 and lane["width"] == pytest.approx(
-            LANE_WIDTH, rel=0.01
-        )
-        assert lane["borders"] == pytest.approx([half, -half], abs=1e-3) and lane[
-            "turns"
-        ] == pytest.approx(0.0, abs=1e-6)
+        assert lane["limit"] == 12.0
+        assert lane["width"] == pytest.approx(LANE_WIDTH, rel=0.01)
+        assert lane["borders"] == pytest.approx([half, -half], abs=1e-3)
+        assert lane["turns"] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_road_reaches_as_far_beside_the_lanes_as_the_metrics_have_it(
@@ -283,14 +287,25 @@ WRONG = {
 @pytest.mark.parametrize("how", WRONG)
 def test_what_goes_wrong_in_a_scene_costs_that_scene_and_is_told(nuplan, tmp_path, how):
     ego = nuplan(f"--planner nuplan_planners:Wrong how={how} bad=3.5", replan_every=5)
-    setup = Setup(scene_set(), ego, ego_name="nuplan", sim=SimSettings(), batch=4)
+    setup = Setup(
+        scene_set(),
+        ego,
+        ego_name="nuplan",
+        sim=SimSettings(),
+        batch=4,
+    )
     (row,) = run_protocol(
-        setup, [Method("replay", LogReplay())], seeds=[0], folder=tmp_path
+        setup,
+        [Method("replay", LogReplay())],
+        seeds=[0],
+        folder=tmp_path,
     )
     (entry,) = json.loads((tmp_path / ERRORED_FILE).read_text())
     reason, detail = WRONG[how]
-    assert row["errored"] == {f"raised {reason}": 1} and row["n_rollouts"] == 4
-    assert entry["scene_id"] == scene_set().scene_id[BAD] and detail in entry["detail"]
+    assert row["errored"] == {f"raised {reason}": 1}
+    assert row["n_rollouts"] == 4
+    assert entry["scene_id"] == scene_set().scene_id[BAD]
+    assert detail in entry["detail"]
 
 
 def test_a_planner_of_cameras_is_refused(nuplan):

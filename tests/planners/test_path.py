@@ -54,7 +54,13 @@ def test_drive_is_nearly_unicycle_motion():
 
 
 def test_caps_halt_at_red_lights_and_obey_limits():
-    path = MissionPath(world_of(num_vehicles=1, red_light_x=60.0, limit=8.0)[1])
+    path = MissionPath(
+        world_of(
+            num_vehicles=1,
+            red_light_x=60.0,
+            limit=8.0,
+        )[1]
+    )
     caps = path.speed_caps(20.0)
     stop = 60.0 - 4.5 / 2 - 1.0
     assert torch.allclose(
@@ -65,27 +71,69 @@ def test_caps_halt_at_red_lights_and_obey_limits():
         look_up(caps, at), torch.tensor([36.0, 9.0, 0.0, 0.0]).sqrt(), atol=0.02
     )
     assert torch.allclose(
-        path.speed_caps(20.0, limits=False, lights=False), torch.tensor(400.0), atol=0.1
+        path.speed_caps(
+            20.0,
+            limits=False,
+            lights=False,
+        ),
+        torch.tensor(400.0),
+        atol=0.1,
     )
 
 
 def stop(colour, speed, light_x=50.0):
     """Metres from the ego's centre to the stop line that binds."""
-    world = world_of(num_vehicles=1, red_light_x=light_x)[1]
+    world = world_of(
+        num_vehicles=1,
+        red_light_x=light_x,
+    )[1]
     world.scene["light_state"][:], world.states[:, 0, 3] = colour, speed
     return MissionPath(world).stop_distance(braking=3.0).item() + 4.5 / 2 + STOP_GAP
 
 
 def test_red_binds_unless_halting_is_hopeless_yellow_where_it_is_comfortable():
-    assert stop(colour=1, speed=10) == 50.0 and stop(colour=2, speed=10) == 50.0
-    assert stop(colour=1, speed=20) == 50.0 and stop(colour=2, speed=20) == float("inf")
-    assert stop(colour=1, speed=30) == float("inf")
-    assert stop(colour=3, speed=10) == float("inf") and stop(
-        colour=0, speed=10
-    ) == float("inf")
-    assert stop(colour=1, speed=1, light_x=-5.0) == float("inf"), (
-        "a line passed binds no longer"
+    assert (
+        stop(
+            colour=1,
+            speed=10,
+        )
+        == 50.0
     )
+    assert (
+        stop(
+            colour=2,
+            speed=10,
+        )
+        == 50.0
+    )
+    assert (
+        stop(
+            colour=1,
+            speed=20,
+        )
+        == 50.0
+    )
+    assert stop(
+        colour=2,
+        speed=20,
+    ) == float("inf")
+    assert stop(
+        colour=1,
+        speed=30,
+    ) == float("inf")
+    assert stop(
+        colour=3,
+        speed=10,
+    ) == float("inf")
+    assert stop(
+        colour=0,
+        speed=10,
+    ) == float("inf")
+    assert stop(
+        colour=1,
+        speed=1,
+        light_x=-5.0,
+    ) == float("inf"), "a line passed binds no longer"
 
 
 @pytest.mark.parametrize(
@@ -101,18 +149,25 @@ def test_a_deviation_fades_as_a_critically_damped_return(d, turned, length):
         length=torch.tensor(length).double(),
         ahead=ahead,
     )
-    assert offset[0].item() == pytest.approx(d) and slope[0].item() == pytest.approx(
-        math.tan(turned)
-    )
+    assert offset[0].item() == pytest.approx(d)
+    assert slope[0].item() == pytest.approx(math.tan(turned))
     (first,), (bend,) = (
         torch.gradient(offset, spacing=0.01),
         torch.gradient(slope, spacing=0.01),
     )
     inner = slice(2, -2)
-    torch.testing.assert_close(first[inner], slope[inner], atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        first[inner],
+        slope[inner],
+        atol=1e-4,
+        rtol=0,
+    )
     balance = length**2 * bend + 2 * length * slope + offset
     torch.testing.assert_close(
-        balance[inner], torch.zeros_like(balance[inner]), atol=2e-2, rtol=0
+        balance[inner],
+        torch.zeros_like(balance[inner]),
+        atol=2e-2,
+        rtol=0,
     )
 
 
@@ -124,7 +179,8 @@ def test_caps_slow_down_for_curves():
     scenes.scenes["route_points"][0, 0] = torch.stack([x, y], -1)
     caps = MissionPath(worlds(scenes)[1]).speed_caps(20.0, limits=False)[0]
     assert torch.allclose(caps[32:44].min(), torch.tensor(3.0 * 20), rtol=0.05)
-    assert caps[15] < 399 and abs(caps[-5] - 400) < 1e-2
+    assert caps[15] < 399
+    assert abs(caps[-5] - 400) < 1e-2
 
 
 def test_the_path_stays_on_its_part_of_a_mission_that_crosses_itself():

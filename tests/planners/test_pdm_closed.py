@@ -44,24 +44,44 @@ def touched(data):
 
 
 def test_it_follows_a_slower_leader_without_contact():
-    data, last = driven(EGO, vehicles=[(0, 0, 14.0), (30, 0, 6.0)], num_vrus=0)
-    assert not touched(data) and 5.0 < float(last[3]) < 8.0
+    data, last = driven(
+        EGO,
+        vehicles=[(0, 0, 14.0), (30, 0, 6.0)],
+        num_vrus=0,
+    )
+    assert not touched(data)
+    assert 5.0 < float(last[3]) < 8.0
 
 
 def test_it_stops_behind_whom_stands_and_at_a_red_light():
     data, last = driven(
-        EGO, steps=100, vehicles=[(0, 0, 10.0), (60, 0, 0.0)], num_vrus=0
+        EGO,
+        steps=100,
+        vehicles=[(0, 0, 10.0), (60, 0, 0.0)],
+        num_vrus=0,
     )
-    assert not touched(data) and float(last[3]) < 1.5 and float(last[0]) > 45
+    assert not touched(data)
+    assert float(last[3]) < 1.5
+    assert float(last[0]) > 45
     _, last = driven(
-        EGO, steps=100, vehicles=[(0, 0, 10.0)], num_vrus=0, red_light_x=50.0
+        EGO,
+        steps=100,
+        vehicles=[(0, 0, 10.0)],
+        num_vrus=0,
+        red_light_x=50.0,
     )
-    assert float(last[3]) < 1.5 and 35 < float(last[0]) < 50
+    assert float(last[3]) < 1.5
+    assert 35 < float(last[0]) < 50
 
 
 @pytest.mark.parametrize("limit", [8.0, 15.0])
 def test_it_keeps_the_speed_limit(limit):
-    data, last = driven(EGO, vehicles=[(0, 0, 5.0)], num_vrus=0, limit=limit)
+    data, last = driven(
+        EGO,
+        vehicles=[(0, 0, 5.0)],
+        num_vrus=0,
+        limit=limit,
+    )
     assert data["next", "agents", "states"][0, :, 0, 3].max() < limit + 0.1
     assert float(last[3]) > 0.9 * min(limit, 14.0)
 
@@ -73,35 +93,58 @@ def test_it_keeps_the_speed_limit(limit):
 def test_a_slow_ego_brakes_as_hard_as_it_can_before_a_collision_that_is_near_a_fast_one_as_idm_may(
     speed, braking
 ):
-    _, world = world_of(vehicles=[(0, 0, speed), (speed, 0, 0.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, speed), (speed, 0, 0.0)],
+        num_vrus=0,
+    )
     lost = EGO.plan(world)[0, :5, 3].diff() / DT
-    torch.testing.assert_close(lost, torch.full_like(lost, -braking), atol=0.05, rtol=0)
+    torch.testing.assert_close(
+        lost,
+        torch.full_like(lost, -braking),
+        atol=0.05,
+        rtol=0,
+    )
 
 
 @pytest.mark.parametrize("beside", [1.0, -1.0])
 def test_it_comes_over_where_somebody_who_stands_beside_blocks_the_mission(beside):
     """A parked car reaches 0.2 m into the ego's way; a metre to the other side the ego
     passes it."""
-    scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (40.0, 0, 0.0)], num_vrus=0)
+    scenes = make_scenes(
+        1,
+        vehicles=[(0.0, 0, 10.0), (40.0, 0, 0.0)],
+        num_vrus=0,
+    )
     scenes.scenes["start"][0, 1, 1] = scenes.scenes["logged"][0, :, 1, 1] = 1.8 * beside
     env, world = worlds(scenes)
     assert EGO.plan(world)[0, -1, 1] * beside < -0.7
     data = env.rollout(80, EgoPolicy(EGO, env))
-    assert not touched(data) and env.world().states[0, 0, 0] > 60
+    assert not touched(data)
+    assert env.world().states[0, 0, 0] > 60
 
 
 def test_proposals_lead_to_their_offsets_and_are_slower_by_their_fraction():
-    _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0, limit=10.0)
+    _, world = world_of(
+        vehicles=[(0, 0, 10.0)],
+        num_vrus=0,
+        limit=10.0,
+    )
     states = EGO.proposals(world)
     assert states.shape[:2] == (1, COUNT)
     end = states[0, :, -1].view(len(OFFSETS), len(FRACTIONS), 4)
     torch.testing.assert_close(
-        end[:, -1, 1], end[0, -1, 1] + torch.tensor(OFFSETS), atol=0.2, rtol=0
+        end[:, -1, 1],
+        end[0, -1, 1] + torch.tensor(OFFSETS),
+        atol=0.2,
+        rtol=0,
     )
-    assert (end[..., 3].diff(dim=1) > 0).all() and (end[..., 0].diff(dim=1) > 0).all()
+    assert (end[..., 3].diff(dim=1) > 0).all()
+    assert (end[..., 0].diff(dim=1) > 0).all()
 
 
-FAULTS = {  # the ego's speed; the other's place beside a moving ego, and its motion: at fault in one lane, in several
+# The ego's speed; the other's place beside a moving ego, and its motion; whether the ego
+# is at fault in one lane, in several.
+FAULTS = {
     "the front meets a slower one": (10.0, (4.6, 0.0, 0.0, 5.0), True, True),
     "the front meets one that comes": (10.0, (4.6, 0.0, math.pi, 5.0), True, True),
     "one that comes from behind": (10.0, (-4.6, 0.0, 0.0, 15.0), False, False),
@@ -145,18 +188,25 @@ def others_at(place):
     states = torch.tensor(place)[None, None, None]
     there = torch.ones(1, 1, dtype=torch.bool)
     return Others(
-        states=states, size=torch.tensor([[[4.8, 2.0]]]), present=there, objects=~there
+        states=states,
+        size=torch.tensor([[[4.8, 2.0]]]),
+        present=there,
+        objects=~there,
     )
 
 
 def test_an_object_that_it_hits_halves_the_score():
     """A vehicle that it hits leaves nothing; both make it brake alike."""
-    _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 10.0), (20, 0, 0.0)],
+        num_vrus=0,
+    )
     ahead = scored_others(world)
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
     vehicle, time = score(world, go, others=ahead)
     thing, same = score(world, go, others=ahead._replace(objects=ahead.present))
-    assert vehicle.item() == 0 and time.item() == same.item() < 2.0
+    assert vehicle.item() == 0
+    assert time.item() == same.item() < 2.0
     assert thing.item() == pytest.approx(
         0.5 * (PROGRESS + COMFORT) / (PROGRESS + TIME_TO_COLLISION + COMFORT)
     )
@@ -201,7 +251,10 @@ def test_in_several_lanes_the_time_to_collision_looks_150_degrees_to_each_side(
 
 @pytest.mark.parametrize(("offset", "expected"), [(0.7, False), (0.8, True)])
 def test_who_reaches_beyond_a_lane_of_3_5_metres_is_in_several(offset, expected):
-    _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 10.0)],
+        num_vrus=0,
+    )
     world.scene["size"][0, 0, 1] = 2.0
     states = world.states[:, :1, None].clone()
     states[..., 1] = offset
@@ -210,7 +263,10 @@ def test_who_reaches_beyond_a_lane_of_3_5_metres_is_in_several(offset, expected)
 
 @pytest.mark.parametrize(("seconds", "brakes"), [(1.9, True), (2.1, False)])
 def test_it_brakes_for_a_collision_within_two_seconds(monkeypatch, seconds, brakes):
-    _, world = world_of(vehicles=[(0, 0, 4.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 4.0)],
+        num_vrus=0,
+    )
     found = (torch.zeros(1, COUNT), torch.full((1, COUNT), seconds))
     monkeypatch.setattr(pdm_closed, "score", lambda *_: found)
     accel = (EGO.plan(world)[0, 0, 3] - 4.0) / DT
@@ -219,7 +275,11 @@ def test_it_brakes_for_a_collision_within_two_seconds(monkeypatch, seconds, brak
 
 def test_the_free_road_term_of_its_idm_has_the_exponent_10():
     """1.5 m/s^2 at most; the whole limit of 15 m/s is the fifth proposal's."""
-    _, world = world_of(vehicles=[(0, 0, 12.0)], num_vrus=0, limit=15.0)
+    _, world = world_of(
+        vehicles=[(0, 0, 12.0)],
+        num_vrus=0,
+        limit=15.0,
+    )
     accel = (EGO.proposals(world)[0, 4, 0, 3] - 12.0) / DT
     assert accel.item() == pytest.approx(1.5 * (1 - 0.8**10), abs=0.01)
 
@@ -234,7 +294,10 @@ def test_the_free_road_term_of_its_idm_has_the_exponent_10():
     ],
 )
 def test_comfort_ends_at_nuplan_s_bounds(accel, yaw_rate, expected):
-    _, world = world_of(vehicles=[(0, 0, 5.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 5.0)],
+        num_vrus=0,
+    )
     world.accel[:, 0] = accel
     actions = torch.tensor([accel, yaw_rate]).expand(SCORED_STEPS, 2)
     states = dynamics.rollout(world.states[0, 0], actions)[None, None]
@@ -245,7 +308,10 @@ def test_comfort_ends_at_nuplan_s_bounds(accel, yaw_rate, expected):
 def test_comfort_has_the_published_windows_and_bounds():
     """Smooth braking at 4 m/s^2 is within −4.05; a step of 1.3 m/s^2 between two halves
     of 2 s is no jerk of 4.13."""
-    _, world = world_of(vehicles=[(0, 0, 30.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 30.0)],
+        num_vrus=0,
+    )
     world.accel[:, 0] = -4.0
 
     def smooth(accelerations):
@@ -265,7 +331,12 @@ def test_comfort_has_the_published_windows_and_bounds():
 def test_the_limit_of_the_present_lane_holds_for_the_whole_plan():
     """It does not brake before a lower limit that begins 20 m ahead, as the published
     one does not."""
-    scenes = make_scenes(1, vehicles=[(0, 0, 10.0)], num_vrus=0, limit=10.0)
+    scenes = make_scenes(
+        1,
+        vehicles=[(0, 0, 10.0)],
+        num_vrus=0,
+        limit=10.0,
+    )
     slower = scenes.scenes["route_limit"].clone()
     slower[..., slower.shape[-1] // 2 :] = 2.0
     _, world = worlds(scenes)
@@ -279,7 +350,10 @@ def test_the_limit_of_the_present_lane_holds_for_the_whole_plan():
 def test_the_score_is_the_weighted_mean_of_its_terms():
     """Alone on the road: the fastest has all; the slower lose progress in proportion; a
     hard brake loses comfort."""
-    _, world = world_of(vehicles=[(0, 0, 10.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 10.0)],
+        num_vrus=0,
+    )
     start = world.states[:, :1]
     none = scored_others(world)
     actions = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [-6.0, 0.0]])[:, None].expand(
@@ -294,13 +368,21 @@ def test_the_score_is_the_weighted_mean_of_its_terms():
         + TIME_TO_COLLISION
         + COMFORT * torch.tensor([1.0, 1.0, 0.0])
     )
-    torch.testing.assert_close(found, expected / whole, atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        found,
+        expected / whole,
+        atol=1e-4,
+        rtol=0,
+    )
     scored = torch.cat([start.expand(3, -1, -1)[None], states[:, :, :SCORED_STEPS]], 2)
     assert comfortable(world, scored)[0].tolist() == [True, True, False]
 
 
 def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
-    _, world = world_of(vehicles=[(0, 0, 10.0), (20, 0, 0.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 10.0), (20, 0, 0.0)],
+        num_vrus=0,
+    )
     ahead = scored_others(world)
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
     found, collides = score(world, go, others=ahead)
@@ -319,7 +401,8 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
         )
         + 1
     )
-    assert found.item() == 0 and collides.item() == pytest.approx(DT * first)
+    assert found.item() == 0
+    assert collides.item() == pytest.approx(DT * first)
     turn = dynamics.rollout(
         world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2)
     )[:, None]
@@ -330,7 +413,10 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
 def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_collision():
     """Braking late, the ego halts 0.8 m behind whom stands, whom it would hit within
     0.9 s if it let go the brake."""
-    _, world = world_of(vehicles=[(0, 0, 10.0), (20.0, 0, 0.0)], num_vrus=0)
+    _, world = world_of(
+        vehicles=[(0, 0, 10.0), (20.0, 0, 0.0)],
+        num_vrus=0,
+    )
     ahead = scored_others(world)
     actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
     states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
@@ -341,14 +427,21 @@ def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_col
     )
     assert collides.isinf().all()
     torch.testing.assert_close(
-        found[0], expected / (PROGRESS + TIME_TO_COLLISION + COMFORT), atol=1e-4, rtol=0
+        found[0],
+        expected / (PROGRESS + TIME_TO_COLLISION + COMFORT),
+        atol=1e-4,
+        rtol=0,
     )
 
 
 def test_where_every_proposal_is_excluded_it_drives_the_slowest():
     """The road ends ahead: no proposal is better than another, and no collision makes
     it brake."""
-    scenes = make_scenes(1, vehicles=[(0, 0, 10.0)], num_vrus=0)
+    scenes = make_scenes(
+        1,
+        vehicles=[(0, 0, 10.0)],
+        num_vrus=0,
+    )
     scenes.scenes["field"][:, 86:] = 10.0  # from x = 6 m on
     _, world = worlds(scenes)
     states = EGO.proposals(world)
@@ -364,4 +457,9 @@ def test_a_scene_is_planned_alike_alone_and_in_a_batch():
     whole = EGO.plan(world)
     for k in range(3):
         alone = EGO.plan(take(world, torch.tensor([k])))[0]
-        torch.testing.assert_close(alone, whole[k], atol=1e-3, rtol=0)
+        torch.testing.assert_close(
+            alone,
+            whole[k],
+            atol=1e-3,
+            rtol=0,
+        )

@@ -90,7 +90,12 @@ def test_other_shapes_are_refused(tmp_path, rows, numbers):
         ("policy.onnx", bytes(MAX_FILE + 1), "larger than"),
     ],
 )
-def test_what_is_no_policy_is_named(tmp_path, name, content, what):
+def test_what_is_no_policy_is_named(
+    tmp_path,
+    name,
+    content,
+    what,
+):
     if callable(content):
         content(tmp_path / name)
     elif content is not None:
@@ -118,7 +123,10 @@ def onnx_file(file, *nodes, functions=(), **constants):
     graph = helper.make_graph([cut, *nodes], "policy", *sides, held)
     versions = [helper.make_opsetid("", 18), helper.make_opsetid("own", 1)]
     model = helper.make_model(
-        graph, opset_imports=versions, ir_version=9, functions=functions
+        graph,
+        opset_imports=versions,
+        ir_version=9,
+        functions=functions,
     )
     file.write_bytes(model.SerializeToString())
     return str(file)
@@ -212,7 +220,11 @@ def test_damaged_bytes_are_refused_or_arithmetic():
 def drive(ego, **options):
     """States [30, 3, 4] of the egos of three scenes with others around."""
     env = DrivingEnv(
-        make_scenes(3, num_vehicles=6, red_light_x=60.0),
+        make_scenes(
+            3,
+            num_vehicles=6,
+            red_light_x=60.0,
+        ),
         SimSettings(),
         3,
         agents=True,
@@ -234,7 +246,13 @@ def drive(ego, **options):
 def actor():
     """With an opinion, and statistics of observations of its own."""
     torch.manual_seed(1)
-    ego = wild(ActorEgo(hidden=(16, 8), room=3.0), 0.1)
+    ego = wild(
+        ActorEgo(
+            hidden=(16, 8),
+            room=3.0,
+        ),
+        0.1,
+    )
     ego.network.normaliser.observe(torch.randn(50, OBSERVATION_SIZE))
     return ego
 
@@ -248,13 +266,9 @@ def test_the_same_rollouts(actor, tmp_path, name):
     ego = PolicyFileEgo(str(tmp_path / name))
     observation = 2 * torch.randn(200, OBSERVATION_SIZE)
     expected = actor.act(None, observation, None)
-    assert (
-        torch.allclose(ego.decide(observation), expected, atol=1e-5)
-        and expected.std(0).min() > 0.05
-    )
+    assert torch.allclose(ego.decide(observation), expected, atol=1e-5)
+    assert expected.std(0).min() > 0.05
     driven = drive(ego)
     own = drive(actor)
-    assert (
-        torch.allclose(driven, own, atol=1e-3)
-        and (own[-1, :, 0] - own[0, :, 0]).min() > 5
-    )
+    assert torch.allclose(driven, own, atol=1e-3)
+    assert (own[-1, :, 0] - own[0, :, 0]).min() > 5

@@ -31,7 +31,12 @@ def drive(scenes, batch=2):
 def test_an_empty_road_is_driven_at_the_limit():
     data, world = drive(
         make_scenes(
-            2, num_vehicles=1, num_vrus=0, speed=10.0, limit=12.0, road=(-60.0, 600.0)
+            2,
+            num_vehicles=1,
+            num_vrus=0,
+            speed=10.0,
+            limit=12.0,
+            road=(-60.0, 600.0),
         )
     )
     assert ((world.states[:, 0, 3] > 11.0) & (world.states[:, 0, 3] < 12.0)).all()
@@ -40,14 +45,20 @@ def test_an_empty_road_is_driven_at_the_limit():
 
 def test_a_standing_car_and_a_red_light_are_halted_at():
     data, world = drive(make_scenes(2, vehicles=[(0.0, 0, 10.0), (45.0, 0, 0.0)]))
-    assert (
-        not data["next", "metrics", "contact"].any()
-        and (world.states[:, 0, 3] < 1.0).all()
-    )
+    assert not data["next", "metrics", "contact"].any()
+    assert (world.states[:, 0, 3] < 1.0).all()
     assert (world.states[:, 0, 0] > 30.0).all()
-    _, world = drive(make_scenes(2, num_vehicles=1, num_vrus=0, red_light_x=50.0))
+    _, world = drive(
+        make_scenes(
+            2,
+            num_vehicles=1,
+            num_vrus=0,
+            red_light_x=50.0,
+        )
+    )
     front = world.states[:, 0, 0] + 2.25
-    assert (front < 50.0).all() and (front > 40.0).all()
+    assert (front < 50.0).all()
+    assert (front > 40.0).all()
 
 
 def test_a_car_in_the_other_lane_is_no_leader():
@@ -57,7 +68,11 @@ def test_a_car_in_the_other_lane_is_no_leader():
 
 
 def test_an_offset_is_steered_back():
-    scenes = make_scenes(2, num_vehicles=1, num_vrus=0)
+    scenes = make_scenes(
+        2,
+        num_vehicles=1,
+        num_vrus=0,
+    )
     scenes.scenes["start"][:, 0, 1], scenes.scenes["start"][:, 0, 2] = 1.0, 0.1
     _, world = drive(scenes)
     assert world.states[:, 0, 1].abs().max() < 0.1
@@ -65,7 +80,13 @@ def test_an_offset_is_steered_back():
 
 def test_leading_dims_do_not_matter():
     env = DrivingEnv(
-        make_scenes(3, num_vehicles=12, red_light_x=60.0), SimSettings(), 3
+        make_scenes(
+            3,
+            num_vehicles=12,
+            red_light_x=60.0,
+        ),
+        SimSettings(),
+        3,
     )
     observation = env.rollout(10)["observation"]
     one_by_one = torch.stack([follow(row) for row in observation.flatten(0, 1)])
@@ -74,13 +95,19 @@ def test_leading_dims_do_not_matter():
 
 def test_the_order_of_the_agents_changes_nothing_and_each_of_them_counts():
     torch.manual_seed(0)
-    trunk = Trunk((32, 16), 8, out=2, last_gain=1.0)
+    trunk = Trunk(
+        (32, 16),
+        8,
+        out=2,
+        last_gain=1.0,
+    )
     seen = torch.randn(5, OBSERVATION_SIZE)
     agents = seen[:, AGENTS].unflatten(1, (NEAREST, PER_AGENT))
     shuffled = seen.clone()
     out = trunk(seen)
     shuffled[:, AGENTS] = agents[:, torch.randperm(NEAREST)].flatten(1)
-    assert out.shape == (5, 2) and torch.allclose(trunk(shuffled), out, atol=1e-6)
+    assert out.shape == (5, 2)
+    assert torch.allclose(trunk(shuffled), out, atol=1e-6)
     for slot in range(NEAREST):
         moved = seen.clone()
         moved[
@@ -93,12 +120,25 @@ def test_the_rest_of_the_scene_counts_and_a_last_layer_of_zeros_says_nothing():
     torch.manual_seed(0)
     seen = torch.randn(OBSERVATION_SIZE, requires_grad=True)
     (gradient,) = torch.autograd.grad(
-        Trunk((32,), 8, out=1, last_gain=1.0)(seen).sum(), seen
+        Trunk(
+            (32,),
+            8,
+            out=1,
+            last_gain=1.0,
+        )(seen).sum(),
+        seen,
     )
-    assert (gradient[: AGENTS.start] != 0).all() and (
-        gradient[AGENTS.stop :] != 0
-    ).all()
-    assert torch.equal(Trunk((32, 16), 8, out=2, last_gain=0.0)(seen), torch.zeros(2))
+    assert (gradient[: AGENTS.start] != 0).all()
+    assert (gradient[AGENTS.stop :] != 0).all()
+    assert torch.equal(
+        Trunk(
+            (32, 16),
+            8,
+            out=2,
+            last_gain=0.0,
+        )(seen),
+        torch.zeros(2),
+    )
 
 
 def test_the_gradient_of_the_largest_is_shared_among_equals():

@@ -21,7 +21,10 @@ def test_boxed_in_it_is_never_worse_than_hard_braking():
     """Cars on both sides and one standing ahead, too near to stop: the plan hits no
     harder than braking would."""
     box = [(0.0, 0, 12.0), (11.0, 0, 0.0), (0.0, 1, 12.0), (-25.0, 0, 12.0)]
-    _, world = world_of(vehicles=box, num_vrus=0)
+    _, world = world_of(
+        vehicles=box,
+        num_vrus=0,
+    )
     plan = SamplingEgo().plan(world)[0]
     size = world.scene["size"][0, 0]
     wall = world.states[0, 1]
@@ -30,10 +33,19 @@ def test_boxed_in_it_is_never_worse_than_hard_braking():
     )
 
     def impact(states):
-        hit = (separation(states, size, second=wall, second_size=size) < 0).nonzero()
+        hit = (
+            separation(
+                states,
+                size,
+                second=wall,
+                second_size=size,
+            )
+            < 0
+        ).nonzero()
         return states[hit[0, 0], 3].item() if len(hit) else 0.0
 
-    assert impact(braking) > 1 and impact(plan) <= impact(braking) + 0.5
+    assert impact(braking) > 1
+    assert impact(plan) <= impact(braking) + 0.5
 
 
 def test_candidates_obey_the_simulator_s_bounds():
@@ -42,14 +54,13 @@ def test_candidates_obey_the_simulator_s_bounds():
     _, world = worlds(scenes)
     candidates = SamplingEgo().candidates(world)
     count = len(PROFILES) * (2 * len(SHIFTS) + 1)
-    assert (
-        candidates.states.shape == (2, count, PLAN_STEPS, 4)
-        and torch.isfinite(candidates.states).all()
-    )
+    assert candidates.states.shape == (2, count, PLAN_STEPS, 4)
+    assert torch.isfinite(candidates.states).all()
     start = world.states[:, :1].expand(-1, count, -1)[:, :, None]
     states = torch.cat([start, candidates.states], 2)
     actions = dynamics.inverse(states)
-    assert (actions[..., 0] > -8 - 1e-3).all() and (actions[..., 0] < 5 + 1e-3).all()
+    assert (actions[..., 0] > -8 - 1e-3).all()
+    assert (actions[..., 0] < 5 + 1e-3).all()
     mean = (states[..., 1:, 3] + states[..., :-1, 3]) / 2
     assert (
         actions[..., 1].abs()
@@ -60,16 +71,28 @@ def test_candidates_obey_the_simulator_s_bounds():
         < dynamics.MAX_LATERAL + 0.05
     ).all()
     torch.testing.assert_close(
-        dynamics.rollout(start[:, :, 0], actions), candidates.states, atol=2e-3, rtol=0
+        dynamics.rollout(start[:, :, 0], actions),
+        candidates.states,
+        atol=2e-3,
+        rtol=0,
     )
 
 
 def test_moves_lead_beside_the_mission():
-    _, world = world_of(num_vehicles=1, num_vrus=0, limit=0.0)
+    _, world = world_of(
+        num_vehicles=1,
+        num_vrus=0,
+        limit=0.0,
+    )
     candidates = SamplingEgo().candidates(world)
     cruise = PROFILES.index((0.0, 0.0)) * (2 * len(SHIFTS) + 1)
     side = candidates.states[0, cruise : cruise + len(SHIFTS), -1, 1]
-    torch.testing.assert_close(side, torch.tensor(SHIFTS), atol=0.25, rtol=0)
+    torch.testing.assert_close(
+        side,
+        torch.tensor(SHIFTS),
+        atol=0.25,
+        rtol=0,
+    )
 
 
 @pytest.mark.parametrize("beside", [1.0, -1.0])
@@ -77,14 +100,22 @@ def test_a_mirrored_scene_gets_the_mirrored_plan(beside):
     """Somebody comes over from one side; the road is as wide on both."""
     plans = []
     for sign in (beside, -beside):
-        scenes = make_scenes(1, vehicles=[(0.0, 0, 10.0), (3.0, 0, 10.0)], num_vrus=0)
+        scenes = make_scenes(
+            1,
+            vehicles=[(0.0, 0, 10.0), (3.0, 0, 10.0)],
+            num_vrus=0,
+        )
         start = scenes.scenes["start"]
         start[0, 1, 1:3] = torch.tensor([2.6 * sign, -0.12 * sign])
         scenes.scenes["field"].fill_(-10.0)
         plans.append(
             SamplingEgo().plan(worlds(scenes)[1]) * torch.tensor([1.0, sign, sign, 1.0])
         )
-    torch.testing.assert_close(*plans, atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        *plans,
+        atol=1e-3,
+        rtol=0,
+    )
     assert plans[0][..., 1].abs().max() > 0.3
 
 
@@ -96,14 +127,12 @@ def test_speed_profiles_keep_the_caps():
         caps=caps,
         braking=4.0,
     )
-    assert speed.shape == (1, 3, PLAN_STEPS + 1) and (speed[..., 0] == 10).all()
-    assert (
-        torch.allclose(speed[0, :2, 10:], torch.tensor(8.0))
-        and (speed[0, 2, 15:] == 0).all()
-    )
-    assert (speed.diff(dim=-1) / DT > -8.001).all() and (
-        speed[0, :2].diff(dim=-1) / DT > -4.001
-    ).all()
+    assert speed.shape == (1, 3, PLAN_STEPS + 1)
+    assert (speed[..., 0] == 10).all()
+    assert torch.allclose(speed[0, :2, 10:], torch.tensor(8.0))
+    assert (speed[0, 2, 15:] == 0).all()
+    assert (speed.diff(dim=-1) / DT > -8.001).all()
+    assert (speed[0, :2].diff(dim=-1) / DT > -4.001).all()
 
 
 def test_steering_catches_up_with_what_a_bound_withheld():
@@ -113,7 +142,11 @@ def test_steering_catches_up_with_what_a_bound_withheld():
 
 
 def test_a_curve_is_driven_along_its_mission():
-    scenes = make_scenes(1, num_vehicles=1, num_vrus=0)
+    scenes = make_scenes(
+        1,
+        num_vehicles=1,
+        num_vrus=0,
+    )
     angle = torch.arange(150) * 2.0 / 40
     scenes.scenes["route_points"][0, 0, 0] = torch.stack(
         [40 * angle.sin() - 20, 40 * (1 - angle.cos())], -1
@@ -131,12 +164,15 @@ def test_a_curve_is_driven_along_its_mission():
     )
     driven = candidates.states[0, 0]
     radius = (driven[:, :2] - torch.tensor([-20.0, 40.0])).norm(dim=-1)
-    assert (radius - 40).abs().max() < 0.5 and driven[-1, 2] > 0.9
+    assert (radius - 40).abs().max() < 0.5
+    assert driven[-1, 2] > 0.9
 
 
 def test_forecasts_of_constant_acceleration_and_turn():
     scenes = make_scenes(
-        1, vehicles=[(0.0, 0, 10.0), (20.0, 0, 10.0), (40.0, 1, 10.0)], num_vrus=0
+        1,
+        vehicles=[(0.0, 0, 10.0), (20.0, 0, 10.0), (40.0, 1, 10.0)],
+        num_vrus=0,
     )
     scenes.scenes["start_accel"][0, 1], scenes.scenes["start_yaw_rate"][0, 2] = (
         -8.0,
@@ -146,13 +182,22 @@ def test_forecasts_of_constant_acceleration_and_turn():
     agents, present = nearest(world, 5)
     assert present.tolist() == [[True, True, False, False, False]]
     assert agents[0, :2].tolist() == [1, 2]
-    states = forecast(world, (agents, present), times=TIMES, hold=1.0, turn=2.0).states[
-        0
-    ]
+    states = forecast(
+        world,
+        (agents, present),
+        times=TIMES,
+        hold=1.0,
+        turn=2.0,
+    ).states[0]
     expected = (
         20 + 10 * TIMES - 4 * TIMES.clamp(max=1) ** 2 - 8 * (TIMES - 1).clamp(min=0)
     )
-    torch.testing.assert_close(states[0, :, 0], expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        states[0, :, 0],
+        expected,
+        atol=1e-3,
+        rtol=0,
+    )
     torch.testing.assert_close(states[0, :, 3], 10 - 8 * TIMES.clamp(max=1))
     early = TIMES < 2
     torch.testing.assert_close(
@@ -176,7 +221,12 @@ def test_pair_costs_order_situations():
     weights = SamplingEgo()
     size = torch.tensor([[4.5, 2.0]])
 
-    def cost(x, y, speed, ego_speed=10.0):
+    def cost(
+        x,
+        y,
+        speed,
+        ego_speed=10.0,
+    ):
         ego = torch.tensor([[0.0, 0.0, 0.0, ego_speed]])
         other = torch.tensor([[x, y, 0.0, speed]])
         pairs = Pairs(
@@ -194,7 +244,12 @@ def test_pair_costs_order_situations():
     assert cost(0.0, 2.2, 10.0) > cost(0.0, 2.6, 10.0) > cost(0.0, 3.1, 10.0) == 0
 
 
-def cost_of(x, y, ego_speed, other_speed=0.0):
+def cost_of(
+    x,
+    y,
+    ego_speed,
+    other_speed=0.0,
+):
     """Of a vehicle of 4 x 2 m beside or ahead of another, by the file's weights: 200
     for a contact, 30 for nearness, 1.5 s of headway; margin 1 m."""
     size = torch.tensor([[4.0, 2.0]])
@@ -241,7 +296,8 @@ def test_the_ranked_begin_with_the_plan_and_are_driven_differently():
     _, world = world_of(num_scenes=2)
     ego = SamplingEgo()
     states, costs = ego.ranked(world, 8)
-    assert states.shape == (2, 8, PLAN_STEPS, 4) and (costs.diff(dim=1) >= 0).all()
+    assert states.shape == (2, 8, PLAN_STEPS, 4)
+    assert (costs.diff(dim=1) >= 0).all()
     assert torch.equal(states[:, 0], ego.plan(world))
     apart = (states[:, :, None] - states[:, None]).abs().amax((3, 4)) + torch.eye(8)
     assert (apart > 1e-4).all()
@@ -253,7 +309,12 @@ def test_a_plan_of_its_own_is_rated_as_it_was_ranked():
     _, world = world_of(num_scenes=2)
     ego = SamplingEgo(lateral_offset=0.0)
     states, costs = ego.ranked(world, 8)
-    torch.testing.assert_close(ego.rated(world, states), costs, atol=0.2, rtol=0)
+    torch.testing.assert_close(
+        ego.rated(world, states),
+        costs,
+        atol=0.2,
+        rtol=0,
+    )
     into = world.states[:, None, 1:2].expand(-1, 1, PLAN_STEPS, -1)
     assert (ego.rated(world, into) > costs[:, :1] + 50).all(), (
         "one that is where another agent is"

@@ -59,7 +59,8 @@ def test_a_batch_is_halved_until_the_one_that_raises_is_alone(error):
     assert [task for tasks, _ in done for task in tasks] == [0, 1, 2, 3, 4, 6, 7]
     assert [(task, why["reason"]) for task, why in ended] == [
         (5, f"raised {type(error).__name__}")
-    ] and len(asked) == 7
+    ]
+    assert len(asked) == 7
 
 
 @pytest.mark.parametrize(

@@ -33,14 +33,11 @@ def test_joined_rows_keep_their_traffic():
     assert twice.source.tolist() == list(range(6))
     assert len(twice.parts) == 2
     for pool in (both, other_way):
-        assert pool.parts[0] is attack.parts[0] and len(pool) == 9, (
-            "the tracks are shared"
-        )
+        assert pool.parts[0] is attack.parts[0], "the tracks are shared"
+        assert len(pool) == 9, "the tracks are shared"
         assert torch.equal(pool.scene_index, INDEX.repeat(3))
-    assert (
-        both.seed.tolist() == [0] * 6 + [7, 8, 9]
-        and both.eta.tolist() == [2.0] * 3 + [0.0] * 3 + [1.0] * 3
-    )
+    assert both.seed.tolist() == [0] * 6 + [7, 8, 9]
+    assert both.eta.tolist() == [2.0] * 3 + [0.0] * 3 + [1.0] * 3
 
 
 def test_tracks_are_gathered_from_the_parts_as_from_one():

@@ -49,11 +49,9 @@ def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_s
         track[..., 0], start[..., 0] + start[..., 3] * time - time**2, rtol=0, atol=1e-2
     )
     assert torch.equal(track[..., 1:3], start[..., 1:3].expand_as(track[..., 1:3]))
-    assert (
-        out.valid[:, :, there].all()
-        and not out.adversaries.any()
-        and (out.transport_others == 0).all()
-    )
+    assert out.valid[:, :, there].all()
+    assert not out.adversaries.any()
+    assert (out.transport_others == 0).all()
 
 
 def test_zero_intensity_is_the_nominal_rollout_more_of_it_is_not_and_seeds_decide():
@@ -66,12 +64,14 @@ def test_zero_intensity_is_the_nominal_rollout_more_of_it_is_not_and_seeds_decid
     other = drive(scene_set, on, 2.0, seeds=[10, 11, 12])
     assert torch.equal(pushed.states, again.states)
     assert not torch.equal(pushed.states[:, :, 1:5], other.states[:, :, 1:5])
-    assert torch.equal(nominal.states, zero.states) and not zero.adversaries.any()
-    assert (pushed.adversaries.any(1)).all() and not pushed.adversaries[:, 0].any()
-    assert (zero.transport_adversary == 0).all() and (
-        pushed.transport_adversary > 0
-    ).all()
-    assert (zero.transport_anchor == 0).all() and (nominal.transport_anchor == 0).all()
+    assert torch.equal(nominal.states, zero.states)
+    assert not zero.adversaries.any()
+    assert (pushed.adversaries.any(1)).all()
+    assert not pushed.adversaries[:, 0].any()
+    assert (zero.transport_adversary == 0).all()
+    assert (pushed.transport_adversary > 0).all()
+    assert (zero.transport_anchor == 0).all()
+    assert (nominal.transport_anchor == 0).all()
 
 
 def test_the_start_is_the_scene_s_and_parked_vehicles_stay():
@@ -84,10 +84,8 @@ def test_the_start_is_the_scene_s_and_parked_vehicles_stay():
     torch.testing.assert_close(
         out.states[:, :, parked], out.states[:, :1, parked].expand(-1, 21, -1)
     )
-    assert (
-        out.simulated[:, : len(VEHICLES)].all()
-        and not out.simulated[:, len(VEHICLES) :].any()
-    )
+    assert out.simulated[:, : len(VEHICLES)].all()
+    assert not out.simulated[:, len(VEHICLES) :].any()
     assert out.states.isfinite().all()
 
 
@@ -100,10 +98,12 @@ def test_traffic_drives_on_as_planned_after_the_ego_has_left(replay_ego):
     scene_set.scenes["logged_valid"][:, 4:, 0] = False
     scene_set.scenes["logged"][:, 50:, 1:ROWS, :2] += 500.0
     out = drive(scene_set, synthesizer(), 0.0, ego=ReplayEgo(), replay_ego=replay_ego)
-    assert not out.valid[:, 5:, 0].any() and not out.simulated[:, 0].any()
+    assert not out.valid[:, 5:, 0].any()
+    assert not out.simulated[:, 0].any()
     there = out.valid[:, 1:, 1:5] & out.valid[:, :-1, 1:5]
     jump = (out.states[:, 1:, 1:5, :2] - out.states[:, :-1, 1:5, :2]).norm(dim=-1)
-    assert there.any() and jump[there].max() < 4.0
+    assert there.any()
+    assert jump[there].max() < 4.0
 
 
 class Turns(Traffic):
@@ -129,7 +129,8 @@ def test_adversaries_are_whoever_was_one_at_any_time_and_the_transport_is_shared
     assert out.transport_adversary.tolist() == [
         2.0,
         2.0,
-    ] and out.transport_others.tolist() == [0.25, 0.25]
+    ]
+    assert out.transport_others.tolist() == [0.25, 0.25]
     assert torch.equal(out.routes, scenes(2).scenes["route_log"].clamp(min=0)), (
         "nobody said otherwise"
     )
@@ -142,7 +143,8 @@ def test_the_traffic_of_a_round_is_the_rollouts_and_its_seeds_are_the_scenes_own
         scene_set, synthesizer(), sim=SimSettings(), batch=2
     )
     found = synthesize(EGO, rows, 2.0, 5)
-    assert torch.equal(found["scene_index"], rows) and found["states"].shape[:2] == (
+    assert torch.equal(found["scene_index"], rows)
+    assert found["states"].shape[:2] == (
         3,
         21,
     )

@@ -35,7 +35,8 @@ def test_rollouts_are_the_log_bit_for_bit_with_its_gaps():
     valid = scene_set.scenes["logged_valid"][:, :, 1:]
     assert torch.equal(rollouts.valid[:, :, 1:], valid)
     assert torch.equal(rollouts.states[:, :, 1:][valid], logged[valid])
-    assert not rollouts.adversaries.any() and (rollouts.transport_others == 0).all()
+    assert not rollouts.adversaries.any()
+    assert (rollouts.transport_others == 0).all()
 
 
 def test_after_the_recording_s_end_nobody_is_there():
@@ -44,9 +45,8 @@ def test_after_the_recording_s_end_nobody_is_there():
     world.step = torch.tensor([12])
     _, plan = LogReplay().replan(None, world, world.states[:, :1])
     here = scene["logged_valid"][:, 13:31, :ROWS].transpose(1, 2)
-    assert (
-        torch.equal(plan.present[..., :18], here) and not plan.present[..., 18:].any()
-    )
+    assert torch.equal(plan.present[..., :18], here)
+    assert not plan.present[..., 18:].any()
     assert torch.equal(
         plan.states[..., :18, :], scene["logged"][:, 13:31, :ROWS].transpose(1, 2)
     )
@@ -68,7 +68,8 @@ def test_everybody_goes_straight_on_for_the_whole_rollout_and_nobody_leaves():
     expected = start[..., :2] + velocity * DT * torch.arange(41)[:, None, None]
     torch.testing.assert_close(track[..., :2], expected, rtol=0, atol=1e-4)
     assert torch.equal(track[..., 2:], start[..., 2:].expand_as(track[..., 2:]))
-    assert rollouts.valid[:, :, 1:6].all() and (rollouts.states[:, :, 5, 3] == 0).all()
+    assert rollouts.valid[:, :, 1:6].all()
+    assert (rollouts.states[:, :, 5, 3] == 0).all()
 
 
 def test_who_reverses_goes_on_at_constant_velocity_and_halts_under_idm():
@@ -87,10 +88,8 @@ def test_who_reverses_goes_on_at_constant_velocity_and_halts_under_idm():
     torch.testing.assert_close(
         along, (halts[:, 1:, 3] + halts[:, :-1, 3]) / 2 * DT, rtol=0, atol=2e-3
     )
-    assert (
-        along.sum(1).tolist() == pytest.approx([-1.5, -1.5], abs=0.02)
-        and (halts[:, 11:, 3] == 0).all()
-    )
+    assert along.sum(1).tolist() == pytest.approx([-1.5, -1.5], abs=0.02)
+    assert (halts[:, 11:, 3] == 0).all()
 
 
 NO_BOUNDS = BoundSettings(meeting=False, curve=False)
@@ -179,13 +178,12 @@ def test_vehicles_drive_on_the_middle_of_their_lane_and_never_backwards():
     for key in ("start", "logged"):
         scene_set.scenes[key][..., 1, 1] += 0.4
     track = drive(scene_set, idm(BoundSettings()), 0.0).states[:, :, 1:4]
-    assert (track[..., 3] >= 0).all() and (track.diff(dim=1)[..., 0] >= -1e-4).all()
+    assert (track[..., 3] >= 0).all()
+    assert (track.diff(dim=1)[..., 0] >= -1e-4).all()
     aside = track[..., 1] - torch.tensor([0, 0, 3.5])
-    assert (
-        aside[..., 1:].abs().max() < 1e-4
-        and aside[:, -1, 0].max() < 0.15
-        and aside[..., 0].min() > -0.01
-    )
+    assert aside[..., 1:].abs().max() < 1e-4
+    assert aside[:, -1, 0].max() < 0.15
+    assert aside[..., 0].min() > -0.01
 
 
 @pytest.mark.parametrize("colour", [LIGHT_RED, LIGHT_YELLOW])
@@ -201,10 +199,11 @@ def test_it_stops_at_the_line_of_a_red_or_yellow_light_and_waits(colour):
     scene_set.scenes["light_state"][:] = colour
     track = drive(scene_set, idm(BoundSettings()), 0.0).states[0]
     front = track[:, 1:4, 0] + LENGTH / 2
-    assert (
-        (front[:, 0] < line).all() and front[-1, 0] > line - 3 and track[-1, 1, 3] < 0.3
-    )
-    assert front[-1, 1] < front[-1, 0] - LENGTH and track[-1, 2, 3] < 0.5
+    assert (front[:, 0] < line).all()
+    assert front[-1, 0] > line - 3
+    assert track[-1, 1, 3] < 0.3
+    assert front[-1, 1] < front[-1, 0] - LENGTH
+    assert track[-1, 2, 3] < 0.5
     assert front[-1, 2] > line + 50, "who is at the line at speed goes on"
 
 
@@ -214,9 +213,8 @@ def test_a_green_light_is_no_obstacle():
         scene = scenes_of([AWAY, (0, 0, 10)], red_light_x=25.0, limit=LIMIT).scenes
         scene["light_state"][:] = LIGHT_RED if red else LIGHT_RED + 2
         found[red] = acceleration_in(plan_of(World.at_start(scene)))
-    assert found[True] < -1 and found[False] == pytest.approx(
-        1 - (10 / LIMIT) ** 4, abs=1e-4
-    )
+    assert found[True] < -1
+    assert found[False] == pytest.approx(1 - (10 / LIMIT) ** 4, abs=1e-4)
 
 
 def test_who_stands_at_the_start_stands_for_good():
@@ -225,7 +223,8 @@ def test_who_stands_at_the_start_stands_for_good():
     assert torch.equal(
         states[1:, 1:3, :2], scene_set.scenes["start"][0, 1:3, :2].expand(60, 2, 2)
     )
-    assert (states[1:, 1:3, 3] == 0).all() and states[-1, 3, 0] > 40
+    assert (states[1:, 1:3, 3] == 0).all()
+    assert states[-1, 3, 0] > 40
 
 
 def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
@@ -235,9 +234,9 @@ def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
     rollouts = drive(scene_set, idm(BoundSettings()), 0.0)
     x = rollouts.states[0, :, 1:3, 0]
     there = rollouts.valid[0, :, 1:3]
-    assert (
-        there[:, 1].all() and not there[-1, 0] and (x[:, 0][there[:, 0]] <= 80.5).all()
-    )
+    assert there[:, 1].all()
+    assert not there[-1, 0]
+    assert (x[:, 0][there[:, 0]] <= 80.5).all()
     assert (there[1:, 0] <= there[:-1, 0]).all(), "nobody comes back"
 
 

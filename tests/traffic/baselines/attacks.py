@@ -44,5 +44,10 @@ def first_replan(on: Baseline, scene, eta: float = 2.0):
     ego_plan = EGO.plan(world)
     state = replace(state, lane=on.lane_now(state, world, ego_plan))
     context = on.encode(state, world, ego_plan)
-    replan = Replan(state, world, ego_plan=ego_plan, noise=on.noise(state))
+    replan = Replan(
+        state,
+        world,
+        ego_plan=ego_plan,
+        noise=on.noise(state),
+    )
     return (replan, context), View.of(replan, context, on.strength(state))

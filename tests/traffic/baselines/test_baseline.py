@@ -14,14 +14,23 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, executed, replanned, sce
 @pytest.mark.parametrize("knowledge", ["plan", "predicted"])
 @pytest.mark.parametrize("name", SMALL)
 def test_without_gain_it_is_the_prior_bit_for_bit(name, knowledge):
-    on = baseline(name, gain=0.0, knowledge=knowledge)
-    scene = scenes(2).scenes
-    _, plan = replanned(on, scene, eta=2.0, times=3)
-    _, nominal = replanned(NominalTraffic(on.prior, knowledge), scene, times=3)
-    assert torch.equal(plan.states, nominal.states) and torch.equal(
-        plan.present, nominal.present
+    on = baseline(
+        name,
+        gain=0.0,
+        knowledge=knowledge,
     )
-    assert not plan.adversary.any() and (plan.path_kl == 0).all()
+    scene = scenes(2).scenes
+    _, plan = replanned(
+        on,
+        scene,
+        eta=2.0,
+        times=3,
+    )
+    _, nominal = replanned(NominalTraffic(on.prior, knowledge), scene, times=3)
+    assert torch.equal(plan.states, nominal.states)
+    assert torch.equal(plan.present, nominal.present)
+    assert not plan.adversary.any()
+    assert (plan.path_kl == 0).all()
 
 
 @pytest.mark.parametrize("name", ADVERSARIES)
@@ -34,7 +43,12 @@ def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_o
     eta = torch.tensor([0.0, 2.0])
     _, plan = on.replan(on.reset(scene, torch.arange(2), eta), world, EGO.plan(world))
     _, nominal = replanned(NominalTraffic(on.prior, on.knowledge), scene)
-    torch.testing.assert_close(plan.states[0], nominal.states[0], rtol=0, atol=5e-3)
+    torch.testing.assert_close(
+        plan.states[0],
+        nominal.states[0],
+        rtol=0,
+        atol=5e-3,
+    )
     assert not plan.adversary[0].any()
     _, calm = replanned(on, scene, eta=0.0)
     assert torch.equal(calm.states, nominal.states)
@@ -44,9 +58,26 @@ def test_without_intensity_it_is_the_prior_bit_for_bit_also_beside_scenes_with_o
 def test_a_scene_is_planned_alike_alone_and_in_a_batch(name):
     on = baseline(name)
     scene = scenes(3).scenes
-    _, whole = replanned(on, scene, eta=2.0, seeds=[5, 6, 7], times=2)
-    _, alone = replanned(on, scene[1:2], eta=2.0, seeds=[6], times=2)
-    torch.testing.assert_close(alone.states, whole.states[1:2], rtol=0, atol=2e-2)
+    _, whole = replanned(
+        on,
+        scene,
+        eta=2.0,
+        seeds=[5, 6, 7],
+        times=2,
+    )
+    _, alone = replanned(
+        on,
+        scene[1:2],
+        eta=2.0,
+        seeds=[6],
+        times=2,
+    )
+    torch.testing.assert_close(
+        alone.states,
+        whole.states[1:2],
+        rtol=0,
+        atol=2e-2,
+    )
     assert torch.equal(alone.adversary, whole.adversary[1:2])
 
 
@@ -56,7 +87,8 @@ def test_it_attacks_on_the_authors_terms_and_on_ours(name):
     for terms in ({}, {"knowledge": "predicted", "responsibility": "full"}):
         _, plan = replanned(baseline(name, **terms), scene, eta=2.0)
         _, nominal = replanned(baseline(name, **terms), scene, eta=0.0)
-        assert plan.adversary.any() and not plan.adversary[:, 0].any()
+        assert plan.adversary.any()
+        assert not plan.adversary[:, 0].any()
         assert not torch.equal(
             plan.states[plan.adversary], nominal.states[plan.adversary]
         )
@@ -85,7 +117,8 @@ def test_the_yielding_rule_binds_the_adversaries():
         state, _, context = bound.replan_group(now)
         duties.append(context.obstacles.duty)
         assert torch.equal(duties[-1].exempt | duties[-1].yields, state.adversary)
-    assert not duties[0].yields.any() and duties[1].yields.any()
+    assert not duties[0].yields.any()
+    assert duties[1].yields.any()
 
 
 @pytest.mark.parametrize("name", ["ccdiff", "cat"])
@@ -106,4 +139,5 @@ def test_who_is_left_alone_replays_and_the_prior_sees_where_they_are(name):
         torch.testing.assert_close(
             state.lane.states()[here][:, :3], logged.states[here][:, 4, :3]
         )
-    assert traffic.adversary.any() and not (traffic.adversary & ~driven).any()
+    assert traffic.adversary.any()
+    assert not (traffic.adversary & ~driven).any()

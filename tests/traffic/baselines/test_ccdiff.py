@@ -25,9 +25,8 @@ def test_risk_is_the_time_until_the_gap_closes_on_both_axes():
     closing = pair(
         [0.0, 0.0, 0.0, 10.0], [24.0, 0.0, 0.0, 0.0]
     )  # 20 m of gap at 10 m/s, side by side on y
-    assert closing[0, 1].item() == pytest.approx((20 - 2) / 20) and torch.equal(
-        closing, closing.T
-    )
+    assert closing[0, 1].item() == pytest.approx((20 - 2) / 20)
+    assert torch.equal(closing, closing.T)
     assert (
         pair([0.0, 0.0, 0.0, 0.0], [24.0, 0.0, 0.0, 10.0])[0, 1] == 0
     )  # it drives away
@@ -44,7 +43,10 @@ def test_the_past_ends_at_the_start():
     states = recent_states(scene)
     assert states.shape[2] == 11
     torch.testing.assert_close(
-        states[:, :2, -1], scene["start"][:, :2], rtol=1e-4, atol=1e-3
+        states[:, :2, -1],
+        scene["start"][:, :2],
+        rtol=1e-4,
+        atol=1e-3,
     )
     torch.testing.assert_close(
         states[0, 1, 0, :2],

@@ -21,7 +21,12 @@ def control_inputs():
     level, low = on.prior.sampler.levels(on.prior.schedule)[1:3]
 
     def objective(x):
-        motion = motion_of(on.prior, x, context=context, batch=2)
+        motion = motion_of(
+            on.prior,
+            x,
+            context=context,
+            batch=2,
+        )
         return on.loss(motion, view).sum()
 
     return on, context, objective, replan.noise[0, :, :, 0], level, low
@@ -91,9 +96,8 @@ def test_clean_guidance_is_clipped_and_leaves_masked_rows_alone():
         x, level, 3, context, lambda value: on.prior.denoise(value, level, context)
     )
     shift = (x0 - nominal).abs()
-    assert (shift[~guided] == 0).all() and shift.max().item() == pytest.approx(
-        0.25, rel=1e-4
-    )
+    assert (shift[~guided] == 0).all()
+    assert shift.max().item() == pytest.approx(0.25, rel=1e-4)
 
 
 def test_samples_go_along_the_batch_and_back():
@@ -103,7 +107,12 @@ def test_samples_go_along_the_batch_and_back():
     many = flat.unflatten(0, (3, 2))
     for number in range(3):
         one = on.prior.sample(context, now.noise[..., number, :].contiguous()).x0
-        torch.testing.assert_close(many[number], one, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            many[number],
+            one,
+            rtol=1e-4,
+            atol=1e-4,
+        )
     by_scene = torch.tensor([2, 0])
     by_vehicle = torch.arange(8).expand(2, -1) % 3
     assert torch.equal(pick(flat, by_scene)[0], many[2, 0])
@@ -130,7 +139,12 @@ def test_guidance_lowers_the_loss_of_bundled_scenes(name, bundled):
     guided = state.adversary if on.adversarial else context.active
 
     def loss(x):
-        motion = motion_of(prior, x, context=context, batch=len(x))
+        motion = motion_of(
+            prior,
+            x,
+            context=context,
+            batch=len(x),
+        )
         return torch.where(guided, on.loss(motion, view)[0], 0.0).sum()
 
     assert loss(x0) < loss(nominal)

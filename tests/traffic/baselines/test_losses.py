@@ -27,7 +27,12 @@ from tests.traffic.e2.traffic_scenes import scenes
 SIZE = torch.tensor([[4.0, 2.0]])
 
 
-def pose(x, y=0.0, heading=0.0, speed=5.0):
+def pose(
+    x,
+    y=0.0,
+    heading=0.0,
+    speed=5.0,
+):
     return torch.tensor([[[x, y, heading, speed]]])
 
 
@@ -40,7 +45,12 @@ def test_disks_reach_from_bumper_to_bumper():
 
 def pair(x):
     """A vehicle, and another x m ahead of it."""
-    return Pairs(pose(0.0), SIZE, other=pose(x), other_size=SIZE)
+    return Pairs(
+        pose(0.0),
+        SIZE,
+        other=pose(x),
+        other_size=SIZE,
+    )
 
 
 def test_the_gaussian_is_flat_inside_the_box_and_falls_outside():
@@ -55,9 +65,8 @@ def test_the_soft_minimum_lies_between_least_and_mean_distance():
     sharp, soft = (
         approach_term(states, temperature)[0, 0, 1].item() for temperature in (0.1, 1e4)
     )
-    assert sharp == pytest.approx(
-        3.0 + 0.1 * math.log(4), abs=1e-3
-    ) and soft == pytest.approx(6.5, abs=1e-2)
+    assert sharp == pytest.approx(3.0 + 0.1 * math.log(4), abs=1e-3)
+    assert soft == pytest.approx(6.5, abs=1e-2)
 
 
 def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
@@ -68,7 +77,12 @@ def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
         states[..., :2].shape, generator=generator
     )
     weights = torch.tensor([0.5, 0.3, 0.2])
-    term = overlap_term(states, view, margin=0.2, weights=weights)
+    term = overlap_term(
+        states,
+        view,
+        margin=0.2,
+        weights=weights,
+    )
     expected = torch.zeros_like(term)
     for s, b in product(range(2), range(2)):
         for i, j in permutations(view.valid[b].nonzero()[:, 0].tolist(), 2):
@@ -86,7 +100,11 @@ def test_pairs_cost_what_all_pairs_computed_one_by_one_cost():
     torch.testing.assert_close(term, expected)
     everybody = torch.ones_like(view.routed.conflict)
     without = overlap_term(
-        states, view, margin=0.2, weights=weights, left_out=everybody
+        states,
+        view,
+        margin=0.2,
+        weights=weights,
+        left_out=everybody,
     )
     assert (without == 0).all()
 
@@ -112,8 +130,14 @@ def test_discounts_sum_to_one_and_comfort_is_free_within_its_bounds():
     accel = torch.tensor([[[[0.0, 1.0, 2.0], [-6.0, -6.0, -6.0]]]])
     motion = LaneState(*([torch.zeros_like(accel)] * 10))
     motion.a = accel
-    value = comfort_term(motion, low=-3.5, high=2.0, jerk=2.0)[0, 0]
-    assert value[0] == 0 and value[1].item() == pytest.approx(2.5**2)
+    value = comfort_term(
+        motion,
+        low=-3.5,
+        high=2.0,
+        jerk=2.0,
+    )[0, 0]
+    assert value[0] == 0
+    assert value[1].item() == pytest.approx(2.5**2)
 
 
 def test_a_discount_is_a_tenth_a_step():
@@ -172,7 +196,11 @@ def test_diffscene_s_adversary_obstructs_the_ego_s_route_within_1_metre(offset, 
     ],
 )
 def test_diffscene_lets_accelerations_from_minus_3_5_to_2_pass(name, value, free):
-    on = baseline("diffscene", safety=0.0, functionality=0.0)
+    on = baseline(
+        "diffscene",
+        safety=0.0,
+        functionality=0.0,
+    )
     _, view = first_replan(on, scenes(1).scenes)
     adversary = torch.zeros_like(view.active)
     adversary[:, 2] = True

@@ -17,7 +17,12 @@ def test_a_plan_goes_on_where_it_was_left():
     generator = torch.Generator().manual_seed(0)
     points = torch.stack(
         [
-            arc(0.0, 5.0 * i, heading=0.1 * i, curvature=0.004 * (i - 2))
+            arc(
+                0.0,
+                5.0 * i,
+                heading=0.1 * i,
+                curvature=0.004 * (i - 2),
+            )
             for i in range(5)
         ]
     )
@@ -30,25 +35,45 @@ def test_a_plan_goes_on_where_it_was_left():
     for age in (1, 4, 7):
         lane = whole.map(lambda value, at=5 * age - 1: value[..., at])
         rest = decode(
-            later(x, begun, lane=lane, age=torch.tensor([age]), has_lane=on_lane),
+            later(
+                x,
+                begun,
+                lane=lane,
+                age=torch.tensor([age]),
+                has_lane=on_lane,
+            ),
             lane,
             points=points[None],
         )
         known = HORIZON - 5 * age
         torch.testing.assert_close(
-            rest.v[..., :known], whole.v[..., 5 * age :], rtol=0, atol=0.1
+            rest.v[..., :known],
+            whole.v[..., 5 * age :],
+            rtol=0,
+            atol=0.1,
         )
         gap = torch.hypot(
             rest.x[..., :known] - whole.x[..., 5 * age :],
             rest.y[..., :known] - whole.y[..., 5 * age :],
         )
-        assert gap.max() < 0.3 and gap.mean() < 0.1
+        assert gap.max() < 0.3
+        assert gap.mean() < 0.1
 
 
 def test_after_the_plan_speed_is_kept():
     x = torch.ones(1, 2, SIZE)
     lane = random_state(
-        torch.stack([arc(0, 0, heading=0, curvature=0)] * 2),
+        torch.stack(
+            [
+                arc(
+                    0,
+                    0,
+                    heading=0,
+                    curvature=0,
+                )
+            ]
+            * 2
+        ),
         torch.Generator().manual_seed(1),
     )
     lane = lane.map(lambda value: value[None])
@@ -59,7 +84,8 @@ def test_after_the_plan_speed_is_kept():
         age=torch.tensor([9]),
         has_lane=torch.ones(1, 2, dtype=torch.bool),
     )
-    assert (rest[..., 0] == 1).all() and (rest[..., 1:10] == 0).all()
+    assert (rest[..., 0] == 1).all()
+    assert (rest[..., 1:10] == 0).all()
 
 
 def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
@@ -88,8 +114,7 @@ def test_who_is_held_does_not_react_to_the_ego():
     after = executed(world, first, ego_plan=plan)
     _, calm = on.replan(state, after, EGO.plan(after))
     _, other = on.replan(state, after, EGO.plan(after) + 20.0)
-    assert state.held.any() and torch.equal(
-        calm.states[state.held], other.states[state.held]
-    )
+    assert state.held.any()
+    assert torch.equal(calm.states[state.held], other.states[state.held])
     moved = first.states[state.held][:, 5:30] - calm.states[state.held][:, :25]
     assert moved[..., :2].norm(dim=-1).mean() < 0.5

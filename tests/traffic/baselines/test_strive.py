@@ -19,21 +19,38 @@ def test_latents_are_decoded_as_by_ddim_without_noise():
     on.steps = 4
     (now, context), _ = first_replan(on, scenes(2).scenes)
     prior = small_prior(
-        0, sampler=SamplerSettings(sampler="ddim", spacing="level", steps=4, churn=0.0)
+        0,
+        sampler=SamplerSettings(
+            sampler="ddim",
+            spacing="level",
+            steps=4,
+            churn=0.0,
+        ),
     )
     expected = prior.sample(context, now.noise[..., 0, :]).x0
     torch.testing.assert_close(on.decode(now.noise[0, ..., 0, :], context), expected)
 
 
 def test_the_objective_falls_over_the_iterations():
-    on = baseline("strive", iterations=12, knowledge="predicted")
+    on = baseline(
+        "strive",
+        iterations=12,
+        knowledge="predicted",
+    )
     (now, context), view = first_replan(on, scenes(3).scenes)
     first = now.noise[0, :, :, 0]
     values = []
 
     def loss(latent):
         motion = on.motion(on.decode(latent, context), context)
-        values.append(on.loss(motion, latent, first=first, view=view))
+        values.append(
+            on.loss(
+                motion,
+                latent,
+                first=first,
+                view=view,
+            )
+        )
         return values[-1]
 
     on.optimised(first, loss)
@@ -48,9 +65,11 @@ def test_the_planner_is_driven_anew_at_every_iteration_and_not_without_its_plan(
     look = Lookahead(EGO, world)
     react = lambda rows, planned: asked.append(planned) or look(rows, planned)  # noqa: E731
     on = baseline("strive", iterations=3)
-    assert on.queries_ego and not baseline("strive", knowledge="predicted").queries_ego
+    assert on.queries_ego
+    assert not baseline("strive", knowledge="predicted").queries_ego
     on.replan(begin(on, scene, eta=2.0), world, EGO.plan(world), react)
-    assert len(asked) == 4 and not torch.equal(asked[0], asked[3])
+    assert len(asked) == 4
+    assert not torch.equal(asked[0], asked[3])
 
 
 def test_nobody_behind_the_ego_is_the_attacker():
@@ -58,9 +77,8 @@ def test_nobody_behind_the_ego_is_the_attacker():
     _, view = first_replan(on, scenes(1).scenes)
     states = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
     weight = softmin(states, view)[0].sum(-1)
-    assert (
-        weight[3] == 0 and weight.argmax() == 2
-    )  # 20 m behind; 10 m ahead in the next lane
+    assert weight[3] == 0
+    assert weight.argmax() == 2  # 20 m behind; 10 m ahead in the next lane
     assert abs(weight.sum().item() - 1) < 1e-4
     alone = softmin(states, replace(view, active=view.active & False))
     assert (alone == 0).all()
@@ -83,7 +101,12 @@ def test_an_ego_that_is_boxed_in_has_no_solution():
     for states in (far, walled):
         motion = on.motion(torch.zeros_like(first), context)
         motion.x, motion.y, motion.heading, motion.v = states.unbind(-1)
-        solved = on.solvable(first, motion, view=view, context=context)
+        solved = on.solvable(
+            first,
+            motion,
+            view=view,
+            context=context,
+        )
         found.append(solved.tolist())
     assert found == [[True], [False]]
 
@@ -111,10 +134,25 @@ def test_the_objective_weighs_latents_by_who_attacks():
     first[..., 0] = -1.0
     energy = (1.0 - 0.995 * fraction) * 0.5 * 4.0
     moved = (0.5 - 0.45 * fraction) * 9.0
-    value = on.loss(motion, latent, first=first, view=view)
-    calm = on.loss(motion, 0 * latent, first=0 * latent, view=view)
+    value = on.loss(
+        motion,
+        latent,
+        first=first,
+        view=view,
+    )
+    calm = on.loss(
+        motion,
+        0 * latent,
+        first=0 * latent,
+        view=view,
+    )
     torch.testing.assert_close(value - calm, (energy + moved).sum()[None])
     away = replace(motion, y=motion.y + 500.0)
     cost = (20 * 5.0 / view.size.norm(dim=-1))[view.active].sum()
-    far = on.loss(away, 0 * latent, first=0 * latent, view=view)
+    far = on.loss(
+        away,
+        0 * latent,
+        first=0 * latent,
+        view=view,
+    )
     torch.testing.assert_close(far, cost[None])

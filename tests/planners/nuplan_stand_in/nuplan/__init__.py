@@ -217,14 +217,23 @@ class DetectionsTracks(Observation):
 
 
 class SimulationHistoryBuffer:
-    def __init__(self, ego_state_buffer, observations_buffer, sample_interval=None):
+    def __init__(
+        self,
+        ego_state_buffer,
+        observations_buffer,
+        sample_interval=None,
+    ):
         self._egos = ego_state_buffer
         self._observations = observations_buffer
         self.sample_interval = sample_interval
 
     @classmethod
     def initialize_from_list(
-        cls, buffer_size, ego_states, observations, sample_interval=None
+        cls,
+        buffer_size,
+        ego_states,
+        observations,
+        sample_interval=None,
     ):
         return cls(
             deque(ego_states, buffer_size),
