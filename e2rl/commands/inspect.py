@@ -241,7 +241,8 @@ def check_apart(rows: Sequence[Row], source: Source, other: Source) -> str:
     for path, locations in ((source.path, places), (other.path, others)):
         if "" in locations:
             raise InputError(
-                f"{path}: the place of some logs is not known; name it in index.csv (docs/guide/data.md)"
+                f"{path}: the place of some logs is not known; name it in index.csv "
+                "(docs/guide/data.md)"
             )
     if shared := sorted(places & others):
         common = f"{len(shared)} places in common ({', '.join(shared[:5])})"

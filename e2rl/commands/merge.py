@@ -69,7 +69,7 @@ def merge(runs: Sequence[Path], into: Path) -> int:
 
 
 def opened(file: Path, run: Path) -> IO[bytes]:
-    """A file of a shard, to read; InputError for a link to elsewhere, a pipe, a device."""
+    """A shard's file, to read; InputError for a link to elsewhere, a pipe, a device."""
     try:
         return open_regular(file, within=run)
     except OSError as error:

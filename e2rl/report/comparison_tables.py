@@ -174,7 +174,7 @@ def save_compared(folder: Path, tables: Sequence[Table], name: str = METHODS) ->
 
 
 def by_ego(rows: Sequence[dict], names: Sequence[str]) -> dict[tuple[str, str], dict]:
-    """{(ego, traffic and intensity): row} of the closed-loop rows of the egos `names`."""
+    """{(ego, traffic and intensity): row} of the closed-loop rows of these egos."""
     cells: dict[tuple[str, str], dict] = {}
     for name in names:
         group = [row for row in rows if row["ego"] == name and row.get("stage") is None]

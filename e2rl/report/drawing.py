@@ -38,7 +38,8 @@ VULNERABLE = "#f0950c"
 CONTACT = "#dc2f3c"
 CLEAR = (0, 0, 0, 0)
 UNDATED = {"CreationDate": None, "Producer": None, "Creator": None}  # of a PDF
-VERGE = 0.8  # m added to a lane's drawn width, because the gap between neighbouring lanes is road, too
+# m added to a lane's drawn width: the gap between neighbouring lanes is road, too.
+VERGE = 0.8
 
 # Outlines in units of half the length and half the width, the front at x = 1.
 BODY = (

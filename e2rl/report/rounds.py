@@ -30,7 +30,8 @@ def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
     errored = f", without a score: {reasons}" if reasons else ""
     left = f", {left_out:.0f} left out" if left_out else ""
     return (
-        f"round {number}/{rounds}: the attacks hit in {hit:.0%} of {metrics['synthesizer/scenes']:.0f} scenes{left} "
+        f"round {number}/{rounds}: the attacks hit in {hit:.0%} of "
+        f"{metrics['synthesizer/scenes']:.0f} scenes{left} "
         f"(eta {metrics['synthesizer/eta']:.2f}); {metrics['time/improve']:.0f} s learning{errored}"
     )
 

@@ -148,7 +148,7 @@ class SkeletonPicture:
         return drawing.BACKGROUND
 
     def ttc(self, weight: float) -> float:
-        """Time to collision [s] of a pair of this weight, eq. (ttc_weight_t) inverted."""
+        """Time to collision [s] of a pair of a weight: eq. (ttc_weight_t) inverted."""
         odds = weight / (1 - weight)
         return max(0.0, self.settings.tau_max - self.settings.beta * math.log(odds))
 

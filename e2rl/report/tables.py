@@ -411,7 +411,7 @@ def number(metric: Metric, value: float, sign: str = "") -> str:
 
 
 def save_tables(path: Path, tables: Iterable[Table]) -> None:
-    """Write the tables into one Markdown file, with a list of what each metric means."""
+    """Write the tables into a Markdown file, with a list of what each metric means."""
     texts = [table.markdown() for table in tables]
     write_atomically(path, "\n".join([*texts, f"```\n{legend()}\n```\n"]))
 

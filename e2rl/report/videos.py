@@ -28,8 +28,9 @@ KEYS = (  # always in the palette
 # H.264 as all players take it; the file names the matrix of its colours, since players
 # guess another.
 MP4 = (
-    f"-y -v error -f rawvideo -pix_fmt rgb24 -s {{}}x{{}} -r {1000 / FRAME_MS:g} -i - -c:v libx264 -pix_fmt yuv420p"
-    " -crf 20 -movflags +faststart -f mp4 -vf crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt709"
+    f"-y -v error -f rawvideo -pix_fmt rgb24 -s {{}}x{{}} -r {1000 / FRAME_MS:g} -i - "
+    "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart -f mp4 "
+    "-vf crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt709"
 )
 
 

@@ -50,7 +50,8 @@ def test_every_command_is_a_module_with_a_main():
     "name", ["evaluate", "train", "prior-tables", "skeleton", "tune"]
 )
 def test_a_command_shows_its_configuration_in_an_empty_folder(name, tmp_path):
-    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from e2rl.commands.cli import main; main()"
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
+    code += "from e2rl.commands.cli import main; main()"
     command = [sys.executable, "-c", code, name, "--cfg", "job"]
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, timeout=300

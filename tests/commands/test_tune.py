@@ -11,7 +11,7 @@ from tests.scripts import SHORT, call, error_line
 
 @pytest.fixture
 def tune(tmp_path, monkeypatch, capsys):
-    """Runs the command in a folder of its own; returns it, or with `wrong` the error."""
+    """Runs the command in a folder of its own; returns it, or if `wrong` the error."""
     runs = []
 
     def run(*options, wrong=False):

@@ -50,7 +50,7 @@ def write_run(folder: Path, rollouts: dict[str, Rollouts]) -> Path:
 
 
 def failed_run(folder: Path) -> Path:
-    """A run of two methods with failures; those of `planned` know plans and evasions."""
+    """A run of two methods with failures; `planned` ones know plans and evasions."""
     return write_run(
         folder,
         {

@@ -336,8 +336,8 @@ def test_rollouts_in_which_the_planner_raised_are_failures_and_named():
     nominal["metrics"]["errored"] = value(1 / 12)
     text = " ".join(" ".join(answer_lines([nominal, row("e2", 2.0, cfr=0.5)])).split())
     assert (
-        "was hit, or raised, in 6 of 12 attacked rollouts (50%), 1 of 12 nominal (hit in 0, raised in 1)."
-        in text
+        "was hit, or raised, in 6 of 12 attacked rollouts (50%), 1 of 12 nominal "
+        "(hit in 0, raised in 1)." in text
     )
     assert (
         "10,000 attacked, 1,667 nominal; without 1 rollout in which it raised." in text

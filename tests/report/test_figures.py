@@ -80,7 +80,7 @@ def shown():
     )
 
 
-def test_the_moment_is_that_of_the_greatest_risk_of_the_links_and_times_are_those_the_weights_came_from(
+def test_the_moment_is_that_of_the_greatest_risk_and_times_are_those_of_the_weights(
     shown,
 ):
     own = shown.selection.weights[0, :, 1, 0] + shown.selection.weights[0, :, 2, 1]

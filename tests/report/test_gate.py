@@ -79,7 +79,8 @@ def test_the_rollouts_that_it_asks_for_decide(tmp_path, capsys):
     (result,) = json.loads(file.read_text())
     assert (
         status == 3
-        and f"not enough rollouts: about {result['more']} more, at further places; preventable<=0.05: found 0.0"
+        and f"not enough rollouts: about {result['more']} more, at further places; "
+        "preventable<=0.05: found 0.0"
         in said
     )
     enough = run_with(tmp_path / "enough", 30 + result["more"], hits=0)
@@ -355,7 +356,8 @@ def test_at_few_places_a_planner_that_raises_in_every_scene_fails(
         for seed in (0, 1)
     ]
     found, said = gate(capsys, run_of(tmp_path, rows), rule)
-    alone = f"in {2 * crashed} of them the planner raised: these alone break the limit, in {crashed} of 3 scenes"
+    alone = f"in {2 * crashed} of them the planner raised: these alone break the "
+    alone += f"limit, in {crashed} of 3 scenes"
     assert found == status and (alone in said) == (
         status == 1 or rule == "contacts<=0.05"
     )

@@ -24,7 +24,8 @@ from e2rl.planners.lane_graph_planner import LaneGraphEgo
 
 class Fragile(LaneGraphEgo):
     def plan(self, world):
-        if bool(((world.scene["start"][:, 0, 3] - 10.45).abs() < 0.01).any() and (world.step > 20).any()):
+        fast = (world.scene["start"][:, 0, 3] - 10.45).abs() < 0.01
+        if bool(fast.any() and (world.step > 20).any()):
             raise RuntimeError("no feasible trajectory")
         return super().plan(world)
 """
@@ -59,7 +60,8 @@ def test_scenes_count_once_however_often_they_fail_and_errors_stand_apart():
     found = headline(rows, searched=False)
     assert (found.scenes, found.preventable, found.raised, found.failed) == (5, 2, 2, 4)
     assert headline_text(found, "a", traffic="e2") == (
-        "a under e2: preventable failures, or it raised, in 4 of 5 scenes; preventable failures in 2 of 5, in 2 ways; "
+        "a under e2: preventable failures, or it raised, in 4 of 5 scenes; preventable "
+        "failures in 2 of 5, in 2 ways; "
         "it raised in 2 of 5."
     )
     whole = headline_text(headline(rows[:5], searched=False), "a", traffic="e2")
@@ -99,7 +101,8 @@ def test_people_and_objects_are_told_by_traffic_and_kind():
     ]
     assert touched_lines(rows[2:]) == []
     assert touched_lines(rows) == [
-        "a touched a pedestrian or cyclist in 2 of 3 rollouts under e2 at η=2: scene_0 (seed 0), scene_1 (seed 0)."
+        "a touched a pedestrian or cyclist in 2 of 3 rollouts under e2 at η=2: "
+        "scene_0 (seed 0), scene_1 (seed 0)."
     ]
     rows += [
         row_of(k, method="nominal", eta=0.0, cfr_object=float(k == 0)) for k in range(3)
@@ -108,7 +111,8 @@ def test_people_and_objects_are_told_by_traffic_and_kind():
     assert touched_lines(rows)[0].endswith(ends)
     people, objects = touched_lines(rows, shown=True)
     assert people == (
-        "a touched a pedestrian or cyclist in 2 of 3 rollouts under e2 at η=2, 0 of 3 rollouts under nominal; the "
+        "a touched a pedestrian or cyclist in 2 of 3 rollouts under e2 at η=2, 0 of 3 "
+        "rollouts under nominal; the "
         "failure report lacks them, see cfr_vru in rollouts.csv."
     )
     assert objects.startswith(

@@ -38,14 +38,16 @@ pytestmark = [
 ]
 DECODE = """const done = arguments[1];
 page.store.replay(arguments[0]).then(({ replay }) => done(replay.tracks.map((track) =>
-  Object.fromEntries(Object.keys(page.report.channels).map((name) => [name, Array.from(track[name])])))));"""
+  Object.fromEntries(Object.keys(page.report.channels).map(
+    (name) => [name, Array.from(track[name])])))));"""
 COLOUR_AT = """const { player } = page;
 player.shown.clear();
 player.draw();
 const { replay, time, metres, node: { scene } } = player;
 const [x, y] = cameraAt(replay, time);
 const scale = Math.min(scene.width, scene.height) / metres;
-const at = [scene.width / 2 + (arguments[0] - x) * scale, scene.height / 2 - (arguments[1] - y) * scale];
+const at = [scene.width / 2 + (arguments[0] - x) * scale,
+            scene.height / 2 - (arguments[1] - y) * scale];
 return Array.from(scene.getContext("2d").getImageData(...at, 1, 1).data.slice(0, 3));"""
 EGO = [0x15, 0x65, 0xD8]  # page.css
 
@@ -233,7 +235,8 @@ def test_a_link_opens_at_its_failure_from_a_folder_and_from_a_server(run, page):
                 page.get(f"{base}#failure={rollout_key(row)}")
                 wait_for(
                     page,
-                    f"return page.player.failure.key === {rollout_key(row)!r} && page.player.replay !== null",
+                    f"return page.player.failure.key === {rollout_key(row)!r} && "
+                    "page.player.replay !== null",
                 )
                 assert page.current_url == page.find_element(
                     "css selector", "#copies input"
@@ -267,7 +270,8 @@ def test_the_first_lines_are_of_one_traffic_and_others_can_be_chosen(run, page):
 
 def test_failures_of_a_scene_stand_together_whatever_the_traffic(run, page):
     groups = page.execute_script(
-        """return [...document.querySelectorAll("#index tbody tr")].map((row) => [row.className, row.textContent]);"""
+        """return [...document.querySelectorAll("#index tbody tr")].map(
+            (row) => [row.className, row.textContent]);"""
     )
     scenes = []
     under = {}

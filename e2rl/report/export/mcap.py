@@ -1,12 +1,14 @@
 """MCAP files of Foxglove's scene updates, to watch in Foxglove or Lichtblick (extra
 `mcap`; docs/guide/export.md).
 
-| topic | schema | messages |
-| --- | --- | --- |
-| /map | foxglove.SceneUpdate | at the start: centrelines of lanes, borders of the drivable area |
-| /traffic | foxglove.SceneUpdate | every step, whole: boxes of all agents, lights, the contact |
-| /plans | foxglove.SceneUpdate | every replan: plans of the ego and the adversaries, where the rollout has them |
-| /tf | foxglove.FrameTransform | every step: the frame `ego` in `map`, to follow it |
+Topics are foxglove.SceneUpdate, but for /tf, a foxglove.FrameTransform:
+
+| topic | messages |
+| --- | --- |
+| /map | at the start: centrelines of lanes, borders of the drivable area |
+| /traffic | every step, whole: boxes of all agents, lights, the contact |
+| /plans | every replan: plans of the ego and the adversaries, where there are some |
+| /tf | every step: the frame `ego` in `map`, to follow it |
 
 Time begins at 0 at the start frame. The facts of the rollout are the metadata record
 `e2rl`.

@@ -25,7 +25,7 @@ LANE = -1  # the only lane of a road, right of the (offset) reference line
 
 
 def write_roads(episode: Episode, path: Path) -> None:
-    """Write the lanes of an episode; userData of the header tells the scene's origin."""
+    """Write the lanes of an episode; the header's userData tells the scene's origin."""
     root = road_network(episode).get_element()
     header = root.find("header")
     points = episode.rollout.lane_points
@@ -162,7 +162,7 @@ def add_lane_speeds(element: ElementTree.Element) -> None:
 
 
 def span_places(lane: Lane, span: Span) -> np.ndarray:
-    """Returns x, y [m] and direction [rad], [P, 3], of a part of a lane's centreline."""
+    """Returns x, y [m], direction [rad], [P, 3], of a part of a lane's centreline."""
     arc = arc_length(lane.points)
     inside = (arc > span.begin) & (arc < span.end)
     at = np.concatenate([[span.begin], arc[inside], [span.end]])

@@ -38,7 +38,8 @@ def episodes_of(
         if not waiting:
             return
     raise InputError(
-        f"{run}: the data of the run hold no scene {next(iter(waiting))!r} now; restore them, {WITHOUT}"
+        f"{run}: the data of the run hold no scene {next(iter(waiting))!r} now; restore "
+        f"them, {WITHOUT}"
     )
 
 
@@ -80,7 +81,7 @@ def source_of_run(run: Path, split: str, plugins: Sequence[str]) -> Source:
 
 
 def recordings(source: Source, wanted: Sequence[str]) -> Iterator[Recording]:
-    """The recordings with the `wanted` ids, those first whose log's name tells the id."""
+    """The recordings with these ids, those first whose log's name tells the id."""
     names = {name.rsplit("@", 1)[0] for name in wanted}
     for log in sorted(
         source.logs(), key=lambda log: not any(name in log for name in names)

@@ -93,7 +93,8 @@ def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(
 ):
     (tmp_path / "theirs.py").write_text(
         "from dataclasses import dataclass\nfrom e2rl.scenes.scenarionet import ScenarioNetSource\n"
-        f"open({str(tmp_path / 'ran')!r}, 'w').close()\n@dataclass\nclass Theirs(ScenarioNetSource):\n    pass\n"
+        f"open({str(tmp_path / 'ran')!r}, 'w').close()\n"
+        "@dataclass\nclass Theirs(ScenarioNetSource):\n    pass\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     edit(copy, _target_="theirs.Theirs")
