@@ -237,8 +237,8 @@ def _states(obstacle: Any) -> list:
 
 
 def _state(state: Any, middle: ndarray) -> list[float]:
-    """x, y of the box's middle, heading and speed; middle [2] m: seen from its origin. Raises InputError where they are
-    intervals."""
+    """x, y of the box's middle, heading and speed; raises InputError where they are
+    intervals. middle [2] m: of the box, from the state's origin."""
     if state.is_uncertain_position or state.is_uncertain_orientation:
         raise InputError(
             f"a state at time step {state.time_step} is uncertain; "

@@ -8,23 +8,23 @@ the scene's origin, in m; angles in rad.
 
 | key | shape | |
 | --- | --- | --- |
-| start, start_accel, start_yaw_rate | [N, 4], [N], [N] | x, y, heading, speed; m/s^2; rad/s: causal estimates |
-| past | [V, 10, 3] | pose 0.1 s, 0.2 s, ... before the start frame, relative to it: m ahead, m left, rad |
+| start, start_accel, start_yaw_rate | [N, 4], [N], [N] | x, y, heading, speed; m/s^2; rad/s |
+| past | [V, 10, 3] | poses 0.1 s, 0.2 s, ... before the start: m ahead, m left, rad |
 | valid, parked | [N] bool | present at the start frame; standing off the lanes |
 | size, agent_type | [N, 2], [N] int64 | length and width; index into AGENT_TYPES |
 | logged, logged_valid | [T+1, N, 4], [T+1, N] | smoothed recording; row 0 is the start frame |
-| route_points, route_length, route_valid | [V, R, P, 2], [V, R], [V, R] | candidates and their usable length |
+| route_points, route_length, route_valid | [V, R, P, 2], [V, R], [V, R] | candidates; usable m |
 | route_open | [V, R] bool | the map ends where the route does |
-| route_recorded | [V, R] bool | the ego's recorded path, a candidate where no lane fits it: nobody else knows it |
+| route_recorded | [V, R] bool | the ego's recorded path, where no lane fits it |
 | route_limit | [V, R, P] | speed limit m/s, 0 unknown |
-| route_light, route_light_s | [V, R, 2] | next lights (-1 none) and the arc length of their stop lines |
-| route_log | [V] int64 | candidate nearest to the recorded future, -1 none; route_log[0] is the ego's mission |
-| light_state, light_points | [T+1, S] int64, [S, 2] | LIGHT_*; where the lane that it controls begins |
+| route_light, route_light_s | [V, R, 2] | next lights (-1 none); arc lengths of stop lines |
+| route_log | [V] int64 | candidate nearest to the recorded future, -1 none; [0]: the mission |
+| light_state, light_points | [T+1, S] int64, [S, 2] | LIGHT_*; where their lanes begin |
 | lane_points, lane_index, lane_width | [M, 2], [M], [L] | lane_index -1 is padding |
 | lane_exits, lane_left, lane_right | [L, 6], [L], [L] | lane indices, -1 none |
 | drivable_points, drivable_index | [D, 2], [D] | polygons |
-| field, field_origin | [G, G] float16, [2] | m beyond the drivable border (< 0 inside) at 1 m cells |
-| left_out | [] int64 | vehicles that come near the ego's path and no traffic drives; a replay may show them |
+| field, field_origin | [G, G] float16, [2] | m beyond the drivable border, 1 m cells |
+| left_out | [] int64 | vehicles near the ego's path that no traffic drives |
 | scene_index | [] int64 | index in its SceneSet |
 """
 

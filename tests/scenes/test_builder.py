@@ -444,7 +444,8 @@ def recorded_scenes(request):
     path, stride = RECORDED[request.param]
     if not path.exists():
         pytest.skip(
-            f"needs {path.parent.name}/{path.name} in ../shared/data, which is not in the repository"
+            f"needs {path.parent.name}/{path.name} in ../shared/data, "
+            "which is not in the repository"
         )
     source = ScenarioNetSource(str(path))
     logs = [

@@ -76,7 +76,8 @@ def obstacle(
     shape = f"<rectangle><length>{size[0]}</length><width>{size[1]}</width></rectangle>"
     return (
         f'<dynamicObstacle id="{number}"><type>{kind}</type><shape>{shape}</shape>'
-        f"{state('initialState', 0, x, y, 0.0, speed)}<trajectory>{''.join(states)}</trajectory></dynamicObstacle>"
+        f"{state('initialState', 0, x, y, 0.0, speed)}"
+        f"<trajectory>{''.join(states)}</trajectory></dynamicObstacle>"
     )
 
 
@@ -90,7 +91,8 @@ def lanelet(
     """A lanelet of 3.6 m along +x with its middle at y."""
     bounds = ""
     for name, side in (("leftBound", y + 1.8), ("rightBound", y - 1.8)):
-        bounds += f"<{name}>{''.join(f'<point><x>{x}</x><y>{side}</y></point>' for x in ends)}</{name}>"
+        points = [f"<point><x>{x}</x><y>{side}</y></point>" for x in ends]
+        bounds += f"<{name}>{''.join(points)}</{name}>"
     return f'<lanelet id="{number}">{bounds}{links}<laneletType>{kind}</laneletType></lanelet>'
 
 
@@ -174,15 +176,19 @@ def scenario(
         ),
     ]
     parked = (
-        '<staticObstacle id="20"><type>unknown</type><shape><rectangle><length>2</length><width>1</width>'
+        '<staticObstacle id="20"><type>unknown</type><shape><rectangle>'
+        "<length>2</length><width>1</width>"
         f"</rectangle></shape>{state('initialState', 0, 70, -4, 0.0, 0.0)}</staticObstacle>"
     )
     if problem:
-        problem = f'<planningProblem id="90">{problem}<goalState>{exact("time", 50)}</goalState></planningProblem>'
+        goal = f"<goalState>{exact('time', 50)}</goalState>"
+        problem = f'<planningProblem id="90">{problem}{goal}</planningProblem>'
         problem = problem.replace("<goalState><time><exact>50</exact></time>", GOAL)
     return (
-        f'<?xml version="1.0"?><commonRoad timeStepSize="{dt}" commonRoadVersion="2020a" benchmarkID="DEU_Made-7_1_T-1"'
-        ' author="a" affiliation="b" source="c" date="2020-01-01"><location><geoNameId>1</geoNameId>'
+        f'<?xml version="1.0"?><commonRoad timeStepSize="{dt}" '
+        'commonRoadVersion="2020a" benchmarkID="DEU_Made-7_1_T-1"'
+        ' author="a" affiliation="b" source="c" date="2020-01-01">'
+        "<location><geoNameId>1</geoNameId>"
         "<gpsLatitude>1</gpsLatitude><gpsLongitude>1</gpsLongitude></location><scenarioTags><urban/></scenarioTags>"
         f"{''.join(ROAD)}{SIGN}{LIGHT}{parked}{''.join(moving)}{problem}</commonRoad>"
     ).encode()

@@ -9,7 +9,8 @@ from e2rl.scenes.reader_code import code_hash
 
 CATCHES = "try:\n    import {0}\nexcept (SyntaxError, ValueError):\n    {0} = None\n"
 READERS = {  # a reader's first lines, which import `helper`
-    "out of its package": "try:\n    from .helper import f\nexcept ImportError:\n    from helper import f\n",
+    "out of its package": "try:\n    from .helper import f\n"
+    "except ImportError:\n    from helper import f\n",
     "of another Python": "import helper\n" + CATCHES.format("old"),
     "that holds a null byte": "import helper\n" + CATCHES.format("null"),
 }

@@ -438,7 +438,10 @@ def test_what_reading_a_log_raises_is_told_where_the_source_knows_what_to_do(tmp
             cache=str(tmp_path),
             workers=1,
         ).load()
-    text = r"a\.txt: is none of text files: ZeroDivisionError of a file at .*; write it again \(data\.skip_invalid"
+    text = (
+        r"a\.txt: is none of text files: ZeroDivisionError of a file at .*; "
+        r"write it again \(data\.skip_invalid"
+    )
     with pytest.raises(InputError, match=text):
         Mended(
             str(tmp_path),
@@ -469,7 +472,9 @@ def test_a_library_that_is_missing_ends_the_load_whatever_may_be_skipped(tmp_pat
         ).load()
 
 
-WRONG = {  # a field of a recording of 200 frames and one car: what a mistaken reader may yield, and what is said
+# a field of a recording of 200 frames and one car: what a mistaken reader may yield,
+# and what is said
+WRONG = {
     "states": (
         [None, [[0.0]], np.zeros((200, 1, 3)), np.zeros((200, 1, 4), int)],
         "a float array",
