@@ -18,8 +18,7 @@ FREE_GAP = 200.0  # m: the gap of a vehicle without a leader
 STRETCH = 10  # vertices
 
 
-# Called, because a field `index` of a class statement hides tuple.index for the type
-# checker.
+# Called, because a field `index` of a class hides tuple.index for the type checker.
 class Leaders(
     NamedTuple("Leaders", [("gap", Tensor), ("speed", Tensor), ("index", Tensor)])
 ):
@@ -27,9 +26,30 @@ class Leaders(
     speed along the route [m/s], its index."""
 
 
+class Pairs(NamedTuple):
+    """Vehicles and agents near their routes, each [Q] int64: scene, vehicle, agent,
+    moment, and the nearest vertex of the vehicle's route."""
+
+    scene: Tensor
+    vehicle: Tensor
+    agent: Tensor
+    moment: Tensor
+    vertex: Tensor
+
+
+class Followers(NamedTuple):
+    """Vehicles on their routes: arc length s and offset d [B, V] m, points [B, V, P, 2]
+    m."""
+
+    s: Tensor
+    d: Tensor
+    points: Tensor
+
+
 def leaders(
     s: Tensor,
     points: Tensor,
+    *,
     agents: Tensor,
     size: Tensor,
     present: Tensor,
@@ -37,115 +57,104 @@ def leaders(
     free_gap: float = FREE_GAP,
 ) -> Leaders:
     """The nearest agent ahead of each vehicle whose box is within GATE_MARGIN of the
-    vehicle's lateral range.
+    vehicle's lateral range, at T moments of the agents.
 
-    Fields [B, V, T]: at T moments of the agents.
+    A vehicle's lateral range is its width around the route; with offsets it also covers
+    the distance from the offset back to the route.
 
-    s [B, V]: arc lengths of the vehicles on their routes points [B, V, P, 2], where
-    they are all the while; agents [B, M, T, 4], size [B, M, 2] and present [B, M]: of
-    all agents, the vehicles in rows 0..V-1. A vehicle's lateral range is its width
-    around the route; with offsets d [B, V] it also covers the distance from the offset
-    back to the route. Without a leader nearer than `free_gap` m, the gap is `free_gap`
-    and the speed is the vehicle's own.
+    Args:
+        s: [B, V] m, arc lengths of the vehicles, where they are all the while.
+        points: [B, V, P, 2] m, their routes.
+        agents: [B, M, T, 4] states, the vehicles in rows 0 .. V-1.
+        size: [B, M, 2] m.
+        present: [B, M] bool.
+        d: [B, V] m, offsets of the vehicles (None: 0).
+        free_gap: m.
+
+    Returns:
+        Fields [B, V, T]. Without a leader nearer than `free_gap`, the gap is `free_gap`
+        and the speed is the vehicle's own.
     """
-    moments = agents.shape[2]
-    reach = (
-        size[:, : s.shape[1], 1] / 2
-        + GATE_MARGIN
-        + (torch.zeros_like(s) if d is None else d.abs())
-    )
+    d = torch.zeros_like(s) if d is None else d
+    reach = size[:, : s.shape[1], 1] / 2 + GATE_MARGIN + d.abs()
     room = reach[..., None] + size.norm(dim=-1)[:, None] / 2
-    pairs = scene, vehicle, other, moment, _ = _near_pairs(
-        points, s, xy=agents[..., :2], room=room, present=present
-    )
-    aside = torch.zeros_like(s) if d is None else d
-    gap, along, leads = ahead_of(s, aside, agents, size, points, *pairs)
-    table = gap.new_full((*s.shape, moments, agents.shape[1]), free_gap)
-    pair = scene, vehicle, moment, other
-    nearest, index = table.index_put(pair, torch.where(leads > 0, gap, free_gap)).min(
-        -1
-    )
-    speed = (
-        torch.zeros_like(table)
-        .index_put(pair, along)
-        .gather(-1, index[..., None])[..., 0]
-    )
+    pairs = _near_pairs(points, s, xy=agents[..., :2], room=room, present=present)
+    gap, along, leads = ahead_of(Followers(s, d, points), agents, size, pairs)
+    table = gap.new_full((*s.shape, agents.shape[2], agents.shape[1]), free_gap)
+    at = (pairs.scene, pairs.vehicle, pairs.moment, pairs.agent)
+    gaps = table.index_put(at, torch.where(leads > 0, gap, free_gap))
+    nearest, index = gaps.min(-1)
+    speeds = torch.zeros_like(table).index_put(at, along)
+    speed = speeds.gather(-1, index[..., None])[..., 0]
     speed = torch.where(nearest < free_gap, speed, agents[:, : s.shape[1], :, 3])
-    return Leaders(nearest.clamp(max=free_gap), speed, index=index)
+    return Leaders(nearest.clamp(max=free_gap), speed, index)
 
 
-@fused("B V", "B V", "B X T 4!", "B X 2!", "B V P 2!", *["Q:int64"] * 5)
+@fused(("B V", "B V", "B V P 2!"), "B X T 4!", "B X 2!", "Q:int64")
 def ahead_of(
-    s: Tensor,
-    d: Tensor,
-    agents: Tensor,
-    size: Tensor,
-    points: Tensor,
-    scene: Tensor,
-    vehicle: Tensor,
-    other: Tensor,
-    moment: Tensor,
-    vertex: Tensor,
+    followers: Followers, agents: Tensor, size: Tensor, pairs: Pairs
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of pairs [Q] of a vehicle and an agent at a moment, by the nearest vertex of the
-    vehicle's route: the gap m, the agent's speed along the route m/s, and 1 where it is
-    a leader (see `leaders`), else 0."""
-    own = scene, vehicle
-    agent = agents[scene, other, moment]
-    box = size[scene, other]
-    at, offset, heading = onto_segments(
-        agent[:, :2],
-        vertex,
+    """Of each pair [Q] the gap m, the agent's speed along the route m/s, and 1 where it
+    is a leader (see `leaders`), else 0.
+
+    Args:
+        followers: the vehicles.
+        agents: [B, X, T, 4] states.
+        size: [B, X, 2] m.
+        pairs: vehicles and agents.
+    """
+    s, d, points = followers
+    at = (pairs.scene, pairs.vehicle)
+    x, y, heading, v = agents[pairs.scene, pairs.agent, pairs.moment].unbind(-1)
+    place, offset, route_heading = onto_segments(
+        torch.stack([x, y], -1),
+        pairs.vertex,
         last=points.shape[2] - 2,
-        take=lambda index: points[*own, index],
+        take=lambda index: points[pairs.scene, pairs.vehicle, index],
     )
-    turn = agent[:, 2] - heading
+    turn = heading - route_heading
     cos = torch.cos(turn)
     sin = torch.sin(turn)
-    length, width = size[scene, vehicle].unbind(-1)
-    side = width / 2 + (box[:, 0] * sin.abs() + box[:, 1] * cos.abs()) / 2 + GATE_MARGIN
-    ahead = at - s[own]
-    gap = ahead - length / 2 - (box[:, 0] * cos.abs() + box[:, 1] * sin.abs()) / 2
-    low = d[own].clamp(max=0)
-    high = d[own].clamp(min=0)
-    offset = offset - torch.minimum(torch.maximum(offset, low), high)
-    return (
-        gap,
-        agent[:, 3] * cos,
-        torch.where((offset.abs() < side) & (ahead > 0), 1.0, 0.0),
+    length, width = size[at].unbind(-1)
+    box_length, box_width = size[pairs.scene, pairs.agent].unbind(-1)
+    across = (box_length * sin.abs() + box_width * cos.abs()) / 2
+    along = (box_length * cos.abs() + box_width * sin.abs()) / 2
+    ahead = place - s[at]
+    aside = offset - torch.minimum(
+        torch.maximum(offset, d[at].clamp(max=0)), d[at].clamp(min=0)
     )
+    leads = (aside.abs() < width / 2 + across + GATE_MARGIN) & (ahead > 0)
+    return ahead - length / 2 - along, v * cos, torch.where(leads, 1.0, 0.0)
 
 
 def _near_pairs(
-    points: Tensor, s: Tensor, xy: Tensor, room: Tensor, present: Tensor
-) -> tuple[Tensor, ...]:
-    """Pairs (scene, vehicle, agent, moment, index of the nearest vertex; each [Q]) of
-    present agents xy [B, M, T, 2] within room [B, V, M] m of the vehicle's route and
-    not behind it. Where the route comes by an agent more than once, the first time
-    counts. A route continues straight beyond its last vertex."""
+    points: Tensor, s: Tensor, *, xy: Tensor, room: Tensor, present: Tensor
+) -> Pairs:
+    """Pairs of present agents xy [B, M, T, 2] within room [B, V, M] m of the vehicle's
+    route and not behind it. Where the route comes by an agent more than once, the first
+    time counts. A route continues straight beyond its last vertex."""
     vehicles, count = points.shape[1:3]
     moments = xy.shape[2]
     stretches = _stretches(points)  # [B, V, C, 2, STRETCH + 1]
     low, high = torch.aminmax(stretches, dim=-1)
-    ends = SPACING * (
-        STRETCH * torch.arange(1, low.shape[2] + 1, device=s.device)
-    ).clamp(max=count - 1)
+    number = torch.arange(1, low.shape[2] + 1, device=s.device)
+    ends = SPACING * (STRETCH * number).clamp(max=count - 1)
     to_come = (ends >= s[..., None] - SPACING).to(s.dtype)
     itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)
     counts = present[:, :vehicles, None] & present[:, None] & ~itself
     far = (room + SPACING / 2).repeat_interleave(moments, -1)
     flat = xy.flatten(1, 2)
-    ends_at = points[:, :, -2], points[:, :, -1]
-    some = near_some(low, high, *ends_at, to_come, flat, far) > 0
+    before = points[:, :, -2]
+    last = points[:, :, -1]
+    some = near_some(low, high, before, last, to_come, flat, far) > 0
     b, v, m = (counts.repeat_interleave(moments, -1) & some).nonzero(as_tuple=True)
-    there = flat[b, m]
+    place = flat[b, m]
     within = far[b, v, m]
-    near = _near(low[b, v], high[b, v], xy=there[:, None], far=within[:, None]) & (
-        to_come[b, v] > 0
-    )
-    near[:, -1] |= _beyond(ends_at[0][b, v], ends_at[1][b, v], xy=there, far=within)
+    near = _near(low[b, v], high[b, v], xy=place[:, None], far=within[:, None])
+    near &= to_come[b, v] > 0
+    near[:, -1] |= _beyond(before[b, v], last[b, v], xy=place, far=within)
     pair, stretch = near.nonzero(as_tuple=True)
-    gap = stretches[b[pair], v[pair], stretch] - flat[b, m][pair][..., None]
+    gap = stretches[b[pair], v[pair], stretch] - place[pair][..., None]
     nearest, index = gap.square().sum(1).min(-1)
     table = nearest.new_full(near.shape, torch.inf).index_put((pair, stretch), nearest)
     vertex = torch.zeros_like(table, dtype=torch.long).index_put(
@@ -153,7 +162,7 @@ def _near_pairs(
     )
     chosen = _first_passage(table, within.square())
     vertex = vertex.gather(1, chosen[:, None])[:, 0].clamp(max=count - 1)
-    return b, v, m // moments, m % moments, vertex
+    return Pairs(b, v, m // moments, m % moments, vertex)
 
 
 def _first_passage(squared: Tensor, reach: Tensor) -> Tensor:
@@ -177,17 +186,22 @@ def near_some(
     xy: Tensor,
     far: Tensor,
 ) -> Tensor:
-    """1 where points xy [B, Q, 2] are within far [B, V, Q] m of the box, low to high,
-    of a stretch that is to come (1, else 0), or of the route's straight continuation
-    beyond its last two vertices; else 0."""
+    """1 where a point [B, V, Q] is near a stretch that is to come, or the route's
+    straight continuation; else 0.
+
+    Args:
+        low, high: [B, V, C, 2] m, corners of the stretches' boxes.
+        before, last: [B, V, 2] m, the last two vertices of the routes.
+        to_come: [B, V, C], 1 where it is, else 0.
+        xy: [B, Q, 2] m, the points.
+        far: [B, V, Q] m, what is near.
+    """
     near = _near(
         low[..., None, :], high[..., None, :], xy=xy[:, None, None], far=far[:, :, None]
     )
     beyond = _beyond(before[:, :, None], last[:, :, None], xy=xy[:, None], far=far)
-    return torch.maximum(
-        torch.where(near, to_come[..., None], 0.0).amax(2),
-        torch.where(beyond, 1.0, 0.0),
-    )
+    on_stretch = torch.where(near, to_come[..., None], 0.0).amax(2)
+    return torch.maximum(on_stretch, torch.where(beyond, 1.0, 0.0))
 
 
 def _near(low: Tensor, high: Tensor, xy: Tensor, far: Tensor) -> Tensor:
@@ -241,29 +255,35 @@ def desired_gap(speed: Tensor, leader_speed: Tensor, driver: IDMParameters) -> T
 def idm_acceleration(
     speed: Tensor,
     desired_speed: Tensor,
+    *,
     gap: Tensor,
     leader_speed: Tensor,
     driver: IDMParameters,
     improved: bool,
 ) -> Tensor:
-    """IDM acceleration [...] m/s^2: the free-road term less a (s* / s)^2. Speeds in
-    m/s; gap s [...] m, inf: no leader.
+    """IDM acceleration [...] m/s^2: the free-road term less a (s* / s)^2.
 
     Treiber, Hennecke and Helbing, Physical Review E 62 (2000), eqs. (3) and (4), whose
-    free-road term is a (1 - (v / v0)^n). `improved`: above the desired speed v0 it is
-    -b (1 - (v0 / v)^(a n / b)), which brakes by b at most (Treiber and Kesting, Traffic
-    Flow Dynamics, 2013, eq. 11.23).
+    free-road term is a (1 - (v / v0)^n).
+
+    Args:
+        speed: [...] m/s, v.
+        desired_speed: [...] m/s, v0.
+        gap: [...] m, s; inf: no leader.
+        leader_speed: [...] m/s.
+        driver: a, b, n and what s* takes.
+        improved: above the desired speed the free-road term is -b (1 - (v0 / v)^(a n /
+            b)), which brakes by b at most (Treiber and Kesting, Traffic Flow Dynamics,
+            2013, eq. 11.23).
     """
     a = driver.acceleration
     b = driver.braking
     n = driver.exponent
-    interaction = (
-        desired_gap(speed, leader_speed, driver=driver) / gap.clamp(min=0.1)
-    ) ** 2
+    wanted = desired_gap(speed, leader_speed, driver)
+    interaction = (wanted / gap.clamp(min=0.1)) ** 2
     if not improved:
         return a * (1 - (speed / desired_speed).clamp(min=0) ** n - interaction)
     below = a * (1 - (speed / desired_speed).clamp(0, 1) ** n)
-    above = -b * (
-        1 - (desired_speed / speed.clamp(min=1e-3)).clamp(max=1) ** (a * n / b)
-    )
+    ratio = (desired_speed / speed.clamp(min=1e-3)).clamp(max=1)
+    above = -b * (1 - ratio ** (a * n / b))
     return torch.where(speed > desired_speed, above, below) - a * interaction

@@ -21,8 +21,8 @@ def light_state_at(light_state: Tensor, light: Tensor, step: Tensor) -> Tensor:
     if not light_state.shape[-1]:
         return torch.full_like(light, LIGHT_UNKNOWN)
     row = torch.arange(step.shape[0], device=step.device)
-    now = light_state[row, step.clamp(0, light_state.shape[1] - 1)]
-    state = now.gather(1, light.clamp(min=0).flatten(1)).view(light.shape)
+    states = light_state[row, step.clamp(0, light_state.shape[1] - 1)]
+    state = states.gather(1, light.clamp(min=0).flatten(1)).view(light.shape)
     return state.masked_fill(light < 0, LIGHT_UNKNOWN)
 
 
@@ -39,16 +39,20 @@ def lights_of(light_state: Tensor, light: Tensor) -> Tensor:
 def stop_line_distance(
     state: Tensor,
     ahead: Tensor,
+    *,
     speed: Tensor,
     red_braking: float,
     yellow_braking: float,
 ) -> Tensor:
-    """Metres [...] to the next stop line that binds, inf for none; state, ahead [...,
-    K]: of K lights.
-
-    A red light binds if braking at less than red_braking m/s^2 from speed [...] m/s
-    halts before its line, a yellow light at less than yellow_braking. A vehicle that
+    """Metres [...] to the next stop line that binds, inf for none. A vehicle that
     cannot halt in time continues.
+
+    Args:
+        state: [..., K] of K lights.
+        ahead: [..., K] m, to their stop lines.
+        speed: [...] m/s.
+        red_braking, yellow_braking: m/s^2; a light binds if braking at less halts
+            before its line.
     """
     needed = speed[..., None] ** 2 / (2 * ahead.clamp(min=1e-3))
     red = (state == LIGHT_RED) & (needed < red_braking)
@@ -56,12 +60,16 @@ def stop_line_distance(
     return ahead.masked_fill(~((ahead > 0) & (red | yellow)), torch.inf).amin(-1)
 
 
-def ran_red(light_state: Tensor, light: Tensor, line: Tensor, front: Tensor) -> Tensor:
+def ran_red(
+    light_state: Tensor, light: Tensor, *, line: Tensor, front: Tensor
+) -> Tensor:
     """Step [Q] int64 at which vehicles last crossed a stop line at red, -1 for never.
 
-    light_state [Q, T + 1, S]; light, line [Q, K]: indices of lights (-1 none) and arc
-    lengths of their stop lines; front [Q, T + 1]: arc length of the front bumper, on
-    the same route.
+    Args:
+        light_state: [Q, T + 1, S].
+        light: [Q, K], indices of lights, -1 none.
+        line: [Q, K] m, arc lengths of their stop lines.
+        front: [Q, T + 1] m, arc length of the front bumper, on the same route.
     """
     crossed = (front[:, :-1, None] < line[:, None]) & (
         front[:, 1:, None] >= line[:, None]

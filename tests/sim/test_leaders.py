@@ -132,10 +132,18 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
     size = torch.tensor([4.5, 2.0]).expand(batch, count, 2)
     present = draw(batch, count) < 0.8
     d = 6 * (draw(batch, vehicles) - 0.5) * offsets
-    given = (60 * draw(batch, vehicles), points, agents, size, present)
-    expected = all_pairs(*given, d, free_gap)
-    at = (*given[:2], agents[:, :, None], *given[3:], d if offsets else None, free_gap)
-    found = Leaders(*(value[..., 0] for value in leaders(*at)))
+    s = 60 * draw(batch, vehicles)
+    expected = all_pairs(s, points, agents, size, present, d, free_gap)
+    found = leaders(
+        s,
+        points,
+        agents=agents[:, :, None],
+        size=size,
+        present=present,
+        d=d if offsets else None,
+        free_gap=free_gap,
+    )
+    found = Leaders(*(value[..., 0] for value in found))
     led = expected[0] < free_gap
     assert led.sum() > 40 and torch.equal(found.index[led], expected[2][led])
     torch.testing.assert_close(found.gap, expected[0], rtol=0, atol=1e-4)
@@ -155,8 +163,14 @@ def gap(speed, leader_speed):
 
 
 def accel(speed, desired, gap, leading, improved):
-    values = (torch.tensor(float(value)) for value in (speed, desired, gap, leading))
-    return idm_acceleration(*values, DRIVER, improved).item()
+    return idm_acceleration(
+        torch.tensor(float(speed)),
+        torch.tensor(float(desired)),
+        gap=torch.tensor(float(gap)),
+        leader_speed=torch.tensor(float(leading)),
+        driver=DRIVER,
+        improved=improved,
+    ).item()
 
 
 def test_standing_following_closing_and_falling_behind():
