@@ -33,20 +33,17 @@ def save_prior(prior: Prior, folder: Path, origin: dict) -> Path:
     in the header as JSON.
     """
     network = asdict(prior.denoiser.settings)
-    architecture = {"denoiser": network, "features": FEATURES}
     header = {
         "format": FORMAT,
-        "architecture": json.dumps(architecture),
+        "architecture": json.dumps({"denoiser": network, "features": FEATURES}),
         "origin": json.dumps(origin),
     }
     tensors = {
         key: value.detach().cpu().contiguous()
         for key, value in prior.state_dict().items()
     }
-    path = (
-        Path(folder)
-        / f"prior-{hashlib.sha256(save(tensors)).hexdigest()[:12]}.safetensors"
-    )
+    mark = hashlib.sha256(save(tensors)).hexdigest()[:12]
+    path = Path(folder) / f"prior-{mark}.safetensors"
     write_atomically(path, weight_bytes(tensors, header))
     return path
 
@@ -57,23 +54,27 @@ def load_prior(
     bounds: BoundSettings | None = None,
     device: str = "cpu",
 ) -> tuple[Prior, dict]:
-    """The frozen prior in a checkpoint file (or `bundled`), and its origin.
+    """The frozen prior in a checkpoint file, and its origin.
 
-    Raises InputError, naming the file, where it is missing, damaged or of another
-    architecture.
+    Args:
+        checkpoint: the file, or `bundled`: the one that comes with the package, trained
+            on the bundled scenes alone.
+        sampler: how it samples (None: the configuration's default).
+        bounds: of what is executed (None: the default).
+        device: where it is put.
+
+    Raises:
+        InputError: naming the file, where it is missing, damaged or of another
+            architecture.
     """
     path = Path(checkpoint)
-    if (
-        checkpoint == BUNDLED
-    ):  # shipped with the package, trained on the bundled scenes alone
-        path = max(
-            Path(str(files("e2rl") / "assets" / "prior")).glob("prior-*.safetensors"),
-            default=path,
-        )
+    if checkpoint == BUNDLED:
+        folder = Path(str(files("e2rl") / "assets" / "prior"))
+        path = max(folder.glob("prior-*.safetensors"), default=path)
     if not path.exists():
         raise InputError(
-            f"prior.checkpoint={checkpoint}: no such file; train one with `python train.py stage=prior`, "
-            f"or use prior.checkpoint={BUNDLED}"
+            f"prior.checkpoint={checkpoint}: no such file; train one with `python "
+            f"train.py stage=prior`, or use prior.checkpoint={BUNDLED}"
         )
     try:
         tensors, header = read_weights(path)
@@ -83,32 +84,32 @@ def load_prior(
         ) from error
     if header.get("format") != FORMAT:
         raise InputError(
-            f"{path}: format {header.get('format')!r}, expected {FORMAT!r}: no prior; train one by `python train.py "
-            f"stage=prior`, or use prior.checkpoint={BUNDLED} (an actor is given by ego=actor ego.checkpoint=)"
+            f"{path}: format {header.get('format')!r}, expected {FORMAT!r}: no prior; "
+            f"train one by `python train.py stage=prior`, or use prior.checkpoint="
+            f"{BUNDLED} (an actor is given by ego=actor ego.checkpoint=)"
         )
     try:
         architecture = json.loads(header["architecture"])
         origin = json.loads(header["origin"])
+        if architecture.keys() != {"denoiser", "features"}:
+            raise ValueError(f"parts {sorted(architecture)}")
         if architecture["features"] != FEATURES:
             raise ValueError(
-                f"made for {architecture['features']} features, this version has {FEATURES}"
+                f"made for {architecture['features']} features, this version has "
+                f"{FEATURES}"
             )
-        settings = settings_of(
-            DenoiserSettings, architecture["denoiser"], where="denoiser"
-        )
+        network = architecture["denoiser"]
+        settings = settings_of(DenoiserSettings, network, where="denoiser")
         if max(settings.width, settings.blocks, settings.pair) > LARGEST:
             raise ValueError(f"a size above {LARGEST} in {settings}")
-        if architecture.get("free_space"):
-            raise ValueError("a prior without lanes, of an earlier version")
         make = partial(Prior, settings, sampler, bounds)
         if wrong := unlike(make, tensors):
             raise ValueError(wrong)
         prior = make()
         prior.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError, InputError) as error:
-        reason = " ".join(
-            str(error).split("\n\t")[:2]
-        )  # of torch's list of tensors that do not fit, the first
+        # Of torch's list of tensors that do not fit, the first.
+        reason = " ".join(str(error).split("\n\t")[:2])
         raise InputError(
             f"{path}: another architecture ({reason}); train the prior again"
         ) from error

@@ -33,7 +33,8 @@ class DenoiserSettings:
     def __post_init__(self) -> None:
         if self.heads and self.width % self.heads:
             raise InputError(
-                f"prior.network.width={self.width}: expected a multiple of heads={self.heads}"
+                f"prior.network.width={self.width}: expected a multiple of "
+                f"heads={self.heads}"
             )
 
 
@@ -52,15 +53,11 @@ class Encoding:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Encoding":
         """An Encoding with `function` applied to every tensor."""
-        biases, modulations = (
-            [function(value) for value in values]
-            for values in (self.biases, self.modulations)
-        )
         return Encoding(
             function(self.nodes),
             function(self.pairs),
-            biases=biases,
-            modulations=modulations,
+            biases=[function(value) for value in self.biases],
+            modulations=[function(value) for value in self.modulations],
         )
 
     def repeat(self, count: int) -> "Encoding":
@@ -95,31 +92,33 @@ class Block(nn.Module):
     def forward(
         self, h: Tensor, modulation: Tensor, bias: Tensor, pairs: Tensor
     ) -> Tensor:
-        """h [B, V, W] after the block; modulation [B, V, 6 W]; bias [B, heads, V, V];
-        pairs [B, V, V, E]."""
+        """h [B, V, W] after the block.
+
+        Args:
+            h: [B, V, W].
+            modulation: [B, V, 6 W].
+            bias: [B, heads, V, V], of the attention.
+            pairs: [B, V, V, E].
+        """
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.chunk(6, -1)
         batch, vehicles, width = h.shape
-        each = width // self.heads
-        q, k, v = (
-            self.qkv(torch.addcmul(shift_a, self.norm_attention(h), scale_a))
-            .reshape(batch, vehicles, 3, self.heads, each)
-            .permute(2, 0, 3, 1, 4)
-            .flatten(1, 2)
-        )
-        logits = torch.baddbmm(
-            bias.flatten(0, 1), q, k.transpose(1, 2), alpha=1 / math.sqrt(each)
-        )
+        size = width // self.heads
+
+        def by_vehicle(value: Tensor) -> Tensor:
+            """[B, V, heads, ...] of a value [B heads, V, ...]."""
+            return value.unflatten(0, (batch, self.heads)).transpose(1, 2)
+
+        qkv = self.qkv(torch.addcmul(shift_a, self.norm_attention(h), scale_a))
+        qkv = qkv.reshape(batch, vehicles, 3, self.heads, size)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4).flatten(1, 2)
+        scale = 1 / math.sqrt(size)
+        logits = torch.baddbmm(bias.flatten(0, 1), q, k.transpose(1, 2), alpha=scale)
         weight = self.drop(torch.softmax(logits, -1))
-        mixed = (
-            (weight @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
-        )
-        pair = (
-            weight.unflatten(0, (batch, self.heads)).transpose(1, 2) @ pairs
-        ).flatten(2)
+        mixed = by_vehicle(weight @ v).flatten(2)
+        pair = (by_vehicle(weight) @ pairs).flatten(2)
         h = torch.addcmul(h, gate_a, self.out(mixed + self.pair_value(pair)))
-        return torch.addcmul(
-            h, gate_m, self.mlp(torch.addcmul(shift_m, self.norm_mlp(h), scale_m))
-        )
+        hidden = torch.addcmul(shift_m, self.norm_mlp(h), scale_m)
+        return torch.addcmul(h, gate_m, self.mlp(hidden))
 
 
 class Denoiser(nn.Module):
@@ -155,11 +154,11 @@ class Denoiser(nn.Module):
         self.register_buffer(
             "frequencies", torch.logspace(-0.3, 1.7, 16), persistent=False
         )
-        sizes = (width, settings.heads, settings.pair, settings.dropout)
-        self.blocks = cast(
-            Iterable[Block],
-            nn.ModuleList(Block(*sizes) for _ in range(settings.blocks)),
-        )
+        blocks = [
+            Block(width, settings.heads, settings.pair, settings.dropout)
+            for _ in range(settings.blocks)
+        ]
+        self.blocks = cast(Iterable[Block], nn.ModuleList(blocks))
         last = nn.Linear(width, SIZE)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
@@ -184,9 +183,7 @@ class Denoiser(nn.Module):
         """`encode`, operation by operation."""
         node = self.encode_node(((nodes - self.node_mean) / self.node_std).clamp(-6, 6))
         pair = self.encode_pair(pairs)
-        absent = torch.zeros_like(present, dtype=pair.dtype).masked_fill(
-            ~present, -1e4
-        )[:, None, None, :]
+        absent = torch.where(present, 0.0, -1e4).to(pair.dtype)[:, None, None, :]
         bias = self.bias(pair).permute(0, 3, 1, 2) + absent
         # The modulation is linear in node and level: the nodes' part is the same for
         # all levels.
@@ -215,8 +212,15 @@ class Denoiser(nn.Module):
             or (torch.is_grad_enabled() and x.requires_grad)
         ):
             return self.estimate(x, level, encoding=encoding)
-        scene = encoding.nodes, encoding.pairs, *encoding.biases, *encoding.modulations
-        return fused_estimate(self.settings)(x, level, *scene, *self._read)
+        return fused_estimate(self.settings)(
+            x,
+            level,
+            encoding.nodes,
+            encoding.pairs,
+            *encoding.biases,
+            *encoding.modulations,
+            *self._read,
+        )
 
     def _learns(self) -> bool:
         """Whether dropout acts, or gradients by the weights are wanted: fused functions
@@ -233,15 +237,10 @@ class Denoiser(nn.Module):
     def estimate(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
         """`forward`, operation by operation."""
         h = self.embed_x(x) + encoding.nodes
-        parts = zip(
-            self.blocks,
-            encoding.biases,
-            encoding.modulations,
-            self.modulated(level),
-            strict=True,
-        )
-        for block, bias, of_node, of_level in parts:
-            h = block(h, of_node + of_level, bias, encoding.pairs)
+        of_level = self.modulated(level)
+        for index, block in enumerate(self.blocks):
+            modulation = encoding.modulations[index] + of_level[index]
+            h = block(h, modulation, encoding.biases[index], encoding.pairs)
         alpha = self.schedule.alpha(level)[..., None]
         sigma = self.schedule.sigma(level)[..., None]
         return alpha * x + sigma * self.head(h).to(x.dtype)
@@ -259,14 +258,13 @@ class _Module(nn.Module):
         ]
         self.sizes = [" ".join(map(str, value.shape)) for value in self.network._read]
 
-    def forward(self, *given: Any) -> Any:
-        return getattr(self.network, self.method)(*given)
+    def forward(self, *values: Any) -> Any:
+        return getattr(self.network, self.method)(*values)
 
-    def call(self, weights: Iterable[Tensor], *given: Any) -> Any:
+    def call(self, weights: Iterable[Tensor], *values: Any) -> Any:
         """The method with these weights and constants."""
-        return torch.func.functional_call(
-            self, dict(zip(self.names, weights, strict=True)), given
-        )
+        named = dict(zip(self.names, weights, strict=True))
+        return torch.func.functional_call(self, named, values)
 
 
 @cache
@@ -277,27 +275,26 @@ def fused_estimate(settings: DenoiserSettings) -> Fused:
     blocks = settings.blocks
 
     def denoise(
-        x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *given: Tensor
+        x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *rest: Tensor
     ) -> Tensor:
         encoding = Encoding(
             nodes,
             pairs,
-            biases=list(given[:blocks]),
-            modulations=list(given[blocks : 2 * blocks]),
+            biases=list(rest[:blocks]),
+            modulations=list(rest[blocks : 2 * blocks]),
         )
-        return module.call(given[2 * blocks :], x, level, encoding)
+        return module.call(rest[2 * blocks :], x, level, encoding)
 
-    scene = [
+    shapes = (
+        f"B V {SIZE}",
+        "1 V",
         f"B V {settings.width}",
         f"B V V {settings.pair}",
         *[f"B {settings.heads} V V"] * blocks,
-    ]
-    scene += [f"B V {6 * settings.width}"] * blocks
-    return Fused(
-        denoise,
-        (f"B V {SIZE}", "1 V", *scene, *module.sizes),
-        constants=len(module.sizes),
+        *[f"B V {6 * settings.width}"] * blocks,
+        *module.sizes,
     )
+    return Fused(denoise, shapes, constants=len(module.sizes))
 
 
 @cache
@@ -309,8 +306,8 @@ def fused_encoding(settings: DenoiserSettings) -> Fused:
     def encode(
         nodes: Tensor, pairs: Tensor, present: Tensor, *weights: Tensor
     ) -> tuple[Tensor, ...]:
-        found = module.call(weights, nodes, pairs, present)
-        return found.nodes, found.pairs, *found.biases, *found.modulations
+        scene = module.call(weights, nodes, pairs, present)
+        return scene.nodes, scene.pairs, *scene.biases, *scene.modulations
 
-    scene = f"B V {NODE}", f"B V V {EDGE}", "B V:bool"
-    return Fused(encode, (*scene, *module.sizes), constants=len(module.sizes))
+    shapes = (f"B V {NODE}", f"B V V {EDGE}", "B V:bool", *module.sizes)
+    return Fused(encode, shapes, constants=len(module.sizes))

@@ -375,8 +375,8 @@ def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tens
     driven = track.s - begin.s - begin.v * time - begin.a * distance[:, 0]
     damp, bend = _roughness(device)
     pull = bend * begin.a
+    rows, inverse = _fit_of_all(device)  # a constant, made before anything is compiled
     if torch.compiler.is_compiling():  # all is known: the system is solved already
-        rows, inverse = _fit_of_all(device)
         target = torch.cat([speed, 0.5 * driven], -1)
         return ((target @ rows + pull) @ inverse).clamp(*HARDEST)
     weight = torch.ones_like(track.v) if known is None else known.to(basis.dtype)

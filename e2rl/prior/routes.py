@@ -18,14 +18,10 @@ from e2rl.sim.mission import light_state_at
 CONFLICT_STRIDE = 2  # vertices: conflicts are looked for every 4 m
 CONFLICT_RANGE = 80  # vertices from the route's start on
 CONFLICT_GAP = 2.5  # m: routes nearer than this are in conflict
-ROUTE_FIELDS = (
-    "points",
-    "length",
-    "open",
-    "limit",
-    "light",
-    "light_s",
-)  # scene["route_..."] of the assigned candidate
+FEATURES = 16
+TURN_AT = (10.0, 20.0, 35.0, 55.0, 80.0)  # m ahead
+# scene["route_..."] of the assigned candidate.
+ROUTE_FIELDS = ("points", "length", "open", "limit", "light", "light_s")
 
 
 @dataclass
@@ -65,18 +61,8 @@ class RoutedScene:
 
 # Shapes of a RoutedScene's tensors, see `fused`; X agents in all.
 ROUTED = (
-    *(
-        "B X 2",
-        "B T L:int64",
-        "B V 10 3",
-        "B V:int64",
-        "B V P 2!",
-        "B V",
-        "B V:bool",
-        "B V P",
-        "B V 2:int64",
-        "B V 2",
-    ),
+    *("B X 2", "B T L:int64", "B V 10 3", "B V:int64"),
+    *("B V P 2!", "B V", "B V:bool", "B V P", "B V 2:int64", "B V 2"),
     *("B V V:bool", "B V V", "B V V", "B V:bool", "B V:bool", "B V:bool"),
 )
 
@@ -98,24 +84,26 @@ def route_scene(scene: TensorDictBase, route: Tensor) -> RoutedScene:
     valid = scene["valid"][:, :vehicles]
     parked = scene["parked"][:, :vehicles]
     has_lane = take_route(scene["route_valid"], route)
-    all_rows = torch.arange(vehicles, device=route.device)
-    pairs = [_conflicts(points, all_rows)[0] for points in assigned["points"]]
-    conflict, conflict_s, crossing = (
-        torch.stack(parts) for parts in zip(*pairs, strict=True)
+    everybody = torch.arange(vehicles, device=route.device)
+    of_scenes = [_conflicts(points, everybody)[0] for points in assigned["points"]]
+    meets, conflict_s, crossing = (
+        torch.stack(values) for values in zip(*of_scenes, strict=True)
     )
-    both = valid & ~parked & has_lane
-    given = {
-        "size": scene["size"],
-        "light_state": scene["light_state"],
-        "past": scene["past"][:, :vehicles],
-    }
-    meet = {
-        "conflict": conflict & both[:, :, None] & both[:, None, :],
-        "conflict_s": conflict_s,
-        "crossing": crossing,
-    }
-    kind = {"modelled": valid & ~parked, "parked": parked, "has_lane": has_lane}
-    return RoutedScene(route=route, **given, **assigned, **meet, **kind)
+    modelled = valid & ~parked
+    both = modelled & has_lane
+    return RoutedScene(
+        size=scene["size"],
+        light_state=scene["light_state"],
+        past=scene["past"][:, :vehicles],
+        route=route,
+        **assigned,
+        conflict=meets & both[:, :, None] & both[:, None, :],
+        conflict_s=conflict_s,
+        crossing=crossing,
+        modelled=modelled,
+        parked=parked,
+        has_lane=has_lane,
+    )
 
 
 def start_state(scene: TensorDictBase, routed: RoutedScene) -> LaneState:
@@ -144,14 +132,23 @@ def on_map(routed: RoutedScene, s: Tensor) -> Tensor:
 def reroute(
     routed: RoutedScene,
     scene: TensorDictBase,
+    *,
     route: Tensor,
     moved: Tensor,
     off_lane: Tensor,
     off_lane_path: Tensor,
 ) -> RoutedScene:
-    """`routed` with the vehicles `moved` [B, V] on new lines: candidates route [B, V]
-    or, where off_lane [B, V], the off_lane_path [B, V, P, 2]. Such a path has no
-    lights; its limit is the highest of the candidate's."""
+    """`routed` with some vehicles on new lines.
+
+    Args:
+        routed: the scenes with their routes.
+        scene: the same, with all candidates.
+        route: [B, V], new candidates.
+        moved: [B, V] bool, whose line changes.
+        off_lane: [B, V] bool, who leaves the lanes.
+        off_lane_path: [B, V, P, 2] m, along which; such a path has no lights; its limit
+            is the highest of the candidate's.
+    """
     off_lane = off_lane & moved
     lane = {
         name: take_route(scene[f"route_{name}"], route)
@@ -161,40 +158,38 @@ def reroute(
         "points": off_lane_path,
         "length": SPACING * (off_lane_path.shape[2] - 1),
         "open": False,
+        "limit": lane["limit"].amax(-1, keepdim=True),
+        "light": -1,
+        "light_s": 0.0,
     }
-    path |= {"limit": lane["limit"].amax(-1, keepdim=True), "light": -1, "light_s": 0.0}
 
-    def change(old: Tensor, on_lane: Tensor, on_path: Tensor | float) -> Tensor:
-        extra = [1] * (old.dim() - 2)
+    def changed(old: Tensor, on_lane: Tensor, on_path: Tensor | float) -> Tensor:
+        shape = (*moved.shape, *[1] * (old.dim() - 2))
         on_path = torch.as_tensor(on_path, dtype=old.dtype, device=old.device)
-        new = torch.where(off_lane.view(*off_lane.shape, *extra), on_path, on_lane)
-        return torch.where(moved.view(*moved.shape, *extra), new, old)
+        new = torch.where(off_lane.view(shape), on_path, on_lane)
+        return torch.where(moved.view(shape), new, old)
 
-    changed = {
-        name: change(getattr(routed, name), lane[name], path[name])
+    lines = {
+        name: changed(getattr(routed, name), lane[name], path[name])
         for name in ROUTE_FIELDS
     }
-    pairs = [
-        value.clone() for value in (routed.conflict, routed.conflict_s, routed.crossing)
-    ]
+    pairs = [routed.conflict, routed.conflict_s, routed.crossing]
+    meets, conflict_s, crossing = pairs = [value.clone() for value in pairs]
     for b in moved.any(1).nonzero()[:, 0].tolist():
         rows = moved[b].nonzero()[:, 0]
-        for old, own, other in zip(
-            pairs, *_conflicts(changed["points"][b], rows), strict=True
-        ):
-            old[b][:, rows], old[b][rows] = other.T, own
+        of_rows, of_others = _conflicts(lines["points"][b], rows)
+        for value, forth, back in zip(pairs, of_rows, of_others, strict=True):
+            value[b][:, rows] = back.T
+            value[b][rows] = forth
     both = routed.modelled & lane["valid"]
-    changed |= {
-        "conflict": pairs[0] & both[:, :, None] & both[:, None],
-        "conflict_s": pairs[1],
-        "crossing": pairs[2],
-    }
-    has_lane = change(routed.has_lane, lane["valid"], True)
     return replace(
         routed,
         route=torch.where(moved, route, routed.route),
-        has_lane=has_lane,
-        **changed,
+        has_lane=changed(routed.has_lane, lane["valid"], True),
+        conflict=meets & both[:, :, None] & both[:, None],
+        conflict_s=conflict_s,
+        crossing=crossing,
+        **lines,
     )
 
 
@@ -216,9 +211,7 @@ def _conflicts(
     conflict = meets & (rows[:, None] != torch.arange(vehicles, device=rows.device))
     tangent = torch.gradient(line, dim=1)[0]
     angle = torch.atan2(tangent[..., 1], tangent[..., 0])
-    crossing = (
-        angle.gather(1, other.T).T - angle[rows].gather(1, first) + torch.pi
-    ) % (2 * torch.pi) - torch.pi
+    crossing = wrap(angle.gather(1, other.T).T - angle[rows].gather(1, first))
     spacing = SPACING * CONFLICT_STRIDE
     return (conflict, first * spacing, crossing), (
         conflict,
@@ -231,30 +224,19 @@ def _conflicts(
 def first_conflicts(apart: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Whether lines [C, V] are in conflict, of their distances [C, K, V, K], and the
     first vertex of each that is."""
+    count = apart.shape[1]
     if torch.compiler.is_compiling():  # without truth values, which are slow
-        left = torch.arange(
-            apart.shape[1], 0, -1, dtype=apart.dtype, device=apart.device
-        )
-        own, others = (
-            torch.where(apart < CONFLICT_GAP, each, 0.0).amax((1, 3))
-            for each in (left[:, None, None], left)
-        )
-        count = apart.shape[1]
-        return (
-            own > 0,
-            torch.where(own > 0, count - own, 0.0).long(),
-            torch.where(own > 0, count - others, 0.0).long(),
-        )
+        left = torch.arange(count, 0, -1, dtype=apart.dtype, device=apart.device)
+        near = apart < CONFLICT_GAP
+        of_row = torch.where(near, left[:, None, None], 0.0).amax((1, 3))
+        of_other = torch.where(near, left, 0.0).amax((1, 3))
+        first = torch.where(of_row > 0, count - of_row, 0.0).long()
+        return of_row > 0, first, torch.where(of_row > 0, count - of_other, 0.0).long()
     near = apart < CONFLICT_GAP
-    meets = near.any(
-        3
-    )  # [C, K, V]: this vertex of a row's route meets the other route somewhere
+    # [C, K, V]: this vertex of a row's route meets the other route somewhere.
+    meets = near.any(3)
     # The first of several points, where they share a stretch.
     return meets.any(1), meets.float().argmax(1), near.any(1).float().argmax(2)
-
-
-FEATURES = 16
-TURN_AT = (10.0, 20.0, 35.0, 55.0, 80.0)  # m ahead
 
 
 class Moment(NamedTuple):
@@ -277,38 +259,42 @@ def start_of(scene: TensorDictBase) -> Moment:
     )
 
 
-def candidate_features(scene: TensorDictBase, now: Moment) -> Tensor:
-    """[B, V, R, FEATURES] of each route candidate as seen from the vehicles now."""
-    vehicles = now.states.shape[1]
-    points = scene["route_points"][:, :vehicles]
-    length = scene["route_length"][:, :vehicles]
-    s, d, heading = (
-        value[..., 0] for value in project(now.states[:, :, None, None, :2], points)
-    )
-    v = now.states[..., 3].clamp(min=0)[..., None].expand_as(s)
-    at = s[..., None] + torch.tensor((0.0, *TURN_AT), device=s.device)
-    angle = interpolate(points, at)[1]
+def candidate_features(scene: TensorDictBase, moment: Moment) -> Tensor:
+    """[B, V, R, FEATURES] of each route candidate as seen from the vehicles."""
+    vehicles = moment.states.shape[1]
+    routes = {
+        name: scene[f"route_{name}"][:, :vehicles]
+        for name in ("points", "length", "limit", "light")
+    }
+    points = routes["points"]
+    place = project(moment.states[:, :, None, None, :2], points)
+    s, d, heading = (value[..., 0] for value in place)
+    v = moment.states[..., 3].clamp(min=0)[..., None].expand_as(s)
+    ahead = torch.tensor((0.0, *TURN_AT), device=s.device)
+    _, angle, _ = interpolate(points, s[..., None] + ahead)
     turn = wrap(angle[..., 1:] - angle[..., :1])
-    curvature = turn.abs().diff(dim=-1, prepend=torch.zeros_like(turn[..., :1])).abs()
-    tight = (
-        curvature / torch.tensor([10.0, 10.0, 15.0, 20.0, 25.0], device=s.device)
-    ).amax(-1)
-    excess = (v**2 * tight / 4 - 1).clamp(0, 4)
-    at = (s / SPACING).long().clamp(0, points.shape[3] - 1)[..., None]
-    limit = scene["route_limit"][:, :vehicles].gather(-1, at)[..., 0]
-    light = scene["route_light"][:, :vehicles, :, 0]
-    colour = light_state_at(scene["light_state"], light, step=now.step)
-    green, red = (
-        (light >= 0) & (colour == state) for state in (LIGHT_GREEN, LIGHT_RED)
-    )
-    rank = torch.arange(s.shape[-1], device=s.device).expand_as(s)
-    rest = (length - s).clamp(0, 100) / 50
-    bend = (now.yaw_rate[..., None] / v.clamp(min=2.0) - turn[..., 0] / 10.0) * 10
-    aside = wrap(now.states[..., 2][..., None] - heading) * 3
-    features = [d.abs(), d, aside, *turn.unbind(-1), rest, v / 10, excess, bend]
-    return torch.stack(
-        [*features, green.float(), red.float(), rank / 3, (v - limit) / 10], -1
-    )
+    bends = turn.abs().diff(dim=-1, prepend=torch.zeros_like(turn[..., :1])).abs()
+    tight = (bends / ahead.diff()).amax(-1)
+    vertex = (s / SPACING).long().clamp(0, points.shape[3] - 1)
+    limit = routes["limit"].gather(-1, vertex[..., None])[..., 0]
+    light = routes["light"][..., 0]
+    colour = light_state_at(scene["light_state"], light, step=moment.step)
+    bend = moment.yaw_rate[..., None] / v.clamp(min=2.0) - turn[..., 0] / 10.0
+    features = [
+        d.abs(),
+        d,
+        wrap(moment.states[..., 2][..., None] - heading) * 3,
+        *turn.unbind(-1),
+        (routes["length"] - s).clamp(0, 100) / 50,
+        v / 10,
+        (v**2 * tight / 4 - 1).clamp(0, 4),
+        bend * 10,
+        ((light >= 0) & (colour == LIGHT_GREEN)).float(),
+        ((light >= 0) & (colour == LIGHT_RED)).float(),
+        torch.arange(s.shape[-1], device=s.device).expand_as(s) / 3,
+        (v - limit) / 10,
+    ]
+    return torch.stack(features, -1)
 
 
 class RouteChoice(nn.Module):
@@ -316,30 +302,26 @@ class RouteChoice(nn.Module):
 
     def __init__(self, width: int = 64):
         super().__init__()
-        hidden = [
+        self.net = nn.Sequential(
             nn.Linear(FEATURES, width),
             nn.GELU(),
             nn.Linear(width, width),
             nn.GELU(),
-        ]
-        self.net = nn.Sequential(*hidden, nn.Linear(width, 1))
+            nn.Linear(width, 1),
+        )
 
-    def forward(self, scene: TensorDictBase, now: Moment | None = None) -> Tensor:
-        """Logits [B, V, R] of the first V vehicles now (None: of all at the start);
-        -inf where there is no candidate, except for the first that is not recorded,
-        straight ahead, of a vehicle without any."""
-        now = start_of(scene) if now is None else now
-        valid, recorded = (
-            scene[f"route_{name}"][:, : now.states.shape[1]]
-            for name in ("valid", "recorded")
-        )
-        first = torch.zeros_like(valid).scatter(
-            -1, recorded.int().argmin(-1, keepdim=True), True
-        )
+    def forward(self, scene: TensorDictBase, moment: Moment | None = None) -> Tensor:
+        """Logits [B, V, R] of the first V vehicles at a moment (None: of all at the
+        start); -inf where there is no candidate, except for the first that is not
+        recorded, straight ahead, of a vehicle without any."""
+        moment = start_of(scene) if moment is None else moment
+        vehicles = moment.states.shape[1]
+        valid = scene["route_valid"][:, :vehicles]
+        plain = scene["route_recorded"][:, :vehicles].int().argmin(-1, keepdim=True)
+        first = torch.zeros_like(valid).scatter(-1, plain, True)
         possible = valid | (first & ~valid.any(-1, keepdim=True))
-        return self.net(candidate_features(scene, now))[..., 0].masked_fill(
-            ~possible, -torch.inf
-        )
+        logits = self.net(candidate_features(scene, moment))[..., 0]
+        return logits.masked_fill(~possible, -torch.inf)
 
 
 def sample_route(logits: Tensor, temperature: float, uniform: Tensor) -> Tensor:
@@ -348,7 +330,6 @@ def sample_route(logits: Tensor, temperature: float, uniform: Tensor) -> Tensor:
     if temperature <= 0:
         return logits.argmax(-1)
     total = torch.softmax(logits / temperature, -1).cumsum(-1)
-    below = (
-        uniform.clamp(max=1 - 1e-6)[..., None] * total[..., -1:]
-    )  # never past the last possible one
+    # Never past the last possible one.
+    below = uniform.clamp(max=1 - 1e-6)[..., None] * total[..., -1:]
     return (total <= below).sum(-1)

@@ -19,14 +19,22 @@ REGIONS = {"covered_50": 0.5, "covered_90": 0.9}  # central regions of the sampl
 def sample_variances(
     prior: Prior, scene: TensorDictBase, samples: int, seed: int = 0
 ) -> dict[str, Tensor]:
-    """Sums [B] over the moving vehicles on lanes of scenes [B] of the variance over
-    `samples` joint samples, and their number: `knots` and `lateral`, mean over the
-    knots of x; `travel` [m^2], of the distance after 5 s; `vehicles`. Of those recorded
-    for 5 s: in how many the recorded distance lies in each of REGIONS of the samples',
-    and their number `recorded`.
+    """Sums [B] over the moving vehicles on lanes of scenes [B].
 
     Routes are the recorded ones, drawn where there is none; the ego is sampled like
     every vehicle. So what varies is the reverse SDE alone.
+
+    Args:
+        prior: to sample from.
+        scene: scenes [B].
+        samples: number of joint samples.
+        seed: of these.
+
+    Returns:
+        Variance over the samples: `knots` and `lateral`, mean over the knots of x;
+        `travel` [m^2], of the distance after 5 s; and the number of `vehicles`. Of
+        those recorded for 5 s: in how many the recorded distance lies in each of
+        REGIONS of the samples', and their number `recorded`.
     """
     device = scene["start"].device
     shape = scene["route_log"].shape
@@ -48,47 +56,33 @@ def sample_variances(
     x = torch.stack(drawn)
     travel = torch.stack(
         [
-            lane_relative.speeds(lane, ACCEL_SCALE * one[..., :KNOTS])[1][..., -1]
-            for one in x
+            lane_relative.speeds(lane, ACCEL_SCALE * sample[..., :KNOTS])[1][..., -1]
+            for sample in x
         ]
     )
     variance = x.var(0)
-    parts = {
-        "knots": variance[..., :KNOTS].mean(-1),
-        "lateral": variance[..., KNOTS:].mean(-1),
-        "travel": travel.var(0),
+    numbers = {
+        "knots": variance[..., :KNOTS].mean(-1) * counted,
+        "lateral": variance[..., KNOTS:].mean(-1) * counted,
+        "travel": travel.var(0) * counted,
+        "vehicles": counted,
     }
-    sums = {name: (value * counted).sum(-1).double() for name, value in parts.items()}
-    at = min(HORIZON, scene["logged"].shape[1] - 1)
     vehicles = shape[1]
-    recorded = (
-        counted
-        & (scene["route_log"] >= 0)
-        & scene["logged_valid"][:, at, :vehicles]
-        & (at == HORIZON)
-    )
-    logged = torch.where(
+    last = min(HORIZON, scene["logged"].shape[1] - 1)
+    recorded = counted & (scene["route_log"] >= 0)
+    recorded = recorded & scene["logged_valid"][:, last, :vehicles] & (last == HORIZON)
+    xy = torch.where(
         recorded[..., None],
-        scene["logged"][:, at, :vehicles, :2],
+        scene["logged"][:, last, :vehicles, :2],
         scene["start"][:, :vehicles, :2],
     )
-    way = (
-        project(
-            logged[:, :, None], routed.points, hint=(lane.s + travel.mean(0))[..., None]
-        )[0][..., 0]
-        - lane.s
-    )
-    rank = (travel < way).sum(0)
-    inside = {
-        name: (central(rank, samples, part=part) * recorded).sum(-1).double()
-        for name, part in REGIONS.items()
-    }
-    return (
-        sums
-        | {"vehicles": counted.sum(-1).double()}
-        | inside
-        | {"recorded": recorded.sum(-1).double()}
-    )
+    hint = (lane.s + travel.mean(0))[..., None]
+    place = project(xy[:, :, None], routed.points, hint=hint)[0][..., 0]
+    rank = (travel < place - lane.s).sum(0)
+    for name, part in REGIONS.items():
+        numbers[name] = central(rank, samples, part=part) * recorded
+    numbers["recorded"] = recorded
+    return {name: value.sum(-1).double() for name, value in numbers.items()}
 
 
 def central(rank: Tensor, samples: int, part: float) -> Tensor:

@@ -20,22 +20,16 @@ FORMAT = "e2rl-rollout/1"
 ROLLOUTS = "rollouts"  # folder of a run with a file per rollout
 MAX_BYTES = 1 << 27  # of a file, unpacked
 MOST = 1e6  # intensity
-FARTHEST, FASTEST, LONGEST, TURNED = (
-    1e5,
-    150.0,
-    100.0,
-    1e3,
-)  # m, m/s, m and rad of an agent
-PLAIN = re.compile(
-    r"[a-z0-9.@+-]+(_[a-z0-9.@+-]+)*"
-)  # part of a file name that stands for itself
-STEM, DIGITS = (
-    200,
-    10,
-)  # characters of a file name without its ending, and of the hash after it
-UNPRINTABLE = re.compile(
-    r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
-)  # also what turns text round
+FARTHEST = 1e5  # m, of an agent
+FASTEST = 150.0  # m/s
+LONGEST = 100.0  # m
+TURNED = 1e3  # rad
+# Part of a file name that stands for itself.
+PLAIN = re.compile(r"[a-z0-9.@+-]+(_[a-z0-9.@+-]+)*")
+STEM = 200  # characters of a file name without its ending
+DIGITS = 10  # characters of the hash after it
+# Also what turns text round.
+UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def array(
@@ -140,40 +134,35 @@ class Rollout(Road):
             raise InputError(
                 f"{path}: no readable rollout ({error}); run evaluate.py again to rewrite it"
             ) from error
-        known = fields(cls)
+        present = [entry for entry in fields(cls) if entry.name in data]
         missing = [
-            each.name
-            for each in known
-            if each.default is not None and each.name not in data
+            entry.name
+            for entry in fields(cls)
+            if entry.default is not None and entry.name not in data
         ]
         if missing or str(data.get("format")) != FORMAT:
             raise InputError(
                 f"{path}: not of format {FORMAT} (missing: {', '.join(missing) or 'nothing'}; format: "
                 f"{data.get('format')}); give a folder that evaluate.py wrote"
             )
-        if wrong := _misfit(data, known) or _odd_agents(data) or _odd_map(data):
+        if wrong := _misfit(data, present) or _odd_agents(data) or _odd_map(data):
             raise InputError(
                 f"{path}: damaged: {wrong}; run evaluate.py again to rewrite it"
             )
-        found: dict[str, Any] = {
-            each.name: data[each.name] for each in known if each.name in data
-        }
-        return cls(
-            **{
-                name: value if value.shape else value.item()
-                for name, value in found.items()
-            }
-        )
+        values: dict[str, Any] = {entry.name: data[entry.name] for entry in present}
+        for name, value in values.items():
+            values[name] = value if value.shape else value.item()
+        return cls(**values)
 
     def write(self, folder: Path) -> Path:
         """Write its file into a folder, whole or not at all; returns its path."""
-        known: dict[str, Any] = {
+        arrays: dict[str, Any] = {
             name: np.asarray(value)
             for name, value in vars(self).items()
             if value is not None
         }
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, format=np.array(FORMAT), **known)
+        np.savez_compressed(buffer, format=np.array(FORMAT), **arrays)
         path = Path(folder) / self.name
         write_atomically(path, buffer.getvalue())
         return path
@@ -192,14 +181,10 @@ class Failure:
         InputError where they do not fit."""
         path = Path(run) / ROLLOUTS / rollout_name(row)
         rollout = Rollout.read(path, run)
-        (steps, agents), step, partner = (
-            rollout.valid.shape,
-            row["contact_step"],
-            row["partner"],
-        )
-        if rollout.name != path.name or (
-            step == step and not (step in range(steps) and partner in range(agents))
-        ):
+        steps, agents = rollout.valid.shape
+        step = row["contact_step"]
+        within = step in range(steps) and row["partner"] in range(agents)
+        if rollout.name != path.name or (step == step and not within):
             raise InputError(
                 f"{path}: does not fit to its row of the table; run evaluate.py again to rewrite both"
             )
@@ -247,38 +232,37 @@ def file_stem(*parts: object) -> str:
     return f"{stem[:STEM]}~{hashlib.sha256(json.dumps(texts).encode()).hexdigest()[:DIGITS]}"
 
 
-def _misfit(data: Mapping[str, np.ndarray], known: Iterable[Field]) -> str | None:
+def _misfit(data: Mapping[str, np.ndarray], present: Iterable[Field]) -> str | None:
     """Which array of a file has another type, shape or range than its field; None:
     none."""
     sizes: dict[str, int] = {}
-    given = [each for each in known if each.name in data]
-    for each in given:
-        value = data[each.name]
-        kinds = each.metadata["kinds"]
-        shape = each.metadata["shape"]
+    for entry in present:
+        value = data[entry.name]
+        kinds = entry.metadata["kinds"]
+        shape = entry.metadata["shape"]
         if not shape and (value.shape != () or value.dtype.kind not in kinds):
-            return f"{each.name} is no single {'text' if kinds == 'U' else 'number'}"
+            return f"{entry.name} is no single {'text' if kinds == 'U' else 'number'}"
         if not shape and kinds == "U" and UNPRINTABLE.search(value.item()):
-            return f"{each.name} holds control characters"
+            return f"{entry.name} holds control characters"
         wrong = value.ndim != len(shape) or value.dtype.kind not in kinds
         if wrong or any(
             sizes.setdefault(letter, int(letter) if letter.isdigit() else size) != size
             for letter, size in zip(shape, value.shape, strict=True)
         ):
-            return f"{each.name} has shape {value.shape} and type {value.dtype}"
+            return f"{entry.name} has shape {value.shape} and type {value.dtype}"
     if min(sizes["T"], sizes["N"]) < 1 or sizes["L"] != sizes["W"] + 1:
         return "it holds no agent, or as many lanes as borders between them"
     if len(data.keys() & {"planners", "plans", "targets"}) not in (0, 3):
         return "of planners, plans, targets some are missing"
-    for each in given:
-        low = each.metadata["low"]
-        high = each.metadata["high"]
+    for entry in present:
+        low = entry.metadata["low"]
+        high = entry.metadata["high"]
         if low is not None:
             most = high + sizes["N"] if high < 0 else high
             if not (
-                (data[each.name] >= low) & (data[each.name] <= most)
+                (data[entry.name] >= low) & (data[entry.name] <= most)
             ).all():  # NaN is not, either
-                return f"{each.name} is out of range"
+                return f"{entry.name} is out of range"
     return None
 
 
@@ -289,8 +273,8 @@ def _odd_agents(data: Mapping[str, np.ndarray]) -> str | None:
     size = data["size"][data["valid"].any(0)]
     if not ((size > 0) & (size <= LONGEST)).all():
         return f"an agent's size is not between 0 and {LONGEST:g} m"
-    for name, known in (("states", "valid"), ("logged", "logged_valid")):
-        states = data[name][data[known]]
+    for name, valid in (("states", "valid"), ("logged", "logged_valid")):
+        states = data[name][data[valid]]
         if not np.isfinite(states).all():
             return "a valid state is NaN or infinite"
         if (np.abs(states) > [FARTHEST, FARTHEST, TURNED, FASTEST]).any():

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
 from e2rl.scenes.recording import AGENT_TYPES, VEHICLE
 from e2rl.scenes.scene import SceneSet
@@ -136,71 +135,16 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
     def of(cls, rollouts: Sequence[Rollout]) -> "Rollouts":
         """Rollouts, padded to the longest; without plans, targets, evasion and driver,
         which drawings alone need."""
-
-        def pad(name: str, fill: float = 0) -> Tensor:
-            arrays = [torch.as_tensor(getattr(rollout, name)) for rollout in rollouts]
-            shape = [
-                max(sizes)
-                for sizes in zip(*(each.shape for each in arrays), strict=True)
-            ]
-            result = torch.full((len(arrays), *shape), fill, dtype=arrays[0].dtype)
-            for row, each in zip(result, arrays, strict=True):
-                row[tuple(slice(length) for length in each.shape)] = each
-            return result
-
-        tracks = (
-            "states",
-            "valid",
-            "size",
-            "simulated",
-            "adversaries",
-            "logged",
-            "logged_valid",
-        )
-        padded = (*tracks, "lane_points", "lane_width", "drivable_points")
-        lines: dict[str, list[Tensor]] = {
-            "lane": [],
-            "drivable": [],
-        }  # the line number of each point
-        for each in rollouts:
-            for name, numbers in lines.items():
-                counts = np.diff(getattr(each, f"{name}_offsets"))
-                numbers.append(
-                    torch.from_numpy(np.repeat(np.arange(len(counts)), counts))
-                )
-        codes = [
-            torch.tensor([AGENT_TYPES.index(kind) for kind in each.agent_type.tolist()])
-            for each in rollouts
-        ]
-        lights = all(rollout.ran_light is not None for rollout in rollouts)
-        return cls(
-            **{name: pad(name) for name in padded},
-            agent_type=pad_sequence(codes, batch_first=True),
-            **{
-                f"{name}_index": pad_sequence(each, True, padding_value=-1)
-                for name, each in lines.items()
-            },
-            ran_light=pad("ran_light", -1) if lights else None,
-            seed=torch.tensor([rollout.seed for rollout in rollouts]),
-            eta=torch.tensor(
-                [rollout.eta for rollout in rollouts], dtype=torch.float64
-            ),
-            **{
-                name: [getattr(rollout, name) for rollout in rollouts] for name in TEXTS
-            },
-            batch_size=[len(rollouts)],
-        )
+        parts: Any = [_of_one(rollout) for rollout in rollouts]
+        joined: Any = torch.cat(parts)
+        return joined
 
     @classmethod
     def from_npz(cls, paths: Path | Iterable[Path]) -> "Rollouts":
         """The rollouts of one or several files, padded. Raises InputError, naming the
         file, where one is damaged."""
-        return cls.of(
-            [
-                Rollout.read(path)
-                for path in ([paths] if isinstance(paths, str | Path) else paths)
-            ]
-        )
+        paths = [paths] if isinstance(paths, str | Path) else paths
+        return cls.of([Rollout.read(path) for path in paths])
 
     def to_npz(self, folder: Path) -> list[Path]:
         """Write a file for each of B rollouts into a folder; returns their paths."""
@@ -239,6 +183,28 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
             driver=_known_track(row.driver),
             **plans,
         )
+
+
+def _of_one(rollout: Rollout) -> Rollouts:
+    """The rollout as Rollouts [1]."""
+    tracks = ("states", "valid", "size", "simulated", "adversaries", "logged")
+    others = ("logged_valid", "lane_points", "lane_width", "drivable_points")
+    arrays: dict[str, Any] = {
+        name: getattr(rollout, name) for name in (*tracks, *others)
+    }
+    arrays["agent_type"] = [AGENT_TYPES.index(kind) for kind in rollout.agent_type]
+    for name in ("lane", "drivable"):  # the line number of each point
+        counts = np.diff(getattr(rollout, f"{name}_offsets"))
+        arrays[f"{name}_index"] = np.repeat(np.arange(len(counts)), counts)
+    if rollout.ran_light is not None:
+        arrays["ran_light"] = rollout.ran_light
+    return Rollouts(
+        **{name: torch.as_tensor(value)[None] for name, value in arrays.items()},
+        seed=torch.tensor([rollout.seed]),
+        eta=torch.tensor([rollout.eta], dtype=torch.float64),
+        **{name: [getattr(rollout, name)] for name in TEXTS},
+        batch_size=[1],
+    )
 
 
 _tensorclass_function = Rollouts.__torch_function__
@@ -301,17 +267,16 @@ def padded(values: Sequence[Tensor], fill: float) -> list[Tensor]:
 
 def road_of(scene: Rollouts | TensorDictBase) -> Road:
     """The map of one scene or rollout, without its padding."""
-    found = {name: scene.get(name) for name in MAP}
     lanes, lane_offsets, whole = polylines(
-        found["lane_points"], found["lane_index"], minimum=2
+        scene.get("lane_points"), scene.get("lane_index"), minimum=2
     )
     rings, ring_offsets, _ = polylines(
-        found["drivable_points"], found["drivable_index"], minimum=3
+        scene.get("drivable_points"), scene.get("drivable_index"), minimum=3
     )
     return Road(
         lane_points=lanes,
         lane_offsets=lane_offsets,
-        lane_width=found["lane_width"].float().numpy()[whole],
+        lane_width=scene.get("lane_width").float().numpy()[whole],
         drivable_points=rings,
         drivable_offsets=ring_offsets,
     )

@@ -266,7 +266,14 @@ def onto(
         off_lane = torch.zeros_like(moved)
     if paths is None:
         paths = state.routed.points
-    routed = reroute(state.routed, world.scene, route, moved, off_lane, paths)
+    routed = reroute(
+        state.routed,
+        world.scene,
+        route=route,
+        moved=moved,
+        off_lane=off_lane,
+        off_lane_path=paths,
+    )
     lane = locate(
         world.states[:, : route.shape[1]],
         state.lane.a,

@@ -288,3 +288,10 @@ def test_who_comes_alongside_falls_behind_and_who_crosses_does_not(cosine, behin
 def test_whoever_is_free_has_a_cap_beyond_what_a_car_can_do():
     decode, state, obstacles = traffic((0, 0, 0, 10))
     assert caps(decode, state, obstacles=obstacles).tolist() == [20.0]
+
+
+@pytest.mark.parametrize(("aside", "free"), [(2.09, False), (2.11, True)])
+def test_a_tenth_of_a_metre_is_kept_to_either_side(aside, free):
+    """Of two cars of 2 m, one beside the other's way."""
+    cap = caps(*traffic((0, 0, 0, 10), (20, aside, 0, 0)))[0]
+    assert (cap == NO_CAP) == free
