@@ -43,7 +43,10 @@ class BoundSettings:
 
     meeting: bool = setting()
     curve: bool = setting()
-    look: float = setting(low=0.5, high=5.0)
+    look: float = setting(
+        low=0.5,
+        high=5.0,
+    )
     lateral: float = setting(low=0.1)
     floor: float = setting(high=0)
 
@@ -95,7 +98,12 @@ def bounded(
     """
     cap = torch.full_like(state.v, NO_CAP)
     for _ in range(2):
-        caps = acceleration_caps(settings, motion, state=state, obstacles=obstacles)
+        caps = acceleration_caps(
+            settings,
+            motion,
+            state=state,
+            obstacles=obstacles,
+        )
         cap = torch.minimum(cap, caps)
         rows = (cap < NO_CAP).nonzero(as_tuple=True)
         if len(rows[0]):
@@ -123,10 +131,20 @@ def acceleration_caps(
     steps = torch.arange(STRIDE - 1, last, STRIDE, device=state.v.device)
     braking = torch.full_like(state.v, -NO_CAP)
     if settings.meeting:
-        meeting = _meeting_braking(motion, state, obstacles=obstacles, steps=steps)
+        meeting = _meeting_braking(
+            motion,
+            state,
+            obstacles=obstacles,
+            steps=steps,
+        )
         braking = torch.maximum(braking, meeting)
     if settings.curve:
-        curve = _curve_braking(motion, state, lateral=settings.lateral, steps=steps)
+        curve = _curve_braking(
+            motion,
+            state,
+            lateral=settings.lateral,
+            steps=steps,
+        )
         braking = torch.maximum(braking, curve)
     return (-braking).clamp(min=settings.floor)
 
@@ -142,14 +160,14 @@ def apply_cap(cap: Tensor, x0: Tensor, state: LaneState) -> tuple[Tensor, LaneSt
 class Plans(NamedTuple):
     """What vehicles [B, V] and all agents [B, N] do up to steps [K].
 
-    own [B, V, K, 4] and everybody [B, N, K, 4]: states; driven [B, V, K] m; own_size
+    planned [B, V, K, 4] and everybody [B, N, K, 4]: states; driven [B, V, K] m; vehicle_size
     [B, V, 2], size [B, N, 2]; here [B, V], present [B, N]: whether they are there.
     """
 
-    own: Tensor
+    planned: Tensor
     everybody: Tensor
     driven: Tensor
-    own_size: Tensor
+    vehicle_size: Tensor
     size: Tensor
     here: Tensor
     present: Tensor
@@ -157,7 +175,11 @@ class Plans(NamedTuple):
 
 
 def _meeting_braking(
-    motion: LaneState, state: LaneState, *, obstacles: Obstacles, steps: Tensor
+    motion: LaneState,
+    state: LaneState,
+    *,
+    obstacles: Obstacles,
+    steps: Tensor,
 ) -> Tensor:
     """`meeting_braking` [B, V] of planned motion, towards the agent that each vehicle
     runs into first."""
@@ -165,12 +187,12 @@ def _meeting_braking(
     present = obstacles.present
     vehicles = state.v.shape[1]
     others = constant_velocity(obstacles.agents[:, vehicles:], DT * (steps + 1))
-    own = motion.states()[:, :, steps]
+    planned = motion.states()[:, :, steps]
     plans = Plans(
-        own=own,
-        everybody=torch.cat([own, others], 1),
+        planned=planned,
+        everybody=torch.cat([planned, others], 1),
         driven=motion.s[..., steps] - state.s[..., None],
-        own_size=size[:, :vehicles],
+        vehicle_size=size[:, :vehicles],
         size=size,
         here=present[:, :vehicles],
         present=present,
@@ -201,7 +223,10 @@ def _meeting_braking(
     ("B V:bool", "B V:bool", "B V"),
 )
 def braking_for_meetings(
-    plans: Plans, speed: Tensor, length: Tensor, duty: Duty
+    plans: Plans,
+    speed: Tensor,
+    length: Tensor,
+    duty: Duty,
 ) -> Tensor:
     """`meeting_braking` [B, V] for the `first_meeting`.
 
@@ -209,15 +234,20 @@ def braking_for_meetings(
         plans: of vehicles and everybody.
         speed, length, duty: of `meeting_braking`.
     """
-    return meeting_braking(first_meeting(plans), speed, length=length, duty=duty)
+    return meeting_braking(
+        first_meeting(plans),
+        speed,
+        length=length,
+        duty=duty,
+    )
 
 
 class Meeting(NamedTuple):
-    """Vehicles and each of N agents, the ego first, when they first meet: own, other
-    [B, V, N, 4] their states, after the vehicle has driven `driven` [B, V, N] m in
+    """Vehicles and each of N agents, the ego first, when they first meet: vehicle,
+    other [B, V, N, 4] their states, after the vehicle has driven `driven` [B, V, N] m in
     `steps` [B, V, N] steps; happens [B, V, N]: they do meet."""
 
-    own: Tensor
+    vehicle: Tensor
     other: Tensor
     driven: Tensor
     steps: Tensor
@@ -227,29 +257,35 @@ class Meeting(NamedTuple):
 def first_meeting(plans: Plans) -> Meeting:
     """Where boxes of vehicles, wider by LATERAL_MARGIN on both sides, first overlap
     those of everybody."""
-    own = plans.own
-    length, width = plans.own_size.unbind(-1)
+    planned = plans.planned
+    length, width = plans.vehicle_size.unbind(-1)
     wide = torch.stack([length, width + 2 * LATERAL_MARGIN], -1)
     meets = overlap(
-        own[:, :, None],
+        planned[:, :, None],
         wide[:, :, None, None],
         second=plans.everybody[:, None],
         second_size=plans.size[:, None, :, None],
     )  # [B, V, N, K]
-    number = torch.arange(plans.present.shape[1], device=own.device)
-    itself = number == torch.arange(own.shape[1], device=own.device)[:, None]
+    number = torch.arange(plans.present.shape[1], device=planned.device)
+    itself = number == torch.arange(planned.shape[1], device=planned.device)[:, None]
     counts = plans.present[:, None, :] & plans.here[..., None] & ~itself
     count = plans.steps.shape[0]
-    rest = torch.arange(count, 0, -1, dtype=own.dtype, device=own.device)
+    rest = torch.arange(
+        count,
+        0,
+        -1,
+        dtype=planned.dtype,
+        device=planned.device,
+    )
     left = torch.where(meets & counts[..., None], rest, 0.0).amax(-1)
     first = torch.where(left > 0, count - left, 0.0).long()  # [B, V, N]
     vehicles, agents = first.shape[1:]
     index = first[..., None, None].expand(*first.shape, 1, 4)
     everybody = plans.everybody[:, None].expand(-1, vehicles, -1, -1, -1)
     driven = plans.driven[:, :, None].expand(-1, -1, agents, -1)
-    own = own[:, :, None].expand(-1, -1, agents, -1, -1)
+    planned = planned[:, :, None].expand(-1, -1, agents, -1, -1)
     return Meeting(
-        own=own.gather(3, index)[..., 0, :],
+        vehicle=planned.gather(3, index)[..., 0, :],
         other=everybody.gather(3, index)[..., 0, :],
         driven=driven.gather(3, first[..., None])[..., 0],
         steps=plans.steps[first],
@@ -258,7 +294,11 @@ def first_meeting(plans: Plans) -> Meeting:
 
 
 def meeting_braking(
-    meeting: Meeting, speed: Tensor, *, length: Tensor, duty: Duty
+    meeting: Meeting,
+    speed: Tensor,
+    *,
+    length: Tensor,
+    duty: Duty,
 ) -> Tensor:
     """Braking [B, V] m/s^2 that keeps vehicles GAP short of what they meet, -NO_CAP
     where none has to brake.
@@ -274,12 +314,12 @@ def meeting_braking(
             -inf: nobody falls behind it.
         duty: how adversaries treat the ego.
     """
-    own, other, driven, steps, happens = meeting
-    dx, dy = (other[..., :2] - own[..., :2]).unbind(-1)
-    ahead = dx * torch.cos(own[..., 2]) + dy * torch.sin(own[..., 2])
+    vehicle, other, driven, steps, happens = meeting
+    dx, dy = (other[..., :2] - vehicle[..., :2]).unbind(-1)
+    ahead = dx * torch.cos(vehicle[..., 2]) + dy * torch.sin(vehicle[..., 2])
     ahead_of_other = -(dx * torch.cos(other[..., 2]) + dy * torch.sin(other[..., 2]))
     yields = happens & (ahead > ahead_of_other)
-    along = torch.cos(other[..., 2] - own[..., 2])
+    along = torch.cos(other[..., 2] - vehicle[..., 2])
     u = (other[..., 3] * along).clamp(min=0)
     room = (driven - GAP - u * DT * steps).clamp(min=LEAST_ROOM)
     closing = (speed[..., None] - u).clamp(min=0)
@@ -298,7 +338,11 @@ def meeting_braking(
 
 
 def _curve_braking(
-    motion: LaneState, state: LaneState, *, lateral: float, steps: Tensor
+    motion: LaneState,
+    state: LaneState,
+    *,
+    lateral: float,
+    steps: Tensor,
 ) -> Tensor:
     """Braking [B, V] by which v^2 kappa is at most `lateral` m/s^2 at every point of
     the plan."""

@@ -28,7 +28,10 @@ class DenoiserSettings:
     heads: int = setting(low=1)
     blocks: int = setting(low=1)
     pair: int = setting(low=1)
-    dropout: float = setting(low=0, high=1)
+    dropout: float = setting(
+        low=0,
+        high=1,
+    )
 
     def __post_init__(self) -> None:
         if self.heads and self.width % self.heads:
@@ -69,7 +72,13 @@ class Block(nn.Module):
     """Attention over vehicles and an MLP, modulated by noise level and node
     (adaLN-Zero, Peebles and Xie 2023)."""
 
-    def __init__(self, width: int, heads: int, pair: int, dropout: float):
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        pair: int,
+        dropout: float,
+    ):
         super().__init__()
         self.heads = heads
         self.norm_attention = nn.LayerNorm(width, elementwise_affine=False)
@@ -90,7 +99,11 @@ class Block(nn.Module):
         nn.init.zeros_(self.modulation.bias)
 
     def forward(
-        self, h: Tensor, modulation: Tensor, bias: Tensor, pairs: Tensor
+        self,
+        h: Tensor,
+        modulation: Tensor,
+        bias: Tensor,
+        pairs: Tensor,
     ) -> Tensor:
         """h [B, V, W] after the block.
 
@@ -164,7 +177,12 @@ class Denoiser(nn.Module):
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(nn.LayerNorm(width), last)
 
-    def encode(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
+    def encode(
+        self,
+        nodes: Tensor,
+        pairs: Tensor,
+        present: Tensor,
+    ) -> Encoding:
         """Encoding of node features [B, V, NODE], pair features [B, V, V, EDGE] and
         presence [B, V]."""
         if self._learns() or not is_on():
@@ -179,7 +197,12 @@ class Denoiser(nn.Module):
             modulations=rest[self.settings.blocks :],
         )
 
-    def encoding(self, nodes: Tensor, pairs: Tensor, present: Tensor) -> Encoding:
+    def encoding(
+        self,
+        nodes: Tensor,
+        pairs: Tensor,
+        present: Tensor,
+    ) -> Encoding:
         """`encode`, operation by operation."""
         node = self.encode_node(((nodes - self.node_mean) / self.node_std).clamp(-6, 6))
         pair = self.encode_pair(pairs)
@@ -202,7 +225,12 @@ class Denoiser(nn.Module):
         level = self.embed_level(torch.cat([torch.sin(angle), torch.cos(angle)], -1))
         return [block.modulation(level) + self.unit_scale for block in self.blocks]
 
-    def forward(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
+    def forward(
+        self,
+        x: Tensor,
+        level: Tensor,
+        encoding: Encoding,
+    ) -> Tensor:
         """Denoised estimate x0 [B, V, SIZE] of x [B, V, SIZE] at noise level [B, V], or
         [1, V] for all scenes."""
         if (
@@ -234,7 +262,12 @@ class Denoiser(nn.Module):
         """The weights and constants that `estimate` reads."""
         return [*self.parameters(), *self.buffers()]
 
-    def estimate(self, x: Tensor, level: Tensor, encoding: Encoding) -> Tensor:
+    def estimate(
+        self,
+        x: Tensor,
+        level: Tensor,
+        encoding: Encoding,
+    ) -> Tensor:
         """`forward`, operation by operation."""
         h = self.embed_x(x) + encoding.nodes
         of_level = self.modulated(level)
@@ -275,7 +308,11 @@ def fused_estimate(settings: DenoiserSettings) -> Fused:
     blocks = settings.blocks
 
     def denoise(
-        x: Tensor, level: Tensor, nodes: Tensor, pairs: Tensor, *rest: Tensor
+        x: Tensor,
+        level: Tensor,
+        nodes: Tensor,
+        pairs: Tensor,
+        *rest: Tensor,
     ) -> Tensor:
         encoding = Encoding(
             nodes,

@@ -42,17 +42,31 @@ def as_driven(motion: LaneState, state: LaneState, on_lane: Tensor) -> LaneState
     motion = replace(motion, v=torch.where(back < 0, back, motion.v))
     before = torch.cat([state.v[..., None], motion.v[..., :-1]], -1)
     driven = ((before + motion.v) / 2 * DT).cumsum(-1)
-    placed = _placed(motion, state, driven=driven, on_lane=on_lane)
+    placed = _placed(
+        motion,
+        state,
+        driven=driven,
+        on_lane=on_lane,
+    )
     placed = select(state.v < 0, motion, placed)  # no line lies behind the vehicle
     headings = torch.cat([state.heading[..., None], placed.heading], -1)
     bound = turn_bound((before + motion.v) / 2)
     turn = torch.maximum(torch.minimum(wrap(headings.diff(dim=-1)), bound), -bound)
     x, y, heading, _ = steered(state.states(), motion.v, turn=turn).unbind(-1)
-    return replace(placed, x=x, y=y, heading=heading)
+    return replace(
+        placed,
+        x=x,
+        y=y,
+        heading=heading,
+    )
 
 
 def _placed(
-    motion: LaneState, state: LaneState, *, driven: Tensor, on_lane: Tensor
+    motion: LaneState,
+    state: LaneState,
+    *,
+    driven: Tensor,
+    on_lane: Tensor,
 ) -> LaneState:
     """The motion with its places ALONG_LINE those after `driven` [..., H] m of its
     line."""
@@ -60,7 +74,13 @@ def _placed(
     stretch = torch.hypot(along, motion.d1)  # m of the line per m of the route
     stretch = torch.where(on_lane[..., None], stretch, 1.0)
     mean = (stretch + torch.cat([stretch[..., :1], stretch[..., :-1]], -1)) / 2
-    metres = (mean * motion.s.diff(dim=-1, prepend=state.s[..., None])).cumsum(-1)
+    metres = (
+        mean
+        * motion.s.diff(
+            dim=-1,
+            prepend=state.s[..., None],
+        )
+    ).cumsum(-1)
     metres = torch.nn.functional.pad(metres, (1, 0))
 
     whole = state.map(

@@ -19,7 +19,12 @@ TURN_AT = (10.0, 20.0, 40.0, 60.0, 80.0)  # m ahead
 LEADER_AT = (0.0, 1.5, 3.0)  # s ahead, the others at constant velocity
 COMFORT_LATERAL = 2.5  # m/s^2
 COMFORT_BRAKE = 1.2  # m/s^2
-DRIVER = IDMParameters(headway=1.0, standstill_gap=2.0, acceleration=1.5, braking=2.0)
+DRIVER = IDMParameters(
+    headway=1.0,
+    standstill_gap=2.0,
+    acceleration=1.5,
+    braking=2.0,
+)
 NODE = 51 + PAST + 4
 EDGE = 15
 # Features that change sign under a mirror image.
@@ -99,7 +104,10 @@ def _route_features(routed: RoutedScene, state: LaneState) -> list[Tensor]:
     count = len(CURVATURE_AT)
     turn = wrap(heading[..., count:-1] - heading[..., -1:])
     curve = curve_speed(
-        state, routed.points, lateral=COMFORT_LATERAL, brake=COMFORT_BRAKE
+        state,
+        routed.points,
+        lateral=COMFORT_LATERAL,
+        brake=COMFORT_BRAKE,
     )
     rest = torch.where(routed.open, routed.length - state.s, 200.0).clamp(-10.0, 200.0)
     return [
@@ -113,7 +121,11 @@ def _route_features(routed: RoutedScene, state: LaneState) -> list[Tensor]:
 
 
 def curve_speed(
-    state: LaneState, points: Tensor, *, lateral: float, brake: float
+    state: LaneState,
+    points: Tensor,
+    *,
+    lateral: float,
+    brake: float,
 ) -> Tensor:
     """Highest speed [B, V] m/s from which all curves within 80 m can be met.
 
@@ -130,7 +142,11 @@ def curve_speed(
 
 
 def leaders_ahead(
-    routed: RoutedScene, s: Tensor, *, agents: Tensor, present: Tensor
+    routed: RoutedScene,
+    s: Tensor,
+    *,
+    agents: Tensor,
+    present: Tensor,
 ) -> Leaders:
     """Leaders [B, V, 3] of vehicles once all agents have kept their velocity for
     LEADER_AT.
@@ -186,7 +202,7 @@ def _past_features(past: Tensor, v: Tensor, estimated: Tensor) -> list[Tensor]:
 
 @fused(ROUTED, "B V")
 def edge_features(routed: RoutedScene, state: LaneState) -> Tensor:
-    """[B, V, V, EDGE] of each pair (i, j): j in i's frame, and where their routes meet."""
+    """[B, V, V, EDGE] of each pair (i, j): j in i's frame, and where routes meet."""
 
     def of_pairs(value: Tensor) -> Tensor:
         """Value of j less that of i."""

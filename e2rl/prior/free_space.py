@@ -60,7 +60,11 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
     turned = 0.5 * reach * (of_first + half * second + (end - half) * second**2 / 2)
     heading = begin.heading + turned + end * beyond
     before = torch.cat([begin.heading, heading[..., :-1]], -1)
-    step = torch.diff(travelled, dim=-1, prepend=torch.zeros_like(travelled[..., :1]))
+    step = torch.diff(
+        travelled,
+        dim=-1,
+        prepend=torch.zeros_like(travelled[..., :1]),
+    )
     middle = (heading + before) / 2
     zero = torch.zeros_like(v)
     return LaneState(
@@ -79,7 +83,10 @@ def decode(x: Tensor, state: LaneState) -> LaneState:
 
 @fused(f"B V {SIZE}", "B V", "B V P 2!", "B V:bool")
 def decode_plans(
-    x: Tensor, state: LaneState, points: Tensor, on_lane: Tensor
+    x: Tensor,
+    state: LaneState,
+    points: Tensor,
+    on_lane: Tensor,
 ) -> LaneState:
     """Planned motion, fields [B, V, HORIZON], of every vehicle.
 
@@ -92,7 +99,13 @@ def decode_plans(
     return select(on_lane, lane_relative.decode(x, state, points), decode(x, state))
 
 
-def fit(heading: Tensor, known: Tensor, *, state: LaneState, knots: Tensor) -> Tensor:
+def fit(
+    heading: Tensor,
+    known: Tensor,
+    *,
+    state: LaneState,
+    knots: Tensor,
+) -> Tensor:
     """Lateral knots [..., V, 2] whose path has the recorded headings, by ridge least
     squares.
 

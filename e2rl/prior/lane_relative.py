@@ -60,7 +60,12 @@ class LaneState:
     kappa: Tensor
 
     @classmethod
-    def from_states(cls, states: Tensor, s: Tensor, d: Tensor) -> "LaneState":
+    def from_states(
+        cls,
+        states: Tensor,
+        s: Tensor,
+        d: Tensor,
+    ) -> "LaneState":
         """States [..., 4] with arc length s and offset d [...]; the rest is 0."""
         x, y, heading, v = states.unbind(-1)
         zero = torch.zeros_like(v)
@@ -112,19 +117,32 @@ def locate(
 
 @fused("B V 4", "B V", "B V", "B V P 2!")
 def locate_anywhere(
-    states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor
+    states: Tensor,
+    accel: Tensor,
+    yaw_rate: Tensor,
+    points: Tensor,
 ) -> LaneState:
     """`locate` without a hint.
 
     Args:
         states, accel, yaw_rate, points: of `locate`.
     """
-    return _locate(states, accel, yaw_rate=yaw_rate, points=points, hint=None)
+    return _locate(
+        states,
+        accel,
+        yaw_rate=yaw_rate,
+        points=points,
+        hint=None,
+    )
 
 
 @fused("B V 4", "B V", "B V", "B V P 2!", "B V")
 def locate_near(
-    states: Tensor, accel: Tensor, yaw_rate: Tensor, points: Tensor, hint: Tensor
+    states: Tensor,
+    accel: Tensor,
+    yaw_rate: Tensor,
+    points: Tensor,
+    hint: Tensor,
 ) -> LaneState:
     """`locate` with a hint.
 
@@ -132,7 +150,13 @@ def locate_near(
         states, accel, yaw_rate, points, hint: of `locate`.
     """
     hint = hint[..., None]
-    return _locate(states, accel, yaw_rate=yaw_rate, points=points, hint=hint)
+    return _locate(
+        states,
+        accel,
+        yaw_rate=yaw_rate,
+        points=points,
+        hint=hint,
+    )
 
 
 def _locate(
@@ -243,7 +267,14 @@ def decode(
     """
     knots, half, end = split(x, state)
     v, travelled = speeds(state, knots)
-    accel = torch.diff(v, dim=-1, prepend=state.v[..., None])[..., steps] / DT
+    accel = (
+        torch.diff(
+            v,
+            dim=-1,
+            prepend=state.v[..., None],
+        )[..., steps]
+        / DT
+    )
     v = v[..., steps]
     travelled = travelled[..., steps]
     reach = lateral_horizon(state.v)[..., None]
@@ -300,7 +331,11 @@ class _Polynomial(torch.autograd.Function):
             (table[..., : 7 - shift, :] * grad[..., None, :]).sum(-1)
             for shift, grad in enumerate(grads)
         )
-        power = torch.arange(7, device=c.device, dtype=c.dtype)
+        power = torch.arange(
+            7,
+            device=c.device,
+            dtype=c.dtype,
+        )
         pad = torch.nn.functional.pad
         of_c = of_value + power * pad(of_first, (1, 0))
         of_c = of_c + power * (power - 1) * pad(of_second, (2, 0))
@@ -325,7 +360,7 @@ def fit(
     (second differences damped), on offset for the lateral knots.
     """
     knots = _fit_knots(track, known, state=state)
-    known = torch.ones_like(track.v) if known is None else known
+    mask = torch.ones_like(track.v) if known is None else known
     _, travelled = speeds(state, knots)
     u = (travelled / lateral_horizon(state.v)[..., None]).clamp(max=1.0)
 
@@ -335,16 +370,16 @@ def fit(
     zero = torch.zeros_like(state.d)
     still = replace(state.map(torch.zeros_like), v=state.v)
     of_half = offsets(still, zero + 1, zero)
-    half = of_half * known
-    end = offsets(still, zero, zero + 1) * known
+    half = of_half * mask
+    end = offsets(still, zero, zero + 1) * mask
     # In units of x: half = (d + end) / 2 + BEND_SCALE x_0, end = OFFSET_SCALE x_1.
     unit = torch.stack([BEND_SCALE * half, OFFSET_SCALE * (end + 0.5 * half)], -1)
     base = offsets(state, zero, zero)
-    rest = (track.d - base - 0.5 * state.d[..., None] * of_half) * known
+    rest = (track.d - base - 0.5 * state.d[..., None] * of_half) * mask
     lateral = ridge(unit, rest, torch.diag(unit.new_tensor(LATERAL_DAMPING)))
     beside = (rest - (unit * lateral[..., None, :]).sum(-1)).abs()
     left = beside + (track.s - state.s[..., None] - travelled).abs()
-    error = (left * known).sum(-1) / known.sum(-1).clamp(min=1)
+    error = (left * mask).sum(-1) / mask.sum(-1).clamp(min=1)
     return torch.cat([knots / ACCEL_SCALE, lateral], -1), error
 
 
@@ -378,21 +413,27 @@ def _fit_knots(track: LaneState, known: Tensor | None, state: LaneState) -> Tens
     rows, inverse = _fit_of_all(device)  # a constant, made before anything is compiled
     if torch.compiler.is_compiling():  # all is known: the system is solved already
         target = torch.cat([speed, 0.5 * driven], -1)
-        return ((target @ rows + pull) @ inverse).clamp(*HARDEST)
+        return ((target @ rows + pull) @ inverse).clamp(HARDEST[0], HARDEST[1])
     weight = torch.ones_like(track.v) if known is None else known.to(basis.dtype)
     target = torch.cat([weight * speed, 0.5 * weight * driven], -1)
     weight = weight[..., None]
     rows = torch.cat([weight * basis[:, 1:], 0.5 * weight * distance[:, 1:]], -2)
     gram = rows.transpose(-1, -2) @ rows + damp
     right = (rows.transpose(-1, -2) @ target[..., None])[..., 0] + pull
-    return torch.linalg.solve(gram, right[..., None])[..., 0].clamp(*HARDEST)
+    return torch.linalg.solve(gram, right[..., None])[..., 0].clamp(
+        HARDEST[0], HARDEST[1]
+    )
 
 
 @cache
 def _roughness(device: torch.device) -> tuple[Tensor, Tensor]:
     """The damping [KNOTS, KNOTS] of fitted knots, and the pull [KNOTS] of a present
     acceleration of 1 on them."""
-    second = torch.diff(torch.eye(KNOTS + 1, device=device), n=2, dim=0)
+    second = torch.diff(
+        torch.eye(KNOTS + 1, device=device),
+        n=2,
+        dim=0,
+    )
     ridge_of_knots = KNOT_DAMPING * torch.eye(KNOTS, device=device)
     damp = ROUGHNESS * second[:, 1:].T @ second[:, 1:] + ridge_of_knots
     return damp, -ROUGHNESS * second[:, 1:].T @ second[:, 0]

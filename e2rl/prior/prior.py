@@ -162,9 +162,19 @@ class Prior(nn.Module):
         present = world.valid
         here = present[:, : state.s.shape[1]]
         if known is None:
-            followed = leaders_ahead(routed, state.s, agents=agents, present=present)
+            followed = leaders_ahead(
+                routed,
+                state.s,
+                agents=agents,
+                present=present,
+            )
         else:
-            followed = _leaders_anew(known, routed, s=state.s, world=world)
+            followed = _leaders_anew(
+                known,
+                routed,
+                s=state.s,
+                world=world,
+            )
         begins = world.step == 0
         nodes = node_features(routed, state, followed, world.step, begins)
         active = here & routed.modelled
@@ -180,7 +190,12 @@ class Prior(nn.Module):
             all_on_lane=bool((routed.has_lane | ~here).all()),
         )
 
-    def denoise(self, x: Tensor, level: Tensor, context: Context) -> Tensor:
+    def denoise(
+        self,
+        x: Tensor,
+        level: Tensor,
+        context: Context,
+    ) -> Tensor:
         """x0 [B, V, SIZE] of x at a scalar noise level; a known plan of the ego
         replaces its row, nearly noise-free."""
         levels = level.repeat(1, x.shape[1])
@@ -260,7 +275,11 @@ class Prior(nn.Module):
         past = None
         for index in range(settings.steps - 1):
             high = levels[index]
-            denoise = partial(self.denoise, level=high, context=context)
+            denoise = partial(
+                self.denoise,
+                level=high,
+                context=context,
+            )
             k = settings.steps - index
             x, nominal, x0 = control(x, high, k, context, denoise)
             clean = Estimates(x0, nominal)
@@ -270,7 +289,11 @@ class Prior(nn.Module):
             past = Estimates(x0, nominal)
             before = high
         # The last step takes x0 itself: without noise there is no KL to count.
-        denoise = partial(self.denoise, level=levels[-2], context=context)
+        denoise = partial(
+            self.denoise,
+            level=levels[-2],
+            context=context,
+        )
         _, nominal, x0 = control(x, levels[-2], 1, context, denoise)
         if budget is not None:
             within = kl.sum(-1) < BUDGET_SPENT * budget
@@ -292,10 +315,19 @@ class Prior(nn.Module):
             has_lane = alone(context.routed.has_lane)
             part = replace(
                 context,
-                routed=replace(context.routed, points=points, has_lane=has_lane),
+                routed=replace(
+                    context.routed,
+                    points=points,
+                    has_lane=has_lane,
+                ),
                 state=context.state.map(alone),
             )
-            motion = self._driven(alone(x0), part, held=alone(held), cap=cap[:, None])
+            motion = self._driven(
+                alone(x0),
+                part,
+                held=alone(held),
+                cap=cap[:, None],
+            )
             return motion.map(lambda value: value[:, 0])
 
         motion = bounded(
@@ -308,7 +340,12 @@ class Prior(nn.Module):
         return Plan(motion, on_map(context.routed, motion.s))
 
     def _driven(
-        self, x0: Tensor, context: Context, *, held: Tensor, cap: Tensor | None = None
+        self,
+        x0: Tensor,
+        context: Context,
+        *,
+        held: Tensor,
+        cap: Tensor | None = None,
     ) -> LaneState:
         """The motion of x0 `as_driven`, with vehicles `held` [B, V], and standing ones
         whose plan is too short for a start, held in place."""
@@ -320,7 +357,11 @@ class Prior(nn.Module):
         zero = torch.zeros_like(still.v)
         return select(
             ((state.v.abs() < STANDING_SPEED) & short) | held,
-            replace(still, v=zero, a=zero),
+            replace(
+                still,
+                v=zero,
+                a=zero,
+            ),
             motion,
         )
 
@@ -345,18 +386,29 @@ def uncontrolled(
 
 
 def _leaders_anew(
-    known: Context, routed: RoutedScene, *, s: Tensor, world: World
+    known: Context,
+    routed: RoutedScene,
+    *,
+    s: Tensor,
+    world: World,
 ) -> Leaders:
-    """`leaders_ahead`, of scenes in which nobody has moved those of the known Context."""
+    """`leaders_ahead`; of scenes in which nobody has moved, those of a known Context."""
     moved = s != known.state.s
     if routed.points is not known.routed.points:
         moved = moved | (routed.points != known.routed.points).flatten(2).any(-1)
     rows = moved.any(1).nonzero()[:, 0]
     if not len(rows):
         return known.followed
-    part = replace(routed, points=routed.points[rows], size=routed.size[rows])
+    part = replace(
+        routed,
+        points=routed.points[rows],
+        size=routed.size[rows],
+    )
     anew = leaders_ahead(
-        part, s[rows], agents=world.states[rows], present=world.valid[rows]
+        part,
+        s[rows],
+        agents=world.states[rows],
+        present=world.valid[rows],
     )
     pairs = zip(known.followed, anew, strict=True)
     return Leaders(*(old.index_copy(0, rows, new) for old, new in pairs))
@@ -370,7 +422,12 @@ def plan_to_x(plan: Tensor, state: LaneState, routed: RoutedScene) -> Tensor:
 
 
 @fused("B 50 4", "B", "B P 2!", "B 1:bool")
-def mission_x(plan: Tensor, ego: LaneState, points: Tensor, on_lane: Tensor) -> Tensor:
+def mission_x(
+    plan: Tensor,
+    ego: LaneState,
+    points: Tensor,
+    on_lane: Tensor,
+) -> Tensor:
     """`plan_to_x` of an ego on a route, or in free space.
 
     Args:
@@ -386,6 +443,9 @@ def mission_x(plan: Tensor, ego: LaneState, points: Tensor, on_lane: Tensor) -> 
     x, _ = lane_relative.fit(LaneState.from_states(plan, s, d), None, ego)
     knots = x[..., :KNOTS]
     lateral = free_space.fit(
-        plan[..., 2], torch.ones_like(s), state=ego, knots=ACCEL_SCALE * knots
+        plan[..., 2],
+        torch.ones_like(s),
+        state=ego,
+        knots=ACCEL_SCALE * knots,
     )
     return torch.where(on_lane, x, torch.cat([knots, lateral], -1))

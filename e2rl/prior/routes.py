@@ -165,7 +165,11 @@ def reroute(
 
     def changed(old: Tensor, on_lane: Tensor, on_path: Tensor | float) -> Tensor:
         shape = (*moved.shape, *[1] * (old.dim() - 2))
-        on_path = torch.as_tensor(on_path, dtype=old.dtype, device=old.device)
+        on_path = torch.as_tensor(
+            on_path,
+            dtype=old.dtype,
+            device=old.device,
+        )
         new = torch.where(off_lane.view(shape), on_path, on_lane)
         return torch.where(moved.view(shape), new, old)
 
@@ -226,7 +230,13 @@ def first_conflicts(apart: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     first vertex of each that is."""
     count = apart.shape[1]
     if torch.compiler.is_compiling():  # without truth values, which are slow
-        left = torch.arange(count, 0, -1, dtype=apart.dtype, device=apart.device)
+        left = torch.arange(
+            count,
+            0,
+            -1,
+            dtype=apart.dtype,
+            device=apart.device,
+        )
         near = apart < CONFLICT_GAP
         of_row = torch.where(near, left[:, None, None], 0.0).amax((1, 3))
         of_other = torch.where(near, left, 0.0).amax((1, 3))
@@ -252,7 +262,9 @@ def start_of(scene: TensorDictBase) -> Moment:
     """The vehicles at the start of scenes [B]."""
     vehicles = scene["route_log"].shape[1]
     step = torch.zeros(
-        len(scene["start"]), dtype=torch.long, device=scene["start"].device
+        len(scene["start"]),
+        dtype=torch.long,
+        device=scene["start"].device,
     )
     return Moment(
         scene["start"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles], step=step
@@ -273,7 +285,14 @@ def candidate_features(scene: TensorDictBase, moment: Moment) -> Tensor:
     ahead = torch.tensor((0.0, *TURN_AT), device=s.device)
     _, angle, _ = interpolate(points, s[..., None] + ahead)
     turn = wrap(angle[..., 1:] - angle[..., :1])
-    bends = turn.abs().diff(dim=-1, prepend=torch.zeros_like(turn[..., :1])).abs()
+    bends = (
+        turn.abs()
+        .diff(
+            dim=-1,
+            prepend=torch.zeros_like(turn[..., :1]),
+        )
+        .abs()
+    )
     tight = (bends / ahead.diff()).amax(-1)
     vertex = (s / SPACING).long().clamp(0, points.shape[3] - 1)
     limit = routes["limit"].gather(-1, vertex[..., None])[..., 0]

@@ -44,15 +44,30 @@ class NoiseSchedule:
         """Integral of beta over [low, high]: 2 log(alpha(low) / alpha(high))."""
         return 2.0 * torch.log(self.alpha(low) / self.alpha(high))
 
-    def noised(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+    def noised(
+        self,
+        x0: Tensor,
+        t: Tensor,
+        noise: Tensor,
+    ) -> Tensor:
         """A sample of x_t given x_0 (forward diffusion)."""
         return self.alpha(t) * x0 + self.sigma(t) * noise
 
-    def score(self, x: Tensor, x0: Tensor, t: Tensor) -> Tensor:
+    def score(
+        self,
+        x: Tensor,
+        x0: Tensor,
+        t: Tensor,
+    ) -> Tensor:
         """Score of x_t given the clean estimate: (alpha x0 - x) / sigma^2."""
         return (self.alpha(t) * x0 - x) / self.sigma(t) ** 2
 
-    def noise(self, x: Tensor, x0: Tensor, t: Tensor) -> Tensor:
+    def noise(
+        self,
+        x: Tensor,
+        x0: Tensor,
+        t: Tensor,
+    ) -> Tensor:
         """The noise eps in x_t given x0."""
         return (x - self.alpha(t) * x0) / self.sigma(t)
 
@@ -62,7 +77,10 @@ class NoiseSchedule:
         return torch.log(self.alpha(t) / self.sigma(t))
 
     def levels(
-        self, steps: int, device: torch.device | None = None, spacing: str = "level"
+        self,
+        steps: int,
+        device: torch.device | None = None,
+        spacing: str = "level",
     ) -> Tensor:
         """Noise levels t_K > ... > t_0 = 0, [steps + 1].
 
@@ -201,7 +219,10 @@ class SamplerSettings:
     sampler: str = setting(choices=SAMPLERS)
     steps: int = setting(low=1)
     spacing: str = setting(choices=SPACINGS)
-    churn: float = setting(low=0, high=1)
+    churn: float = setting(
+        low=0,
+        high=1,
+    )
     temperature: float = setting(low=0)
     route_temperature: float = setting(low=0)
 
@@ -286,7 +307,10 @@ def fused_step(settings: SamplerSettings, size: int, limited: bool) -> Fused:
             x0 = nominal + fraction * (x0 - nominal)
             added = fraction[..., 0] ** 2 * added
         martingale = path_martingale(
-            moved - plain, noise, variance=variance, temperature=temperature
+            moved - plain,
+            noise,
+            variance=variance,
+            temperature=temperature,
         )
         return Moved(
             moved, x0, account.kl + added, account.log_ratio + added + martingale
@@ -306,8 +330,8 @@ def within_budget(budget: Tensor, spent: Tensor, added: Tensor) -> Tensor:
 
 
 def path_kl(shift: Tensor, variance: Tensor) -> Tensor:
-    """Path KL [...] that one step adds (eq. 5 in discrete form), ||shift of the mean||^2
-    / (2 variance), of shift [..., D].
+    """Path KL [...] that one step adds (eq. 5 in discrete form): ||shift of the
+    mean||^2 / (2 variance), of shift [..., D].
 
     Two Gaussians of equal variance have this divergence; the sum over the steps is the
     KL of the discrete paths (chain rule). Steps without noise have no density: 0 where
@@ -318,7 +342,11 @@ def path_kl(shift: Tensor, variance: Tensor) -> Tensor:
 
 
 def path_martingale(
-    shift: Tensor, noise: Tensor, *, variance: Tensor, temperature: float
+    shift: Tensor,
+    noise: Tensor,
+    *,
+    variance: Tensor,
+    temperature: float,
 ) -> Tensor:
     """What log q/p [...] of one step is beyond `path_kl`: shift . noise / standard
     deviation, of mean 0 under q.

@@ -17,7 +17,10 @@ REGIONS = {"covered_50": 0.5, "covered_90": 0.9}  # central regions of the sampl
 
 @torch.no_grad()
 def sample_variances(
-    prior: Prior, scene: TensorDictBase, samples: int, seed: int = 0
+    prior: Prior,
+    scene: TensorDictBase,
+    samples: int,
+    seed: int = 0,
 ) -> dict[str, Tensor]:
     """Sums [B] over the moving vehicles on lanes of scenes [B].
 
@@ -40,7 +43,12 @@ def sample_variances(
     shape = scene["route_log"].shape
     generator = torch.Generator(device).manual_seed(seed)
     drawn_route = prior.choose_routes(
-        scene, torch.rand(shape, generator=generator, device=device)
+        scene,
+        torch.rand(
+            shape,
+            generator=generator,
+            device=device,
+        ),
     )
     routed, lane = prior.start(
         scene, torch.where(scene["route_log"] >= 0, scene["route_log"], drawn_route)
@@ -50,7 +58,11 @@ def sample_variances(
     drawn = []
     for _ in range(samples):
         noise = torch.randn(
-            prior.sampler.steps, *shape, SIZE, generator=generator, device=device
+            prior.sampler.steps,
+            *shape,
+            SIZE,
+            generator=generator,
+            device=device,
         )
         drawn.append(prior.sample(context, noise).x0)
     x = torch.stack(drawn)

@@ -35,7 +35,7 @@ METRICS = (*CONTACTS, "off_road", "progress")
 
 
 def touches(metrics: TensorDictBase) -> Tensor:
-    """Bool [..., 1]: the ego touches anybody, by the metrics [...] of an environment."""
+    """Bool [..., 1]: the ego touches anybody, by an environment's metrics [...]."""
     return metrics["contact"] | metrics["contact_vru"] | metrics["contact_object"]
 
 
@@ -45,9 +45,18 @@ class SimSettings:
     """Bounds of the ego's action, what ends an episode, and the weights of the reward
     (conf/sim/default.yaml)."""
 
-    max_acceleration: float = setting(low=0.1, high=100.0)
-    max_braking: float = setting(low=0.1, high=100.0)
-    max_yaw_rate: float = setting(low=0.1, high=100.0)
+    max_acceleration: float = setting(
+        low=0.1,
+        high=100.0,
+    )
+    max_braking: float = setting(
+        low=0.1,
+        high=100.0,
+    )
+    max_yaw_rate: float = setting(
+        low=0.1,
+        high=100.0,
+    )
     end_on_contact: bool = setting()
     end_off_road: bool = setting()
     end_when_gone: bool = setting()
@@ -94,7 +103,10 @@ class DrivingEnv(EnvBase):
             raise InputError(
                 f"DrivingEnv: hold={hold}; an action lasts at least one step"
             )
-        super().__init__(device=device, batch_size=[batch_size])
+        super().__init__(
+            device=device,
+            batch_size=[batch_size],
+        )
         self.scenes = scenes
         self.settings = settings
         self.agents = agents
@@ -103,9 +115,11 @@ class DrivingEnv(EnvBase):
         width = OBSERVATION_SIZE if observed else 0
         self._generator = torch.Generator()
         self.generators = {self._generator}
-        """All that episodes are drawn with: `set_seed` seeds them alike. A transform adds its own."""
+        """All that episodes are drawn with, those of transforms among them: `set_seed`
+        seeds them alike."""
         self.scene = scenes.batch(torch.zeros(batch_size, dtype=torch.long)).to(device)
-        """The running scenes, in one storage for the environment's lifetime: a reset overwrites its rows."""
+        """The running scenes, in one storage for the environment's lifetime: a reset
+        overwrites its rows."""
         self.horizon = self.scene["logged"].shape[1] - 1
         low = [-settings.max_braking, -settings.max_yaw_rate]
         high = [settings.max_acceleration, settings.max_yaw_rate]
@@ -114,7 +128,11 @@ class DrivingEnv(EnvBase):
         self._config = StepConfig(*(torch.tensor(x, device=device) for x in numbers))
         self._trajectories = Trajectories(self.scene)
         self._static = static_scene(self.scene, mission_of(self.scene))
-        flags = torch.zeros(batch_size, dtype=torch.bool, device=device)
+        flags = torch.zeros(
+            batch_size,
+            dtype=torch.bool,
+            device=device,
+        )
         self._ego = self._at_start(self.scene, self._static.mission, on_road=flags)
         # As last observed.
         self._features = torch.zeros(batch_size, width, device=device)
@@ -128,11 +146,18 @@ class DrivingEnv(EnvBase):
 
         def flag(size: int = 1) -> Binary:
             return Binary(
-                size, shape=(batch, size), dtype=torch.bool, device=self.device
+                size,
+                shape=(batch, size),
+                dtype=torch.bool,
+                device=self.device,
             )
 
         def number(*size: int, dtype: torch.dtype = torch.float32) -> Unbounded:
-            return Unbounded((batch, *(size or (1,))), dtype=dtype, device=self.device)
+            return Unbounded(
+                (batch, *(size or (1,))),
+                dtype=dtype,
+                device=self.device,
+            )
 
         def group(**specs) -> Composite:
             return Composite(**specs, shape=[batch], device=self.device)
@@ -152,14 +177,23 @@ class DrivingEnv(EnvBase):
             )
         self.observation_spec = group(**specs)
         self.reward_spec = number()
-        self.full_done_spec = group(done=flag(), terminated=flag(), truncated=flag())
+        self.full_done_spec = group(
+            done=flag(),
+            terminated=flag(),
+            truncated=flag(),
+        )
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             for generator in self.generators:
                 generator.manual_seed(seed)
 
-    def set_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
+    def set_traffic(
+        self,
+        rows: Tensor,
+        states: Tensor,
+        valid: Tensor,
+    ) -> None:
         """Set the traffic of environments rows [b] int64 from their next reset on,
         instead of the recording.
 
@@ -169,14 +203,24 @@ class DrivingEnv(EnvBase):
         """
         self._trajectories.schedule(rows, states, valid)
 
-    def write_traffic(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
+    def write_traffic(
+        self,
+        rows: Tensor,
+        states: Tensor,
+        valid: Tensor,
+    ) -> None:
         """Overwrite the vehicles' traffic of environments rows [b] at the coming steps;
         steps beyond T are dropped.
 
         states [b, V, H, 4], valid [b, V, H].
         """
         step = self._ego.step[rows]
-        self._trajectories.write(rows, step=step, states=states, valid=valid)
+        self._trajectories.write(
+            rows,
+            step=step,
+            states=states,
+            valid=valid,
+        )
 
     def world(self) -> World:
         """The current World. Its `scene` is the environment's own storage, which the
@@ -198,7 +242,11 @@ class DrivingEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **_) -> TensorDict:
         batch = self.batch_size[0]
         request = TensorDict() if tensordict is None else tensordict
-        every = torch.ones(batch, dtype=torch.bool, device=self.device)
+        every = torch.ones(
+            batch,
+            dtype=torch.bool,
+            device=self.device,
+        )
         index = request.get("_reset", every).view(batch).nonzero().squeeze(-1)
         chosen = request.get("scene_index", None)
         if chosen is None:
@@ -224,8 +272,8 @@ class DrivingEnv(EnvBase):
             if len(index) < batch:
                 static = static._replace(field=field.index_select(0, index))
             others = Agents(*(fresh[name][:, 1:] for name in START_KEYS))
-            seen = features(static, ego, others, ego.step / self.horizon)
-            self._features = self._features.index_copy(0, index, seen)
+            observation = features(static, ego, others, ego.step / self.horizon)
+            self._features = self._features.index_copy(0, index, observation)
         nothing = torch.zeros_like(self._ego.present)
         outcome = dict.fromkeys((*FLAGS, *METRICS), nothing)
         outcome["progress"] = self._ego.pose.s - self._ego.start_s
@@ -241,7 +289,11 @@ class DrivingEnv(EnvBase):
             scene[name] = self.scene[name][:, :, :1][index]
         # Storage that write_rows leaves alone.
         scene["field"] = self.scene["field"][: len(index)]
-        return TensorDict(scene, batch_size=[len(index)], device=self.device)
+        return TensorDict(
+            scene,
+            batch_size=[len(index)],
+            device=self.device,
+        )
 
     @staticmethod
     def _at_start(scene: TensorDictBase, mission: Mission, on_road: Tensor) -> EgoState:

@@ -78,7 +78,13 @@ def leaders(
     d = torch.zeros_like(s) if d is None else d
     reach = size[:, : s.shape[1], 1] / 2 + GATE_MARGIN + d.abs()
     room = reach[..., None] + size.norm(dim=-1)[:, None] / 2
-    pairs = _near_pairs(points, s, xy=agents[..., :2], room=room, present=present)
+    pairs = _near_pairs(
+        points,
+        s,
+        xy=agents[..., :2],
+        room=room,
+        present=present,
+    )
     gap, along, leads = ahead_of(Followers(s, d, points), agents, size, pairs)
     table = gap.new_full((*s.shape, agents.shape[2], agents.shape[1]), free_gap)
     at = (pairs.scene, pairs.vehicle, pairs.moment, pairs.agent)
@@ -92,7 +98,10 @@ def leaders(
 
 @fused(("B V", "B V", "B V P 2!"), "B X T 4!", "B X 2!", "Q:int64")
 def ahead_of(
-    followers: Followers, agents: Tensor, size: Tensor, pairs: Pairs
+    followers: Followers,
+    agents: Tensor,
+    size: Tensor,
+    pairs: Pairs,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Of each pair [Q] the gap m, the agent's speed along the route m/s, and 1 where it
     is a leader (see `leaders`), else 0.
@@ -128,7 +137,12 @@ def ahead_of(
 
 
 def _near_pairs(
-    points: Tensor, s: Tensor, *, xy: Tensor, room: Tensor, present: Tensor
+    points: Tensor,
+    s: Tensor,
+    *,
+    xy: Tensor,
+    room: Tensor,
+    present: Tensor,
 ) -> Pairs:
     """Pairs of present agents xy [B, M, T, 2] within room [B, V, M] m of the vehicle's
     route and not behind it. Where the route comes by an agent more than once, the first
@@ -140,7 +154,12 @@ def _near_pairs(
     number = torch.arange(1, low.shape[2] + 1, device=s.device)
     ends = SPACING * (STRETCH * number).clamp(max=count - 1)
     to_come = (ends >= s[..., None] - SPACING).to(s.dtype)
-    itself = torch.eye(vehicles, xy.shape[1], dtype=torch.bool, device=s.device)
+    itself = torch.eye(
+        vehicles,
+        xy.shape[1],
+        dtype=torch.bool,
+        device=s.device,
+    )
     counts = present[:, :vehicles, None] & present[:, None] & ~itself
     far = (room + SPACING / 2).repeat_interleave(moments, -1)
     flat = xy.flatten(1, 2)
@@ -150,9 +169,19 @@ def _near_pairs(
     b, v, m = (counts.repeat_interleave(moments, -1) & some).nonzero(as_tuple=True)
     place = flat[b, m]
     within = far[b, v, m]
-    near = _near(low[b, v], high[b, v], xy=place[:, None], far=within[:, None])
+    near = _near(
+        low[b, v],
+        high[b, v],
+        xy=place[:, None],
+        far=within[:, None],
+    )
     near &= to_come[b, v] > 0
-    near[:, -1] |= _beyond(before[b, v], last[b, v], xy=place, far=within)
+    near[:, -1] |= _beyond(
+        before[b, v],
+        last[b, v],
+        xy=place,
+        far=within,
+    )
     pair, stretch = near.nonzero(as_tuple=True)
     gap = stretches[b[pair], v[pair], stretch] - place[pair][..., None]
     nearest, index = gap.square().sum(1).min(-1)
@@ -197,25 +226,46 @@ def near_some(
         far: [B, V, Q] m, what is near.
     """
     near = _near(
-        low[..., None, :], high[..., None, :], xy=xy[:, None, None], far=far[:, :, None]
+        low[..., None, :],
+        high[..., None, :],
+        xy=xy[:, None, None],
+        far=far[:, :, None],
     )
-    beyond = _beyond(before[:, :, None], last[:, :, None], xy=xy[:, None], far=far)
+    beyond = _beyond(
+        before[:, :, None],
+        last[:, :, None],
+        xy=xy[:, None],
+        far=far,
+    )
     on_stretch = torch.where(near, to_come[..., None], 0.0).amax(2)
     return torch.maximum(on_stretch, torch.where(beyond, 1.0, 0.0))
 
 
-def _near(low: Tensor, high: Tensor, xy: Tensor, far: Tensor) -> Tensor:
+def _near(
+    low: Tensor,
+    high: Tensor,
+    xy: Tensor,
+    far: Tensor,
+) -> Tensor:
     """Bool [...]: points xy [..., 2] are within far [...] m of boxes low to high [...,
     2]."""
     x, y = torch.maximum(low - xy, xy - high).clamp(min=0).unbind(-1)
     return x.square() + y.square() < far.square()
 
 
-def _beyond(before: Tensor, last: Tensor, xy: Tensor, far: Tensor) -> Tensor:
+def _beyond(
+    before: Tensor,
+    last: Tensor,
+    xy: Tensor,
+    far: Tensor,
+) -> Tensor:
     """Bool [...]: points are within far m of a line that goes on straight beyond its
     last two vertices [..., 2]."""
     tip = last - before
-    unit = tip / tip.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    unit = tip / tip.norm(
+        dim=-1,
+        keepdim=True,
+    ).clamp(min=1e-6)
     past = xy - last
     across = past[..., 1] * unit[..., 0] - past[..., 0] * unit[..., 1]
     return ((past * unit).sum(-1) > 0) & (across.abs() < far)
@@ -243,7 +293,7 @@ class IDMParameters(NamedTuple):
 
 
 def desired_gap(speed: Tensor, leader_speed: Tensor, driver: IDMParameters) -> Tensor:
-    """s* [...] m behind a leader: s0 + max(0, v T + v (v - v_leader) / (2 sqrt(a b)))."""
+    """s* [...] m behind a leader: s0 + max(0, v T + v (v - v_leader) / (2 sqrt(ab)))."""
     closing = (
         speed
         * (speed - leader_speed)

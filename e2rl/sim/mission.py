@@ -61,7 +61,11 @@ def stop_line_distance(
 
 
 def ran_red(
-    light_state: Tensor, light: Tensor, *, line: Tensor, front: Tensor
+    light_state: Tensor,
+    light: Tensor,
+    *,
+    line: Tensor,
+    front: Tensor,
 ) -> Tensor:
     """Step [Q] int64 at which vehicles last crossed a stop line at red, -1 for never.
 

@@ -49,7 +49,11 @@ def rotation_into(ego: Tensor) -> Tensor:
 
 
 def neighbours_of(
-    ego: Tensor, rotation: Tensor, *, static: StaticScene, agents: Agents
+    ego: Tensor,
+    rotation: Tensor,
+    *,
+    static: StaticScene,
+    agents: Agents,
 ) -> Neighbours:
     """Neighbours of egos.
 
@@ -66,12 +70,21 @@ def neighbours_of(
     turned = product(rotation, poses.view(batch, 2, -1)).view(batch, 2, 2, -1)
     position, direction = turned.unbind(2)
     half = static.size[..., None] / 2
-    gap = separation_in_frame(position, direction, own=half, half_size=static.half_size)
+    gap = separation_in_frame(
+        position,
+        direction,
+        own=half,
+        half_size=static.half_size,
+    )
     return Neighbours(position, direction, gap, agents)
 
 
 def separation_in_frame(
-    position: Tensor, direction: Tensor, *, own: Tensor, half_size: Tensor
+    position: Tensor,
+    direction: Tensor,
+    *,
+    own: Tensor,
+    half_size: Tensor,
 ) -> Tensor:
     """Box separation [B, M] m of a box at the origin from others, by the separating
     axis theorem, as in `separation`.
@@ -135,16 +148,16 @@ def passed(
     sin = ego[:, 2:3].sin()
     change = torch.stack([cos * x + sin * y, cos * y - sin * x])
     position = near.position.transpose(0, 1)
-    own = (static.size / 2).T[..., None]
+    half = (static.size / 2).T[..., None]
     other = static.half_size.transpose(0, 1)
     begin, end = time_inside(
         position - change,
         change,
         direction=near.direction.transpose(0, 1),
-        own=own,
+        own=half,
         other=other,
     )
-    passes = is_fast(change, own, other) & tracks.valid[at] & (begin > 0)
+    passes = is_fast(change, half, other) & tracks.valid[at] & (begin > 0)
     passes = passes & (begin < end) & fast
     touch = torch.where(passes, position - (1 - begin) * change, position)
     return near._replace(
@@ -154,7 +167,12 @@ def passed(
 
 
 def standing(
-    tracks: Tracks, *, row: Tensor, step: Tensor, agent: Tensor, long: Tensor
+    tracks: Tracks,
+    *,
+    row: Tensor,
+    step: Tensor,
+    agent: Tensor,
+    long: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Whether agents move at a step, and whether they have stood up to it; each [B]
     bool. Every LOOKED-th step is looked at.
@@ -169,9 +187,9 @@ def standing(
     """
     back = torch.arange(0, STOOD + 1, LOOKED, device=step.device) * long[:, None]
     at = row, (step[:, None] - back).clamp(min=0), agent[:, None]
-    known = tracks.valid[at]
-    moves = (tracks.states[..., 3][at].abs() > STANDING) & known
-    return moves[:, 0], known[:, 0] & ~some(moves)
+    present = tracks.valid[at]
+    moves = (tracks.states[..., 3][at].abs() > STANDING) & present
+    return moves[:, 0], present[:, 0] & ~some(moves)
 
 
 def own_fault(

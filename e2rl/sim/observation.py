@@ -180,7 +180,10 @@ def observation_config(device: torch.device) -> ObservationConfig:
 
 
 def observe(
-    static: StaticScene, ego: EgoState, agents: Agents, time: Tensor
+    static: StaticScene,
+    ego: EgoState,
+    agents: Agents,
+    time: Tensor,
 ) -> Observed:
     """The observation of egos.
 
@@ -192,18 +195,42 @@ def observe(
     """
     config = observation_config(ego.state.device)
     rotation = rotation_into(ego.state)
-    neighbours = neighbours_of(ego.state, rotation, static=static, agents=agents)
+    neighbours = neighbours_of(
+        ego.state,
+        rotation,
+        static=static,
+        agents=agents,
+    )
     border = _border(config, static, ego.state, rotation=rotation)
-    route, limit = route_features(config, static, ego=ego, rotation=rotation)
+    route, limit = route_features(
+        config,
+        static,
+        ego=ego,
+        rotation=rotation,
+    )
     near = nearest(static, neighbours)
     blocks = [
-        ego_features(static, ego, limit=limit, time=time),
+        ego_features(
+            static,
+            ego,
+            limit=limit,
+            time=time,
+        ),
         route,
-        light_features(config, static, step=ego.step, s=ego.pose.s),
+        light_features(
+            config,
+            static,
+            step=ego.step,
+            s=ego.pose.s,
+        ),
         (border / 4).clamp(-1, 1),
         agent_features(config, ego, near=near),
         prospects(
-            static, ego.state, pose=ego.pose, rotation=rotation, others=others_of(near)
+            static,
+            ego.state,
+            pose=ego.pose,
+            rotation=rotation,
+            others=others_of(near),
         ),
     ]
     return Observed(neighbours, border[:, CENTRE], limit, torch.cat(blocks, -1))
@@ -211,7 +238,10 @@ def observe(
 
 @fused(STATIC, EGO_STATE, AGENTS, "B")
 def features(
-    static: StaticScene, ego: EgoState, agents: Agents, time: Tensor
+    static: StaticScene,
+    ego: EgoState,
+    agents: Agents,
+    time: Tensor,
 ) -> Tensor:
     """The features [B, OBSERVATION_SIZE] of `observe`, alone.
 
@@ -222,7 +252,10 @@ def features(
 
 
 def glance(
-    static: StaticScene, ego: EgoState, agents: Agents, time: Tensor
+    static: StaticScene,
+    ego: EgoState,
+    agents: Agents,
+    time: Tensor,
 ) -> Observed:
     """`observe` without the features: what events and reward need, at a moment at which
     no policy looks.
@@ -231,14 +264,23 @@ def glance(
         static, ego, agents, time: of `observe`.
     """
     rotation = rotation_into(ego.state)
-    neighbours = neighbours_of(ego.state, rotation, static=static, agents=agents)
+    neighbours = neighbours_of(
+        ego.state,
+        rotation,
+        static=static,
+        agents=agents,
+    )
     beyond = off_road(ego.state[:, None, :2], static.field, origin=static.origin)
     limit = limit_at(static.mission, ego.pose.s)
     return Observed(neighbours, beyond[:, 0], limit, features=ego.state[:, :0])
 
 
 def _border(
-    config: ObservationConfig, static: StaticScene, state: Tensor, *, rotation: Tensor
+    config: ObservationConfig,
+    static: StaticScene,
+    state: Tensor,
+    *,
+    rotation: Tensor,
 ) -> Tensor:
     """[B, 25] m that the probes of egos [B, 4] are beyond the drivable border."""
     if not torch.compiler.is_compiling():
@@ -252,11 +294,20 @@ def _border(
         + left * rotation[:, 1, k, None]
         for k in (0, 1)
     )
-    return off_road_at(x, y, field=static.field, origin=static.origin)
+    return off_road_at(
+        x,
+        y,
+        field=static.field,
+        origin=static.origin,
+    )
 
 
 def ego_features(
-    static: StaticScene, ego: EgoState, *, limit: Tensor, time: Tensor
+    static: StaticScene,
+    ego: EgoState,
+    *,
+    limit: Tensor,
+    time: Tensor,
 ) -> Tensor:
     """[B, 11]: speed, last action (2), offset and heading to the mission (3), speed
     limit, distance to the map's end, size (2), elapsed fraction of the episode.
@@ -294,7 +345,11 @@ def read_as(limit: Tensor, speed: Tensor) -> Tensor:
 
 
 def route_features(
-    config: ObservationConfig, static: StaticScene, *, ego: EgoState, rotation: Tensor
+    config: ObservationConfig,
+    static: StaticScene,
+    *,
+    ego: EgoState,
+    rotation: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """[B, 12 * 5]: mission points ahead in the ego's frame (2), relative heading,
     curvature, speed limit; and the speed limit at the ego [B] m/s.
@@ -306,7 +361,12 @@ def route_features(
         rotation: [B, 2, 2], into their frames.
     """
     ahead = look_along(static, ego.pose.s[:, None] + config.ahead)
-    x, y = seen_from(ego.state, rotation, x=ahead.x, y=ahead.y)
+    x, y = seen_from(
+        ego.state,
+        rotation,
+        x=ahead.x,
+        y=ahead.y,
+    )
     columns = [
         x / FAR,
         y / NEAR,
@@ -319,7 +379,11 @@ def route_features(
 
 
 def light_features(
-    config: ObservationConfig, static: StaticScene, *, step: Tensor, s: Tensor
+    config: ObservationConfig,
+    static: StaticScene,
+    *,
+    step: Tensor,
+    s: Tensor,
 ) -> Tensor:
     """[B, 2 * 4]: the mission's lights red, yellow, green (one-hot while ahead) and
     nearness (1 at the line, 0 far).
@@ -331,12 +395,12 @@ def light_features(
         s: [B] m, where the egos are on their missions.
     """
     ahead = static.mission.light_s - s[:, None]
-    seen = (static.mission.light >= 0) & (ahead > -2)
+    counts = (static.mission.light >= 0) & (ahead > -2)
     state = static.lights[static.row[:, 0], step.clamp(0, static.lights.shape[1] - 1)]
     colours = state[..., None] == config.colours
     near = (-ahead.clamp(min=0) / 30).exp()
     features = torch.cat([colours.to(s.dtype), near[..., None]], -1)
-    return (features * seen[..., None]).flatten(1)
+    return (features * counts[..., None]).flatten(1)
 
 
 def nearest(static: StaticScene, others: Neighbours) -> Tensor:
@@ -351,7 +415,11 @@ def nearest(static: StaticScene, others: Neighbours) -> Tensor:
     table = pad(torch.cat(columns, 1), (0, NEAREST))
     apart = others.position.square().sum(1).masked_fill(~present, torch.inf)
     apart = pad(apart, (0, NEAREST), value=torch.inf)
-    index = apart.topk(NEAREST, dim=1, largest=False).indices[:, None]
+    index = apart.topk(
+        NEAREST,
+        dim=1,
+        largest=False,
+    ).indices[:, None]
     return table.gather(2, index.expand(-1, table.shape[1], -1))
 
 
@@ -366,7 +434,10 @@ def agent_features(config: ObservationConfig, ego: EgoState, near: Tensor) -> Te
     velocity = relative_velocity(ego.state, speed, direction)
     closing = -(local * velocity).sum(1, True)
     time = (closing / (velocity.square().sum(1, True) + 1e-3)).clamp(0, 8)
-    miss = (local + velocity * time).norm(dim=1, keepdim=True)
+    miss = (local + velocity * time).norm(
+        dim=1,
+        keepdim=True,
+    )
     motion = torch.cat([local, direction, velocity, speed, accel, half, vehicle], 1)
     columns = [
         present,

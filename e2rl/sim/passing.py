@@ -8,7 +8,11 @@ PARALLEL = 1e-6  # m: a smaller displacement along an axis is none
 
 
 def time_inside(
-    offset: Tensor, change: Tensor, direction: Tensor, own: Tensor, other: Tensor
+    offset: Tensor,
+    change: Tensor,
+    direction: Tensor,
+    own: Tensor,
+    other: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Fractions of a step at which two boxes of fixed headings begin and end to
     overlap; where they do not, the end is not after the begin. The separating axis

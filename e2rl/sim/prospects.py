@@ -87,7 +87,11 @@ def travelled(speed: Tensor, accel: Tensor, time: Tensor) -> Tensor:
 
 
 def manoeuvres(
-    static: StaticScene, state: Tensor, *, pose: FrenetPose, rotation: Tensor
+    static: StaticScene,
+    state: Tensor,
+    *,
+    pose: FrenetPose,
+    rotation: Tensor,
 ) -> Tensor:
     """x, y, cosine and sine of the direction [4, B, T, C] of egos in their own frames;
     C: accelerations x offsets.
@@ -103,7 +107,12 @@ def manoeuvres(
     distance = travelled(speed, plan.accel, plan.moment)  # [B, T A]
     ahead = look_along(static, pose.s[:, None] + distance)
     turned = ahead.heading - state[:, 2:3]
-    place = seen_from(state, rotation, x=ahead.x, y=ahead.y)
+    place = seen_from(
+        state,
+        rotation,
+        x=ahead.x,
+        y=ahead.y,
+    )
     x, y, cos, sin = (
         value.unflatten(1, (len(TIMES), -1))[..., None]
         for value in (*place, turned.cos(), turned.sin())
@@ -169,9 +178,9 @@ def gaps(ego: Tensor, size: Tensor, others: Others) -> Tensor:
     length, width = others.half_size.unbind(1)
     shift = (length - width).clamp(min=0)[:, None] * plan.ends  # [B, 3, K]
     centre = place + direction * shift[:, None]  # [2, B, T, 3, K]
-    own = (size / 2)[:, :, None, None]
+    half = (size / 2)[:, :, None, None]
     # Half of the capsule's axis: lengths are in this unit below.
-    unit = (own[:, 0] - own[:, 1]).clamp(min=SHORTEST)
+    unit = (half[:, 0] - half[:, 1]).clamp(min=SHORTEST)
     cos = cos / unit
     sin = sin / unit
     ahead, across = (
@@ -183,7 +192,7 @@ def gaps(ego: Tensor, size: Tensor, others: Others) -> Tensor:
     else:
         beyond = torch.nn.functional.softshrink(ahead, 1.0)
     apart = across.square_().addcmul_(beyond, beyond).amin(2).sqrt_()
-    reach = own[:, 1] + width[:, None]
+    reach = half[:, 1] + width[:, None]
     reach = reach.masked_fill(~others.present[:, None], -torch.inf)
     return apart.mul_(unit[..., None]).sub_(reach[..., None]).amin(2)
 
@@ -216,7 +225,12 @@ def prospects(
         static, state, pose, rotation: of `manoeuvres`.
         others: in the egos' frames.
     """
-    ego = manoeuvres(static, state, pose=pose, rotation=rotation)
+    ego = manoeuvres(
+        static,
+        state,
+        pose=pose,
+        rotation=rotation,
+    )
     gap = gaps(ego, static.size, others)
     end = TIMES[-1] + TIMES[0]
     time = manoeuvres_on(gap.device).time[:, None]

@@ -98,10 +98,32 @@ class Rollout(Road):
     split: str = array("U", "")
     method: str = array("U", "")
     ego_policy: str = array("U", "")
-    seed: int = array("iu", "", low=0, high=np.inf)
-    eta: float = array("iuf", "", low=0, high=MOST)
-    dt: float = array("iuf", "", low=1e-3, high=1, default=DT)
-    ego: int = array("iu", "", low=0, high=-1, default=0)
+    seed: int = array(
+        "iu",
+        "",
+        low=0,
+        high=np.inf,
+    )
+    eta: float = array(
+        "iuf",
+        "",
+        low=0,
+        high=MOST,
+    )
+    dt: float = array(
+        "iuf",
+        "",
+        low=1e-3,
+        high=1,
+        default=DT,
+    )
+    ego: int = array(
+        "iu",
+        "",
+        low=0,
+        high=-1,
+        default=0,
+    )
     states: np.ndarray = array("f", "TN4")
     valid: np.ndarray = array("b", "TN")
     size: np.ndarray = array("f", "N2")
@@ -113,9 +135,21 @@ class Rollout(Road):
     ran_light: np.ndarray | None = array("iu", "N", default=None)
     evasion: np.ndarray | None = array("f", "T4", default=None)
     driver: np.ndarray | None = array("f", "T4", default=None)
-    planners: np.ndarray | None = array("iu", "P", low=0, high=-1, default=None)
+    planners: np.ndarray | None = array(
+        "iu",
+        "P",
+        low=0,
+        high=-1,
+        default=None,
+    )
     plans: np.ndarray | None = array("f", "KPH2", default=None)
-    targets: np.ndarray | None = array("iu", "KP", low=-1, high=-1, default=None)
+    targets: np.ndarray | None = array(
+        "iu",
+        "KP",
+        low=-1,
+        high=-1,
+        default=None,
+    )
 
     @property
     def name(self) -> str:
@@ -142,8 +176,9 @@ class Rollout(Road):
         ]
         if missing or str(data.get("format")) != FORMAT:
             raise InputError(
-                f"{path}: not of format {FORMAT} (missing: {', '.join(missing) or 'nothing'}; format: "
-                f"{data.get('format')}); give a folder that evaluate.py wrote"
+                f"{path}: not of format {FORMAT} (missing: "
+                f"{', '.join(missing) or 'nothing'}; format: {data.get('format')}); "
+                f"give a folder that evaluate.py wrote"
             )
         if wrong := _misfit(data, present) or _odd_agents(data) or _odd_map(data):
             raise InputError(
@@ -170,7 +205,7 @@ class Rollout(Road):
 
 @dataclass(frozen=True)
 class Failure:
-    """A rollout with its row of rollouts.csv: what happened, and what the verdicts say."""
+    """A rollout with its row of rollouts.csv: what happened and what verdicts say."""
 
     rollout: Rollout
     row: Mapping[str, Any]
@@ -186,7 +221,8 @@ class Failure:
         within = step in range(steps) and row["partner"] in range(agents)
         if rollout.name != path.name or (step == step and not within):
             raise InputError(
-                f"{path}: does not fit to its row of the table; run evaluate.py again to rewrite both"
+                f"{path}: does not fit to its row of the table; run evaluate.py again "
+                f"to rewrite both"
             )
         return cls(rollout, row)
 
@@ -278,7 +314,10 @@ def _odd_agents(data: Mapping[str, np.ndarray]) -> str | None:
         if not np.isfinite(states).all():
             return "a valid state is NaN or infinite"
         if (np.abs(states) > [FARTHEST, FARTHEST, TURNED, FASTEST]).any():
-            return f"a valid state of {name} is beyond {FARTHEST:g} m, {TURNED:g} rad or {FASTEST:g} m/s"
+            return (
+                f"a valid state of {name} is beyond {FARTHEST:g} m, {TURNED:g} rad or "
+                f"{FASTEST:g} m/s"
+            )
     return None
 
 

@@ -134,7 +134,11 @@ def look_along(static: StaticScene, s: Tensor) -> Ahead:
 
 
 def seen_from(
-    ego: Tensor, rotation: Tensor, *, x: Tensor, y: Tensor
+    ego: Tensor,
+    rotation: Tensor,
+    *,
+    x: Tensor,
+    y: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Places in the frame of egos, each [B, K] m.
 

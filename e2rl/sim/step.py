@@ -181,7 +181,7 @@ def _moved(
     static: StaticScene,
     config: StepConfig,
 ) -> EgoState:
-    """The egos at step `moment` [B]: driven by their actions or along their recording."""
+    """The egos at step `moment` [B]: driven by actions or along their recording."""
     present = ego.present
     if isinstance(command, Tensor):
         action = torch.clamp(command, config.low, config.high)
@@ -216,7 +216,13 @@ def _step(
 ) -> tuple[EgoState, Outcome]:
     """See `step`; moment [B]: the step that the egos come to, others: at that step."""
     horizon = tracks.states.shape[1] - 1
-    moved = _moved(ego, command, moment=moment, static=static, config=config)
+    moved = _moved(
+        ego,
+        command,
+        moment=moment,
+        static=static,
+        config=config,
+    )
     if ended is not None:
         stay = ended
         moved = ego.merged(
@@ -225,10 +231,10 @@ def _step(
                 stay.view(-1, *[1] * (new.ndim - 1)), old, new
             ),
         )
-    seen = (observe if look else glance)(static, moved, others, moment / horizon)
+    view = (observe if look else glance)(static, moved, others, moment / horizon)
 
     near = passed(
-        seen.neighbours,
+        view.neighbours,
         ego=moved.state,
         ego_before=ego.state,
         tracks=tracks,
@@ -248,13 +254,13 @@ def _step(
     kinds = (static.vehicle, ~(static.vehicle | static.plain), static.plain)
     contacts = [some(hit & kind) for kind in kinds]
     touched = contacts[0] | contacts[1] | contacts[2]
-    off = seen.beyond > 0
+    off = view.beyond > 0
     off_road = off & ego.been_on_road & moved.present
     gone = ~moved.present | (moved.pose.s >= static.mission.end)
 
     conduct = Conduct(
         progress=rewarded_progress(
-            moved.pose.s - ego.pose.s, seen.limit, static.top_speed
+            moved.pose.s - ego.pose.s, view.limit, static.top_speed
         ),
         contact=touched,
         fault=own_fault(
@@ -269,12 +275,12 @@ def _step(
         action=moved.action,
         last_action=ego.action,
         speed=moved.state[:, 3],
-        limit=seen.limit,
+        limit=view.limit,
         offset=moved.pose.d,
     )
     on_contact, off_the_road, when_gone = config.ends.unbind()
     outcome = {
-        "observation": seen.features,
+        "observation": view.features,
         "reward": weighted_sum(reward_terms(conduct), config.weights),
         **dict(zip(CONTACTS, contacts, strict=True)),
         "off_road": off_road,
@@ -283,7 +289,11 @@ def _step(
         "progress": moved.pose.s - ego.start_s,
     }
     on_road = ego.been_on_road | ~off
-    return moved._replace(present=~gone, been_on_road=on_road, inside=inside), outcome
+    return moved._replace(
+        present=~gone,
+        been_on_road=on_road,
+        inside=inside,
+    ), outcome
 
 
 def since_birth(

@@ -47,7 +47,11 @@ class World:
         states, valid, accel, turn_rate = (scene[key] for key in START_KEYS)
         return cls(
             scene,
-            step=torch.zeros(len(states), dtype=torch.int64, device=states.device),
+            step=torch.zeros(
+                len(states),
+                dtype=torch.int64,
+                device=states.device,
+            ),
             states=states,
             valid=valid,
             accel=accel,
@@ -144,7 +148,12 @@ class Trajectories:
         self.vehicles = scene["route_log"].shape[1]
         self._scheduled: list[tuple[Tensor, Tracks]] = []
 
-    def schedule(self, rows: Tensor, states: Tensor, valid: Tensor) -> None:
+    def schedule(
+        self,
+        rows: Tensor,
+        states: Tensor,
+        valid: Tensor,
+    ) -> None:
         """See `DrivingEnv.set_traffic`."""
         expected = (len(rows), *self.tracks.states.shape[1:])
         if tuple(states.shape) != expected or tuple(valid.shape) != expected[:-1]:
@@ -181,7 +190,12 @@ class Trajectories:
                 self._scheduled.append((rows[~due], rest))
 
     def write(
-        self, rows: Tensor, *, step: Tensor, states: Tensor, valid: Tensor
+        self,
+        rows: Tensor,
+        *,
+        step: Tensor,
+        states: Tensor,
+        valid: Tensor,
     ) -> None:
         """See `DrivingEnv.write_traffic`.
 
@@ -211,6 +225,6 @@ def agents_at(tracks: Tracks, step: Tensor) -> Agents:
     states, before = tracks.states.flatten(0, 1).index_select(0, at).chunk(2)
     present, was = tracks.valid.flatten(0, 1).index_select(0, at).chunk(2)
     change = states[..., 2:] - before[..., 2:]
-    known = present & was
-    accel = change[..., 1] / DT * known
-    return Agents(states, present, accel, turn_rate=wrap(change[..., 0]) / DT * known)
+    both = present & was
+    accel = change[..., 1] / DT * both
+    return Agents(states, present, accel, turn_rate=wrap(change[..., 0]) / DT * both)

@@ -21,7 +21,13 @@ def denoiser(mean, std):
     return estimate
 
 
-def flow(x, mean, std, high, low):
+def flow(
+    x,
+    mean,
+    std,
+    high,
+    low,
+):
     """Where the probability-flow ODE of N(mean, std^2) leads x from level high to level
     low."""
     spread = [
@@ -33,7 +39,13 @@ def flow(x, mean, std, high, low):
     )
 
 
-def run(estimate, sampler, churn, levels, noise):
+def run(
+    estimate,
+    sampler,
+    churn,
+    levels,
+    noise,
+):
     """The sampler's x at the last of levels, or x0 where that is 0; noise [len(levels)
     - 1, ...]."""
     x = noise[0]
@@ -48,7 +60,13 @@ def run(estimate, sampler, churn, levels, noise):
     return x
 
 
-def moments(estimate, sampler, churn, steps, spacing="level"):
+def moments(
+    estimate,
+    sampler,
+    churn,
+    steps,
+    spacing="level",
+):
     """Exact mean and standard deviation of K-step samples where the estimate is affine
     in x: samples are affine in the noises then, and one run with no noise and one with
     each noise alone give all their coefficients."""

@@ -18,7 +18,13 @@ def small_prior(seed: int = 0, **options) -> Prior:
     matters."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        prior = Prior(DenoiserSettings(width=32, blocks=1), **options)
+        prior = Prior(
+            DenoiserSettings(
+                width=32,
+                blocks=1,
+            ),
+            **options,
+        )
         with torch.no_grad():
             for block in prior.denoiser.blocks:
                 block.modulation.weight.normal_(0, 0.1)
@@ -112,7 +118,12 @@ def mirrored(scene: TensorDict) -> TensorDict:
     return scene
 
 
-def moved(scene: TensorDict, x: float, y: float, angle: float) -> TensorDict:
+def moved(
+    scene: TensorDict,
+    x: float,
+    y: float,
+    angle: float,
+) -> TensorDict:
     """The scene turned by `angle` about the origin and then shifted by (x, y)."""
     scene = scene.clone()
     cos = math.cos(angle)

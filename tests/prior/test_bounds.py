@@ -31,7 +31,13 @@ ONSET = 2.0
 STRIDE = 3
 
 
-def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
+def traffic(
+    *cars,
+    turn=0.0,
+    exempt=(),
+    yields=(),
+    patience=0.0,
+):
     """Vehicles (x, y, heading, speed) on routes of curvature `turn`: decode(rows, cap)
     at even speed, state, others.
 
@@ -39,7 +45,15 @@ def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
     """
     agents = torch.tensor([cars], dtype=torch.float32)
     routes = torch.stack(
-        [arc(x, y, heading=heading, curvature=turn) for x, y, heading, _ in cars]
+        [
+            arc(
+                x,
+                y,
+                heading=heading,
+                curvature=turn,
+            )
+            for x, y, heading, _ in cars
+        ]
     )[None]
     zero = torch.zeros(1, len(cars))
     state = locate(
@@ -70,14 +84,20 @@ def traffic(*cars, turn=0.0, exempt=(), yields=(), patience=0.0):
         decode,
         state,
         Obstacles(
-            agents, size, present=torch.ones(1, len(cars), dtype=torch.bool), duty=duty
+            agents,
+            size,
+            present=torch.ones(1, len(cars), dtype=torch.bool),
+            duty=duty,
         ),
     )
 
 
 def caps(decode, state, obstacles, **settings):
     return acceleration_caps(
-        BoundSettings(**settings), decode(), state=state, obstacles=obstacles
+        BoundSettings(**settings),
+        decode(),
+        state=state,
+        obstacles=obstacles,
     )[0]
 
 
@@ -92,7 +112,11 @@ def test_plans_that_meet_nobody_are_free():
     )
     assert (caps(decode, state, obstacles=obstacles) == NO_CAP).all()
     motion = bounded(
-        BoundSettings(), decode(), capped=decode, state=state, obstacles=obstacles
+        BoundSettings(),
+        decode(),
+        capped=decode,
+        state=state,
+        obstacles=obstacles,
     )
     assert torch.equal(motion.states(), decode().states())
 
@@ -192,22 +216,48 @@ def test_a_pedestrian_without_a_plan_keeps_its_velocity():
 
 def test_a_curve_is_met_at_the_lateral_acceleration_allowed():
     decode, state, obstacles = traffic((0, 0, 0, 12), turn=1 / 20.0)
-    cap = caps(decode, state, obstacles=obstacles, lateral=4.0)[0]
+    cap = caps(
+        decode,
+        state,
+        obstacles=obstacles,
+        lateral=4.0,
+    )[0]
     assert (
         cap == pytest.approx(-(12**2 - 4.0 * 20) / (2 * 12 * STRIDE * DT), rel=0.1)
         or cap == -7.0
     )
-    assert caps(decode, state, obstacles=obstacles, lateral=8.0)[0] == NO_CAP
     assert (
-        caps(decode, state, obstacles=obstacles, lateral=4.0, curve=False)[0] == NO_CAP
+        caps(
+            decode,
+            state,
+            obstacles=obstacles,
+            lateral=8.0,
+        )[0]
+        == NO_CAP
+    )
+    assert (
+        caps(
+            decode,
+            state,
+            obstacles=obstacles,
+            lateral=4.0,
+            curve=False,
+        )[0]
+        == NO_CAP
     )
 
 
 def test_whoever_follows_a_braking_vehicle_brakes_too():
     decode, state, obstacles = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12))
-    assert caps(decode, state, obstacles=obstacles, look=1.6)[2] == NO_CAP, (
-        "its plan meets nobody's as they stand"
-    )
+    assert (
+        caps(
+            decode,
+            state,
+            obstacles=obstacles,
+            look=1.6,
+        )[2]
+        == NO_CAP
+    ), "its plan meets nobody's as they stand"
     motion = bounded(
         BoundSettings(look=1.6),
         decode(),
@@ -245,7 +295,7 @@ def braking_of(
     GAP + room m in so many steps."""
     number = lambda value: torch.full((1, 1, 1), float(value))  # noqa: E731
     meeting = Meeting(
-        own=torch.tensor([0.0, 0.0, 0.0, speed]).view(1, 1, 1, 4),
+        vehicle=torch.tensor([0.0, 0.0, 0.0, speed]).view(1, 1, 1, 4),
         other=torch.tensor([ahead, 0.0, angle, other_speed]).view(1, 1, 1, 4),
         driven=number(GAP + room),
         steps=number(steps),
@@ -281,7 +331,13 @@ def test_who_waits_looks_half_a_second_ahead(patience, waits):
 @pytest.mark.parametrize(("cosine", "behind"), [(0.72, True), (0.68, False)])
 def test_who_comes_alongside_falls_behind_and_who_crosses_does_not(cosine, behind):
     """4 + 1.2 - 0.5 m back within a second."""
-    braking = braking_of(2.0, 50.0, angle=math.acos(cosine), ahead=0.5, yields=True)
+    braking = braking_of(
+        2.0,
+        50.0,
+        angle=math.acos(cosine),
+        ahead=0.5,
+        yields=True,
+    )
     assert braking == pytest.approx(2 * 4.7 if behind else MIN_BRAKING, rel=1e-3)
 
 

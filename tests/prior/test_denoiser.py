@@ -26,7 +26,14 @@ def inputs(seed=0):
     )
 
 
-def run(net, x, level, nodes, pairs, present):
+def run(
+    net,
+    x,
+    level,
+    nodes,
+    pairs,
+    present,
+):
     return net(x, level, net.encode(nodes, pairs, present))
 
 
@@ -43,7 +50,14 @@ def test_vehicles_may_be_listed_in_any_order():
     )
     torch.testing.assert_close(
         there,
-        run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)[:, order],
+        run(
+            net,
+            x,
+            level=level,
+            nodes=nodes,
+            pairs=pairs,
+            present=present,
+        )[:, order],
         rtol=0,
         atol=1e-5,
     )
@@ -51,24 +65,57 @@ def test_vehicles_may_be_listed_in_any_order():
 
 def test_absent_vehicles_do_not_influence_the_others():
     net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
-    here = run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)
+    here = run(
+        net,
+        x,
+        level=level,
+        nodes=nodes,
+        pairs=pairs,
+        present=present,
+    )
     hidden = ~present
     x = x.clone()
     nodes = nodes.clone()
     pairs = pairs.clone()
     x[hidden], nodes[hidden] = 50.0, -9.0
     pairs[hidden[:, None, :].expand(pairs.shape[:3])] = 7.0
-    there = run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)
-    torch.testing.assert_close(there[present], here[present], rtol=0, atol=0)
+    there = run(
+        net,
+        x,
+        level=level,
+        nodes=nodes,
+        pairs=pairs,
+        present=present,
+    )
+    torch.testing.assert_close(
+        there[present],
+        here[present],
+        rtol=0,
+        atol=0,
+    )
 
 
 def test_present_vehicles_influence_each_other():
     net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
-    here = run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)
+    here = run(
+        net,
+        x,
+        level=level,
+        nodes=nodes,
+        pairs=pairs,
+        present=present,
+    )
     x = x.clone()
     x[:, 1] += 1
     assert (
-        run(net, x, level=level, nodes=nodes, pairs=pairs, present=present)[0, 3]
+        run(
+            net,
+            x,
+            level=level,
+            nodes=nodes,
+            pairs=pairs,
+            present=present,
+        )[0, 3]
         != here[0, 3]
     ).any()
 
@@ -77,7 +124,14 @@ def test_an_untrained_denoiser_scales_x_and_a_clean_one_keeps_it():
     x, level, nodes, pairs, present = inputs()
     net = Denoiser()
     torch.testing.assert_close(
-        run(net, x, level=level, nodes=nodes, pairs=pairs, present=present),
+        run(
+            net,
+            x,
+            level=level,
+            nodes=nodes,
+            pairs=pairs,
+            present=present,
+        ),
         net.schedule.alpha(level)[..., None] * x,
     )
     clean = run(
@@ -97,7 +151,14 @@ def test_a_repeated_encoding_is_that_of_a_repeated_batch():
     both = net(torch.cat([x, x + 1]), torch.cat([level, level]), tiled)
     torch.testing.assert_close(
         both[BATCH:],
-        run(net, x + 1, level=level, nodes=nodes, pairs=pairs, present=present),
+        run(
+            net,
+            x + 1,
+            level=level,
+            nodes=nodes,
+            pairs=pairs,
+            present=present,
+        ),
         rtol=0,
         atol=1e-5,
     )

@@ -25,7 +25,12 @@ def generator():
 def routes(sharpest):
     return torch.stack(
         [
-            arc(0.0, 0.0, heading=0.3, curvature=curvature)
+            arc(
+                0.0,
+                0.0,
+                heading=0.3,
+                curvature=curvature,
+            )
             for curvature in torch.linspace(-sharpest, sharpest, COUNT)
         ]
     )
@@ -63,7 +68,12 @@ def test_every_step_is_as_long_as_the_speed_makes_it_and_along_the_heading(
         state, as_driven(plan, state, on_lane=ON_LANE)
     )
     expected = DT * speed[..., None] * torch.stack([heading.cos(), heading.sin()], -1)
-    torch.testing.assert_close(step, expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        step,
+        expected,
+        rtol=0,
+        atol=1e-4,
+    )
     assert (change.abs() <= turn_bound(speed) + 1e-5).all()
 
 
@@ -76,7 +86,11 @@ def test_a_plan_along_a_straight_route_is_driven_as_it_is(generator):
     driven = as_driven(plan, state, on_lane=ON_LANE)
     for name in ("s", "d", "v", "a", "heading"):
         torch.testing.assert_close(
-            getattr(driven, name), getattr(plan, name), rtol=0, atol=1e-3, msg=name
+            getattr(driven, name),
+            getattr(plan, name),
+            rtol=0,
+            atol=1e-3,
+            msg=name,
         )
 
 
@@ -86,7 +100,12 @@ def test_who_keeps_beside_a_bend_drives_a_circle_of_its_own_at_its_own_speed(sid
     the route."""
     radius = 40.0
     speed = 10.0
-    points = arc(0.0, 0.0, heading=0.0, curvature=1 / radius)[None]
+    points = arc(
+        0.0,
+        0.0,
+        heading=0.0,
+        curvature=1 / radius,
+    )[None]
     states = torch.tensor([[[0.0, side, 0.0, speed]]])
     state = lane_relative.locate(
         states,
@@ -141,7 +160,12 @@ def test_who_reverses_rolls_to_a_halt_and_then_drives_as_planned():
     )
     step, speed, heading, _ = steps_of(state, driven)
     expected = DT * speed[..., None] * torch.stack([heading.cos(), heading.sin()], -1)
-    torch.testing.assert_close(step, expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        step,
+        expected,
+        rtol=0,
+        atol=1e-4,
+    )
     torch.testing.assert_close(
         driven.v[:, :6], -2.0 + 0.3 * torch.arange(1, 7).expand(COUNT, 6)
     )

@@ -32,7 +32,12 @@ def features(scene, step=None):
     nodes = node_features(
         routed,
         state,
-        leaders_ahead(routed, state.s, agents=scene["start"], present=scene["valid"]),
+        leaders_ahead(
+            routed,
+            state.s,
+            agents=scene["start"],
+            present=scene["valid"],
+        ),
         step,
         step == 0,
     )
@@ -49,7 +54,12 @@ def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
     there = features(mirrored(scene))[kind]
     sign = torch.ones(here.shape[-1])
     sign[list(sided)] = -1
-    torch.testing.assert_close(there, here * sign, rtol=0, atol=2e-3)
+    torch.testing.assert_close(
+        there,
+        here * sign,
+        rtol=0,
+        atol=2e-3,
+    )
     flipping = (
         ((here - there).abs() > 5e-3).flatten(0, -2).any(0).nonzero()[:, 0].tolist()
     )
@@ -61,9 +71,23 @@ def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
 def test_features_do_not_know_where_the_scene_lies():
     scene = curved_scenes()
     for here, there in zip(
-        features(scene), features(moved(scene, 120.0, y=-40.0, angle=0.7)), strict=True
+        features(scene),
+        features(
+            moved(
+                scene,
+                120.0,
+                y=-40.0,
+                angle=0.7,
+            )
+        ),
+        strict=True,
     ):
-        torch.testing.assert_close(there, here, rtol=0, atol=5e-3)
+        torch.testing.assert_close(
+            there,
+            here,
+            rtol=0,
+            atol=5e-3,
+        )
 
 
 def test_only_estimates_look_at_the_past():
@@ -103,16 +127,24 @@ def test_a_queue_a_light_and_a_limit_are_seen():
 
 
 def test_the_curve_speed_of_a_circle_is_that_of_its_radius():
-    points = arc(0, 0, heading=0, curvature=0.02)[None, None]
+    points = arc(
+        0,
+        0,
+        heading=0,
+        curvature=0.02,
+    )[None, None]
     state = locate(
         torch.tensor([[[0.0, 0.0, 0.0, 8.0]]]),
         torch.zeros(1, 1),
         yaw_rate=torch.zeros(1, 1),
         points=points,
     )
-    assert curve_speed(state, points, lateral=2.5, brake=1.2).item() == pytest.approx(
-        math.sqrt(2.5 / 0.02), rel=1e-2
-    )
+    assert curve_speed(
+        state,
+        points,
+        lateral=2.5,
+        brake=1.2,
+    ).item() == pytest.approx(math.sqrt(2.5 / 0.02), rel=1e-2)
 
 
 def spiral(rate):
@@ -137,25 +169,55 @@ def test_curvature_is_seen_now_and_up_to_60_metres_ahead():
     """15 times the curvature."""
     nodes = ego_nodes(spiral(0.001))
     at = torch.tensor([5.0, 10.0, 20.0, 30.0, 45.0, 60.0])
-    torch.testing.assert_close(nodes[10:16], 15 * 0.001 * at, rtol=0, atol=2e-2)
+    torch.testing.assert_close(
+        nodes[10:16],
+        15 * 0.001 * at,
+        rtol=0,
+        atol=2e-2,
+    )
 
 
 def test_turns_are_seen_10_to_80_metres_ahead():
-    nodes = ego_nodes(arc(0.0, 0.0, heading=0.0, curvature=0.01))
+    nodes = ego_nodes(
+        arc(
+            0.0,
+            0.0,
+            heading=0.0,
+            curvature=0.01,
+        )
+    )
     expected = torch.tensor([0.1, 0.2, 0.4, 0.6, 0.8])
-    torch.testing.assert_close(nodes[16:21], expected, rtol=0, atol=5e-3)
+    torch.testing.assert_close(
+        nodes[16:21],
+        expected,
+        rtol=0,
+        atol=5e-3,
+    )
 
 
 def test_speed_to_spare_is_that_of_comfortable_curves():
     """2.5 m/s^2 of lateral acceleration in a circle of 50 m."""
-    nodes = ego_nodes(arc(0.0, 0.0, heading=0.0, curvature=0.02))
+    nodes = ego_nodes(
+        arc(
+            0.0,
+            0.0,
+            heading=0.0,
+            curvature=0.02,
+        )
+    )
     assert nodes[22].item() == pytest.approx((math.sqrt(2.5 * 50) - 8) / 5, abs=0.01)
 
 
 def test_speed_to_spare_before_a_curve_is_that_of_comfortable_braking():
     """Straight for 40 m, then a circle of 10 m, met after braking by 1.2 m/s^2; the
     vertices round where it begins."""
-    bend = arc(40.0, 0.0, heading=0.0, curvature=0.1, back=0.0)
+    bend = arc(
+        40.0,
+        0.0,
+        heading=0.0,
+        curvature=0.1,
+        back=0.0,
+    )
     straight = torch.stack([torch.arange(-20.0, 40.0, 2.0), torch.zeros(30)], -1)
     nodes = ego_nodes(torch.cat([straight, bend])[:150])
     expected = math.sqrt(2.5 * 10 + 2 * 1.2 * 40) - 8
@@ -178,7 +240,12 @@ def test_leaders_are_seen_now_and_in_one_and_a_half_and_three_seconds():
     assert gap.diff().tolist() == pytest.approx([9.0, 9.0], abs=0.1)
 
 
-def idm(v, limit, gap=None, leading=0.0):
+def idm(
+    v,
+    limit,
+    gap=None,
+    leading=0.0,
+):
     """Acceleration of a driver with 1 s of headway, 2 m at a standstill, 1.5 and 2
     m/s^2."""
     wanted = 2.0 + max(0, v + v * (v - leading) / (2 * math.sqrt(1.5 * 2.0)))
@@ -187,7 +254,30 @@ def idm(v, limit, gap=None, leading=0.0):
 
 
 def test_what_a_driver_would_do_is_seen():
-    nodes = ego_nodes(arc(0.0, 0.0, heading=0.0, curvature=0.0), limit=15.0)
+    nodes = ego_nodes(
+        arc(
+            0.0,
+            0.0,
+            heading=0.0,
+            curvature=0.0,
+        ),
+        limit=15.0,
+    )
     gap = -20 * math.log(nodes[25])
-    expected = idm(8.0, 15.0, gap=gap, leading=6.0)
+    expected = idm(
+        8.0,
+        15.0,
+        gap=gap,
+        leading=6.0,
+    )
     assert nodes[31].item() == pytest.approx(expected / 2, abs=0.02)
+
+
+def test_what_a_driver_would_do_on_a_free_road_is_seen():
+    scene = curved_scenes(limit=15.0)
+    scene["valid"][:, 1:] = False
+    scene["route_points"][:, 0] = arc(0.0, 0.0, heading=0.0, curvature=0.0)
+    assert features(scene)[0][0, 0, 31].item() == pytest.approx(
+        idm(8.0, 15.0) / 2,
+        abs=0.01,
+    )

@@ -41,7 +41,10 @@ def test_constant_curvature_is_a_circle():
     centre_y = state.y + state.heading.cos() / state.kappa
     radius = torch.hypot(plan.x - centre_x[:, None], plan.y - centre_y[:, None])
     torch.testing.assert_close(
-        radius, (1 / state.kappa.abs())[:, None].expand_as(radius), rtol=1e-3, atol=5e-3
+        radius,
+        (1 / state.kappa.abs())[:, None].expand_as(radius),
+        rtol=1e-3,
+        atol=5e-3,
     )
     way = state.v[:, None] * 0.1 * torch.arange(1, HORIZON + 1)
     torch.testing.assert_close(
@@ -51,7 +54,10 @@ def test_constant_curvature_is_a_circle():
         atol=1e-3,
     )
     torch.testing.assert_close(
-        plan.kappa, state.kappa[:, None].expand_as(plan.kappa), rtol=0, atol=1e-5
+        plan.kappa,
+        state.kappa[:, None].expand_as(plan.kappa),
+        rtol=0,
+        atol=1e-5,
     )
 
 
@@ -66,11 +72,21 @@ def test_fitting_a_decoded_plan_gives_it_back():
     )
     plan = decode(x, state)
     wrapped = torch.remainder(plan.heading + torch.pi, 2 * torch.pi) - torch.pi
-    found = fit(wrapped, torch.ones_like(plan.heading), state=state, knots=x[:, :KNOTS])
+    found = fit(
+        wrapped,
+        torch.ones_like(plan.heading),
+        state=state,
+        knots=x[:, :KNOTS],
+    )
     again = decode(torch.cat([x[:, :KNOTS], found], 1), state)
     gap = torch.hypot(again.x - plan.x, again.y - plan.y)
     assert gap.max() < 0.1
-    torch.testing.assert_close(found, x[:, KNOTS:], rtol=0, atol=0.15)
+    torch.testing.assert_close(
+        found,
+        x[:, KNOTS:],
+        rtol=0,
+        atol=0.15,
+    )
 
 
 def test_heading_is_the_direction_of_motion():
@@ -104,7 +120,10 @@ def test_fitted_knots_are_no_larger_than_six_units():
     state = start(torch.full((1,), 8.0), torch.zeros(1), heading=torch.zeros(1))
     spin = 0.05 * torch.arange(1, HORIZON + 1)[None]
     lateral = fit(
-        spin, torch.ones(1, HORIZON), state=state, knots=torch.zeros(1, KNOTS)
+        spin,
+        torch.ones(1, HORIZON),
+        state=state,
+        knots=torch.zeros(1, KNOTS),
     )
     assert lateral.abs().max().item() == pytest.approx(6.0)
 
@@ -123,5 +142,15 @@ def test_fitted_knots_are_those_of_the_ridge():
     gram = rows.T @ rows + 1e-3 * torch.eye(2).double()
     expected = torch.linalg.solve(gram, (0.02 * rows).sum(0))
     heading = torch.full((1, HORIZON), 0.02)
-    lateral = fit(heading, known, state=state, knots=torch.zeros(1, KNOTS))
-    torch.testing.assert_close(lateral[0].double(), expected, rtol=1e-2, atol=1e-4)
+    lateral = fit(
+        heading,
+        known,
+        state=state,
+        knots=torch.zeros(1, KNOTS),
+    )
+    torch.testing.assert_close(
+        lateral[0].double(),
+        expected,
+        rtol=1e-2,
+        atol=1e-4,
+    )

@@ -31,10 +31,26 @@ def generator():
 
 def routes(count=COUNT):
     curvature = torch.linspace(-0.02, 0.02, count).tolist()
-    return torch.stack([arc(0.0, 0.0, heading=0.3, curvature=c) for c in curvature])
+    return torch.stack(
+        [
+            arc(
+                0.0,
+                0.0,
+                heading=0.3,
+                curvature=c,
+            )
+            for c in curvature
+        ]
+    )
 
 
-def straight(v, a=0.0, d=0.0, heading=0.0, count=1):
+def straight(
+    v,
+    a=0.0,
+    d=0.0,
+    heading=0.0,
+    count=1,
+):
     """Vehicles at 20 m of a route along +x."""
     full = lambda value: torch.full((count,), float(value))  # noqa: E731
     return LaneState(
@@ -71,15 +87,32 @@ def test_plans_begin_where_and_as_the_vehicle_is(generator):
     assert turn.abs().max() < 0.08
     assert (plan.v[:, 0] - state.v).abs().max() < 0.1 * 4 + 1e-4
     torch.testing.assert_close(
-        plan.a[:, 0], 0.9 * state.a + 0.1 * x[:, 0], rtol=0, atol=1e-2, msg="trapezoid"
+        plan.a[:, 0],
+        0.9 * state.a + 0.1 * x[:, 0],
+        rtol=0,
+        atol=1e-2,
+        msg="trapezoid",
     )
 
 
 def test_the_offset_passes_its_half_way_mark_and_ends_flat_at_its_target(generator):
-    state = straight(8.0, d=1.5, heading=0.05)
+    state = straight(
+        8.0,
+        d=1.5,
+        heading=0.05,
+    )
     x = torch.zeros(1, SIZE)
     x[:, KNOTS:] = torch.tensor([0.8, -2.0])
-    plan = decode(x, state, points=arc(0, 0, heading=0, curvature=0)[None])
+    plan = decode(
+        x,
+        state,
+        points=arc(
+            0,
+            0,
+            heading=0,
+            curvature=0,
+        )[None],
+    )
     reach = lateral_horizon(state.v).item()
     end = -2.0 * OFFSET_SCALE
     way = plan.s - state.s
@@ -91,10 +124,16 @@ def test_the_offset_passes_its_half_way_mark_and_ends_flat_at_its_target(generat
     after = way[0] >= reach
     assert after.any()
     torch.testing.assert_close(
-        plan.d[0, after], torch.full((int(after.sum()),), end), rtol=0, atol=1e-4
+        plan.d[0, after],
+        torch.full((int(after.sum()),), end),
+        rtol=0,
+        atol=1e-4,
     )
     torch.testing.assert_close(
-        plan.heading[0, after], torch.zeros(int(after.sum())), rtol=0, atol=1e-4
+        plan.heading[0, after],
+        torch.zeros(int(after.sum())),
+        rtol=0,
+        atol=1e-4,
     )
 
 
@@ -102,10 +141,22 @@ def test_the_offset_passes_its_half_way_mark_and_ends_flat_at_its_target(generat
 def test_constant_acceleration_is_the_closed_form(accel):
     state = straight(12.0, a=accel)
     x = torch.cat([torch.full((1, KNOTS), accel), torch.zeros(1, 2)], 1)
-    plan = decode(x, state, points=arc(0, 0, heading=0, curvature=0)[None])
+    plan = decode(
+        x,
+        state,
+        points=arc(
+            0,
+            0,
+            heading=0,
+            curvature=0,
+        )[None],
+    )
     torch.testing.assert_close(plan.v[0], 12 + accel * TIME)
     torch.testing.assert_close(
-        plan.x[0], 12 * TIME + accel * TIME**2 / 2, rtol=1e-4, atol=1e-3
+        plan.x[0],
+        12 * TIME + accel * TIME**2 / 2,
+        rtol=1e-4,
+        atol=1e-3,
     )
 
 
@@ -131,9 +182,22 @@ def test_gradients_are_finite_everywhere(generator):
 
 
 def test_a_standing_vehicle_does_not_move_sideways():
-    state = straight(0.0, d=1.0, heading=0.2)
+    state = straight(
+        0.0,
+        d=1.0,
+        heading=0.2,
+    )
     x = torch.cat([-torch.ones(1, KNOTS), torch.tensor([[3.0, -4.0]])], 1)
-    plan = decode(x, state, points=arc(0, 0, heading=0, curvature=0)[None])
+    plan = decode(
+        x,
+        state,
+        points=arc(
+            0,
+            0,
+            heading=0,
+            curvature=0,
+        )[None],
+    )
     for name in ("x", "y", "heading"):
         torch.testing.assert_close(
             getattr(plan, name),
@@ -155,11 +219,19 @@ def test_fitting_a_decoded_plan_gives_it_back(generator):
     plan = decode(x, state, points=points)
     found, error = fit(plan, torch.ones_like(plan.s), state=state)
     assert error.max() < 0.1
-    torch.testing.assert_close(found[:, :KNOTS], x[:, :KNOTS], rtol=0, atol=0.15)
+    torch.testing.assert_close(
+        found[:, :KNOTS],
+        x[:, :KNOTS],
+        rtol=0,
+        atol=0.15,
+    )
     # The ridge pulls lateral knots towards 0; the offsets they stand for are met within
     # centimetres.
     torch.testing.assert_close(
-        decode(found, state, points=points).d, plan.d, rtol=0, atol=0.08
+        decode(found, state, points=points).d,
+        plan.d,
+        rtol=0,
+        atol=0.08,
     )
 
 
@@ -177,11 +249,18 @@ def test_unknown_steps_do_not_influence_a_fit(generator):
 
 
 def test_travelled_distance_is_the_integral_of_speed(generator):
-    state = straight(3.0, a=-1.0, count=COUNT)
+    state = straight(
+        3.0,
+        a=-1.0,
+        count=COUNT,
+    )
     v, way = speeds(state, torch.randn(COUNT, KNOTS, generator=generator))
     before = torch.cat([state.v[:, None], v[:, :-1]], 1)
     torch.testing.assert_close(
-        way.diff(dim=-1, prepend=torch.zeros(COUNT, 1)),
+        way.diff(
+            dim=-1,
+            prepend=torch.zeros(COUNT, 1),
+        ),
         (v + before) / 2 * 0.1,
         rtol=0,
         atol=1e-5,
@@ -192,8 +271,22 @@ def test_the_polynomial_and_its_gradients():
     """Value and derivatives are those of the power sum; the gradients in closed form
     are the numerical ones."""
     draw = torch.Generator().manual_seed(2)
-    c = torch.randn(3, 2, 7, generator=draw, dtype=torch.float64, requires_grad=True)
-    u = torch.rand(3, 2, 5, generator=draw, dtype=torch.float64, requires_grad=True)
+    c = torch.randn(
+        3,
+        2,
+        7,
+        generator=draw,
+        dtype=torch.float64,
+        requires_grad=True,
+    )
+    u = torch.rand(
+        3,
+        2,
+        5,
+        generator=draw,
+        dtype=torch.float64,
+        requires_grad=True,
+    )
     power = torch.arange(7)
     at = u[..., None]
     value, first, second = polynomial(c, u)
@@ -235,7 +328,12 @@ def test_deep_inside_a_bend_a_metre_of_route_is_three_tenths_of_the_line():
         torch.tensor([[[0.0, 19.0, turn, 5.0]]]),
         torch.zeros(1, 1),
         yaw_rate=torch.zeros(1, 1),
-        points=arc(0.0, 0.0, heading=0.0, curvature=0.05)[None, None],
+        points=arc(
+            0.0,
+            0.0,
+            heading=0.0,
+            curvature=0.05,
+        )[None, None],
         hint=torch.full((1, 1), 20.0),
     )
     at_nearest = state.d1 / torch.tan(wrap_of(state, turn))
@@ -263,7 +361,10 @@ def ridge_fit(track, known, state):
     base_v, base_s = speeds(state, torch.zeros(1, KNOTS))
     rows_v = torch.cat([v - base_v for v, _ in columns]).T * known.T
     rows_s = torch.cat([s - base_s for _, s in columns]).T * known.T / 2
-    bend = torch.eye(KNOTS + 1).diff(n=2, dim=0)
+    bend = torch.eye(KNOTS + 1).diff(
+        n=2,
+        dim=0,
+    )
     rows = [rows_v, rows_s, 0.3**0.5 * bend[:, 1:], 1e-3**0.5 * torch.eye(KNOTS)]
     right = [
         (known * (track.v - base_v))[0],
@@ -281,17 +382,36 @@ def test_fitted_accelerations_are_those_of_the_ridge(steps):
     state = straight(12.0, a=1.0)
     x = torch.zeros(1, SIZE)
     x[0, :KNOTS:2] = 2.0
-    track = decode(x, state, arc(0, 0, heading=0, curvature=0)[None])
+    track = decode(
+        x,
+        state,
+        arc(
+            0,
+            0,
+            heading=0,
+            curvature=0,
+        )[None],
+    )
     known = (torch.arange(HORIZON) < steps).float()[None]
     knots = fit(track, known, state)[0][0, :KNOTS]
     expected = ridge_fit(track, known, state)
-    torch.testing.assert_close(knots.double(), expected, rtol=0, atol=2e-3)
+    torch.testing.assert_close(
+        knots.double(),
+        expected,
+        rtol=0,
+        atol=2e-3,
+    )
 
 
 def test_fitted_lateral_knots_are_those_of_the_ridge():
     """Weighted by 0.05 and 0.02, of a jump of 2 m that five steps know."""
     state = straight(8.0)
-    route = arc(0, 0, heading=0, curvature=0)[None]
+    route = arc(
+        0,
+        0,
+        heading=0,
+        curvature=0,
+    )[None]
     track = decode(torch.zeros(1, SIZE), state, route)
     track.d = torch.full_like(track.d, 2.0)
     known = torch.zeros(1, HORIZON)
@@ -305,7 +425,12 @@ def test_fitted_lateral_knots_are_those_of_the_ridge():
     gram = rows.T @ rows + torch.diag(torch.tensor([0.05, 0.02])).double()
     expected = torch.linalg.solve(gram, (2.0 * rows).sum(0))
     lateral = fit(track, known, state)[0][0, KNOTS:]
-    torch.testing.assert_close(lateral.double(), expected, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(
+        lateral.double(),
+        expected,
+        rtol=1e-3,
+        atol=1e-3,
+    )
 
 
 @pytest.mark.parametrize(("accel", "limit"), [(-15.0, -8.0), (12.0, 5.0)])

@@ -14,7 +14,10 @@ from e2rl.prior.sde import SamplerSettings
 from e2rl.sim.world import World
 from tests.prior.small import VEHICLES, arc, curved_scenes, small_prior
 
-FREE = BoundSettings(meeting=False, curve=False)
+FREE = BoundSettings(
+    meeting=False,
+    curve=False,
+)
 MEAN = 0.4
 STD = 0.6
 
@@ -74,7 +77,13 @@ def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
     def paths(shift):
         seen = []
 
-        def control(x, level, k, context, denoise):
+        def control(
+            x,
+            level,
+            k,
+            context,
+            denoise,
+        ):
             seen.append(x[:, 0, 0])
             x0 = denoise(x)
             return x, x0, x0 + shift
@@ -88,14 +97,20 @@ def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
     expected = 0.5 * moved @ torch.linalg.solve(mix @ mix.T, moved) * SIZE
     assert (none == 0).all()
     torch.testing.assert_close(
-        kl[:, 0].double(), expected.expand(steps + 1), rtol=1e-3, atol=0
+        kl[:, 0].double(),
+        expected.expand(steps + 1),
+        rtol=1e-3,
+        atol=0,
     )
 
 
 def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
     """Both laws of the path are products of Gaussian steps, whose densities torch
     knows."""
-    prior = gaussian_prior(steps=4, sampler="ddim")
+    prior = gaussian_prior(
+        steps=4,
+        sampler="ddim",
+    )
     noise = torch.randn(
         4, 6, 1, SIZE, generator=torch.Generator().manual_seed(2)
     ).double()
@@ -104,7 +119,13 @@ def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
     total = torch.zeros(6, 1).double()
     before = []
 
-    def control(x, level, k, context, denoise):
+    def control(
+        x,
+        level,
+        k,
+        context,
+        denoise,
+    ):
         if before:
             means = [
                 step(*before[-1][:1], x0, *before[-1][2:], x * 0)[0]
@@ -123,7 +144,12 @@ def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
         return x, x0, x0 + 0.2 * x
 
     sample = prior.sample(None, noise, control)
-    torch.testing.assert_close(sample.log_ratio, total, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        sample.log_ratio,
+        total,
+        rtol=1e-4,
+        atol=1e-4,
+    )
 
 
 def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
@@ -131,7 +157,13 @@ def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
     noise = torch.randn(6, 2, 1, SIZE, generator=torch.Generator().manual_seed(0))
     seen = []
 
-    def control(x, level, k, context, denoise):
+    def control(
+        x,
+        level,
+        k,
+        context,
+        denoise,
+    ):
         seen.append(x)
         x0 = denoise(x)
         return x, x0, x0 + 0.5
@@ -141,7 +173,10 @@ def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
     seen.clear()
     sample = prior.sample(None, noise, control, budget)
     torch.testing.assert_close(
-        sample.kl[:, 0], torch.stack([budget[0], free[1]]), rtol=1e-4, atol=0
+        sample.kl[:, 0],
+        torch.stack([budget[0], free[1]]),
+        rtol=1e-4,
+        atol=0,
     )
     last = prior.sampler.levels(prior.schedule)[5]
     x = seen[-1][:1]  # the last step is the prior's own where the budget is spent
@@ -182,7 +217,12 @@ def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     scene["start"][:, 5] = torch.tensor(
         [-7.0, 0.0, 0.0, 14.0]
     )  # runs into the ego from behind
-    scene["route_points"][:, 5] = arc(-7.0, 0.0, heading=0.0, curvature=0.0)
+    scene["route_points"][:, 5] = arc(
+        -7.0,
+        0.0,
+        heading=0.0,
+        curvature=0.0,
+    )
     x0 = torch.zeros(*scene["route_log"].shape, SIZE)
     tight, loose = (
         small_prior(bounds=bounds) for bounds in (BoundSettings(curve=False), FREE)
@@ -254,7 +294,12 @@ def test_samples_do_not_depend_on_the_batch_nor_on_absent_vehicles():
     noise = noise_for(prior, scene)
     whole = prior.sample(context_of(prior, scene), noise).x0
     alone = prior.sample(context_of(prior, scene[1:2]), noise[:, 1:2]).x0
-    torch.testing.assert_close(whole[1:2], alone, rtol=0, atol=2e-4)
+    torch.testing.assert_close(
+        whole[1:2],
+        alone,
+        rtol=0,
+        atol=2e-4,
+    )
     wild = noise.clone()
     wild[:, :, len(VEHICLES) :] = 5.0
     here = scene["valid"][0, : scene["route_log"].shape[1]]
@@ -295,7 +340,10 @@ def test_routes_are_drawn_in_proportion_and_never_where_there_is_none():
     chosen = sample_route(logits, 0.5, uniform=uniform)
     share = torch.bincount(chosen, minlength=4) / len(chosen)
     torch.testing.assert_close(
-        share, torch.softmax(logits[0] / 0.5, -1), rtol=0, atol=0.01
+        share,
+        torch.softmax(logits[0] / 0.5, -1),
+        rtol=0,
+        atol=0.01,
     )
     assert (sample_route(logits, 0.0, uniform=uniform) == 0).all()
 
@@ -378,7 +426,13 @@ def test_a_budget_counts_as_spent_a_thousandth_before_its_end(spent, controlled)
     prior = gaussian_prior(steps=3)
     noise = torch.randn(3, 1, 1, SIZE, generator=torch.Generator().manual_seed(3))
 
-    def control(x, level, k, context, denoise):
+    def control(
+        x,
+        level,
+        k,
+        context,
+        denoise,
+    ):
         x0 = denoise(x)
         return x, x0, x0 + 0.5
 

@@ -29,7 +29,12 @@ def same(one, other):
 
 def test_rerouting_to_candidates_is_routing_anew():
     world = make_world(VEHICLES, copies=2)
-    add_route(world, 1, candidate=2, heading=0.5)
+    add_route(
+        world,
+        1,
+        candidate=2,
+        heading=0.5,
+    )
     route = world.route.clone()
     route[0, 1] = 2
     before = route_scene(world.scene, world.route)
@@ -89,7 +94,12 @@ def conflict_of(other):
     """Whether the route along +x from -20 m is in conflict with another one, and after
     how many metres."""
     scene = make_scenes(1, vehicles=[(0.0, 0, 8.0), (0.0, 1, 8.0)]).scenes
-    scene["route_points"][:, 0] = arc(0.0, 0.0, heading=0.0, curvature=0.0)
+    scene["route_points"][:, 0] = arc(
+        0.0,
+        0.0,
+        heading=0.0,
+        curvature=0.0,
+    )
     scene["route_points"][:, 1] = other
     routed = route_scene(scene, scene["route_log"].clamp(min=0))
     return bool(routed.conflict[0, 0, 1]), routed.conflict_s[0, 0, 1].item()
@@ -97,12 +107,27 @@ def conflict_of(other):
 
 def crossing(distance):
     """A route that crosses +x at a right angle, `distance` m after -20 m."""
-    return arc(distance - 20.0, 0.0, heading=UP, curvature=0.0)
+    return arc(
+        distance - 20.0,
+        0.0,
+        heading=UP,
+        curvature=0.0,
+    )
 
 
 @pytest.mark.parametrize(("aside", "meets"), [(2.4, True), (2.6, False)])
 def test_routes_nearer_than_two_and_a_half_metres_are_in_conflict(aside, meets):
-    assert conflict_of(arc(0.0, aside, heading=0.0, curvature=0.0))[0] == meets
+    assert (
+        conflict_of(
+            arc(
+                0.0,
+                aside,
+                heading=0.0,
+                curvature=0.0,
+            )
+        )[0]
+        == meets
+    )
 
 
 @pytest.mark.parametrize(("distance", "meets"), [(156.0, True), (164.0, False)])
@@ -117,7 +142,17 @@ def test_conflicts_are_looked_for_every_four_metres():
 
 def test_candidates_are_seen_by_their_turns_10_to_80_metres_ahead():
     scene = make_scenes(1, num_vehicles=1).scenes
-    scene["route_points"][:, 0, 0] = arc(0.0, 0.0, heading=0.0, curvature=0.01)
+    scene["route_points"][:, 0, 0] = arc(
+        0.0,
+        0.0,
+        heading=0.0,
+        curvature=0.01,
+    )
     features = candidate_features(scene, start_of(scene))[0, 0, 0]
     expected = torch.tensor([0.1, 0.2, 0.35, 0.55, 0.8])
-    torch.testing.assert_close(features[3:8], expected, rtol=0, atol=2e-3)
+    torch.testing.assert_close(
+        features[3:8],
+        expected,
+        rtol=0,
+        atol=2e-3,
+    )

@@ -27,7 +27,13 @@ def beta(t):
 
 
 def test_variance_is_preserved_and_beta_is_the_schedule_s():
-    t = torch.linspace(0.01, 0.98, 50, dtype=torch.float64, requires_grad=True)
+    t = torch.linspace(
+        0.01,
+        0.98,
+        50,
+        dtype=torch.float64,
+        requires_grad=True,
+    )
     torch.testing.assert_close(
         SCHEDULE.alpha(t) ** 2 + SCHEDULE.sigma(t) ** 2, torch.ones_like(t)
     )
@@ -51,7 +57,13 @@ def test_the_integral_of_beta_is_exact():
 
 def test_the_score_of_the_denoised_estimate_is_the_gradient_of_the_log_density():
     t = torch.tensor(0.4, dtype=torch.float64)
-    x = torch.linspace(-2, 2, 9, dtype=torch.float64, requires_grad=True)
+    x = torch.linspace(
+        -2,
+        2,
+        9,
+        dtype=torch.float64,
+        requires_grad=True,
+    )
     alpha = SCHEDULE.alpha(t)
     sigma = SCHEDULE.sigma(t)
     density = -0.5 * (x - alpha * MEAN) ** 2 / (alpha**2 * STD**2 + sigma**2)
@@ -126,7 +138,12 @@ def test_levels_are_even_in_what_they_are_spaced_by():
         even.diff(), torch.full((8,), -SCHEDULE.start / 8, dtype=torch.float64)
     )
     steps = SCHEDULE.log_ratio(ratio[:-1]).diff()
-    torch.testing.assert_close(steps, steps[:1].expand(7), rtol=1e-3, atol=0)
+    torch.testing.assert_close(
+        steps,
+        steps[:1].expand(7),
+        rtol=1e-3,
+        atol=0,
+    )
     assert (
         ratio[0].item() == pytest.approx(SCHEDULE.start)
         and ratio[-1] == 0 < ratio[-2] < even[-2]
@@ -201,7 +218,13 @@ def guided(gradient, scaling):
         ("clean", "sigma", DDPM, 0.0084, 0.0693),
     ],
 )
-def test_bias_of_the_guidance_modes(gradient, scaling, sampler, mean, std):
+def test_bias_of_the_guidance_modes(
+    gradient,
+    scaling,
+    sampler,
+    mean,
+    std,
+):
     """Many steps, so that what is left is the mode's: through the denoiser with the
     exact weight, V of the estimate instead of E[exp -V] goes beyond the tilt (0.58 of
     0.72); deterministic samplers add to it; the straight-through gradient and the tamed
@@ -225,7 +248,16 @@ def errors(sampler, counts):
             torch.cat([x[None], torch.zeros(count - 1, 5)]),
         )
         out.append(
-            (end - flow(x, MEAN, std=STD, high=levels[0], low=levels[-1]))
+            (
+                end
+                - flow(
+                    x,
+                    MEAN,
+                    std=STD,
+                    high=levels[0],
+                    low=levels[-1],
+                )
+            )
             .abs()
             .max()
             .item()
@@ -238,10 +270,16 @@ def test_halving_the_step_quarters_the_error_of_2m_and_halves_that_of_ddim():
     second = errors(ODE_2M, counts)
     first = errors(DDIM_0, counts)
     torch.testing.assert_close(
-        second[:-1] / second[1:], torch.full((2,), 4.0), rtol=0.06, atol=0
+        second[:-1] / second[1:],
+        torch.full((2,), 4.0),
+        rtol=0.06,
+        atol=0,
     )
     torch.testing.assert_close(
-        first[:-1] / first[1:], torch.full((2,), 2.0), rtol=0.06, atol=0
+        first[:-1] / first[1:],
+        torch.full((2,), 2.0),
+        rtol=0.06,
+        atol=0,
     )
     assert second[0] < first[0] / 30
 
@@ -262,11 +300,20 @@ def test_control_shifts_the_mean_only_so_that_path_energy_is_that_of_two_gaussia
 ):
     high, low, x = (torch.tensor(v, dtype=torch.float64) for v in (0.6, 0.4, 1.7))
     before = torch.tensor(0.8, dtype=torch.float64)
-    step = partial(SAMPLERS[sampler](SCHEDULE).step, x, high=high, low=low)
+    step = partial(
+        SAMPLERS[sampler](SCHEDULE).step,
+        x,
+        high=high,
+        low=low,
+    )
     tensor = partial(torch.tensor, dtype=torch.float64)
     steps = [
         [
-            step(x0=tensor(x0), noise=tensor(noise), past=(tensor(past), before))
+            step(
+                x0=tensor(x0),
+                noise=tensor(noise),
+                past=(tensor(past), before),
+            )
             for noise in (-1.0, 0.5)
         ]
         for x0, past in ((0.2, 0.1), (0.5, 0.3))

@@ -16,7 +16,12 @@ STD = 0.6
 
 
 def test_without_noise_all_samples_are_one():
-    prior = small_prior(sampler=SamplerSettings(steps=3, temperature=0.0))
+    prior = small_prior(
+        sampler=SamplerSettings(
+            steps=3,
+            temperature=0.0,
+        )
+    )
     found = sample_variances(prior, scenes(2).scenes, samples=3)
     assert found["vehicles"].min() > 0
     assert all(

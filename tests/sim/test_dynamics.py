@@ -18,10 +18,17 @@ MAX_CURVATURE = 0.3
 def random_case(batch=64, horizon=50, seed=0):
     generator = torch.Generator().manual_seed(seed)
     start = torch.rand(
-        batch, 4, generator=generator, dtype=torch.float64
+        batch,
+        4,
+        generator=generator,
+        dtype=torch.float64,
     ) * torch.tensor([50.0, 50, 6, 20])
     action = torch.randn(
-        batch, horizon, 2, generator=generator, dtype=torch.float64
+        batch,
+        horizon,
+        2,
+        generator=generator,
+        dtype=torch.float64,
     ) * torch.tensor([6.0, 1.0])
     return start, action
 
@@ -93,7 +100,12 @@ def test_who_reverses_and_brakes_harder_goes_on_from_the_speed_that_it_has():
         torch.stack([accelerations, torch.zeros(10)], -1),
     )
     speeds = torch.tensor([-3.2, -2.4, -1.6, -0.8, -0.5, -0.2, 0.0, 0.0, 0.5, 0.0])
-    torch.testing.assert_close(states[:, 3], speeds, rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        states[:, 3],
+        speeds,
+        rtol=0,
+        atol=1e-5,
+    )
 
 
 def test_a_rollout_is_repeated_steps_forwards_and_backwards():
@@ -105,7 +117,12 @@ def test_a_rollout_is_repeated_steps_forwards_and_backwards():
     state = start
     for moment, expected in enumerate(dynamics.rollout(start, actions).unbind(1)):
         state = dynamics.step(state, actions[:, moment])
-        torch.testing.assert_close(state, expected, rtol=0, atol=1e-9)
+        torch.testing.assert_close(
+            state,
+            expected,
+            rtol=0,
+            atol=1e-9,
+        )
 
 
 def test_who_reverses_turns_within_the_steering_s_limits():

@@ -29,7 +29,12 @@ def act(env, acceleration=0.0, yaw_rate=0.0):
     return env.step(TensorDict({"action": action}, env.batch_size))["next"]
 
 
-def drive(env, steps, acceleration=0.0, yaw_rate=0.0):
+def drive(
+    env,
+    steps,
+    acceleration=0.0,
+    yaw_rate=0.0,
+):
     """The td after `steps` equal actions, or at the first step where all are done."""
     for _ in range(steps):
         td = act(env, acceleration, yaw_rate=yaw_rate)
@@ -97,7 +102,14 @@ def test_the_reported_agents_are_the_environments_world():
     environment."""
     env = DrivingEnv(make_scenes(3), SimSettings(), 2, agents=True)
     env.reset()
-    told = World.of(act(env, acceleration=1.0, yaw_rate=0.2), env.scene)
+    told = World.of(
+        act(
+            env,
+            acceleration=1.0,
+            yaw_rate=0.2,
+        ),
+        env.scene,
+    )
     now = env.world()
     for name in ("step", "states", "valid", "accel", "turn_rate"):
         assert torch.equal(getattr(told, name), getattr(now, name)), name
@@ -107,7 +119,11 @@ def test_the_reported_agents_are_the_environments_world():
 def test_partial_resets_keep_the_others_running():
     """next.timestep is timestep + 1 at every transition, and a trajectory never changes
     its scene."""
-    env = make_env(batch=8, num_vehicles=4, num_scenes=5)
+    env = make_env(
+        batch=8,
+        num_vehicles=4,
+        num_scenes=5,
+    )
     env.set_seed(0)
     torch.manual_seed(0)
     data = env.rollout(200, break_when_any_done=False)
@@ -126,7 +142,10 @@ def test_partial_resets_keep_the_others_running():
 def test_seed_makes_batches_identical():
     def batch():
         torch.manual_seed(7)
-        env = make_env(batch=4, num_scenes=6)
+        env = make_env(
+            batch=4,
+            num_scenes=6,
+        )
         env.set_seed(3)
         return env.rollout(
             20,
@@ -201,13 +220,21 @@ def test_running_into_a_parked_car_terminates_at_the_first_overlap():
 
 
 def test_leaving_the_road_terminates():
-    _, td = ended(num_vehicles=1, num_vrus=0, yaw_rate=-0.3)
+    _, td = ended(
+        num_vehicles=1,
+        num_vrus=0,
+        yaw_rate=-0.3,
+    )
     assert flags(td) == ["terminated", "off_road"]
 
 
 def test_an_ego_that_begins_off_the_road_leaves_it_only_once_it_was_there():
     """The border comes back to it after 20 m, and ends behind it after 40 m more."""
-    env = make_env(num_scenes=1, num_vehicles=1, num_vrus=0)
+    env = make_env(
+        num_scenes=1,
+        num_vehicles=1,
+        num_vrus=0,
+    )
     field = env.scenes.scenes["field"]
     x = env.scenes.scenes["field_origin"][0, 0] + torch.arange(field.shape[1])
     field[:] = torch.where((x > 20) & (x < 60), -2.0, 2.0)[None, :, None].to(
@@ -220,7 +247,9 @@ def test_an_ego_that_begins_off_the_road_leaves_it_only_once_it_was_there():
 
 def test_pedestrian_contact_is_its_own_metric():
     env = make_env(
-        num_scenes=1, num_vehicles=1, settings=SimSettings(end_off_road=False)
+        num_scenes=1,
+        num_vehicles=1,
+        settings=SimSettings(end_off_road=False),
     )
     env.scenes.scenes["logged"][:, :, 32, 1] = 0.0
     env.reset()
@@ -229,7 +258,9 @@ def test_pedestrian_contact_is_its_own_metric():
 
 def test_contact_with_an_object_is_its_own_metric():
     env = make_env(
-        num_scenes=1, num_vehicles=1, settings=SimSettings(end_off_road=False)
+        num_scenes=1,
+        num_vehicles=1,
+        settings=SimSettings(end_off_road=False),
     )
     env.scenes.scenes["logged"][:, :, 32, 1] = 0.0
     env.scenes.scenes["agent_type"][:, 32] = OTHER
@@ -242,7 +273,10 @@ def test_who_appears_within_the_ego_touches_it_once_they_have_been_apart(apart):
     """A pedestrian appears at step 20 where the ego is, goes along with it, and stays
     there or is aside for a step."""
     env = make_env(
-        batch=1, num_scenes=1, num_vehicles=1, settings=SimSettings(end_off_road=False)
+        batch=1,
+        num_scenes=1,
+        num_vehicles=1,
+        settings=SimSettings(end_off_road=False),
     )
     scene = env.scenes.scenes
     scene["logged"][:, :, 32] = scene["logged"][:, :, 0]
@@ -258,7 +292,10 @@ def test_who_appears_within_the_ego_touches_it_once_they_have_been_apart(apart):
 
 
 def test_map_end_truncates():
-    env, td = ended(num_vehicles=1, road=(-60.0, 40.0))
+    env, td = ended(
+        num_vehicles=1,
+        road=(-60.0, 40.0),
+    )
     assert flags(td) == ["truncated"]
     assert (
         38 <= td["metrics", "progress"].mean() <= 41
@@ -280,7 +317,11 @@ def test_an_episode_goes_on_beyond_the_map_where_the_settings_say_so():
 
 
 def test_replayed_ego_follows_its_log_and_progress_is_its_way():
-    env = make_env(num_scenes=1, num_vehicles=2, settings=SimSettings(replay_ego=True))
+    env = make_env(
+        num_scenes=1,
+        num_vehicles=2,
+        settings=SimSettings(replay_ego=True),
+    )
     env.reset()
     td = drive(env, 80, acceleration=-8.0)
     assert torch.allclose(
@@ -291,7 +332,13 @@ def test_replayed_ego_follows_its_log_and_progress_is_its_way():
 
 def test_lonely_ego_and_no_lights():
     """N = 1: nobody else, padded or not."""
-    scenes = make_scenes(1, num_vehicles=1, num_vrus=0, max_vehicles=1, max_agents=1)
+    scenes = make_scenes(
+        1,
+        num_vehicles=1,
+        num_vrus=0,
+        max_vehicles=1,
+        max_agents=1,
+    )
     scenes.scenes["light_state"] = scenes.scenes["light_state"][..., :0]
     env = DrivingEnv(scenes, SimSettings(), 2)
     check_env_specs(env)
@@ -301,7 +348,9 @@ def test_lonely_ego_and_no_lights():
 
 # --- held actions
 
-WAYS = {  # what may end an episode on the way: 80 is no multiple of 3, contact and border come between decisions
+# What may end an episode on the way: 80 is no multiple of 3, contact and border come
+# between decisions.
+WAYS = {
     "horizon": {"num_scenes": 3, "num_vehicles": 1, "num_vrus": 0},
     "contact": {"num_scenes": 3, "vehicles": [(0.0, 0, 10.0), (30.0, 0, 0.0)]},
     "map end": {"num_scenes": 3, "num_vehicles": 1, "road": (-60.0, 40.0)},
@@ -356,7 +405,14 @@ def test_a_held_action_is_that_action_at_every_step_until_the_episode_ends(way, 
 
 
 def test_what_a_reset_of_some_writes_is_what_a_reset_of_all_writes():
-    whole, some = (make_env(batch=4, num_vehicles=6, num_scenes=5) for _ in range(2))
+    whole, some = (
+        make_env(
+            batch=4,
+            num_vehicles=6,
+            num_scenes=5,
+        )
+        for _ in range(2)
+    )
     index = torch.tensor([[4], [1], [3], [0]])
     seen = whole.reset(TensorDict({"scene_index": index}, [4]))["observation"]
     some.reset(TensorDict({"scene_index": torch.tensor([[0], [1], [2], [0]])}, [4]))

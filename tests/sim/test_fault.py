@@ -14,7 +14,13 @@ SIZE = torch.tensor([[4.0, 2.0]])
 STOOD = 20  # steps: two seconds (UK Highway Code, rule 126)
 
 
-def judged(ego, others, since=0, vehicle=True, steps=40):
+def judged(
+    ego,
+    others,
+    since=0,
+    vehicle=True,
+    steps=40,
+):
     """Of egos [B, 4] among agents [B, M, 4], all of one size; the first of them have
     had their speed since a step."""
     count, agents = others.shape[:2]
@@ -30,7 +36,12 @@ def judged(ego, others, since=0, vehicle=True, steps=40):
         ego,
         rotation_into(ego),
         static=static,
-        agents=Agents(others, still == 0, accel=still, turn_rate=still),
+        agents=Agents(
+            others,
+            still == 0,
+            accel=still,
+            turn_rate=still,
+        ),
     )
     states = torch.cat([ego[:, None], others], 1)[:, None].repeat(1, steps + 1, 1, 1)
     states[:, :since, 1:2, 3] = 6.0
@@ -62,7 +73,12 @@ def judged(ego, others, since=0, vehicle=True, steps=40):
         ((0.0, 1.9), 5.0, 0.11, False),
     ],
 )
-def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
+def test_own_fault_by_place_and_speed(
+    place,
+    speed,
+    other_speed,
+    expected,
+):
     for heading in (0.0, 2.0):  # whichever way the ego looks
         cos = math.cos(heading)
         sin = math.sin(heading)
@@ -88,14 +104,22 @@ def test_own_fault_by_place_and_speed(place, speed, other_speed, expected):
 def test_what_the_front_hits_must_have_stood(since, vehicle, expected):
     ego = torch.tensor([[0.0, 0.0, 0.0, 5.0]])
     others = torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
-    assert judged(ego, others, since=since, vehicle=vehicle) == [expected]
+    assert judged(
+        ego,
+        others,
+        since=since,
+        vehicle=vehicle,
+    ) == [expected]
 
 
 def test_who_stands_since_the_start_has_stood():
     ego = torch.tensor([[0.0, 0.0, 0.0, 5.0]])
     others = torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
     assert judged(ego, others, steps=3) == [True] and judged(
-        ego, others, since=1, steps=3
+        ego,
+        others,
+        since=1,
+        steps=3,
     ) == [False]
 
 

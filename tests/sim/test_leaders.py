@@ -18,7 +18,12 @@ FREE_GAP = 200.0
 GATE_MARGIN = 0.3
 LENGTH = 4.0
 WIDTH = 2.0
-DRIVER = IDMParameters(headway=1.0, standstill_gap=5.0, acceleration=1.0, braking=3.0)
+DRIVER = IDMParameters(
+    headway=1.0,
+    standstill_gap=5.0,
+    acceleration=1.0,
+    braking=3.0,
+)
 
 
 def lead(agents):
@@ -28,7 +33,12 @@ def lead(agents):
     present = torch.ones(agents.shape[:2]).bool()
     found = leaders(
         agents[:, :1, 0] + 20.0,
-        arc(0.0, 0.0, heading=0.0, curvature=0.0)[None, None],
+        arc(
+            0.0,
+            0.0,
+            heading=0.0,
+            curvature=0.0,
+        )[None, None],
         agents=agents[:, :, None],
         size=size,
         present=present,
@@ -60,7 +70,15 @@ def test_who_stands_at_the_crossing_of_a_loop_leads_at_the_first_passage_to_come
     """Even where it is nearer to the other passage, or to one that lies behind."""
     for x, y in ((35.3, 0.0), (35.0, 0.3), (35.2, -0.2)):
         ego = torch.cat(
-            [track(loop(), s, speed=8.0, steps=0)[0], torch.tensor([x, y, 0.0, 0.0])]
+            [
+                track(
+                    loop(),
+                    s,
+                    speed=8.0,
+                    steps=0,
+                )[0],
+                torch.tensor([x, y, 0.0, 0.0]),
+            ]
         ).view(1, 2, 4)
         size = torch.tensor([LENGTH, WIDTH]).expand(1, 2, 2)
         present = torch.ones(1, 2, dtype=torch.bool)
@@ -77,7 +95,15 @@ def test_who_stands_at_the_crossing_of_a_loop_leads_at_the_first_passage_to_come
         )
 
 
-def all_pairs(s, points, agents, size, present, d, free_gap):
+def all_pairs(
+    s,
+    points,
+    agents,
+    size,
+    present,
+    d,
+    free_gap,
+):
     """The definition, with every agent projected onto every route."""
     length, width = size[:, : s.shape[1]].unbind(-1)
     at, offset, heading = project(agents[:, None, :, :2], points)
@@ -146,8 +172,18 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
     found = Leaders(*(value[..., 0] for value in found))
     led = expected[0] < free_gap
     assert led.sum() > 40 and torch.equal(found.index[led], expected[2][led])
-    torch.testing.assert_close(found.gap, expected[0], rtol=0, atol=1e-4)
-    torch.testing.assert_close(found.speed[led], expected[1][led], rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        found.gap,
+        expected[0],
+        rtol=0,
+        atol=1e-4,
+    )
+    torch.testing.assert_close(
+        found.speed[led],
+        expected[1][led],
+        rtol=0,
+        atol=1e-4,
+    )
     assert torch.equal(found.speed[~led], agents[:, :vehicles, 3][~led]), (
         "nobody ahead moves as the vehicle does"
     )
@@ -155,14 +191,23 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
 
 def gap(speed, leader_speed):
     driver = IDMParameters(
-        headway=1.5, standstill_gap=2.0, acceleration=1.0, braking=4.0
+        headway=1.5,
+        standstill_gap=2.0,
+        acceleration=1.0,
+        braking=4.0,
     )
     return desired_gap(
         torch.tensor(speed), torch.tensor(leader_speed), driver=driver
     ).item()
 
 
-def accel(speed, desired, gap, leading, improved):
+def accel(
+    speed,
+    desired,
+    gap,
+    leading,
+    improved,
+):
     return idm_acceleration(
         torch.tensor(float(speed)),
         torch.tensor(float(desired)),
@@ -185,27 +230,80 @@ def test_equilibrium_gap(improved):
     """At constant speed behind a leader of the same speed: gap = (s0 + v T) / sqrt(1 -
     (v / v0)^4)."""
     gap = (5 + 6 * 1.0) / (1 - (6 / 10) ** 4) ** 0.5
-    assert abs(accel(6, 10, gap=gap, leading=6, improved=improved)) < 1e-5
     assert (
-        accel(6, 10, gap=gap + 1, leading=6, improved=improved)
+        abs(
+            accel(
+                6,
+                10,
+                gap=gap,
+                leading=6,
+                improved=improved,
+            )
+        )
+        < 1e-5
+    )
+    assert (
+        accel(
+            6,
+            10,
+            gap=gap + 1,
+            leading=6,
+            improved=improved,
+        )
         > 0
-        > accel(6, 10, gap=gap - 1, leading=6, improved=improved)
+        > accel(
+            6,
+            10,
+            gap=gap - 1,
+            leading=6,
+            improved=improved,
+        )
     )
 
 
 @pytest.mark.parametrize("improved", [False, True])
 def test_a_free_road(improved):
     assert (
-        abs(accel(10, 10, gap=torch.inf, leading=0, improved=improved)) < 1e-6
-        and accel(0, 10, gap=torch.inf, leading=0, improved=improved) == 1.0
+        abs(
+            accel(
+                10,
+                10,
+                gap=torch.inf,
+                leading=0,
+                improved=improved,
+            )
+        )
+        < 1e-6
+        and accel(
+            0,
+            10,
+            gap=torch.inf,
+            leading=0,
+            improved=improved,
+        )
+        == 1.0
     )
 
 
 def test_above_the_desired_speed_only_the_improved_term_brakes_comfortably():
-    assert -3.0 <= accel(20, 10, gap=torch.inf, leading=0, improved=True) < 0
-    assert accel(20, 10, gap=torch.inf, leading=0, improved=False) == pytest.approx(
-        1 - 2**4
+    assert (
+        -3.0
+        <= accel(
+            20,
+            10,
+            gap=torch.inf,
+            leading=0,
+            improved=True,
+        )
+        < 0
     )
+    assert accel(
+        20,
+        10,
+        gap=torch.inf,
+        leading=0,
+        improved=False,
+    ) == pytest.approx(1 - 2**4)
 
 
 @pytest.mark.parametrize(("clearance", "leads"), [(0.28, True), (0.32, False)])

@@ -27,13 +27,27 @@ def test_a_line_is_run_at_the_step_at_which_the_front_passes_it_at_red():
     front = torch.tensor([[8.0, 9.0, 9.9, 10.1, 11.0, 12.0]])
     light = torch.tensor([[0, -1]])
     line = torch.tensor([[10.0, 9.5]])
-    assert ran_red(light_state, light, line=line, front=front).tolist() == [3]
     assert ran_red(
-        light_state, torch.tensor([[1, -1]]), line=line, front=front
+        light_state,
+        light,
+        line=line,
+        front=front,
+    ).tolist() == [3]
+    assert ran_red(
+        light_state,
+        torch.tensor([[1, -1]]),
+        line=line,
+        front=front,
     ).tolist() == [-1], "green"
-    assert ran_red(light_state, light, line=line + 5, front=front).tolist() == [-1], (
-        "it halts before the line"
-    )
-    assert ran_red(light_state[..., :0], light, line=line, front=front).tolist() == [
-        -1
-    ], "no lights"
+    assert ran_red(
+        light_state,
+        light,
+        line=line + 5,
+        front=front,
+    ).tolist() == [-1], "it halts before the line"
+    assert ran_red(
+        light_state[..., :0],
+        light,
+        line=line,
+        front=front,
+    ).tolist() == [-1], "no lights"

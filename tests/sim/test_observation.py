@@ -15,7 +15,12 @@ from tests.synthetic import make_scenes
 
 
 def scenes_with_everything():
-    return make_scenes(2, num_vehicles=9, num_vrus=3, red_light_x=70.0)
+    return make_scenes(
+        2,
+        num_vehicles=9,
+        num_vrus=3,
+        red_light_x=70.0,
+    )
 
 
 def observe(scenes: SceneSet):
@@ -94,11 +99,26 @@ def test_a_map_without_limits_looks_like_one_with_the_usual_one_or_that_of_the_e
     speed, limit
 ):
     unknown, known = (
-        observe(make_scenes(2, speed=speed, limit=value)) for value in (0.0, limit)
+        observe(
+            make_scenes(
+                2,
+                speed=speed,
+                limit=value,
+            )
+        )
+        for value in (0.0, limit)
     )
     assert torch.allclose(unknown, known, atol=1e-6)
     assert not torch.allclose(
-        known, observe(make_scenes(2, speed=speed, limit=limit + 1.0)), atol=1e-3
+        known,
+        observe(
+            make_scenes(
+                2,
+                speed=speed,
+                limit=limit + 1.0,
+            )
+        ),
+        atol=1e-3,
     )
 
 
@@ -138,7 +158,9 @@ def test_driving_in_the_mirror_looks_like_the_mirror_of_driving():
     accelerates at random."""
     torch.manual_seed(0)
     scenes = e2rl.load_scenes(
-        "bundled", num_scenes=16, versions=["recorded", "mirrored"]
+        "bundled",
+        num_scenes=16,
+        versions=["recorded", "mirrored"],
     )
     first = [
         k

@@ -172,7 +172,9 @@ def test_manoeuvres_are_held_against_the_six_nearest(nearer, counts):
     gaps = []
     for ahead in (20.0, 200.0):
         scenes = make_scenes(
-            1, vehicles=[(0.0, 0, 10.0), (ahead, 0, 0.0)], num_vrus=nearer
+            1,
+            vehicles=[(0.0, 0, 10.0), (ahead, 0, 0.0)],
+            num_vrus=nearer,
         )
         scenes.scenes["start"][0, 32 : 32 + nearer, :2] = torch.tensor([-9.0, -9.0])
         names = [entry.name for entry in observation_layout()]

@@ -20,7 +20,9 @@ def random_steps(count, generator):
 
     def draw(low, high):
         return low + (high - low) * torch.rand(
-            count, generator=generator, dtype=torch.float64
+            count,
+            generator=generator,
+            dtype=torch.float64,
         )
 
     offset = torch.stack([draw(-8, 8), draw(-5, 5)])
@@ -51,7 +53,10 @@ def test_the_interval_is_that_of_a_fine_look():
     )
     still = torch.zeros(4, dtype=torch.float64)
     gap = separation(
-        still, 2 * own.T[:, None], second=box, second_size=2 * other.T[:, None]
+        still,
+        2 * own.T[:, None],
+        second=box,
+        second_size=2 * other.T[:, None],
     )
     inside = (gap < 0).any(1)
     assert torch.equal(inside | ((gap.amin(1) < 0.02) & (begin < end)), begin < end)
@@ -81,10 +86,24 @@ def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
     size = torch.tensor([[4.0, 1.9]])
     still = torch.zeros(1, 1)
     half = torch.tensor([[[1.1], [0.4]]])
-    agents = Agents(now, still == 0, accel=still, turn_rate=still)
+    agents = Agents(
+        now,
+        still == 0,
+        accel=still,
+        turn_rate=still,
+    )
     first = torch.zeros(1, 1, dtype=torch.int64)
-    static = SimpleNamespace(size=size, half_size=half, row=first)
-    near = neighbours_of(ego, rotation_into(ego), static=static, agents=agents)
+    static = SimpleNamespace(
+        size=size,
+        half_size=half,
+        row=first,
+    )
+    near = neighbours_of(
+        ego,
+        rotation_into(ego),
+        static=static,
+        agents=agents,
+    )
     tracks = torch.stack([torch.cat([ego[:, None], at], 1) for at in (before, now)], 1)
     there = torch.tensor([[[True, known], [True, True]]])
     found = passed(
@@ -117,8 +136,18 @@ def tiny_pass(displacement, speed, past):
         half_size=torch.full((1, 2, 1), 0.05),
         row=first,
     )
-    agents = Agents(agent, still == 0, accel=still, turn_rate=still)
-    near = neighbours_of(ego, rotation_into(ego), static=static, agents=agents)
+    agents = Agents(
+        agent,
+        still == 0,
+        accel=still,
+        turn_rate=still,
+    )
+    near = neighbours_of(
+        ego,
+        rotation_into(ego),
+        static=static,
+        agents=agents,
+    )
     states = torch.stack(
         [torch.cat([ego[:, None], at], 1) for at in (before, agent)], 1
     )
@@ -138,7 +167,14 @@ def tiny_pass(displacement, speed, past):
 def test_who_is_slower_than_half_a_pedestrian_in_a_step_is_not_looked_at(
     speed, looked_at
 ):
-    assert tiny_pass(0.25, speed=speed, past=0.12) == looked_at
+    assert (
+        tiny_pass(
+            0.25,
+            speed=speed,
+            past=0.12,
+        )
+        == looked_at
+    )
 
 
 @pytest.mark.parametrize(("past", "looked_at"), [(1.55, True), (1.65, False)])
@@ -146,4 +182,11 @@ def test_who_is_farther_than_half_as_much_again_as_it_moves_is_not_looked_at(
     past, looked_at
 ):
     """At 10 m/s: 1 m in a step; gaps of 1.45 and 1.55 m."""
-    assert tiny_pass(3.0, speed=10.0, past=past) == looked_at
+    assert (
+        tiny_pass(
+            3.0,
+            speed=10.0,
+            past=past,
+        )
+        == looked_at
+    )

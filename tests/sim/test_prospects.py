@@ -60,7 +60,14 @@ def test_the_way_is_driven_to_the_halt_and_never_backwards():
 def polygon(x, y, heading):
     box = shapely.box(-CAR[0] / 2, -CAR[1] / 2, CAR[0] / 2, CAR[1] / 2)
     return shapely.affinity.translate(
-        shapely.affinity.rotate(box, heading, origin=(0, 0), use_radians=True), x, y
+        shapely.affinity.rotate(
+            box,
+            heading,
+            origin=(0, 0),
+            use_radians=True,
+        ),
+        x,
+        y,
     )
 
 
@@ -114,7 +121,12 @@ def test_who_turns_goes_on_turning():
         there = (x + chord * math.cos(middle), y + chord * math.sin(middle))
         car = others((*there, heading + turn, 0.0, 0.0))
         standing.append(gaps(ego, size, others=car)[0, 0, 0])
-    torch.testing.assert_close(found[:4], torch.stack(standing), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        found[:4],
+        torch.stack(standing),
+        rtol=0,
+        atol=1e-4,
+    )
 
 
 @pytest.mark.parametrize(
@@ -125,7 +137,13 @@ def test_the_time_to_contact_is_that_of_going_on_behind_a_standing_car(gap, expe
     swerving does not count."""
     cars = [(0.0, 0, 10.0), (gap + 4.5, 0, 0.0)]
     observation = DrivingEnv(
-        make_scenes(1, vehicles=cars, num_vrus=0), SimSettings(), 1
+        make_scenes(
+            1,
+            vehicles=cars,
+            num_vrus=0,
+        ),
+        SimSettings(),
+        1,
     ).reset()["observation"]
     assert time_to_contact(observation).item() == pytest.approx(expected, abs=1e-3)
 
@@ -141,7 +159,10 @@ def test_an_arc_is_the_unicycle_s_motion_while_it_lasts():
     )
     states = dynamics.rollout(torch.tensor([0.0, 0.0, 0.0, 9.0]), actions)
     torch.testing.assert_close(
-        torch.stack([ahead, left, turn], -1), states[:, :3], rtol=0, atol=0.01
+        torch.stack([ahead, left, turn], -1),
+        states[:, :3],
+        rtol=0,
+        atol=0.01,
     )
 
 
@@ -188,7 +209,11 @@ def test_an_offset_is_reached_smoothly_in_a_second_and_a_half():
 
 def standing_beside(gap):
     """Prospects of an ego that stands, `gap` m beside a car that stands."""
-    scenes = make_scenes(1, vehicles=[(0.0, 0, 0.0), (0.0, 1, 0.0)], num_vrus=0)
+    scenes = make_scenes(
+        1,
+        vehicles=[(0.0, 0, 0.0), (0.0, 1, 0.0)],
+        num_vrus=0,
+    )
     scene = scenes.scenes
     width = scene["size"][0, 0, 1].item()
     for key in ("start", "logged"):

@@ -43,17 +43,36 @@ def test_terms_grow_with_what_they_name():
     )
     assert term("fault", fault=torch.tensor([True])) == 1
     assert abs(term("speeding", speed=torch.tensor([15.0])) - 0.25) < 1e-6
-    assert term("speeding", speed=torch.tensor([15.0]), limit=torch.zeros(1)) == 0
+    assert (
+        term(
+            "speeding",
+            speed=torch.tensor([15.0]),
+            limit=torch.zeros(1),
+        )
+        == 0
+    )
     assert term("lane_offset", offset=torch.tensor([-1.0])) == 0.5
     steady = torch.tensor([[4.0, 0.0]])
-    assert abs(term("comfort", action=steady, last_action=steady) - 1) < 1e-6
+    assert (
+        abs(
+            term(
+                "comfort",
+                action=steady,
+                last_action=steady,
+            )
+            - 1
+        )
+        < 1e-6
+    )
     turning = torch.tensor([[0.0, 0.4]])
     assert abs(term("comfort", action=turning) - 1) < 1e-6
     assert (
         term("acceleration", action=torch.tensor([[-1.0, 0.0]])) == 0.25
     )  # linear: a small one has its price, too
     assert term("comfort", action=steady) > term(
-        "comfort", action=steady, last_action=steady
+        "comfort",
+        action=steady,
+        last_action=steady,
     )
 
 
@@ -62,7 +81,17 @@ def test_terms_are_capped_and_squares_of_what_is_felt():
     action = torch.tensor([[1.0, 0.2]])
     before = torch.tensor([[0.5, 0.0]])
     expected = (1 / 4) ** 2 + (10 * 0.2 / 4) ** 2 + (0.5 / 0.1 / 20) ** 2
-    assert abs(term("comfort", action=action, last_action=before) - expected) < 1e-6
+    assert (
+        abs(
+            term(
+                "comfort",
+                action=action,
+                last_action=before,
+            )
+            - expected
+        )
+        < 1e-6
+    )
     hard = {
         "action": torch.tensor([[-8.0, 1.6]]),
         "speed": torch.tensor([40.0]),
@@ -80,7 +109,12 @@ def test_terms_are_capped_and_squares_of_what_is_felt():
     }
     assert (
         abs(
-            term("speeding", speed=torch.tensor([0.8]), limit=torch.tensor([0.5])) - 0.3
+            term(
+                "speeding",
+                speed=torch.tensor([0.8]),
+                limit=torch.tensor([0.5]),
+            )
+            - 0.3
         )
         < 1e-6
     ), "of 1 m/s at least"

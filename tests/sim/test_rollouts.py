@@ -76,16 +76,30 @@ def test_rollouts_read_back_are_those_written_padded_where_others_are_longer(
         "seed",
     ):
         torch.testing.assert_close(
-            read.get(key), rollouts.get(key), equal_nan=True, rtol=0, atol=0
+            read.get(key),
+            rollouts.get(key),
+            equal_nan=True,
+            rtol=0,
+            atol=0,
         )
     for key in ("scene_id", "location", "method"):
         assert list(read.get(key)) == list(rollouts.get(key))
-    short = random_rollouts(2, seed=2, steps=40, vehicles=6, others=1)
+    short = random_rollouts(
+        2,
+        seed=2,
+        steps=40,
+        vehicles=6,
+        others=1,
+    )
     both = Rollouts.of([rollouts.rollout(0), short.rollout(1)])
     assert both.states.shape[1:3] == rollouts.states.shape[1:3]
     assert not both.valid[1, 41:].any() and not both.valid[1, :, 7:].any()
     torch.testing.assert_close(
-        both.states[1, :41, :7], short.states[1], equal_nan=True, rtol=0, atol=0
+        both.states[1, :41, :7],
+        short.states[1],
+        equal_nan=True,
+        rtol=0,
+        atol=0,
     )
     for rows in (
         read[1:3],
@@ -99,8 +113,18 @@ def test_rollouts_read_back_are_those_written_padded_where_others_are_longer(
 
 def test_rollouts_of_other_maps_and_sizes_are_joined_and_score_as_before():
     """What one of them does not know, all together do not."""
-    small = random_rollouts(2, seed=3, vehicles=4, others=1)
-    large = random_rollouts(3, seed=5, vehicles=7, others=2)
+    small = random_rollouts(
+        2,
+        seed=3,
+        vehicles=4,
+        others=1,
+    )
+    large = random_rollouts(
+        3,
+        seed=5,
+        vehicles=7,
+        others=2,
+    )
     line = torch.tensor([[-50.0, 0.0], [0.0, 1.0], [50.0, 0.0]]).expand(2, -1, -1)
     small = small.replace(
         lane_points=line,
@@ -116,7 +140,11 @@ def test_rollouts_of_other_maps_and_sizes_are_joined_and_score_as_before():
     apart = score_rollouts(small)[0] + score_rollouts(large)[0]
     for row, alone in zip(rows, apart, strict=True):
         row["nfe"] = alone["nfe"]
-        assert row == pytest.approx(alone, nan_ok=True, abs=1e-9)
+        assert row == pytest.approx(
+            alone,
+            nan_ok=True,
+            abs=1e-9,
+        )
 
 
 def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_left_out(
@@ -129,7 +157,10 @@ def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_le
     driver = rollouts.states[:, :, 0] + 1
     evasion[1] = driver[2] = torch.nan
     more = rollouts.replace(
-        plans=plans, targets=targets, evasion=evasion, driver=driver
+        plans=plans,
+        targets=targets,
+        evasion=evasion,
+        driver=driver,
     )
     for index, path in enumerate(more.to_npz(tmp_path)):
         data = Rollout.read(path)
@@ -141,7 +172,12 @@ def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_le
 
 
 def test_scenes_tell_who_is_simulated_and_what_was_recorded():
-    scenes = make_scenes(2, vehicles=[(0, 0, 5.0), (20, 0, 5.0)], num_vrus=1, steps=10)
+    scenes = make_scenes(
+        2,
+        vehicles=[(0, 0, 5.0), (20, 0, 5.0)],
+        num_vrus=1,
+        steps=10,
+    )
     scene = scenes.scenes
     more = {
         "adversaries": scene["valid"] & False,
@@ -230,7 +266,12 @@ def test_names_that_no_path_may_hold_are_mended(tmp_path, rollouts):
     ),
     st.floats(0.3, 1),
 )
-def test_a_damaged_rollout_is_refused_by_name(tmp_path, rollouts, changes, kept):
+def test_a_damaged_rollout_is_refused_by_name(
+    tmp_path,
+    rollouts,
+    changes,
+    kept,
+):
     """Only bytes that say nothing may be changed: then the arrays are the same."""
     path = rollouts[:1].to_npz(tmp_path)[0]
     whole = Rollout.read(path)
@@ -273,7 +314,11 @@ def test_a_damaged_rollout_is_refused_by_name(tmp_path, rollouts, changes, kept)
     ],
 )
 def test_arrays_that_do_not_fit_together_are_named(
-    tmp_path, rollouts, name, value, what
+    tmp_path,
+    rollouts,
+    name,
+    value,
+    what,
 ):
     path = rollouts[:1].to_npz(tmp_path)[0]
     np.savez(path, **(dict(np.load(path)) | {name: value}))

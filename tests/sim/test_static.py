@@ -24,7 +24,11 @@ def winding(seed=0):
     scene = make_scenes(BATCH, num_points=COUNT).scenes
     mission = mission_of(scene)
     mission = Mission(
-        points, limit, end=mission.end, light=mission.light, light_s=mission.light_s
+        points,
+        limit,
+        end=mission.end,
+        light=mission.light,
+        light_s=mission.light_s,
     )
     return static_scene(scene, mission), mission, draw
 
@@ -47,15 +51,32 @@ def test_the_way_ahead_is_interpolated_with_its_limit():
     ahead = look_along(static, s)
     xy, heading, curvature = interpolate(mission.points, s)
     torch.testing.assert_close(
-        torch.stack([ahead.x, ahead.y], -1), xy, rtol=1e-5, atol=1e-5
+        torch.stack([ahead.x, ahead.y], -1),
+        xy,
+        rtol=1e-5,
+        atol=1e-5,
     )
-    torch.testing.assert_close(ahead.heading, heading, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(ahead.curvature, curvature, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        ahead.heading,
+        heading,
+        rtol=1e-5,
+        atol=1e-5,
+    )
+    torch.testing.assert_close(
+        ahead.curvature,
+        curvature,
+        rtol=1e-5,
+        atol=1e-5,
+    )
     assert torch.equal(ahead.limit, limit_at(mission, s))
 
 
 def test_others_are_seen_in_the_ego_frame_with_their_gap():
-    scene = make_scenes(BATCH, num_vehicles=20, num_vrus=5).scenes
+    scene = make_scenes(
+        BATCH,
+        num_vehicles=20,
+        num_vrus=5,
+    ).scenes
     static = static_scene(scene, mission_of(scene))
     draw = torch.Generator().manual_seed(1)
     scale = torch.tensor([6.0, 6.0, 3.0, 5.0])
@@ -67,7 +88,12 @@ def test_others_are_seen_in_the_ego_frame_with_their_gap():
         ego,
         rotation_into(ego),
         static=static,
-        agents=Agents(others, present, accel=others[..., 0], turn_rate=others[..., 1]),
+        agents=Agents(
+            others,
+            present,
+            accel=others[..., 0],
+            turn_rate=others[..., 1],
+        ),
     )
     assert torch.allclose(
         seen.position.transpose(1, 2),
@@ -81,6 +107,11 @@ def test_others_are_seen_in_the_ego_frame_with_their_gap():
     size = scene["size"]
     assert torch.allclose(
         seen.gap,
-        separation(ego[:, None], size[:, :1], second=others, second_size=size[:, 1:]),
+        separation(
+            ego[:, None],
+            size[:, :1],
+            second=others,
+            second_size=size[:, 1:],
+        ),
         atol=1e-5,
     )

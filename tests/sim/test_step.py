@@ -11,10 +11,19 @@ from e2rl.sim.step import drive
 from tests.synthetic import make_scenes
 
 
-def outcomes(batch, vehicles, hold, compiled):
+def outcomes(
+    batch,
+    vehicles,
+    hold,
+    compiled,
+):
     """Of a few episodes of egos that steer at random, and reset where they end."""
     environment = DrivingEnv(
-        make_scenes(3, num_vehicles=vehicles, red_light_x=60.0),
+        make_scenes(
+            3,
+            num_vehicles=vehicles,
+            red_light_x=60.0,
+        ),
         SimSettings(),
         batch,
         hold=hold,
@@ -30,7 +39,12 @@ def outcomes(batch, vehicles, hold, compiled):
 @pytest.mark.parametrize(
     ("batch", "vehicles", "hold"), [(1, 2, 1), (3, 9, 2), (5, 20, 1)]
 )
-def test_a_compiled_step_is_the_eager_one(batch, vehicles, hold, monkeypatch):
+def test_a_compiled_step_is_the_eager_one(
+    batch,
+    vehicles,
+    hold,
+    monkeypatch,
+):
     called = set()
     for each in (features, drive):
         monkeypatch.setitem(
@@ -39,11 +53,19 @@ def test_a_compiled_step_is_the_eager_one(batch, vehicles, hold, monkeypatch):
             lambda flat, run=each._run, name=each.name: called.add(name) or run(flat),
         )
     eager, other = (
-        outcomes(batch, vehicles, hold=hold, compiled=compiled)
+        outcomes(
+            batch,
+            vehicles,
+            hold=hold,
+            compiled=compiled,
+        )
         for compiled in (False, True)
     )
     assert called == {features.name, drive.name}, "they never ran compiled"
     for key in eager.keys(True, True):
         assert torch.allclose(
-            eager[key].float(), other[key].float(), rtol=1e-6, atol=1e-5
+            eager[key].float(),
+            other[key].float(),
+            rtol=1e-6,
+            atol=1e-5,
         ), key
