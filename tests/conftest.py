@@ -22,8 +22,8 @@ from safetensors.torch import save_file
 from e2rl.prior.checkpoint import save_prior
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
-from e2rl.run.files import HASH
 from e2rl.run.fused import switched_off
+from e2rl.run.weights import HASH
 from tests.scenes.descriptions import (
     Malicious,
     description,

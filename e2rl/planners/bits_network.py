@@ -25,7 +25,8 @@ from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import RoutePath
 from e2rl.planners.trunk import Normaliser, linear
 from e2rl.run.errors import InputError
-from e2rl.run.files import read_weights, unlike, weight_bytes, write_atomically
+from e2rl.run.files import write_atomically
+from e2rl.run.weights import read_weights, unlike, weight_bytes
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.observation import OBSERVATION_SIZE

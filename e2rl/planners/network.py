@@ -16,7 +16,8 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from e2rl.planners.reference import LAST_ACTION, follow
 from e2rl.planners.trunk import Normaliser, Trunk
 from e2rl.run.errors import InputError
-from e2rl.run.files import altered, read_weights, weight_bytes, write_atomically
+from e2rl.run.files import altered, write_atomically
+from e2rl.run.weights import read_weights, weight_bytes
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint

@@ -13,7 +13,7 @@ import e2rl
 from e2rl.prior.checkpoint import load_prior, save_prior
 from e2rl.prior.sde import SamplerSettings
 from e2rl.run.errors import InputError
-from e2rl.run.files import HASH, read_weights
+from e2rl.run.weights import HASH, read_weights
 from tests.prior.small import small_prior
 
 

@@ -24,19 +24,17 @@ from safetensors.torch import save
 from e2rl.run import files
 from e2rl.run.errors import InputError
 from e2rl.run.files import (
-    HASH,
     SEAL,
     CsvReader,
     alone_in,
     altered,
     csv_text,
     locked,
-    read_weights,
-    weight_bytes,
     write_atomically,
     write_beside,
     written_whole,
 )
+from e2rl.run.weights import HASH, read_weights, weight_bytes
 
 WEIGHTS = {
     "a": torch.arange(12.0).view(3, 4),
@@ -154,19 +152,10 @@ print("after")
 """
 
 
-@pytest.mark.parametrize(
-    "name", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"]
-)
 @pytest.mark.parametrize("into", ["file", "pipe", "socket"])
-def test_standard_output_is_written_in_turn_whatever_it_is(tmp_path, name, into):
+def test_standard_output_is_written_in_turn_whatever_it_is(tmp_path, into):
     """An output that is a file is not replaced, or what is printed next would be lost."""
-    (tmp_path / "link").symlink_to("/dev/stdout")
-    command = [
-        sys.executable,
-        "-c",
-        PRINTS,
-        str(tmp_path / "link") if name == "link" else name,
-    ]
+    command = [sys.executable, "-c", PRINTS, "/dev/stdout"]
     if into == "pipe":
         said = subprocess.run(
             command, stdout=subprocess.PIPE, check=True, timeout=60

@@ -5,8 +5,8 @@ import json
 import pytest
 import torch
 
-from e2rl.run.files import weight_bytes
 from e2rl.run.parts import state_bytes
+from e2rl.run.weights import weight_bytes
 from tools import kills
 
 FILES = {
