@@ -20,13 +20,14 @@ HASHED = b"e2rl-sha256:"
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a run's stage that are done, in folder/parts/<stage>.
+    """The parts of a run's stage that are on disk, in folder/parts/<stage>.
 
     A part holds plain values and tensors. It counts where its file is whole and its
     identity is the one asked for.
 
     Args:
         folder: of the run; None: nothing is written.
+        stage: of the run.
         about: what all parts of the stage depend on besides the run's inputs, such as
             the weights of a round.
     """
@@ -40,15 +41,22 @@ class Parts:
         name: str,
         identity: Any,
         compute: Callable[[], Any],
-        valid: Callable[[Any], bool] = lambda found: True,
+        valid: Callable[[Any], bool] = lambda value: True,
     ) -> Any:
-        """Returns the part `name`, where it is there and valid; else compute(), which
-        is written."""
-        found = self.load(name, identity)
-        if found is None or not valid(found):
-            found = compute()
-            self.save(name, identity, value=found)
-        return found
+        """Returns a part, where it is on disk and valid; else what is computed, which
+        is written.
+
+        Args:
+            name: of the part.
+            identity: what it depends on, plain values.
+            compute: makes its value.
+            valid: whether a value on disk counts.
+        """
+        value = self.load(name, identity)
+        if value is None or not valid(value):
+            value = compute()
+            self.save(name, identity, value)
+        return value
 
     def load(self, name: str, identity: Any) -> Any:
         """Returns the value of a part; None where it is not there, damaged, or of
@@ -57,31 +65,27 @@ class Parts:
             return None
         try:
             part = read_state(self._file(name), self.folder)
-            known = [part[key] for key in ("format", "about", "identity")]
-            return part["value"] if known == [FORMAT, self.about, identity] else None
-        except (
-            ValueError,
-            TypeError,
-            LookupError,
-        ):  # damaged, or a stranger's: the part is done again
-            return None
+            fits = part["format"] == FORMAT and part["about"] == self.about
+            return part["value"] if fits and part["identity"] == identity else None
+        except (ValueError, TypeError, LookupError):
+            return None  # damaged, or a stranger's: the part is done again
 
     def save(self, name: str, identity: Any, value: Any) -> None:
         """Write a part, in place of an older one of its name; a link or a pipe there is
         not written through."""
-        if self.folder is not None:
-            file = self._file(name)
-            if file.is_symlink() or (
-                file.exists() and not file.is_file() and not file.is_dir()
-            ):
-                file.unlink()
-            part = {
-                "format": FORMAT,
-                "about": self.about,
-                "identity": identity,
-                "value": value,
-            }
-            write_atomically(file, state_bytes(part))
+        if self.folder is None:
+            return
+        file = self._file(name)
+        irregular = file.exists() and not file.is_file() and not file.is_dir()
+        if file.is_symlink() or irregular:
+            file.unlink()
+        part = {
+            "format": FORMAT,
+            "about": self.about,
+            "identity": identity,
+            "value": value,
+        }
+        write_atomically(file, state_bytes(part))
 
     def _file(self, name: str) -> Path:
         assert self.folder is not None
@@ -94,9 +98,10 @@ NO_PARTS = Parts()
 def state_bytes(state: Any) -> bytes:
     """Returns plain values and tensors in torch's format, after its hash: as bytes, a
     full disk is an OSError."""
-    content = io.BytesIO()
-    torch.save(state, content)
-    return HASHED + hashlib.sha256(content.getvalue()).digest() + content.getvalue()
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    content = buffer.getvalue()
+    return HASHED + hashlib.sha256(content).digest() + content
 
 
 def read_state(file: Path, folder: Path | None = None) -> Any:
@@ -104,14 +109,12 @@ def read_state(file: Path, folder: Path | None = None) -> Any:
     is unpickled. Raises ValueError where the file is damaged, or lies outside of
     `folder` once links are followed."""
     try:
-        content = read_regular(file, within=folder)
+        whole = read_regular(file, within=folder)
         begin = len(HASHED) + hashlib.sha256().digest_size
-        if (
-            content[: len(HASHED)] != HASHED
-            or hashlib.sha256(content[begin:]).digest() != content[len(HASHED) : begin]
-        ):
-            raise ValueError("not what was written, or of an earlier version")
-        return load_plain(content[begin:])
+        content = whole[begin:]
+        if whole[:begin] != HASHED + hashlib.sha256(content).digest():
+            raise ValueError("not what was written, or of another version")
+        return load_plain(content)
     except Exception as error:  # damaged bytes raise anything
         raise ValueError(f"{file}: damaged ({error})") from error
 
@@ -122,27 +125,32 @@ def load_plain(content: bytes) -> Any:
     nothing; damaged bytes raise anything."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = archive.infolist()
-    packed = (
-        any(each.compress_type != zipfile.ZIP_STORED for each in members)
-        or content[:2] != b"PK"
-    )
-    if packed or sum(each.file_size for each in members) > len(content):
+    packed = any(member.compress_type != zipfile.ZIP_STORED for member in members)
+    size = sum(member.file_size for member in members)
+    if packed or content[:2] != b"PK" or size > len(content):
         raise ValueError("packed")
     value = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    check_tensors(value)
+    return value
+
+
+def check_tensors(value: Any) -> None:
+    """Raises ValueError where the tensors in nested containers have more than MAX_FILE
+    bytes together, or are sparse."""
     waiting = [value]
-    known = set()
+    visited = set()
     size = 0
     while waiting:
         part = waiting.pop()
-        if id(part) not in known and isinstance(part, dict | list | tuple):
-            waiting += part.values() if isinstance(part, dict) else part
-        elif id(part) not in known and isinstance(part, torch.Tensor):
-            size += (
-                part.numel() * part.element_size()
-                if part.layout == torch.strided
-                else MAX_FILE
-            )
-        known.add(id(part))
+        if id(part) in visited:
+            continue
+        visited.add(id(part))
+        if isinstance(part, dict):
+            waiting += part.values()
+        elif isinstance(part, list | tuple):
+            waiting += part
+        elif isinstance(part, torch.Tensor):
+            strided = part.layout == torch.strided
+            size += part.numel() * part.element_size() if strided else MAX_FILE
     if size > MAX_FILE:
         raise ValueError(f"its tensors have {size / 1e6:.0f} MB")
-    return value

@@ -33,6 +33,7 @@ from e2rl.run.files import (
     MAX_RECORD,
     altered,
     hash_files,
+    misfit,
     read_regular,
     sha256_of,
     write_atomically,
@@ -49,16 +50,20 @@ from e2rl.run.trust import (
 )
 
 PROVENANCE = "provenance.json"
+PROVENANCE_SHAPE = {
+    "command": str,
+    "cwd": str,
+    "choices": dict,
+    "inputs": dict,
+    "settings": dict,
+    "files": dict,
+    "versions": [{"git": str}],
+}
 PACKAGE = Path(__file__).parents[1]
-LOGS = (
-    ".log",
-    ".out",
-    ".err",
-)  # files that whatever starts a command may write into its run's folder
-READ_OTHERWISE = (
-    "data",
-    "tuning",
-)  # groups whose files are not hashed: scenes are, and a study is to grow
+# files that whatever starts a command may write into its run's folder
+LOGS = (".log", ".out", ".err")
+# groups whose files are not hashed: scenes are, and a study is to grow
+READ_OTHERWISE = ("data", "tuning")
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,8 @@ class Run:
     """What a command does.
 
     Args:
+        config: its configuration.
+        folder: that it writes to.
         choices: the file of each group of the configuration.
         free: keys of the configuration that may be others where the run goes on.
     """
@@ -83,32 +90,27 @@ class Run:
         (`e2rl.run.trust`); for settings that are fixed."""
         hydra = HydraConfig.get()
         if not config.resume:
-            return cls(
-                config,
-                Path(hydra.runtime.output_dir),
-                dict(hydra.runtime.choices),
-                free,
-            )
+            folder = Path(hydra.runtime.output_dir)
+            return cls(config, folder, dict(hydra.runtime.choices), free)
         folder = Path(config.resume).resolve()
         where = f"resume={config.resume}"
         saved = saved_configuration(config, folder, where=where)
-        known = read_provenance(folder)
-        given = {item.split("=", 1)[0].lstrip("+~") for item in hydra.overrides.task}
+        choices = read_provenance(folder)["choices"]
+        keys = {item.split("=", 1)[0].lstrip("+~") for item in hydra.overrides.task}
         default = load_config(str(hydra.job.config_name))
-        needed = {
-            option.partition("=")[0]
-            for option in written_outside(saved, folder, default)
-        }
-        if wrong := sorted(given - {*free, *ALWAYS, *needed}):
+        needed = written_outside(saved, folder, default)
+        allowed = {*free, *ALWAYS, *(option.partition("=")[0] for option in needed)}
+        if fixed := sorted(keys - allowed):
             raise InputError(
-                f"{where}: goes on as it was begun; leave out {', '.join(wrong)} (only {', '.join(free)} can change)"
+                f"{where}: goes on as it was begun; leave out {', '.join(fixed)} (only "
+                f"{', '.join(free)} can change)"
             )
         check_written(saved, folder, where, config, default)
-        for key in given.intersection(free):
+        for key in keys.intersection(free):
             saved[key] = config[key]
         saved.plugins = config.plugins
         saved.resume = str(folder)
-        return cls(saved, folder, known["choices"], free)
+        return cls(saved, folder, choices, free)
 
     def enter(self) -> None:
         """Make the folder ready, once nobody else is at work in it. Raises InputError
@@ -116,82 +118,87 @@ class Run:
         what is left of a run that was killed as it began."""
         if not os.access(self.folder, os.W_OK):
             raise InputError(
-                f"{self.folder}: cannot be written; make it writable, or name another folder"
+                f"{self.folder}: cannot be written; make it writable, or name another "
+                "folder"
             )
         if self.config.resume:
-            for left in list(
-                self.folder.rglob(".*.part")
-            ):  # of what was being written at the end
-                shutil.rmtree(left) if left.is_dir() else left.unlink(missing_ok=True)
+            for part in list(self.folder.rglob(".*.part")):  # was being written
+                shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
             return
-        found = {
-            path.relative_to(self.folder).parts[0]
-            for path in self.folder.rglob("*")
-            if not path.is_dir()
-        }
-        found -= {name for name in found if name.endswith(LOGS)}
-        if {PROVENANCE, PARTS} & found:
+        names = set()
+        for path in self.folder.rglob("*"):
+            name = path.relative_to(self.folder).parts[0]
+            if not path.is_dir() and not name.endswith(LOGS):
+                names.add(name)
+        if {PROVENANCE, PARTS} & names:
             raise InputError(
-                f"{self.folder}: has a run already; go on with it by {assigned('resume', self.folder)}, or name "
-                "another folder by hydra.run.dir=FOLDER"
+                f"{self.folder}: has a run already; go on with it by "
+                f"{assigned('resume', self.folder)}, or name another folder by "
+                "hydra.run.dir=FOLDER"
             )
-        if CONFIG.parts[0] not in found and (others := sorted(found)):
+        if names and CONFIG.parts[0] not in names:
             raise InputError(
-                f"{self.folder}: is not empty ({others[0]}); name another folder by hydra.run.dir=FOLDER"
+                f"{self.folder}: is not empty ({min(names)}); name another folder by "
+                "hydra.run.dir=FOLDER"
             )
 
     def parts(self, stage: str = "", about: str = "") -> Parts:
-        """Returns the parts of a stage that are done."""
+        """Returns the parts of a stage that are on disk."""
         return Parts(self.folder, stage, about=about)
 
     def begin(self, scenes: Mapping[str, tuple[str, str]]) -> None:
         """Write what the run was begun with; or where it goes on, compare with that.
-        Raises InputError for other inputs or settings than those that the run was begun
-        with. Other versions are told on stderr.
+        Other versions are told on stderr.
 
-        scenes: of each set of scenes, by its name, what `e2rl.scenes.scene_list.listed`
-        returns.
+        Args:
+            scenes: of each set of scenes, by its name, what
+                `e2rl.scenes.scene_list.listed` returns.
+
+        Raises:
+            InputError: for other inputs or settings than those that the run was begun
+                with.
         """
         lists = {
             name: hashlib.sha256(text.encode()).hexdigest()
             for name, (text, _) in scenes.items()
         }
-        now = {
+        provenance = {
+            "command": command_line(),
+            "cwd": str(Path.cwd()),
+            "choices": dict(self.choices),
             "versions": [versions(self.config)],
             "settings": settings(self.config, self.free),
             "inputs": lists | dict(inputs(self.config)),
             "files": {name: files for name, (_, files) in scenes.items()},
         }
         if self.config.resume:
-            self._compare(json.loads(json.dumps(now)))
+            self._compare(json.loads(json.dumps(provenance)))
             return
         write_atomically(self.folder / CONFIG, OmegaConf.to_yaml(self.config))
         for name, (text, _) in scenes.items():
             write_atomically(self.folder / f"{name.replace(' ', '_')}.csv", text)
-        begun = {
-            "command": command_line(),
-            "cwd": str(Path.cwd()),
-            "choices": dict(self.choices),
-        }
-        self._write(begun | now)
+        self._write(provenance)
 
-    def _compare(self, now: Mapping[str, Any]) -> None:
-        known = read_provenance(self.folder)
+    def _compare(self, present: Mapping[str, Any]) -> None:
+        provenance = read_provenance(self.folder)
         for kind in ("inputs", "settings"):
-            if names := changed(known[kind], now[kind]):
+            if names := changed(provenance[kind], present[kind]):
                 raise InputError(
-                    f"resume={self.folder}: {', '.join(names)} changed since the run began, so what is finished "
-                    "would not fit to the rest; restore them, or begin a new run"
+                    f"resume={self.folder}: {', '.join(names)} changed since the run "
+                    "began, so what is finished would not fit to the rest; restore "
+                    "them, or begin a new run"
                 )
-        last = known["versions"][-1]
-        here = now["versions"][0]
-        if names := [
-            name for name in changed(last, here) if name in last
-        ]:  # modules may join
-            said = f"other versions than before ({', '.join(names)}); see {PROVENANCE}"
-            print(f"resume={self.folder}: {said}", file=sys.stderr)
-            known["versions"].append(here)
-            self._write(known)
+        last = provenance["versions"][-1]
+        here = present["versions"][0]
+        names = [name for name in changed(last, here) if name in last]
+        if names:  # modules may join
+            print(
+                f"resume={self.folder}: other versions than before "
+                f"({', '.join(names)}); see {PROVENANCE}",
+                file=sys.stderr,
+            )
+            provenance["versions"].append(here)
+            self._write(provenance)
 
     def _write(self, provenance: Mapping[str, Any]) -> None:
         write_atomically(self.folder / PROVENANCE, json.dumps(provenance, indent=1))
@@ -200,20 +207,20 @@ class Run:
 def how_to_go_on(config: DictConfig) -> str:
     """Returns the command that goes on with a run that ends early, for a shell: the
     same where it had not begun."""
-    folder = Path(config.resume or HydraConfig.get().runtime.output_dir)
+    hydra = HydraConfig.get()
+    folder = Path(config.resume or hydra.runtime.output_dir)
     if not (folder / PROVENANCE).is_file():
         return command_line()
     words = program()
     arguments = sys.argv[1:]
     for position, argument in enumerate(arguments):  # further folders of configuration
-        if argument.split("=")[0] in ("--config-dir", "-cd"):
-            words += (
-                [argument] if "=" in argument else arguments[position : position + 2]
-            )
+        if argument in ("--config-dir", "-cd"):
+            words += arguments[position : position + 2]
+        elif argument.startswith(("--config-dir=", "-cd=")):
+            words.append(argument)
     words.append(assigned("resume", folder))
-    words += written_outside(
-        config, folder, load_config(str(HydraConfig.get().job.config_name))
-    )
+    default = load_config(str(hydra.job.config_name))
+    words += written_outside(config, folder, default)
     if modules := sorted(outside_modules(config)):
         words.append(f"plugins=[{','.join(modules)}]")
     return shlex.join(words)
@@ -223,35 +230,20 @@ def read_provenance(folder: Path) -> dict[str, Any]:
     """Returns the content of a run's provenance.json; InputError where it is not there
     or damaged."""
     file = Path(folder) / PROVENANCE
-    damaged = InputError(
-        f"{file}: damaged, or of another version; restore it, or begin a new run"
-    )
     try:
-        known = json.loads(read_regular(file, MAX_RECORD, within=Path(folder)))
-        kinds = {
-            "command": str,
-            "cwd": str,
-            "choices": dict,
-            "inputs": dict,
-            "settings": dict,
-            "files": dict,
-        }
-        wrong = [
-            name for name, kind in kinds.items() if not isinstance(known[name], kind)
-        ]
-        if (
-            not wrong
-            and known["versions"]
-            and all(isinstance(each["git"], str) for each in known["versions"])
-        ):
-            return known
+        provenance = json.loads(read_regular(file, MAX_RECORD, within=Path(folder)))
+        reason = misfit(provenance, PROVENANCE_SHAPE)
+        if reason or not provenance["versions"]:
+            raise ValueError(reason)
+        return provenance
     except FileNotFoundError as error:
         raise InputError(
             f"{file}: not there; give the folder of a run that had begun"
         ) from error
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise damaged from error
-    raise damaged
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{file}: damaged, or of another version; restore it, or begin a new run"
+        ) from error
 
 
 def origin_of(folder: Path) -> dict[str, Any]:
@@ -259,25 +251,22 @@ def origin_of(folder: Path) -> dict[str, Any]:
     where it went on with others."""
     if not (Path(folder) / PROVENANCE).is_file():
         return {"git": git_commit(), "command": command_line()}
-    known = read_provenance(folder)
-    return {
-        "git": ", ".join(dict.fromkeys(each["git"] for each in known["versions"])),
-        "command": known["command"],
-    }
+    provenance = read_provenance(folder)
+    commits = dict.fromkeys(each["git"] for each in provenance["versions"])
+    return {"git": ", ".join(commits), "command": provenance["command"]}
 
 
 # --- what a run depends on
 
 
-def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def changed(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
     """Returns the names whose plain values differ."""
-    texts = [
-        {name: json.dumps(value, sort_keys=True) for name, value in each.items()}
-        for each in (before, now)
-    ]
-    return sorted(
-        name for name in {*before, *now} if texts[0].get(name) != texts[1].get(name)
-    )
+
+    def text(values: Mapping[str, Any], name: str) -> str:
+        return json.dumps(values[name], sort_keys=True) if name in values else ""
+
+    names = sorted({*before, *after})
+    return [name for name in names if text(before, name) != text(after, name)]
 
 
 def settings(config: DictConfig, free: Sequence[str]) -> dict[str, Any]:
@@ -293,92 +282,84 @@ def versions(config: DictConfig) -> dict[str, str]:
     """Returns commit, versions of python and torch, and hashes: of the code of e2rl, of
     the weights that come with it, and of modules outside of it that the configuration
     names."""
-    found = {
+    result = {
         "git": git_commit(),
         "python": platform.python_version(),
         "torch": torch.__version__,
+        "e2rl": hash_files(sorted(PACKAGE.rglob("*.py"))).hex(),
+        "bundled weights": hash_files(sorted(PACKAGE.rglob("*.safetensors"))).hex(),
     }
-    found["e2rl"] = hash_files(sorted(PACKAGE.rglob("*.py"))).hex()
-    found["bundled weights"] = hash_files(sorted(PACKAGE.rglob("*.safetensors"))).hex()
     for name in sorted(outside_modules(config)):
         spec = find_spec(name)
-        found[name] = (
-            hash_files([Path(spec.origin)]).hex()
-            if spec is not None and spec.origin is not None
-            else ""
-        )
-    return found
+        origin = spec.origin if spec else None
+        result[name] = hash_files([Path(origin)]).hex() if origin else ""
+    return result
 
 
 def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
-    """(name, hash) of every file that a configuration names, (name, content) of files
-    in conf/ that it names."""
-    for key, value in leaves(
-        {
-            name: part
-            for name, part in resolved(config).items()
-            if name not in READ_OTHERWISE
-        }
-    ):
-        if not isinstance(value, str) or not value or key == "resume":
+    """Yields (name, hash) of every file that a configuration names, (name, content) of
+    files in conf/ that it names."""
+    plain = resolved(config)
+    for group in (*READ_OTHERWISE, "resume"):
+        plain.pop(group, None)
+    for key, value in leaves(plain):
+        if not isinstance(value, str) or not value:
             continue
         path = Path(value)
-        if (
-            "checkpoint" in key and path.is_dir()
-        ):  # perhaps a run's folder, of which the newest whole checkpoint counts
-            whole = [
-                each
-                for each in sorted(path.glob("checkpoints/*/"))
-                if altered(each) is None
-            ]
-            path = next(
-                iter(sorted((whole[-1] if whole else path).glob("*.safetensors"))), path
-            )
+        if "checkpoint" in key and path.is_dir():
+            path = newest_weights(path)
         if path.is_file():
             try:
                 yield f"{key}={value}", sha256_of(path)
             except OSError as error:
                 raise InputError(
-                    f"{key}={value}: cannot be read: {error.strerror}; name another file"
+                    f"{key}={value}: cannot be read: {error.strerror}; name another "
+                    "file"
                 ) from error
-    families = (
-        config.search.families.values()
-        if "search" in config and config.get("tries") != 1
-        else ()
-    )
-    of_families = (
-        family.get("method", "e2")
-        for family in families
-        if isinstance(family, DictConfig)
-    )
-    for name in dict.fromkeys([*config.get("methods", ()), *of_families]):
-        if name not in (*config.get("variants", ()), config.synthesizer.name, "search"):
-            yield f"synthesizer={name}", resolved(load_choice("synthesizer", name))
+    methods = list(config.get("methods", ()))
+    if "search" in config and config.get("tries") != 1:
+        for family in config.search.families.values():
+            if isinstance(family, DictConfig):
+                methods.append(family.get("method", "e2"))
+    for name in dict.fromkeys(methods):
+        if name in ("search", config.synthesizer.name, *config.get("variants", ())):
+            continue
+        yield f"synthesizer={name}", resolved(load_choice("synthesizer", name))
     for entry in config.get("egos", {}).values():
-        yield (
-            f"ego={entry.ego}",
-            OmegaConf.to_container(load_choice("ego", entry.ego)),
-        )  # as written
+        ego = load_choice("ego", entry.ego)
+        yield f"ego={entry.ego}", OmegaConf.to_container(ego)  # as written
+
+
+def newest_weights(folder: Path) -> Path:
+    """Returns the weights in a folder, or of the newest whole checkpoint where it is a
+    run's; the folder itself where there are none."""
+    whole = [
+        path for path in sorted(folder.glob("checkpoints/*/")) if altered(path) is None
+    ]
+    place = whole[-1] if whole else folder
+    return min(place.glob("*.safetensors"), default=folder)
 
 
 @cache
 def git_commit() -> str:
     """Returns the package's commit, with '+changes' where tracked files differ from it;
     "" outside a git checkout."""
+    try:
+        commit = _git("rev-parse", "HEAD")
+        changes = _git("status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return commit + ("+changes" if changes else "")
 
-    def git(*arguments: str) -> str | None:
-        try:
-            done = subprocess.run(
-                ["git", *arguments],
-                cwd=PACKAGE,
-                capture_output=True,
-                text=True,
-                timeout=20,
-            )
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return done.stdout.strip() if done.returncode == 0 else None
 
-    commit = git("rev-parse", "HEAD")
-    changes = git("status", "--porcelain", "--untracked-files=no")
-    return "" if commit is None else commit + ("+changes" if changes else "")
+def _git(*arguments: str) -> str:
+    """What git says of the package."""
+    ended = subprocess.run(
+        ["git", *arguments],
+        cwd=PACKAGE,
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=True,
+    )
+    return ended.stdout.strip()

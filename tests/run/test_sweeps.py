@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from e2rl.evaluation.check import evaluation_settings
-from e2rl.run.command import told
 from e2rl.run.config import check_list, load_config
 from e2rl.run.errors import InputError
+from e2rl.run.options import wrong_option
 
 ROOT = Path(__file__).parents[2]
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 )
 def test_several_values_are_told_as_a_list(key, value, mend):
     said = f"Ambiguous value for argument '{key}={value}'\n1. To use it as a list, use key=[value1,value2]"
-    assert mend in told("evaluate", [f"{key}={value}"], said=said)
+    assert mend in wrong_option("evaluate", [], said)
     with pytest.raises(InputError, match="several values are a list") as refused:
         check_list(key, value)
     assert mend in str(refused.value)

@@ -192,7 +192,7 @@ RUN = OmegaConf.to_yaml(EVALUATE)
         ),
         (changed(EVALUATE, {"methods": ["${hydra:job.name}"]}), "refers to more"),
         (changed(EVALUATE, {"x": "${sim}${sim}"}), "sim, which is no plain"),
-        (changed(EVALUATE, {"x": "${nothing}"}), "nothing, which is not there"),
+        (changed(EVALUATE, {"x": "${nothing}"}), "nothing, which is no plain"),
         ((RUN + "x: 0x" + "f" * 10_000).encode(), "x is an endless number"),
         (b"[1, 2]", "no configuration of a run"),
         (b"stage: prior\nseed: 0\n", "missing"),
