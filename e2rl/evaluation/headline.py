@@ -23,8 +23,8 @@ class Headline(NamedTuple):
         failed: scenes with one of the two.
         ways: different ways of failing preventably, cells of the atlas.
         searches: of a scene, by how many seeds; 0: it was not searched.
-        tries, nfe: of a search of a scene in the mean; nfe does not count tries that
-            errored.
+        tries: of a search of a scene in the mean.
+        nfe: of a search of a scene in the mean, without tries that errored.
     """
 
     scenes: int
@@ -40,28 +40,35 @@ class Headline(NamedTuple):
 def headline(rows: Sequence[Mapping[str, Any]], searched: bool) -> Headline:
     """Returns the headline of rows of rollouts of one ego, method and intensity;
     `searched`: they are tries."""
-    driven = [row for row in rows if not lost(row)]
-    scenes = {row["scene_id"] for row in driven}
-    failures = [
-        row for row in driven if row.get("cfr_preventable") == 1 and not raised(row)
-    ]
-    preventable = {row["scene_id"] for row in failures}
-    crashed = {row["scene_id"] for row in driven if raised(row)}
-    cells = {cell_of(row) for row in failures} - {None}
-    seeds = {row["seed"] // TRIES for row in driven} if searched else set()
+    scenes = set()
+    preventable = set()
+    crashed = set()
+    cells = set()
+    seeds = set()
+    tries = 0
+    nfe = 0.0
+    for row in rows:
+        if lost(row):
+            continue
+        scene = row["scene_id"]
+        scenes.add(scene)
+        seeds.add(row["seed"] // TRIES)
+        tries += 1
+        cost = row.get("nfe", 0.0)
+        nfe += cost if cost == cost else 0.0
+        if raised(row):
+            crashed.add(scene)
+        elif row.get("cfr_preventable") == 1:
+            preventable.add(scene)
+            cells.add(cell_of(row))
     searches = max(len(scenes) * len(seeds), 1)
-    known = [
-        row["nfe"]
-        for row in driven
-        if row.get("nfe") == row.get("nfe") and "nfe" in row
-    ]
     return Headline(
         scenes=len(scenes),
         preventable=len(preventable),
         raised=len(crashed),
         failed=len(preventable | crashed),
-        ways=len(cells),
-        searches=len(seeds),
-        tries=len(driven) / searches if searched else 0.0,
-        nfe=sum(known) / searches if searched else 0.0,
+        ways=len(cells - {None}),
+        searches=len(seeds) if searched else 0,
+        tries=tries / searches if searched else 0.0,
+        nfe=nfe / searches if searched else 0.0,
     )

@@ -18,20 +18,30 @@ from e2rl.search.tries import TRIES
 
 GROUP = ("dataset", "split", "method", "ego_policy", "eta")
 Key = tuple  # values of GROUP
+Scores = tuple[list[dict], list[dict[str, Tensor]]]  # rows and samples
+UNKNOWN = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
 
 
 def group_of(row: Mapping) -> Key:
-    """Values of GROUP of a row of metrics.json, of rollouts.csv or of errored.json."""
-    return tuple(
-        row["ego" if name == "ego_policy" and "ego" in row else name] for name in GROUP
-    )
+    """Returns the values of GROUP of a row of metrics.json, of rollouts.csv or of
+    errored.json."""
+    ego = row["ego"] if "ego" in row else row["ego_policy"]
+    return row["dataset"], row["split"], row["method"], ego, row["eta"]
 
 
 def metric_row(
-    key: Key, scenes: int, seeds: int, rollouts: int, metrics: Mapping, **fields: Any
+    key: Key, *, scenes: int, seeds: int, rollouts: int, metrics: Mapping, **fields: Any
 ) -> dict:
-    """One row of metrics.json; key: dataset, split, method, ego and eta; fields
-    override or extend it."""
+    """Returns a row of metrics.json.
+
+    Args:
+        key: dataset, split, method, ego and eta.
+        scenes: number of scenes.
+        seeds: number of seeds.
+        rollouts: number of rollouts.
+        metrics: means and intervals.
+        fields: override or extend the row.
+    """
     identity = dict(zip(("dataset", "split", "method", "ego", "eta"), key, strict=True))
     counts = {"n_scenes": scenes, "n_seeds": seeds, "n_rollouts": rollouts}
     origin = {"git": git_commit(), "command": command_line()}
@@ -40,7 +50,8 @@ def metric_row(
 
 def metric_rows(
     rows: Sequence[dict],
-    features: Sequence[dict[str, Tensor]],
+    samples: Sequence[dict[str, Tensor]],
+    *,
     draws: int = DRAWS,
     realism_draws: int = REALISM_DRAWS,
     egos: Sequence[tuple[str, str]] = (),
@@ -48,70 +59,135 @@ def metric_rows(
     searched: bool = False,
     **fields: Any,
 ) -> list[dict]:
-    """Rows of metrics.json from the rows of rollouts and their realism samples
-    (`features`).
+    """Returns rows of metrics.json from the rows of rollouts.
 
-    Rollouts that the traffic lost take no part. Of tries of searches (`searched`)
-    events are those of `scene_rows`, as rates of tries are none of the planner, and
-    nothing is paired: a search goes on by what it has found.
+    Rollouts that the traffic lost take no part. A row's `paired` compares it with every
+    other method (or eta) on the same dataset, split and ego over the shared (scene,
+    seed); a method there with several etas is named method@eta.
 
-    A row's `paired` compares it with every other method (or eta) on the same dataset,
-    split and ego over the shared (scene, seed); a method there with several etas is
-    named method@eta. egos: pairs of egos of which the first is also compared with the
-    second in the same traffic, under `ego SECOND`, realism without intervals; as these
-    are many, a method is then compared with the first other one of its ego only.
-    references: the methods that others are compared with (None: all; of many rows, the
-    differences cost more than the means). `fields` extend each row.
+    Args:
+        rows: of rollouts.
+        samples: of realism, one for each row.
+        draws: of the bootstrap.
+        realism_draws: of the bootstrap of realism.
+        egos: pairs of egos of which the first is also compared with the second in the
+            same traffic, under `ego SECOND`, realism without intervals; as these are
+            many, a method is then compared with the first other one of its ego only.
+        references: the methods that others are compared with (None: all; of many rows,
+            the differences cost more than the means).
+        searched: the rollouts are tries. Events are those of `scene_rows`, as rates of
+            tries are none of the planner, and nothing is paired: a search goes on by
+            what it has found.
+        fields: extend each row.
     """
-    groups: dict[Key, list[int]] = {}
-    for index, row in enumerate(rows):
+    groups: dict[Key, Scores] = {}
+    for row, sample in zip(rows, samples, strict=True):
         if not lost(row):
-            groups.setdefault(group_of(row), []).append(index)
-    members = {
-        key: ([rows[i] for i in index], [features[i] for i in index])
-        for key, index in groups.items()
-    }
+            group = groups.setdefault(group_of(row), ([], []))
+            group[0].append(row)
+            group[1].append(sample)
     result = []
-    for key, ours in members.items():
+    for key, (group_rows, group_samples) in groups.items():
         paired = {}
-        others = [
-            other
-            for other in members
-            if other != key and (*other[:2], other[3]) == (*key[:2], key[3])
-        ]
-        others = [
-            other for other in others if references is None or other[2] in references
-        ]
-        for other in others[: 0 if searched else 1 if egos else None]:
-            differences = paired_differences(
-                *ours, *members[other], draws=draws, realism_draws=realism_draws
+        if not searched:
+            paired = paired_with_methods(
+                key,
+                groups,
+                draws=draws,
+                realism_draws=realism_draws,
+                references=references,
+                only_first=bool(egos),
             )
-            paired[_method_name(other, members)] = differences
-        for first, second in () if searched else egos:
-            other = (*key[:3], second, key[4])
-            if first == key[3] and other in members:
-                paired[f"ego {second}"] = paired_differences(
-                    *ours, *members[other], draws=draws, realism_draws=0, relative=True
-                )
-        metrics = summarise(*ours, draws=draws, realism_draws=realism_draws)
+            paired |= paired_with_egos(key, groups, egos=egos, draws=draws)
+        metrics = summarise(
+            group_rows, group_samples, draws=draws, realism_draws=realism_draws
+        )
         if searched:
-            metrics |= scene_metrics(ours[0], draws)
-        scenes = {row["scene_id"] for row in ours[0]}
-        seeds = {row["seed"] // (TRIES if searched else 1) for row in ours[0]}
+            metrics |= scene_metrics(group_rows, draws)
+        step = TRIES if searched else 1
         row = metric_row(
             key,
-            len(scenes),
-            seeds=len(seeds),
-            rollouts=len(ours[0]),
+            scenes=len({row["scene_id"] for row in group_rows}),
+            seeds=len({row["seed"] // step for row in group_rows}),
+            rollouts=len(group_rows),
             metrics=metrics,
             paired=paired,
             **fields,
         )
-        result.append(
-            row
-            | {"searched": searched, "headline": headline(ours[0], searched)._asdict()}
-        )
+        counts = headline(group_rows, searched)._asdict()
+        result.append(row | {"searched": searched, "headline": counts})
     return result
+
+
+def paired_with_methods(
+    key: Key,
+    groups: Mapping[Key, Scores],
+    *,
+    draws: int,
+    realism_draws: int,
+    references: Collection[str] | None,
+    only_first: bool,
+) -> dict[str, dict]:
+    """Returns paired differences of a group to the other methods and intensities of its
+    ego.
+
+    Args:
+        key: of the group.
+        groups: all of them.
+        draws: of the bootstrap.
+        realism_draws: of the bootstrap of realism.
+        references: methods to compare with (None: all).
+        only_first: with the first of them alone.
+    """
+    others = []
+    for other in groups:
+        same = (other[0], other[1], other[3]) == (key[0], key[1], key[3])
+        if same and other != key and (references is None or other[2] in references):
+            others.append(other)
+    paired = {}
+    for other in others[:1] if only_first else others:
+        etas = {each[4] for each in groups if each[:4] == other[:4]}
+        name = other[2] if len(etas) == 1 else f"{other[2]}@{other[4]:g}"
+        paired[name] = paired_differences(
+            groups[key][0],
+            groups[key][1],
+            groups[other][0],
+            groups[other][1],
+            draws=draws,
+            realism_draws=realism_draws,
+        )
+    return paired
+
+
+def paired_with_egos(
+    key: Key,
+    groups: Mapping[Key, Scores],
+    *,
+    egos: Sequence[tuple[str, str]],
+    draws: int,
+) -> dict[str, dict]:
+    """Returns paired differences of a group to other egos in its traffic.
+
+    Args:
+        key: of the group.
+        groups: all of them.
+        egos: pairs of names.
+        draws: of the bootstrap.
+    """
+    paired = {}
+    for first, second in egos:
+        other = (*key[:3], second, key[4])
+        if first == key[3] and other in groups:
+            paired[f"ego {second}"] = paired_differences(
+                groups[key][0],
+                groups[key][1],
+                groups[other][0],
+                groups[other][1],
+                draws=draws,
+                realism_draws=0,
+                relative=True,
+            )
+    return paired
 
 
 def events() -> list[str]:
@@ -122,71 +198,62 @@ def events() -> list[str]:
 def scene_rows(
     rows: Sequence[Mapping], names: Collection[str] | None = None
 ) -> list[dict]:
-    """A row for each search of each scene, from the rows of its tries: `names`, 1 where
-    any try has the event, NaN where none knows it; whether the planner raised; seed: of
-    the search. Tries that the traffic lost take no part."""
-    names = [
-        name for name in (events() if names is None else names) if name != "errored"
-    ]
-    found: dict[tuple, dict] = {}
-    for row in (row for row in rows if not lost(row)):
-        identity = {name: row[name] for name in (*GROUP, "scene_id", "location")} | {
-            "seed": row["seed"] // TRIES
-        }
-        scene = found.setdefault(
-            tuple(identity.values()),
-            identity | dict.fromkeys(names, math.nan) | {"errored": 0.0},
+    """Returns a row for each search of each scene, from the rows of its tries: `names`,
+    1 where any try has the event, NaN where none knows it; whether the planner raised;
+    seed: of the search. Tries that the traffic lost take no part."""
+    names = events() if names is None else names
+    names = [name for name in names if name != "errored"]
+    scenes: dict[tuple, dict] = {}
+    for row in rows:
+        if lost(row):
+            continue
+        identity = {name: row[name] for name in (*GROUP, "scene_id", "location")}
+        identity["seed"] = row["seed"] // TRIES
+        unknown = dict.fromkeys(names, math.nan)
+        scene = scenes.setdefault(
+            tuple(identity.values()), identity | unknown | {"errored": 0.0}
         )
         for name in names:
-            value = (
-                METRICS[name].raised
-                if raised(row)
-                else float(row.get(METRICS[name].source, math.nan))
-            )
-            known = [each for each in (scene[name], value) if not math.isnan(each)]
-            scene[name] = max(known, default=math.nan)
+            metric = METRICS[name]
+            value = float(row.get(metric.source, math.nan))
+            if raised(row):
+                value = metric.raised
+            if not scene[name] >= value and not math.isnan(value):
+                scene[name] = value
         scene["errored"] = max(scene["errored"], float(raised(row)))
-    return list(found.values())
+    return list(scenes.values())
 
 
 def scene_metrics(rows: Sequence[Mapping], draws: int) -> dict[str, dict[str, float]]:
     """Returns the events of the scenes of tries as `summarise` gives them; rates per
     kilometre are not known."""
     scenes = scene_rows(rows)
-    found = summarise(scenes, [NO_SAMPLES] * len(scenes), draws=draws, realism_draws=0)
-    nothing = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
-    per_distance = {name: nothing for name, metric in METRICS.items() if metric.per}
-    return {name: found[name] for name in events()} | per_distance
+    samples = [NO_SAMPLES] * len(scenes)
+    metrics = summarise(scenes, samples, draws=draws, realism_draws=0)
+    per_distance = [name for name, metric in METRICS.items() if metric.per]
+    known = {name: metrics[name] for name in events()}
+    return known | dict.fromkeys(per_distance, UNKNOWN)
 
 
 def empty_rows(known: Sequence[dict], errored: Sequence[dict]) -> list[dict]:
-    """Rows of metrics.json of the groups of which every rollout errored: no metric is
-    known. known: the rows of the others, of which the first lends the fields that all
-    have."""
-    present = set(map(group_of, known))
-    absent = dict.fromkeys(map(group_of, errored))
-    nothing = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
+    """Returns rows of metrics.json of the groups of which every rollout errored: no
+    metric is known. known: the rows of the others, of which the first lends the fields
+    that all have."""
+    first = known[0] if known else {}
     shared = {
-        name: known[0][name]
-        for name in ("git", "command", "stage")
-        if known and name in known[0]
+        name: first[name] for name in ("git", "command", "stage") if name in first
     }
+    present = {group_of(row) for row in known}
+    absent = dict.fromkeys(group_of(entry) for entry in errored)
     return [
         metric_row(
             key,
-            0,
+            scenes=0,
             seeds=0,
             rollouts=0,
-            metrics=dict.fromkeys(METRICS, nothing),
+            metrics=dict.fromkeys(METRICS, UNKNOWN),
             **shared,
         )
         for key in absent
         if key not in present
     ]
-
-
-def _method_name(key: Key, keys: Collection[Key]) -> str:
-    """The group's method, with its eta if the method occurs with several etas for the
-    same ego."""
-    etas = {other[4] for other in keys if other[:4] == key[:4]}
-    return key[2] if len(etas) == 1 else f"{key[2]}@{key[4]:g}"

@@ -9,14 +9,15 @@ from torch import Tensor
 
 from e2rl.search.tries import Family
 
-CHANCE_TRIES = (
-    10.0  # first tries of scenes that a family's chance stands for at the start
-)
-SCENE_TRIES, FAMILY_TRIES = (
-    2.0,
-    4.0,
-)  # after which the next in the scene, and of the family there, has half the chance
-CONTACT, CLOSER, FARTHER, LEAST = 0.75, 2.0, 0.15, 0.1  # see `nearness`
+# first tries of scenes that a family's chance stands for at the start
+CHANCE_TRIES = 10.0
+SCENE_TRIES = 2.0  # after which the next in the scene has half the chance
+FAMILY_TRIES = 4.0  # after which the next of the family there has half the chance
+# see `nearness`
+CONTACT = 0.75
+CLOSER = 2.0
+FARTHER = 0.15
+LEAST = 0.1
 
 
 @dataclass
@@ -39,55 +40,55 @@ class Portfolio:
     learns: bool = True
 
     def __post_init__(self) -> None:
-        prior = torch.tensor(
-            [family.chance for family in self.families], dtype=torch.float64
-        )
+        chance = [family.chance for family in self.families]
+        nfe = [CHANCE_TRIES * family.nfe for family in self.families]
+        prior = torch.tensor(chance, dtype=torch.float64)
         self.tried = torch.zeros(self.scenes, len(self.families), dtype=torch.float64)
         self.nearest = torch.full((self.scenes,), torch.nan, dtype=torch.float64)
-        self.found, self.exposed = (
-            CHANCE_TRIES * prior,
-            torch.full_like(prior, CHANCE_TRIES),
-        )  # and the x of the tries
-        self.spent = torch.tensor(
-            [CHANCE_TRIES * family.nfe for family in self.families], dtype=torch.float64
-        )
-        self.driven = torch.full_like(
-            prior, CHANCE_TRIES
-        )  # tries that have spent so many NFE
+        self.found = CHANCE_TRIES * prior
+        self.exposed = torch.full_like(prior, CHANCE_TRIES)  # and the x of the tries
+        self.spent = torch.tensor(nfe, dtype=torch.float64)
+        self.driven = torch.full_like(prior, CHANCE_TRIES)  # tries that spent that
 
     def tell(
-        self, scene: int, family: int, found: float, margin: float, nfe: float
+        self, scene: int, family: int, *, reward: float, margin: float, nfe: float
     ) -> None:
-        """Learn from a try whose find is worth 0 to 1."""
-        self.found[family] += found
+        """Learn from a try.
+
+        Args:
+            scene: its position.
+            family: its position.
+            reward: what its find is worth, 0 to 1.
+            margin: of the try.
+            nfe: that it cost.
+        """
+        self.found[family] += reward
         self.exposed[family] += self.share(slice(scene, scene + 1))[0, family]
         self.tried[scene, family] += 1
         self.spent[family] += nfe
         self.driven[family] += 1
-        self.nearest[scene] = torch.fmax(
-            self.nearest[scene], torch.tensor(margin, dtype=torch.float64)
-        )
+        nearest = torch.tensor(margin, dtype=torch.float64)
+        self.nearest[scene] = torch.fmax(self.nearest[scene], nearest)
 
     def forget(self, scene: int) -> None:
         """Forget what the tries of a scene have told of it: something else is searched
-        for now."""
-        self.tried[scene], self.nearest[scene] = 0.0, torch.nan
+        for there."""
+        self.tried[scene] = 0.0
+        self.nearest[scene] = torch.nan
 
     def share(self, scenes: slice = slice(None)) -> Tensor:
-        """x [N, F] of some scenes: what is left of the chances of a first try."""
+        """Returns x [N, F] of some scenes: what is left of the chances of a first try."""
         tried = self.tried[scenes]
-        before = (1 + tried.sum(1, keepdim=True) / SCENE_TRIES) * (
-            1 + tried / FAMILY_TRIES
-        )
-        return nearness(self.nearest[scenes])[:, None] / before
+        in_scene = 1 + tried.sum(1, keepdim=True) / SCENE_TRIES
+        of_family = 1 + tried / FAMILY_TRIES
+        return nearness(self.nearest[scenes])[:, None] / (in_scene * of_family)
 
     def worth(self, generator: torch.Generator) -> Tensor:
-        """A draw of the chances [N, F] per NFE, relative to the most expensive family;
-        those of a scene as if tried one after another, the best first."""
+        """Returns a draw of the chances [N, F] per NFE, relative to the most expensive
+        family; those of a scene as if tried one after another, the best first."""
         if not self.learns:
-            return torch.rand(
-                self.tried.shape, generator=generator, dtype=torch.float64
-            )
+            shape = self.tried.shape
+            return torch.rand(shape, generator=generator, dtype=torch.float64)
         chance = torch._standard_gamma(self.found, generator=generator) / self.exposed
         cost = self.spent / self.driven
         worth = self.share() * chance * cost.amax() / cost
@@ -97,9 +98,7 @@ class Portfolio:
 
 
 def nearness(margin: Tensor) -> Tensor:
-    """How likely a find is in scenes whose nearest try has this margin, beside one
-    without a try (NaN), which has 1."""
-    near = (
-        CONTACT + torch.where(margin > 0, CLOSER, FARTHER) * margin.clamp(max=1)
-    ).clamp(min=LEAST)
-    return near.nan_to_num(1.0)
+    """Returns how likely a find is in scenes whose nearest try has this margin, beside
+    one without a try (NaN), which has 1."""
+    slope = torch.where(margin > 0, CLOSER, FARTHER)
+    return (CONTACT + slope * margin.clamp(max=1)).clamp(min=LEAST).nan_to_num(1.0)

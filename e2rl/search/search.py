@@ -1,5 +1,5 @@
 """The search for failures of a planner with a budget: ask for tries, tell what became
-of them (docs/search.md).
+of them (docs/guide/evaluate.md).
 
 First cover, then refine: tries are drawn from the families of a portfolio, stratified,
 where they are likely to find something new.
@@ -8,7 +8,6 @@ where they are likely to find something new.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count
 from typing import NamedTuple
 
 import torch
@@ -18,9 +17,13 @@ from e2rl.run.settings import configured, setting
 from e2rl.search.portfolio import Portfolio
 from e2rl.search.tries import Family, Try
 
-ROUND = 24  # tries that a round of few scenes has at least: its batches cost much the same with one try as with several
-RAISES = 3  # tries of a scene, in all of which the planner raised, after which no more are spent on it
-NEAR = 0.15  # of a failure, that a contact counts which the competent driver nearly prevents
+# tries that a round has at least: a batch costs much the same with one as with several
+ROUND = 24
+# tries of a scene, in all of which the planner raised, after which no more are spent
+RAISES = 3
+# of a failure, that a contact counts which the competent driver nearly prevents
+NEAR = 0.15
+RAISED = "raised"  # a kind of failure beside the cells of the atlas
 
 
 @configured("search/portfolio")
@@ -36,13 +39,15 @@ class SearchSettings:
     climb: bool = setting()
 
 
-RAISED = "raised"  # a kind of failure beside the cells of the atlas
-
-
 class Outcome(NamedTuple):
-    """What became of a try: margin (`metrics.margin`); cell of the atlas, "" unless the
-    failure is preventable; nfe: what it cost; raised: the planner raised, which is a
-    failure of its own kind."""
+    """What became of a try.
+
+    Args:
+        margin: `metrics.margin`.
+        cell: of the atlas, "" unless the failure is preventable.
+        nfe: what the try cost.
+        raised: the planner raised, which is a failure of its own kind.
+    """
 
     margin: float
     cell: str
@@ -51,7 +56,7 @@ class Outcome(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The way of failing; "" for none."""
+        """The kind of failure; "" for none."""
         return RAISED if self.raised else self.cell
 
 
@@ -59,8 +64,12 @@ class Outcome(NamedTuple):
 class Search(Extension):
     """The tries of N scenes so far, and what is tried next.
 
-    Tries are drawn from `families`. The `numbers` [N] tell scenes apart in seeds,
-    whatever scenes are beside them.
+    Args:
+        families: that tries are drawn from.
+        numbers: [N] of the scenes, which tell them apart in seeds, whatever scenes are
+            beside them.
+        seed: of the search.
+        settings: how tries are spent.
     """
 
     families: Sequence[Family]
@@ -78,97 +87,99 @@ class Search(Extension):
         self._generator = torch.Generator().manual_seed(self.seed)
 
     def ask(self) -> list[Try]:
-        """The next tries, to be told in this order: one of every scene until it has
-        `cover` of them, then of those families in those scenes that are worth the most:
-        as many as there are scenes, or `growth` of the tries so far, but no more than a
-        quarter of what could be chosen; ROUND at least. None of scenes that are not
-        `active`."""
+        """Returns the next tries, to be told in this order: one of every scene until it
+        has `cover` of them, then of those families in those scenes that are worth the
+        most: as many as there are scenes, or `growth` of the tries so far, but no more
+        than a quarter of what could be chosen; ROUND at least. None of scenes that are
+        not `active`."""
         worth = self._portfolio.worth(self._generator)
         active = self.active()
         if not active:
             return []
-        found = self.settings.bandit & torch.tensor(
-            [self._found(scene) for scene in active]
-        )
-        worth = torch.where(
-            found[:, None], self.settings.again * worth[active], worth[active]
-        )
-        uncovered = self.settings.cover - min(
-            len(self.tries[scene]) for scene in active
-        )
+        worth = worth[active]  # [N', F]
+        failed = torch.tensor([self._has_failure(scene) for scene in active])
+        if self.settings.bandit:
+            again = self.settings.again * worth
+            worth = torch.where(failed[:, None], again, worth)
+        tried = [len(tries) for tries in self.tries]
+        uncovered = self.settings.cover - min(tried[scene] for scene in active)
         if uncovered > 0:
-            each = worth.topk(
-                min(-(-ROUND // len(worth)), uncovered, len(self.families)), dim=1
-            ).indices
-            chosen = [
-                (scene, family)
-                for scene, families in enumerate(each.tolist())
+            share = -(-ROUND // len(worth))
+            best = worth.topk(min(share, uncovered, len(self.families)), dim=1)
+            pairs = [
+                (position, family)
+                for position, families in enumerate(best.indices.tolist())
                 for family in families
             ]
         else:
-            grown = min(
-                round(self.settings.growth * sum(map(len, self.tries))),
-                worth.numel() // 4,
-            )
-            size = min(max(ROUND, len(worth), grown), worth.numel())
-            best = worth.flatten().topk(size).indices.sort().values
-            chosen = [divmod(pair, worth.shape[1]) for pair in best.tolist()]
-        number = [
-            count(len(tries)) for tries in self.tries
-        ]  # of the next try of each scene
-        rest = [self._rest(scene) for scene in range(len(self.numbers))]
+            grown = round(self.settings.growth * sum(tried))
+            size = max(ROUND, len(worth), min(grown, worth.numel() // 4))
+            chosen = worth.flatten().topk(min(size, worth.numel())).indices
+            pairs = [
+                divmod(pair, len(self.families))
+                for pair in chosen.sort().values.tolist()
+            ]
         drawn = []
-        for scene, family in (
-            (active[position], family) for position, family in chosen
-        ):
-            if rest[scene] > 0:
-                drawn.append(self._draw(scene, family, number=next(number[scene])))
-                rest[scene] -= 1
+        left = [self._tries_left(scene) for scene in range(len(self.numbers))]
+        for position, family in pairs:
+            scene = active[position]
+            if left[scene] > 0:
+                drawn.append(self._draw(scene, family, number=tried[scene]))
+                tried[scene] += 1
+                left[scene] -= 1
         return drawn
 
     def active(self) -> list[int]:
         """Returns the scenes that tries are spent on: not those in which the planner
         always raised, RAISES times."""
-        return [scene for scene in range(len(self.numbers)) if self._rest(scene) > 0]
+        scenes = range(len(self.numbers))
+        return [scene for scene in scenes if self._tries_left(scene) > 0]
 
-    def _rest(self, scene: int) -> float:
+    def _tries_left(self, scene: int) -> float:
         """How many more tries may be spent on a scene."""
         outcomes = self.outcomes[scene]
-        return (
-            RAISES - len(outcomes)
-            if outcomes and all(each.raised for each in outcomes)
-            else math.inf
-        )
+        if outcomes and all(outcome.raised for outcome in outcomes):
+            return RAISES - len(outcomes)
+        return math.inf
 
     def tell(self, tries: Sequence[Try], outcomes: Sequence[Outcome]) -> None:
-        """What became of tries that were asked for."""
-        names = [family.name for family in self._portfolio.families]
-        for one, outcome in zip(tries, outcomes, strict=True):
-            known = self._found(one.scene)
-            new = bool(outcome.kind) and (not known or outcome.kind not in self.cells)
-            climbs = self.settings.climb and not known
-            reward = 1.0 if new else climbs * NEAR * min(max(outcome.margin, 0.0), 1.0)
-            margin = outcome.margin if self.settings.climb else 0.0
+        """Learn what became of tries that were asked for."""
+        families = [family.name for family in self._portfolio.families]
+        climb = self.settings.climb
+        for attempt, outcome in zip(tries, outcomes, strict=True):
+            scene = attempt.scene
+            kind = outcome.kind
+            failed = self._has_failure(scene)
+            new = bool(kind) and (not failed or kind not in self.cells)
+            reward = 1.0 if new else 0.0
+            if climb and not new and not failed:
+                reward = NEAR * min(max(outcome.margin, 0.0), 1.0)
             self._portfolio.tell(
-                one.scene, names.index(one.family), reward, margin, outcome.nfe
+                scene,
+                families.index(attempt.family),
+                reward=reward,
+                margin=outcome.margin if climb else 0.0,
+                nfe=outcome.nfe,
             )
-            if (
-                new and not known
-            ):  # from now on other failures of this scene are searched for
-                self._portfolio.forget(one.scene)
-            self.cells |= {outcome.kind} if outcome.kind else set()
-            self.tries[one.scene].append(one)
-            self.outcomes[one.scene].append(outcome)
+            if new and not failed:  # other failures of this scene are searched for
+                self._portfolio.forget(scene)
+            if kind:
+                self.cells.add(kind)
+            self.tries[scene].append(attempt)
+            self.outcomes[scene].append(outcome)
 
-    def _found(self, scene: int) -> bool:
+    def _has_failure(self, scene: int) -> bool:
         return any(outcome.kind for outcome in self.outcomes[scene])
 
     def _draw(self, scene: int, family: int, number: int) -> Try:
         """The next try of a family in a scene, the scene's `number`-th."""
         return self.families[family].draw(
-            scene, number, self.seed_of(scene), self.settings.stratified
+            scene,
+            number,
+            seed=self.seed_of(scene),
+            stratified=self.settings.stratified,
         )
 
     def seed_of(self, scene: int) -> int:
-        """The seed of the draws of a scene."""
+        """Returns the seed of the draws of a scene."""
         return self.seed * 1_000_003 + int(self.numbers[scene])

@@ -44,8 +44,8 @@ class Evolution(Search):
         return family.attempt(
             scene,
             len(self.tries[scene]) + k,
-            self.seed_of(scene),
-            torch.from_numpy(point[1:]),
+            seed=self.seed_of(scene),
+            draw=torch.from_numpy(point[1:]),
         )
 
     def tell(self, tries, outcomes):

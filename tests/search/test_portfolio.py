@@ -41,7 +41,7 @@ def test_a_family_is_worth_its_own_chance_and_less_in_a_scene_where_it_failed():
     torch.testing.assert_close(
         mean_worth(found), torch.full((2, 1), SURE).double(), rtol=0.01, atol=0
     )
-    found.tell(0, 0, 0.0, 0.0, 100.0)
+    found.tell(0, 0, reward=0.0, margin=0.0, nfe=100.0)
     worth = mean_worth(found)
     family = SURE * CHANCE_TRIES / (CHANCE_TRIES + 1)
     after = nearness(torch.tensor(0.0)).item() / (
@@ -55,7 +55,7 @@ def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
     finds = 20
     found = portfolio(chance=chance, nfe=(100.0, 100.0))
     for _ in range(finds):
-        found.tell(0, 0, 1.0, 2.0, 100.0)
+        found.tell(0, 0, reward=1.0, margin=2.0, nfe=100.0)
     near = nearness(torch.tensor(2.0))
     tries = torch.arange(1, finds)
     exposed = (
@@ -73,9 +73,9 @@ def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
 def test_late_tries_where_all_others_failed_tell_less_against_a_family_than_first_ones():
     found = portfolio(scenes=20, nfe=(100.0, 100.0))
     for scene in range(10):
-        found.tell(scene, 0, 0.0, 0.0, 100.0)
+        found.tell(scene, 0, reward=0.0, margin=0.0, nfe=100.0)
     for _ in range(10):
-        found.tell(10, 1, 0.0, 0.0, 100.0)
+        found.tell(10, 1, reward=0.0, margin=0.0, nfe=100.0)
     worth = mean_worth(found)[19]
     assert worth[1] > 1.2 * worth[0]
 
@@ -83,8 +83,8 @@ def test_late_tries_where_all_others_failed_tell_less_against_a_family_than_firs
 def test_a_scene_forgets_what_its_tries_told_and_others_do_not():
     found = portfolio(scenes=3)
     for _ in range(20):
-        found.tell(0, 0, 0.0, 0.0, 100.0)
-        found.tell(1, 0, 0.0, 0.0, 100.0)
+        found.tell(0, 0, reward=0.0, margin=0.0, nfe=100.0)
+        found.tell(1, 0, reward=0.0, margin=0.0, nfe=100.0)
     found.forget(0)
     worth = mean_worth(found)[:, 0]
     assert close(worth[0].item(), worth[2].item()) and worth[1] < 0.05 * worth[0]
@@ -98,7 +98,7 @@ def test_a_dear_family_is_worth_less_in_proportion():
     )  # it would be the second, besides
     for _ in range(int(CHANCE_TRIES)):
         found.tell(
-            1, 1, 0.0, 0.0, 200.0
+            1, 1, reward=0.0, margin=0.0, nfe=200.0
         )  # it costs less than it was said to: 300 in the mean
     worth = mean_worth(found)[0]
     exposed = found.exposed[1].item()
@@ -110,7 +110,7 @@ def test_a_dear_family_is_worth_less_in_proportion():
 
 def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
     found = portfolio(scenes=1, nfe=(100.0, 110.0, 120.0))
-    found.tell(0, 2, 0.0, 0.0, 120.0)
+    found.tell(0, 2, reward=0.0, margin=0.0, nfe=120.0)
     share = found.share()[0]
     worth = mean_worth(found)[0]
     alone = (
@@ -135,8 +135,10 @@ def test_the_nearer_a_scene_came_the_likelier_is_a_find_there():
     assert nearness(torch.tensor(torch.nan)) == 1 and nearness(torch.tensor(0.0)) < 1
     found = portfolio(scenes=3)
     for scene, nearest in enumerate((-30.0, 0.5)):
-        found.tell(scene, 0, 0.0, nearest, 100.0)
-        found.tell(scene, 0, 0.0, -40.0, 100.0)  # the nearest try tells
+        found.tell(scene, 0, reward=0.0, margin=nearest, nfe=100.0)
+        found.tell(
+            scene, 0, reward=0.0, margin=-40.0, nfe=100.0
+        )  # the nearest try tells
     worth = mean_worth(found)[:, 0]
     assert close(
         (worth[1] / worth[0]).item(), (nearness(torch.tensor(0.5)) / LEAST).item()
@@ -148,7 +150,7 @@ def test_without_learning_nothing_that_was_told_changes_the_choice():
         [Family("a", "e2", ranges={}), Family("b", "e2", ranges={})], 2, learns=False
     )
     for _ in range(50):
-        found.tell(0, 0, 1.0, 2.0, 100.0)
+        found.tell(0, 0, reward=1.0, margin=2.0, nfe=100.0)
     torch.testing.assert_close(
         mean_worth(found, 4000), torch.full((2, 2), 0.5).double(), atol=0.03, rtol=0
     )

@@ -163,4 +163,6 @@ def test_a_planner_that_raises_has_failed_in_a_way_of_its_own():
     search = search_of(scenes=2, settings=replace(PLAIN, cover=1))
     tries = search.ask()
     search.tell(tries, [Outcome(-30.0, "", nfe=100.0, raised=True) for _ in tries])
-    assert search.cells == {"raised"} and all(search._found(scene) for scene in (0, 1))
+    assert search.cells == {"raised"} and all(
+        search._has_failure(scene) for scene in (0, 1)
+    )

@@ -12,7 +12,10 @@ TIMED = Family("timed", "e2", ranges={"moment": (1.0, 5.0), "strength": (0.5, 1.
 
 
 def drawn(count, stratified, family=TIMED, seed=7):
-    return [family.draw(0, number, seed, stratified) for number in range(count)]
+    return [
+        family.draw(0, number, seed=seed, stratified=stratified)
+        for number in range(count)
+    ]
 
 
 @pytest.mark.parametrize("stratified", [True, False])
