@@ -86,7 +86,7 @@ def spread_rows(
         )
         row = metric_row(
             (scenes.dataset, scenes.split, method.name, EGO, method.eta),
-            len(scenes),
+            scenes=len(scenes),
             seeds=samples,
             rollouts=len(scenes) * samples,
             metrics=_metrics(sums, reference_sums, scenes=scenes),
