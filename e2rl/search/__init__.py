@@ -1,2 +1,2 @@
 """The attack with a budget: tries of a scene that differ, spent where they find most
-(docs/search.md)."""
+(docs/guide/evaluate.md)."""

@@ -1,5 +1,5 @@
 """Searches for failures with a budget, round by round, and what each of their tries was
-(docs/search.md).
+(docs/guide/evaluate.md).
 
 Every method is tried again and again, with other noise; the method `search` spends its
 tries on a portfolio of families.
