@@ -74,7 +74,8 @@ class DrivingVectorEnv(VectorEnv):
         """Raises InputError: TorchRL's GymWrapper alone asks for it, and cannot carry
         the scenes' ids of the info."""
         raise InputError(
-            "GymWrapper: e2rl.make_env(NUM_ENVS) is this batch as an environment of TorchRL; use that"
+            "GymWrapper: e2rl.make_env(NUM_ENVS) is this batch as an environment of "
+            "TorchRL; use that"
         )
 
     def reset(
@@ -114,10 +115,10 @@ class DrivingVectorEnv(VectorEnv):
                 last, reward, terminated=terminated, truncated=truncated
             )
         observation, info = self._shown(self._now)
-        done = terminated | truncated
-        if done.any():
+        ended = terminated | truncated
+        if ended.any():
             info["final_obs"], info["final_info"] = self._shown(last)
-            info |= {"_final_obs": done, "_final_info": done}
+            info |= {"_final_obs": ended, "_final_info": ended}
         return observation, reward, terminated, truncated, info
 
     def _begun_in_next_step(
@@ -151,15 +152,15 @@ class DrivingVectorEnv(VectorEnv):
         }
         return observation, reward, terminated, truncated, info
 
-    def _shown(self, found: TensorDictBase) -> tuple[np.ndarray, Info]:
+    def _shown(self, data: TensorDictBase) -> tuple[np.ndarray, Info]:
         """Observation and info."""
-        told = {name: value[:, 0].numpy() for name, value in found["metrics"].items()}
+        metrics = {name: value[:, 0].numpy() for name, value in data["metrics"].items()}
         ids = [
             self.env.scenes.scene_id[scene]
-            for scene in found["scene_index"][:, 0].tolist()
+            for scene in data["scene_index"][:, 0].tolist()
         ]
-        eta = self.env.transform.pool.eta[found["traffic", "row"][:, 0]].numpy()
-        return found["observation"].numpy().copy(), told | {
+        eta = self.env.transform.pool.eta[data["traffic", "row"][:, 0]].numpy()
+        return data["observation"].numpy().copy(), metrics | {
             "scene": np.array(ids, dtype=object),
             "eta": eta,
         }
@@ -186,9 +187,13 @@ class DrivingGymEnv(gymnasium.Env):
         observation, reward, terminated, truncated, info = self._batch.step(
             np.asarray(action)[None]
         )
-        seen = info.get("final_obs", observation)[0]
-        told = row_of(info.get("final_info", info), 0)
-        return seen, float(reward[0]), bool(terminated[0]), bool(truncated[0]), told
+        return (
+            info.get("final_obs", observation)[0],
+            float(reward[0]),
+            bool(terminated[0]),
+            bool(truncated[0]),
+            row_of(info.get("final_info", info), 0),
+        )
 
 
 def row_of(info: Info, row: int) -> Info:

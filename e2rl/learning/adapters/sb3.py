@@ -45,16 +45,16 @@ class SB3Env(VecEnv):
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]:
         observation, reward, terminated, truncated, info = self.batch.step(self._given)
-        done = terminated | truncated
+        ended = terminated | truncated
         last = info.pop("final_info", {})
-        seen = info.pop("final_obs", observation)
-        infos = [row_of(last if ended else info, row) for row, ended in enumerate(done)]
-        for row in done.nonzero()[0]:
+        final = info.pop("final_obs", observation)
+        infos = [row_of(last if over else info, row) for row, over in enumerate(ended)]
+        for row in ended.nonzero()[0]:
             infos[row] |= {
-                "terminal_observation": seen[row],
+                "terminal_observation": final[row],
                 "TimeLimit.truncated": not terminated[row],
             }
-        return observation, reward, done, infos
+        return observation, reward, ended, infos
 
     def close(self) -> None:
         self.batch.close()
@@ -119,16 +119,17 @@ def check_spaces(model: BaseAlgorithm) -> None:
     shape = model.observation_space.shape
     if shape != (OBSERVATION_SIZE,):
         raise InputError(
-            f"the model observes {list(shape or ())} numbers, not the {OBSERVATION_SIZE} of a moment: as an ego it "
-            "gets no stacked or added ones; train it without that wrapper"
+            f"the model observes {list(shape or ())} numbers, not the "
+            f"{OBSERVATION_SIZE} of a moment: as an ego it gets no stacked or added "
+            "ones; train it without that wrapper"
         )
     low, high = (
         np.asarray(getattr(model.action_space, name)) for name in ("low", "high")
     )
     if not ((low == -1).all() and (high == 1).all()):
         raise InputError(
-            f"the model's actions lie in [{low.min():g}, {high.max():g}], those of e2rl in [-1, 1]: train it without "
-            "the wrapper that rescales them"
+            f"the model's actions lie in [{low.min():g}, {high.max():g}], those of "
+            "e2rl in [-1, 1]: train it without the wrapper that rescales them"
         )
 
 
@@ -142,15 +143,17 @@ def driving_of(model: BaseAlgorithm, env: VecEnv | None) -> Driving:
     if source is None or not source.has_attr("driving"):
         if trained is None:
             raise InputError(
-                "the model has no environment of e2rl, which has the bounds: pass env=e2rl.make_sb3_env(1)"
+                "the model has no environment of e2rl, which has the bounds: "
+                "pass env=e2rl.make_sb3_env(1)"
             )
         return trained
     present = source.get_attr("driving")[0]
     if trained is not None and bounds_line(trained) != bounds_line(present):
         raise InputError(
-            f"the model was trained with actions from {bounds_line(trained)}, its environment has those from "
-            f"{bounds_line(present)}: load it without one, by load(FILE), or give the environment the same "
-            "max_acceleration, max_braking and max_yaw_rate"
+            f"the model was trained with actions from {bounds_line(trained)}, its "
+            f"environment has those from {bounds_line(present)}: load it without one, "
+            "by load(FILE), or give the environment the same max_acceleration, "
+            "max_braking and max_yaw_rate"
         )
     return present if trained is None else trained
 
@@ -158,7 +161,10 @@ def driving_of(model: BaseAlgorithm, env: VecEnv | None) -> Driving:
 def bounds_line(driving: Driving) -> str:
     """The bounds of the actions in words."""
     accelerations, yaw_rates = zip(driving["low"], driving["high"], strict=True)
-    return f"{accelerations[0]:g} to {accelerations[1]:g} m/s^2 and {yaw_rates[0]:g} to {yaw_rates[1]:g} rad/s"
+    return (
+        f"{accelerations[0]:g} to {accelerations[1]:g} m/s^2 and "
+        f"{yaw_rates[0]:g} to {yaw_rates[1]:g} rad/s"
+    )
 
 
 def normalisers_of(env: VecEnv | None) -> list[tuple[Tensor, Tensor, float]]:
@@ -185,8 +191,9 @@ def check_wrappers(env: VecEnv | None) -> None:
         for kind in (gymnasium.ObservationWrapper, TransformAction)
     ):
         raise InputError(
-            "a wrapper of gymnasium changes the model's observations or actions, and the policy's file would not have "
-            "it: normalise by VecNormalize of Stable-Baselines3, which is saved, or pass a module of the whole map"
+            "a wrapper of gymnasium changes the model's observations or actions, and "
+            "the policy's file would not have it: normalise by VecNormalize of "
+            "Stable-Baselines3, which is saved, or pass a module of the whole map"
         )
 
 
@@ -202,8 +209,9 @@ def check_last_observation(
         return
     if model._last_obs is None:
         raise InputError(
-            "a model that was loaded with an environment does not tell whether it was trained under VecNormalize: load "
-            "it without one, and pass the VecNormalize, if it had any: save_policy(PPO.load(FILE), POLICY, env=ENV)"
+            "a model that was loaded with an environment does not tell whether it was "
+            "trained under VecNormalize: load it without one, and pass the "
+            "VecNormalize, if it had any: save_policy(PPO.load(FILE), POLICY, env=ENV)"
         )
     elapsed = torch.as_tensor(np.asarray(model._last_obs), dtype=torch.float64)[
         :, ELAPSED

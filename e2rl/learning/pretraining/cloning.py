@@ -17,7 +17,8 @@ LABEL_WIDTH = (0.25, 0.12)  # of acceleration and yaw rate, in halves of the ran
 EXPERT_RANGE = 0.99  # of the bounds, at which the squashed density is infinite
 # Standard deviations of noise on the network's normalised input while cloning, and on
 # the last executed action in it, which an imitator otherwise just repeats.
-NOISE = (0.3, 1.0)
+INPUT_NOISE = 0.3
+LAST_ACTION_NOISE = 1.0
 
 
 def clip_expert(action: Tensor, low: Tensor, high: Tensor) -> Tensor:

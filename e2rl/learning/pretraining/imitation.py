@@ -21,7 +21,12 @@ from torchrl.envs import TransformedEnv
 
 from e2rl.evaluation.build import build_ego, build_sim
 from e2rl.learning.logging import RunLogger
-from e2rl.learning.pretraining.cloning import NOISE, clip_expert, cloning_loss
+from e2rl.learning.pretraining.cloning import (
+    INPUT_NOISE,
+    LAST_ACTION_NOISE,
+    clip_expert,
+    cloning_loss,
+)
 from e2rl.learning.pretraining.supervised import Epochs, stage_settings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego_policy import EgoPolicy
@@ -116,8 +121,8 @@ def shown(
         return tensordict
 
     steps = driven.rollout(env.horizon, disturbed, break_when_any_done=False)
-    done = steps["next", "done"][..., 0].int()
-    alive = done.cumsum(1) - done == 0
+    ends = steps["next", "done"][..., 0].int()
+    alive = ends.cumsum(1) - ends == 0
     action = executed(steps) if disturb is None else steps["intended"]
     bounds = env.action_spec.space
     return TensorDict(
@@ -164,7 +169,7 @@ class Imitation(Epochs):
 
     def loss(self, batch: TensorDictBase) -> Tensor:
         """The cloning loss [] under noise on the input."""
-        with self.network.network.noisy(*NOISE):
+        with self.network.network.noisy(INPUT_NOISE, LAST_ACTION_NOISE):
             return cloning_loss(self.network.actor, batch)
 
     @torch.no_grad()

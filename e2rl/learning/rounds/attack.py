@@ -40,13 +40,13 @@ def solvable(
         tracks | {name: scene[name] for name in ("size", "agent_type")}
     )
     late = (first["stop"] - LATE).clamp(min=0).masked_fill(~first["hit"], 0)
-    found = find_evasions(scene, states, valid=valid, sim=sim, moment=late).found
-    again = (~found & (late > 0)).nonzero()[:, 0]
+    evaded = find_evasions(scene, states, valid=valid, sim=sim, moment=late).found
+    again = (~evaded & (late > 0)).nonzero()[:, 0]
     if len(again):
-        found[again] = find_evasions(
+        evaded[again] = find_evasions(
             scene[again], states[again], valid=valid[again], sim=sim
         ).found
-    avoidable[hit] = found
+    avoidable[hit] = evaded
     return avoidable
 
 
@@ -136,15 +136,15 @@ def _make_part(
     them (entered [s], the others of the rows that were made); and the errored rest."""
     scenes = order.scenes[rows]
     eta = order.eta[rows] if attack else torch.zeros_like(order.eta[rows])
-    made = synthesize(order.ego, scenes, eta, order.seed)
-    causes: Mapping[int, dict] = made.get("errored", {})
+    traffic = synthesize(order.ego, scenes, eta, order.seed)
+    causes: Mapping[int, dict] = traffic.get("errored", {})
     places = torch.tensor(
         [row for row in range(len(rows)) if row not in causes], dtype=torch.int64
     )
     enters = torch.ones(len(places), dtype=torch.bool)
     if attack and len(places) and solvable is not None:
-        enters = solvable(made)
-    tracks = {name: made[name] for name in TRACKS} | {"eta": eta[places]}
+        enters = solvable(traffic)
+    tracks = {name: traffic[name] for name in TRACKS} | {"eta": eta[places]}
     about = {"round": order.number, "during": ATTACK if attack else NOMINAL}
     errored = [
         about | {"scene": int(scenes[row]), "eta": round(float(eta[row]), 4)} | cause
@@ -152,8 +152,8 @@ def _make_part(
     ]
     return {
         **{name: value[enters] for name, value in tracks.items()},
-        "attacked": made["adversaries"].any(-1),
-        "contact": made["contact"],
+        "attacked": traffic["adversaries"].any(-1),
+        "contact": traffic["contact"],
         "entered": torch.zeros(len(rows), dtype=torch.bool).index_fill(
             0, places[enters], True
         ),

@@ -67,9 +67,11 @@ class BeforeAfter:
         if stage == "before":
             measured.save(stage, None, (scored.rows, scored.samples))
         elif (before := measured.load("before", None)) is not None:
+            scores, samples = before
             for row in rows:
                 row["paired"]["before"] = paired_differences(
-                    *_of_row(row, scored.rows, scored.samples), *_of_row(row, *before)
+                    *_of_row(row, scored.rows, scored.samples),
+                    *_of_row(row, scores, samples),
                 )
         file = self.folder / METRICS_FILE
         earlier = read_metrics(file) if file.exists() else []

@@ -63,6 +63,11 @@ def decisions(steps, hold: int):
     return (steps + hold - 1) // hold
 
 
+def outcomes(data: TensorDictBase) -> TensorDictBase:
+    """What is read of a batch [B, T], on the CPU."""
+    return data.select(*OUTCOME_KEYS).cpu().clone()
+
+
 def finished_episodes(
     batches: list[TensorDictBase],
     adversarial: Tensor,
@@ -76,8 +81,8 @@ def finished_episodes(
     omitted: only the failures among them would be finished.
 
     Args:
-        batches: [B, T_i] in order, with OUTCOME_KEYS; all environments are reset at the
-            first frame.
+        batches: `outcomes` [B, T_i] in order; all environments are reset at the first
+            frame.
         adversarial: of the pool's rows, [R] bool.
         horizon: steps of an episode at most.
         hold: steps of a frame, for which a decision is held.
@@ -85,9 +90,7 @@ def finished_episodes(
     Returns:
         E episodes, whose `survivable` is unknown.
     """
-    data = TensorDict.cat(
-        [batch.select(*OUTCOME_KEYS).to("cpu") for batch in batches], 1
-    )
+    data = TensorDict.cat(batches, 1)
     after = data["next"]
     metrics = after["metrics"]
     frames = data.shape[1]

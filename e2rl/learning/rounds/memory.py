@@ -20,7 +20,8 @@ from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 from e2rl.traffic.pool import TrafficPool
 
-FOLDER, ERRORED = "memory", "errored"  # of a run; the key of a file's metadata
+FOLDER = "memory"  # of a run
+ERRORED = "errored"  # key of a file's metadata
 
 
 @dataclass(frozen=True)
@@ -86,25 +87,25 @@ class Memory:
     def pool(self) -> TrafficPool:
         """Rows of all rounds, the newest first. The tracks stay in their files."""
         newest, *older = (
-            TrafficPool.stored(each.traffic, each.traffic["eta"])
-            for each in reversed(self.rounds)
+            TrafficPool.stored(part.traffic, part.traffic["eta"])
+            for part in reversed(self.rounds)
         )
         return sum(older, newest)
 
     def index(self) -> list[dict[str, int]]:
         """The rounds in memory by number and checksum, the oldest first, for a
         checkpoint."""
-        return [{"round": one.number, "crc32": one.crc32} for one in self.rounds]
+        return [{"round": part.number, "crc32": part.crc32} for part in self.rounds]
 
     def restore(self, index: list[dict[str, int]]) -> None:
         """Map the rounds of an `index`; raises InputError for a missing, damaged or
         exchanged file."""
         self.rounds = [self._mapped(entry["round"]) for entry in index]
-        for entry, found in zip(index, self.rounds, strict=True):
-            if found.crc32 != entry["crc32"]:
-                path = self.path(found.number)
+        for entry, part in zip(index, self.rounds, strict=True):
+            if part.crc32 != entry["crc32"]:
                 raise InputError(
-                    f"{path}: damaged, or not of this run; restore it or begin a new run"
+                    f"{self.path(part.number)}: damaged, or not of this run; "
+                    "restore it or begin a new run"
                 )
 
     def prune(self, first: int) -> None:
@@ -117,12 +118,11 @@ class Memory:
         path = self.path(number)
         if not path.is_file():
             raise InputError(
-                f"{path}: this file of the run's memory is missing; restore it or begin a new run"
+                f"{path}: this file of the run's memory is missing; "
+                "restore it or begin a new run"
             )
         try:
-            traffic = load_file(
-                path
-            )  # maps the file: its pages are read when they are used
+            traffic = load_file(path)  # mapped: pages are read when they are used
             with safe_open(path, "pt") as file:
                 errored = json.loads((file.metadata() or {}).get(ERRORED, "[]"))
         except (SafetensorError, OSError, ValueError) as error:

@@ -17,7 +17,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from e2rl.learning.pretraining.imitation import recorded_demonstrations
-from e2rl.learning.rounds.episodes import OUTCOME_KEYS, Episodes, finished_episodes
+from e2rl.learning.rounds.episodes import Episodes, finished_episodes, outcomes
 from e2rl.learning.rounds.improvement import Improvement
 from e2rl.learning.rounds.scheduler import CurriculumScheduler
 from e2rl.learning.rounds.teaching import Teacher, TeachingSettings
@@ -172,7 +172,7 @@ class PolicyImprovement(Improvement):
             curriculum.priority(), curriculum.fraction
         )
         self._collector.reset()
-        outcomes = []
+        driven = []
         metrics = []
         seconds = 0.0
         frames = self.frames
@@ -187,7 +187,7 @@ class PolicyImprovement(Improvement):
             data = self.collected()
             seconds += time.perf_counter() - begin
             self.frames += steps_of(data)
-            outcomes.append(data.select(*OUTCOME_KEYS).cpu().clone())
+            driven.append(outcomes(data))
             watched = self._watch(data, pool.adversarial)
             labels = None if self.teacher is None else self.teacher.labelled
             row = self.learner.update(data, self.demonstrations, labels)
@@ -198,7 +198,7 @@ class PolicyImprovement(Improvement):
             )
         self.ego.network.set_weights(self.learning.network.weights())
         episodes = finished_episodes(
-            outcomes,
+            driven,
             pool.adversarial,
             horizon=self.horizon,
             hold=self.settings.hold,

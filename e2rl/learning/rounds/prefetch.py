@@ -23,7 +23,8 @@ class Prefetch:
     def __init__(self, work: Callable[[], None], name: str) -> None:
         """name: of the work, in messages."""
         context = multiprocessing.get_context("fork")
-        self._name, (self._receiver, sender) = name, context.Pipe(duplex=False)
+        self._name = name
+        self._receiver, sender = context.Pipe(duplex=False)
         for stream in filter(None, (sys.stdout, sys.stderr)):
             stream.flush()  # or the fork would write it once more
         self._worker = context.Process(

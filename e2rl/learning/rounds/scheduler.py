@@ -96,8 +96,8 @@ class CurriculumScheduler(Extension):
     A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and
     a YAML file in conf/curriculum with its `_target_` and settings. It overrides `etas`
     where the scenes of a round differ in intensity. Its constructor takes its own
-    settings by name and hands on the others, `def __init__(self, *run, stairs,
-    **scenes): super().__init__(*run, **scenes)`.
+    settings by name and hands on the others, `def __init__(self, num_scenes, rounds,
+    seed=0, *, stairs, **scenes): super().__init__(num_scenes, rounds, seed, **scenes)`.
 
     Args:
         rounds: of the whole run.
@@ -133,10 +133,16 @@ class CurriculumScheduler(Extension):
         return torch.full((len(scenes),), float(self.eta))
 
     def around(
-        self, count: int, spread: float, low: float = 0.0, high: float = float("inf")
+        self, count: int, spread: float, *, low: float = 0.0, high: float = math.inf
     ) -> Tensor:
-        """Intensities [count] drawn uniformly from [eta - spread, eta + spread], cut at
-        `low` and `high`."""
+        """Returns intensities [count] around `eta`, drawn uniformly.
+
+        Args:
+            count: how many.
+            spread: they are at most so far from `eta`.
+            low: the lowest.
+            high: the highest.
+        """
         first = max(self.eta - spread, low)
         last = min(self.eta + spread, high)
         return first + (last - first) * torch.rand(count, generator=self._generator)

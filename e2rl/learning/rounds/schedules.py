@@ -17,9 +17,16 @@ class ConstantCurriculum(CurriculumScheduler):
     conf/curriculum/constant.yaml."""
 
     def __init__(
-        self, *run: int, eta: float | Sequence[float], fraction: float, **scenes: Any
+        self,
+        num_scenes: int,
+        rounds: int,
+        seed: int = 0,
+        *,
+        eta: float | Sequence[float],
+        fraction: float,
+        **scenes: Any,
     ) -> None:
-        super().__init__(*run, **scenes)
+        super().__init__(num_scenes, rounds, seed, **scenes)
         check_range("curriculum.fraction", fraction, low=0, high=1)
         self._cycle = torch.tensor(
             [eta] if isinstance(eta, int | float) else list(eta), dtype=torch.float32
@@ -43,7 +50,10 @@ class LinearCurriculum(CurriculumScheduler):
 
     def __init__(
         self,
-        *run: int,
+        num_scenes: int,
+        rounds: int,
+        seed: int = 0,
+        *,
         eta: float,
         eta_final: float,
         spread: float,
@@ -52,7 +62,7 @@ class LinearCurriculum(CurriculumScheduler):
         ramp: float,
         **scenes: Any,
     ) -> None:
-        super().__init__(*run, **scenes)
+        super().__init__(num_scenes, rounds, seed, **scenes)
         check_range("curriculum.fraction", fraction, low=0, high=1)
         check_range("curriculum.fraction_final", fraction_final, low=0, high=1)
         check_range("curriculum.spread", spread, low=0)
@@ -62,9 +72,8 @@ class LinearCurriculum(CurriculumScheduler):
         self._spread = spread
 
     def _between(self, first: float, last: float) -> float:
-        return first + min(1.0, self.round / max(1.0, self._ramp * self.rounds)) * (
-            last - first
-        )
+        part = min(1.0, self.round / max(1.0, self._ramp * self.rounds))
+        return first + part * (last - first)
 
     @property
     def eta(self) -> float:  # type: ignore[override]
@@ -90,7 +99,10 @@ class AdaptiveCurriculum(CurriculumScheduler):
 
     def __init__(
         self,
-        *run: int,
+        num_scenes: int,
+        rounds: int,
+        seed: int = 0,
+        *,
         eta: float,
         eta_min: float,
         eta_max: float,
@@ -101,7 +113,7 @@ class AdaptiveCurriculum(CurriculumScheduler):
         fraction: float,
         **scenes: Any,
     ) -> None:
-        super().__init__(*run, **scenes)
+        super().__init__(num_scenes, rounds, seed, **scenes)
         check_range("curriculum.target_low", target_low, low=0, high=target_high)
         check_range("curriculum.target_high", target_high, low=target_low, high=1)
         check_range("curriculum.fraction", fraction, low=0, high=1)
@@ -115,14 +127,15 @@ class AdaptiveCurriculum(CurriculumScheduler):
 
     def etas(self, scenes: Tensor) -> Tensor:
         """Drawn around the current intensity, within its bounds."""
-        return self.around(len(scenes), self._spread, *self._bounds)
+        lowest, highest = self._bounds
+        return self.around(len(scenes), self._spread, low=lowest, high=highest)
 
     def advance(self, collision_rate: float | None = None) -> None:
         """Advance to the next round; without a collision rate the intensity stays."""
         super().advance(collision_rate)
         if collision_rate is not None:
             low, high = self._band
-            moved = self.eta + self._step * (
-                (collision_rate < low) - (collision_rate > high)
-            )
-            self.eta = min(max(moved, self._bounds[0]), self._bounds[1])
+            direction = (collision_rate < low) - (collision_rate > high)
+            lowest, highest = self._bounds
+            moved = self.eta + self._step * direction
+            self.eta = min(max(moved, lowest), highest)

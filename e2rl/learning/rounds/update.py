@@ -13,7 +13,8 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from e2rl.learning.pretraining.cloning import (
-    NOISE,
+    INPUT_NOISE,
+    LAST_ACTION_NOISE,
     cloning_loss,
     mirrored_labels,
     sampled,
@@ -153,8 +154,8 @@ class Learner:
     def _learning_rate(self) -> float:
         """Of this update: it falls linearly to final_lr of it."""
         settings = self.settings
-        done = 0.0 if self.total is None else min(self.updates / self.total, 1.0)
-        return settings.learning_rate * (1 - (1 - settings.final_lr) * done)
+        part = 0.0 if self.total is None else min(self.updates / self.total, 1.0)
+        return settings.learning_rate * (1 - (1 - settings.final_lr) * part)
 
     @torch.no_grad()
     def _with_advantages(self, data: TensorDictBase, least: float) -> TensorDict:
@@ -195,9 +196,8 @@ class Learner:
         """
         after = data["next"]
         value = self._value(seen)
-        done = after["done"]
         terminated = after["terminated"]
-        cut = done & ~terminated
+        cut = after["done"] & ~terminated
         cut[:, -1] = True
         following = torch.cat([value[:, 1:], value[:, -1:]], 1)
         last = self.network.normaliser(after["observation"][cut[..., 0]])
@@ -208,7 +208,7 @@ class Learner:
             state_value=value,
             next_state_value=following,
             reward=after["reward"],
-            done=done,
+            done=after["done"],
             terminated=terminated,
         )
 
@@ -240,7 +240,7 @@ class Learner:
             total = total + settings.action_penalty * penalty
         if demonstrations is not None:
             shown = sampled(demonstrations, CLONED).to(self.network.device)
-            with network.noisy(*NOISE):
+            with network.noisy(INPUT_NOISE, LAST_ACTION_NOISE):
                 loss = cloning_loss(self.network.actor, shown)
             losses["loss_cloning"] = loss
             total = total + settings.cloning * loss

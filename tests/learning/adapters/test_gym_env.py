@@ -63,7 +63,8 @@ def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
     td, (seen, info) = env.reset(), batch.reset(seed=5)
     ended = 0
     for step in range(90):
-        assert (seen == td["observation"].numpy()).all() and seen.dtype == np.float32
+        assert (seen == td["observation"].numpy()).all()
+        assert seen.dtype == np.float32
         assert [given["scenes"].index(scene) for scene in info["scene"]] == td[
             "scene_index"
         ][:, 0].tolist()
@@ -106,12 +107,11 @@ def test_a_scene_drives_alone_as_in_a_batch(given):
         action = actions(1, step)[0]
         alone, reward, terminated, truncated, info = one.step(action)
         both, rewards, *_, infos = batch.step(np.stack([action, action]))
-        assert reward == pytest.approx(rewards[0], abs=1e-5) and info["scene"] == name
+        assert reward == pytest.approx(rewards[0], abs=1e-5)
+        assert info["scene"] == name
         if terminated or truncated:
-            assert (
-                np.allclose(alone, infos["final_obs"][0], atol=1e-5)
-                and alone[ELAPSED] > 0
-            )
+            assert np.allclose(alone, infos["final_obs"][0], atol=1e-5)
+            assert alone[ELAPSED] > 0
             assert terminated == (info["contact"] or info["off_road"])
             return
     pytest.fail("no end")
@@ -127,7 +127,8 @@ def test_a_seed_decides_the_episodes_in_attacked_traffic(given):
         ].tolist()
 
     (ours, scenes), (again, same), (_, others) = driven(1), driven(1), driven(3)
-    assert all(map(np.array_equal, ours, again)) and scenes == same != others
+    assert all(map(np.array_equal, ours, again))
+    assert scenes == same != others
 
 
 def test_environments_without_a_seed_drive_in_other_scenes(bundled):
@@ -187,10 +188,10 @@ def test_in_the_next_step_an_episode_begins_whatever_is_done(given):
     episodes = 0
     for step in range(100):
         observation, reward, terminated, truncated, info = env.step(actions(4, step))
-        assert (observation[begins, ELAPSED] == 0).all() and (
-            observation[~begins, ELAPSED] > 0
-        ).all()
-        assert not (terminated | truncated)[begins].any() and not reward[begins].any()
+        assert (observation[begins, ELAPSED] == 0).all()
+        assert (observation[~begins, ELAPSED] > 0).all()
+        assert not (terminated | truncated)[begins].any()
+        assert not reward[begins].any()
         assert "final_obs" not in info
         begins = terminated | truncated
         assert not info["off_road"][~begins].any()
@@ -205,7 +206,8 @@ def test_gymnasium_normalises_the_observations_of_a_batch(given):
     env.reset(seed=0)
     for step in range(40):
         observation = env.step(actions(3, step))[0]
-    assert np.abs(observation).max() < 20 and env.obs_rms.count > 100
+    assert np.abs(observation).max() < 20
+    assert env.obs_rms.count > 100
     with pytest.raises(InputError, match="autoreset=never"):
         e2rl.make_gym_env(3, autoreset="never", **given)
 
@@ -243,10 +245,8 @@ def test_what_cannot_be_is_named(given, monkeypatch):
     with pytest.raises(InputError, match="scene=nowhere"):
         env.reset(options={"scene": "nowhere"})
     before = env.reset(seed=1)[1]["scene"]
-    assert (
-        len({env.reset(seed=seed)[1]["scene"] for seed in range(8)}) > 1
-        and env.reset(seed=1)[1]["scene"] == before
-    )
+    assert len({env.reset(seed=seed)[1]["scene"] for seed in range(8)}) > 1
+    assert env.reset(seed=1)[1]["scene"] == before
     with pytest.raises(InputError, match="num_envs=0"):
         e2rl.make_gym_env(0, **given)
     with pytest.raises(InputError, match="max_speed"):

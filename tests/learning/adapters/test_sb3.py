@@ -49,7 +49,13 @@ def trained(env, kind):
             "MlpPolicy", env, n_steps=8, batch_size=16, device="cpu", seed=0
         ).learn(64)
     if kind == "sac":
-        return SAC("MlpPolicy", env, learning_starts=8, device="cpu", seed=0).learn(40)
+        return SAC(
+            "MlpPolicy",
+            env,
+            learning_starts=8,
+            device="cpu",
+            seed=0,
+        ).learn(40)
     return PPO(
         "MlpPolicy", VecNormalize(env), n_steps=8, batch_size=16, device="cpu", seed=0
     ).learn(64)
@@ -74,13 +80,12 @@ def test_it_is_the_batch_of_gymnasium(given):
         action[1] = -1.0, 0.0  # stands
         seen, reward, done, infos = env.step(action)
         other, rewards, terminated, truncated, info = batch.step(action)
-        assert (reward == rewards).all() and (done == (terminated | truncated)).all()
+        assert (reward == rewards).all()
+        assert (done == (terminated | truncated)).all()
         for row in range(3):
             told = info["final_info"] if done[row] else info
-            assert (
-                infos[row]["scene"] == told["scene"][row]
-                and infos[row]["contact"] == told["contact"][row]
-            )
+            assert infos[row]["scene"] == told["scene"][row]
+            assert infos[row]["contact"] == told["contact"][row]
             assert ("terminal_observation" in infos[row]) == done[row]
             if done[row]:
                 assert (
@@ -116,10 +121,8 @@ def test_a_saved_policy_does_what_the_model_predicts(given, tmp_path, kind, suff
     wanted = in_units(
         predicted, torch.tensor([-8.0, -1.6]), high=torch.tensor([5.0, 1.6])
     )
-    assert (
-        torch.allclose(ego.decide(torch.tensor(observation)), wanted, atol=1e-4)
-        and wanted.std(0).min() > 5e-3
-    )
+    assert torch.allclose(ego.decide(torch.tensor(observation)), wanted, atol=1e-4)
+    assert wanted.std(0).min() > 5e-3
 
 
 def test_a_saved_model_says_its_bounds_itself(given, tmp_path):
@@ -184,9 +187,14 @@ def test_a_saved_model_takes_its_normalisation_along(given, tmp_path):
 
 def test_statistics_of_several_normalisers_are_applied_in_turn(given, tmp_path):
     env = VecNormalize(VecNormalize(e2rl.make_sb3_env(4, **given), clip_obs=2.0))
-    model = PPO("MlpPolicy", env, n_steps=8, batch_size=16, device="cpu", seed=0).learn(
-        64
-    )
+    model = PPO(
+        "MlpPolicy",
+        env,
+        n_steps=8,
+        batch_size=16,
+        device="cpu",
+        seed=0,
+    ).learn(64)
     ego = e2rl.make_ego(
         "policy_file", file=str(e2rl.save_policy(model, tmp_path / "policy.onnx"))
     )

@@ -89,15 +89,15 @@ def test_goals_are_where_the_recording_is_5_s_later():
     torch.testing.assert_close(
         exact["distance"], torch.full((27,), 50.0), atol=1e-2, rtol=0
     )
-    assert (
-        exact["offset"].abs().max() < 1e-3 and disturbed["offset"].abs().max() < 1e-3
-    ), "each on its own route"
+    assert exact["offset"].abs().max() < 1e-3
+    assert disturbed["offset"].abs().max() < 1e-3, "each on its own route"
     assert set((exact["start"][:, 1] / LANE_WIDTH).round().tolist()) == {0, 1}
     moved = (
         disturbed["start"][:, 1]
         - LANE_WIDTH * (disturbed["start"][:, 1] / LANE_WIDTH).round()
     )
-    assert 0.2 < moved.std() < 1.0 and 0.3 < disturbed["start"][:, 3].std() < 2.0
+    assert 0.2 < moved.std() < 1.0
+    assert 0.3 < disturbed["start"][:, 3].std() < 2.0
 
 
 def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
@@ -111,10 +111,8 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
     for _ in range(40):
         run.turn()
     after = run.measure(data)
-    assert (
-        after["trajectory"] < 0.4 < before["trajectory"] / 5
-        and after["goal"] < before["goal"] - 3
-    )
+    assert after["trajectory"] < 0.4 < before["trajectory"] / 5
+    assert after["goal"] < before["goal"] - 3
     start = data[(data["start"][:, 3] == 10) & (data["distance"] < 20)][:1]
     path = RoutePath(start["start"], start["route"])
     code = network.encode(start["observation"])
@@ -126,7 +124,8 @@ def test_training_lowers_the_losses_and_the_plan_halts_as_recorded(monkeypatch):
         side=start["offset"][:, None],
     )
     driven = drive_controls(controls, start["start"], path=path)
-    assert driven.states[0, 0, -1, 3] < 1.0 and abs(driven.distance.item() - 10.0) < 1.5
+    assert driven.states[0, 0, -1, 3] < 1.0
+    assert abs(driven.distance.item() - 10.0) < 1.5
 
 
 def test_a_loss_of_zero_is_the_recording():
@@ -134,7 +133,8 @@ def test_a_loss_of_zero_is_the_recording():
     its plan is the recording."""
     data = windows(small_scenes(2, steps=60), 0, disturbed=(0.0, 0.0, 0.0))
     found = losses(BitsNetwork(16).eval(), data)
-    assert found["trajectory"] < 1e-3 and found["goal"] > 5
+    assert found["trajectory"] < 1e-3
+    assert found["goal"] > 5
 
 
 def small_stage(monkeypatch, folder, scenes=None):

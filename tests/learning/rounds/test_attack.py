@@ -27,7 +27,13 @@ def even_scenes(traffic):
 @pytest.mark.parametrize("batch", [1, 2, 5])
 def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
     attack = brake_check(small_scenes(5))
-    order = Order(0, SCENES, eta=ETA, seed=7, ego=None)
+    order = Order(
+        0,
+        SCENES,
+        eta=ETA,
+        seed=7,
+        ego=None,
+    )
     traffic, _ = make_traffic(
         order, attack, solvable=even_scenes, nominal=nominal, batch=batch
     )
@@ -38,7 +44,12 @@ def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
     assert traffic["eta"].tolist() == [2.0, 0.0, 1.5] + [0.0] * (len(scenes) - 3)
     assert traffic["attacked"] == 4 / 5, "of all that were attacked"
     assert traffic["contact"] == 3 / 5
-    whole, _ = make_traffic(order, attack, solvable=even_scenes, nominal=nominal)
+    whole, _ = make_traffic(
+        order,
+        attack,
+        solvable=even_scenes,
+        nominal=nominal,
+    )
     assert set(traffic) == set(whole)
     assert all(torch.equal(traffic[name], whole[name]) for name in whole)
 
@@ -63,16 +74,26 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
         ego=IDMEgo(),
     )
     made, errored = make_traffic(
-        order, synthesize_traffic(scenes, Stumbles(), sim=SimSettings(), batch=3)
+        order,
+        synthesize_traffic(
+            scenes,
+            Stumbles(),
+            sim=SimSettings(),
+            batch=3,
+        ),
     )
     whole, none = make_traffic(
-        order, synthesize_traffic(scenes, Ambush(), sim=SimSettings(), batch=3)
+        order,
+        synthesize_traffic(
+            scenes,
+            Ambush(),
+            sim=SimSettings(),
+            batch=3,
+        ),
     )
-    assert (
-        made["entered"].tolist() == [True, True, False, True]
-        and whole["entered"].all()
-        and not none
-    )
+    assert made["entered"].tolist() == [True, True, False, True]
+    assert whole["entered"].all()
+    assert not none
     (entry,) = errored
     assert (entry["round"], entry["during"], entry["scene"], entry["eta"]) == (
         2,
@@ -80,16 +101,17 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
         2,
         2.0,
     )
-    assert (
-        entry["reason"] == "raised ZeroDivisionError"
-        and "no way out" in entry["traceback"]
-    )
-    assert (
-        made["scene_index"].tolist() == [0, 1, 3, 0, 1, 2, 3]
-        and made["eta"].tolist() == [2.0] * 3 + [0.0] * 4
-    )
+    assert entry["reason"] == "raised ZeroDivisionError"
+    assert "no way out" in entry["traceback"]
+    assert made["scene_index"].tolist() == [0, 1, 3, 0, 1, 2, 3]
+    assert made["eta"].tolist() == [2.0] * 3 + [0.0] * 4
     rest = torch.tensor([0, 1, 3, 4, 5, 6, 7])
-    torch.testing.assert_close(made["states"], whole["states"][rest], rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        made["states"],
+        whole["states"][rest],
+        rtol=0,
+        atol=1e-4,
+    )
     assert made["contact"] == 1.0, "the share of those that were made"
 
 
@@ -118,7 +140,8 @@ def test_the_doomed_are_left_out_and_reported():
     run.settings = type(run.settings)(scenes=4, nominal="log")
     metrics = train_round(run)
     kept = run.memory.rounds[-1].traffic["scene_index"]
-    assert sorted(kept.tolist()) == [0, 2] and metrics["synthesizer/left_out"] == 2.0
+    assert sorted(kept.tolist()) == [0, 2]
+    assert metrics["synthesizer/left_out"] == 2.0
     assert metrics["synthesizer/contact"] == 1.0, "the intensity follows all of them"
     assert set(run.episodes.scene_index[run.episodes.adversarial].tolist()) <= {0, 2}
 

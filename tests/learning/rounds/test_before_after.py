@@ -14,12 +14,22 @@ from tests.learning.small import Ambush, small_scenes
 
 def test_both_stages_are_kept_and_the_second_is_compared_with_the_first(tmp_path):
     torch.manual_seed(0)
-    setup = Setup(small_scenes(3), IDMEgo(), ego_name="idm", sim=SimSettings())
+    setup = Setup(
+        small_scenes(3),
+        IDMEgo(),
+        ego_name="idm",
+        sim=SimSettings(),
+    )
     methods = [
         Method("nominal", ConstantVelocity()),
         Method("ambush", Ambush(), eta=2.0),
     ]
-    measure = BeforeAfter(setup, methods, seeds=[0], folder=tmp_path)
+    measure = BeforeAfter(
+        setup,
+        methods,
+        seeds=[0],
+        folder=tmp_path,
+    )
     slow = IDMEgo(desired_speed=3.0, use_limits=False)
     fast = IDMEgo(desired_speed=12.0, use_limits=False)
     measure("before", slow, 0)
@@ -49,4 +59,6 @@ def test_both_stages_are_kept_and_the_second_is_compared_with_the_first(tmp_path
             ]
             for paired in (unchanged, changed)
         ]
-        assert differences[0] and not any(differences[0]) and any(differences[1])
+        assert differences[0]
+        assert not any(differences[0])
+        assert any(differences[1])

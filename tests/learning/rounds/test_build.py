@@ -98,7 +98,8 @@ def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
             "prioritised": False,
         }
     run = built(config, tmp_path)
-    assert isinstance(run.curriculum, Doubling) and not run.curriculum.prioritised
+    assert isinstance(run.curriculum, Doubling)
+    assert not run.curriculum.prioritised
     assert train_round(run)["curriculum/eta"] == 0.25
     save_checkpoint(tmp_path, run)
     again = built(config, tmp_path)
@@ -126,10 +127,8 @@ def test_the_time_left_is_told_once_each_kind_of_phase_was_measured(monkeypatch)
         left.append(progress.left())
         with progress.phase(kind):
             now[0] += seconds
-    assert (
-        left == ["", "", "about 11 min left", "about 10 min left"]
-        and progress.left() == ""
-    )
+    assert left == ["", "", "about 11 min left", "about 10 min left"]
+    assert progress.left() == ""
 
 
 def test_a_run_that_goes_on_has_measured_nothing_yet():

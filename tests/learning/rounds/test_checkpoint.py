@@ -32,7 +32,12 @@ def test_resumed_rounds_are_those_of_one_run(tmp_path, kind):
     whole = small_run(seed=3, folder=tmp_path / "whole", **settings)
     expected = rounds(whole, 4)
     folder, shorter = tmp_path / "run", 2  # a run of two rounds, to which two are added
-    first = small_run(seed=3, folder=folder, rounds=shorter, **settings)
+    first = small_run(
+        seed=3,
+        folder=folder,
+        rounds=shorter,
+        **settings,
+    )
     begun = rounds(first, 2)
     save_checkpoint(folder, first)
     second = small_run(seed=99, folder=folder, **settings)

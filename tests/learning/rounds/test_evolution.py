@@ -26,15 +26,16 @@ def test_a_round_improves_moves_on_and_reports():
     assert etas == [[1.0] * 3, [0.0] * 3], (
         "the attack, then the same scenes by the prior alone"
     )
-    assert asked[0][0] is run.ego and asked[0][2] == asked[1][2]
+    assert asked[0][0] is run.ego
+    assert asked[0][2] == asked[1][2]
     assert any(
         not torch.equal(value, before[key])
         for key, value in run.ego.network.weights().items()
     )
-    assert run.round == 1 and all(name.split("/")[0] in GROUPS for name in metrics)
-    assert metrics["curriculum/eta"] == 1.0 and run.curriculum.eta == 1.25, (
-        "no contact at eta 1: it rises"
-    )
+    assert run.round == 1
+    assert all(name.split("/")[0] in GROUPS for name in metrics)
+    assert metrics["curriculum/eta"] == 1.0
+    assert run.curriculum.eta == 1.25, "no contact at eta 1: it rises"
     assert all(isinstance(value, float) for value in metrics.values())
     train_round(run)
     assert asked[2][2] != asked[0][2], "another round, another seed"

@@ -29,9 +29,8 @@ def filled(folder, bound, rounds=5):
 )
 def test_the_oldest_rounds_leave_and_the_newest_stays(tmp_path, bound, left):
     memory = filled(tmp_path, bound)
-    assert [one.number for one in memory.rounds] == left and memory.rows == 4 * len(
-        left
-    )
+    assert [one.number for one in memory.rounds] == left
+    assert memory.rows == 4 * len(left)
     assert len(list(memory.folder.iterdir())) == 5, "a checkpoint may still name them"
     memory.prune(left[0])
     assert sorted(memory.folder.iterdir()) == [memory.path(number) for number in left]

@@ -27,7 +27,13 @@ def test_the_traffic_is_that_of_the_same_order_here():
     meanwhile."""
     scenes = small_scenes()
     run = real(
-        small_run(scenes=scenes, nominal="prior", spread=0.5, prefetch=True), scenes
+        small_run(
+            scenes=scenes,
+            nominal="prior",
+            spread=0.5,
+            prefetch=True,
+        ),
+        scenes,
     )
     train_round(run)
     order = run._next
@@ -37,14 +43,11 @@ def test_the_traffic_is_that_of_the_same_order_here():
     expected, _ = make_traffic(order, run.synthesize)
     metrics = train_round(run)
     found = run.memory.rounds[-1].traffic
-    assert (
-        set(found) == set(expected)
-        and order.number == run.memory.rounds[-1].number == 1
-    )
+    assert set(found) == set(expected)
+    assert order.number == run.memory.rounds[-1].number == 1
     assert all(torch.equal(found[name], expected[name]) for name in expected)
-    assert metrics["time/waiting"] >= 0 and metrics["synthesizer/eta"] == pytest.approx(
-        order.eta.mean().item()
-    )
+    assert metrics["time/waiting"] >= 0
+    assert metrics["synthesizer/eta"] == pytest.approx(order.eta.mean().item())
     assert all(
         torch.equal(value, order.ego.network.weights()[name])
         for name, value in kept.items()

@@ -48,7 +48,12 @@ def failing(curriculum, *rates):
 def test_regret_is_the_variance_of_recent_failures_in_adversarial_traffic(monkeypatch):
     monkeypatch.setattr(scheduler, "SMOOTHING", 0.25)
     curriculum = curriculum_of()
-    episodes(curriculum, [0, 1, 1], failed=[True, False, True], adversarial=False)
+    episodes(
+        curriculum,
+        [0, 1, 1],
+        failed=[True, False, True],
+        adversarial=False,
+    )
     assert curriculum.regret().isnan().all(), (
         "nothing is known of adversarial traffic yet"
     )
@@ -107,7 +112,12 @@ def test_regret_is_what_a_teacher_would_have_survived_where_one_tells():
         survivable=[0.25, 0.75, math.nan, 1.0],
     )
     assert curriculum.regret()[:3].nan_to_num(-1).tolist() == [0.5 * 0.5, 0.0, -1.0]
-    episodes(curriculum, [1], failed=[True], survivable=0.75)
+    episodes(
+        curriculum,
+        [1],
+        failed=[True],
+        survivable=0.75,
+    )
     assert curriculum.regret()[1] == 0.75
 
 
@@ -138,11 +148,9 @@ def test_state_goes_on_exactly():
     second.load_state_dict(first.state_dict())
     for curriculum in (first, second):
         curriculum.advance(0.9)
-    assert (
-        torch.equal(first.draw(4), second.draw(4))
-        and first.eta == second.eta
-        and first.round == second.round
-    )
+    assert torch.equal(first.draw(4), second.draw(4))
+    assert first.eta == second.eta
+    assert first.round == second.round
     assert torch.equal(first.etas(torch.arange(4)), second.etas(torch.arange(4)))
     assert torch.equal(first.priority(), second.priority())
     with pytest.raises(InputError, match="holds 6 scenes, the data 5"):

@@ -34,7 +34,12 @@ def test_adaptive_intensity_seeks_the_band_within_its_bounds():
         "target_low": 0.2,
         "target_high": 0.4,
     }
-    curriculum = AdaptiveCurriculum(6, 10, eta=1.0, **band)
+    curriculum = AdaptiveCurriculum(
+        6,
+        10,
+        eta=1.0,
+        **band,
+    )
     seen = []
     for rate in (0.0, 0.2, 0.4, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9, 0.9):
         curriculum.advance(rate)
@@ -43,9 +48,8 @@ def test_adaptive_intensity_seeks_the_band_within_its_bounds():
         "the band's ends belong to it"
     )
     curriculum.advance()
-    assert curriculum.eta == 0.5 and curriculum.round == 11, (
-        "no collision rate is known: it stays"
-    )
+    assert curriculum.eta == 0.5
+    assert curriculum.round == 11, "no collision rate is known: it stays"
 
 
 @pytest.mark.parametrize(
@@ -63,24 +67,38 @@ def test_scenes_have_intensities_uniform_around_the_round_s_cut_at_the_bounds(
     etas = AdaptiveCurriculum(
         6, 10, eta=eta, spread=spread, eta_min=0.25, eta_max=5.0
     ).etas(SCENES)
-    assert etas.min() >= low and etas.max() <= high
+    assert etas.min() >= low
+    assert etas.max() <= high
     assert etas.mean().item() == pytest.approx((low + high) / 2, abs=0.05)
     assert etas.std().item() == pytest.approx((high - low) / 12**0.5, abs=0.05)
 
 
 def test_a_linear_intensity_is_never_below_zero():
-    etas = LinearCurriculum(6, 10, eta=0.5, eta_final=2.0, spread=1.0).etas(SCENES)
-    assert 0 <= etas.min() < 0.05 and 1.4 < etas.max() <= 1.5
+    etas = LinearCurriculum(
+        6,
+        10,
+        eta=0.5,
+        eta_final=2.0,
+        spread=1.0,
+    ).etas(SCENES)
+    assert 0 <= etas.min() < 0.05
+    assert 1.4 < etas.max() <= 1.5
 
 
 def test_constant_intensities_take_turns():
-    curriculum = ConstantCurriculum(6, 10, eta=[1.0, 2.0, 3.0], fraction=0.3)
+    curriculum = ConstantCurriculum(
+        6,
+        10,
+        eta=[1.0, 2.0, 3.0],
+        fraction=0.3,
+    )
     seen = []
     for _ in range(3):
         seen.append(curriculum.etas(torch.arange(4)).tolist())
         curriculum.advance(0.0)
     assert seen == [[1.0, 2.0, 3.0, 1.0], [2.0, 3.0, 1.0, 2.0], [3.0, 1.0, 2.0, 3.0]]
-    assert curriculum.eta == 2.0 and curriculum.fraction == 0.3
+    assert curriculum.eta == 2.0
+    assert curriculum.fraction == 0.3
 
 
 @pytest.mark.parametrize(

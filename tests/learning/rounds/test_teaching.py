@@ -92,7 +92,12 @@ def attacked(scenes, eta=1.0):
 def collected(scenes, pool, hold=2, **given):
     """A batch of `small_run`'s policy in the pool, and its learner."""
     expert = {"teacher": SamplingEgo(), "teaching": {**ANY, **given}}
-    run = small_run(scenes=scenes, expert=expert, teaching=0.1, collect={"hold": hold})
+    run = small_run(
+        scenes=scenes,
+        expert=expert,
+        teaching=0.1,
+        collect={"hold": hold},
+    )
     run.improve.synthesizer.pool = pool
     run.improve.draw.probability = pool.probabilities(torch.ones(len(scenes)), 1.0)
     run.improve._collector.reset()
@@ -106,7 +111,13 @@ def test_a_label_is_what_the_planner_would_do_in_the_same_state():
     pool = attacked(scenes)
     data, improve = collected(scenes, pool)
     index = data["scene_index"][:, 0, 0]
-    env = DrivingEnv(scenes, SimSettings(), len(index), agents=True, hold=2)
+    env = DrivingEnv(
+        scenes,
+        SimSettings(),
+        len(index),
+        agents=True,
+        hold=2,
+    )
     planner = SamplingEgo()
     states, valid = pool.tracks(data["traffic", "row"][:, 0, 0])
     env.set_traffic(torch.arange(len(index)), states, valid)
@@ -119,7 +130,12 @@ def test_a_label_is_what_the_planner_would_do_in_the_same_state():
         for name in ("states", "valid", "accel", "turn_rate"):
             assert torch.equal(frames["agents", name], getattr(world, name)), name
         labels, _ = improve.teacher.labels(frames, improve.ego)
-        actions, costs = ranked_actions(planner, world, count=48, hold=2)
+        actions, costs = ranked_actions(
+            planner,
+            world,
+            count=48,
+            hold=2,
+        )
         assert torch.equal(labels["action"], clip_expert(actions, low, high=high))
         assert torch.equal(labels["weight"], torch.softmax(-costs / 5.0, -1))
         assert torch.equal(labels["observation"], frames["observation"])
@@ -172,7 +188,8 @@ def test_a_row_is_survivable_where_the_teacher_gets_away_and_the_policy_does_not
     hopeless["agents", "states"][:, 1, :2] = hopeless["agents", "states"][
         :, 0, :2
     ] + torch.tensor([3.0, 0.0])
-    assert away.all() and not teacher.labels(hopeless, Blind())[1].any()
+    assert away.all()
+    assert not teacher.labels(hopeless, Blind())[1].any()
 
 
 def test_nominal_episodes_are_not_labelled_and_the_newest_labels_stay():
@@ -192,10 +209,8 @@ def test_nominal_episodes_are_not_labelled_and_the_newest_labels_stay():
     }
     first = teacher.labelled["observation"].clone()
     teacher.watch(data, pool.adversarial, ego, 20)
-    assert (
-        torch.equal(teacher.labelled["observation"][:10], first[10:])
-        and len(teacher.labelled) == 30
-    )
+    assert torch.equal(teacher.labelled["observation"][:10], first[10:])
+    assert len(teacher.labelled) == 30
     of_one = (data["scene_index"] == 1).sum().item()
     assert (
         teacher.watch(data, torch.tensor([False, True, False]), ego, 5)["critical"]

@@ -96,7 +96,8 @@ def test_ppo_learns_to_drive_from_standing():
         learner.update(data)
         progress.append(data["next", "metrics", "progress"][:, -1].mean().item())
     collector.shutdown()
-    assert progress[0] < 10.0 and sum(progress[-3:]) / 3 > progress[0] + 4.0
+    assert progress[0] < 10.0
+    assert sum(progress[-3:]) / 3 > progress[0] + 4.0
     assert not data["next", "metrics", "contact"].any()
 
 
@@ -118,7 +119,8 @@ def test_a_teacher_of_the_left_teaches_the_right_too():
     for _ in range(8):
         learner.update(batch_of(ego), labels=labels)
     left, right = (now - then for now, then in zip(turns(), before, strict=True))
-    assert left > 0.05 and right < -0.05
+    assert left > 0.05
+    assert right < -0.05
 
 
 def test_the_action_penalty_makes_meant_accelerations_smaller():
@@ -168,7 +170,8 @@ def test_the_first_updates_fit_the_critic_alone():
         for key, value in ego.network.weights().items()
         if not torch.equal(value, before[key])
     }
-    assert changed and all(key.startswith(("critic", "normaliser")) for key in changed)
+    assert changed
+    assert all(key.startswith(("critic", "normaliser")) for key in changed)
     learner.update(data, demonstrations_of(data, [1.0, 0.0]))
     assert not torch.equal(
         ego.network.weights()["network.trunk.last.weight"],
@@ -186,7 +189,8 @@ def test_passes_stop_at_the_target_kl():
     }
     _, learner, data = begun(std=0.05, **options)
     row = learner.update(data)
-    assert row["stopped_by_kl"] == 1.0 and row["steps"] < 40
+    assert row["stopped_by_kl"] == 1.0
+    assert row["steps"] < 40
 
 
 def test_advantages_are_those_of_torchrl():
@@ -196,7 +200,8 @@ def test_advantages_are_those_of_torchrl():
     ego = ActorEgo(hidden=(16,), room=None, initial_std=(0.9, 0.9))
     learner = Learner(ego.network, settings_of(gamma=0.9, lmbda=0.8))
     data = batch_of(ego, 16, steps=50)
-    assert data["next", "terminated"].any() and data["next", "truncated"].any()
+    assert data["next", "terminated"].any()
+    assert data["next", "truncated"].any()
     learner.returns.update(5 * torch.randn(100, 1) + 3)
     learner.network.normaliser.observe(data["observation"])
     values = TensorDictModule(
@@ -204,12 +209,20 @@ def test_advantages_are_those_of_torchrl():
         ["observation"],
         ["state_value"],
     )
-    expected = GAE(gamma=0.9, lmbda=0.8, value_network=values, deactivate_vmap=True)(
-        data.clone()
-    )
+    expected = GAE(
+        gamma=0.9,
+        lmbda=0.8,
+        value_network=values,
+        deactivate_vmap=True,
+    )(data.clone())
     found = learner.advantages(data, ego.network.prepared(data["observation"])["seen"])
     for name, value in zip(("advantage", "value_target"), found, strict=True):
-        torch.testing.assert_close(value, expected[name], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            value,
+            expected[name],
+            rtol=1e-4,
+            atol=1e-4,
+        )
 
 
 def test_the_critic_learns_values_of_any_size():
@@ -252,10 +265,8 @@ def test_frames_with_little_to_learn_are_left_out():
         .mean()
         .item()
     )
-    assert (
-        learner.update(data)["frames_used"] == pytest.approx(expected)
-        and 0 < expected < 1
-    )
+    assert learner.update(data)["frames_used"] == pytest.approx(expected)
+    assert 0 < expected < 1
     every = Learner(
         ego.network, settings_of(advantage_filter=0.0, critic_warmup=0, epochs=1)
     )
@@ -310,8 +321,6 @@ def test_what_is_shown_counts_by_its_weight(name):
         ), missed
 
     (none, far), (little, _), (much, near) = after(0.0), after(1e-9), after(1.0)
-    assert (
-        torch.allclose(none, little, atol=2e-5)
-        and not torch.allclose(none, much, atol=2e-5)
-        and near < far
-    )
+    assert torch.allclose(none, little, atol=2e-5)
+    assert not torch.allclose(none, much, atol=2e-5)
+    assert near < far

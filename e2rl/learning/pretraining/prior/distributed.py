@@ -71,9 +71,9 @@ class Processes:
     def leader_first(self, work: Callable[[], Value]) -> Value:
         """`work()` in every process, first in the leader, whose cached files the others
         then read."""
-        own: list[Value] = []
-        self.from_leader(lambda: own.append(work()))
-        return own[0] if self.leader else work()
+        results: list[Value] = []
+        self.from_leader(lambda: results.append(work()))
+        return results[0] if self.leader else work()
 
 
 ALONE = Processes()
@@ -97,7 +97,8 @@ def process_group(device: str) -> Iterator[tuple[Processes, str]]:
         gpus = torch.cuda.device_count()
         if count > gpus:
             raise InputError(
-                f"torchrun --nproc_per_node={count}: this machine has {gpus} GPUs; start at most {gpus}"
+                f"torchrun --nproc_per_node={count}: this machine has {gpus} GPUs; "
+                f"start at most {gpus}"
             )
         device = f"cuda:{local}"
         torch.cuda.set_device(local)

@@ -24,7 +24,8 @@ from e2rl.prior.prior import EGO_LEVEL, Prior
 
 LEVELS = 4  # noise levels a window
 TRAJECTORY = 0.15  # weight of the trajectory term beside the denoising loss
-MIRROR, DROP = 0.5, 0.1  # fractions of mirrored windows and of hidden other vehicles
+MIRROR = 0.5  # fraction of mirrored windows
+DROP = 0.1  # fraction of other vehicles that are hidden
 ACCEL_NOISE = 0.35  # m/s^2 on the current acceleration, in half of the windows
 FEATURE_NOISE = 0.1  # on the features, in units of their standard deviations
 MIN_STD = 0.02  # smallest standard deviation that a feature is divided by
@@ -39,7 +40,9 @@ SIDED = {
 def augment(batch: TensorDictBase, generator: torch.Generator) -> TensorDictBase:
     """Windows [W] mirrored, with noise on the accelerations and some of the other
     vehicles hidden."""
-    batch, size, device = batch.clone(), batch.shape[0], batch["x0"].device
+    batch = batch.clone()
+    size = batch.shape[0]
+    device = batch["x0"].device
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(shape, generator=generator, device=device)
@@ -169,18 +172,22 @@ def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
 
 @torch.no_grad()
 def held_out_loss(
-    prior: Prior, windows: TensorDictBase, batch: int, batches: int = 20
+    prior: Prior, windows: TensorDictBase, *, batch: int, batches: int = 20
 ) -> float:
-    """Denoising loss on at most `batches` batches of windows, with a fixed seed and
-    without augmentation."""
+    """Returns the denoising loss, with a fixed seed and without augmentation.
+
+    Args:
+        prior: that is measured.
+        windows: [W].
+        batch: windows at once.
+        batches: of which so many are taken at most.
+    """
     device = next(prior.parameters()).device
     generator = torch.Generator(device).manual_seed(1)
     measure = DenoisingLoss(prior.denoiser, feature_noise=0.0)
     losses = []
-    for part in windows[: batches * batch].split(batch):
-        part = part.to(device)
+    for part in windows[: batches * batch].to(device).split(batch):
         drawn = draw(part, generator)
-        losses.append(
-            measure(part, drawn, loss_weight(part, drawn).sum().clamp(min=1))[0].item()
-        )
+        total = loss_weight(part, drawn).sum().clamp(min=1)
+        losses.append(measure(part, drawn, total)[0].item())
     return sum(losses) / len(losses)

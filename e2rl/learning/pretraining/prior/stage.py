@@ -40,11 +40,11 @@ def run_prior_stage(
     settings = stage_settings(config, TrainingSettings)
     with process_group(config.device) as (processes, device):
         folder = processes.from_leader(lambda: run.folder)
-        own = config.prior
+        options = config.prior
         prior = Prior(  # whose first weights follow the run's seed
-            settings_of(DenoiserSettings, own.network, where="prior.network"),
-            settings_of(SamplerSettings, own.sampler, where="prior.sampler"),
-            bounds=settings_of(BoundSettings, own.bounds, where="prior.bounds"),
+            settings_of(DenoiserSettings, options.network, where="prior.network"),
+            settings_of(SamplerSettings, options.sampler, where="prior.sampler"),
+            bounds=settings_of(BoundSettings, options.bounds, where="prior.bounds"),
         ).to(device)
         scenes = processes.leader_first(
             lambda: load_scenes(

@@ -43,7 +43,7 @@ from e2rl.scenes.scene import SceneSet
 HELD_OUT = 8  # one in HELD_OUT places is held out for validation
 WARM_UP = 50  # steps
 WEIGHT_DECAY = 0.1
-EMA = 0.998  # decay of the weights' moving average at most; (1 + step) / (10 + step) up to step 4500
+EMA = 0.998  # highest decay of the weights' average; first (1 + step) / (10 + step)
 CAUSAL = 0.4  # fraction of windows whose start states are a causal observer's estimates
 RANK_SEED = 1_000_003  # difference of the generator seeds of consecutive ranks
 

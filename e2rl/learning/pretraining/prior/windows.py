@@ -2,6 +2,7 @@
 reproduces their next 5 s."""
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -17,20 +18,19 @@ from e2rl.traffic.motion import take
 
 OFFSETS = (0, 5, 10, 15)  # frames after a scene's start frame at which a window begins
 ROWS = 16  # vehicles of a window: the modelled ones nearest to the ego
-MAX_ERROR = 0.5  # m: vehicles with a larger representation error are not trained on (wrong or self-crossing route)
+MAX_ERROR = 0.5  # m of representation: beyond it the route is wrong or crosses itself
 STANDING_WEIGHT = 0.25
 
 
 def derivative(values: Tensor, valid: Tensor) -> Tensor:
     """Central difference over time of values [B, T, V] (one-sided at the ends of a
     recorded piece), per second."""
-    ahead = torch.cat(
-        [values[:, 1:] - values[:, :-1], torch.zeros_like(values[:, :1])], 1
-    )
-    known = torch.cat([valid[:, 1:] & valid[:, :-1], torch.zeros_like(valid[:, :1])], 1)
-    ahead = torch.where(known, ahead, 0.0)
+    last = torch.zeros_like(valid[:, :1])
+    recorded = torch.cat([valid[:, 1:] & valid[:, :-1], last], 1)
+    change = torch.cat([values.diff(dim=1), torch.zeros_like(values[:, :1])], 1)
+    ahead = torch.where(recorded, change, 0.0)
     behind = torch.roll(ahead, 1, 1)
-    count = known.float() + torch.roll(known, 1, 1).float()
+    count = recorded.float() + torch.roll(recorded, 1, 1).float()
     return (ahead + behind) / count.clamp(min=1) / DT
 
 
@@ -44,11 +44,9 @@ def make_windows(scenes: TensorDictBase, chunk: int = 32) -> TensorDict:
         valid = scene["logged_valid"][:, :, :vehicles]
         accel = derivative(logged[..., 3], valid).clamp(-6.0, 4.0)
         heading = torch.where(valid, logged[..., 2], 0.0)
-        unwrapped = torch.cumsum(
-            torch.cat([heading[:, :1], wrap(heading.diff(dim=1))], 1), 1
-        )
-        yaw_rate = derivative(unwrapped, valid).clamp(-1.0, 1.0)
-        exact = [
+        turns = torch.cat([heading[:, :1], wrap(heading.diff(dim=1))], 1)
+        yaw_rate = derivative(turns.cumsum(1), valid).clamp(-1.0, 1.0)
+        parts += [
             _window(
                 scene,
                 routed,
@@ -59,11 +57,15 @@ def make_windows(scenes: TensorDictBase, chunk: int = 32) -> TensorDict:
             )
             for offset in OFFSETS
         ]
-        observed = (
-            scene["start_accel"][:, :vehicles],
-            scene["start_yaw_rate"][:, :vehicles],
+        estimates = _window(
+            scene,
+            routed,
+            offset=0,
+            accel=scene["start_accel"][:, :vehicles],
+            yaw_rate=scene["start_yaw_rate"][:, :vehicles],
+            causal=True,
         )
-        parts += [*exact, _window(scene, routed, 0, *observed, True)]
+        parts.append(estimates)
     windows = TensorDict.cat(parts)
     return windows[windows["weight"].sum(-1) > 0]
 
@@ -71,6 +73,7 @@ def make_windows(scenes: TensorDictBase, chunk: int = 32) -> TensorDict:
 def _window(
     scene: TensorDictBase,
     routed: RoutedScene,
+    *,
     offset: int,
     accel: Tensor,
     yaw_rate: Tensor,
@@ -93,34 +96,25 @@ def _window(
     state = locate(agents[:, :vehicles], accel, yaw_rate=yaw_rate, points=routed.points)
     step = torch.full((len(logged),), offset, dtype=torch.long, device=logged.device)
     estimated = torch.full_like(step, causal, dtype=torch.bool)
-    tracks, known = _future(scene, offset, vehicles=vehicles)
-    x0, error, ahead, d = _targets(routed, state, tracks=tracks, known=known)
+    tracks, recorded = _future(scene, offset, vehicles=vehicles)
+    x0, error, ahead, d = _targets(routed, state, tracks=tracks, recorded=recorded)
     ends = slice(KNOT_STEPS - 1, HORIZON, KNOT_STEPS)
-    at_knots = known[..., ends]
-    moving = torch.where(known, tracks[..., 3], 0.0).amax(-1).clamp(min=state.v) > 0.5
-    here = valid[:, :vehicles]
-    fits = (scene["route_log"] >= 0) | ~routed.has_lane
-    use = (
-        here
-        & routed.modelled
-        & fits
-        & (error < MAX_ERROR)
-        & (known.sum(-1) >= KNOT_STEPS)
-    )
-    columns = {name: getattr(state, name) for name in ("v", "a", "d", "d1", "d2")} | {
-        "nodes": node_features(
-            routed,
-            state,
-            leaders_ahead(routed, state.s, agents=agents, present=valid),
-            step,
-            estimated,
-        ),
-        "present": here,
+    at_knots = recorded[..., ends]
+    lateral_knots = (recorded[..., [24]], recorded[..., [44]])
+    speed = torch.where(recorded, tracks[..., 3], 0.0)
+    moving = speed.amax(-1).clamp(min=state.v) > 0.5
+    present = valid[:, :vehicles]
+    on_route = (scene["route_log"] >= 0) | ~routed.has_lane
+    long = recorded.sum(-1) >= KNOT_STEPS
+    use = present & routed.modelled & on_route & (error < MAX_ERROR) & long
+    leaders = leaders_ahead(routed, state.s, agents=agents, present=valid)
+    columns = {
+        **{name: getattr(state, name) for name in ("v", "a", "d", "d1", "d2")},
+        "nodes": node_features(routed, state, leaders, step, estimated),
+        "present": present,
         "x0": x0,
         "weight": use * torch.where(moving, 1.0, STANDING_WEIGHT),
-        "knot_weight": torch.cat(
-            [at_knots, known[..., [24]], known[..., [44]]], -1
-        ).float(),
+        "knot_weight": torch.cat([at_knots, *lateral_knots], -1).float(),
         "on_lane": routed.has_lane,
         "ahead": ahead[..., ends],
         "aside": d[..., ends],
@@ -128,53 +122,56 @@ def _window(
     }
     distance = (logged[:, :vehicles, :2] - logged[:, :1, :2]).norm(dim=-1)
     distance[:, 0] = -1e6  # the ego comes first
-    order = (distance + 1e3 * ~use + 1e4 * ~here).argsort(1)[:, :ROWS]
-    pairs = take(
-        take(edge_features(routed, state), order).transpose(1, 2), order
-    ).transpose(1, 2)
-    window = {key: take(value, order) for key, value in columns.items()} | {
-        "pairs": pairs,
-        "causal": estimated,
-    }
-    return TensorDict(window, batch_size=[len(logged)])
+    order = (distance + 1e3 * ~use + 1e4 * ~present).argsort(1)[:, :ROWS]
+    pairs = take(edge_features(routed, state), order).transpose(1, 2)
+    return TensorDict(
+        {
+            **{key: take(value, order) for key, value in columns.items()},
+            "pairs": take(pairs, order).transpose(1, 2),
+            "causal": estimated,
+        },
+        batch_size=[len(logged)],
+    )
 
 
 def _future(scene: TensorDictBase, offset: int, vehicles: int) -> tuple[Tensor, Tensor]:
     """States [B, V, HORIZON, 4] recorded after frame `offset`, and a mask [B, V,
-    HORIZON] of the known ones."""
+    HORIZON] of the recorded ones, up to the first gap."""
     future = slice(offset + 1, offset + 1 + HORIZON)
     tracks = scene["logged"][:, future, :vehicles].transpose(1, 2)
-    known = scene["logged_valid"][:, future, :vehicles].transpose(1, 2)
-    short = HORIZON - known.shape[2]
-    tracks = torch.nn.functional.pad(tracks, (0, 0, 0, short))
-    known = torch.nn.functional.pad(known, (0, short))
-    return tracks, known.cumprod(-1).bool()
+    valid = scene["logged_valid"][:, future, :vehicles].transpose(1, 2)
+    missing = HORIZON - valid.shape[2]
+    recorded = F.pad(valid, (0, missing)).cumprod(-1).bool()
+    return F.pad(tracks, (0, 0, 0, missing)), recorded
 
 
 def _targets(
-    routed: RoutedScene, state: LaneState, tracks: Tensor, known: Tensor
+    routed: RoutedScene, state: LaneState, tracks: Tensor, recorded: Tensor
 ) -> tuple[Tensor, ...]:
     """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], recorded distance
     and offset [B, V, HORIZON]."""
-    hint = state.s[..., None] + (torch.where(known, tracks[..., 3], 0.0) * DT).cumsum(
-        -1
-    )
+    travelled = (torch.where(recorded, tracks[..., 3], 0.0) * DT).cumsum(-1)
+    hint = state.s[..., None] + travelled
     s, d, _ = project(tracks[..., :2], routed.points, hint=hint)
-    x0, error = lane_relative.fit(
-        LaneState.from_states(tracks, s, d=d), known.float(), state=state
-    )
+    weight = recorded.float()
+    motion = LaneState.from_states(tracks, s, d=d)
+    x0, error = lane_relative.fit(motion, weight, state=state)
     ahead = s - state.s[..., None]
     lane = routed.has_lane
     if bool(lane.all()):
         return x0, error, ahead, d
-    knots = lane_relative.ACCEL_SCALE * x0[..., :KNOTS]
-    lateral = free_space.fit(tracks[..., 2], known.float(), state=state, knots=knots)
-    free = torch.cat([x0[..., :KNOTS], lateral], -1)
-    motion = free_space.decode(free, state)
-    gap = torch.hypot(motion.x - tracks[..., 0], motion.y - tracks[..., 1])
-    free_error = (gap * known).sum(-1) / known.sum(-1).clamp(min=1) / 2
+    longitudinal = x0[..., :KNOTS]
+    knots = lane_relative.ACCEL_SCALE * longitudinal
+    lateral = free_space.fit(tracks[..., 2], weight, state=state, knots=knots)
+    free = torch.cat([longitudinal, lateral], -1)
+    decoded = free_space.decode(free, state)
+    gap = torch.hypot(decoded.x - tracks[..., 0], decoded.y - tracks[..., 1])
+    free_error = (gap * recorded).sum(-1) / recorded.sum(-1).clamp(min=1) / 2
     before = torch.cat([state.v[..., None], tracks[..., :-1, 3]], -1)
-    driven = (torch.where(known, (tracks[..., 3] + before) / 2, 0.0) * DT).cumsum(-1)
-    x0 = torch.where(lane[..., None], x0, free)
-    ahead = torch.where(lane[..., None], ahead, driven)
-    return x0, torch.where(lane, error, free_error), ahead, d
+    speed = torch.where(recorded, (tracks[..., 3] + before) / 2, 0.0)
+    return (
+        torch.where(lane[..., None], x0, free),
+        torch.where(lane, error, free_error),
+        torch.where(lane[..., None], ahead, (speed * DT).cumsum(-1)),
+        d,
+    )

@@ -56,11 +56,9 @@ def test_hidden_vehicles_are_absent_weigh_nothing_and_are_never_the_ego(
     windows, augmented
 ):
     batch = augmented(windows, DROP=1.0)
-    assert (
-        batch["present"][:, 0].all()
-        and not batch["present"][:, 1:].any()
-        and (batch["weight"][:, 1:] == 0).all()
-    )
+    assert batch["present"][:, 0].all()
+    assert not batch["present"][:, 1:].any()
+    assert (batch["weight"][:, 1:] == 0).all()
 
 
 def test_accelerations_are_noisy_in_feature_and_state_alike(windows, augmented):
@@ -75,11 +73,9 @@ def test_accelerations_are_noisy_in_feature_and_state_alike(windows, augmented):
 def test_noise_levels_are_stratified_and_a_clean_ego_weighs_nothing(windows):
     drawn = draw(windows, seeded())
     level = drawn["level"]
-    assert (
-        level.shape == (len(windows), loss.LEVELS)
-        and level.min() >= 0.01
-        and level.max() <= 0.99
-    )
+    assert level.shape == (len(windows), loss.LEVELS)
+    assert level.min() >= 0.01
+    assert level.max() <= 0.99
     bins = ((level - 0.01) / 0.98 * loss.LEVELS).floor()
     assert torch.equal(bins, torch.arange(float(loss.LEVELS)).expand_as(bins))
     weight = loss_weight(windows, drawn).unflatten(0, (loss.LEVELS, len(windows)))
@@ -95,7 +91,9 @@ def test_a_perfect_estimate_costs_nothing_but_the_fit_s_own_error(windows):
         [windows["x0"]] * loss.LEVELS
     )
     total, action, trajectory = terms(prior, windows, generator=seeded())
-    assert action == 0 and trajectory < 0.05 and total == loss.TRAJECTORY * trajectory
+    assert action == 0
+    assert trajectory < 0.05
+    assert total == loss.TRAJECTORY * trajectory
 
 
 def test_the_action_term_is_the_weighted_mean_square_over_known_knots(windows):
@@ -120,4 +118,5 @@ def test_offsets_count_on_lanes_only(windows):
     seen, unseen = (
         terms(prior, batch, generator=seeded())[2] for batch in (windows, free)
     )
-    assert seen > 0.2 and unseen < 0.05
+    assert seen > 0.2
+    assert unseen < 0.05

@@ -35,8 +35,6 @@ def test_each_held_out_log_is_driven_from_its_earliest_start():
     scenes.scene_id[:] = ["a@30", "a@10", "b@10", "c@50", "c@30", "d@10"]
     scenes.location[:] = ["p", "p", "q", "p", "p", "q"]
     first = _first_starts(scenes)
-    assert (
-        first.scene_id == ["a@10", "c@30"]
-        and first.location == ["p", "p"]
-        and len(first.scenes) == 2
-    )
+    assert first.scene_id == ["a@10", "c@30"]
+    assert first.location == ["p", "p"]
+    assert len(first.scenes) == 2

@@ -42,11 +42,24 @@ def untrained(seed=0):
 
 
 def of(windows, seed=0, settings=SETTINGS):
-    return PriorTraining(untrained(seed), windows, test=windows, settings=settings)
+    return PriorTraining(
+        untrained(seed),
+        windows,
+        test=windows,
+        settings=settings,
+    )
 
 
 def test_training_lowers_the_loss(windows):
-    run = of(windows, settings=replace(SETTINGS, steps=60, batch=8, learning_rate=5e-3))
+    run = of(
+        windows,
+        settings=replace(
+            SETTINGS,
+            steps=60,
+            batch=8,
+            learning_rate=5e-3,
+        ),
+    )
     before = held_out_loss(run.prior, windows, batch=8)
     run.train(60)
     assert held_out_loss(run.prior, windows, batch=8) < 0.8 * before
@@ -165,19 +178,24 @@ def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_w
         .split()
         for name in ("whole", "part")
     ]
-    assert losses[0] == losses[1] and len(losses[0]) == 2
+    assert losses[0] == losses[1]
+    assert len(losses[0]) == 2
     assert origin["held_out_loss"] == pytest.approx(
         min(float(line.split(",")[1]) for line in losses[0])
     )
-    assert (
-        origin["windows"] > 0
-        and origin["command"] == "test"
-        and origin["versions"]["torch"] == torch.__version__
-    )
+    assert origin["windows"] > 0
+    assert origin["command"] == "test"
+    assert origin["versions"]["torch"] == torch.__version__
 
 
 def test_logs_without_a_moving_vehicle_are_named(tmp_path):
     scenes = make_scenes(2, speed=0.0)
     scenes.location[:] = ["a", "b"]
     with pytest.raises(InputError, match="no vehicle moves"):
-        train_prior(untrained(), scenes, settings=SETTINGS, folder=tmp_path, origin={})
+        train_prior(
+            untrained(),
+            scenes,
+            settings=SETTINGS,
+            folder=tmp_path,
+            origin={},
+        )

@@ -22,7 +22,8 @@ def test_constant_velocity_along_the_lane_is_zero_x():
     windows = make_windows(make_scenes(2, num_vehicles=3).scenes)
     assert len(windows) == 2 * (len(OFFSETS) + 1)
     use = windows["weight"] > 0
-    assert use[:, :3].all() and not use[:, 3:].any()
+    assert use[:, :3].all()
+    assert not use[:, 3:].any()
     torch.testing.assert_close(
         windows["x0"][use], torch.zeros(int(use.sum()), SIZE), rtol=0, atol=2e-2
     )
@@ -55,7 +56,13 @@ def test_mirrored_scenes_give_mirrored_windows(free):
             there[key][:, :FIRST], -here[key][:, :FIRST], rtol=0, atol=2e-3, msg=key
         )
     for key in ("v", "a", "ahead", "weight"):
-        torch.testing.assert_close(there[key], here[key], rtol=0, atol=2e-2, msg=key)
+        torch.testing.assert_close(
+            there[key],
+            here[key],
+            rtol=0,
+            atol=2e-2,
+            msg=key,
+        )
 
 
 def test_the_ego_leads_every_window_and_parked_or_lost_vehicles_teach_nothing():
@@ -84,7 +91,12 @@ def test_free_space_windows_are_not_judged_by_their_offset_from_a_route():
     assert (free[:, :FIRST].sum(1) == 1).all()
     time = 0.5 * torch.arange(1, KNOTS + 1)
     expected = (mixed["v"][..., None] * time)[free]
-    torch.testing.assert_close(mixed["ahead"][free], expected, rtol=0.02, atol=0.1)
+    torch.testing.assert_close(
+        mixed["ahead"][free],
+        expected,
+        rtol=0.02,
+        atol=0.1,
+    )
 
 
 def test_the_derivative_of_a_parabola_is_exact_inside_and_one_sided_at_gaps():
@@ -92,10 +104,14 @@ def test_the_derivative_of_a_parabola_is_exact_inside_and_one_sided_at_gaps():
     values = (time**2)[None, :, None]
     valid = torch.ones(1, 12, 1, dtype=torch.bool)
     found = derivative(values, valid)[0, :, 0]
-    torch.testing.assert_close(found[1:-1], 2 * time[1:-1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        found[1:-1],
+        2 * time[1:-1],
+        rtol=0,
+        atol=1e-5,
+    )
     valid[:, 6] = False
     gap = derivative(values, valid)[0, :, 0]
     assert gap[6] == 0
-    assert gap[5].item() == pytest.approx(2 * 0.45, abs=1e-4) and gap[
-        7
-    ].item() == pytest.approx(2 * 0.75, abs=1e-4)
+    assert gap[5].item() == pytest.approx(2 * 0.45, abs=1e-4)
+    assert gap[7].item() == pytest.approx(2 * 0.75, abs=1e-4)
