@@ -1,10 +1,5 @@
-"""Builds the parts of an evolution from a run's configuration, and says how long the
-rest takes."""
+"""Builds the parts of an evolution from a run's configuration."""
 
-import time
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -21,13 +16,13 @@ from e2rl.learning.rounds.evolution import Evolution, RoundSettings
 from e2rl.learning.rounds.improvement import Improvement
 from e2rl.learning.rounds.memory import Memory
 from e2rl.learning.rounds.prefetch import why_no_prefetch
+from e2rl.learning.rounds.progress import Progress
 from e2rl.learning.rounds.scheduler import CurriculumScheduler
 from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
 from e2rl.run.config import built, check_device, load_choice, resolved
 from e2rl.run.errors import InputError
 from e2rl.run.settings import setting, settings_of
-from e2rl.run.terminal import Bar, duration
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes, source_of
 from e2rl.scenes.versions import RECORDED
@@ -227,43 +222,6 @@ def build_measure(
         search=search,
         budget=options.budget,
     )
-
-
-class Progress:
-    """The phases of a training, by their kinds, in order. Phases of one kind take about
-    equally long."""
-
-    def __init__(self, kinds: Sequence[str]) -> None:
-        """kinds: of the phases of which one of its kind has to be over before its
-        length is known."""
-        self._kinds = list(kinds)
-        self._spent: dict[str, list[float]] = defaultdict(list)
-
-    @contextmanager
-    def phase(self, kind: str) -> Iterator[None]:
-        """The next phase, of this kind, is done in the block."""
-        begin = time.monotonic()
-        yield
-        self._spent[kind].append(time.monotonic() - begin)
-
-    def left(self) -> str:
-        """Returns the time left in words, "about 12 min left", by what phases of this
-        run have taken.
-
-        "" where nothing is left, and where no phase of a kind that is to come is over.
-        """
-        coming = Counter(self._kinds)
-        coming.subtract({kind: len(seconds) for kind, seconds in self._spent.items()})
-        rest = {kind: count for kind, count in coming.items() if count > 0}
-        if not rest or not all(self._spent[kind] for kind in rest):
-            return ""
-        means = {kind: sum(self._spent[kind]) / len(self._spent[kind]) for kind in rest}
-        return f"about {duration(sum(count * means[kind] for kind, count in rest.items()))} left"
-
-    def say(self, text: str) -> None:
-        """Print a line with the time left, where it is known, above any progress bar."""
-        with Bar.external_write_mode():
-            print("; ".join(filter(None, [text, self.left()])), flush=True)
 
 
 def build_progress(config: DictConfig, done: int = 0) -> Progress:
