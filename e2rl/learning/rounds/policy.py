@@ -123,11 +123,13 @@ class PolicyImprovement(Improvement):
         if update.cloning > 0:
             self.demonstrations = recorded_demonstrations(scenes, sim, seed=seed)
         if update.teaching > 0:
-            if not isinstance(teacher, Ego):
-                options = OmegaConf.create(dict(teacher))
-                teacher = built(options, "learner.teacher", kind=Ego)
+            planner = (
+                teacher
+                if isinstance(teacher, Ego)
+                else built(OmegaConf.create(dict(teacher)), "learner.teacher", kind=Ego)
+            )
             self.teacher = Teacher(
-                teacher,
+                planner,
                 placed,
                 low=network.low,
                 high=network.high,
