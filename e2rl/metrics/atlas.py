@@ -28,7 +28,13 @@ def cell_of(row: Row) -> Cell | None:
     if row.get("cfr_preventable") != 1 or not is_failure(row):
         return None
     words = {name: word(row, name) for name in CELL} | {
-        "speed_band": speed_band(number(row, "ego_speed", unknown=math.nan))
+        "speed_band": speed_band(
+            number(
+                row,
+                "ego_speed",
+                unknown=math.nan,
+            )
+        )
     }
     return tuple(words[name] for name in CELL)
 
@@ -46,8 +52,16 @@ def by_likelihood(row: Row) -> tuple:
     """Sorts failures, the likeliest first: by the path KL [nats] that moved the traffic
     away from the prior, infinite where it is unknown (`transport`), then by the realism
     of the adversaries, the higher first, then by scene and seed."""
-    cost = number(row, "transport", unknown=math.inf)
-    realism = number(row, "real_adv", unknown=-math.inf)
+    cost = number(
+        row,
+        "transport",
+        unknown=math.inf,
+    )
+    realism = number(
+        row,
+        "real_adv",
+        unknown=-math.inf,
+    )
     return (
         cost,
         -realism,

@@ -31,17 +31,23 @@ class Metric:
     decimals: int | None = None  # printed; None: three significant digits
     column: str = ""  # of the rows, where it differs from the name
     weight: str = ""  # column that weights the mean
-    per: str = ""  # column by whose sum the sum of its own column is divided, instead of the mean
+    # Column by whose sum the sum of its own column is divided, instead of the mean.
+    per: str = ""
     median: bool = False  # instead of the mean
-    places: int = 0  # of a column of labels: expected number of labels at so many places, instead of the mean
-    samples: str = ""  # of a metric that `metrics.realism` computes from pooled samples: those that it needs
-    per_collision: bool = False  # known for collisions only: paired differences compare each group's own collisions
-    cost: bool = (
-        False  # of the computation: a difference in it is not marked as significant
-    )
-    event: bool = False  # happens to the ego in a rollout or not; of a search: in a scene, in any of its tries
-    raised: float = math.nan  # value of a rollout in which the planner raised (`metrics.errored`); NaN: it knows none
-    tables: str = ""  # closed-loop tables (`metrics=...` of evaluate.py) that show it, such as "main egos"; or new ones
+    # Of a column of labels: expected number of them at so many places, not the mean.
+    places: int = 0
+    # Of a metric that `metrics.realism` computes from pooled samples: which it needs.
+    samples: str = ""
+    # Known for collisions only: paired differences compare each group's own collisions.
+    per_collision: bool = False
+    # Of the computation: a difference in it is not marked as significant.
+    cost: bool = False
+    # Happens to the ego in a rollout or not; in a search: in a scene, in any of its tries.
+    event: bool = False
+    # Value of a rollout in which the planner raised (`metrics.errored`); NaN: unknown.
+    raised: float = math.nan
+    # Closed-loop tables (`metrics=...` of evaluate.py) that show it, such as "main egos".
+    tables: str = ""
 
     @property
     def source(self) -> str:
@@ -59,7 +65,8 @@ TABLES = (
     "egos",
     "public",
 )  # of the package
-ORDER = (  # of columns in every table (docs/method.md, section 10); others follow as they are declared
+# Of columns in every table (docs/method.md, section 10); others follow as declared.
+ORDER = (
     *(
         "cfr",
         "cfr_preventable",
@@ -84,32 +91,20 @@ ORDER = (  # of columns in every table (docs/method.md, section 10); others foll
     ),
 )
 METRICS: dict[str, Metric] = {}  # of rollouts, in ORDER
-COMPUTE: dict[
-    str, Compute
-] = {}  # functions of a batch: a dict of columns, or the column of the metric of that name
-EVENTS: list[
-    str
-] = []  # columns of a row after its metrics: what happened, and what metrics rest on
-WORDS: dict[
-    str, tuple[str, ...]
-] = {}  # columns that hold one of these words, or "" where the computed index is -1
+# Functions of a batch: a dict of columns, or the column of the metric of that name.
+COMPUTE: dict[str, Compute] = {}
+# Columns of a row after its metrics: what happened, and what metrics rest on.
+EVENTS: list[str] = []
+# Columns that hold one of these words, or "" where the computed index is -1.
+WORDS: dict[str, tuple[str, ...]] = {}
 SOURCE = ("dataset", "split", "method", "ego_policy")  # columns of a row of a run
-IDENTITY = (
-    "scene_id",
-    "location",
-    "seed",
-    "eta",
-)  # columns of a row before its metrics
-LATER: dict[
-    str, float | str
-] = {  # last columns of a row: what rows of earlier versions, which lack them, know of them
-    **{
-        "errored": math.nan,
-        "raised_by": "",
-        "error": "",
-    },  # whether, by whom ("ego", "traffic"), and with what message
+IDENTITY = ("scene_id", "location", "seed", "eta")  # columns before a row's metrics
+LATER: dict[str, float | str] = {  # last columns, and what rows that lack them know
+    "errored": math.nan,
+    "raised_by": "",  # "ego" or "traffic"
+    "error": "",  # the message
     "cfr_object": math.nan,
-    "left_out": math.nan,  # vehicles that come near in the recording and are neither driven nor replayed
+    "left_out": math.nan,  # vehicles that come near, neither driven nor replayed
 }
 SPREAD_STAGE = "spread"
 STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own
@@ -127,10 +122,11 @@ def declare(
         raise ValueError(
             f"metric {taken[0]}: name is taken; choose another, or unregister it first"
         )
-    found = {**METRICS, **{metric.name: metric for metric in metrics}}
     rank = {name: place for place, name in enumerate(ORDER)}
+    declared = [*METRICS.values(), *metrics]
+    declared.sort(key=lambda metric: rank.get(metric.name, len(rank)))
     METRICS.clear()
-    METRICS.update(sorted(found.items(), key=lambda item: rank.get(item[0], len(rank))))
+    METRICS.update({metric.name: metric for metric in declared})
     EVENTS.extend(events)
     WORDS.update(words or {})
 
@@ -144,7 +140,11 @@ def columns(
     computes (see `declare`)."""
 
     def computes(compute: Compute) -> Compute:
-        declare(*metrics, events=events, words=words)
+        declare(
+            *metrics,
+            events=events,
+            words=words,
+        )
         COMPUTE[compute.__name__] = compute
         return compute
 
@@ -157,12 +157,13 @@ def register(metric: Metric, compute: Compute | None = None) -> None:
     Args:
         metric: what it is.
         compute: compute(batch) returns the metric's column [B], NaN where it is
-            unknown, or a dict of columns: this
-            one, and those that `weight` or `per` name. `score_rollouts` calls it on the CPU for at most 32 rollouts at
-            once. The batch holds the tensors of `sim.rollouts.Rollouts` (positions in float64, 0 where invalid),
-            `traffic` [B, N] bool, the simulated vehicles other than the ego, and the fields of
-            `contact.first_contact`, such as `hit` and `stop` [B]. None: the metric is read from a column that exists
-            already or is added to the rows later.
+            unknown, or a dict of columns: this one, and those that `weight` or `per`
+            name. `score_rollouts` calls it on the CPU for at most 32 rollouts at once.
+            The batch holds the tensors of `sim.rollouts.Rollouts` (positions in
+            float64, 0 where invalid), `traffic` [B, N] bool, the simulated vehicles
+            other than the ego, and the fields of `contact.first_contact`, such as `hit`
+            and `stop` [B]. None: the metric is read from a column that exists already
+            or is added to the rows later.
 
     Raises:
         ValueError: the name or the column is taken.
@@ -171,7 +172,8 @@ def register(metric: Metric, compute: Compute | None = None) -> None:
         compute is not None and metric.source in row_columns()
     ):
         raise ValueError(
-            f"metric {metric.name}: name or column is taken; choose another, or unregister it first"
+            f"metric {metric.name}: name or column is taken; choose another, or "
+            "unregister it first"
         )
     declare(metric)
     if compute is not None:

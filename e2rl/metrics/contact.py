@@ -58,9 +58,18 @@ def first_contact(batch: Batch) -> Batch:
     possible = valid & valid[..., :1]
     possible[..., 0] = False
     boxes = {"second": states, "second_size": size[:, None], "possible": possible}
-    area = pair_overlap(states[:, :, :1], size[:, None, :1], **boxes)
+    area = pair_overlap(
+        states[:, :, :1],
+        size[:, None, :1],
+        **boxes,
+    )
     born_inside = overlaps_from_birth(area > 0, valid)
-    area, moment = with_passing(states[:, :, :1], size[:, None, :1], area=area, **boxes)
+    area, moment = with_passing(
+        states[:, :, :1],
+        size[:, None, :1],
+        area=area,
+        **boxes,
+    )
     area = area * ~born_inside
     vehicle_area = area * (batch["agent_type"] == VEHICLE)[:, None]
     overlaps = (vehicle_area > 0).any(-1)
@@ -120,7 +129,11 @@ def overlaps_from_birth(overlap: Tensor, valid: Tensor) -> Tensor:
         return torch.where(condition, steps, otherwise).cummax(1).values
 
     last_valid = latest(valid, -HIDDEN - 1)
-    before = torch.nn.functional.pad(last_valid[:, :-1], (1, 0), value=0)
+    before = torch.nn.functional.pad(
+        last_valid[:, :-1],
+        (1, 0),
+        value=0,
+    )
     birth = latest(valid & (steps - before > HIDDEN + 1), -1)
     apart = latest(valid & ~overlap, -2)
     result[rows, :, agents] = overlap & (birth >= 0) & (apart < birth)
@@ -144,13 +157,24 @@ def states_at_contact(
     high = latest
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        states = interpolated(before, after, fraction=middle[:, None])
+        states = interpolated(
+            before,
+            after,
+            fraction=middle[:, None],
+        )
         gap = separation(
-            states[:, 0], sizes[:, 0], second=states[:, 1], second_size=sizes[:, 1]
+            states[:, 0],
+            sizes[:, 0],
+            second=states[:, 1],
+            second_size=sizes[:, 1],
         )
         low = torch.where(gap <= 0, low, middle)
         high = torch.where(gap <= 0, middle, high)
-    return interpolated(before, after, fraction=high[:, None])
+    return interpolated(
+        before,
+        after,
+        fraction=high[:, None],
+    )
 
 
 def contact_kind(states: Tensor, sizes: Tensor) -> Tensor:
@@ -162,8 +186,17 @@ def contact_kind(states: Tensor, sizes: Tensor) -> Tensor:
     """
     ego, other = states.unbind(1)
     ego_size, other_size = sizes.unbind(1)
-    parts = edge_parts_inside(ego, ego_size, other=other, other_size=other_size)
-    nearness = -edge_distances(ego, ego_size, point=other[..., :2])
+    parts = edge_parts_inside(
+        ego,
+        ego_size,
+        other=other,
+        other_size=other_size,
+    )
+    nearness = -edge_distances(
+        ego,
+        ego_size,
+        point=other[..., :2],
+    )
     inside = parts.amax(-1, keepdim=True) > LEAST_PART
     edge = torch.where(inside, parts, nearness).argmax(-1)
     return torch.tensor(EDGE_KIND, device=edge.device)[edge]
@@ -174,7 +207,10 @@ def kinds_at_stop(batch: Batch) -> Tensor:
     the ego touches at `stop`."""
     states = batch["states"][torch.arange(len(batch["stop"])), batch["stop"]]
     parts = edge_parts_inside(
-        states[:, :1], batch["size"][:, :1], other=states, other_size=batch["size"]
+        states[:, :1],
+        batch["size"][:, :1],
+        other=states,
+        other_size=batch["size"],
     )
     inside = ((parts > LEAST_PART) & batch["touching"][..., None]).any(1)
     left, rear, right, front = inside.unbind(-1)
@@ -191,9 +227,16 @@ def kinds_at_stop(batch: Batch) -> Tensor:
         raised=1.0,
         tables="main traffic adversaries methods egos public",
     ),
-    event("cfr_adv", "ego hits an adversary", tables="main adversaries methods"),
     event(
-        "cfr_vru", "ego hits a pedestrian or cyclist", raised=1.0, tables="main public"
+        "cfr_adv",
+        "ego hits an adversary",
+        tables="main adversaries methods",
+    ),
+    event(
+        "cfr_vru",
+        "ego hits a pedestrian or cyclist",
+        raised=1.0,
+        tables="main public",
     ),
     event(
         "cfr_object",
@@ -203,12 +246,18 @@ def kinds_at_stop(batch: Batch) -> Tensor:
     ),
     *(
         event(
-            kind, f"first contact at the ego's {kind}", tables="main adversaries egos"
+            kind,
+            f"first contact at the ego's {kind}",
+            tables="main adversaries egos",
         )
         for kind in KINDS
     ),
     *(
-        event(f"{kind}_any", f"ego's {kind} in contact at first contact", tables="egos")
+        event(
+            f"{kind}_any",
+            f"ego's {kind} in contact at first contact",
+            tables="egos",
+        )
         for kind in KINDS
     ),
     rate(

@@ -131,7 +131,11 @@ class HumanDriver(NamedTuple):
         rising = (state.braking + self.jerk * DT).clamp(max=self.braking)
         eased = self.release * (time >= 0).to(time)
         braking = torch.where(time >= self.delay, rising, eased)
-        return DriverState(time, braking, decided=state.decided), -braking
+        return DriverState(
+            time,
+            braking,
+            decided=state.decided,
+        ), -braking
 
 
 class RegulationLimit(NamedTuple):
@@ -169,7 +173,11 @@ class RegulationLimit(NamedTuple):
         braking = torch.where(
             time >= self.delay + self.lag, self.braking, self.release * eases.to(time)
         )
-        return DriverState(time, braking, decided=decided), -braking
+        return DriverState(
+            time,
+            braking,
+            decided=decided,
+        ), -braking
 
 
 class ResponsibilitySensitiveSafety(NamedTuple):
@@ -225,7 +233,11 @@ class ResponsibilitySensitiveSafety(NamedTuple):
         time = next_risk_time(state, danger).masked_fill(~danger, -1)
         rising = (state.braking + self.jerk * DT).clamp(max=self.braking)
         braking = rising * (time >= self.response)
-        return DriverState(time, braking, decided=state.decided), -braking
+        return DriverState(
+            time,
+            braking,
+            decided=state.decided,
+        ), -braking
 
 
 class FuzzySafetyModel(NamedTuple):
@@ -302,12 +314,20 @@ class FuzzySafetyModel(NamedTuple):
         )
         comfortable = self.comfortable_braking
         hard = comfortable + (self.braking - comfortable) * critical
-        soft = comfortable * self.proactive(gap, speed, other_speed=other_speed)
+        soft = comfortable * self.proactive(
+            gap,
+            speed,
+            other_speed=other_speed,
+        )
         wanted = torch.where(critical > 0, hard, soft) * concerns
         time = next_risk_time(state, wanted > 0).masked_fill(wanted <= 0, -1)
         rising = torch.minimum(wanted, state.braking + self.jerk * DT)
         braking = rising * (time >= self.reaction)
-        return DriverState(time, braking, decided=state.decided), -braking
+        return DriverState(
+            time,
+            braking,
+            decided=state.decided,
+        ), -braking
 
 
 Driver = (

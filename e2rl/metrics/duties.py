@@ -116,7 +116,11 @@ def entry(states: Tensor, collisions: Collisions) -> tuple[Tensor, Tensor]:
         size[:, PARTNER:],
         present=torch.ones_like(partner[..., :1], dtype=torch.bool),
     )
-    along = along_path(ego, size[:, EGO, 1], others=track)
+    along = along_path(
+        ego,
+        size[:, EGO, 1],
+        others=track,
+    )
     lateral_gap, rear, speed = (
         value[..., 0].T for value in (along.lateral_gap, along.rear, along.speed)
     )

@@ -59,7 +59,9 @@ declare(
         tables="main adversaries",
     ),
     rate(
-        "avoidable_1s", "the same, acting only 1 s before contact", per_collision=True
+        "avoidable_1s",
+        "the same, acting only 1 s before contact",
+        per_collision=True,
     ),
     Metric(
         "evasion_accel",
@@ -141,7 +143,10 @@ def find_evasions(
     parts = [
         search(
             EvasionScene.after(
-                moment[row], scene[row], states=states[row].float(), valid=valid[row]
+                moment[row],
+                scene[row],
+                states=states[row].float(),
+                valid=valid[row],
             ),
             grid(
                 driven_acceleration(states[row].float(), valid[row], moment[row]),
@@ -168,7 +173,11 @@ def driven_acceleration(states: Tensor, valid: Tensor, moment: Tensor) -> Tensor
 def search(scene: EvasionScene, knots: Knots, sim: SimSettings) -> Evasions:
     """The mildest evasion of each scene among these manoeuvres, and, where none is
     clean, among ROUNDS of an evolution strategy that begins with them."""
-    pool = executed(scene, knots, sim=sim)
+    pool = executed(
+        scene,
+        knots,
+        sim=sim,
+    )
     result = pool.evasions()
     row = torch.arange(len(result))
     generator = torch.Generator().manual_seed(0)
@@ -179,7 +188,11 @@ def search(scene: EvasionScene, knots: Knots, sim: SimSettings) -> Evasions:
             break
         scene = scene[left]
         parents = pool[left].best(SURVIVORS)
-        children = executed(scene, mutated(parents.knots, generator), sim=sim)
+        children = executed(
+            scene,
+            mutated(parents.knots, generator),
+            sim=sim,
+        )
         pool = Trials.cat([parents, children], 1)
         result[row] = pool.evasions()
     return result
@@ -219,7 +232,11 @@ def lateral_targets(route_valid: Tensor, mission: Tensor) -> tuple[Tensor, Tenso
     shift = torch.cat([shift[:, :first], no_shift, shift[:, first:]], 1)
     useful = torch.ones_like(route, dtype=torch.bool)
     useful[:, first : first + count] = route_valid & (others != mission[:, None])
-    order = torch.argsort(~useful, dim=1, stable=True)[:, :TARGETS]
+    order = torch.argsort(
+        ~useful,
+        dim=1,
+        stable=True,
+    )[:, :TARGETS]
     return route.gather(1, order), shift.gather(1, order)
 
 
@@ -252,7 +269,12 @@ def executed(scene: EvasionScene, knots: Knots, sim: SimSettings) -> Trials:
         steps=scene.inside.shape[1],
         sim=sim,
     )
-    violation = violations(states, scene, clearance=CLEARANCE, road_margin=ROAD_MARGIN)
+    violation = violations(
+        states,
+        scene,
+        clearance=CLEARANCE,
+        road_margin=ROAD_MARGIN,
+    )
     return Trials(
         knots=knots,
         actions=actions,
@@ -268,11 +290,23 @@ def mutated(parents: Knots, generator: torch.Generator) -> Knots:
     over about 1 s, with a strength drawn for each child."""
     count = parents.accel.shape[-1]
     parent = torch.rand(SAMPLES, generator=generator)
-    strength = torch.rand(SAMPLES, 2, generator=generator).square() + LEAST_STRENGTH
+    strength = (
+        torch.rand(
+            SAMPLES,
+            2,
+            generator=generator,
+        ).square()
+        + LEAST_STRENGTH
+    )
     gap = torch.arange(count)[:, None] - torch.arange(count)
     smooth = torch.exp(-((gap / SMOOTH_KNOTS) ** 2) / 2)
     smooth = smooth / smooth.norm(dim=-1, keepdim=True)
-    white = torch.randn(2, SAMPLES, count, generator=generator)
+    white = torch.randn(
+        2,
+        SAMPLES,
+        count,
+        generator=generator,
+    )
     accel, shift = white @ smooth.T * strength.T[..., None]
     children = parents[:, (parent.square() * parents.route.shape[1]).long()]
     children.accel = children.accel + ACCEL_STD * accel
@@ -307,7 +341,13 @@ def add_avoidable(
     contact = torch.tensor([int(row["contact_step"]) for row in collided])
     late_moment = (contact - round(LATE / DT)).clamp(min=0)
     early, late = (
-        find_evasions(scene[hit], states, valid=valid, sim=sim, moment=moment)
+        find_evasions(
+            scene[hit],
+            states,
+            valid=valid,
+            sim=sim,
+            moment=moment,
+        )
         for moment in (start, late_moment)
     )
     # Avoidable late implies avoidable early: drive as in the rollout until then.
@@ -321,7 +361,11 @@ def add_avoidable(
     driven = states[:, :, 0]
     rows_hit = hit.nonzero()[:, 0]
     for evasion, moment in ((late, late_moment), (early, start)):
-        later = spliced(driven[:, 1:], evasion.states, moment=moment)
+        later = spliced(
+            driven[:, 1:],
+            evasion.states,
+            moment=moment,
+        )
         whole = torch.cat([driven[:, :1], later], 1)
         rollouts.evasion[rows_hit[evasion.found]] = whole[evasion.found]
 

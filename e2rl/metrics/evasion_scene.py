@@ -55,7 +55,10 @@ class EvasionScene(TensorClass):
         ever = present.any(1).any(0)
         mission = mission_of(scene)
         s, _, _ = project_track(
-            states[:, :, 0, :2], mission.points, known=valid[:, :, 0], start=BEHIND
+            states[:, :, 0, :2],
+            mission.points,
+            known=valid[:, :, 0],
+            start=BEHIND,
         )
         return EvasionScene(
             start=states[row, moment, 0],
@@ -86,10 +89,22 @@ def violations(
         clearance: m.
         road_margin: m inside the drivable border.
     """
-    missing = clearance_violation(states, scene, clearance=clearance)
-    beyond = road_violation(states, scene, margin=road_margin)
+    missing = clearance_violation(
+        states,
+        scene,
+        clearance=clearance,
+    )
+    beyond = road_violation(
+        states,
+        scene,
+        margin=road_margin,
+    )
     violation = (missing + beyond) * scene.inside[:, None]
-    ended = past_end(states, violation > 0, scene=scene)
+    ended = past_end(
+        states,
+        violation > 0,
+        scene=scene,
+    )
     return violation.masked_fill(ended[..., None], 0.0)
 
 
@@ -126,8 +141,19 @@ def clearance_violation(
 def road_violation(states: Tensor, scene: EvasionScene, margin: float) -> Tensor:
     """Metres [B, C, T] beyond a line `margin` m inside the drivable border, from the
     first time within it."""
-    start = off_road(scene.start[:, None, :2], scene.field, origin=scene.origin)
-    beyond = off_road(states[..., :2], scene.field, origin=scene.origin) + margin
+    start = off_road(
+        scene.start[:, None, :2],
+        scene.field,
+        origin=scene.origin,
+    )
+    beyond = (
+        off_road(
+            states[..., :2],
+            scene.field,
+            origin=scene.origin,
+        )
+        + margin
+    )
     start = (start + margin)[..., None].expand_as(beyond[..., :1])
     before = torch.cat([start, beyond[..., :-1]], -1)
     return beyond.clamp(min=0) * (before.cummin(-1).values <= 0)
@@ -147,5 +173,9 @@ def past_end(states: Tensor, wrong: Tensor, scene: EvasionScene) -> Tensor:
     speed = torch.cat([start_speed, states[..., 3]], -1)
     driven = ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1)
     hint = scene.s[:, None] + driven.gather(2, last)[..., 0]
-    s, _, _ = project(position[:, :, 0], scene.mission, hint=hint)
+    s, _, _ = project(
+        position[:, :, 0],
+        scene.mission,
+        hint=hint,
+    )
     return (s >= scene.end[:, None]) & (first > 0)

@@ -83,8 +83,16 @@ def failure_columns(batch: Batch) -> Batch:
     before the contact, NaN without one."""
     collisions = batch["collisions"]
     window, known = collisions.window(collisions.before, WINDOW)
-    lanes = lane_headings(collisions, window, every=LANE_EVERY)
-    manoeuvres = manoeuvre(window, known, lanes=lanes)
+    lanes = lane_headings(
+        collisions,
+        window,
+        every=LANE_EVERY,
+    )
+    manoeuvres = manoeuvre(
+        window,
+        known,
+        lanes=lanes,
+    )
     ego_moved, partner_moved = batch["moved_into"].unbind(1)
     words = {
         "approach": approach(
@@ -121,7 +129,11 @@ def manoeuvre(window: Tensor, known: Tensor, lanes: Tensor) -> Tensor:
     across = across.masked_fill(follows_bend, 0.0)
     late_seconds = known.clamp(1, LATE)[:, None] * DT
     acceleration = (speed[:, -1] - speed[:, -1 - LATE]) / late_seconds
-    result = torch.full_like(turn, KEEPS, dtype=torch.int64)
+    result = torch.full_like(
+        turn,
+        KEEPS,
+        dtype=torch.int64,
+    )
     result[acceleration > SPEEDING] = ACCELERATES
     result[acceleration < -SPEEDING] = BRAKES
     for change, threshold, left in (
@@ -155,9 +167,21 @@ def approach(
     late = -1 - LATE
     heading = travel_heading(window)
     relative = wrap(heading[:, 0, PARTNER] - heading[:, 0, EGO])
-    on_path, follows, offset = place_on_path(window, size, step=0)
-    on_path_late, _, late_offset = place_on_path(window, size, step=late)
-    _, is_followed, _ = place_on_path(window.flip(2), size.flip(1), step=0)
+    on_path, follows, offset = place_on_path(
+        window,
+        size,
+        step=0,
+    )
+    on_path_late, _, late_offset = place_on_path(
+        window,
+        size,
+        step=late,
+    )
+    _, is_followed, _ = place_on_path(
+        window.flip(2),
+        size.flip(1),
+        step=0,
+    )
     same_direction = (relative.abs() < ALIGNED) | follows | is_followed | stands
 
     ego_pose = torch.cat([window[:, late, EGO, :2], heading[:, late, EGO, None]], -1)
@@ -189,7 +213,12 @@ def place_on_path(
     path = window[:, step:, 0]
     other = window[:, step, 1]
     boxes, sizes = path_boxes(path, size[:, 0])
-    gap = separation(other[:, None], size[:, None, 1], second=boxes, second_size=sizes)
+    gap = separation(
+        other[:, None],
+        size[:, None, 1],
+        second=boxes,
+        second_size=sizes,
+    )
     touches = (gap <= 0).any(-1)
     nearest = (path[..., :2] - other[:, None, :2]).norm(dim=-1).argmin(-1)
     pose = path[torch.arange(len(path)), nearest]

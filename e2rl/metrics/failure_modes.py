@@ -24,10 +24,9 @@ Row = Mapping[str, Any]
 THRESHOLD = 1.0  # mean distance of two groups of failures up to which they are one mode
 SPEED_WEIGHT = 0.025  # of a difference of 1 m/s
 AGREED = 2 / 3  # fraction of a mode's failures that a word of its name is true of
-LEAST, MANY = (
-    0.02,
-    10,
-)  # fraction of the failures that a mode has at least, and two where there are MANY failures
+# Failures that a mode has at least: a fraction of all, and two where there are MANY.
+LEAST = 0.02
+MANY = 10
 SIDE = re.compile(r"(?: from the| on the)? (left|right)$")
 SPEEDS = ("ego_speed", "partner_speed")
 PLACES = 10  # at which `mode_coverage` looks: failures at fewer places give none
@@ -45,12 +44,15 @@ declare(
         "mode_coverage", f"failure modes expected of collisions at {PLACES} places"
     ),
     _coverage(
-        "mode_coverage_counted", "the same, of collisions that count", weight="counted"
+        "mode_coverage_counted",
+        "the same, of collisions that count",
+        weight="counted",
     ),
 )
 
 
-FEATURES = {  # columns of words: how far apart two failures are whose words differ in kind, in the side (left, right)
+# Columns of words: how far apart two failures are whose words differ in kind, in side.
+FEATURES = {
     "approach": (2.0, 0.5),
     "duty": (1.0, 0.0),
     "partner_manoeuvre": (0.5, 0.25),
@@ -73,8 +75,8 @@ def word(row: Row, column: str) -> str:
 def split_side(text: str) -> tuple[str, str]:
     """Kind and side of a word: ("crossing", "left") of "crossing from the left",
     ("brakes", "") of "brakes"."""
-    found = SIDE.search(text)
-    return (text[: found.start()], found.group(1)) if found else (text, "")
+    match = SIDE.search(text)
+    return (text[: match.start()], match.group(1)) if match else (text, "")
 
 
 def known_features(failures: Sequence[Row]) -> list[str]:
@@ -120,7 +122,16 @@ def cluster_failures(failures: Sequence[Row]) -> list[int]:
     number = {
         cluster: place for place, (cluster, _) in enumerate(sizes.most_common(), 1)
     }
-    return [number[cluster] for _, cluster in sorted(zip(order, found, strict=True))]
+    return [
+        number[cluster]
+        for _, cluster in sorted(
+            zip(
+                order,
+                found,
+                strict=True,
+            )
+        )
+    ]
 
 
 def large_modes(modes: Sequence[int]) -> list[int]:

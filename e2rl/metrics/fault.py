@@ -158,7 +158,11 @@ def blocks_lane(collisions: Collisions) -> Tensor:
     line = collisions.lane_index
     start = collisions.lane_points[:, :-1]
     along = collisions.lane_points.diff(dim=1)
-    gap = from_segment(ego[:, None, :2], start, along=along).norm(dim=-1)
+    gap = from_segment(
+        ego[:, None, :2],
+        start,
+        along=along,
+    ).norm(dim=-1)
     turn = wrap(torch.atan2(along[..., 1], along[..., 0]) - direction[:, None])
     is_lane = (line[:, 1:] == line[:, :-1]) & (line[:, 1:] >= 0)
     runs_there = is_lane & (gap <= LANE_HALF) & (turn.abs() < LANE_ANGLE)

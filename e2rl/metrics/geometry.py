@@ -44,17 +44,25 @@ def pair_overlap(
     second_size: Tensor,
     possible: Tensor,
 ) -> Tensor:
-    """Overlap area [...] [m2] of pairs of boxes; 0 where `possible` [...] is false or
-    the area is at most MIN_AREA.
+    """Overlap area [...] [m2] of pairs of boxes; 0 where the area is at most MIN_AREA.
 
     The exact area is computed only for the pairs that `scenes.boxes.overlap` finds.
+
+    Args:
+        first, second: states [..., 4].
+        first_size, second_size: [..., 2].
+        possible: [...] bool, pairs that count; the area of others is 0.
     """
     boxes = (first, first_size, second, second_size)
     meets = possible & overlap(*boxes)
     area = overlap_area(
         *(box.expand(*meets.shape, box.shape[-1])[meets] for box in boxes)
     )
-    result = torch.zeros(meets.shape, dtype=first.dtype, device=first.device)
+    result = torch.zeros(
+        meets.shape,
+        dtype=first.dtype,
+        device=first.device,
+    )
     return result.masked_scatter(meets, area.masked_fill(area <= MIN_AREA, 0.0))
 
 
@@ -67,9 +75,17 @@ def overlap_area(
     point of it clamped into the second box, encloses exactly the intersection, so area
     = sum over edges of the integral of clamp(x) d clamp(y). The integrand is continuous
     in the boxes, hence shared or collinear edges need no special case.
+
+    Args:
+        first, second: states [..., 4].
+        first_size, second_size: [..., 2].
     """
     start, change, half, bounds = _edges_in_frame(
-        first, first_size, other=second, other_size=second_size, zero=1.0
+        first,
+        first_size,
+        other=second,
+        other_size=second_size,
+        zero=1.0,
     )
     begin, end = bounds[..., 1].clamp(0, 1)  # where y is inside the second box's width
     knots = torch.stack([begin, *(bounds[..., 0].maximum(begin).minimum(end)), end], -1)
@@ -85,9 +101,18 @@ def edge_parts_inside(
     box: Tensor, size: Tensor, other: Tensor, other_size: Tensor
 ) -> Tensor:
     """Length [..., 4] [m] of each of the box's edges (order `EDGES`) that lies inside
-    the other box."""
+    the other box.
+
+    Args:
+        box, other: states [..., 4].
+        size, other_size: [..., 2].
+    """
     _, change, _, (enter, leave) = _edges_in_frame(
-        box, size, other=other, other_size=other_size, zero=torch.finfo(box.dtype).tiny
+        box,
+        size,
+        other=other,
+        other_size=other_size,
+        zero=torch.finfo(box.dtype).tiny,
     )
     part = (leave.amin(-1).clamp(0, 1) - enter.amax(-1).clamp(0, 1)).clamp(min=0)
     return part * change.norm(dim=-1)
@@ -119,7 +144,9 @@ def edge_distances(box: Tensor, size: Tensor, point: Tensor) -> Tensor:
     [..., 2]."""
     start = corners(box, size)
     return from_segment(
-        point[..., None, :], start, along=start.roll(-1, -2) - start
+        point[..., None, :],
+        start,
+        along=start.roll(-1, -2) - start,
     ).norm(dim=-1)
 
 
@@ -153,9 +180,14 @@ def candidates(
 ) -> tuple[Tensor, Tensor]:
     """Pairs (point index, item index) of the same group that share a cell.
 
-    points [n, D] m, their groups [n] int64 >= 0; items with bounds low, high [m, D] m,
-    their groups [m]; cell size [m]. Every point inside an item's bounds [low, high] is
-    among the pairs; each pair occurs once.
+    Every point inside an item's bounds is among the pairs; each pair occurs once.
+
+    Args:
+        points: [n, D] m.
+        point_group: [n] int64 >= 0.
+        low, high: [m, D] m, bounds of the items.
+        item_group: [m] int64 >= 0.
+        cell: m, size of the cells.
     """
     empty = points.new_zeros(0, dtype=torch.int64)
     if not len(points) or not len(low):
@@ -174,11 +206,24 @@ def candidates(
         covered.append(first[item, axis] + index % span[item, axis])
         index = index // span[item, axis]
     item_key, order = cell_key(
-        item_group[item], torch.stack(covered, -1), extent=extent
+        item_group[item],
+        torch.stack(covered, -1),
+        extent=extent,
     ).sort()
-    point_key = cell_key(point_group, cells, extent=extent)
+    point_key = cell_key(
+        point_group,
+        cells,
+        extent=extent,
+    )
     begin = torch.searchsorted(item_key, point_key)
-    point, index = ragged(torch.searchsorted(item_key, point_key, right=True) - begin)
+    point, index = ragged(
+        torch.searchsorted(
+            item_key,
+            point_key,
+            right=True,
+        )
+        - begin
+    )
     return point, item[order[begin[point] + index]]
 
 

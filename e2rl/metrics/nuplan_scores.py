@@ -147,7 +147,11 @@ def places_of(batch: Batch) -> Places:
     is_used = torch.zeros_like(batch["lane_width"], dtype=torch.bool)
     is_used[point // count, lane] = True
     most = max(1, int(is_used.sum(1).amax()))
-    order = is_used.byte().argsort(dim=1, descending=True, stable=True)
+    order = is_used.byte().argsort(
+        dim=1,
+        descending=True,
+        stable=True,
+    )
     lanes = order[:, :most]
     slot = (is_used.long().cumsum(1) - 1)[point // count, lane]
     inside = states.new_zeros(len(states) * count, most)
@@ -215,8 +219,18 @@ def linked(batch: Batch, lanes: Tensor) -> Tensor:
     lane = index.masked_fill(index < 0, count)
 
     def end_points(reduce: str) -> Tensor:
-        ends = torch.zeros(len(index), count + 1, dtype=torch.int64)
-        ends = ends.scatter_reduce(1, lane, position, reduce, include_self=False)
+        ends = torch.zeros(
+            len(index),
+            count + 1,
+            dtype=torch.int64,
+        )
+        ends = ends.scatter_reduce(
+            1,
+            lane,
+            position,
+            reduce,
+            include_self=False,
+        )
         return batch["lane_points"][rows, ends.gather(1, lanes)]
 
     first = end_points("amin")
@@ -249,9 +263,16 @@ def contacts_of(batch: Batch, places: Places) -> Contacts:
     ego = batch["states"][row, step, 0]
     size = batch["size"][row, 0]
     other = batch["states"][index]
-    angle = angle_at(rear_axle(ego, size), ego[:, 2], centre=other[:, :2])
+    angle = angle_at(
+        rear_axle(ego, size),
+        ego[:, 2],
+        centre=other[:, :2],
+    )
     parts = edge_parts_inside(
-        ego, size, other=other, other_size=batch["size"][row, agent]
+        ego,
+        size,
+        other=other,
+        other_size=batch["size"][row, agent],
     )
     front = parts[:, 3] > 0
     moves = ego[:, 3].abs() > STOPPED
@@ -281,7 +302,11 @@ def drivable_area(batch: Batch) -> Tensor:
     rollout = torch.arange(len(states)).repeat_interleave(xy[0, ..., 0].numel())
     points = Points(xy.flatten(0, 2), rollout)
     polygons = Segments.polygons(batch)
-    inside = near_lane(points, batch, margin=MAX_OUTSIDE)
+    inside = near_lane(
+        points,
+        batch,
+        margin=MAX_OUTSIDE,
+    )
     others, index = points.outside(inside)
     inside[index] = inside_polygon(others, polygons)
     near_border, _ = near_segments(points, polygons, MAX_OUTSIDE)
@@ -319,7 +344,11 @@ def time_to_collision(batch: Batch, places: Places, contacts: Contacts) -> Tenso
     speed = batch["track_speed"]
     ego = states[:, :, :1]
     axle = rear_axle(ego, size[:, None, :1])
-    angle = angle_at(axle, ego[..., 2], centre=states[..., :2])
+    angle = angle_at(
+        axle,
+        ego[..., 2],
+        centre=states[..., :2],
+    )
     beside = (places.loose | places.crossing)[..., None] & (angle <= BEHIND)
     met = contacts.first.cumsum(1) > 0
     counted = batch["valid"] & ~met & ((angle < AHEAD) | beside)
@@ -330,11 +359,24 @@ def time_to_collision(batch: Batch, places: Places, contacts: Contacts) -> Tenso
     counted &= (states[..., :2] - ego[..., :2]).norm(dim=-1) < reach
     index = counted.nonzero(as_tuple=True)
     row, step, agent = index
-    seconds = torch.arange(DT, LEAST_TTC, DT, dtype=states.dtype)[:, None]  # [K, 1]
+    seconds = torch.arange(
+        DT,
+        LEAST_TTC,
+        DT,
+        dtype=states.dtype,
+    )[:, None]  # [K, 1]
     touches = overlap(
-        projected(states[row, step, 0], speed[row, step, 0], seconds=seconds),
+        projected(
+            states[row, step, 0],
+            speed[row, step, 0],
+            seconds=seconds,
+        ),
         size[row, 0],
-        second=projected(states[index], speed[index], seconds=seconds),
+        second=projected(
+            states[index],
+            speed[index],
+            seconds=seconds,
+        ),
         second_size=size[row, agent],
     )
     meets = torch.zeros(len(states), dtype=torch.bool)
@@ -361,12 +403,21 @@ def expert_progress(batch: Batch) -> Tensor:
     0 where the ego ends more than f behind its start.
     """
     last = torch.full_like(batch["stop"], batch["states"].shape[1] - 1)
-    path, count = ego_path(batch["states"], batch["valid"], stop=last)
+    path, count = ego_path(
+        batch["states"],
+        batch["valid"],
+        stop=last,
+    )
     recorded, recorded_count = ego_path(
-        batch["logged"], batch["logged_valid"], stop=last
+        batch["logged"],
+        batch["logged_valid"],
+        stop=last,
     )
     fraction = route_completion(
-        path, count, logged=batch["logged"], logged_valid=batch["logged_valid"]
+        path,
+        count,
+        logged=batch["logged"],
+        logged_valid=batch["logged_valid"],
     )
     pieces = torch.arange(1, recorded.shape[1]) < recorded_count[:, None]
     length = (recorded[:, 1:, :2] - recorded[:, :-1, :2]).norm(dim=-1)
@@ -408,10 +459,27 @@ def comfort(ego: Tensor, length: Tensor) -> Tensor:
     total = smoothed(accel.abs(), window=8)
     motion = {
         "longitudinal": longitudinal,
-        "yaw_rate": smoothed(heading, window=5, deriv=1),
-        "yaw_accel": smoothed(heading, window=5, order=3, deriv=2),
-        "longitudinal_jerk": smoothed(longitudinal, window=15, deriv=1),
-        "jerk": smoothed(total, window=15, deriv=1),
+        "yaw_rate": smoothed(
+            heading,
+            window=5,
+            deriv=1,
+        ),
+        "yaw_accel": smoothed(
+            heading,
+            window=5,
+            order=3,
+            deriv=2,
+        ),
+        "longitudinal_jerk": smoothed(
+            longitudinal,
+            window=15,
+            deriv=1,
+        ),
+        "jerk": smoothed(
+            total,
+            window=15,
+            deriv=1,
+        ),
     }
     within = [
         (low < motion[name]) & (motion[name] < high)
@@ -439,4 +507,10 @@ def smoothed(
     """
     values = np.asarray(values)
     length = min(window, values.shape[-1])
-    return savgol_filter(values, length, order, deriv=deriv, delta=DT).round(8)
+    return savgol_filter(
+        values,
+        length,
+        order,
+        deriv=deriv,
+        delta=DT,
+    ).round(8)

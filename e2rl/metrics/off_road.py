@@ -70,7 +70,11 @@ class Segments(NamedTuple):
     @classmethod
     def polygons(cls, batch: Batch) -> "Segments":
         """Of the borders of the drivable polygons of a batch."""
-        return cls.of(batch["drivable_points"], batch["drivable_index"], closed=True)
+        return cls.of(
+            batch["drivable_points"],
+            batch["drivable_index"],
+            closed=True,
+        )
 
 
 def near_segments(
@@ -88,7 +92,11 @@ def near_segments(
         cell=CELL,
     )
     start, end = segments.ends[segment].unbind(1)
-    offset = from_segment(points.xy[point], start, along=end - start)
+    offset = from_segment(
+        points.xy[point],
+        start,
+        along=end - start,
+    )
     near = offset.square().sum(-1) <= reach[segment].square()
     return point[near], segment[near]
 
@@ -165,8 +173,16 @@ def has_map(batch: Batch) -> Tensor:
         weight="aor_vehicle_steps",
         tables="main traffic adversaries methods public",
     ),
-    rate("aor_any", "off the road, of rollouts", tables="main traffic methods"),
-    event("ego_off_road", "ego leaves the road", tables="main egos public"),
+    rate(
+        "aor_any",
+        "off the road, of rollouts",
+        tables="main traffic methods",
+    ),
+    event(
+        "ego_off_road",
+        "ego leaves the road",
+        tables="main egos public",
+    ),
     events=("aor_vehicle_steps", "aor_left_out"),
 )
 def off_road_columns(batch: Batch) -> Batch:

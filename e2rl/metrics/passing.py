@@ -51,8 +51,19 @@ def with_passing(
     one_before = boxes[0][rollout, step - 1, agent]
     two_before = boxes[2][rollout, step - 1, agent]
     half = torch.full_like(one[:, 0], 0.5)
-    heading = interpolated(one_before, one, fraction=half)[:, 2]
-    turn = interpolated(two_before, two, fraction=half)[:, 2] - heading
+    heading = interpolated(
+        one_before,
+        one,
+        fraction=half,
+    )[:, 2]
+    turn = (
+        interpolated(
+            two_before,
+            two,
+            fraction=half,
+        )[:, 2]
+        - heading
+    )
     frame = torch.nn.functional.pad(heading[:, None], (2, 0))
     begin, end = time_inside(
         to_frame(two_before[:, :2] - one_before[:, :2], frame).T,
@@ -63,9 +74,17 @@ def with_passing(
     )
     middle = (begin + end) / 2
     overlap = pair_overlap(
-        interpolated(one_before, one, fraction=middle),
+        interpolated(
+            one_before,
+            one,
+            fraction=middle,
+        ),
         one_size,
-        second=interpolated(two_before, two, fraction=middle),
+        second=interpolated(
+            two_before,
+            two,
+            fraction=middle,
+        ),
         second_size=two_size,
         possible=begin < end,
     )

@@ -67,7 +67,9 @@ class Collision(NamedTuple):
     def others(self) -> Tracks:
         """All but the ego."""
         return Tracks(
-            self.states[:, :, 1:], self.size[:, 1:], present=self.present[:, :, 1:]
+            self.states[:, :, 1:],
+            self.size[:, 1:],
+            present=self.present[:, :, 1:],
         )
 
 
@@ -87,11 +89,17 @@ def preventions(
     length = collision.states.shape[1]
     collision = extended(nearest_first(collision))
     along = along_path(
-        collision.states[:, :, 0], collision.size[:, 0, 1], others=collision.others
+        collision.states[:, :, 0],
+        collision.size[:, 0, 1],
+        others=collision.others,
     )
     result = {}
     for name, driver in drivers.items():
-        found = prevention(driver, collision, along=along)
+        found = prevention(
+            driver,
+            collision,
+            along=along,
+        )
         result[name] = found._replace(states=found.states[:, :length])
     return result
 
@@ -102,19 +110,38 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
     others = collision.others
     stop = collision.stop
     size = collision.size[:, 0]
-    driven = redrive(driver, collision.states[:, :, 0], size=size, others=along)
+    driven = redrive(
+        driver,
+        collision.states[:, :, 0],
+        size=size,
+        others=along,
+    )
     steps = torch.arange(driven.shape[1], device=stop.device)
     counts = ((steps >= 1) & (steps <= stop[:, None] + AFTER))[..., None]
-    touched = contacts(driven, size, others=others) & counts
+    touched = (
+        contacts(
+            driven,
+            size,
+            others=others,
+        )
+        & counts
+    )
     misses_partner = ~touched[:, :, 0].any(1)
     row = torch.arange(len(stop), device=stop.device)
     first_touch = touched[:, :, 0].int().argmax(1)
     stands = driven[row, first_touch, 3] <= CREEPING
     avoided, followers = followers_brake(
-        Leader(driven, size), others, touched, counts=counts, avoided=misses_partner
+        Leader(driven, size),
+        others,
+        touched,
+        counts=counts,
+        avoided=misses_partner,
     )
     return Prevention(
-        avoided, followers, states=driven, struck=~misses_partner & stands
+        avoided,
+        followers,
+        states=driven,
+        struck=~misses_partner & stands,
     )
 
 
@@ -128,7 +155,11 @@ class Leader(NamedTuple):
     def track(self) -> Tracks:
         """The same, as the only one of N = 1 vehicles."""
         present = torch.ones_like(self.states[:, :, :1], dtype=torch.bool)
-        return Tracks(self.states[:, :, None], self.size[:, None], present=present)
+        return Tracks(
+            self.states[:, :, None],
+            self.size[:, None],
+            present=present,
+        )
 
 
 def followers_brake(
@@ -144,7 +175,11 @@ def followers_brake(
         counts: [B, T+1, 1] bool, steps in which a contact counts.
         avoided: [B] bool, the partner is not touched.
     """
-    followers = torch.zeros(len(avoided), dtype=torch.int64, device=avoided.device)
+    followers = torch.zeros(
+        len(avoided),
+        dtype=torch.int64,
+        device=avoided.device,
+    )
     row = torch.arange(len(avoided), device=avoided.device)
     blamed = touched.any(1)
     blamed[:, 0] = False  # the partner
@@ -155,7 +190,10 @@ def followers_brake(
         first_touch = touched.int().argmax(1)
         follower = first_touch.masked_fill(~blamed, touched.shape[1]).argmin(1)
         comes_from_behind = follows(
-            leader.states, others, step=first_touch[row, follower], index=follower
+            leader.states,
+            others,
+            step=first_touch[row, follower],
+            index=follower,
         )
         avoided = avoided & (~hits | (comes_from_behind & (blamed.sum(1) == 1)))
         states = others.states[row, :, follower]
@@ -164,14 +202,41 @@ def followers_brake(
             DRIVERS["human"],
             states,
             size=size,
-            others=along_path(states, size[:, 1], others=leader.track),
+            others=along_path(
+                states,
+                size[:, 1],
+                others=leader.track,
+            ),
         )
-        still_hits = (contacts(braked, size, others=leader.track) & counts).any(1)
+        still_hits = (
+            contacts(
+                braked,
+                size,
+                others=leader.track,
+            )
+            & counts
+        ).any(1)
         avoided = avoided & (~hits | ~still_hits[:, 0])
         followers = followers + (hits & avoided).long()
-        recorded = (contacts(states, size, others=others) & counts).any(1, keepdim=True)
+        recorded = (
+            contacts(
+                states,
+                size,
+                others=others,
+            )
+            & counts
+        ).any(1, keepdim=True)
         itself = one_hot(follower, blamed.shape[1]).bool()[:, None]
-        touched = contacts(braked, size, others=others) & counts & ~recorded & ~itself
+        touched = (
+            contacts(
+                braked,
+                size,
+                others=others,
+            )
+            & counts
+            & ~recorded
+            & ~itself
+        )
         blamed = touched.any(1) & (hits & avoided)[:, None]
         leader = Leader(braked, size)
     return avoided, followers
@@ -249,7 +314,12 @@ def contacts(states: Tensor, size: Tensor, others: Tracks) -> Tensor:
     first = states[:, :, None]
     first_size = size[:, None, None]
     second_size = others.size[:, None]
-    gap = separation(first, first_size, second=others.states, second_size=second_size)
+    gap = separation(
+        first,
+        first_size,
+        second=others.states,
+        second_size=second_size,
+    )
     touches = (gap < 0) & others.present
     _, moment = with_passing(
         first,
@@ -287,7 +357,11 @@ def poses(states: Tensor, s: Tensor) -> Tensor:
     """Poses [B, K, 3] at arc lengths s [B, K] of a path states [B, T+1, 4], straight on
     beyond its end."""
     length = driven_length(states)
-    after = torch.searchsorted(length, s.contiguous(), right=True)
+    after = torch.searchsorted(
+        length,
+        s.contiguous(),
+        right=True,
+    )
     after = after.clamp(1, length.shape[1] - 1)
     low = length.gather(1, after - 1)
     high = length.gather(1, after)
@@ -308,7 +382,9 @@ def along_path(states: Tensor, width: Tensor, others: Tracks) -> Along:
     """Others seen along the path states [B, T+1, 4] of a vehicle of `width` [B] m."""
     reach = STRAIGHT + (driven_length(states).amax().item() if len(states) else 0.0)
     vertices = SPACING * torch.arange(
-        int(reach / SPACING) + 2, device=states.device, dtype=states.dtype
+        int(reach / SPACING) + 2,
+        device=states.device,
+        dtype=states.dtype,
     )
     route = poses(states, vertices.expand(len(states), -1))[..., :2]
     present = others.present.to(route.dtype)
@@ -373,7 +449,12 @@ def extended(collision: Collision) -> Collision:
     rollout saves nobody."""
     states = collision.states
     present = collision.present
-    times = DT * torch.arange(1, AFTER + 1, device=states.device, dtype=states.dtype)
+    times = DT * torch.arange(
+        1,
+        AFTER + 1,
+        device=states.device,
+        dtype=states.dtype,
+    )
     onwards = constant_velocity(states[:, -1], times).transpose(1, 2)
     return collision._replace(
         states=torch.cat([states, onwards], 1),

@@ -22,18 +22,33 @@ SMOOTHING = 0.5  # s, moving average of the ego's speed before its derivative
 LEAST_WAY = 1.0  # m: of a shorter recorded way no fraction is known
 STANDING = 0.5  # m/s at the start frame
 MOVED = 2.0  # m from the start position
-per_km = partial(Metric, unit="1/km", per="driven_km", tables="egos")
+per_km = partial(
+    Metric,
+    unit="1/km",
+    per="driven_km",
+    tables="egos",
+)
 
 
 @columns(
-    Metric("min_dtc", "smallest gap to another agent", unit="m", tables="main methods"),
+    Metric(
+        "min_dtc",
+        "smallest gap to another agent",
+        unit="m",
+        tables="main methods",
+    ),
     Metric(
         "ttc_c",
         "time-to-collision cost, adversaries",
         tables="main adversaries methods",
     ),
     Metric("ttc_c_all", "time-to-collision cost, all agents"),
-    Metric("macc", "ego's mean |acceleration|", unit="m/s²", tables="main egos public"),
+    Metric(
+        "macc",
+        "ego's mean |acceleration|",
+        unit="m/s²",
+        tables="main egos public",
+    ),
     Metric(
         "progress",
         "distance that the ego drives",
@@ -46,8 +61,16 @@ per_km = partial(Metric, unit="1/km", per="driven_km", tables="egos")
         "fraction of the recorded ego's path driven until contact",
         tables="public",
     ),
-    per_km("failures_per_km", "`cfr`, of all that the ego drives", column="cfr"),
-    per_km("counted_per_km", "the same of `cfr_counted`", column="cfr_counted"),
+    per_km(
+        "failures_per_km",
+        "`cfr`, of all that the ego drives",
+        column="cfr",
+    ),
+    per_km(
+        "counted_per_km",
+        "the same of `cfr_counted`",
+        column="cfr_counted",
+    ),
 )
 def motion_columns(batch: Batch) -> Batch:
     """min_dtc, ttc_c, ttc_c_all, macc, progress, driven_km and route_completion over
@@ -68,7 +91,11 @@ def motion_columns(batch: Batch) -> Batch:
     cost = closest_approach_cost(
         states[..., :2] - states[..., :1, :2], moving - moving[..., :1, :]
     )
-    path, count = ego_path(states, valid, stop=stop)
+    path, count = ego_path(
+        states,
+        valid,
+        stop=stop,
+    )
     driven = progress(path, count)
     return {
         "min_dtc": gap.masked_fill(gap.isinf(), torch.nan).masked_fill(
@@ -80,7 +107,10 @@ def motion_columns(batch: Batch) -> Batch:
         "progress": driven,
         "driven_km": driven / 1000,
         "route_completion": route_completion(
-            path, count, logged=batch["logged"], logged_valid=batch["logged_valid"]
+            path,
+            count,
+            logged=batch["logged"],
+            logged_valid=batch["logged_valid"],
         ),
     }
 
@@ -140,14 +170,23 @@ def route_completion(
     """Fraction [B] in [0, 1] of the recorded ego's path that lies behind the ego at the
     end of its path.
 
-    path [B, T+1, 4] of `count` [B] states; logged [B, T+1, N, 4], logged_valid [B, T+1,
-    N]: the recording. The ego is projected onto the nearest piece of the recorded way,
+    The ego is projected onto the nearest piece of the recorded way,
     as MetaDrive does. Where that jumps, as at a crossing of the way with itself, it is
     followed from the start on instead. NaN where the ego is in no step, or where the
     recorded way is shorter than LEAST_WAY.
+
+    Args:
+        path: [B, T+1, 4].
+        count: [B], states of the path.
+        logged: [B, T+1, N, 4], the recording.
+        logged_valid: [B, T+1, N] bool.
     """
     steps = torch.full_like(count, logged.shape[1] - 1)
-    recorded, known = ego_path(logged, logged_valid, stop=steps)
+    recorded, known = ego_path(
+        logged,
+        logged_valid,
+        stop=steps,
+    )
     piece = (
         torch.arange(recorded.shape[1] - 1, device=path.device) < (known - 1)[:, None]
     )
@@ -199,7 +238,10 @@ def _place_on(
     )
     if len(rows):
         nearest[rows] = _followed(
-            place[rows], gap[rows], ends=ends[rows], moved=moved[rows]
+            place[rows],
+            gap[rows],
+            ends=ends[rows],
+            moved=moved[rows],
         )
     return nearest.gather(1, (count - 1).clamp(min=0)[:, None])[:, 0]
 

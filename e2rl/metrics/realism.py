@@ -65,7 +65,13 @@ declare(
         samples="a_lon",
         tables="traffic",
     ),
-    Metric("w1_jerk", "W1 of |jerk|", unit="m/s³", samples="a_lon", tables="traffic"),
+    Metric(
+        "w1_jerk",
+        "W1 of |jerk|",
+        unit="m/s³",
+        samples="a_lon",
+        tables="traffic",
+    ),
 )
 
 
@@ -80,8 +86,11 @@ def kinematic_samples(
     """{quantity: [2, n]} per rollout: samples of the rollout (row 0) and of its log
     (row 1), blocks of steps 1..stop.
 
-    states, logged [B, T+1, N, 4], their validity [B, T+1, N], agents [B, N] bool
-    (simulated, not the ego), stop [B].
+    Args:
+        states, logged: [B, T+1, N, 4].
+        valid, logged_valid: [B, T+1, N] bool.
+        agents: [B, N] bool, simulated, not the ego.
+        stop: [B].
     """
     blocks = (states.shape[1] - 1) // BLOCK
     both = valid & logged_valid
@@ -95,12 +104,18 @@ def kinematic_samples(
     thrice = twice[:, 1:] & twice[:, :-1]
     pair = [block_kinematics(track) for track in (states, logged)]
     result: list[Samples] = [{} for _ in range(len(states))]
-    for name, mask in zip(KINEMATICS, (twice, twice, thrice), strict=True):
+    for name, mask in zip(
+        KINEMATICS,
+        (twice, twice, thrice),
+        strict=True,
+    ):
         values = torch.stack([motion[name][mask] for motion in pair]).clamp(
             -CLIP[name], CLIP[name]
         )
         for samples, part in zip(
-            result, values.split(mask.sum((1, 2)).tolist(), 1), strict=True
+            result,
+            values.split(mask.sum((1, 2)).tolist(), 1),
+            strict=True,
         ):
             samples[name] = part.clone()
     return result
@@ -115,8 +130,19 @@ def traffic_samples(batch: dict[str, Tensor]) -> list[Samples]:
         *tracks, batch["traffic"] & batch["adversaries"], batch["stop"]
     )
     return [
-        samples | dict(zip(OF_ADVERSARIES, theirs.values(), strict=True))
-        for samples, theirs in zip(everybody, adversaries, strict=True)
+        samples
+        | dict(
+            zip(
+                OF_ADVERSARIES,
+                theirs.values(),
+                strict=True,
+            )
+        )
+        for samples, theirs in zip(
+            everybody,
+            adversaries,
+            strict=True,
+        )
     ]
 
 
@@ -176,8 +202,18 @@ def realism(
     rollouts' clusters, draws [D, C]: the multiplicities of clusters in each draw. NaN
     where a quantity has no sample.
     """
-    return _pooled(samples, cluster, draws=draws, names=KINEMATICS) | {
-        "real_adv": _pooled(samples, cluster, draws=draws, names=OF_ADVERSARIES)["real"]
+    return _pooled(
+        samples,
+        cluster,
+        draws=draws,
+        names=KINEMATICS,
+    ) | {
+        "real_adv": _pooled(
+            samples,
+            cluster,
+            draws=draws,
+            names=OF_ADVERSARIES,
+        )["real"]
     }
 
 
@@ -201,7 +237,11 @@ def _pooled(
             [sample[name].shape[1] for sample in samples], device=pair.device
         )
         distances.append(
-            wasserstein(pair, cluster.repeat_interleave(counts), draws=draws.to(pair))
+            wasserstein(
+                pair,
+                cluster.repeat_interleave(counts),
+                draws=draws.to(pair),
+            )
         )
         log = pair[1].sort().values
         ranges.append(
@@ -215,7 +255,13 @@ def _pooled(
         "real": 1 - distance.clamp(max=1).mean(0),
         "real_norm": 1 - (distance / log_range).clamp(max=1).mean(0),
     }
-    return table | dict(zip(W1, distances, strict=True))
+    return table | dict(
+        zip(
+            W1,
+            distances,
+            strict=True,
+        )
+    )
 
 
 def quantile_of_sorted(values: Tensor, fraction: float) -> Tensor:

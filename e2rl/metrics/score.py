@@ -28,7 +28,11 @@ CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
 
 
 @columns(
-    Metric("transport", "path KL of the control", tables="main adversaries"),
+    Metric(
+        "transport",
+        "path KL of the control",
+        tables="main adversaries",
+    ),
     Metric("transport_adversary", "path KL of the control, adversaries"),
     Metric("transport_others", "path KL of the control, other vehicles"),
     Metric("transport_anchor", "anchor jump"),
@@ -132,12 +136,24 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     ]
     if wrong:
         raise ValueError(
-            f"{', '.join(wrong)}: a metric is one number per rollout, a tensor [{len(traffic)}] here"
+            f"{', '.join(wrong)}: a metric is one number per rollout, a tensor "
+            f"[{len(traffic)}] here"
         )
     samples = traffic_samples(batch)
-    once = torch.ones(1, 1, dtype=torch.float64)
+    once = torch.ones(
+        1,
+        1,
+        dtype=torch.float64,
+    )
     owner = torch.zeros(1, dtype=torch.int64)
-    single = [realism([sample], owner, draws=once) for sample in samples]
+    single = [
+        realism(
+            [sample],
+            owner,
+            draws=once,
+        )
+        for sample in samples
+    ]
     return (
         result
         | {name: torch.cat([values[name] for values in single]) for name in single[0]},

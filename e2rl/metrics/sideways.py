@@ -44,7 +44,11 @@ def moved_within(states: Tensor, size: Tensor, lanes: Tensor) -> Tensor:
     """`moved_into` [C, 2] by states [C, W + 1, P, 4], sizes [C, P, 2] and headings of
     lanes [C, W + 1, P]."""
     left = torch.stack([-lanes.sin(), lanes.cos()], -1)
-    offset = lateral_motion(states, lanes, left=left)
+    offset = lateral_motion(
+        states,
+        lanes,
+        left=left,
+    )
     held = torch.cat(
         [
             states[..., :2] - offset[..., None] * left,
@@ -54,10 +58,21 @@ def moved_within(states: Tensor, size: Tensor, lanes: Tensor) -> Tensor:
         -1,
     )
     gap = separation(
-        held, size[:, None], second=states.flip(2), second_size=size.flip(1)[:, None]
+        held,
+        size[:, None],
+        second=states.flip(2),
+        second_size=size.flip(1)[:, None],
     )
     avoids = (gap > 0).all(1)
-    enters = (strip_gap(states, size, lanes=lanes, left=left)[:, :-1] > 0).any(1)
+    enters = (
+        strip_gap(
+            states,
+            size,
+            lanes=lanes,
+            left=left,
+        )[:, :-1]
+        > 0
+    ).any(1)
     to_other = states.flip(2)[:, -1, :, :2] - held[:, -1, :, :2]
     towards = (to_other * left[:, -1]).sum(-1).sign() * offset[:, -1]
     moves = (towards > LEAST_OFFSET) & (towards >= LEAST_SHARE * towards.flip(1))
@@ -137,7 +152,11 @@ def lanes_along(collisions: Collisions, moments: Tensor) -> tuple[Tensor, Tensor
     high = places.amax(1, keepdim=True) + LANE_REACH
     near = ((points >= low) & (points <= high)).all(-1) & (index >= 0)
     count = max(int(near.sum(1).amax()), 1)
-    chosen = torch.argsort(~near, dim=1, stable=True)[:, :count]
+    chosen = torch.argsort(
+        ~near,
+        dim=1,
+        stable=True,
+    )[:, :count]
     directions = lane_directions(points, index).gather(1, chosen)
     distance = torch.cdist(
         places,

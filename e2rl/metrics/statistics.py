@@ -55,7 +55,11 @@ def cluster_index(
     of which a scene may be one of several windows, LOG@START."""
     names = [
         f"location {place}" if place else f"log {scene.split('@')[0]}"
-        for place, scene in zip(locations, scenes, strict=True)
+        for place, scene in zip(
+            locations,
+            scenes,
+            strict=True,
+        )
     ]
     number = {name: index for index, name in enumerate(sorted(set(names)))}
     clusters = torch.tensor([number[name] for name in names], dtype=torch.int64)
@@ -66,10 +70,27 @@ def bootstrap_draws(clusters: int, draws: int = DRAWS, seed: int = 0) -> Tensor:
     """Multiplicities [1 + draws, clusters] float64 of clusters drawn with replacement;
     row 0 counts each once."""
     generator = torch.Generator().manual_seed(seed)
-    chosen = torch.randint(max(clusters, 1), (draws, clusters), generator=generator)
-    counts = torch.zeros(draws, clusters, dtype=torch.float64)
+    chosen = torch.randint(
+        max(clusters, 1),
+        (draws, clusters),
+        generator=generator,
+    )
+    counts = torch.zeros(
+        draws,
+        clusters,
+        dtype=torch.float64,
+    )
     counts.scatter_add_(1, chosen, torch.ones_like(chosen, dtype=torch.float64))
-    return torch.cat([torch.ones(1, clusters, dtype=torch.float64), counts])
+    return torch.cat(
+        [
+            torch.ones(
+                1,
+                clusters,
+                dtype=torch.float64,
+            ),
+            counts,
+        ]
+    )
 
 
 def resampled_means(
@@ -127,7 +148,9 @@ def resampled_labels(
     values, index = labels[known].unique(return_inverse=True)
     counts = draws.new_zeros(draws.shape[1], len(values))
     counts.index_put_(
-        (cluster[known], index), draws.new_ones(len(index)), accumulate=True
+        (cluster[known], index),
+        draws.new_ones(len(index)),
+        accumulate=True,
     )
     total = counts.sum(1, keepdim=True)
     times = draws * (total[:, 0] > 0)
@@ -243,7 +266,11 @@ class Bootstrap:
         def crossed(draws: int) -> Tensor:
             """[D, C * K]: places and trainings are drawn independently."""
             of_places = bootstrap_draws(places, draws)[:, :, None]
-            of_trainings = bootstrap_draws(trainings, draws, seed=1)[:, None]
+            of_trainings = bootstrap_draws(
+                trainings,
+                draws,
+                seed=1,
+            )[:, None]
             return (of_places * of_trainings).flatten(1)
 
         self.place_draws = bootstrap_draws(places, draws)
@@ -255,7 +282,10 @@ class Bootstrap:
     ) -> dict[str, Tensor]:
         """{metric: values [D] in each draw}."""
         means = resampled_means(
-            table.totals, table.weights, cluster=self.cluster, draws=self.draws
+            table.totals,
+            table.weights,
+            cluster=self.cluster,
+            draws=self.draws,
         )
         values = {}
         for column, metric in enumerate(row_metrics()):
@@ -263,7 +293,9 @@ class Bootstrap:
             values[metric.name] = means[:, column]
             if metric.median:
                 values[metric.name] = resampled_medians(
-                    total, self.cluster, draws=self.draws
+                    total,
+                    self.cluster,
+                    draws=self.draws,
                 )
             if metric.places:
                 values[metric.name] = resampled_labels(
@@ -272,7 +304,11 @@ class Bootstrap:
                     draws=self.place_draws,
                     places=metric.places,
                 )
-        return values | realism(list(samples), self.cluster, draws=self.realism_draws)
+        return values | realism(
+            list(samples),
+            self.cluster,
+            draws=self.realism_draws,
+        )
 
     def places(self, chosen: Tensor) -> int:
         """Number of places of the rollouts chosen [R] bool."""
@@ -296,7 +332,11 @@ class Bootstrap:
         places = self.places(known)
         if places < LEAST or metric.per:
             return UNKNOWN
-        return exact_interval(mean, places, level=level)
+        return exact_interval(
+            mean,
+            places,
+            level=level,
+        )
 
     def agreed(
         self, metric: Metric, values: Tensor, *, known: Tensor, least: float
@@ -320,7 +360,11 @@ class Bootstrap:
         if ((drawn - mean).abs() > SAME * max(1, abs(mean))).any():
             return None
         if metric.fraction:
-            return bounds_of_alike(mean, places, least=least)
+            return bounds_of_alike(
+                mean,
+                places,
+                least=least,
+            )
         return mean, mean
 
     def intervals(
@@ -375,21 +419,41 @@ def summarise(
         raise ValueError(
             f"{len(rows)} rows but {len(samples)} samples; score_rollouts makes both"
         )
-    bootstrap = Bootstrap(rows, draws, realism_draws=realism_draws)
+    bootstrap = Bootstrap(
+        rows,
+        draws,
+        realism_draws=realism_draws,
+    )
     table = MetricTable.of(rows, row_metrics())
     known = known_rollouts(~table.totals.isnan() & (table.weights > 0), samples)
     values = bootstrap.resampled(table, samples)
     result = bootstrap.intervals(values, known)
     for column, metric in enumerate(row_metrics()):
         name = metric.name
-        bounds = bootstrap.agreed(metric, values[name], known=known[name], least=0.0)
+        bounds = bootstrap.agreed(
+            metric,
+            values[name],
+            known=known[name],
+            least=0.0,
+        )
         if bounds is None and bootstrap.is_rare(
             metric, table.totals[:, column], table.weights[:, column]
         ):
             mean = values[name][0].item()
-            bounds = bootstrap.exact(metric, table, mean=mean, level=LEVEL)
+            bounds = bootstrap.exact(
+                metric,
+                table,
+                mean=mean,
+                level=LEVEL,
+            )
         if bounds is not None:
-            result[name] |= dict(zip(("low", "high"), bounds, strict=True))
+            result[name] |= dict(
+                zip(
+                    ("low", "high"),
+                    bounds,
+                    strict=True,
+                )
+            )
     return result
 
 
@@ -431,9 +495,18 @@ def paired_differences(
     table.totals = table.totals.masked_fill(unmatched, torch.nan)
     other_table.totals = other_table.totals.masked_fill(unmatched, torch.nan)
     shared = [  # either may tell the training
-        {**other, **row} for row, other in zip(rows, other_rows, strict=True)
+        {**other, **row}
+        for row, other in zip(
+            rows,
+            other_rows,
+            strict=True,
+        )
     ]
-    bootstrap = Bootstrap(shared, draws, realism_draws=realism_draws)
+    bootstrap = Bootstrap(
+        shared,
+        draws,
+        realism_draws=realism_draws,
+    )
     values = bootstrap.resampled(table, samples)
     others = bootstrap.resampled(other_table, other_samples)
     known_rows = ~table.totals.isnan() | ~other_table.totals.isnan()
@@ -445,21 +518,36 @@ def paired_differences(
     for column, metric in enumerate(row_metrics()):
         name = metric.name
         bounds = bootstrap.agreed(
-            metric, differences[name], known=both[name], least=-1.0
+            metric,
+            differences[name],
+            known=both[name],
+            least=-1.0,
         )
         if bounds is None and any(
             bootstrap.is_rare(metric, each.totals[:, column], each.weights[:, column])
             for each in (table, other_table)
         ):
             low, high = bootstrap.exact(
-                metric, table, mean=values[name][0].item(), level=(1 + LEVEL) / 2
+                metric,
+                table,
+                mean=values[name][0].item(),
+                level=(1 + LEVEL) / 2,
             )
             other_low, other_high = bootstrap.exact(
-                metric, other_table, mean=others[name][0].item(), level=(1 + LEVEL) / 2
+                metric,
+                other_table,
+                mean=others[name][0].item(),
+                level=(1 + LEVEL) / 2,
             )
             bounds = low - other_high, high - other_low
         if bounds is not None:
-            result[name] |= dict(zip(("low", "high"), bounds, strict=True))
+            result[name] |= dict(
+                zip(
+                    ("low", "high"),
+                    bounds,
+                    strict=True,
+                )
+            )
     found = {
         name: {"difference": value.pop("mean"), **value}
         for name, value in result.items()

@@ -36,10 +36,18 @@ def traffic_contact_columns(batch: Batch) -> Batch:
     vehicles = traffic.any(0).nonzero()[:, 0]
     one, two = vehicles[torch.triu_indices(len(vehicles), len(vehicles), 1)]
     index = near_pairs(
-        states, size, one=one, two=two, present=batch["valid"] & traffic[:, None]
+        states,
+        size,
+        one=one,
+        two=two,
+        present=batch["valid"] & traffic[:, None],
     )
     row, step, pair = index
-    overlap = torch.zeros(*states.shape[:2], len(one), dtype=torch.bool)
+    overlap = torch.zeros(
+        *states.shape[:2],
+        len(one),
+        dtype=torch.bool,
+    )
     area = pair_overlap(
         states[row, step, one[pair]],
         size[row, one[pair]],

@@ -32,14 +32,26 @@ from e2rl.metrics.preventable import CREEPING, Collision, Prevention, prevention
 from e2rl.scenes.recording import VEHICLE
 
 TABLES = "main adversaries methods egos"
-failure = partial(event, raised=1.0, tables=f"{TABLES} public")
+failure = partial(
+    event,
+    raised=1.0,
+    tables=f"{TABLES} public",
+)
 share = partial(rate, per_collision=True)
 declare(
     failure("cfr_counted", "a failure that counts: preventable, or the ego's fault"),
     failure("cfr_preventable", "a failure that a competent driver prevents"),
     failure("cfr_clean", "a clean failure: preventable, and nobody else did wrong"),
-    share("counted", "collisions that count", tables="main adversaries"),
-    share("at_fault", "ego's fault, per collision", tables=f"{TABLES} public"),
+    share(
+        "counted",
+        "collisions that count",
+        tables="main adversaries",
+    ),
+    share(
+        "at_fault",
+        "ego's fault, per collision",
+        tables=f"{TABLES} public",
+    ),
     share(
         "preventable",
         "prevented by UN R157's careful and competent driver",

@@ -10,7 +10,7 @@ from e2rl.metrics.drivers import Driver, Observation, no_conflict
 from e2rl.scenes.recording import DT
 
 LENGTH, WIDTH = 4.3, 1.9  # m, of both vehicles
-LATERAL_GAP = 1.6  # m between the sides of two vehicles in the middle of neighbouring lanes of 3.5 m
+LATERAL_GAP = 1.6  # m between vehicles in the middle of neighbouring lanes of 3.5 m
 LATERAL_ACCELERATION = 1.5  # m/s^2
 DURATION = 40.0  # s after the lateral speed has been reached
 
