@@ -157,3 +157,21 @@ def test_a_contact_is_the_ego_s_front_if_they_lapped_by_less_than_0_8_m(lap, cou
         settled=torch.tensor([True]),
     )
     assert bool(foresight.worth > 0) == counts
+
+
+# Delay s and braking m/s^2 of the drivers who react, and what each weighs.
+DRIVERS = [(0.85, 6.5, 0.4), (1.0, 5.5, 0.3), (1.25, 5.0, 0.15), (1.6, 4.0, 0.1)]
+
+
+@pytest.mark.parametrize("number", range(len(DRIVERS)))
+def test_each_driver_stops_within_its_delay_and_braking(number):
+    """Between the gaps that driver `number` and the next need, all worse ones and the
+    one who never reacts are hit: v (t + b / 2 j) + v^2 / 2 b, the braking rising by j.
+    """
+    delay, braking, _ = DRIVERS[number]
+    rise = braking / (2 * HumanDriver().jerk)
+    gap = SPEED * (delay + rise) + SPEED**2 / (2 * braking) + 1.0
+    foresight = standing(gap)()
+    late = 1 - 0.1 * float(foresight.time) / 5.1
+    worse = sum(weight for *_, weight in DRIVERS[number + 1 :]) + 0.05
+    assert float(foresight.worth) == pytest.approx(worse * late, abs=1e-3)
