@@ -241,9 +241,9 @@ def save_policy(policy: Any, path: str | Path, env: Any = None) -> Path:
 
     Args:
         policy: a Stable-Baselines3 model trained here, or a module of such a map
-            (docs/observation.md).
+            (docs/guide/policies.md).
         env: of a model that was loaded: the VecNormalize that was saved with it
-            (docs/how-to/gym.md).
+            (docs/guide/policies.md).
     """
     if not isinstance(policy, torch.nn.Module):
         policy = library(
@@ -260,7 +260,7 @@ def save_video(failure: Failure, path: str | Path) -> Path:
 
 
 def score(rollouts: Rollouts) -> list[dict]:
-    """Returns one row of metrics per rollout (docs/method.md, section 10)."""
+    """Returns one row of metrics per rollout (docs/reference/metrics.md)."""
     return score_rollouts(rollouts)[0]
 
 

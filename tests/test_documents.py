@@ -82,14 +82,6 @@ def named_paths(text: str) -> set[str]:
     return {path for path in found if not PLACEHOLDER.search(path)}
 
 
-# Pages by their names in docstrings of e2rl/.
-FORMER = re.compile(
-    r"docs/(?:how-to/|notes/)?(?:adversaries|baselines|cluster|compare|data|export|gym|"
-    r"learning|method|modes|nuplan|nuplan-scores|observation|planner|planners|"
-    r"reproduce|search|torchrl|training|verdicts)\.md"
-)
-
-
 @cache
 def python_files() -> set[str]:
     """Names of the repository's Python files."""
@@ -188,8 +180,6 @@ def test_what_is_named_exists(name):
     missing = {path for path in named_paths(text) if not (ROOT / path).exists()}
     known = {path.name for path in documents()} | WRITTEN
     missing |= set(DOCUMENT.findall(text)) - known
-    if name.startswith("e2rl/"):
-        missing = {each for each in missing if not FORMER.search("docs/" + each)}
     assert not missing, f"{name} names what is not there: {', '.join(sorted(missing))}"
 
 

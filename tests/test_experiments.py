@@ -130,7 +130,8 @@ def test_egos_before_and_after_are_rated_in_one_run(evaluated):
         "ego before",
     }
     text = (run / "tables.md").read_text()
-    assert "Difference of each ego to before" in text and "Guards of after" in text
+    assert "Difference of each ego to before" in text
+    assert "Guards of after" in text
     assert {path.name for path in run.glob("policy_learning.*")} == {
         "policy_learning.png",
         "policy_learning.pdf",
@@ -162,9 +163,8 @@ def test_table_4_has_a_row_for_every_ego_in_three_formats(evaluated):
         "side_any",
         "rear_any",
     )
-    assert head.startswith("ego,traffic,") and all(
-        f"{name} [%]" in head.split(",") for name in columns
-    )
+    assert head.startswith("ego,traffic,")
+    assert all(f"{name} [%]" in head.split(",") for name in columns)
     for suffix in ("md", "tex"):
         assert "Difference of each ego to lane" in (run / f"egos.{suffix}").read_text()
     differences = (run / "egos_differences.csv").read_text().splitlines()
@@ -215,8 +215,6 @@ def test_one_scene_is_driven_as_among_all(evaluated, tmp_path):
                 for path in (folder / "rollouts").glob("*.npz")
             }
         )
-    assert (
-        len(found[0]) == 2
-        and len(found[1]) == 1
-        and found[1].items() <= found[0].items()
-    )
+    assert len(found[0]) == 2
+    assert len(found[1]) == 1
+    assert found[1].items() <= found[0].items()

@@ -36,18 +36,19 @@ def test_a_notebook_rolls_out_what_the_command_does():
     setup = Setup(scenes, ego, ego_name="lane_graph", sim=build_sim(config))
     traffic = build_traffic(config.synthesizer, build_prior(config)[0])
     theirs = setup.roll_out(Method("e2", traffic, eta=2.0), [Task(0, 0), Task(1, 0)])
-    assert (ours.states == theirs.states).all() and ours.adversaries.any()
+    assert (ours.states == theirs.states).all()
+    assert ours.adversaries.any()
     rows = e2rl.score(ours)
-    assert [row["scene_id"] for row in rows] == scenes.scene_id and {
-        row["eta"] for row in rows
-    } == {2.0}
+    assert [row["scene_id"] for row in rows] == scenes.scene_id
+    assert {row["eta"] for row in rows} == {2.0}
 
 
 def test_a_failure_is_found_in_a_few_rollouts(tmp_path):
     """Places first: with the bundled scenes the first four are of four places."""
     scenes = e2rl.load_scenes("bundled", num_scenes=12)
     found = e2rl.find_failures("lane_graph", "e2", scenes=scenes)
-    assert found and all(
+    assert found
+    assert all(
         failure.row["cfr"] == 1 and failure.contact is not None for failure in found
     )
     assert {failure.rollout.scene_id for failure in found} <= set(scenes.scene_id)
@@ -61,11 +62,9 @@ def test_settings_reach_the_objects_and_wrong_ones_are_named():
         support="topology",
         topology={"beta": 2.0},
     )
-    assert (
-        traffic.support == "topology"
-        and traffic.topology.beta == 2.0
-        and traffic.prior.sampler.steps == 4
-    )
+    assert traffic.support == "topology"
+    assert traffic.topology.beta == 2.0
+    assert traffic.prior.sampler.steps == 4
     with pytest.raises(InputError, match="synthesizer=e2: .*suport"):
         e2rl.make_traffic("e2", e2rl.load_prior(), suport="topology")
     with pytest.raises(InputError, match="ego=nobody"):

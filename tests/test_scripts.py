@@ -91,7 +91,8 @@ def test_bad_input_is_one_line_and_leaves_nothing_but_scenes(
         *(option.replace("=IN/", f"={world}/") for option in options),
     )
     status, said = call(script, given, monkeypatch=monkeypatch, capsys=capsys)
-    assert status == 2 and what in error_line(said)
+    assert status == 2
+    assert what in error_line(said)
     assert all(
         path.startswith("cache/scenes-") and data == "good"
         for path in left_behind(tmp_path)
@@ -138,7 +139,9 @@ def test_rounds_of_evolution_from_the_first_command_to_tables_and_a_resume(
         for row in (("nominal", 0), ("e2", 1), ("e2", 2))
     }
     tables = (run / "tables.md").read_text()
-    assert "cfr [%]" in tables and "cfr [points]" in tables and "after" in tables
+    assert "cfr [%]" in tables
+    assert "cfr [points]" in tables
+    assert "after" in tables
     tries = [
         len((run / stage / "search" / "tries.csv").read_text().splitlines())
         for stage in ("before", "after")

@@ -1,5 +1,5 @@
 """Failure modes and atlas of a run: modes.json, the column `mode` of rollouts.csv,
-atlas.json (docs/modes.md)."""
+atlas.json (docs/reference/metrics.md)."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence

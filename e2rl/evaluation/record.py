@@ -1,5 +1,5 @@
 """The closed-loop protocol: methods x scenes x seeds with one ego, and the files of a
-run (docs/method.md, section 11)."""
+run (docs/reference/metrics.md)."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

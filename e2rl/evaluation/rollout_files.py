@@ -1,5 +1,5 @@
 """Tables of a run, written and read whole: rollouts.csv, metrics.json, errored.json
-(docs/method.md, section 11)."""
+(docs/reference/metrics.md)."""
 
 import csv
 import io

@@ -1,5 +1,5 @@
 """The atlas of a run's failures: in how many different ways an ego fails preventably,
-and each way's likeliest failure (docs/modes.md).
+and each way's likeliest failure (docs/reference/metrics.md).
 
 A cell is made of from where the partner came, what it did, which duty it broke, how
 fast the ego was, and where the ego was hit. Only preventable failures enter. A cell

@@ -65,7 +65,7 @@ TABLES = (
     "egos",
     "public",
 )  # of the package
-# Of columns in every table (docs/method.md, section 10); others follow as declared.
+# Of columns in every table (docs/reference/metrics.md); others follow as declared.
 ORDER = (
     *(
         "cfr",

@@ -1,5 +1,4 @@
-"""The ego's first contact in each rollout, its type and severity (docs/method.md,
-section 10).
+"""The ego's first contact in each rollout, its type and severity (docs/reference/metrics.md).
 
 Shapes: B rollouts, N agents (the ego is row 0), T steps. Tensors over time hold T + 1
 states; step 0 is the start. A contact counts at steps >= 1. `stop` is the step of the

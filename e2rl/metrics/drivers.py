@@ -1,5 +1,5 @@
 """Four drivers who meet one other vehicle: UN R157's human driver, UN R157's limit, RSS
-and FSM (docs/verdicts.md).
+and FSM (docs/reference/verdicts.md).
 
 Each driver is a NamedTuple of parameters with `step(state, observation)`, which returns
 the next state (the first is `no_conflict`) and the longitudinal acceleration [...]

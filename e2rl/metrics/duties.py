@@ -1,4 +1,4 @@
-"""Which duty a vehicle broke before a collision (docs/verdicts.md).
+"""Which duty a vehicle broke before a collision (docs/reference/verdicts.md).
 
 The partner broke the first of these duties that applies: it ran into the ego from
 behind; it had crossed a stop line at red; it drove against its lane; it crossed the

@@ -1,5 +1,4 @@
-"""Which collisions the ego could have avoided, found by search (docs/method.md, section
-10).
+"""Which collisions the ego could have avoided, found by search (docs/reference/metrics.md).
 
 The others move as they did: they do not react. Candidates are longitudinal profiles on
 lateral targets (the ego's routes, and shifts beside its mission). Where none is clean,

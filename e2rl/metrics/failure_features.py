@@ -1,5 +1,5 @@
 """What happens in a collision of the ego: from where the partner comes, and what both
-do (docs/modes.md).
+do (docs/reference/metrics.md).
 
 Everything is read from the last two seconds before the contact, relative to the two
 vehicles and the lanes, so moving or turning the world changes nothing and mirroring it

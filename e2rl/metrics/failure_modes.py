@@ -1,4 +1,4 @@
-"""Failures grouped into modes: the few ways in which a planner fails (docs/modes.md).
+"""Failures grouped into modes: the few ways in which a planner fails (docs/reference/metrics.md).
 
 A failure is a row of `score_rollouts` with a collision of the ego. Two failures are as
 far apart as the sum of the weights of what differs: from where the partner came, what

@@ -1,4 +1,4 @@
-"""Whose fault a collision is (docs/verdicts.md)."""
+"""Whose fault a collision is (docs/reference/verdicts.md)."""
 
 import math
 

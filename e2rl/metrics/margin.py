@@ -22,7 +22,7 @@ CLOSING = 1.0  # m/s of relative velocity from which on a pair counts
 PREVENTED = 2.0
 
 
-@columns(Metric("margin", "nearness to a preventable failure (docs/search.md)"))
+@columns(Metric("margin", "nearness to a preventable failure (docs/guide/evaluate.md)"))
 def margin_columns(batch: Batch) -> Batch:
     """margin [B]."""
     return {

@@ -1,7 +1,7 @@
 """nuPlan's closed-loop score of the ego in [0, 1] and its eight terms
 (`experiment=nuplan`).
 
-Definitions and thresholds are those of nuplan-devkit 1.2 (docs/nuplan-scores.md, which
+Definitions and thresholds are those of nuplan-devkit 1.2 (docs/results/nuplan-scores.md, which
 tells what differs: lanes here are strips about centrelines, and intersections are where
 strips overlap). Terms look at the whole rollout, on through contacts. They are NaN
 where the ego overlaps a vehicle at the start or is absent at a step.

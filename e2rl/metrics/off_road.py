@@ -1,5 +1,5 @@
 """Off the road: a vehicle's centre outside every drivable polygon and far from every
-lane (docs/method.md, section 10).
+lane (docs/reference/metrics.md).
 
 On the road means inside a drivable polygon (even-odd rule), in the seam between two of
 them, or within half the lane's width + 1.0 m of its centreline. Distances are exact,

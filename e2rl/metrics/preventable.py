@@ -1,5 +1,5 @@
 """Would a competent driver in the ego's place have had the collision
-(docs/verdicts.md)?
+(docs/reference/verdicts.md)?
 
 The ego is driven again along its own path; all others are replayed. A vehicle behind
 that is replayed into a driver who brakes earlier than the ego did is driven again, too:

@@ -1,5 +1,5 @@
 """The ego's distance to others, acceleration, progress and fraction of the recorded
-path until its first contact (docs/method.md, section 10).
+path until its first contact (docs/reference/metrics.md).
 
 Vehicles that stand at the start: parked ones should stay, some of those on a lane
 should start.

@@ -1,5 +1,5 @@
 """How closely the motion of simulated traffic follows the recordings' distribution
-(docs/method.md, section 10).
+(docs/reference/metrics.md).
 
 Longitudinal and lateral acceleration and |jerk|, from means over blocks of 0.5 s, of
 the simulated vehicles other than the ego that move, in frames valid both in the rollout

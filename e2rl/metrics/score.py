@@ -1,4 +1,4 @@
-"""All metrics of rollouts, one row per rollout (docs/method.md, section 10)."""
+"""All metrics of rollouts, one row per rollout (docs/reference/metrics.md)."""
 
 import math
 

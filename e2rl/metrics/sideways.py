@@ -1,4 +1,4 @@
-"""Who moved sideways into whom before a collision (docs/verdicts.md), and the lanes by
+"""Who moved sideways into whom before a collision (docs/reference/verdicts.md), and the lanes by
 which that is judged.
 
 A vehicle moved into the other if it was beside the other's strip a second before, and if

@@ -1,4 +1,4 @@
-"""Means and 95% intervals over rollouts (docs/method.md, section 10).
+"""Means and 95% intervals over rollouts (docs/reference/metrics.md).
 
 The interval is a cluster bootstrap: whole locations (or logs) are drawn, not rollouts.
 A draw holds each cluster with a multiplicity. Every resampled mean is a quotient of two

@@ -1,4 +1,4 @@
-"""Contacts within the simulated traffic (docs/method.md, section 10)."""
+"""Contacts within the simulated traffic (docs/reference/metrics.md)."""
 
 import torch
 from torch import Tensor

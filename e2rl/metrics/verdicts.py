@@ -1,5 +1,5 @@
 """The verdict on every collision of the ego: whose fault, preventable by whom, which
-duty broken (docs/verdicts.md).
+duty broken (docs/reference/verdicts.md).
 
 A collision counts if it is the ego's fault or a careful and competent driver in its
 place would have prevented it. Nobody prevents by braking what comes to an ego that

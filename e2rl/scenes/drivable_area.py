@@ -1,5 +1,5 @@
 """The drivable area as a field, metres beyond its border on a 1 m grid, and its look-up
-(docs/method.md, section 1)."""
+(docs/reference/scenes.md)."""
 
 import numpy as np
 import torch

@@ -1,5 +1,5 @@
 """Source of logs that py123d has converted: nuScenes, nuPlan, Waymo, Argoverse 2,
-KITTI-360 and others in one format (Arrow; extra `py123d`; docs/data.md).
+KITTI-360 and others in one format (Arrow; extra `py123d`; docs/guide/data.md).
 
 The ego is the recording vehicle. Logs of a higher rate are read at about 10 Hz, long
 ones and those with pauses in pieces.

@@ -516,7 +516,7 @@ AGENT = (
 
 def observation_layout() -> list[Entry]:
     """The OBSERVATION_SIZE entries of an observation, in order, named
-    `block.number.quantity` (docs/observation.md)."""
+    `block.number.quantity` (docs/guide/policies.md)."""
     manoeuvres = [
         f"manoeuvre.{accel:+g}.{offset:+g}"
         for accel in ACCELERATIONS

@@ -1,5 +1,5 @@
 """The file of a rollout: an npz of format e2rl-rollout/1, readable without pickle
-(docs/method.md, section 11)."""
+(docs/reference/metrics.md)."""
 
 import hashlib
 import io

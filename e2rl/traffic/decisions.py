@@ -1,5 +1,5 @@
 """What e2 decides by rule, as numbers that a search may draw for each rollout
-(docs/search.md).
+(docs/guide/evaluate.md).
 
 The rule is the mode of every distribution of attacks: a try of which nothing is drawn
 is e2 as it stands.

@@ -1,7 +1,7 @@
 """What feasibility, skeleton and anchoring have in common: picking vehicles, and coarse
 motion along routes.
 
-The red light that a proposal keeps (docs/adversaries.md).
+The red light that a proposal keeps (docs/reference/attack.md).
 """
 
 import torch

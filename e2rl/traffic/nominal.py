@@ -3,7 +3,7 @@ is known of the ego.
 
 Traffic predicts the ego from its state and past, as other drivers see it: on the route
 that its motion makes likeliest. So no planner can mislead its adversaries by what it
-announces as its plan (docs/adversaries.md). With `knowledge` "plan" it is told the plan
+announces as its plan (docs/reference/attack.md). With `knowledge` "plan" it is told the plan
 and the mission.
 """
 

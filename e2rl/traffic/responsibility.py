@@ -1,4 +1,4 @@
-"""The yielding rule: what adversaries owe the ego (docs/adversaries.md).
+"""The yielding rule: what adversaries owe the ego (docs/reference/attack.md).
 
 full: an adversary yields to the ego wherever its plan meets the ego's expected motion,
 late but in time, unless the ego follows it; rear: adversaries behind the ego brake for

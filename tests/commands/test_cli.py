@@ -24,7 +24,8 @@ def said(monkeypatch, capsys, *arguments):
 
 def test_help_version_and_the_nearest_command(monkeypatch, capsys):
     text = said(monkeypatch, capsys, "--help")
-    assert text == said(monkeypatch, capsys) and all(name in text for name in COMMANDS)
+    assert text == said(monkeypatch, capsys)
+    assert all(name in text for name in COMMANDS)
     assert {
         line.split()[1] for line in EXAMPLES.splitlines() if line.startswith("  e2rl ")
     } <= set(COMMANDS)
@@ -33,15 +34,15 @@ def test_help_version_and_the_nearest_command(monkeypatch, capsys):
     )
     with pytest.raises(SystemExit) as stopped:
         said(monkeypatch, capsys, "evalute")
-    assert (
-        stopped.value.code == 2 and "did you mean evaluate?" in capsys.readouterr().err
-    )
+    assert stopped.value.code == 2
+    assert "did you mean evaluate?" in capsys.readouterr().err
 
 
 def test_every_command_is_a_module_with_a_main():
     for module, _ in COMMANDS.values():
         spec = find_spec(module)
-        assert spec is not None and "def main(" in Path(spec.origin).read_text(), module
+        assert spec is not None
+        assert "def main(" in Path(spec.origin).read_text(), module
     assert PROJECT["scripts"] == {"e2rl": f"{cli.__name__}:main"}
 
 
@@ -56,6 +57,5 @@ def test_a_command_shows_its_configuration_in_an_empty_folder(name, tmp_path):
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, timeout=300
     )
-    assert done.returncode == 0 and "_target_: e2rl.traffic.e2.e2.E2" in done.stdout, (
-        done.stderr
-    )
+    assert done.returncode == 0
+    assert "_target_: e2rl.traffic.e2.e2.E2" in done.stdout, done.stderr

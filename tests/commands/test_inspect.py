@@ -58,26 +58,17 @@ def test_a_data_set_is_counted_and_what_is_left_out_has_its_reason(
     folder, tmp_path, capsys
 ):
     text = run(folder, "--out", tmp_path / "x.png", capsys=capsys)
-    assert (
-        number(text, "data") == f"scenarionet, {folder}" and number(text, "logs") == "4"
-    )
-    assert (
-        number(text, "scenes") == "2, places not known"
-        and number(text, "left out") == "2"
-    )
-    assert (
-        "1 x sd_02.pkl" in text
-        and "57 rad is the largest heading" in text
-        and "1 x sd_03.pkl" in text
-    )
-    assert (
-        number(text, "vehicles") == "2 (2 to 2)"
-        and number(text, "pedestrians") == "2 (1 to 4)"
-    )
-    assert (
-        number(text, "lanes") == "4 (4 to 4)"
-        and number(text, "traffic lights") == "0 (0 to 1)"
-    )
+    assert number(text, "data") == f"scenarionet, {folder}"
+    assert number(text, "logs") == "4"
+    assert number(text, "scenes") == "2, places not known"
+    assert number(text, "left out") == "2"
+    assert "1 x sd_02.pkl" in text
+    assert "57 rad is the largest heading" in text
+    assert "1 x sd_03.pkl" in text
+    assert number(text, "vehicles") == "2 (2 to 2)"
+    assert number(text, "pedestrians") == "2 (1 to 4)"
+    assert number(text, "lanes") == "4 (4 to 4)"
+    assert number(text, "traffic lights") == "0 (0 to 1)"
     assert number(text, "speed of the ego at the start, m/s") == "8.0 (8.0 to 8.0)"
     assert number(text, "distance driven by the ego, m") == "64 (64 to 64)"
     limits = number(text, "limits").removeprefix("km/h on the routes: ").split(", ")
@@ -102,7 +93,8 @@ def test_the_chosen_scene_is_drawn_with_the_ego_in_the_middle(folder, tmp_path, 
     assert text.endswith(f"lit: {tmp_path / 'lit.png'}\n")
     with Image.open(tmp_path / "lit.png") as picture:
         width, height = picture.size
-        assert width == 900 and height == 900 + 34 + 30
+        assert width == 900
+        assert height == 900 + 34 + 30
         assert picture.getpixel((450 - 15, 34 + 450)) == rgb(
             drawing.EGO
         )  # 1 m behind its middle, at 15 pixels a m
@@ -127,11 +119,9 @@ def test_what_is_not_there_ends_with_one_line_and_writes_nothing(
     with pytest.raises(SystemExit) as ended:
         run(folder / path, *arguments, "--out", tmp_path / "x.png", capsys=capsys)
     error = capsys.readouterr().err.splitlines()[-1]
-    assert (
-        ended.value.code == 2
-        and error.startswith("error: ")
-        and all(message in error for message in messages)
-    )
+    assert ended.value.code == 2
+    assert error.startswith("error: ")
+    assert all(message in error for message in messages)
     assert not (tmp_path / "x.png").exists()
 
 
@@ -147,11 +137,10 @@ def test_where_no_log_makes_a_scene_the_reasons_are_told(tmp_path, capsys):
     with pytest.raises(SystemExit):
         run(folder, "--out", tmp_path / "x.png", capsys=capsys)
     shown = capsys.readouterr()
-    assert (
-        number(shown.out, "left out") == "1"
-        and "1 x ego overlaps a vehicle at the start" in shown.out
-    )
-    assert "no log makes a scene" in shown.err and "None" not in shown.err
+    assert number(shown.out, "left out") == "1"
+    assert "1 x ego overlaps a vehicle at the start" in shown.out
+    assert "no log makes a scene" in shown.err
+    assert "None" not in shown.err
 
 
 def test_two_data_sets_are_apart_where_they_share_no_place(tmp_path, capsys):

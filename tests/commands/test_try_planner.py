@@ -79,14 +79,17 @@ def test_a_planner_that_cannot_be_driven_is_one_line(folder, capsys, planner, me
     with pytest.raises(SystemExit) as stopped:
         main(["--planner", planner.format(name=folder[1])])
     said = capsys.readouterr().err
-    assert stopped.value.code == 2 and message in said and said.strip().count("\n") == 0
+    assert stopped.value.code == 2
+    assert message in said
+    assert said.strip().count("\n") == 0
 
 
 def test_logs_that_nothing_reads_are_refused(folder, capsys):
     (folder[0] / "logs").mkdir()
     with pytest.raises(SystemExit) as stopped:
         main(["logs", "--planner", f"{folder[1]}:Steady"])
-    assert stopped.value.code == 2 and "logs" in capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert "logs" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("form", ["{name}:Steady", "{name}.py:Steady"])
@@ -142,9 +145,8 @@ def test_it_drives_the_class_and_names_it(folder, capsys):
     ]
     main(["--planner", f"{folder[1]}:Steady", "--scenes", "1", "--out", "run", *small])
     rows = read_rows(folder[0] / "run" / "rollouts.csv")
-    assert {row["ego_policy"] for row in rows} == {"Steady"} and {
-        row["method"] for row in rows
-    } == {"e2", "nominal"}
+    assert {row["ego_policy"] for row in rows} == {"Steady"}
+    assert {row["method"] for row in rows} == {"e2", "nominal"}
     assert capsys.readouterr().out.startswith(
         "Drives Steady in the first of bundled scenes against e2, nominal"
     )

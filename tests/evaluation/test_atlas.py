@@ -28,7 +28,8 @@ def test_every_group_has_its_own_atlas(tmp_path):
         (group["rollouts"], group["preventable"], group["cells"])
         for group in (e2, other, nominal)
     ]
-    assert counts == [(5, 5, 2), (2, 1, 1), (2, 0, 0)] and nominal["atlas"] == []
+    assert counts == [(5, 5, 2), (2, 1, 1), (2, 0, 0)]
+    assert nominal["atlas"] == []
     assert [(group["scenes"], group["failed_scenes"]) for group in (e2, nominal)] == [
         (len({row["scene_id"] for row in rows if row["method"] == name}), failed)
         for name, failed in ((e2["method"], 5), ("nominal", 0))
@@ -43,5 +44,6 @@ def test_every_group_has_its_own_atlas(tmp_path):
         3,
         9.0,
     )
-    assert rear_end["transport"] is None and other["atlas"][0]["transport"] == 4.0
+    assert rear_end["transport"] is None
+    assert other["atlas"][0]["transport"] == 4.0
     assert crossing["likeliest"]["file"] == rollout_name(rows[0])

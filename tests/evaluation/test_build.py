@@ -69,15 +69,14 @@ def test_variants_share_the_prior_but_for_what_they_change_and_differ_in_nothing
     far, e2, same, blind, cold = (method.traffic for method in methods)
     assert far.prior is e2.prior is same.prior is blind.prior is prior
     own = settings_in(e2)
-    assert (
-        settings_in(same) == settings_in(cold) == own
-        and cold.prior.sampler.temperature == 0.5
-    )
+    assert settings_in(same) == settings_in(cold) == own
+    assert cold.prior.sampler.temperature == 0.5
     assert settings_in(far) == own | {
         "skeleton": replace(e2.skeleton, far=2),
         "reselect": 0,
     }
-    assert isinstance(blind, CTGAdv) and (blind.knowledge, blind.responsibility) == (
+    assert isinstance(blind, CTGAdv)
+    assert (blind.knowledge, blind.responsibility) == (
         "predicted",
         "full",
     )
@@ -101,7 +100,8 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(
 ):
     config = config_of(f"experiment={experiment}")
     methods = methods_of(f"experiment={experiment}")
-    assert len(methods) == rows and len(set(named(methods))) == rows
+    assert len(methods) == rows
+    assert len(set(named(methods))) == rows
     variants = [method.traffic for method in methods if method.name in config.variants]
     settings = [(settings_in(on), on.prior.sampler, on.prior.bounds) for on in variants]
     assert all(settings.count(each) == 1 for each in settings), (
@@ -204,7 +204,8 @@ def test_table_1_has_every_rival_on_both_terms():
     rows = methods_of("experiment=table1")
     rivals = {"ctg", "ctg_adv", "strive", "safe_sim_opt", "diffscene", "ccdiff", "cat"}
     known = terms_by_method(rows)
-    assert rivals <= set(known) and all(known[name][0] == "plan" for name in rivals)
+    assert rivals <= set(known)
+    assert all(known[name][0] == "plan" for name in rivals)
     assert known["e2_pursuit"] == ("plan", "none")  # the rivals' terms
     ours = terms_by_method(methods_of("experiment=table1_our_terms"))
     for name in rivals:

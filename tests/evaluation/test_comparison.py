@@ -48,7 +48,8 @@ def test_each_failure_is_new_gone_moved_or_the_same(tmp_path):
         "scene_3": "moved",
     }
     assert [pair["change"] for pair in pairs] == list(CHANGES), "in this order"
-    assert group["of"] == 5 and [group[name] for name in CHANGES] == [1, 1, 1, 1]
+    assert group["of"] == 5
+    assert [group[name] for name in CHANGES] == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +71,8 @@ def test_a_failure_moves_with_its_verdict_side_counterpart_or_time(
     _, (pair,) = changes_of(
         tmp_path, [row_of(0, hit=True)], others=[row_of(0, hit=change)]
     )
-    assert pair["what"] == what and pair["change"] == ("moved" if what else "same")
+    assert pair["what"] == what
+    assert pair["change"] == ("moved" if what else "same")
 
 
 def test_exchanging_the_two_exchanges_new_and_gone_and_turns_differences_round(
@@ -100,11 +102,11 @@ def test_exchanging_the_two_exchanges_new_and_gone_and_turns_differences_round(
 def test_a_run_has_no_difference_to_itself(tmp_path):
     rows = [row_of(k, hit=k % 2 == 0, progress=float(k)) for k in range(24)]
     (group,), _ = changes_of(tmp_path, rows, others=rows)
-    assert group["same"] == 12 and not any(group[name] for name in CHANGES[:3])
+    assert group["same"] == 12
+    assert not any(group[name] for name in CHANGES[:3])
     for name, value in group["differences"].items():
-        assert value["difference"] == 0 and not (
-            value["low"] > 0 or value["high"] < 0
-        ), name
+        assert value["difference"] == 0
+        assert not (value["low"] > 0 or value["high"] < 0), name
 
 
 def test_an_ego_that_reverses_makes_negative_progress(tmp_path):
@@ -159,10 +161,8 @@ def test_contacts_with_people_are_compared_where_there_are_any(tmp_path):
         [row_of(k, cfr_vru=float(k < count)) for k in range(12)] for count in (1, 4)
     )
     (group,), pairs = changes_of(tmp_path / "some", first, others=second)
-    assert (
-        group["differences"]["contacts_vru"]["difference"] == pytest.approx(3 / 12)
-        and not pairs
-    )
+    assert group["differences"]["contacts_vru"]["difference"] == pytest.approx(3 / 12)
+    assert not pairs
     assert "contacts_object" not in group["differences"]
 
 
@@ -204,11 +204,10 @@ def test_searches_are_compared_by_scene_and_move_where_they_share_no_way(tmp_pat
     assert {pair["scene_id"]: pair["change"] for pair in pairs} == {
         **{"scene_0": "gone", "scene_1": "same", "scene_2": "new", "scene_3": "moved"}
     }
-    assert group["of"] == 4 and group["unit"] == "searches of a scene"
-    assert (
-        group["differences"]["preventable"]["difference"] == 0
-        and "progress" not in group["differences"]
-    )
+    assert group["of"] == 4
+    assert group["unit"] == "searches of a scene"
+    assert group["differences"]["preventable"]["difference"] == 0
+    assert "progress" not in group["differences"]
 
 
 def test_a_search_shows_its_failure_or_what_came_nearest(tmp_path):
@@ -219,7 +218,8 @@ def test_a_search_shows_its_failure_or_what_came_nearest(tmp_path):
     _, (pair,) = changes_of(
         tmp_path, nearest, others=tries(0, False, False, True), searched=True
     )
-    assert pair["first"]["seed"] == 1 and pair["second"]["seed"] == 2
+    assert pair["first"]["seed"] == 1
+    assert pair["second"]["seed"] == 2
 
 
 def raised(scene, seed=0, by="ego"):

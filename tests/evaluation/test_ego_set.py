@@ -89,9 +89,8 @@ def test_an_ego_does_not_differ_from_itself_at_all(run):
     assert {"cfr", "progress", "macc", "failures_per_km"} <= set(known)
     for value in known.values():
         assert value["difference"] == 0
-        assert math.isnan(value["low"]) and math.isnan(value["high"]), (
-            "three places are too few for an interval"
-        )
+        assert math.isnan(value["low"])
+        assert math.isnan(value["high"]), "three places are too few for an interval"
     assert paired["progress"]["relative"] == 0
 
 
@@ -106,7 +105,8 @@ def test_trainings_are_pooled_and_compared_with_the_same_rollouts_of_another(run
     assert means[2] == pytest.approx((means[0] + means[1]) / 2)
     paired = pooled["paired"]["ego one"]["progress"]
     base = one["metrics"]["progress"]["mean"]
-    assert paired["n"] == 6 and paired["difference"] == pytest.approx(means[2] - base)
+    assert paired["n"] == 6
+    assert paired["difference"] == pytest.approx(means[2] - base)
     assert paired["relative"] == pytest.approx(means[2] / base - 1)
 
 
@@ -122,9 +122,8 @@ def test_a_guard_is_missed_where_the_trained_ego_accelerates_more_than_the_recor
         {row[0].split(" ")[0]: row[-1] for row in table.rows}
         for table in (strict, loose)
     ]
-    assert [verdict["macc"] for verdict in verdicts] == ["missed", "met"] and verdicts[
-        0
-    ]["progress"] == "met"
+    assert [verdict["macc"] for verdict in verdicts] == ["missed", "met"]
+    assert verdicts[0]["progress"] == "met"
 
 
 def rows_of(values, ego, training=None):
@@ -157,7 +156,8 @@ def test_trainings_that_differ_widen_the_interval_that_places_alone_do_not():
     alone, both = (
         [result[name][end] for end in ("low", "mean", "high")] for name in ("a_0", "a")
     )
-    assert alone == pytest.approx([10, 10, 10], abs=0.05) and alone[0] < alone[2]
+    assert alone == pytest.approx([10, 10, 10], abs=0.05)
+    assert alone[0] < alone[2]
     assert both == pytest.approx([10, 15, 20], abs=0.05)
     assert not any("training" in row for row in rows), (
         "the rows themselves stay as they are"
@@ -187,9 +187,8 @@ def test_an_entry_is_a_file_with_changes_whose_first_weights_do_not_depend_on_th
         config_of("+egos.a={ego: lane_graph, max_risk: 0.3}", "+egos.x={ego: actor}"),
         "",
     )
-    assert (
-        isinstance(chosen.egos["a"], LaneGraphEgo) and chosen.egos["a"].max_risk == 0.3
-    )
+    assert isinstance(chosen.egos["a"], LaneGraphEgo)
+    assert chosen.egos["a"].max_risk == 0.3
     alone = (
         build_egos(config_of("+egos.x={ego: actor}"), "").egos["x"].network.weights()
     )
@@ -224,10 +223,8 @@ def test_table_4_compares_every_ego_with_one_of_them():
 
 def test_the_experiment_compares_what_was_trained_with_each_other_ego():
     chosen = build_egos(config_of(*TRAINED), "")
-    assert (
-        list(chosen.egos) == ["before", "after", "lane_graph", "sampling"]
-        and not chosen.trainings
-    )
+    assert list(chosen.egos) == ["before", "after", "lane_graph", "sampling"]
+    assert not chosen.trainings
     assert chosen.pairs == [
         ("after", "before"),
         ("after", "lane_graph"),
@@ -246,10 +243,8 @@ def test_several_checkpoints_are_trainings_of_one_name():
         "lane_graph",
         "sampling",
     ]
-    assert (
-        chosen.trainings == {"after": ["after_0", "after_1"]}
-        and "after" in chosen.names
-    )
+    assert chosen.trainings == {"after": ["after_0", "after_1"]}
+    assert "after" in chosen.names
 
 
 @pytest.mark.parametrize(

@@ -120,14 +120,11 @@ def test_the_others_are_scored_and_the_count_stands_everywhere(
 ):
     (fault, detail), reason = FAULTS[name], f"raised {name}"
     (row,) = run(Fails(8.0, fault), tmp_path, batch=4, processes=processes)
-    assert (
-        row["n_rollouts"] == 8
-        and row["errored"] == {reason: 2}
-        and row["n_scenes"] == 4
-    )
-    assert (
-        row["metrics"]["errored"]["mean"] == 0.25 and row["metrics"]["real"]["n"] == 6
-    )
+    assert row["n_rollouts"] == 8
+    assert row["errored"] == {reason: 2}
+    assert row["n_scenes"] == 4
+    assert row["metrics"]["errored"]["mean"] == 0.25
+    assert row["metrics"]["real"]["n"] == 6
     assert row["metrics"]["cfr_preventable"]["mean"] >= 0.25, "to raise is to fail"
     assert read_metrics(tmp_path / METRICS_FILE)[0]["errored"] == {reason: 2}
     assert f"2 rollouts without a score ({reason})" in metric_tables([row])[0].caption
@@ -137,7 +134,8 @@ def test_the_others_are_scored_and_the_count_stands_everywhere(
     }
     assert all(re.search(detail, entry["traceback"]) for entry in entries)
     rows = read_rows(tmp_path / TABLE)
-    assert len(rows) == 8 and len(list((tmp_path / ROLLOUTS).glob("*.npz"))) == 6
+    assert len(rows) == 8
+    assert len(list((tmp_path / ROLLOUTS).glob("*.npz"))) == 6
     ends = {
         (row["scene_id"], row["seed"], row["raised_by"])
         for row in rows
@@ -146,11 +144,9 @@ def test_the_others_are_scored_and_the_count_stands_everywhere(
     assert ends == {(scene_set().scene_id[2], seed, "ego") for seed in (0, 1)}
     assert all(re.search(detail, row["error"]) for row in rows if row["errored"] == 1)
     (whole,) = run(IDMEgo(), tmp_path, batch=4, processes=processes)
-    assert (
-        whole["errored"] == {}
-        and whole["n_rollouts"] == 8
-        and not (tmp_path / ERRORED_FILE).exists()
-    )
+    assert whole["errored"] == {}
+    assert whole["n_rollouts"] == 8
+    assert not (tmp_path / ERRORED_FILE).exists()
 
 
 def test_where_the_traffic_loses_all_the_message_says_why(tmp_path):
@@ -170,7 +166,8 @@ def test_where_the_traffic_loses_all_the_message_says_why(tmp_path):
 
 def test_a_planner_that_always_raises_is_rated_as_any_other(tmp_path):
     (row,) = run(Fails(6.0, NO_WAY), tmp_path, count=1)
-    assert row["n_rollouts"] == 2 and row["errored"] == {"raised ZeroDivisionError": 2}
+    assert row["n_rollouts"] == 2
+    assert row["errored"] == {"raised ZeroDivisionError": 2}
     assert (
         row["headline"] | {"scenes": 1, "raised": 1, "failed": 1, "preventable": 0}
         == row["headline"]
@@ -194,12 +191,11 @@ def test_a_planner_that_always_raises_is_rated_as_any_other(tmp_path):
         "preventable failures, or it raised, in 1 of 1 scene; preventable failures in 0 of 1; it raised in 1"
         in text
     )
-    assert (
-        "ZeroDivisionError: no way out (2 under replay)" in text
-        and "per 1,000 km" not in text
-    )
+    assert "ZeroDivisionError: no way out (2 under replay)" in text
+    assert "per 1,000 km" not in text
     page = write_report(tmp_path).read_text()
-    assert "ZeroDivisionError: no way out" in page and "it raised in 1 of 1." in page
+    assert "ZeroDivisionError: no way out" in page
+    assert "it raised in 1 of 1." in page
 
 
 def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
@@ -219,10 +215,8 @@ def test_a_method_of_which_all_rollouts_end_stays_in_the_table(tmp_path):
         ("replay", 2),
         ("lost", 0),
     ]
-    assert (
-        rows[1]["errored"] == {"raised ZeroDivisionError": 2}
-        and rows[1]["metrics"]["cfr"]["n"] == 0
-    )
+    assert rows[1]["errored"] == {"raised ZeroDivisionError": 2}
+    assert rows[1]["metrics"]["cfr"]["n"] == 0
     assert (
         "lost: 0 scenes, 0 seeds, 0 rollouts, 2 rollouts without a score"
         in metric_tables(rows)[0].caption
@@ -302,7 +296,8 @@ def test_a_wrong_shape_later_on_ends_rollouts_and_not_the_run(
     """A rollout has 20 plans: of batches of two, those after the first raise from their
     start on."""
     (row,) = run(From(call), tmp_path, batch=batch)
-    assert row["n_rollouts"] == 8 and sum(row["errored"].values()) == raise_in
+    assert row["n_rollouts"] == 8
+    assert sum(row["errored"].values()) == raise_in
     rows = [row for row in read_rows(tmp_path / TABLE) if row["errored"] == 1]
     assert {row["raised_by"] for row in rows} == {"ego"}
     assert all(

@@ -35,7 +35,8 @@ def test_rows_read_back_are_those_written(tmp_path, rollouts):
     rows = score_rollouts(rollouts)[0]
     files.write_rows(tmp_path / "rollouts.csv", rows)
     read = read_rows(tmp_path / "rollouts.csv")
-    assert list(read[0]) == list(files.table_columns()) and len(read) == 6
+    assert list(read[0]) == list(files.table_columns())
+    assert len(read) == 6
     for row, other in zip(rows, read, strict=True):
         for column in files.table_columns():
             same = row[column] == other[column] or (
@@ -63,21 +64,17 @@ def test_metrics_are_strict_json_with_counts_command_and_paired_differences(
         (tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail
     )
     assert (first["n_scenes"], first["n_seeds"], first["n_rollouts"]) == (3, 2, 6)
-    assert (
-        first["command"] == "python evaluate.py 'eta=[1, 2]'"
-        and first["stage"] == "after"
-        and "git" in first
-    )
+    assert first["command"] == "python evaluate.py 'eta=[1, 2]'"
+    assert first["stage"] == "after"
+    assert "git" in first
     assert first["metrics"]["transport"] == {
         "mean": None,
         "low": None,
         "high": None,
         "n": 0,
     }
-    assert (
-        list(first["paired"]) == ["nominal"]
-        and "difference" in first["paired"]["nominal"]["cfr"]
-    )
+    assert list(first["paired"]) == ["nominal"]
+    assert "difference" in first["paired"]["nominal"]["cfr"]
     assert math.isnan(
         read_metrics(tmp_path / "metrics.json")[0]["metrics"]["transport"]["mean"]
     )

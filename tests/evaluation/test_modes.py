@@ -64,11 +64,9 @@ def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):
         1.0,
         0.0,
     )
-    assert (
-        rear_end["at_fault"] == 1
-        and rear_end["avoidable"] is None
-        and rear_end["ego_speed"] == 10
-    )
+    assert rear_end["at_fault"] == 1
+    assert rear_end["avoidable"] is None
+    assert rear_end["ego_speed"] == 10
     assert [(group["failures"], group["modes"]) for group in found["groups"]] == [
         (6, 1),
         (6, 2),
@@ -105,7 +103,8 @@ def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
         "partner [m/s]",
     ]
     first, second, last = table.rows
-    assert first[0].startswith("1. crossing") and first[1:7] == [
+    assert first[0].startswith("1. crossing")
+    assert first[1:7] == [
         "8",
         "100",
         "33",
@@ -115,7 +114,8 @@ def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
     ]
     assert second[1:] == ["4", "0", "67", "–", "0", "100", "100", "10.0", "5.0"]
     assert last[1:5] == ["12", "6 in 1 mode", "6 in 2 modes", "0 in 0 modes"]
-    assert "without duty" in table.caption and "avoidable" in table.caption
+    assert "without duty" in table.caption
+    assert "avoidable" in table.caption
 
 
 def test_small_modes_are_gathered_but_keep_their_numbers():
@@ -128,7 +128,5 @@ def test_small_modes_are_gathered_but_keep_their_numbers():
     assert [(mode["mode"], mode["name"], mode["count"]) for mode in found["modes"]][
         1:
     ] == [(0, "other", 2)]
-    assert (
-        sorted(row["mode"] for row in rows)[-2:] == [2, 3]
-        and found["groups"][0]["modes"] == 1
-    )
+    assert sorted(row["mode"] for row in rows)[-2:] == [2, 3]
+    assert found["groups"][0]["modes"] == 1

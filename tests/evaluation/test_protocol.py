@@ -70,25 +70,19 @@ def test_a_row_for_each_method_and_a_line_and_a_file_for_each_rollout(run):
         for line in read_rows(folder / TABLE)
     }
     files = [Rollout.read(path) for path in (folder / ROLLOUTS).glob("*.npz")]
-    assert {(file.method, file.scene_id, file.seed) for file in files} == keys and len(
-        files
-    ) == len(keys) == 8
+    assert {(file.method, file.scene_id, file.seed) for file in files} == keys
+    assert len(files) == len(keys) == 8
     for file in files:
-        assert (
-            file.seed in SEEDS
-            and file.ego_policy == "idm"
-            and file.states.shape[0] == 81
-        )
-        assert (
-            file.adversaries.any() == (file.method == "e2") and not file.adversaries[0]
-        )
+        assert file.seed in SEEDS
+        assert file.ego_policy == "idm"
+        assert file.states.shape[0] == 81
+        assert file.adversaries.any() == (file.method == "e2")
+        assert not file.adversaries[0]
 
 
 def test_methods_share_the_noise_of_a_scene_and_seed():
-    assert (
-        scene_seed(3, 1) == scene_seed(3, 1)
-        and len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
-    )
+    assert scene_seed(3, 1) == scene_seed(3, 1)
+    assert len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
     methods = [Method("one", synthesizer()), Method("two", synthesizer())]
     twice = run_protocol(setup_of(scenes(SCENES)), methods, seeds=[4])
     one, two = (row["metrics"] for row in twice)
@@ -150,9 +144,8 @@ def stopping_run(folder, stops, scene_set):
                 setup, methods, seeds=SEEDS, folder=folder, parts=Parts(folder)
             )
         except KeyboardInterrupt:
-            assert left < 100 and not (folder / TABLE).exists(), (
-                "no table of half a run"
-            )
+            assert left < 100
+            assert not (folder / TABLE).exists(), "no table of half a run"
     return done
 
 

@@ -76,18 +76,15 @@ def test_each_number_that_differs_is_named_with_both_values():
         "cfr.mean",
         "paired.nominal.cfr.difference",
     ]
-    assert (
-        "d s e2 idm 1.0: cfr.mean: 0.25 then, 0.5 now" in found.text()
-        and "8 of 10" in found.text()
-    )
+    assert "d s e2 idm 1.0: cfr.mean: 0.25 then, 0.5 now" in found.text()
+    assert "8 of 10" in found.text()
     for one, other, place in (
         (table(), table(2.0) + table(), 1),
         (table(2.0) + table(), table(), 2),
     ):
         found = compare_tables(one, other)
-        assert found.equal == len(found.different) == 10 and {
-            entry[place] for entry in found.different
-        } == {"missing"}
+        assert found.equal == len(found.different) == 10
+        assert {entry[place] for entry in found.different} == {"missing"}
 
 
 @pytest.mark.parametrize(("factor", "close"), [(1 + 1e-9, 1), (1 + 2e-6, 0)])
@@ -144,9 +141,9 @@ def test_one_command_makes_the_same_table_in_a_new_folder(
     )
     assert status == 0, said
     found = json.loads((tmp_path / "now" / "reproduced.json").read_text())
-    assert found["different"] == [] and found["close"] == 0 and found["equal"] > 50, (
-        found
-    )
+    assert found["different"] == []
+    assert found["close"] == 0
+    assert found["equal"] > 50, found
     same_runs(then, tmp_path / "now")
     assert read_list(tmp_path / "now") == read_list(then)
     assert before == {
@@ -168,9 +165,9 @@ def test_data_and_weights_may_lie_elsewhere(world, sent, tmp_path, monkeypatch, 
             archive.write(path, path.name)
     other = again(sent, tmp_path / "a", f"prior.checkpoint={sent / 'provenance.json'}")
     status, said = call("evaluate.py", other, monkeypatch=monkeypatch, capsys=capsys)
+    assert status == 2
     assert (
-        status == 2
-        and "prior.checkpoint is another file than the run's prior.checkpoint="
+        "prior.checkpoint is another file than the run's prior.checkpoint="
         in error_line(said)
     )
     status, said = call(
@@ -179,9 +176,9 @@ def test_data_and_weights_may_lie_elsewhere(world, sent, tmp_path, monkeypatch, 
         monkeypatch=monkeypatch,
         capsys=capsys,
     )
+    assert status == 2
     assert (
-        status == 2
-        and "not there; say where the file lies that the run used, by prior.checkpoint=FILE"
+        "not there; say where the file lies that the run used, by prior.checkpoint=FILE"
         in said
     )
     here = [
@@ -211,11 +208,9 @@ def test_other_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, ca
         then, tmp_path / "now", "data=scenarionet", f"data.path={tmp_path / 'good'}"
     )
     status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
-    assert (
-        status == 2
-        and "scenes are not" in error_line(said)
-        and "scene-0" in error_line(said)
-    )
+    assert status == 2
+    assert "scenes are not" in error_line(said)
+    assert "scene-0" in error_line(said)
     assert not left_behind(tmp_path / "now")
 
 
@@ -226,11 +221,9 @@ def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, cap
         monkeypatch=monkeypatch,
         capsys=capsys,
     )
-    assert (
-        status == 2
-        and "leave out seeds (only" in error_line(said)
-        and not left_behind(tmp_path / "now")
-    )
+    assert status == 2
+    assert "leave out seeds (only" in error_line(said)
+    assert not left_behind(tmp_path / "now")
 
 
 def test_a_failure_that_the_run_does_not_have_is_refused(
@@ -240,9 +233,8 @@ def test_a_failure_that_the_run_does_not_have_is_refused(
         status, said = call(
             "evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys
         )
-        assert status == 2 and (
-            "none of the 0 failures" in said or "reproduce=RUN_DIR" in said
-        )
+        assert status == 2
+        assert "none of the 0 failures" in said or "reproduce=RUN_DIR" in said
 
 
 @pytest.mark.slow
@@ -312,9 +304,8 @@ def test_a_stranger_s_run_runs_nothing(sent, tmp_path, monkeypatch, capsys):
             monkeypatch=monkeypatch,
             capsys=capsys,
         )
-        assert status == 2 and "runs code that is no extension of e2rl" in error_line(
-            said
-        )
+        assert status == 2
+        assert "runs code that is no extension of e2rl" in error_line(said)
     assert not (tmp_path / "ran").exists()
 
 
@@ -351,19 +342,16 @@ def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(
     monkeypatch.setattr(Setup, "score", stopped)
     run = tmp_path / "run"
     status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
-    assert (
-        status == 130
-        and f"evaluate.py resume={run}" in said
-        and "interrupted (SIGINT)" in said
-    )
+    assert status == 130
+    assert f"evaluate.py resume={run}" in said
+    assert "interrupted (SIGINT)" in said
     left[0], named = 1, shlex.split(said.rpartition("evaluate.py ")[2])
     status, said = call(
         "evaluate.py", [*named, "seeds=[1]"], monkeypatch=monkeypatch, capsys=capsys
     )
-    assert (
-        status == 2
-        and "leave out seeds (only processes, shard can change)" in error_line(said)
-    )
+    assert status == 2
+    assert "leave out seeds (only processes, shard can change)" in error_line(said)
     status, said = call("evaluate.py", named, monkeypatch=monkeypatch, capsys=capsys)
-    assert status == 0 and left == [0], said
+    assert status == 0
+    assert left == [0], said
     same_runs(tmp_path / "whole", run)

@@ -63,19 +63,16 @@ def test_standing_still_and_rough_driving_are_refused_and_the_best_of_the_rest_i
         startup=15,
         objective=PlannerObjective(0.1, 0.1, progress_floor=0.9, comfort_ceiling=2.0),
     )
-    assert len(trials) == 25 and trials[0]["parameters"] == {
-        name: PRESENT[name] for name in SPACE
-    }
+    assert len(trials) == 25
+    assert trials[0]["parameters"] == {name: PRESENT[name] for name in SPACE}
     for trial in trials:
         refused = (
             trial["metrics"]["progress"] < 0.9 * 80 or trial["metrics"]["comfort"] > 2
         )
         assert trial["admissible"] == (not refused)
     least = min(trials, key=lambda trial: trial["objective"])
-    assert (
-        not least["admissible"]
-        and best_of(trials)["objective"] < trials[0]["objective"]
-    )
+    assert not least["admissible"]
+    assert best_of(trials)["objective"] < trials[0]["objective"]
     admissible = [trial["objective"] for trial in trials if trial["admissible"]]
     assert best_of(trials)["objective"] == min(admissible)
 
@@ -93,9 +90,8 @@ def test_a_study_goes_on_as_if_it_had_not_stopped_nor_been_interrupted_in_a_tria
     part = run("parts", 5)
     with pytest.raises(KeyboardInterrupt):
         run("parts", 9, evaluate=dies)
-    assert len(part) == 5 and run("parts", 9) == whole == run("whole", 9) == tried(
-        trials=9, startup=4
-    )
+    assert len(part) == 5
+    assert run("parts", 9) == whole == run("whole", 9) == tried(trials=9, startup=4)
     for what, more in (
         ("space", {"space": {"speed": [5.0, 20.0]}}),
         (
@@ -164,10 +160,8 @@ def test_every_damage_to_a_study_is_one_clear_line_or_changes_nothing_that_count
             rows = tried(trials=4, file=file)
             save(rows, tmp_path)
         except InputError as error:
-            assert (
-                str(error).startswith(f"tuning.study={file}: ")
-                and file.read_bytes() == before
-            )
+            assert str(error).startswith(f"tuning.study={file}: ")
+            assert file.read_bytes() == before
         else:
             assert all(set(row["parameters"]) == set(SPACE) for row in rows)
     file.write_text("[" * 10**5)
@@ -209,7 +203,8 @@ def test_nan_of_the_present_parameters_stops_and_that_of_others_is_refused():
     with pytest.raises(InputError, match="NaN"):
         tried(evaluate=evaluate)
     first, second = tried(evaluate=lambda parameters: evaluate(parameters, bad=False))
-    assert first["admissible"] and not second["admissible"]
+    assert first["admissible"]
+    assert not second["admissible"]
 
 
 def test_a_ladder_is_even_on_its_scale_and_leaves_the_others_as_they_are():
@@ -233,7 +228,8 @@ def test_the_best_is_written_with_the_groups_of_dotted_names_and_none_where_ther
 ):
     rows = tried(trials=4)
     result = save([row | {"admissible": False} for row in rows], tmp_path)
-    assert result["best"] is None and not (tmp_path / "tuned.yaml").exists()
+    assert result["best"] is None
+    assert not (tmp_path / "tuned.yaml").exists()
     save(rows, tmp_path)
     assert (
         json.loads((tmp_path / "tuning.json").read_text())["trials"][0]["parameters"]

@@ -41,6 +41,5 @@ def test_the_workflow_drives_and_gates(tmp_path):
     )
     assert "an interval needs 10" in done[1].stdout
     kept = steps["keep what was found"]["with"]["path"].split()
-    assert len(kept) == 3 and all(
-        Path(each).is_file() for each in kept if not each.endswith(".html")
-    )
+    assert len(kept) == 3
+    assert all(Path(each).is_file() for each in kept if not each.endswith(".html"))

@@ -51,8 +51,8 @@ def test_a_policy_of_theirs_is_an_ego(settings, tmp_path, capsys, name):
     action = e2rl.make_ego("policy_file", file=str(file)).decide(
         torch.randn(50, OBSERVATION_SIZE)
     )
-    assert action.isfinite().all() and action.std(0).min() > 1e-3
+    assert action.isfinite().all()
+    assert action.std(0).min() > 1e-3
     log = pandas.read_csv(tmp_path / "policy.monitor.csv", comment="#")
-    assert {"r", "l", "contact", "off_road", "progress"} <= set(log) and 0 < log[
-        "l"
-    ].sum() <= 256
+    assert {"r", "l", "contact", "off_road", "progress"} <= set(log)
+    assert 0 < log["l"].sum() <= 256

@@ -60,13 +60,10 @@ def test_adversary_ego_source_and_metric_share_a_table_with_e2(tmp_path):
         row["method"]: row
         for row in json.loads((tmp_path / "run" / "metrics.json").read_text())
     }
-    assert (
-        set(rows) == {"replay", "braking_leader", "e2"}
-        and rows["braking_leader"]["ego"] == "cruise"
-    )
-    assert (
-        rows["braking_leader"]["eta"] == 2 and "hard_braking" in rows["e2"]["metrics"]
-    )
+    assert set(rows) == {"replay", "braking_leader", "e2"}
+    assert rows["braking_leader"]["ego"] == "cruise"
+    assert rows["braking_leader"]["eta"] == 2
+    assert "hard_braking" in rows["e2"]["metrics"]
     with open(tmp_path / "run" / "rollouts.csv") as file:
         assert {row["hard_braking"] for row in csv.DictReader(file)} <= {
             "0.0",
@@ -90,7 +87,8 @@ def test_somebody_else_s_optimiser_spends_the_tries(tmp_path):
     run("evaluate.py", tmp_path / "run", *asked, "report=false", "save_rollouts=false")
     with open(tmp_path / "run" / "tries.csv") as file:
         tries = list(csv.DictReader(file))
-    assert len(tries) == 24 and len({row["family"] for row in tries}) > 4
+    assert len(tries) == 24
+    assert len({row["family"] for row in tries}) > 4
 
 
 @pytest.mark.slow
@@ -132,10 +130,10 @@ def test_the_leader_brakes_by_eta_on_its_path_and_nobody_else_does(braking_leade
     for scene, agent in braked.tolist():
         speed = out.states[scene, :, agent, 3]
         moving = speed[1:] > 0
-        assert (
-            torch.allclose((speed.diff() / DT)[moving], torch.tensor(-2.0), atol=0.02)
-            and speed[-1] == 0
+        assert torch.allclose(
+            (speed.diff() / DT)[moving], torch.tensor(-2.0), atol=0.02
         )
+        assert speed[-1] == 0
         xy = out.states[scene, :, agent, :2]
         path = logged[scene, :, agent, :2]
         assert torch.cdist(xy, path).amin(1).max() < 0.8, (
@@ -160,7 +158,8 @@ def test_the_objective_is_least_in_front_of_the_target(monkeypatch):
         sampled = states[:, :, SAMPLED_STEPS].clone().requires_grad_()
         value = objective.adversarial(sampled, context, 0.5)
         (gradient,) = torch.autograd.grad(value.sum(), sampled)
-        assert gradient[0, 0].abs().sum() == 0 and value[0, 0] == 0
+        assert gradient[0, 0].abs().sum() == 0
+        assert value[0, 0] == 0
         values.append(value[0, 1].item())
     assert values == pytest.approx([0.0, 2.0, 7.0], abs=2e-3)  # in units of 2 m
 
@@ -178,9 +177,8 @@ def test_an_objective_of_one_s_own_steers_e2_elsewhere(tmp_path):
     run("evaluate.py", tmp_path / "run", *small, "report=false")
     with open(tmp_path / "run" / "rollouts.csv") as file:
         rows = list(csv.DictReader(file))
-    assert {row["method"] for row in rows} == {"e2", "cut_in_front"} and {
-        row["errored"] for row in rows
-    } <= {
+    assert {row["method"] for row in rows} == {"e2", "cut_in_front"}
+    assert {row["errored"] for row in rows} <= {
         "0",
         "0.0",
     }

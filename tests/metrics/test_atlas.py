@@ -38,7 +38,8 @@ def test_only_preventable_failures_enter():
     rows = many()
     preventable = [row for row in rows if row["cfr_preventable"] == 1]
     atlas = atlas_of(rows)
-    assert 0 < len(preventable) < len(rows) and atlas == atlas_of(preventable)
+    assert 0 < len(preventable) < len(rows)
+    assert atlas == atlas_of(preventable)
     assert sum(map(len, atlas.values())) == len(preventable)
     for value in (0.0, math.nan):
         assert cell_of(found(cfr_preventable=value)) is None
@@ -55,15 +56,14 @@ def test_a_cell_keeps_its_failure_with_the_least_nats_and_counts_all():
             nats.setdefault(cell, []).append(
                 (math.inf if math.isnan(row["transport"]) else row["transport"], row)
             )
-    assert set(atlas) == set(nats) and len(atlas) > 20
+    assert set(atlas) == set(nats)
+    assert len(atlas) > 20
     for cell, failures in atlas.items():
         least = min(value for value, _ in nats[cell])
-        assert cell_of(failures[0]) == cell and (
-            failures[0]["transport"] == least or least == math.inf
-        )
-        assert len(failures) == len(nats[cell]) and all(
-            row in failures for _, row in nats[cell]
-        )
+        assert cell_of(failures[0]) == cell
+        assert failures[0]["transport"] == least or least == math.inf
+        assert len(failures) == len(nats[cell])
+        assert all(row in failures for _, row in nats[cell])
     order = [by_likelihood(failures[0]) for failures in atlas.values()]
     assert order == sorted(order)  # the cells, too, by likelihood
 

@@ -75,9 +75,11 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
     )
     summaries = metric_rows(rows, samples, draws=20, realism_draws=2)
     (row,) = metric_tables(summaries, table="speeds")[0].rows
-    assert row[0] == "fast [%]" and row[1].startswith(f"{100 * expected:.1f} [")
+    assert row[0] == "fast [%]"
+    assert row[1].startswith(f"{100 * expected:.1f} [")
     assert metric_tables(summaries, table="main")[0].rows[-1] == row
-    assert "above 10 m/s" in legend() and fast not in table_metrics("traffic")
+    assert "above 10 m/s" in legend()
+    assert fast not in table_metrics("traffic")
 
 
 def test_taken_names_and_wrong_shapes_are_refused():

@@ -157,10 +157,8 @@ def test_a_contact_is_with_an_adversary_or_not_and_who_has_left_is_not_hit():
         course(30.5, 0, heading=0, speed=5),
         adversaries=[1],
     )
-    assert (
-        found["cfr_adv"] == 1
-        and row(course(0, 0, heading=0, speed=10), gone)["cfr"] == 0
-    )
+    assert found["cfr_adv"] == 1
+    assert row(course(0, 0, heading=0, speed=10), gone)["cfr"] == 0
 
 
 def test_an_ego_that_overlaps_at_the_start_has_no_collision_metrics():
@@ -177,7 +175,8 @@ def test_an_ego_that_overlaps_at_the_start_has_no_collision_metrics():
         "contact_time",
     ):
         assert math.isnan(result[name]), name
-    assert result["start_overlap_ego"] == 1 and result["contact_type"] == ""
+    assert result["start_overlap_ego"] == 1
+    assert result["contact_type"] == ""
 
 
 def test_pedestrians_count_apart_and_do_not_end_the_rollout():

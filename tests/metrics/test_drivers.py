@@ -81,7 +81,8 @@ def test_braking_keeps_its_bound_and_jerk_whatever_happens(name):
             )
         )
     action = drive(DRIVERS[name], observations)
-    assert action.isfinite().all() and (action <= 0).all()
+    assert action.isfinite().all()
+    assert (action <= 0).all()
     assert action.min().item() == pytest.approx(-BOUNDS[name])
     if name != "regulation":  # R157 5.2.5.2 has no build-up
         assert (-action.diff(dim=0)).max() <= MAX_JERK * DT + 1e-9
@@ -216,7 +217,8 @@ def test_verdicts_are_the_oracle_s(name, dtype):
     crash = simulate_cut_ins(
         DRIVERS[name], CutIn(*(field.to(dtype) for field in scenarios))
     )
-    assert len(crash) == 792 and crash.sum() == CRASHES[name]
+    assert len(crash) == 792
+    assert crash.sum() == CRASHES[name]
     different = crash != expected
     assert not different.any(), [
         tuple(field[different].tolist()) for field in scenarios

@@ -116,11 +116,9 @@ def test_the_strategy_finds_what_the_grid_does_not(monkeypatch):
     fine, scene_set = search(slalom)
     monkeypatch.setattr(evasion, "ROUNDS", 0)
     coarse, _ = search(slalom)
-    assert (
-        not coarse.found.any()
-        and fine.found.all()
-        and not replay(scene_set, fine.actions)[0].any()
-    )
+    assert not coarse.found.any()
+    assert fine.found.all()
+    assert not replay(scene_set, fine.actions)[0].any()
 
 
 def test_a_rollout_s_result_does_not_depend_on_the_batch():
@@ -160,8 +158,10 @@ def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_
     rows = [{"cfr": 1, "contact_step": 40.0}, {"cfr": 0, "contact_step": float("nan")}]
     add_avoidable(rows, rollouts, scene=scene, sim=SimSettings())
     evasions = rollouts.evasion
-    assert rows[0]["avoidable"] == 1 and "avoidable" not in rows[1]
-    assert evasions.shape == (2, 61, 4) and evasions[1].isnan().all()
+    assert rows[0]["avoidable"] == 1
+    assert "avoidable" not in rows[1]
+    assert evasions.shape == (2, 61, 4)
+    assert evasions[1].isnan().all()
     torch.testing.assert_close(evasions[0, 0], scene["logged"][0, 0, 0])
     size = scene["size"][0]
     gap = separation(
@@ -185,10 +185,8 @@ def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
     after = torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
     found = spliced(driven, after, moment=torch.tensor([0, 4, 10]))[..., 0]
     assert found[0].tolist() == list(range(1, 11))
-    assert (
-        found[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6]
-        and found[2].tolist() == [0] * 10
-    )
+    assert found[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6]
+    assert found[2].tolist() == [0] * 10
 
 
 def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkeypatch):

@@ -145,7 +145,8 @@ def test_a_leader_in_a_sharp_bend_is_ahead_and_the_follower_is_behind():
     fast = bend(9.0, 20)
     slow = (slow[0][38:], slow[1][38:])  # 19 m on its way when the fast one starts
     fast = (fast[0][: len(slow[0])], fast[1][: len(slow[0])])
-    assert words(fast, slow)[0] == "ahead" and words(slow, fast)[0] == "from behind"
+    assert words(fast, slow)[0] == "ahead"
+    assert words(slow, fast)[0] == "from behind"
 
 
 def test_along_a_bend_of_the_lane_nobody_veers():

@@ -77,7 +77,8 @@ def crowd(number, seed=0):
 
 
 def test_identical_failures_are_one_mode_and_other_approaches_another():
-    assert cluster_failures([]) == [] and cluster_failures([failure(CROSSING)]) == [1]
+    assert cluster_failures([]) == []
+    assert cluster_failures([failure(CROSSING)]) == [1]
     rows = [failure(CROSSING, scene=str(index)) for index in range(7)]
     assert cluster_failures(rows) == [1] * 7
     rows += [failure(REAR_END, scene=str(index)) for index in range(3)]
@@ -154,9 +155,8 @@ def test_names_say_what_two_thirds_agree_on():
         mode_name([failure({"approach": word}) for word in ("ahead", "oncoming")])
         == "various"
     )
-    assert split_side("beside on the left") == ("beside", "left") and split_side(
-        "brakes"
-    ) == ("brakes", "")
+    assert split_side("beside on the left") == ("beside", "left")
+    assert split_side("brakes") == ("brakes", "")
 
 
 def test_the_medoid_is_the_middle_one_of_the_members():
@@ -176,9 +176,8 @@ def test_the_medoid_is_the_middle_one_of_the_members():
 def test_small_modes_are_those_of_one_or_of_less_than_two_per_cent():
     assert large_modes([1, 1, 2]) == [1, 2], "of few failures each may be one"
     assert large_modes([1] * 8 + [2, 2, 3]) == [1, 2]
-    assert (
-        large_modes([1] * 200 + [2, 2, 2] + [3] * 5) == [1, 3] and large_modes([]) == []
-    )
+    assert large_modes([1] * 200 + [2, 2, 2] + [3] * 5) == [1, 3]
+    assert large_modes([]) == []
 
 
 def expected_labels(labels, places, count):
@@ -233,6 +232,5 @@ def test_coverage_is_the_expected_number_of_modes_at_so_many_places():
         "mode_coverage",
         "mode_coverage_counted",
     ]
-    assert weights.sum(0).tolist() == [36, 12] and set(
-        (totals / weights)[0].tolist()
-    ) == {3.0}
+    assert weights.sum(0).tolist() == [36, 12]
+    assert set((totals / weights)[0].tolist()) == {3.0}

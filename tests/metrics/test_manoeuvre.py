@@ -43,7 +43,8 @@ def test_knots_are_interpolated_and_come_back():
 def test_shifts_begin_at_rest_hold_what_is_held_and_have_their_own_rate():
     knots = torch.randn(3, KNOTS, generator=torch.Generator().manual_seed(0)).double()
     value, rate = shifts(knots, STEPS)
-    assert value[:, 0].abs().max() < 1e-9 and rate[:, 0].abs().max() < 1e-9
+    assert value[:, 0].abs().max() < 1e-9
+    assert rate[:, 0].abs().max() < 1e-9
     simpson = (rate[:, :-2] + 4 * rate[:, 1:-1] + rate[:, 2:]) / 6 * 0.2
     torch.testing.assert_close(value[:, 2:] - value[:, :-2], simpson, atol=0.01, rtol=0)
     value, rate = shifts(torch.full((KNOTS,), 2.0), STEPS)
@@ -70,11 +71,9 @@ def test_limits_hold_and_the_actions_give_the_states():
     actions, states = execute(
         start, arc(15.0), accel=accel, shift=shift, steps=STEPS, sim=LIMITS
     )
-    assert (
-        actions[..., 0].min() >= -8
-        and actions[..., 0].max() <= 5
-        and actions[..., 1].abs().max() <= 1.6
-    )
+    assert actions[..., 0].min() >= -8
+    assert actions[..., 0].max() <= 5
+    assert actions[..., 1].abs().max() <= 1.6
     torch.testing.assert_close(dynamics.rollout(start, actions), states)
     assert peak_acceleration(start, states).max() < dynamics.MAX_LATERAL + 1e-2, (
         "braking and turning share the grip"
@@ -122,7 +121,8 @@ def test_contact_is_what_the_environment_calls_contact():
         clearance=0.0,
         road_margin=0.0,
     )[:, 0]
-    assert torch.equal(missed > 0, torch.stack(hit, 1)) and (missed > 0).any()
+    assert torch.equal(missed > 0, torch.stack(hit, 1))
+    assert (missed > 0).any()
 
 
 def test_pedestrians_count_and_the_absent_do_not():
@@ -134,9 +134,8 @@ def test_pedestrians_count_and_the_absent_do_not():
     ).any()
     scene_set.scenes["logged_valid"][:, :, 4] = False
     task = evasion_scene(scene_set)
-    assert (violations(ego, task, clearance=0.0, road_margin=0.0) == 0).all() and (
-        task.others < AWAY
-    ).all()
+    assert (violations(ego, task, clearance=0.0, road_margin=0.0) == 0).all()
+    assert (task.others < AWAY).all()
 
 
 def test_clearance_widens_and_the_road_ends_beside():

@@ -42,7 +42,8 @@ def test_the_margin_grows_with_nearness_to_contact_to_verdict():
     stops = row(
         course(0, 0, heading=0, speed=10), course(60, 0, heading=0, speed=0.0)
     )  # a wreck far ahead: the ego drives into it
-    assert stops["cfr_preventable"] == 1 and stops["margin"] == PREVENTED
+    assert stops["cfr_preventable"] == 1
+    assert stops["margin"] == PREVENTED
 
 
 def test_a_contact_has_the_share_of_its_speed_that_the_driver_has_lost_before_it():

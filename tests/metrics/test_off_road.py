@@ -77,9 +77,11 @@ def test_a_vehicle_off_the_road_at_the_start_is_left_out():
     assert (result["aor_step"], result["aor_any"], result["aor_left_out"]) == (0, 0, 1)
     result = row(ego, stays, leaves)
     expected = (leaves[0][1:, 1].abs() > 3.0).double().mean().item() / 2
-    assert result["aor_step"] == pytest.approx(expected) and result["aor_any"] == 1
+    assert result["aor_step"] == pytest.approx(expected)
+    assert result["aor_any"] == 1
     only_parked = row(ego, parked)
-    assert np.isnan(only_parked["aor_step"]) and only_parked["aor_vehicle_steps"] == 0
+    assert np.isnan(only_parked["aor_step"])
+    assert only_parked["aor_vehicle_steps"] == 0
 
 
 def test_the_ego_leaves_the_road_or_not_and_is_unknown_where_it_starts_beside_it():

@@ -174,7 +174,9 @@ def test_a_cut_in_is_preventable_where_there_is_room_to_brake():
     near, far = (
         human(collision(ego, cut_in(gap, 14.0, other_speed=6.0))) for gap in (5.0, 14.0)
     )
-    assert not near.avoided.any() and far.avoided.all() and not far.followers.any()
+    assert not near.avoided.any()
+    assert far.avoided.all()
+    assert not far.followers.any()
     needed = HumanDriver().stopping_gap(torch.tensor(8.0))
     assert 5.0 < needed < 14.0
 
@@ -187,7 +189,8 @@ def test_a_driver_that_the_end_of_the_rollout_spares_has_not_got_away(speed):
     case = collision(track(speed), track(0.0, start=(4.5 + 1.6 * speed, 0.0)))
     last = int(case.stop) + 1
     cut = case._replace(states=case.states[:, :last], present=case.present[:, :last])
-    assert not human(case).avoided and not human(cut).avoided
+    assert not human(case).avoided
+    assert not human(cut).avoided
     driven = human(cut).states[0, -1, 0]
     assert driven + 4.5 < 4.5 + 1.6 * speed, (
         "the driver is not there yet as the rollout ends"

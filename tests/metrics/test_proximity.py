@@ -50,7 +50,8 @@ def test_short_paths_have_no_acceleration():
     path = torch.zeros(2, 81, 4, dtype=torch.float64)
     path[..., 3] = torch.arange(81)
     values = mean_acceleration(path, torch.tensor([6, 7]))
-    assert values[0].isnan() and values[1] == pytest.approx(10)
+    assert values[0].isnan()
+    assert values[1] == pytest.approx(10)
 
 
 def test_gaps_of_the_ego_s_track_are_closed_before_measuring():
@@ -59,7 +60,8 @@ def test_gaps_of_the_ego_s_track_are_closed_before_measuring():
     path, count = ego_path(
         states[None, :, None], valid[None, :, None], stop=torch.tensor([80])
     )
-    assert count.item() == 78 and progress(path, count).item() == pytest.approx(80)
+    assert count.item() == 78
+    assert progress(path, count).item() == pytest.approx(80)
 
 
 def completion(ego, recorded, *others):
@@ -175,10 +177,8 @@ def test_everybody_is_counted_once_and_where_it_belongs():
         "starters_log": 1,
     }
     as_logged = values(batch | {"states": batch["logged"]})
-    assert (
-        as_logged["parked_moved"] == 0
-        and as_logged["starters"] == as_logged["starters_log"] == 1
-    )
+    assert as_logged["parked_moved"] == 0
+    assert as_logged["starters"] == as_logged["starters_log"] == 1
     who[0, [PARKED_MOVES, STARTS]] = False
     assert values(batch, who) == {
         "parked_moved": 0,

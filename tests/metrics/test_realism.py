@@ -98,18 +98,14 @@ def test_real_adv_is_real_of_a_traffic_of_adversaries_alone():
     ours, theirs = (
         realism(features_of(given), cluster, draws=draws) for given in (rollouts, alone)
     )
-    assert (
-        ours["real_adv"] == theirs["real"] == theirs["real_adv"]
-        and ours["real_adv"] != ours["real"]
-    )
+    assert ours["real_adv"] == theirs["real"] == theirs["real_adv"]
+    assert ours["real_adv"] != ours["real"]
     nobody = rollouts.replace(adversaries=torch.zeros_like(rollouts.adversaries))
     rows, features = score_rollouts(nobody)
     table = realism(features, cluster, draws=draws)
-    assert (
-        table["real_adv"].isnan()
-        and table["real"] == ours["real"]
-        and rows[0]["real_adv"] != rows[0]["real_adv"]
-    )
+    assert table["real_adv"].isnan()
+    assert table["real"] == ours["real"]
+    assert rows[0]["real_adv"] != rows[0]["real_adv"]
 
 
 def test_a_constant_turn_has_its_lateral_acceleration():

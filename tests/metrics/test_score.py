@@ -56,7 +56,8 @@ def test_rows_and_summary_agree_with_the_independent_scorer(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     theirs = json.loads((tmp_path / "theirs.json").read_text())
     agreement = theirs["agreement"]
-    assert agreement["joined"] == len(rows) and not agreement["missing"]
+    assert agreement["joined"] == len(rows)
+    assert not agreement["missing"]
     assert not any(part["disagree"] for part in agreement["metrics"].values())
     compare_columns(rows, tmp_path / "theirs.csv")
     compare_summary(summarise(rows, features), theirs["groups"][0]["metrics"])
@@ -194,10 +195,8 @@ def test_the_world_s_place_direction_and_hand_do_not_matter(world):
     )
     before = score_rollouts(rollouts)[0]
     after = score_rollouts(changed(rollouts, *change))[0]
-    assert (
-        len({row["approach"] for row in before}) > 4
-        and len({row["preventable"] for row in before}) > 2
-    )
+    assert len({row["approach"] for row in before}) > 4
+    assert len({row["preventable"] for row in before}) > 2
     for row, other in zip(before, after, strict=True):
         row = {
             name: word(value) if isinstance(value, str) else value

@@ -154,7 +154,8 @@ def test_rows_are_what_another_reader_of_the_files_scores(name, tmp_path):
     files = [np.load(path) for path in rollouts.to_npz(tmp_path)]
     theirs = {(str(file["scene_id"]), int(file["seed"])): score(file) for file in files}
     rows = score_rollouts(rollouts)[0]
-    assert len(theirs) == len(rows) and {row["cfr"] for row in rows} >= {0.0, 1.0}
+    assert len(theirs) == len(rows)
+    assert {row["cfr"] for row in rows} >= {0.0, 1.0}
     for row in rows:
         other = theirs[row["scene_id"], row["seed"]]
         assert {key: float(row[key]) for key in other} == pytest.approx(

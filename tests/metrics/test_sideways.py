@@ -281,7 +281,9 @@ def test_a_cyclist_s_or_nobody_s_contact_is_no_movement_into_anybody():
     found = verdict(
         course(0, 0, heading=EAST, speed=9), course(0, 30, heading=EAST, speed=9)
     )
-    assert found["cfr"] == 0 and math.isnan(found["at_fault"]) and found["duty"] == ""
+    assert found["cfr"] == 0
+    assert math.isnan(found["at_fault"])
+    assert found["duty"] == ""
 
 
 @pytest.mark.parametrize("placing", range(5))

@@ -83,25 +83,25 @@ def test_intervals_cover_the_truth_in_about_95_of_100_cases_when_rollouts_come_i
 
 def test_locations_are_clusters_and_logs_where_there_is_none():
     cluster, count = cluster_index(["a", "a", "", "", "", "1"], "121129")
-    assert (
-        count == 4
-        and cluster[0] == cluster[1]
-        and cluster[2] == cluster[3] != cluster[4]
-    )
+    assert count == 4
+    assert cluster[0] == cluster[1]
+    assert cluster[2] == cluster[3] != cluster[4]
     assert cluster[5] not in cluster[:5].tolist(), (
         "a location and a scene of the same name are different clusters"
     )
     cluster, count = cluster_index([""] * 3, ("log@11", "log@102", "other@11"))
-    assert count == 2 and cluster[0] == cluster[1] != cluster[2], (
-        "the windows of a log are one"
-    )
+    assert count == 2
+    assert cluster[0] == cluster[1] != cluster[2], "the windows of a log are one"
 
 
 def test_unknown_values_are_left_out_and_counted_and_never_zero():
     table = brief(*rows_of([1.0, math.nan, 0.0, math.nan], name="relvel"))
-    assert table["relvel"]["n"] == 2 and table["relvel"]["mean"] == 0.5
-    assert table["progress"]["n"] == 0 and math.isnan(table["progress"]["mean"])
-    assert table["real"]["n"] == 0 and math.isnan(table["real"]["mean"])
+    assert table["relvel"]["n"] == 2
+    assert table["relvel"]["mean"] == 0.5
+    assert table["progress"]["n"] == 0
+    assert math.isnan(table["progress"]["mean"])
+    assert table["real"]["n"] == 0
+    assert math.isnan(table["real"]["mean"])
 
 
 def test_a_median_draw_is_the_median_of_the_repeated_values():
@@ -116,10 +116,8 @@ def test_a_median_draw_is_the_median_of_the_repeated_values():
         assert median.item() == pytest.approx(
             repeated.nanquantile(0.5, interpolation="midpoint").item()
         )
-    assert (
-        medians[-1].isnan()
-        and resampled_medians(values * torch.nan, cluster, draws=draws).isnan().all()
-    )
+    assert medians[-1].isnan()
+    assert resampled_medians(values * torch.nan, cluster, draws=draws).isnan().all()
     table = brief(*rows_of([1.0, math.nan, 9.0, 2.0], name="contact_time"))[
         "contact_time"
     ]
@@ -133,7 +131,9 @@ def test_fewer_than_ten_places_give_no_interval():
             name
         ]
         many = brief(*rows_of(values, clusters=list("abcdefghij") * 3, name=name))[name]
-        assert math.isnan(few["low"]) and math.isnan(few["high"]) and few["n"] == 27
+        assert math.isnan(few["low"])
+        assert math.isnan(few["high"])
+        assert few["n"] == 27
         assert many["low"] < many["mean"] < many["high"]
 
 
@@ -167,9 +167,8 @@ def test_rollouts_at_one_place_are_one_trial():
     found = brief(*rows_of(values, clusters=[index // 3 for index in range(120)]))[
         "cfr"
     ]
-    assert (found["low"], found["high"]) == pytest.approx(
-        exact_interval(0.2, 40)
-    ) and found["n"] == 120
+    assert (found["low"], found["high"]) == pytest.approx(exact_interval(0.2, 40))
+    assert found["n"] == 120
 
 
 def test_medians_that_agree_and_ratios_of_few_events_have_no_interval():
@@ -183,9 +182,8 @@ def test_medians_that_agree_and_ratios_of_few_events_have_no_interval():
         brief(*rows_of([1.0] * n + [0.0] * (60 - n), driven_km=[0.1] * 60))
         for n in (9, 10)
     )
-    assert math.isnan(few["failures_per_km"]["low"]) and few["failures_per_km"][
-        "mean"
-    ] == pytest.approx(1.5)
+    assert math.isnan(few["failures_per_km"]["low"])
+    assert few["failures_per_km"]["mean"] == pytest.approx(1.5)
     assert many["failures_per_km"]["low"] < 10 / 6 < many["failures_per_km"]["high"]
 
 
@@ -203,13 +201,12 @@ def test_a_difference_of_rare_events_lies_between_the_differences_of_their_bound
     six = paired_differences(
         *rows_of([0.0] * 6), *rows_of([1.0] * 2 + [0.0] * 4), draws=50, realism_draws=2
     )["cfr"]
-    assert (
-        six["difference"] == pytest.approx(-1 / 3)
-        and math.isnan(six["low"])
-        and math.isnan(six["high"])
-    )
+    assert six["difference"] == pytest.approx(-1 / 3)
+    assert math.isnan(six["low"])
+    assert math.isnan(six["high"])
     same = paired_differences(*ours, *ours, draws=50, realism_draws=2)["cfr"]
-    assert same["difference"] == 0 and same["low"] == -same["high"] < 0
+    assert same["difference"] == 0
+    assert same["low"] == -same["high"] < 0
 
 
 @pytest.mark.parametrize("places", [9, 10, 40])
@@ -223,9 +220,8 @@ def test_a_fraction_that_is_the_same_at_each_place_is_bounded_by_that_of_places_
     found = brief(*rows_of(halves, clusters))["cfr"]
     u = 1 - 0.025 ** (1 / places)
     expected = (0.5 * (1 - u), 0.5 * (1 + u)) if places >= 10 else (math.nan, math.nan)
-    assert (found["low"], found["high"]) == pytest.approx(
-        expected, nan_ok=True
-    ) and found["mean"] == 0.5
+    assert (found["low"], found["high"]) == pytest.approx(expected, nan_ok=True)
+    assert found["mean"] == 0.5
     none = brief(*rows_of([0.0] * places))["cfr"]
     assert (none["low"], none["high"]) == pytest.approx(
         (0.0, u) if places >= 10 else expected, nan_ok=True
@@ -284,11 +280,13 @@ def test_failures_per_kilometre_are_all_failures_over_all_kilometres():
     ours = rows_of([1.0, 0.0, math.nan, 1.0], driven_km=[0.1, 0.3, 5.0, 0.1])
     theirs = rows_of([0.0, 0.0, 1.0, 1.0], driven_km=[0.2, 0.2, 5.0, 0.6])
     table = brief(*ours)["failures_per_km"]
-    assert table["mean"] == pytest.approx(2 / 0.5) and table["n"] == 3
+    assert table["mean"] == pytest.approx(2 / 0.5)
+    assert table["n"] == 3
     paired = paired_differences(
         *ours, *theirs, draws=300, realism_draws=2, relative=True
     )["failures_per_km"]
-    assert paired["difference"] == pytest.approx(4 - 1) and paired["n"] == 3
+    assert paired["difference"] == pytest.approx(4 - 1)
+    assert paired["n"] == 3
     assert paired["relative"] == pytest.approx(3.0)
 
 
@@ -301,15 +299,15 @@ def test_rates_per_distance_leave_out_what_the_planner_raised_in():
         errored=[0.0] * 3 + [1.0] * 20,
     )
     table = brief(*rows)
-    assert (
-        table["failures_per_km"]["mean"] == pytest.approx(2 / 0.5)
-        and table["failures_per_km"]["n"] == 3
-    )
-    assert table["cfr"]["mean"] == pytest.approx(22 / 23) and table["cfr"]["n"] == 23
+    assert table["failures_per_km"]["mean"] == pytest.approx(2 / 0.5)
+    assert table["failures_per_km"]["n"] == 3
+    assert table["cfr"]["mean"] == pytest.approx(22 / 23)
+    assert table["cfr"]["n"] == 23
     nothing = brief(
         *rows_of([math.nan] * 2, driven_km=[math.nan] * 2, errored=[1.0] * 2)
     )["failures_per_km"]
-    assert math.isnan(nothing["mean"]) and nothing["n"] == 0
+    assert math.isnan(nothing["mean"])
+    assert nothing["n"] == 0
 
 
 def test_a_paired_difference_uses_shared_scenes_and_is_narrower_than_unpaired_ones():
@@ -346,4 +344,5 @@ def test_paired_ratios_compare_the_two_groups_own_collisions():
     ours = rows_of([1.0, 1.0, nan, nan], name="rir")
     theirs = rows_of([nan, 0.0, 1.0, nan], name="rir")
     result = paired_differences(*ours, *theirs, draws=300, realism_draws=2)["rir"]
-    assert result["difference"] == pytest.approx(0.5) and result["n"] == 3
+    assert result["difference"] == pytest.approx(0.5)
+    assert result["n"] == 3

@@ -39,22 +39,23 @@ def test_a_collision_counts_if_the_ego_is_at_fault_or_a_competent_driver_prevent
             == max(row["at_fault"], row["preventable"])
             == row["cfr_counted"]
         )
-        assert row["cfr_preventable"] == row["preventable"] and row["duty"] in DUTIES
+        assert row["cfr_preventable"] == row["preventable"]
+        assert row["duty"] in DUTIES
         assert row["preventable_chain"] <= row["preventable"]
 
 
 def test_without_a_collision_shares_are_zero_and_verdicts_unknown(rows):
     for row in rows:
         if row["cfr"] == 0:
-            assert (
-                row["cfr_counted"] == row["cfr_preventable"] == 0 and row["duty"] == ""
-            )
+            assert row["cfr_counted"] == row["cfr_preventable"] == 0
+            assert row["duty"] == ""
             assert all(
                 math.isnan(row[name])
                 for name in ("counted", "at_fault", "preventable", "preventable_rss")
             )
         if math.isnan(row["cfr"]):  # the ego overlaps a vehicle at the start
-            assert math.isnan(row["cfr_counted"]) and math.isnan(row["cfr_preventable"])
+            assert math.isnan(row["cfr_counted"])
+            assert math.isnan(row["cfr_preventable"])
 
 
 def test_a_slow_vehicle_far_ahead_in_the_lane_counts_and_a_rammer_does_not():
@@ -62,10 +63,8 @@ def test_a_slow_vehicle_far_ahead_in_the_lane_counts_and_a_rammer_does_not():
     behind = row_of(
         course(0, 0, heading=0, speed=8), course(-20, 0, heading=0, speed=14)
     )
-    assert (
-        ahead["counted"] == ahead["preventable"] == ahead["at_fault"] == 1
-        and ahead["duty"] == "none"
-    )
+    assert ahead["counted"] == ahead["preventable"] == ahead["at_fault"] == 1
+    assert ahead["duty"] == "none"
     assert (
         behind["counted"] == behind["preventable_fsm"] == behind["preventable_rss"] == 0
     )
@@ -157,7 +156,8 @@ def test_who_comes_over_to_a_driver_that_stands_by_then_breaks_its_right_of_way(
     partner = track(5.0, math.pi, start=(45.0, 0.0))
     partner[0, :, 1] = 3.5 * (1 - ((torch.arange(81) - 2) / 10.0).clamp(0, 1))
     case = collision(slow, partner)
-    assert preventions(case)["human"].struck.item() and duty(case) == "right of way"
+    assert preventions(case)["human"].struck.item()
+    assert duty(case) == "right of way"
 
 
 def test_an_entry_is_forgotten_once_the_gap_was_safe():
@@ -186,7 +186,8 @@ def test_who_is_struck_as_a_competent_driver_would_be_that_has_stood_is_not_at_f
     speed[26:] = 0.3 * torch.arange(1, 56)
     head_on = course(4.5 + 30 * 1.0, 0, heading=math.pi, speed=10.0)
     found = row_of((track(speed)[0], head_on[1]), head_on)
-    assert found["cfr"] == 1 and found["contact_type"] == "front"
+    assert found["cfr"] == 1
+    assert found["contact_type"] == "front"
     assert found["at_fault"] == found["counted"] == 0
 
 
@@ -284,10 +285,8 @@ def test_an_ego_that_creeps_prevents_nothing_by_braking(speed, preventable):
     found = row_of(
         course(0, 0, heading=0, speed=speed), course(5.5, 0, heading=0, speed=0)
     )
-    assert (
-        found["preventable"] == preventable
-        and found["counted"] == found["at_fault"] == 1
-    )
+    assert found["preventable"] == preventable
+    assert found["counted"] == found["at_fault"] == 1
 
 
 @pytest.mark.parametrize(
@@ -309,12 +308,14 @@ def test_an_ego_that_stands_across_a_lane_is_in_the_way_of_who_comes_along_it(
         "lane_index": torch.zeros(1, 41).to(rollouts.lane_index),
     }
     found = score_rollouts(rollouts.replace(**extra))[0][0]
-    assert found["cfr"] == 1 and found["at_fault"] == fault
+    assert found["cfr"] == 1
+    assert found["at_fault"] == fault
 
 
 def test_a_failure_is_clean_if_it_is_preventable_and_nobody_else_did_wrong():
     row = row_of(course(0, 0, heading=0, speed=12), course(40, 0, heading=0, speed=3))
-    assert row["cfr_clean"] == row["preventable"] == 1 and row["replayed"] == 0
+    assert row["cfr_clean"] == row["preventable"] == 1
+    assert row["replayed"] == 0
     none = {"duty": 0, "replayed": 0, "cfr_bg": 0, "aor_any": 0, "ego_off_road": 0}
     cases = [none, *({**none, name: 1} for name in none)]
     columns = {name: torch.tensor([case[name] for case in cases]) for name in none}
@@ -333,10 +334,8 @@ def test_who_strikes_the_ego_is_only_replayed():
     struck = row_of(
         course(0, 0, heading=0, speed=12), course(5, 4, heading=-0.1, speed=12)
     )
-    assert (
-        struck["contact_type"] == "side"
-        and struck["preventable"] == struck["replayed"] == 1
-    )
+    assert struck["contact_type"] == "side"
+    assert struck["preventable"] == struck["replayed"] == 1
 
 
 def test_the_driver_of_the_verdict_goes_with_the_rollout():
@@ -353,7 +352,8 @@ def test_the_driver_of_the_verdict_goes_with_the_rollout():
     assert rollouts.driver[1].isnan().all()
     torch.testing.assert_close(rollouts.driver[0, 0, :2], rollouts.states[0, 0, 0, :2])
     gap = rollouts.states[0, :, 1, 0] - rollouts.driver[0, :, 0]
-    assert gap.min() > 4.8 and (rollouts.driver[0, :, 3].diff() < 0).any()
+    assert gap.min() > 4.8
+    assert (rollouts.driver[0, :, 3].diff() < 0).any()
 
 
 @pytest.mark.parametrize("from_left", [True, False])

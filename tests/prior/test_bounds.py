@@ -142,14 +142,17 @@ def test_braking_is_never_harder_than_the_floor_nor_softer_than_gentle():
 def test_of_two_that_cross_the_later_one_brakes():
     decode, state, obstacles = traffic((-20, 0, 0, 10), (0, -23, math.pi / 2, 10))
     cap = caps(decode, state, obstacles=obstacles)
-    assert cap[0] == NO_CAP and cap[1] < -1
+    assert cap[0] == NO_CAP
+    assert cap[1] < -1
 
 
 def test_only_an_exempt_vehicle_may_meet_the_ego():
     cars = (12, 0, 0, 0), (0, 0, 0, 10), (-12, 0, 0, 13)
     shy = caps(*traffic(*cars))
     bold = caps(*traffic(*cars, exempt=[1]))
-    assert shy[1] < 0 and bold[1] == NO_CAP and bold[2] == shy[2] < 0
+    assert shy[1] < 0
+    assert bold[1] == NO_CAP
+    assert bold[2] == shy[2] < 0
 
 
 def test_who_yields_brakes_for_the_ego_even_where_the_ego_would_have_to():
@@ -166,7 +169,8 @@ def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
     eager, patient = (
         caps(*traffic(ego, (0.0, 0, 0, 8), patience=value))[1] for value in (0.0, 6.0)
     )
-    assert -6 < eager < 0 and patient == NO_CAP
+    assert -6 < eager < 0
+    assert patient == NO_CAP
     closer = caps(*traffic(ego, (5.0, 0, 0, 8), patience=4.0))[1]
     room = 20 - 5 - CAR[0] - GAP
     assert -(8**2) / (2 * (room - 2)) < closer < eager
@@ -265,7 +269,8 @@ def test_whoever_follows_a_braking_vehicle_brakes_too():
         state=state,
         obstacles=obstacles,
     )
-    assert (motion.v <= decode().v + 1e-5).all() and motion.v[0, 2, 10] < 12 - 0.2
+    assert (motion.v <= decode().v + 1e-5).all()
+    assert motion.v[0, 2, 10] < 12 - 0.2
 
 
 def test_a_cap_lowers_the_next_knot_and_at_most_by_its_onset_the_present_acceleration():
@@ -273,9 +278,8 @@ def test_a_cap_lowers_the_next_knot_and_at_most_by_its_onset_the_present_acceler
     state.a = torch.tensor([[1.0, -1.5, -6.0]])
     x0 = torch.tensor([[[0.5] * SIZE, [-3.0] * SIZE, [0.0] * SIZE]])
     capped, after = apply_cap(torch.tensor([[-4.0, -2.0, -5.0]]), x0, state=state)
-    assert after.a.tolist() == [[1.0 - ONSET, -2.0, -6.0]] and capped[
-        0, :, 0
-    ].tolist() == [-4.0, -3.0, -5.0]
+    assert after.a.tolist() == [[1.0 - ONSET, -2.0, -6.0]]
+    assert capped[0, :, 0].tolist() == [-4.0, -3.0, -5.0]
     assert torch.equal(capped[..., 1:], x0[..., 1:])
 
 

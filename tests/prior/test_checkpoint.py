@@ -21,14 +21,13 @@ def test_a_saved_prior_comes_back(tmp_path):
     prior = small_prior()
     path = save_prior(prior, tmp_path / "new", origin={"command": "x", "step": 3})
     back, origin = load_prior(str(path), SamplerSettings(steps=3))
-    assert origin == {"command": "x", "step": 3} and back.sampler.steps == 3
+    assert origin == {"command": "x", "step": 3}
+    assert back.sampler.steps == 3
     assert back.denoiser.settings == prior.denoiser.settings
     for key, value in prior.state_dict().items():
         assert torch.equal(value, back.state_dict()[key])
-    assert (
-        not any(parameter.requires_grad for parameter in back.parameters())
-        and not back.training
-    )
+    assert not any(parameter.requires_grad for parameter in back.parameters())
+    assert not back.training
 
 
 @pytest.mark.parametrize(
@@ -42,7 +41,8 @@ def test_weights_that_come_with_the_package_carry_the_hash_of_what_they_are(
     with safe_open(path, "pt") as file:
         metadata = file.metadata()
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    assert HASH in metadata and read_weights(path)[0].keys() == tensors.keys()
+    assert HASH in metadata
+    assert read_weights(path)[0].keys() == tensors.keys()
     next(value for value in tensors.values() if value.is_floating_point()).view(-1)[
         0
     ] += 1e-3

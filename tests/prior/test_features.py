@@ -112,14 +112,13 @@ def test_only_estimates_look_at_the_past():
 def test_a_queue_a_light_and_a_limit_are_seen():
     nodes, _ = features(curved_scenes(limit=15.0))
     ego = nodes[0, 0]
-    assert (
-        ego[0] == pytest.approx(0.8)
-        and ego[7] == pytest.approx(0.7)
-        and ego[8] == pytest.approx(1.0)
-    )
+    assert ego[0] == pytest.approx(0.8)
+    assert ego[7] == pytest.approx(0.7)
+    assert ego[8] == pytest.approx(1.0)
     gap = -20 * math.log(ego[25])
     assert gap == pytest.approx(18 - 4.5, abs=0.2)
-    assert ego[32] == pytest.approx(1 - 30 / 120, abs=0.01) and ego[33:36].tolist() == [
+    assert ego[32] == pytest.approx(1 - 30 / 120, abs=0.01)
+    assert ego[33:36].tolist() == [
         1,
         0,
         0,

@@ -239,9 +239,8 @@ def test_bounds_change_what_is_executed_of_infeasible_plans_and_only_of_them():
     bold = tight.plan(x0, context).motion.v
     assert (shy[0, 5, 2:] < free[0, 5, 2:]).all()
     others = torch.arange(shy.shape[1]) != 5
-    assert torch.equal(shy[:, others], free[:, others]) and torch.equal(
-        bold[:, others], free[:, others]
-    )
+    assert torch.equal(shy[:, others], free[:, others])
+    assert torch.equal(bold[:, others], free[:, others])
     assert torch.equal(bold[0, 5], free[0, 5]), "an adversary may meet the ego"
 
 
@@ -280,10 +279,11 @@ def test_vehicles_end_where_an_open_route_ends():
         torch.zeros(*scene["route_log"].shape, SIZE), context_of(prior, scene)
     )
     last = int(plan.on_map[0, 2].sum())
-    assert (
-        10 <= last <= 18 and plan.on_map[0, 2, :last].all() and plan.on_map[0, 3].all()
-    )
-    assert (plan.motion.s[0, 2, :last] < 30).all() and plan.motion.s[0, 2, last] >= 30
+    assert 10 <= last <= 18
+    assert plan.on_map[0, 2, :last].all()
+    assert plan.on_map[0, 3].all()
+    assert (plan.motion.s[0, 2, :last] < 30).all()
+    assert plan.motion.s[0, 2, last] >= 30
 
 
 def test_samples_do_not_depend_on_the_batch_nor_on_absent_vehicles():
@@ -354,7 +354,8 @@ def test_the_ego_follows_its_mission_whatever_is_drawn():
     scene["route_valid"][:, :, 1] = scene["route_valid"][:, :, 0]
     scene["route_log"][:, 0] = 1
     chosen = prior.choose_routes(scene, torch.zeros(scene["route_valid"].shape[:2]))
-    assert chosen[0, 0] == 1 and (chosen[0, 1:] == 0).all()
+    assert chosen[0, 0] == 1
+    assert (chosen[0, 1:] == 0).all()
 
 
 @pytest.mark.parametrize("moved", [False, True])

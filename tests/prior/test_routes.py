@@ -68,15 +68,13 @@ def test_a_way_replaces_the_lane_of_those_that_leave_alone_and_the_way_back_is_e
         off_lane=who,
         off_lane_path=ways,
     )
-    assert torch.equal(left.points[:, 2], ways[:, 2]) and torch.equal(
-        left.points[:, 3], before.points[:, 3]
-    )
-    assert (
-        not before.conflict[:, 0, 2].any()
-        and left.conflict[:, 0, 2].all()
-        and left.conflict[:, 2, 0].all()
-    )
-    assert (left.light[:, 2] < 0).all() and not left.open[:, 2].any()
+    assert torch.equal(left.points[:, 2], ways[:, 2])
+    assert torch.equal(left.points[:, 3], before.points[:, 3])
+    assert not before.conflict[:, 0, 2].any()
+    assert left.conflict[:, 0, 2].all()
+    assert left.conflict[:, 2, 0].all()
+    assert (left.light[:, 2] < 0).all()
+    assert not left.open[:, 2].any()
     same(
         reroute(
             left,

@@ -107,9 +107,8 @@ def test_an_ancestral_step_is_the_posterior_given_both_ends():
 def test_many_steps_draw_the_data(sampler, data):
     """Deterministic samplers keep 1% of the mean that the first level's x still holds."""
     mean, std = moments(denoiser(*data), *sampler, 1000)
-    assert mean == pytest.approx(data[0], abs=0.018) and std == pytest.approx(
-        data[1], abs=0.003
-    )
+    assert mean == pytest.approx(data[0], abs=0.018)
+    assert std == pytest.approx(data[1], abs=0.003)
 
 
 @pytest.mark.parametrize(
@@ -144,10 +143,8 @@ def test_levels_are_even_in_what_they_are_spaced_by():
         rtol=1e-3,
         atol=0,
     )
-    assert (
-        ratio[0].item() == pytest.approx(SCHEDULE.start)
-        and ratio[-1] == 0 < ratio[-2] < even[-2]
-    )
+    assert ratio[0].item() == pytest.approx(SCHEDULE.start)
+    assert ratio[-1] == 0 < ratio[-2] < even[-2]
 
 
 def test_levels_begin_at_nearly_pure_noise_and_end_at_little():
@@ -341,4 +338,5 @@ def test_deterministic_steps_carry_no_density(sampler):
     _, variance = SAMPLERS[sampler](SCHEDULE, churn=0.0).step(
         *args, past=(torch.tensor(0.3), torch.tensor(0.8))
     )
-    assert variance == 0 and path_kl(torch.ones(3), variance) == 0
+    assert variance == 0
+    assert path_kl(torch.ones(3), variance) == 0

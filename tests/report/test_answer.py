@@ -98,11 +98,9 @@ def test_an_attack_is_told_with_its_numbers_and_the_weaknesses_that_count():
         "(95% interval +2 to +31)",
     ):
         assert part in text
-    assert (
-        "1. oncoming (2 of 8 failures, 2 count)" in text
-        and "rear (" not in text
-        and "other (" not in text
-    )
+    assert "1. oncoming (2 of 8 failures, 2 count)" in text
+    assert "rear (" not in text
+    assert "other (" not in text
     assert "4 rollouts without a score" in text
 
 
@@ -144,11 +142,9 @@ def test_before_and_after_stand_side_by_side():
     (line,) = [
         line for line in compared_answer([old], [new]) if line.startswith("hit, ")
     ]
-    assert (
-        line.split("  ")[-1].strip() == "-25 [-40, -10]"
-        and "50% (6 of 12)" in line
-        and "25% (3 of 12)" in line
-    )
+    assert line.split("  ")[-1].strip() == "-25 [-40, -10]"
+    assert "50% (6 of 12)" in line
+    assert "25% (3 of 12)" in line
 
 
 def atlas(failed, **scenes):
@@ -227,9 +223,8 @@ def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
             for each in (None, (ways, ways))
         ),
     ):
-        assert len(lines) <= LINES and all(
-            len(line) <= width for line in lines if str(tmp_path) not in line
-        )
+        assert len(lines) <= LINES
+        assert all(len(line) <= width for line in lines if str(tmp_path) not in line)
         assert lines[-1].endswith("tables.md"), "where everything lies is never cut"
 
 
@@ -283,11 +278,9 @@ def test_a_search_is_told_by_its_scenes_and_none_of_its_tries_rates():
         "lane_graph under search at η=2: preventable failures in 5 of 12 scenes, "
         "in 8 ways, within 4.2 tries (630 NFE)"
     )
-    assert (
-        text.startswith(said)
-        and "%" not in text.partition("What it costs")[0]
-        and "per 1,000 km" not in text
-    )
+    assert text.startswith(said)
+    assert "%" not in text.partition("What it costs")[0]
+    assert "per 1,000 km" not in text
 
 
 def test_nominal_failures_are_not_among_those_of_an_attack():
@@ -296,7 +289,8 @@ def test_nominal_failures_are_not_among_those_of_an_attack():
         mode(2, "oncoming", count=0, counted=0, nominal=5),
     )
     text = " ".join(answer_lines([row(cfr=8 / 12), row("e2", 2.0, cfr=4 / 12)], found))
-    assert "rear (4 of 4 failures, 1 count)" in text and "oncoming" not in text
+    assert "rear (4 of 4 failures, 1 count)" in text
+    assert "oncoming" not in text
 
 
 @pytest.mark.parametrize(
@@ -372,10 +366,8 @@ def test_people_touched_are_told_and_named_where_there_is_no_page(report):
             answer_lines([row("e2", 2.0)], rollouts=rollouts, report=report)
         ).split()
     )
-    assert (
-        "lane_graph was hit in 0 of 12 attacked rollouts" in text
-        and "an object" not in text
-    )
+    assert "lane_graph was hit in 0 of 12 attacked rollouts" in text
+    assert "an object" not in text
     assert (
         "lane_graph touched a pedestrian or cyclist in 1 of 12 rollouts under e2 at η=2"
         in text
@@ -394,8 +386,6 @@ def test_people_touched_before_or_after_training_have_a_row():
         each["metrics"] |= {"cfr_vru": value(rate), "cfr_object": value(0.0)}
     lines = compared_answer([old], [new])
     (line,) = [line for line in lines if line.startswith("people touched")]
-    assert (
-        "25% (3 of 12)" in line
-        and "0% (0 of 12)" in line
-        and not any("objects" in line for line in lines)
-    )
+    assert "25% (3 of 12)" in line
+    assert "0% (0 of 12)" in line
+    assert not any("objects" in line for line in lines)

@@ -74,21 +74,19 @@ def test_page_json_and_csv_tell_the_same_pairs(made):
     keys = [
         (pair["change"], pair["scene_id"], str(pair["seed"])) for pair in whole["pairs"]
     ]
-    assert keys == [
-        (row["change"], row["scene_id"], row["seed"]) for row in rows
-    ] and len(set(keys)) == len(keys)
+    assert keys == [(row["change"], row["scene_id"], row["seed"]) for row in rows]
+    assert len(set(keys)) == len(keys)
     assert [sum(key[0] == change for key in keys) for change in CHANGES] == [
         group[change] for change in CHANGES
     ]
     assert (group["new"], group["gone"], group["moved"], group["same"]) == (1, 1, 0, 2)
     changed = [pair for pair in whole["pairs"] if pair["change"] != "same"]
-    assert page["pairs"] == changed and len(page["replays"]) == 2 * len(changed)
+    assert page["pairs"] == changed
+    assert len(page["replays"]) == 2 * len(changed)
     text = " ".join(said)
-    assert (
-        f"{group['new']} failures are new" in text
-        and f"{group['gone']} gone" in text
-        and str(path) in text
-    )
+    assert f"{group['new']} failures are new" in text
+    assert f"{group['gone']} gone" in text
+    assert str(path) in text
 
 
 def test_who_has_no_contact_is_shown_as_long_as_the_other_with_its_partner(runs, made):
@@ -100,19 +98,18 @@ def test_who_has_no_contact_is_shown_as_long_as_the_other_with_its_partner(runs,
         ):
             steps = len(Rollout.read(run / ROLLOUTS / pair[side]["file"]).states)
             if pair[side]["contact"]:
-                assert (
-                    replay["contact"] == round(10 * pair[side]["contact_time"])
-                    and replay["point"]
-                )
+                assert replay["contact"] == round(10 * pair[side]["contact_time"])
+                assert replay["point"]
             else:
-                assert replay["point"] is None and replay["contact"] == min(
-                    other["contact"] + 30, steps - 1
-                )
+                assert replay["point"] is None
+                assert replay["contact"] == min(other["contact"] + 30, steps - 1)
 
 
 def test_the_page_loads_nothing_and_files_cannot_add_markup(made):
     page = made[0].read_text()
-    assert page.count("</script") == 2 and SCENE not in page and "<img" not in page
+    assert page.count("</script") == 2
+    assert SCENE not in page
+    assert "<img" not in page
     outside = re.sub(r"http://www\.w3\.org/2000/svg", "", page)
     assert not re.search(r"https?://|@import|url\(|\bsrc=(?!x onerror)|<link", outside)
 
@@ -126,7 +123,8 @@ def test_without_rollout_files_the_pairs_are_still_told(runs, tmp_path):
     ]
     compare(*map(Driven.read, copies), tmp_path / PAGE)
     page = data_of(tmp_path / PAGE)
-    assert page["pairs"] and not page["replays"]
+    assert page["pairs"]
+    assert not page["replays"]
 
 
 def test_the_command_needs_two_and_a_page(runs, capsys):
@@ -137,7 +135,8 @@ def test_the_command_needs_two_and_a_page(runs, capsys):
     ):
         with pytest.raises(SystemExit) as end:
             main(given)
-        assert end.value.code == 2 and said in capsys.readouterr().err
+        assert end.value.code == 2
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -200,5 +199,6 @@ def test_one_clock_moves_both_replays(made, chromium, width, height):  # noqa: F
     shown = [
         node.text for node in chromium.find_elements("css selector", "#pairs strong")
     ]
-    assert shown and all(text.startswith("Gone") for text in shown)
+    assert shown
+    assert all(text.startswith("Gone") for text in shown)
     assert chromium.get_log("browser") == []

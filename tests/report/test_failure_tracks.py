@@ -93,10 +93,8 @@ def test_the_competent_driver_does_what_the_verdict_says(gap, preventable):
     ego = track_of(replay, "ego")
     assert row["preventable"] == preventable
     assert (motion["gap"][driver].min() > 0) == (preventable == 1)
-    assert (
-        motion["gap"][ego, replay["contact"]] == 0
-        and (motion["gap"][ego, : replay["contact"]] > 0).all()
-    )
+    assert motion["gap"][ego, replay["contact"]] == 0
+    assert (motion["gap"][ego, : replay["contact"]] > 0).all()
     np.testing.assert_allclose(motion["gap"][ego, 0], gap - 4.8, atol=0.01)
 
 

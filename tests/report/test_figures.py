@@ -40,7 +40,8 @@ def test_panels_stand_by_eta_at_their_contacts_and_without_one_at_the_first_of_t
     figure = drawing.image_of(
         intensity_figure([Failure(each.rollout, each.row) for each in replays])
     )
-    assert replays[0].contact is None and replays[1].contact > replays[2].contact
+    assert replays[0].contact is None
+    assert replays[1].contact > replays[2].contact
     times = [replays[1].contact, replays[1].contact, replays[2].contact]
     for index, (time, phase) in enumerate(zip(times, (None, 0.25, 0.25), strict=True)):
         left = (index % 2) * (SIDE + GAP)
@@ -84,7 +85,8 @@ def test_the_moment_is_that_of_the_greatest_risk_and_times_are_those_of_the_weig
     shown,
 ):
     own = shown.selection.weights[0, :, 1, 0] + shown.selection.weights[0, :, 2, 1]
-    assert shown.time == pytest.approx(0.5 * int(own.argmax())) and own.max() > own[0]
+    assert shown.time == pytest.approx(0.5 * int(own.argmax()))
+    assert own.max() > own[0]
     assert shown.nodes() == [0, 1, 2]
     for ttc in (0.0, 0.7, 3.0, 7.5):
         weight = 1 / (
@@ -115,9 +117,8 @@ def test_the_same_figure_is_written_as_the_same_pixels_and_vectors_and_no_name_i
             tmp_path / f"b.{suffix}"
         ).read_bytes()
     content = (tmp_path / "a.pdf").read_bytes()
-    assert (
-        b"/MediaBox [ 0 0 410 270 ]" in content and b"/Subtype /Image" not in content
-    ), "a point is a point"
+    assert b"/MediaBox [ 0 0 410 270 ]" in content
+    assert b"/Subtype /Image" not in content, "a point is a point"
 
 
 def test_the_shown_sweep_is_unharmed_at_first_and_then_hit_ever_earlier():

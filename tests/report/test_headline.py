@@ -127,11 +127,10 @@ def test_of_many_methods_those_are_told_in_which_somebody_was_touched():
         for k in range(9)
     ]
     (line,) = touched_lines(rows)
-    assert "in 9 of 9 rollouts under m1 at η=2: " in line and "m2" not in line
-    assert (
-        "scene_2 (seed 0) and 6 other scenes in rollouts.csv" not in line
-        and "scene_8" in line
-    )
+    assert "in 9 of 9 rollouts under m1 at η=2: " in line
+    assert "m2" not in line
+    assert "scene_2 (seed 0) and 6 other scenes in rollouts.csv" not in line
+    assert "scene_8" in line
     (line,) = touched_lines([row | {"cfr_vru": 1.0} for row in rows])
     assert line.count("and 6 other scenes in rollouts.csv") == 4
 
@@ -185,7 +184,9 @@ def test_screen_page_rows_json_gate_and_comparison_say_the_same(answered, tmp_pa
     scenes = {row["scene_id"] for row in rows}
     preventable = {row["scene_id"] for row in rows if row["cfr_preventable"] == 1}
     raised = {row["scene_id"] for row in rows if row["errored"] == 1}
-    assert len(scenes) == 4 and raised == {"arterial_015_0280"} and len(rows) <= 3 * 4
+    assert len(scenes) == 4
+    assert raised == {"arterial_015_0280"}
+    assert len(rows) <= 3 * 4
     sentence = headline_text(
         headline(rows, searched=True), "fragile", traffic="search at η=2"
     )
@@ -210,7 +211,8 @@ def test_screen_page_rows_json_gate_and_comparison_say_the_same(answered, tmp_pa
     assert group["summary"][0] == sentence
     gated = cli("gate", run, "search:preventable<=1", "--json", tmp_path / "gate.json")
     (rule,) = json.loads((tmp_path / "gate.json").read_text())
-    assert rule["headline"] == metrics["headline"] and rule["value"] == rate["mean"]
+    assert rule["headline"] == metrics["headline"]
+    assert rule["value"] == rate["mean"]
     compared = cli("compare", run, run, "--out", tmp_path / "compare.html")
     for text in (said, gated, compared.replace(f"fragile of {run}", "fragile")):
         assert sentence in " ".join(text.split())
@@ -238,7 +240,8 @@ def test_a_planner_that_raises_is_named_everywhere(answered, tmp_path):
     compared = cli("compare", run, run, "--out", tmp_path / "compare.html")
     with (run / "failures.csv").open(newline="") as file:
         listed = [row for row in csv.DictReader(file) if row["errored"] == "1"]
-    assert listed and all((row["scene_id"], row["error"]) == names for row in listed)
+    assert listed
+    assert all((row["scene_id"], row["error"]) == names for row in listed)
     files = [
         run / "failures.html",
         *(tmp_path / name for name in ("gate.json", "gate.xml", "compare.html")),

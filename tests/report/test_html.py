@@ -54,14 +54,11 @@ def test_every_failure_is_in_the_index_with_its_replay(run, page):
             row["method"],
             row["seed"],
         )
-        assert (
-            entry["ego_speed"] == pytest.approx(row["ego_speed"], abs=1e-4)
-            and entry["avoidable"] is None
-        )
+        assert entry["ego_speed"] == pytest.approx(row["ego_speed"], abs=1e-4)
+        assert entry["avoidable"] is None
         replay = data["replays"][entry["replay"]]
-        assert replay["contact"] == row["contact_step"] and 0 <= replay["map"] < len(
-            data["maps"]
-        )
+        assert replay["contact"] == row["contact_step"]
+        assert 0 <= replay["map"] < len(data["maps"])
     assert sum(group["failures"] for group in data["groups"]) == len(failures)
     assert data["tables"][0]["head"] == ["", "e2 η=2", "planned η=2"]
 
@@ -148,7 +145,8 @@ def test_the_first_lines_say_what_the_tables_say(tmp_path):
             assert of == float(known.strip(")") or group["rollouts"])
             assert hits / of == pytest.approx(mean / 100, abs=5.1e-4)
             assert [rate, *interval] == pytest.approx([mean, *bounds], abs=0.51)
-    assert found >= 3 and len(data["groups"]) == 2
+    assert found >= 3
+    assert len(data["groups"]) == 2
 
 
 def test_a_training_has_a_page_for_what_it_measured(tmp_path, capsys):
@@ -196,17 +194,19 @@ def test_the_page_knows_the_atlas_and_replays_its_likeliest_failures_first(tmp_p
                 tuple(data["cells"][entries[k]["cell"]][name] for name in CELL), k
             )
         atlas = atlas_of([rows[k] for k in ours])
-        assert len(atlas) == 3 and list(found) == list(atlas)
+        assert len(atlas) == 3
+        assert list(found) == list(atlas)
         assert [rows[k] for k in found.values()] == [
             failures[0] for failures in atlas.values()
         ]
         first = replay_order(entries)[: typical + 6]
-        assert all(entries[k]["typical"] for k in first[:typical]) and set(
-            found.values()
-        ) <= set(first)
+        assert all(entries[k]["typical"] for k in first[:typical])
+        assert set(found.values()) <= set(first)
 
 
 def test_the_page_loads_nothing_and_files_cannot_add_markup(page):
-    assert page.count("</script") == 2 and SCENE not in page and "<img" not in page
+    assert page.count("</script") == 2
+    assert SCENE not in page
+    assert "<img" not in page
     outside = re.sub(r"http://www\.w3\.org/2000/svg", "", page)
     assert not re.search(r"https?://|@import|url\(|\bsrc=(?!x onerror)|<link", outside)

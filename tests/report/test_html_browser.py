@@ -125,7 +125,8 @@ def choose(browser, label: str, starts: str) -> None:
 
 
 def test_it_opens_without_a_complaint(run, page):
-    assert page.get_log("browser") == [] and len(rows_of(page)) == len(failures_of(run))
+    assert page.get_log("browser") == []
+    assert len(rows_of(page)) == len(failures_of(run))
     assert (
         len(page.find_elements("css selector", "#curves svg polyline")) >= 5
     )  # ego, partner, driver; gaps of two
@@ -172,16 +173,15 @@ def test_filters_keep_what_they_say_and_names_from_files_are_text(run, page):
     side = [row for row in failures_of(run) if row["contact_type"] == "side"]
     choose(page, "Contact", starts="side")
     shown = rows_of(page)
-    assert 0 < len(shown) == len(side) and {
-        row[heads.index("Contact")] for row in shown
-    } == {"side"}
+    assert 0 < len(shown) == len(side)
+    assert {row[heads.index("Contact")] for row in shown} == {"side"}
     page.find_element("css selector", "#filters button").click()  # reset
     assert len(rows_of(page)) == len(failures_of(run))
     scenes = [row[heads.index("Scene")] for row in rows_of(page)]
-    assert scenes and all(name.startswith(SCENE) for name in scenes)
-    assert not page.find_elements("tag name", "img") and not page.find_elements(
-        "css selector", ".caption b"
-    )
+    assert scenes
+    assert all(name.startswith(SCENE) for name in scenes)
+    assert not page.find_elements("tag name", "img")
+    assert not page.find_elements("css selector", ".caption b")
 
 
 def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(
@@ -207,7 +207,8 @@ def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(
                 if approach == "ahead"
                 else f"{failures[0]['transport']:.0f} nats"
             )
-            assert f"{len(failures)} failure" in button.text and nats in button.text
+            assert f"{len(failures)} failure" in button.text
+            assert nats in button.text
             button.send_keys("\n")
             shown = shown_in(chromium, run)
             assert shown["transport"] == failures[0]["transport"] or approach == "ahead"
@@ -281,17 +282,15 @@ def test_failures_of_a_scene_stand_together_whatever_the_traffic(run, page):
         else:
             under.setdefault(scenes[-1], []).append(text)
     names = {row["scene_id"] for row in failures_of(run)}
-    assert len(scenes) == len(names) == len(under) and sum(
-        map(len, under.values())
-    ) == len(failures_of(run))
+    assert len(scenes) == len(names) == len(under)
+    assert sum(map(len, under.values())) == len(failures_of(run))
     for name in names:
         own = [row for row in failures_of(run) if row["scene_id"] == name]
         (head,) = [
             text for text in scenes if text.startswith(f"{name}: {len(own)} failure")
         ]
-        assert len(under[head]) == len(own) and all(
-            row["method"] in head for row in own
-        )
+        assert len(under[head]) == len(own)
+        assert all(row["method"] in head for row in own)
     assert any("e2 η=2, planned η=2" in text for text in scenes)
 
 
@@ -307,9 +306,8 @@ def test_the_speed_that_is_shown_is_the_speed_driven(run, page):
             page.execute_script("page.player.seek(arguments[0])", step)
             seconds, speed = page.find_element("id", "clock").text.split("\n")
             assert float(seconds.split()[0]) == pytest.approx(0.1 * step, abs=1e-6)
-            assert float(speed.split()[1]) == pytest.approx(
-                states[step, 3], abs=0.0551
-            ) and speed.endswith(" m/s")
+            assert float(speed.split()[1]) == pytest.approx(states[step, 3], abs=0.0551)
+            assert speed.endswith(" m/s")
     assert page.find_element("css selector", ".controls label").text.startswith(
         "Playback"
     )
@@ -323,4 +321,5 @@ def test_what_is_copied_is_the_whole_field(page):
         ends = page.execute_script(
             "return [arguments[0].selectionStart, arguments[0].selectionEnd]", field
         )
-        assert ends == [0, len(field.get_attribute("value"))] and "Copied" in line.text
+        assert ends == [0, len(field.get_attribute("value"))]
+        assert "Copied" in line.text

@@ -40,7 +40,8 @@ def test_a_bar_is_the_gain_in_per_cent_of_a_split_and_intensity_with_its_interva
         tune_1, test_1, tune_2, test_2 = (bar.get_height() for bar in axes.patches)
         assert [tune_1, tune_2, test_2] == pytest.approx(
             [-40 * sign, -50 * sign, -30 * sign]
-        ) and math.isnan(test_1)
+        )
+        assert math.isnan(test_1)
         (bars,) = [
             drawn.lines[2][0] for drawn in axes.containers[:1]
         ]  # limits of the first intensity

@@ -24,7 +24,8 @@ def test_videos_are_of_hits_of_different_scenes(attacked):
     scenes, run, _ = attacked
     traffic = run.memory.rounds[-1].traffic
     rows = hits(traffic, scenes)
-    assert len(rows) and len(set(traffic["scene_index"][rows].tolist())) == len(rows)
+    assert len(rows)
+    assert len(set(traffic["scene_index"][rows].tolist())) == len(rows)
     assert (traffic["eta"][rows] > 0).all()
     twice = {
         name: torch.cat([value, value])
@@ -44,7 +45,5 @@ def test_videos_are_written(attacked, tmp_path):
         folder=tmp_path,
         count=1,
     )
-    assert (
-        video == tmp_path / "videos" / "round-001-1.gif"
-        and Image.open(video).n_frames > 10
-    )
+    assert video == tmp_path / "videos" / "round-001-1.gif"
+    assert Image.open(video).n_frames > 10

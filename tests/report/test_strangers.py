@@ -132,12 +132,11 @@ def test_a_damaged_folder_is_refused_in_one_line(
     with pytest.raises(SystemExit) as end:
         COMMANDS[command](copy, tmp_path / "out")
     said = capsys.readouterr().err
-    assert (
-        end.value.code == 2
-        and said.startswith(f"error: {copy}")
-        and said.removesuffix("\n").isprintable()
-    )
-    assert sorted(copy.rglob("*")) == before and not list(tmp_path.rglob("out/*"))
+    assert end.value.code == 2
+    assert said.startswith(f"error: {copy}")
+    assert said.removesuffix("\n").isprintable()
+    assert sorted(copy.rglob("*")) == before
+    assert not list(tmp_path.rglob("out/*"))
 
 
 def test_the_folder_itself_is_read_by_all_commands(run, tmp_path, capsys, monkeypatch):
@@ -161,5 +160,6 @@ def test_a_link_out_of_the_folder_is_not_written_to(run, tmp_path, capsys, comma
         main(
             [str(copy), *(["--to", "npz", "--no-scene"] if command == "export" else [])]
         )
-    assert end.value.code == 2 and "a link out of" in capsys.readouterr().err
+    assert end.value.code == 2
+    assert "a link out of" in capsys.readouterr().err
     assert not list((tmp_path / "home").iterdir())

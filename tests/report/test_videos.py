@@ -68,11 +68,9 @@ def test_the_command_saves_animations_of_a_run_s_failures(tmp_path, capsys):
     main([str(run), "--failures=1", "--pixels", "120", "--out", str(tmp_path)])
     (gif,) = capsys.readouterr().out.splitlines()
     with Image.open(gif) as animation:
-        assert (
-            animation.size == (120, 120)
-            and animation.n_frames > picture.FREEZE
-            and animation.info["loop"] == 0
-        )
+        assert animation.size == (120, 120)
+        assert animation.n_frames > picture.FREEZE
+        assert animation.info["loop"] == 0
         assert animation.info["duration"] == 100
 
 
@@ -114,16 +112,12 @@ def test_an_mp4_shows_each_picture_when_it_is_due(tmp_path):
     path = tmp_path / "new" / "failure.mp4"
     save_animation(path, drawn)
     facts, *frames = reader.read_frames(path)
-    assert (
-        facts["codec"] == "h264"
-        and facts["pix_fmt"].startswith("yuv420p")
-        and facts["size"] == (120, 120)
-    )
-    assert (
-        facts["fps"] == 10
-        and len(frames) == len(drawn)
-        and facts["duration"] == pytest.approx(len(drawn) / 10)
-    )
+    assert facts["codec"] == "h264"
+    assert facts["pix_fmt"].startswith("yuv420p")
+    assert facts["size"] == (120, 120)
+    assert facts["fps"] == 10
+    assert len(frames) == len(drawn)
+    assert facts["duration"] == pytest.approx(len(drawn) / 10)
     decoded = np.stack([np.frombuffer(frame, np.uint8) for frame in frames]).astype(
         float
     )

@@ -29,7 +29,8 @@ def test_help_has_every_line_of_the_files_that_are_chosen(tmp_path):
         "train",
     ):
         assert (conf_folder() / f"{file}.yaml").read_text().strip() in text
-    assert "gap: 3  # m" in text and all(choice in text for choice in choices("ego"))
+    assert "gap: 3  # m" in text
+    assert all(choice in text for choice in choices("ego"))
 
 
 @pytest.mark.parametrize(
@@ -82,9 +83,9 @@ def test_wrong_options_are_refused_with_the_nearest_name(
         monkeypatch=monkeypatch,
         capsys=capsys,
     )
-    assert (
-        status == 2 and told in error_line(said) and not list(tmp_path.rglob("*.json"))
-    )
+    assert status == 2
+    assert told in error_line(said)
+    assert not list(tmp_path.rglob("*.json"))
 
 
 def test_a_choice_is_its_file_and_an_unknown_one_lists_those_there_are():
@@ -148,6 +149,7 @@ def ego_of(target):
 )
 def test_a_class_from_outside_is_built_or_named_with_the_reason(target, message):
     ego = ego_of(f"{HERE}.Cruise")
-    assert isinstance(ego, Cruise) and (ego.replan_every, ego.speed) == (2, 3)
+    assert isinstance(ego, Cruise)
+    assert (ego.replan_every, ego.speed) == (2, 3)
     with pytest.raises(InputError, match=message):
         ego_of(target)

@@ -71,7 +71,8 @@ def test_an_interrupted_command_leaves_no_process(tmp_path, method, how):
     said = run.communicate(timeout=20)[1]
     while any(map(alive, workers)) and time.monotonic() - begin < 20:
         time.sleep(0.05)
-    assert not any(map(alive, workers)) and time.monotonic() - begin < 20
+    assert not any(map(alive, workers))
+    assert time.monotonic() - begin < 20
     assert run.returncode == {"Ctrl-C": 130, "SIGTERM": 143, "SIGKILL": -9}[how]
     if how != "SIGKILL":
         name = "SIGINT" if how == "Ctrl-C" else how
@@ -114,11 +115,9 @@ def test_a_disk_or_memory_that_is_full_ends_in_one_line_with_how_to_go_on(
     with pytest.raises(SystemExit) as stopped, ending(lambda: "run x again"):
         fail()
     said = capsys.readouterr().err.strip()
-    assert (
-        stopped.value.code == 1
-        and said.startswith(f"error: {told}")
-        and "\n" not in said
-    )
+    assert stopped.value.code == 1
+    assert said.startswith(f"error: {told}")
+    assert "\n" not in said
     assert said.endswith("go on with: run x again")
 
 
@@ -126,7 +125,8 @@ def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):
     before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
     with pytest.raises(SystemExit) as stopped, ending(lambda: "run x again"):
         raise InputError("x=3: no")
-    assert stopped.value.code == 2 and capsys.readouterr().err == "error: x=3: no\n"
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err == "error: x=3: no\n"
     for error in (ValueError("a bug"), FileNotFoundError(2, "none")):
         with pytest.raises(type(error)), ending(lambda: "run x again"):
             raise error
@@ -182,9 +182,8 @@ def test_an_output_that_nobody_reads_is_told_from_others(
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert done.returncode == status and done.stderr.strip().splitlines()[-1:] == (
-        [reason] if reason else []
-    )
+    assert done.returncode == status
+    assert done.stderr.strip().splitlines()[-1:] == ([reason] if reason else [])
 
 
 @pytest.mark.parametrize(
@@ -235,8 +234,6 @@ def test_what_ends_a_command_before_it_begins_is_one_line(code, status, told):
     done = subprocess.run(
         command, stderr=subprocess.PIPE, text=True, preexec_fn=heed, timeout=60
     )
-    assert (
-        done.returncode == status
-        and done.stderr.strip().count("\n") == 0
-        and told in done.stderr
-    )
+    assert done.returncode == status
+    assert done.stderr.strip().count("\n") == 0
+    assert told in done.stderr

@@ -55,7 +55,8 @@ def test_what_fails_on_the_way_leaves_the_old_file_and_no_other(tmp_path, monkey
     monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_atomically(path, b"new")
-    assert path.read_bytes() == b"old" and list(path.parent.iterdir()) == [path]
+    assert path.read_bytes() == b"old"
+    assert list(path.parent.iterdir()) == [path]
 
 
 def by_path(text):
@@ -71,7 +72,8 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path, content):
     (tmp_path / "second").symlink_to(tmp_path / "far" / "file")
     (tmp_path / "first").symlink_to("second")
     write_atomically(tmp_path / "first", content)
-    assert (tmp_path / "first").is_symlink() and (tmp_path / "second").is_symlink()
+    assert (tmp_path / "first").is_symlink()
+    assert (tmp_path / "second").is_symlink()
     assert (tmp_path / "far" / "file").read_text() == "new"
     assert (tmp_path / "far" / "file").stat().st_mode & 0o777 == 0o600
     assert [path.name for path in (tmp_path / "far").iterdir()] == ["file"]
@@ -80,9 +82,8 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path, content):
 def test_a_link_to_nothing_yet_makes_what_it_leads_to(tmp_path):
     (tmp_path / "link").symlink_to("new/file")
     write_atomically(tmp_path / "link", "text")
-    assert (tmp_path / "link").is_symlink() and (
-        tmp_path / "new" / "file"
-    ).read_text() == "text"
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "new" / "file").read_text() == "text"
 
 
 @pytest.mark.parametrize(
@@ -139,7 +140,8 @@ def test_a_pipe_is_written_through(tmp_path, content):
     reader.start()
     write_atomically(tmp_path / "pipe", content)
     reader.join(20)
-    assert read == ["new"] and (tmp_path / "pipe").is_fifo()
+    assert read == ["new"]
+    assert (tmp_path / "pipe").is_fifo()
 
 
 PRINTS = """
@@ -192,9 +194,8 @@ def test_what_is_no_file_is_refused_by_its_name_and_stays(tmp_path, kind):
     with pytest.raises(OSError) as refused:
         write_atomically(path, "new")
     assert refused.value.filename == str(path)
-    assert path.lstat() == before and [each.name for each in tmp_path.iterdir()] == [
-        "target"
-    ]
+    assert path.lstat() == before
+    assert [each.name for each in tmp_path.iterdir()] == ["target"]
 
 
 def test_what_comes_beside_a_file_follows_no_link_out_of_its_folder(tmp_path):
@@ -346,7 +347,8 @@ def test_what_is_written_is_read_and_equal_weights_make_equal_bytes(tmp_path):
     assert len({weight_bytes(dict(WEIGHTS), dict(header)) for _ in range(20)}) == 1
     path.write_bytes(weight_bytes(WEIGHTS, header))
     weights, read = read_weights(path)
-    assert read == header and set(weights) == set(WEIGHTS)
+    assert read == header
+    assert set(weights) == set(WEIGHTS)
     assert all(
         torch.equal(value, WEIGHTS[key]) and value.dtype == WEIGHTS[key].dtype
         for key, value in weights.items()
@@ -365,7 +367,8 @@ def test_a_flipped_bit_changes_no_weight_in_silence(tmp_path, seed):
         weights, header = read_weights(tmp_path / "x.safetensors")
     except ValueError:
         return
-    assert HASH.encode() not in content and header["architecture"] == "small"
+    assert HASH.encode() not in content
+    assert header["architecture"] == "small"
     assert all(torch.equal(value, WEIGHTS[key]) for key, value in weights.items())
 
 

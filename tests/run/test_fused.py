@@ -58,7 +58,8 @@ def test_compiled_it_gives_what_it_gives_eagerly_for_every_size(on, batch, count
     assert not calls, "the function itself was called"
     for one, other in zip(found, across.function(*arguments), strict=True):
         assert torch.allclose(one, other, atol=1e-6)
-    assert isinstance(found, Line) and across.file.exists()
+    assert isinstance(found, Line)
+    assert across.file.exists()
     views = arguments[0].transpose(0, 1).contiguous().transpose(0, 1), *arguments[1:]
     assert torch.equal(across(*views).offset, found.offset), (
         "it depends on how a tensor lies in memory"
@@ -100,7 +101,8 @@ def test_fused_functions_run_as_they_are_until_they_are_switched_on():
 def test_its_file_depends_on_its_shapes_and_sources():
     other = Fused(across.function, ("B K 2", "B", "3", "B:bool"))
     FUSED[across.name] = across
-    assert across.file.name.startswith("across-") and other.file != across.file
+    assert across.file.name.startswith("across-")
+    assert other.file != across.file
     assert across.file.parent.name == "fused"
 
 

@@ -38,13 +38,11 @@ def file(tmp_path):
 def test_a_part_is_computed_once_and_read_as_it_was(tmp_path, file, monkeypatch):
     assert not computes(Parts(tmp_path))
     rows, samples, errored = Parts(tmp_path).load("a", [1])
-    assert (rows, errored) == (VALUE[0], VALUE[2]) and torch.equal(
-        samples[0]["speed"], VALUE[1][0]["speed"]
-    )
+    assert (rows, errored) == (VALUE[0], VALUE[2])
+    assert torch.equal(samples[0]["speed"], VALUE[1][0]["speed"])
     monkeypatch.chdir(tmp_path / "parts")
-    assert computes(Parts()) and computes(Parts()), (
-        "without a folder nothing is written"
-    )
+    assert computes(Parts())
+    assert computes(Parts()), "without a folder nothing is written"
     assert computes(Parts(tmp_path), valid=lambda found: False)
 
 
@@ -70,7 +68,8 @@ def test_every_damage_is_noticed_and_the_part_done_again(tmp_path, file):
     for value in ([1, 2], {"format": "e2rl-part/1"}, "text"):  # whole, but no part
         file.write_bytes(state_bytes(value))
         assert Parts(tmp_path).load("a", [1]) is None
-    assert computes(Parts(tmp_path)) and Parts(tmp_path).load("a", [1]) is not None
+    assert computes(Parts(tmp_path))
+    assert Parts(tmp_path).load("a", [1]) is not None
 
 
 class Malicious:
@@ -89,7 +88,8 @@ def test_a_strangers_part_runs_nothing(tmp_path, file):
         "value": Malicious(tmp_path / "ran"),
     }
     file.write_bytes(state_bytes(part))
-    assert Parts(tmp_path).load("a", [1]) is None and not (tmp_path / "ran").exists()
+    assert Parts(tmp_path).load("a", [1]) is None
+    assert not (tmp_path / "ran").exists()
 
 
 def packed():
@@ -131,4 +131,5 @@ def test_a_part_is_a_file_of_the_run_s_folder(tmp_path, file):
     assert Parts(tmp_path).load("a", [1]) is None
     file.unlink()
     os.mkfifo(file)
-    assert computes(Parts(tmp_path)) and not computes(Parts(tmp_path))
+    assert computes(Parts(tmp_path))
+    assert not computes(Parts(tmp_path))

@@ -42,8 +42,10 @@ def test_jobs_are_reported_when_they_end_not_when_their_turn_comes():
     results = in_processes(
         linger, range(6), processes=2, cost=lambda job: -job, ended=reported.append
     )
-    assert next(results) == 0 and set(reported) >= {1, 2, 3, 4, 5}
-    assert list(results) == [1, 2, 3, 4, 5] and sorted(reported) == list(range(6))
+    assert next(results) == 0
+    assert set(reported) >= {1, 2, 3, 4, 5}
+    assert list(results) == [1, 2, 3, 4, 5]
+    assert sorted(reported) == list(range(6))
     assert (
         list(
             in_processes(linger, [1, 2], processes=1, cost=float, ended=reported.append)

@@ -52,9 +52,8 @@ def test_the_same_run_goes_on(tmp_path, weights):
         processes=3,
         plugins=["json"],
     )
-    assert (tmp_path / PROVENANCE).read_bytes() == begun and again.parts().load(
-        "a", []
-    ) == 1
+    assert (tmp_path / PROVENANCE).read_bytes() == begun
+    assert again.parts().load("a", []) == 1
     assert OmegaConf.load(tmp_path / CONFIG) == run.config
     assert (tmp_path / "scenes.csv").read_text() == SCENES["scenes"][0]
     assert read_provenance(tmp_path)["files"] == {"scenes": "abc"}
@@ -123,9 +122,8 @@ def test_other_code_is_told_and_named_in_the_rows(tmp_path, monkeypatch, capsys)
         begin(tmp_path, resume=True)
     assert "other versions than before (e2rl, git)" in capsys.readouterr().err
     assert len(read_provenance(tmp_path)["versions"]) == 2
-    assert origin_of(tmp_path)["command"] == command and origin_of(tmp_path)[
-        "git"
-    ].endswith(", abc")
+    assert origin_of(tmp_path)["command"] == command
+    assert origin_of(tmp_path)["git"].endswith(", abc")
 
 
 @pytest.mark.parametrize("content", ["{", '{"command": 1}', "[" * 5000])
@@ -171,9 +169,9 @@ def test_a_run_that_is_refused_leaves_everything_as_it_was(
             monkeypatch=monkeypatch,
             capsys=capsys,
         )
+        assert status == 2
         assert (
-            status == 2
-            and f"has a run already; go on with it by resume={tmp_path / 'run'}"
+            f"has a run already; go on with it by resume={tmp_path / 'run'}"
             in error_line(said)
         )
         assert call(script, ["batch=0"], monkeypatch=monkeypatch, capsys=capsys)[0] == 2
@@ -186,9 +184,8 @@ def test_runs_that_begin_in_one_second_have_a_folder_each(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     with ThreadPoolExecutor(8) as pool:
         made = list(pool.map(new_folder, ["runs/x"] * 40))
-    assert len(set(made)) == 40 and all(
-        not list((tmp_path / name).iterdir()) for name in made
-    )
+    assert len(set(made)) == 40
+    assert all(not list((tmp_path / name).iterdir()) for name in made)
     (tmp_path / "file").touch()
     assert new_folder("file/x").startswith("file/x/"), (
         "Hydra says that it cannot be made"

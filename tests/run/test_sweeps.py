@@ -90,4 +90,5 @@ def test_a_job_alone_that_is_refused_says_so_once(tmp_path):
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=120
     )
-    assert done.returncode == 2 and done.stderr == "error: batch=2: refused\n"
+    assert done.returncode == 2
+    assert done.stderr == "error: batch=2: refused\n"

@@ -27,7 +27,8 @@ def test_in_a_file_there_are_lines_at_the_pace_so_far(monkeypatch):
             bar.update(1)
     lines = output.getvalue().splitlines()
     assert lines[0] == "rollouts: 3 of 40 after 12 s, about 2 min left"
-    assert len(lines) == 5 and not any("\r" in line for line in lines)
+    assert len(lines) == 5
+    assert not any("\r" in line for line in lines)
     counts = [int(line.split()[1]) for line in lines]
     assert all(
         4.0 * (after - before) >= terminal.EVERY

@@ -47,7 +47,8 @@ def test_a_family_is_worth_its_own_chance_and_less_in_a_scene_where_it_failed():
     after = nearness(torch.tensor(0.0)).item() / (
         (1 + 1 / SCENE_TRIES) * (1 + 1 / FAMILY_TRIES)
     )
-    assert close(worth[1].item(), family) and close(worth[0].item(), family * after)
+    assert close(worth[1].item(), family)
+    assert close(worth[0].item(), family * after)
 
 
 def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
@@ -64,10 +65,8 @@ def test_what_a_family_finds_in_one_scene_raises_its_worth_in_all():
         + (near / ((1 + tries / SCENE_TRIES) * (1 + tries / FAMILY_TRIES))).sum().item()
     )
     worth = mean_worth(found, 4000)[1]
-    assert (
-        abs(worth[0].item() / ((CHANCE_TRIES * chance + finds) / exposed) - 1) < 0.05
-        and worth[0] > 2 * worth[1]
-    )
+    assert abs(worth[0].item() / ((CHANCE_TRIES * chance + finds) / exposed) - 1) < 0.05
+    assert worth[0] > 2 * worth[1]
 
 
 def test_late_tries_where_all_others_failed_tell_less_against_a_family_than_first_ones():
@@ -87,7 +86,8 @@ def test_a_scene_forgets_what_its_tries_told_and_others_do_not():
         found.tell(1, 0, reward=0.0, margin=0.0, nfe=100.0)
     found.forget(0)
     worth = mean_worth(found)[:, 0]
-    assert close(worth[0].item(), worth[2].item()) and worth[1] < 0.05 * worth[0]
+    assert close(worth[0].item(), worth[2].item())
+    assert worth[1] < 0.05 * worth[0]
 
 
 def test_a_dear_family_is_worth_less_in_proportion():
@@ -131,8 +131,11 @@ def test_tries_of_one_scene_in_a_round_are_worth_less_one_after_another():
 def test_the_nearer_a_scene_came_the_likelier_is_a_find_there():
     margin = torch.linspace(-30, 1, 100)
     near = nearness(margin)
-    assert bool((near.diff() >= 0).all()) and near[0] == LEAST and near[-1] > 2
-    assert nearness(torch.tensor(torch.nan)) == 1 and nearness(torch.tensor(0.0)) < 1
+    assert bool((near.diff() >= 0).all())
+    assert near[0] == LEAST
+    assert near[-1] > 2
+    assert nearness(torch.tensor(torch.nan)) == 1
+    assert nearness(torch.tensor(0.0)) < 1
     found = portfolio(scenes=3)
     for scene, nearest in enumerate((-30.0, 0.5)):
         found.tell(scene, 0, reward=0.0, margin=nearest, nfe=100.0)

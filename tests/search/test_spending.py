@@ -89,7 +89,8 @@ def known(told):
 def test_a_budget_of_tries_is_spent_and_not_exceeded(setup, plan):
     told = found(setup, plan)
     spent = [row["tries"] for row in told]
-    assert spent[-1] == pytest.approx(4.0) and spent == sorted(spent)
+    assert spent[-1] == pytest.approx(4.0)
+    assert spent == sorted(spent)
     assert all(row["seed"] // TRIES == 3 and row["method"] == "search" for row in told)
     assert len({(row["scene_id"], row["seed"]) for row in told}) == len(told)
 
@@ -104,9 +105,8 @@ def test_what_is_returned_is_within_the_budget(setup, plan, unit, budget):
     told = spent.tries
     assert len(rows) == len(spent.scored.samples) == len(told) > 0
     cost = {"tries": [1.0] * len(rows), "nfe": [row["nfe"] for row in rows]}[unit]
-    assert sum(cost) / 3 == pytest.approx(told[-1][unit]) and told[-1][
-        unit
-    ] <= budget * (1 + 1e-9)
+    assert sum(cost) / 3 == pytest.approx(told[-1][unit])
+    assert told[-1][unit] <= budget * (1 + 1e-9)
     assert (sum(cost) + 2 * max(cost)) / 3 > budget or unit == "nfe"
 
 
@@ -186,7 +186,8 @@ def test_the_tries_that_hit_an_ego_are_driven_again_as_they_were(setup, plan, tm
         for row in rows
         if (row["scene_id"], row["seed"]) in keys
     }
-    assert again.keys() == before.keys() and len(before) == len(chosen) > 4
+    assert again.keys() == before.keys()
+    assert len(before) == len(chosen) > 4
     for key, row in before.items():
         for name in ("progress", "min_dtc", "transport"):
             assert again[key][name] == pytest.approx(row[name], rel=1e-3, abs=1e-3), (
@@ -256,13 +257,11 @@ def test_a_row_for_each_method_and_variant_and_its_families_from_the_configurati
         "methods=[search,e2]", "+variants.other={search.cover: 3}"
     )
     assert [each.name for each in (portfolio, e2, other)] == ["search", "e2", "other"]
-    assert len(portfolio.families) > 3 and {
-        family.name for family in portfolio.families
-    } == set(portfolio.traffic)
+    assert len(portfolio.families) > 3
+    assert {family.name for family in portfolio.families} == set(portfolio.traffic)
     assert (len(e2.families), e2.settings.bandit) == (1, False)
-    assert other.settings == replace(portfolio.settings, cover=3) and len(
-        other.families
-    ) == len(portfolio.families)
+    assert other.settings == replace(portfolio.settings, cover=3)
+    assert len(other.families) == len(portfolio.families)
 
 
 def test_no_family_of_the_search_is_told_the_plan_of_the_ego():

@@ -28,7 +28,8 @@ def test_a_try_is_reproducible_from_its_seed_and_number(stratified):
 def test_decisions_lie_in_their_range_and_others_follow_the_rule():
     for one in drawn(50, True):
         found = Decisions(*one.decisions)
-        assert 1 <= found.moment <= 5 and 0.5 <= found.strength <= 1.5
+        assert 1 <= found.moment <= 5
+        assert 0.5 <= found.strength <= 1.5
         assert found._replace(moment=RULE.moment, strength=RULE.strength) == RULE
 
 
@@ -54,7 +55,8 @@ def test_stratified_tries_look_elsewhere_than_those_before_of_whatever_family():
         return max(b - a for a, b in zip([1.0, *moments], [*moments, 5.0], strict=True))
 
     spread, loose = ([gap(kind, seed) for seed in range(40)] for kind in (True, False))
-    assert sum(spread) / 40 < 0.8 * sum(loose) / 40 and max(spread) < max(loose)
+    assert sum(spread) / 40 < 0.8 * sum(loose) / 40
+    assert max(spread) < max(loose)
 
 
 def test_a_family_is_read_from_its_configuration():

@@ -111,9 +111,8 @@ def test_who_reverses_and_brakes_harder_goes_on_from_the_speed_that_it_has():
 def test_a_rollout_is_repeated_steps_forwards_and_backwards():
     start, actions = random_case(256, seed=4)
     start[:, 3] -= 10
-    assert ((start[:, 3] < 0).sum() > 100) and (
-        dynamics.rollout(start, actions)[:, 5, 3] < 0
-    ).any()
+    assert (start[:, 3] < 0).sum() > 100
+    assert (dynamics.rollout(start, actions)[:, 5, 3] < 0).any()
     state = start
     for moment, expected in enumerate(dynamics.rollout(start, actions).unbind(1)):
         state = dynamics.step(state, actions[:, moment])
@@ -139,9 +138,9 @@ def test_turns_respect_curvature_and_lateral_acceleration():
     asked = (10 * actions[..., 1]).abs()
     allowed = torch.minimum(MAX_CURVATURE * speed, MAX_LATERAL / speed.clamp(min=1e-3))
     torch.testing.assert_close(rate, torch.minimum(asked, allowed))
-    assert (asked < allowed).any() and (speed > 6).any() and (speed < 4).any(), (
-        "by steering lock, grip, or neither"
-    )
+    assert (asked < allowed).any()
+    assert (speed > 6).any()
+    assert (speed < 4).any(), "by steering lock, grip, or neither"
 
 
 def test_inverse_returns_the_actions():

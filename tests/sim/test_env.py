@@ -130,13 +130,16 @@ def test_partial_resets_keep_the_others_running():
     assert (data["next", "timestep"] == data["timestep"] + 1).all()
     assert (data["next", "scene_index"] == data["scene_index"]).all()
     done = data["next", "done"][:, :-1]
-    assert done.any(1).all() and (data["timestep"][:, 1:][done] == 0).all()
+    assert done.any(1).all()
+    assert (data["timestep"][:, 1:][done] == 0).all()
     same = data["scene_index"][:, 1:] == data["scene_index"][:, :-1]
-    assert same[~done].all() and not same[done].all()
+    assert same[~done].all()
+    assert not same[done].all()
     carried = (data["next", "observation"][:, :-1] == data["observation"][:, 1:]).all(
         -1, keepdim=True
     )
-    assert carried[~done].all() and not carried[done].any()
+    assert carried[~done].all()
+    assert not carried[done].any()
 
 
 def test_seed_makes_batches_identical():
@@ -188,9 +191,8 @@ def test_written_traffic_is_executed():
     act(env)
     world = env.world()
     assert torch.allclose(world.states[:, 1:vehicles], future[:, 1:, 1])
-    assert not world.valid[:, 2].any() and world.valid[:, 1].all(), (
-        "a vehicle whose traffic turns invalid is gone"
-    )
+    assert not world.valid[:, 2].any()
+    assert world.valid[:, 1].all(), "a vehicle whose traffic turns invalid is gone"
     assert torch.allclose(
         world.states[:, vehicles:], world.scene["logged"][:, 3, vehicles:]
     )
@@ -242,7 +244,8 @@ def test_an_ego_that_begins_off_the_road_leaves_it_only_once_it_was_there():
     )
     env.reset()
     off = [bool(act(env)["metrics", "off_road"].any()) for _ in range(62)]
-    assert not any(off[:59]) and any(off[59:])
+    assert not any(off[:59])
+    assert any(off[59:])
 
 
 def test_pedestrian_contact_is_its_own_metric():
@@ -297,10 +300,8 @@ def test_map_end_truncates():
         road=(-60.0, 40.0),
     )
     assert flags(td) == ["truncated"]
-    assert (
-        38 <= td["metrics", "progress"].mean() <= 41
-        and not env.world().valid[:, 0].any()
-    )
+    assert 38 <= td["metrics", "progress"].mean() <= 41
+    assert not env.world().valid[:, 0].any()
 
 
 def test_an_episode_goes_on_beyond_the_map_where_the_settings_say_so():
@@ -312,7 +313,8 @@ def test_an_episode_goes_on_beyond_the_map_where_the_settings_say_so():
         settings=SimSettings(end_when_gone=False),
     )
     env.reset()
-    assert drive(env, 79)["done"].sum() == 0 and not env.world().valid[:, 0].any()
+    assert drive(env, 79)["done"].sum() == 0
+    assert not env.world().valid[:, 0].any()
     assert act(env)["truncated"].all()
 
 

@@ -115,7 +115,8 @@ def test_what_the_front_hits_must_have_stood(since, vehicle, expected):
 def test_who_stands_since_the_start_has_stood():
     ego = torch.tensor([[0.0, 0.0, 0.0, 5.0]])
     others = torch.tensor([[[3.8, 0.0, 0.0, 0.0]]])
-    assert judged(ego, others, steps=3) == [True] and judged(
+    assert judged(ego, others, steps=3) == [True]
+    assert judged(
         ego,
         others,
         since=1,

@@ -48,11 +48,9 @@ def lead(agents):
 
 def test_the_gap_is_between_bumpers_of_the_nearest():
     gap, speed, index = lead([(0, 0, 0, 9), (30, 0.3, 0, 6), (18, 0, 0, 7)])
-    assert (
-        gap.item() == pytest.approx(18 - LENGTH)
-        and speed.item() == pytest.approx(7)
-        and index.item() == 2
-    )
+    assert gap.item() == pytest.approx(18 - LENGTH)
+    assert speed.item() == pytest.approx(7)
+    assert index.item() == 2
 
 
 def test_a_vehicle_across_the_lane_leads_with_its_side_and_stands_along_it():
@@ -89,10 +87,8 @@ def test_who_stands_at_the_crossing_of_a_loop_leads_at_the_first_passage_to_come
             size=size,
             present=present,
         )
-        assert (
-            found.index.item() == 1
-            and abs(found.gap.item() - gap + LENGTH / 2 + 1.5) < 1.0
-        )
+        assert found.index.item() == 1
+        assert abs(found.gap.item() - gap + LENGTH / 2 + 1.5) < 1.0
 
 
 def all_pairs(
@@ -171,7 +167,8 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
     )
     found = Leaders(*(value[..., 0] for value in found))
     led = expected[0] < free_gap
-    assert led.sum() > 40 and torch.equal(found.index[led], expected[2][led])
+    assert led.sum() > 40
+    assert torch.equal(found.index[led], expected[2][led])
     torch.testing.assert_close(
         found.gap,
         expected[0],
@@ -274,7 +271,9 @@ def test_a_free_road(improved):
             )
         )
         < 1e-6
-        and accel(
+    )
+    assert (
+        accel(
             0,
             10,
             gap=torch.inf,

@@ -137,7 +137,9 @@ def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
         )
         for step in (last, last + 40)
     )
-    assert torch.equal(beyond, at_the_end) and beyond[0, 0] == 1 and beyond[1, 2] == 1
+    assert torch.equal(beyond, at_the_end)
+    assert beyond[0, 0] == 1
+    assert beyond[1, 2] == 1
 
 
 def observations(scenes, actions):

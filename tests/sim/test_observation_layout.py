@@ -47,15 +47,12 @@ def test_every_number_has_a_name_of_its_own():
 
 def test_the_ego_and_its_mission(seen):
     near = {"abs": 1e-4}
-    assert seen["ego.speed"] == pytest.approx(10.1, **near) and seen[
-        "ego.acceleration"
-    ] == pytest.approx(1, **near)
-    assert seen["ego.yaw_rate"] == seen["ego.offset"] == 0 and seen[
-        "ego.heading_cos"
-    ] == pytest.approx(1)
-    assert seen["ego.limit"] == pytest.approx(15) and seen[
-        "ego.elapsed"
-    ] == pytest.approx(1 / 80)
+    assert seen["ego.speed"] == pytest.approx(10.1, **near)
+    assert seen["ego.acceleration"] == pytest.approx(1, **near)
+    assert seen["ego.yaw_rate"] == seen["ego.offset"] == 0
+    assert seen["ego.heading_cos"] == pytest.approx(1)
+    assert seen["ego.limit"] == pytest.approx(15)
+    assert seen["ego.elapsed"] == pytest.approx(1 / 80)
     assert [seen["ego.length"], seen["ego.width"]] == pytest.approx([4.5, 2.0], abs=0.3)
     assert [seen[f"route.{k}.x"] for k in range(3)] == pytest.approx(
         [2, 4, 7], abs=1e-3
@@ -63,9 +60,8 @@ def test_the_ego_and_its_mission(seen):
     assert [
         seen[f"route.3.{name}"] for name in ("y", "heading_sin", "curvature", "limit")
     ] == pytest.approx([0, 0, 0, 15])
-    assert (seen["light.0.red"], seen["light.0.green"]) == (1, 0) and 0 < seen[
-        "light.0.nearness"
-    ] < 0.2
+    assert (seen["light.0.red"], seen["light.0.green"]) == (1, 0)
+    assert 0 < seen["light.0.nearness"] < 0.2
     assert seen["border.+0.+2.5"] == pytest.approx(2.5 - LANE_WIDTH * 1.5, abs=0.2), (
         "m beyond the border"
     )
@@ -84,15 +80,12 @@ def test_the_nearest_agents(seen):
         for name, value in seen.items()
         if name.startswith(f"agent.{ahead}.")
     }
-    assert agent["x"] == pytest.approx(20 + 0.8 - 1.005, abs=0.02) and agent[
-        "y"
-    ] == pytest.approx(0, abs=1e-4)
-    assert agent["velocity_x"] == pytest.approx(8 - 10.1, abs=1e-3) and agent[
-        "speed"
-    ] == pytest.approx(8, abs=1e-3)
-    assert agent["heading_cos"] == pytest.approx(1) and agent[
-        "half_length"
-    ] == pytest.approx(2.25, abs=0.15)
+    assert agent["x"] == pytest.approx(20 + 0.8 - 1.005, abs=0.02)
+    assert agent["y"] == pytest.approx(0, abs=1e-4)
+    assert agent["velocity_x"] == pytest.approx(8 - 10.1, abs=1e-3)
+    assert agent["speed"] == pytest.approx(8, abs=1e-3)
+    assert agent["heading_cos"] == pytest.approx(1)
+    assert agent["half_length"] == pytest.approx(2.25, abs=0.15)
     assert agent["gap"] == pytest.approx(agent["x"] - 2 * agent["half_length"], abs=0.3)
     assert seen["agent.11.present"] == 0
 

@@ -114,13 +114,13 @@ def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
         static=static,
         before=first[0],
     )
-    assert (near.gap > 0).all() and bool((found.gap < 0).all()) == hits
+    assert (near.gap > 0).all()
+    assert bool((found.gap < 0).all()) == hits
     if hits:
         assert found.position[0, :, 0].tolist() == pytest.approx([3.1, 0.0], abs=1e-4)
     else:
-        assert torch.equal(found.gap, near.gap) and torch.equal(
-            found.position, near.position
-        )
+        assert torch.equal(found.gap, near.gap)
+        assert torch.equal(found.position, near.position)
 
 
 def tiny_pass(displacement, speed, past):

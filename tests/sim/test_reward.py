@@ -37,10 +37,8 @@ def test_quiet_driving_only_earns_progress():
 
 
 def test_terms_grow_with_what_they_name():
-    assert (
-        term("contact", contact=torch.tensor([True])) == 1
-        and term("off_road", off_road=torch.tensor([True])) == 1
-    )
+    assert term("contact", contact=torch.tensor([True])) == 1
+    assert term("off_road", off_road=torch.tensor([True])) == 1
     assert term("fault", fault=torch.tensor([True])) == 1
     assert abs(term("speeding", speed=torch.tensor([15.0])) - 0.25) < 1e-6
     assert (

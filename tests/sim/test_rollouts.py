@@ -43,21 +43,16 @@ def test_files_have_the_format_s_keys_types_and_names(tmp_path, rollouts):
             data = dict(archive)
         assert data.keys() == DTYPES.keys()
         for key, kind in DTYPES.items():
-            assert data[key].dtype.kind == kind[0] and (
-                len(kind) < 2 or data[key].dtype == kind
-            ), key
-        assert (
-            str(data["format"]) == "e2rl-rollout/1"
-            and float(data["dt"]) == 0.1
-            and int(data["ego"]) == 0
-        )
+            assert data[key].dtype.kind == kind[0]
+            assert len(kind) < 2 or data[key].dtype == kind, key
+        assert str(data["format"]) == "e2rl-rollout/1"
+        assert float(data["dt"]) == 0.1
+        assert int(data["ego"]) == 0
         for name, least in (("lane", 2), ("drivable", 3)):
             offsets = data[f"{name}_offsets"]
-            assert (
-                offsets[0] == 0
-                and offsets[-1] == len(data[f"{name}_points"])
-                and (np.diff(offsets) >= least).all()
-            )
+            assert offsets[0] == 0
+            assert offsets[-1] == len(data[f"{name}_points"])
+            assert (np.diff(offsets) >= least).all()
         np.testing.assert_array_equal(data["states"], rollouts.states[index].numpy())
 
 
@@ -93,7 +88,8 @@ def test_rollouts_read_back_are_those_written_padded_where_others_are_longer(
     )
     both = Rollouts.of([rollouts.rollout(0), short.rollout(1)])
     assert both.states.shape[1:3] == rollouts.states.shape[1:3]
-    assert not both.valid[1, 41:].any() and not both.valid[1, :, 7:].any()
+    assert not both.valid[1, 41:].any()
+    assert not both.valid[1, :, 7:].any()
     torch.testing.assert_close(
         both.states[1, :41, :7],
         short.states[1],
@@ -106,9 +102,8 @@ def test_rollouts_read_back_are_those_written_padded_where_others_are_longer(
         torch.cat([read[1:2], read[2:3]]),
         read[torch.tensor([False, True, True, False])],
     ):
-        assert list(rows.scene_id) == ["scene_0", "scene_1"] and torch.equal(
-            rows.valid, read.valid[1:3]
-        )
+        assert list(rows.scene_id) == ["scene_0", "scene_1"]
+        assert torch.equal(rows.valid, read.valid[1:3])
 
 
 def test_rollouts_of_other_maps_and_sizes_are_joined_and_score_as_before():
@@ -168,7 +163,8 @@ def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_le
         assert data.planners.tolist() == planners
         assert (data.evasion is None, data.driver is None) == (index == 1, index == 2)
         np.testing.assert_array_equal(data.plans, plans[index][:, planners].numpy())
-        assert (data.targets[:, 0] == -1).all() and (data.targets[:, 1:] == 0).all()
+        assert (data.targets[:, 0] == -1).all()
+        assert (data.targets[:, 1:] == 0).all()
 
 
 def test_scenes_tell_who_is_simulated_and_what_was_recorded():
@@ -194,10 +190,8 @@ def test_scenes_tell_who_is_simulated_and_what_was_recorded():
     assert torch.equal(
         made.simulated, scene["valid"] & (scene["agent_type"] == VEHICLE)
     )
-    assert (
-        not made.logged_valid[:, :, ~scene["valid"][0]].any()
-        and list(made.scene_id) == scenes.scene_id
-    )
+    assert not made.logged_valid[:, :, ~scene["valid"][0]].any()
+    assert list(made.scene_id) == scenes.scene_id
     replayed = Rollouts.in_scenes(
         scenes,
         torch.arange(2),
@@ -206,9 +200,8 @@ def test_scenes_tell_who_is_simulated_and_what_was_recorded():
         replays_ego=True,
         **more,
     )
-    assert not replayed.simulated[:, 0].any() and torch.equal(
-        replayed.simulated[:, 1:], made.simulated[:, 1:]
-    )
+    assert not replayed.simulated[:, 0].any()
+    assert torch.equal(replayed.simulated[:, 1:], made.simulated[:, 1:])
 
 
 def test_a_failure_has_its_contact_and_a_rollout_without_one_has_none(
@@ -239,17 +232,20 @@ def test_lines_too_short_to_be_lines_are_left_out():
     kept, offsets, numbers = polylines(
         points, torch.tensor([0, 0, 3, 4, 4, -1]), minimum=2
     )
-    assert numbers.tolist() == [0, 4] and offsets.tolist() == [0, 2, 4]
+    assert numbers.tolist() == [0, 4]
+    assert offsets.tolist() == [0, 2, 4]
     assert kept.tolist() == points[[0, 1, 3, 4]].tolist()
     empty, offsets, _ = polylines(
         points[:0], torch.zeros(0, dtype=torch.int64), minimum=3
     )
-    assert empty.shape == (0, 2) and offsets.tolist() == [0]
+    assert empty.shape == (0, 2)
+    assert offsets.tolist() == [0]
 
 
 def test_names_that_no_path_may_hold_are_mended(tmp_path, rollouts):
     path = rollouts[:1].replace(scene_id=["a/../b c"]).to_npz(tmp_path)[0]
-    assert path.parent == tmp_path and path.name.startswith("e2__idm__2__a-..-b-c__0~")
+    assert path.parent == tmp_path
+    assert path.name.startswith("e2__idm__2__a-..-b-c__0~")
     assert Rollout.read(path).scene_id == "a/../b c"
 
 

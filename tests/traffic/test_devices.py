@@ -18,9 +18,8 @@ def test_tensors_of_two_devices_do_not_meet():
     with pretended_device():
         here = torch.ones(3)
         there = torch.ones(3, device="cuda")
-        assert device_of(there + 1).type == "cuda" and torch.equal(
-            (there * 2).cpu(), here * 2
-        )
+        assert device_of(there + 1).type == "cuda"
+        assert torch.equal((there * 2).cpu(), here * 2)
         for wrong in (
             lambda: here + there,
             lambda: here[torch.zeros(1, dtype=torch.int64, device="cuda")],
@@ -60,6 +59,5 @@ def test_a_rollout_keeps_to_its_device_and_is_that_of_the_cpu(method, ego):
     with pretended_device():
         there = driven("cuda")
     here = driven("cpu")
-    assert torch.equal(there.states, here.states) and torch.equal(
-        there.adversaries, here.adversaries
-    )
+    assert torch.equal(there.states, here.states)
+    assert torch.equal(there.adversaries, here.adversaries)

@@ -61,7 +61,8 @@ def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
     called = set()
     ego = LaneGraphEgo()
     eager = drive(scene_set, on, 2.0, ego=ego)
-    assert prepared(True) and is_on()
+    assert prepared(True)
+    assert is_on()
     for each in FUSED.values():
         run = each._run
         each.__dict__["_run"] = lambda flat, run=run, name=each.name: (
@@ -89,9 +90,8 @@ def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
     actor = ActorEgo()
     drive(scene_set, on, 2.0, ego=actor)
     actor.network.network.trunk(torch.zeros(2, OBSERVATION_SIZE)).sum().backward()
-    assert torch.equal(eager.valid, fast.valid) and torch.equal(
-        eager.adversaries, fast.adversaries
-    )
+    assert torch.equal(eager.valid, fast.valid)
+    assert torch.equal(eager.adversaries, fast.adversaries)
     assert (eager.states[..., :2] - fast.states[..., :2]).abs().max() < 2e-3
     torch.testing.assert_close(
         eager.transport_adversary, fast.transport_adversary, rtol=1e-3, atol=1e-3
@@ -101,7 +101,8 @@ def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
     } - called
     assert not missing, "they never ran compiled"
     again = prepared("auto")
-    assert again is True and is_on(), "all are there now"
+    assert again is True
+    assert is_on(), "all are there now"
     capsys.readouterr()
 
 
@@ -111,17 +112,18 @@ def test_functions_that_are_not_compiled_are_left_off_unless_they_are_asked_for(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for each in list(FUSED.values()):
         monkeypatch.delitem(each.__dict__, "file", raising=False)
-    assert prepared("auto") is False and not is_on()
+    assert prepared("auto") is False
+    assert not is_on()
     told = capsys.readouterr().err
-    assert ("compile=true" in told) == has_compiler() and not list(
-        tmp_path.rglob("*.so")
-    )
-    assert (
-        prepared(False) is False and prepared("auto", "cuda") is False and not is_on()
-    )
+    assert ("compile=true" in told) == has_compiler()
+    assert not list(tmp_path.rglob("*.so"))
+    assert prepared(False) is False
+    assert prepared("auto", "cuda") is False
+    assert not is_on()
     monkeypatch.setattr(Fused, "compile", lambda self: None)
     monkeypatch.setattr(fused.shutil, "which", lambda name: "/usr/bin/c++")
-    assert prepared(True) is True and is_on()
+    assert prepared(True) is True
+    assert is_on()
     with pytest.raises(
         InputError, match="compile=maybe: choose one of auto, true, false"
     ):

@@ -51,7 +51,9 @@ def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_tha
     for group in groups:
         here = [counts[row] for row in group.rows.tolist()]
         rows = group.vehicles * len(here)
-        assert group.vehicles == max(here) and group.others == 3 and rows <= MOST_ROWS
+        assert group.vehicles == max(here)
+        assert group.others == 3
+        assert rows <= MOST_ROWS
         assert min(here) > SHRUNK * group.vehicles or rows < 2 * FULL_ROWS
 
 
@@ -66,23 +68,24 @@ def test_what_changes_in_a_crop_arrives_where_it_belongs_and_nothing_else_change
     write_state(whole, part, group=group)
     rows = group.rows.tolist()
     changed = whole.routed.conflict_s != state.routed.conflict_s
-    assert changed.nonzero().tolist() == [
-        [rows[0], 1, 2]
-    ] and whole.path_kl.nonzero().tolist() == [[rows[1], 3]]
-    assert group.vehicles < changed.shape[1] and torch.equal(
-        whole.lane.s, state.lane.s
-    ), "there is padding to crop"
+    assert changed.nonzero().tolist() == [[rows[0], 1, 2]]
+    assert whole.path_kl.nonzero().tolist() == [[rows[1], 3]]
+    assert group.vehicles < changed.shape[1]
+    assert torch.equal(whole.lane.s, state.lane.s), "there is padding to crop"
 
 
 def test_noise_is_standard_and_depends_on_seed_and_draw_only():
     seed = torch.tensor([3, 4, 3])
     draw = torch.tensor([1, 1, 2])
     noise = noise_of(seed, draw, shape=(5000,))
-    assert noise.mean(1).abs().max() < 0.06 and (noise.std(1) - 1).abs().max() < 0.04
+    assert noise.mean(1).abs().max() < 0.06
+    assert (noise.std(1) - 1).abs().max() < 0.04
     assert torch.equal(noise[2:], noise_of(seed[2:], draw[2:], shape=(5000,)))
-    assert not torch.equal(noise[0], noise[1]) and not torch.equal(noise[0], noise[2])
+    assert not torch.equal(noise[0], noise[1])
+    assert not torch.equal(noise[0], noise[2])
     uniform = noise_of(seed, draw, shape=(5000,), uniform=True)
-    assert uniform.min() >= 0 and uniform.max() < 1
+    assert uniform.min() >= 0
+    assert uniform.max() < 1
 
 
 def test_rows_are_taken_and_put_in_nested_states_without_touching_the_original():
@@ -91,7 +94,8 @@ def test_rows_are_taken_and_put_in_nested_states_without_touching_the_original()
     part = take_rows(state, rows)
     assert part.v.tolist() == [18.0, 16.0]
     back = put_rows(state, rows, new=part.map(lambda value: value + 100))
-    assert back.v.tolist() == [116.0, 17.0, 118.0, 19.0] and state.v.tolist() == [
+    assert back.v.tolist() == [116.0, 17.0, 118.0, 19.0]
+    assert state.v.tolist() == [
         16.0,
         17.0,
         18.0,

@@ -56,11 +56,10 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
     torch.testing.assert_close(
         found.states[here], expected.states()[here], rtol=1e-4, atol=1e-4
     )
-    assert (
-        torch.equal(found.present[here], expected.on_map[here])
-        and not found.present[~here].any()
-    )
-    assert found.adversary is None and after.replans.tolist() == [1, 1]
+    assert torch.equal(found.present[here], expected.on_map[here])
+    assert not found.present[~here].any()
+    assert found.adversary is None
+    assert after.replans.tolist() == [1, 1]
 
 
 def test_plans_continue_where_the_last_one_was_left():
@@ -159,7 +158,8 @@ def test_the_prediction_begins_at_the_ego():
     world = World.at_start(scene)
     state = begin(synthesizer(), scene)
     found = on.predicted_ego(state, world)[0]
-    assert found.shape == (3, 50, 4) and found.isfinite().all()
+    assert found.shape == (3, 50, 4)
+    assert found.isfinite().all()
     first = world.states[:, 0, 3] * DT
     way = (found[:, 0, :2] - world.states[:, 0, :2]).norm(dim=-1)
     torch.testing.assert_close(way, first, rtol=0.1, atol=0.05)

@@ -85,7 +85,9 @@ def test_a_vehicle_s_term_moves_that_vehicle_alone_and_never_the_ego(potential):
             allow_unused=True,
         )
         moved = gradient.abs().sum((0, 2, 3))
-        assert moved[vehicle] > 0 and moved.sum() == moved[vehicle] and plan is None
+        assert moved[vehicle] > 0
+        assert moved.sum() == moved[vehicle]
+        assert plan is None
 
 
 def test_gradients_are_finite_for_coincident_and_standing_vehicles():
@@ -107,10 +109,12 @@ def test_gradients_are_finite_for_coincident_and_standing_vehicles():
 def test_only_the_coalition_has_v_adv_and_it_acts_on_its_own_target():
     states, context = busy()
     value = adversarial_potential(states, context, settings=SETTINGS)
-    assert (value[0, 3:] == 0).all() and (value[0, 1:3] != 0).all()
+    assert (value[0, 3:] == 0).all()
+    assert (value[0, 1:3] != 0).all()
     far = replace(context, ego_plan=context.ego_plan + 500)
     changed = adversarial_potential(states, far, settings=SETTINGS)
-    assert changed[0, 2] == value[0, 2] and changed[0, 1] > value[0, 1] + 100
+    assert changed[0, 2] == value[0, 2]
+    assert changed[0, 1] > value[0, 1] + 100
 
 
 def test_adversary_and_target_do_not_repel_each_other():
@@ -179,9 +183,8 @@ def test_each_term_of_v_feas_has_its_closed_form_and_cruising_alone_is_free():
         plan[:, 2] += math.pi - 1.0
 
     assert cost(aside, lateral=0.1) == pytest.approx(0.1 * 2.0**2 / 2)
-    assert cost(faster, accel=0.5) == pytest.approx(0.5) and cost(
-        slower, accel=0.5
-    ) == pytest.approx(0.5)
+    assert cost(faster, accel=0.5) == pytest.approx(0.5)
+    assert cost(slower, accel=0.5) == pytest.approx(0.5)
     assert cost(turning, accel=0.5) == pytest.approx(0.5, rel=1e-5)
     assert cost(faster, jerk=2.0) == pytest.approx(2.0 * 4.0**2 / 10)
     assert cost(slower, jerk=2.0) == pytest.approx(2.0 * 7.0**2 / 10)
@@ -207,10 +210,8 @@ def test_the_pair_term_is_the_squared_shortfall_of_the_gap_that_is_wanted():
         context.scene["size"][:, 1:3] = torch.tensor([4.5, size])
         states[0, 2, :, 1] = size + 0.1
         found = feasibility_potential(states, context, settings=only(pair=3.0))[0]
-        assert (
-            found[1].item() == pytest.approx(3.0 * (wanted - 0.1) ** 2, rel=2e-2)
-            and found[1] == found[2]
-        )
+        assert found[1].item() == pytest.approx(3.0 * (wanted - 0.1) ** 2, rel=2e-2)
+        assert found[1] == found[2]
 
 
 def test_v_adv_has_its_closed_form_at_a_constant_distance():

@@ -90,4 +90,5 @@ def test_less_responsibility_binds_only_those_behind_or_nobody(responsibility, e
         eta=torch.tensor([2.0]),
     )
     assert duty.exempt[0, 1:3].tolist() == exempt
-    assert not duty.yields.any() and not duty.patience.any()
+    assert not duty.yields.any()
+    assert not duty.patience.any()

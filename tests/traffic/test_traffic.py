@@ -20,7 +20,8 @@ def test_the_first_point_of_a_plan_is_where_its_vehicle_is_half_a_second_later()
         :, :, :ROWS
     ]
     driven[:, :, 0] = False
-    assert POINT_STEPS == REPLAN_STEPS and driven.sum() > 50
+    assert POINT_STEPS == REPLAN_STEPS
+    assert driven.sum() > 50
     torch.testing.assert_close(
         out.plans[:, :, :, 0][driven], later[driven], rtol=0, atol=1e-4
     )
@@ -39,10 +40,12 @@ def test_the_ego_s_first_plan_is_what_it_plans_at_the_start():
 def test_whoever_aims_is_an_adversary_and_aims_at_the_ego_or_at_another_one():
     out = drive(scenes(steps=40), synthesizer(), 2.0)
     aims = out.targets >= 0
-    assert aims.any() and torch.equal(aims.any(1), out.adversaries[:, :ROWS])
+    assert aims.any()
+    assert torch.equal(aims.any(1), out.adversaries[:, :ROWS])
     for scene, replan, vehicle in aims.nonzero().tolist():
         target = out.targets[scene, replan, vehicle]
-        assert target != vehicle and (target == 0 or aims[scene, replan, target])
+        assert target != vehicle
+        assert target == 0 or aims[scene, replan, target]
 
 
 REPLANS, STEPS = 4, 4  # of two seconds; of the small prior
@@ -63,4 +66,5 @@ def test_every_denoising_step_is_a_pass_of_each_sample_and_a_gradient_doubles_it
         REPLANS * STEPS * 3
     ]  # its gradients stop at the posterior mean
     assert nfe(SafeSimOpt(prior, samples=3)) == [REPLANS * STEPS * 3 * 2]
-    assert not prior.denoiser._forward_hooks and torch.is_grad_enabled()
+    assert not prior.denoiser._forward_hooks
+    assert torch.is_grad_enabled()

@@ -125,10 +125,8 @@ def random_environment(own=0, traffic=None):
 def same(first, second):
     """What episodes are, bit for bit."""
     keys = sorted(first.keys(True, True), key=str)
-    assert (
-        keys == sorted(second.keys(True, True), key=str)
-        and ("next", "agents", "states") in keys
-    )
+    assert keys == sorted(second.keys(True, True), key=str)
+    assert ("next", "agents", "states") in keys
     return all(torch.equal(first[key], second[key]) for key in keys)
 
 
@@ -143,7 +141,8 @@ def test_a_seed_decides_the_episodes(traffic):
     first = random_environment(0, traffic)
     second = random_environment(1, traffic)
     once = episodes(first, 3)
-    assert same(once, episodes(second, 3)) and same(once, episodes(first, 3))
+    assert same(once, episodes(second, 3))
+    assert same(once, episodes(first, 3))
     assert not torch.equal(once["traffic", "row"], episodes(first, 4)["traffic", "row"])
 
 
@@ -191,9 +190,8 @@ def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
     policy = EgoPolicy(IDMEgo(), env)
     tensordict = advance(env, policy, tensordict=env.reset(), steps=7)
     tensordict = env.reset(tensordict.set("_reset", SECOND))
-    assert tensordict["scene_index"][:, 0].tolist() == [0, 0, 2] and tensordict[
-        "timestep"
-    ][:, 0].tolist() == [7, 0, 7]
+    assert tensordict["scene_index"][:, 0].tolist() == [0, 0, 2]
+    assert tensordict["timestep"][:, 0].tolist() == [7, 0, 7]
     assert tensordict["traffic", "row"][:, 0].tolist() == [0, 3, 2]
     tensordict = advance(env, policy, tensordict=tensordict, steps=4)
     assert [steps for steps, _ in on.calls] == [[0, 0, 0], [5, 5, 5], [0], [10, 10]]
@@ -291,9 +289,8 @@ def test_who_raises_where_the_traffic_asks_is_named_by_its_own_scene(due, broken
         driven([0, 1, 2, 3, 4])
     assert list(raised.value.rows) == [3]
     parts, errored = attempt(driven, [0, 1, 2, 3, 4])
-    assert [task for tasks, _ in parts for task in tasks] == [0, 1, 2, 4] and [
-        task for task, _ in errored
-    ] == [3]
+    assert [task for tasks, _ in parts for task in tasks] == [0, 1, 2, 4]
+    assert [task for task, _ in errored] == [3]
     assert errored[0][1]["raised_by"] == ("traffic" if broken else "ego")
 
 
@@ -367,7 +364,8 @@ def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
         env, Watching(IDMEgo(), env), frames_per_batch=36, total_frames=-1, **options
     )
     data = next(iter(collector))
-    assert ("traffic", "plan") not in data.keys(True) and (
+    assert ("traffic", "plan") not in data.keys(True)
+    assert (
         "next",
         "traffic",
         "plan",
@@ -395,5 +393,6 @@ def test_egos_that_drive_differently_meet_plans_of_their_own():
         tensordict["action"] = torch.tensor([[0.0, 0.0], [-5.0, 0.0]])
         tensordict["ego", "plan"] = keep_velocity(env.base_env.world().states[:, 0])
         tensordict = env.step_mdp(env.step(tensordict))
-    assert torch.equal(plans[0][0], plans[0][1]) and len(plans) == 3
+    assert torch.equal(plans[0][0], plans[0][1])
+    assert len(plans) == 3
     assert not torch.equal(plans[-1][0, 1:5], plans[-1][1, 1:5])

@@ -1,2 +1,2 @@
 """The adversaries of other works behind the traffic interface, on the common prior
-(docs/baselines.md)."""
+(docs/reference/deviations.md)."""

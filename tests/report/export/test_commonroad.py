@@ -53,9 +53,8 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
             for state in states_of(obstacle):
                 x, y, heading, speed = rollout.states[state.time_step, row]
                 turned = (heading - state.orientation + np.pi) % (2 * np.pi) - np.pi
-                assert (
-                    np.hypot(*(state.position - [x, y])) < 0.01 and abs(turned) < 1e-3
-                )
+                assert np.hypot(*(state.position - [x, y])) < 0.01
+                assert abs(turned) < 1e-3
                 assert abs(speed - state.velocity) < 0.01
                 seen[state.time_step, row] = True
             assert np.allclose(
@@ -98,7 +97,8 @@ def test_lanelets_lights_and_limits_come_back(scenarios):
     assert set(before.successor) == {
         on.lanelet_id,
         left.lanelet_id,
-    } and on.predecessor == [before.lanelet_id]
+    }
+    assert on.predecessor == [before.lanelet_id]
     assert before.left_vertices[0, 1] == pytest.approx(
         before.right_vertices[0, 1] + 3.6, abs=1e-3
     )
@@ -143,10 +143,8 @@ def test_neighbours_are_mutual():
     }
     assert beside(lanes, "a", side="left") is None
     lanes["b"].right.insert(0, "a")
-    assert (
-        beside(lanes, "a", side="left") == "b"
-        and beside(lanes, "b", side="right") == "a"
-    )
+    assert beside(lanes, "a", side="left") == "b"
+    assert beside(lanes, "b", side="right") == "a"
     assert side_by_side(lanes, ["a", "c", "b"]) == [["c"], ["a", "b"]]
 
 
@@ -167,11 +165,9 @@ def test_an_open_ego_is_a_planning_problem_only(run, tmp_path):
         str(exported(run, tmp_path / "out", "commonroad", "--open-ego")[0])
     ).open()
     numbers = {obstacle.obstacle_id for obstacle in scenario.dynamic_obstacles}
-    assert (
-        1 not in numbers
-        and CUT_IN + 1 in numbers
-        and len(problems.planning_problem_dict) == 1
-    )
+    assert 1 not in numbers
+    assert CUT_IN + 1 in numbers
+    assert len(problems.planning_problem_dict) == 1
 
 
 def test_who_reverses_has_a_negative_velocity(run):

@@ -77,15 +77,12 @@ def test_scenes_that_are_not_those_of_the_run_are_refused(copy, tmp_path, capsys
     assert "pass --no-scene" in refused(capsys, *arguments)
     main([str(argument) for argument in (*arguments, "--no-scene")])
     (line,) = lines(tmp_path / "out")
-    assert line["scene_id"] == "scene-0" and line["partner"] == line[
-        "adversaries"
-    ] == str(CUT_IN)
-    assert (
-        line["cfr"] == "1"
-        and line["duty"]
-        and line["contact_step"]
-        and not (tmp_path / "out" / "scenes").exists()
-    )
+    assert line["scene_id"] == "scene-0"
+    assert line["partner"] == line["adversaries"] == str(CUT_IN)
+    assert line["cfr"] == "1"
+    assert line["duty"]
+    assert line["contact_step"]
+    assert not (tmp_path / "out" / "scenes").exists()
 
 
 def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(
@@ -105,4 +102,5 @@ def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(
     main(
         [str(copy), "--to", "npz", "--out", str(tmp_path / "out"), "--plugin", "theirs"]
     )
-    assert (tmp_path / "ran").exists() and len(lines(tmp_path / "out")) == 1
+    assert (tmp_path / "ran").exists()
+    assert len(lines(tmp_path / "out")) == 1

@@ -67,9 +67,8 @@ def test_every_state_of_everybody_who_is_there_comes_back(run, written):
         assert len(topics["/traffic"]) == len(topics["/tf"]) == len(rollout.states)
         for step, (time, update) in enumerate(topics["/traffic"]):
             agents = boxes(update)
-            assert time == pytest.approx(0.1 * step) and update.entities[
-                0
-            ].timestamp.ToSeconds() == int(time)
+            assert time == pytest.approx(0.1 * step)
+            assert update.entities[0].timestamp.ToSeconds() == int(time)
             assert sorted(agents) == np.flatnonzero(rollout.valid[step]).tolist()
             for row, (*place, heading, length, width, _) in agents.items():
                 x, y, turned, _ = rollout.states[step, row]
@@ -93,17 +92,14 @@ def test_the_map_lights_and_contact(run, written):
     ends = np.array(
         [(point.x, point.y) for point in update.entities[0].lines[0].points]
     ).reshape(-1, 2, 2)
-    assert time == 0 and len(ends) == len(rollout.lane_points) - (
-        len(rollout.lane_offsets) - 1
-    )
+    assert time == 0
+    assert len(ends) == len(rollout.lane_points) - (len(rollout.lane_offsets) - 1)
     assert np.abs(ends[0] - rollout.lane_points[:2]).max() < 1e-5
     lights = [
         entity for entity in topics["/traffic"][0][1].entities if entity.id == "lights"
     ]
-    assert (
-        len(lights[0].spheres) == 2
-        and lights[0].spheres[0].color != lights[0].spheres[1].color
-    )
+    assert len(lights[0].spheres) == 2
+    assert lights[0].spheres[0].color != lights[0].spheres[1].color
     row = read_rows(run / TABLE)[0]
     contacts = [
         time

@@ -142,14 +142,16 @@ def test_a_turn_in_two_pieces_changes_width_and_limit_where_the_second_begins():
     beside = np.linalg.norm(
         np.concatenate([turn[:10], second])[:, None] - line[None], axis=-1
     ).min(1)
-    assert element.get("name") == "t, u" and beside.max() < 0.1
+    assert element.get("name") == "t, u"
+    assert beside.max() < 0.1
     lane = element.find("lanes/laneSection/right/lane")
     widths = [
         (float(each.get("sOffset")), float(each.get("a")))
         for each in lane.iterfind("width")
     ]
     (_, first), (start, other) = widths
-    assert (first, other) == (3.0, 3.2) and start == pytest.approx(15 * arc[9], abs=0.1)
+    assert (first, other) == (3.0, 3.2)
+    assert start == pytest.approx(15 * arc[9], abs=0.1)
     offsets = [float(each.get("a")) for each in element.iterfind("lanes/laneOffset")]
     assert offsets == [1.5, 1.6]
     limits = [kind.find("speed") for kind in element.iterfind("type")]

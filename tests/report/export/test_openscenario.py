@@ -73,9 +73,8 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
                 if not isinstance(action, xosc.FollowTrajectoryAction):
                     continue
                 shape = action.trajectory.shapes
-                assert (
-                    shape.time[0] == pytest.approx(start) and action.timeref.scale == 1
-                )
+                assert shape.time[0] == pytest.approx(start)
+                assert action.timeref.scale == 1
                 for time, place in zip(shape.time, shape.positions, strict=True):
                     step = round(time / 0.1)
                     middle = [
@@ -84,10 +83,8 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
                     ]
                     x, y, heading, _ = rollout.states[step, row]
                     turned = (heading - place.h + np.pi) % (2 * np.pi) - np.pi
-                    assert (
-                        abs(step * 0.1 - time) < 1e-6
-                        and np.hypot(*(np.array(middle) - [x, y])) < 0.01
-                    )
+                    assert abs(step * 0.1 - time) < 1e-6
+                    assert np.hypot(*(np.array(middle) - [x, y])) < 0.01
                     assert abs(turned) < 1e-3
                     seen[step, row] = True
                 assert (
@@ -128,6 +125,5 @@ def test_boxes_types_and_reference_points(run, scenarios):
     assert kinds == ["car", "truck", "bicycle"]
     assert isinstance(found[row_of(rollout, PEDESTRIAN)], xosc.Pedestrian)
     axles = found[0].axles
-    assert axles.rearaxle.xpos == 0 and axles.frontaxle.xpos == pytest.approx(
-        2 * found[0].boundingbox.center.x
-    )
+    assert axles.rearaxle.xpos == 0
+    assert axles.frontaxle.xpos == pytest.approx(2 * found[0].boundingbox.center.x)

@@ -39,7 +39,8 @@ def test_a_crossing_s_connectors_are_one_junction():
 def test_a_turn_in_two_pieces_is_one_connecting_road():
     plan = road_plan(graph(a="xt", b="s", t="u", x="c", u="d", s="d", c="", d=""))
     assert [span.lane for span in plan.roads["t"]] == ["t", "u"]
-    assert plan.connecting["t"] == ("a", "d") and plan.junctions == [["s", "t", "x"]]
+    assert plan.connecting["t"] == ("a", "d")
+    assert plan.junctions == [["s", "t", "x"]]
 
 
 def test_lanes_that_fork_or_merge_directly_are_cut():
@@ -78,7 +79,8 @@ def test_every_link_is_a_way_and_every_end_has_at_most_one_partner(pairs, length
         if first.end == length and second.begin == 0:
             between.add((first.lane, second.lane))
         else:  # a piece and the rest of its lane
-            assert first.lane == second.lane and first.end == second.begin
+            assert first.lane == second.lane
+            assert first.end == second.begin
     assert between == pairs
     for span in {span for spans in plan.roads.values() for span in spans}:
         assert span.begin < span.end

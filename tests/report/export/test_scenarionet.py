@@ -36,11 +36,9 @@ def test_tracks_come_back_to_the_centimetre_with_their_types(run, recordings):
         rows = np.flatnonzero(rollout.valid.any(0))
         driven = recording.states[recording.current :]
         valid = recording.valid[recording.current :]
-        assert (
-            recording.current == 10
-            and recording.ego == 0
-            and (valid == rollout.valid[:, rows]).all()
-        )
+        assert recording.current == 10
+        assert recording.ego == 0
+        assert (valid == rollout.valid[:, rows]).all()
         np.testing.assert_allclose(
             driven[valid], rollout.states[:, rows][valid], atol=1e-4
         )
@@ -53,16 +51,16 @@ def test_tracks_come_back_to_the_centimetre_with_their_types(run, recordings):
 def test_map_and_lights_come_back(recordings):
     lanes = recordings[0].lanes
     lights = recordings[0].lights
-    assert lanes["in"].exits == ["on", "left"] and lanes["near"].exits == []
+    assert lanes["in"].exits == ["on", "left"]
+    assert lanes["near"].exits == []
     np.testing.assert_allclose(
         [lanes["on"].speed_limit, lanes["on"].width], [20, 3.6], rtol=1e-5
     )
     np.testing.assert_allclose(
         lanes["in"].points[[0, -1]], [[-28, 0], [72, 0]], atol=1e-3
     )  # from the ego's start
-    assert lights["on"].tolist() == [LIGHT_RED] * 40 + [LIGHT_GREEN] * 51 and set(
-        lights["left"]
-    ) == {LIGHT_GREEN}
+    assert lights["on"].tolist() == [LIGHT_RED] * 40 + [LIGHT_GREEN] * 51
+    assert set(lights["left"]) == {LIGHT_GREEN}
 
 
 def test_descriptions_are_plain_and_zero_where_nobody_is(folder):
@@ -87,15 +85,14 @@ def test_descriptions_are_plain_and_zero_where_nobody_is(folder):
         check(made)
         assert made["metadata"]["ts"].shape == (made["length"],)
         for name, track in made["tracks"].items():
-            assert (
-                track["metadata"]["object_id"] == name and track["state"]["valid"].any()
-            )
+            assert track["metadata"]["object_id"] == name
+            assert track["state"]["valid"].any()
             for values in track["state"].values():
-                assert len(values) == made["length"] and not np.any(
-                    values[~track["state"]["valid"]]
-                )
+                assert len(values) == made["length"]
+                assert not np.any(values[~track["state"]["valid"]])
         facts = made["metadata"]["e2rl"]
-        assert facts["scene_id"] in made["id"] and facts["adversaries"] == [CUT_IN]
+        assert facts["scene_id"] in made["id"]
+        assert facts["adversaries"] == [CUT_IN]
 
 
 def test_the_summary_counts_what_filters_ask_for(run, folder):

@@ -65,10 +65,8 @@ def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     gone = decoded(anchor.knots[0, 1], speed)[1]
     arrival = torch.searchsorted(gone, torch.tensor(way)).item() * DT
     assert arrival == pytest.approx(ahead / 10, abs=0.25)
-    assert (
-        anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max()
-        and not anchor.off_lane.any()
-    )
+    assert anchor.cost[0, 1] < 0.25 + 0.2 * anchor.knots[0, 1].abs().max()
+    assert not anchor.off_lane.any()
 
 
 @pytest.mark.parametrize(("late", "finite"), [(4.0, True), (9.0, True), (14.0, False)])
@@ -87,7 +85,8 @@ def test_a_leader_brakes_and_a_follower_speeds_up():
     world = make_world([EGO, (25.0, 0.0, 0.0, 10.0), (-20.0, 0.0, 0.0, 10.0)])
     anchor, _ = anchored(world, 1, 2)
     assert anchor.feasible[0, 1:3].all()
-    assert anchor.knots[0, 1].mean() < -0.3 and anchor.knots[0, 2].mean() > 0.3
+    assert anchor.knots[0, 1].mean() < -0.3
+    assert anchor.knots[0, 2].mean() > 0.3
 
 
 def test_the_candidate_that_meets_the_target_is_chosen():
@@ -127,24 +126,25 @@ def test_a_kept_route_is_the_only_one_looked_at():
     assert not proposed(world, skeleton, plan=plan, keep_route=True).feasible.any()
     world.route[:, 1] = 2
     kept = proposed(world, skeleton, plan=plan, keep_route=True)
-    assert kept.feasible[0, 1] and torch.equal(kept.route, world.route)
+    assert kept.feasible[0, 1]
+    assert torch.equal(kept.route, world.route)
 
 
 def test_who_cannot_meet_the_target_has_no_anchor_and_keeps_its_route():
     world = make_world([EGO, (40.0, 30.0, UP, 8.0), (10.0, -90.0, UP, 5.0)])
     anchor, skeleton = anchored(world, 1, 2)
-    assert (
-        skeleton.coalition[0, 1:3].all()
-        and not anchor.feasible.any()
-        and not anchor.knots.any()
-    )
-    assert torch.equal(anchor.route, world.route) and anchor.cost.isinf().all()
+    assert skeleton.coalition[0, 1:3].all()
+    assert not anchor.feasible.any()
+    assert not anchor.knots.any()
+    assert torch.equal(anchor.route, world.route)
+    assert anchor.cost.isinf().all()
 
 
 def test_a_chain_s_first_link_meets_its_target_not_the_ego():
     world = make_world([EGO, (30.0, -20.0, UP, 8.0), (30.0, -38.0, UP, 8.0)])
     anchor, skeleton = anchored(world, 1, 2, near=1)
-    assert skeleton.target[0, 1:3].tolist() == [0, 1] and anchor.feasible[0, 1:3].all()
+    assert skeleton.target[0, 1:3].tolist() == [0, 1]
+    assert anchor.feasible[0, 1:3].all()
     gap = (
         (18 + decoded(anchor.knots[0, 1], 8.0)[1] - decoded(anchor.knots[0, 2], 8.0)[1])
         .abs()
@@ -167,10 +167,13 @@ def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
     monkeypatch.setattr(anchoring, "MAX_OFFSET", 10.0)
     anchor, _ = anchored(world, 1)
     knots = anchor.knots[0, 1]
-    assert knots.min() >= -5.0 and knots.max() <= 4.0 and anchor.feasible[0, 1]
+    assert knots.min() >= -5.0
+    assert knots.max() <= 4.0
+    assert anchor.feasible[0, 1]
     speed, way = decoded(knots, 12.0)
     inside = (way > 16) & (way < 34)
-    assert inside.any() and (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
+    assert inside.any()
+    assert (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
 
 
 @pytest.mark.parametrize(
@@ -209,9 +212,8 @@ def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_sti
     )
     cost, gap, _ = anchoring.scored(candidates, torch.zeros(1, 1, 1, 1), target, limits)
     expected = max(0.5 - slack, 0.0) / 10 + abs(beside) * crossing
-    assert gap.item() == pytest.approx(
-        expected, abs=1e-4
-    ) and cost.item() == pytest.approx(expected, abs=1e-4)
+    assert gap.item() == pytest.approx(expected, abs=1e-4)
+    assert cost.item() == pytest.approx(expected, abs=1e-4)
     shifted = candidates._replace(d=-0.4 * one)
     cost, gap, _ = anchoring.scored(
         shifted, torch.full((1, 1, 1, 1), -1.5), target, limits

@@ -14,7 +14,8 @@ def test_a_coalition_acts_on_the_ego_directly_or_through_members():
     on = synthesizer()
     scene = scenes(4).scenes
     state, plan = replanned(on, scene, eta=2.0)
-    assert state.coalition.any(1).all() and not state.coalition[:, 0].any()
+    assert state.coalition.any(1).all()
+    assert not state.coalition[:, 0].any()
     assert torch.equal(state.coalition, state.target >= 0)
     assert torch.equal(plan.adversary, state.coalition | state.drawn)
     members = state.coalition.clone()
@@ -50,9 +51,8 @@ def test_a_chain_over_a_pruned_member_is_pruned(monkeypatch):
     monkeypatch.setattr(coalition, "build_skeleton", chained)
     monkeypatch.setattr(coalition, "propose", without_one)
     state, _ = replanned(on, scene, eta=1.0)
-    assert (
-        state.coalition.nonzero()[:, 1].tolist() == [3] and state.target[0].max() == 0
-    )
+    assert state.coalition.nonzero()[:, 1].tolist() == [3]
+    assert state.target[0].max() == 0
 
 
 def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
@@ -76,7 +76,8 @@ def test_pursuit_draws_vehicles_where_nobody_has_a_proposal(monkeypatch):
         )
         state, plan = replanned(on, scene, eta=2.0)
         assert state.coalition.any(1).tolist() == [pursuit] * 3
-        assert (plan.path_kl[state.coalition] > 0).all() and not state.anchor_jump.any()
+        assert (plan.path_kl[state.coalition] > 0).all()
+        assert not state.anchor_jump.any()
 
 
 def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
@@ -85,16 +86,16 @@ def test_who_leaves_its_lane_returns_to_it_once_it_meets_nobody():
     world = World.at_start(scene)
     lanes = begin(on, scene, eta=2.0)
     state, _ = on.replan(lanes, world, EGO.plan(world))
-    assert state.off_lane.any() and not (state.off_lane & ~state.coalition).any()
+    assert state.off_lane.any()
+    assert not (state.off_lane & ~state.coalition).any()
     moved = (state.routed.points != lanes.routed.points).flatten(2).any(-1)
     assert torch.equal(moved, state.off_lane)
     nobody = replace(
         state, coalition=state.coalition & False, target=state.target * 0 - 1
     )
     calm, _ = on.replan(nobody, world, EGO.plan(world))
-    assert not calm.off_lane.any() and torch.equal(
-        calm.routed.points, lanes.routed.points
-    )
+    assert not calm.off_lane.any()
+    assert torch.equal(calm.routed.points, lanes.routed.points)
 
 
 @pytest.mark.parametrize("support", ["topology", "random"])
@@ -114,7 +115,8 @@ def test_the_other_supports_choose_a_coalition_too(support):
         eta=2.0,
         seeds=[5, 6, 7],
     )
-    assert plan.adversary.any() and torch.equal(plan.adversary, again.adversary)
+    assert plan.adversary.any()
+    assert torch.equal(plan.adversary, again.adversary)
     vehicles = plan.adversary.shape[1]
     assert not (
         plan.adversary & (scene["parked"] | ~scene["valid"])[:, :vehicles]

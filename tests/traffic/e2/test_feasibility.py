@@ -29,10 +29,8 @@ def test_routes_that_cross_meet_where_the_lines_do():
     table = result.conflicts
     assert result.mask[0].tolist() == [False, True] + [False] * 6
     assert table.s[0, 1, 0] == pytest.approx(20 + 41.7, abs=0.05)
-    assert (
-        table.exists[0, 1].tolist() == [True] + [False] * 5
-        and not table.exists[0, 2].any()
-    )
+    assert table.exists[0, 1].tolist() == [True] + [False] * 5
+    assert not table.exists[0, 2].any()
 
 
 def test_windows_hold_what_both_can_reach():
@@ -43,7 +41,8 @@ def test_windows_hold_what_both_can_reach():
     alone = (
         math.sqrt(100 + 2 * push * (50 - 4.5 / 2)) - 10
     ) / push  # the ego flat out, to its front bumper
-    assert earliest == pytest.approx(alone, abs=0.15) and latest == SETTINGS.horizon
+    assert earliest == pytest.approx(alone, abs=0.15)
+    assert latest == SETTINGS.horizon
 
 
 @pytest.mark.parametrize(
@@ -89,9 +88,8 @@ def test_whoever_is_on_the_road_near_a_centreline_and_along_it_is_associated(
     world.states[:, 1, 2] += turn
     world.scene["field"].fill_(depth)
     result = feasible_vehicles(world.scene, world, settings=SETTINGS)
-    assert result.associated[0, 1] == associated and (
-        associated or not result.mask.any()
-    )
+    assert result.associated[0, 1] == associated
+    assert associated or not result.mask.any()
 
 
 @pytest.mark.parametrize(
@@ -125,10 +123,8 @@ def test_absent_vehicles_and_the_ego_are_never_feasible_and_scenes_do_not_mix():
     world = make_world([EGO, (50.0, -40.0, UP, 10.0)], copies=3)
     world.valid[1, 1] = False
     result = feasible_vehicles(world.scene, world, settings=SETTINGS)
-    assert (
-        result.mask[:, 1].tolist() == [True, False, True]
-        and not result.mask[:, 0].any()
-    )
+    assert result.mask[:, 1].tolist() == [True, False, True]
+    assert not result.mask[:, 0].any()
     torch.testing.assert_close(result.conflicts.s[2], alone.conflicts.s[0])
 
 

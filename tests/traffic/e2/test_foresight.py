@@ -42,7 +42,8 @@ def test_worth_is_highest_just_beyond_what_the_competent_driver_needs():
     near, middle, far = (
         float(standing(gap)().worth) for gap in (1.1 * need, 1.5 * need, 40.0)
     )
-    assert 0.5 < near < 1 and near > middle > far > 0
+    assert 0.5 < near < 1
+    assert near > middle > far > 0
     assert float(standing(0.8 * need)().worth) == 0, "nobody could prevent it"
     assert float(standing(40.0, aside=4.0)().worth) == 0, "nobody is in the way"
 
@@ -82,7 +83,8 @@ def test_who_reverses_is_foreseen_as_the_same_motion_forwards():
         )
         for each in (path, mirrored(path))
     ]
-    assert float(ways[0].worth) > 0.2 and float(ways[0].time) < 3
+    assert float(ways[0].worth) > 0.2
+    assert float(ways[0].time) < 3
     for ahead, back in zip(*ways, strict=True):
         torch.testing.assert_close(back, ahead)
 

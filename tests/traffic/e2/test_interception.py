@@ -136,9 +136,8 @@ def test_what_is_proposed_keeps_the_limits(eta):
     some = found.cost[:, 0].isfinite()
     assert some.any()
     knots = found.knots[some, 0]
-    assert (knots <= settings.push * eta + 1e-5).all() and (
-        knots >= -settings.brake * eta - 1e-5
-    ).all()
+    assert (knots <= settings.push * eta + 1e-5).all()
+    assert (knots >= -settings.brake * eta - 1e-5).all()
     v = world.states[some, 1, 3]
     _, _, curvature = interpolate(
         found.path[some, 0], torch.arange(2.0, 20.0, 2.0).expand(int(some.sum()), -1)

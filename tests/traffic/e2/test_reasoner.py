@@ -135,19 +135,18 @@ def test_the_model_decides_and_is_asked_by_schema_at_temperature_zero(tmp_path):
         "the rules would take the first only"
     )
     request = requests[0]
-    assert (
-        request["path"] == "/v1/chat/completions"
-        and request["temperature"] == 0
-        and request["model"] == "small"
-    )
+    assert request["path"] == "/v1/chat/completions"
+    assert request["temperature"] == 0
+    assert request["model"] == "small"
     schema = request["response_format"]["json_schema"]
-    assert schema["strict"] and schema["schema"]["properties"]["vehicles"]["items"][
-        "required"
-    ] == ["id", *CRITERIA]
+    assert schema["strict"]
+    assert schema["schema"]["properties"]["vehicles"]["items"]["required"] == [
+        "id",
+        *CRITERIA,
+    ]
     text = request["messages"][-1]["content"]
-    assert (
-        "50 m ahead of it and 40 m to its right" in text and "Feasible" not in text
-    ), "the rules' verdict is not told"
+    assert "50 m ahead of it and 40 m to its right" in text
+    assert "Feasible" not in text, "the rules' verdict is not told"
     assert counts == {
         "lm_scenes": 1,
         "lm_requests": 1,
@@ -214,11 +213,9 @@ def test_answers_are_kept_by_content(tmp_path):
     with chat_server(verdicts) as (url, requests):
         first, _ = ask(url, tmp_path, made=world())
         again, counts = ask(url, tmp_path, made=world())
-        assert (
-            len(requests) == 1
-            and counts["lm_cached"] == 1
-            and torch.equal(first.mask, again.mask)
-        )
+        assert len(requests) == 1
+        assert counts["lm_cached"] == 1
+        assert torch.equal(first.mask, again.mask)
         ask(url, tmp_path, made=world(), model="other")
         assert len(requests) == 2, "another model is asked anew"
         moved = world()

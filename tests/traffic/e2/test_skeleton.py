@@ -35,12 +35,10 @@ def test_the_near_agents_are_those_of_least_cost_and_act_on_the_ego():
     )
     cost = torch.tensor([[0.0, 3.0, 2.0, 1.0, torch.inf, 0.0, 0.0, 0.0]])
     result = skeleton_of(world, mask(world, 1, 2, 3), near=2, cost=cost)
-    assert members(result) == [[0, 2], [0, 3]] and torch.equal(
-        result.near, result.coalition
-    )
-    assert result.target[0, :4].tolist() == [-1, -1, 0, 0] and result.depth[
-        0, :4
-    ].tolist() == [0, 0, 1, 1]
+    assert members(result) == [[0, 2], [0, 3]]
+    assert torch.equal(result.near, result.coalition)
+    assert result.target[0, :4].tolist() == [-1, -1, 0, 0]
+    assert result.depth[0, :4].tolist() == [0, 0, 1, 1]
     assert not result.far.any()
     assert members(skeleton_of(world, mask(world, 1), near=3, far=2)) == [[0, 1]], (
         "a small support is used whole"
@@ -52,9 +50,8 @@ def test_a_column_forms_a_chain_and_its_intermediate_is_controlled():
     result = skeleton_of(world, mask(world, 1, 2, 3), near=1)
     assert result.target[0, :4].tolist() == [-1, 0, 1, 2]
     assert result.depth[0, :4].tolist() == [0, 1, 2, 3]
-    assert result.near[0].nonzero().tolist() == [[1]] and result.far[
-        0
-    ].nonzero().tolist() == [[3]]
+    assert result.near[0].nonzero().tolist() == [[1]]
+    assert result.far[0].nonzero().tolist() == [[3]]
     assert members(skeleton_of(world, mask(world, 1, 3), near=1)) == [[0, 1]], (
         "it must be in the support"
     )
@@ -76,10 +73,8 @@ def test_a_column_forms_a_chain_and_its_intermediate_is_controlled():
 def test_chains_beyond_the_limits_are_pruned_to_the_near(change, near, linked):
     world = make_world([EGO, *COLUMN])
     result = skeleton_of(world, mask(world, 1, 2, 3), near=near, **change)
-    assert (
-        members(result) == ([[0, 1], [0, 2], [0, 3]] if linked else [[0, 1]])
-        and bool(result.far.any()) == linked
-    )
+    assert members(result) == ([[0, 1], [0, 2], [0, 3]] if linked else [[0, 1]])
+    assert bool(result.far.any()) == linked
 
 
 @pytest.mark.parametrize(("limit", "far"), [(64.0, 3), (63.0, 2)])
@@ -96,7 +91,8 @@ def test_the_ego_s_own_neighbour_and_following_lanes_hold_no_initiator():
         [EGO, (12.0, -10.0, UP, 8.0), (-30.0, 3.5, 0.0, 12.0), (-20.0, 0.0, 0.0, 12.0)]
     )
     result = skeleton_of(world, mask(world, 1, 2, 3), near=1)
-    assert members(result) == [[0, 1]] and not result.far.any()
+    assert members(result) == [[0, 1]]
+    assert not result.far.any()
     assert lane_of(world.states[:, :4], world.scene).tolist() == [[0, -1, 1, 0]]
     turned = world.states[:, :4].clone()
     turned[0, :, 2] += torch.tensor([1.0, -1.0, 1.1, -1.1])  # 60 degrees are 1.047
@@ -212,7 +208,8 @@ def test_influence_is_that_of_the_equations_of_motion(seed):
                         for t in times.tolist()
                     ]
                 )
-    assert wanted.any() and torch.equal(found, wanted)
+    assert wanted.any()
+    assert torch.equal(found, wanted)
 
 
 def earliest(link, path):
@@ -261,13 +258,15 @@ def test_a_chain_is_a_shortest_one_whose_effects_never_precede_their_causes(seed
     viable = [path for path in paths if earliest(link, path) is not None]
     target = result.target[0].tolist()
     if not viable:
-        assert not result.far.any() and torch.equal(result.coalition, result.near)
+        assert not result.far.any()
+        assert torch.equal(result.coalition, result.near)
         return
     way = [far + 1]
     while way[-1] != 0:
         way.append(target[way[-1]])
     path = tuple(7 if i == 0 else i - 1 for i in way)
-    assert path in viable and len(path) == min(map(len, viable))
+    assert path in viable
+    assert len(path) == min(map(len, viable))
     assert result.far.nonzero().tolist() == [[0, far + 1]]
     assert set(result.coalition[0].nonzero()[:, 0].tolist()) == {
         i + 1 for i in near

@@ -73,8 +73,10 @@ def test_first_contact_is_that_of_stepped_polygons():
 def test_ttc_of_a_follower_of_equal_speeds_and_at_the_horizon(gap, ttc):
     states = torch.tensor([[0.0, 0, 0, 10], [4 + gap, 0, 0, 0], [-30, 0, 0, 10]])
     found = time_to_collision(states, torch.tensor([4.0, 2.0]).expand(3, 2))
-    assert RISK_SECONDS == 8.0 and found[0, 1].item() == pytest.approx(ttc)
-    assert found[0, 2] == torch.inf and found[0, 0] == 0
+    assert RISK_SECONDS == 8.0
+    assert found[0, 1].item() == pytest.approx(ttc)
+    assert found[0, 2] == torch.inf
+    assert found[0, 0] == 0
 
 
 def test_weights_are_the_sigmoid_of_the_ttc_and_nothing_for_the_absent():
@@ -88,11 +90,9 @@ def test_weights_are_the_sigmoid_of_the_ttc_and_nothing_for_the_absent():
         settings=settings,
     )
     assert weight[0, 1].item() == pytest.approx(1 / (1 + math.exp((2.9 - 2.5) / 0.5)))
-    assert (
-        weight[1, 0] == weight[0, 1]
-        and weight[2].sum() == 0
-        and weight.diagonal().sum() == 0
-    )
+    assert weight[1, 0] == weight[0, 1]
+    assert weight[2].sum() == 0
+    assert weight.diagonal().sum() == 0
 
 
 def cliques_by_definition(weight, distance, valid, settings):
@@ -156,7 +156,8 @@ def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypa
     valid[:, :, 0] = valid[:, 0] = True
     settings = TopologySettings(candidates=3, max_clique=3, top_cliques=2)
     result = topological_candidates(track, valid, size=size, settings=settings)
-    assert result.steps.tolist() == list(range(0, 81, STRIDE)) and STRIDE == 5
+    assert result.steps.tolist() == list(range(0, 81, STRIDE))
+    assert STRIDE == 5
     score = [0] * 11
     nearest = [math.inf] * 11
     for number, step in enumerate(result.steps.tolist()):
@@ -175,9 +176,8 @@ def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypa
         (i for i in range(1, 11) if score[i] > 0),
         key=lambda i: (-score[i], nearest[i], i),
     )
-    assert len(order) > 3 and result.candidates[0].nonzero()[:, 0].tolist() == sorted(
-        order[:3]
-    )
+    assert len(order) > 3
+    assert result.candidates[0].nonzero()[:, 0].tolist() == sorted(order[:3])
 
 
 def candidates_of(pairs, vehicles, monkeypatch):

@@ -44,7 +44,8 @@ class TimePoint:
     time_us: int
 
     def __post_init__(self):
-        assert isinstance(self.time_us, int) and self.time_us >= 0
+        assert isinstance(self.time_us, int)
+        assert self.time_us >= 0
 
 
 class VehicleParameters:
