@@ -41,19 +41,19 @@ def put_rows(value: Value, rows: Tensor, new: Value) -> Value:
 def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
     """Map function over every tensor or TensorDict of a value and its counterparts in
     others; the rest is kept."""
+    values = (value, *others)
     if isinstance(value, Tensor | TensorDictBase | SceneRows):
-        return function(value, *others)
+        return function(*values)
     if isinstance(value, tuple):  # a named tuple
-        return type(value)(
-            *(map_tensors(function, *part) for part in zip(value, *others, strict=True))
-        )
+        parts = zip(*values, strict=True)
+        return type(value)(*(map_tensors(function, *part) for part in parts))
     if not is_dataclass(value) or isinstance(value, type):
         return value
-    names = [field.name for field in fields(value)]
-    parts = {name: [getattr(each, name) for each in (value, *others)] for name in names}
-    return replace(
-        value, **{name: map_tensors(function, *part) for name, part in parts.items()}
-    )
+    changes = {
+        name: map_tensors(function, *(getattr(whole, name) for whole in values))
+        for name in (part.name for part in fields(value))
+    }
+    return replace(value, **changes)
 
 
 def of_scenes(context: Context, rows: Tensor) -> Context:
@@ -221,33 +221,44 @@ def crop_world(world: World, group: Group) -> World:
 
 
 def crop_state(value: Any, group: Group, width: int, axes: int | None = 1) -> Any:
-    """Returns the group's part of a state of scenes of `width` vehicle rows; axes: of a
-    tensor, see `no_vehicles`."""
+    """Returns the group's part of a state.
+
+    Args:
+        value: a tensor, or a nested dataclass of tensors.
+        group: scenes.
+        width: vehicle rows of the scenes.
+        axes: vehicle axes of a tensor, see `no_vehicles`.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         parts = {
-            each.name: crop_state(
-                getattr(value, each.name), group, width=width, axes=axes_of(each)
+            part.name: crop_state(
+                getattr(value, part.name), group, width=width, axes=axes_of(part)
             )
-            for each in fields(value)
+            for part in fields(value)
         }
         return replace(value, **parts)
     value = value[group.rows]
     if axes is None:
-        return torch.cat(
-            [value[:, : group.vehicles], value[:, width : width + group.others]], 1
-        )
+        return value[:, group.agents(width)]
     return value[(slice(None), *[slice(group.vehicles)] * axes)]
 
 
 def write_state(full: Any, part: Any, group: Group, axes: int | None = 1) -> None:
-    """Writes the group's part of a state back, in place."""
+    """Writes the group's part of a state back, in place.
+
+    Args:
+        full: a tensor, or a nested dataclass of tensors, of all scenes.
+        part: of the group's scenes.
+        group: scenes.
+        axes: vehicle axes of a tensor, see `no_vehicles`.
+    """
     if is_dataclass(full):
-        for each in fields(full):
+        for part_of in fields(full):
             write_state(
-                getattr(full, each.name),
-                getattr(part, each.name),
+                getattr(full, part_of.name),
+                getattr(part, part_of.name),
                 group=group,
-                axes=axes_of(each),
+                axes=axes_of(part_of),
             )
     elif axes == 2:
         index = torch.arange(group.vehicles)

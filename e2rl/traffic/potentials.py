@@ -131,12 +131,16 @@ def _length(vector: Tensor) -> Tensor:
 def box_gap(
     states: Tensor, size: Tensor, other: Tensor, other_size: Tensor, disks: int = DISKS
 ) -> Tensor:
-    """Returns the signed gap [...] m between a vehicle as `disks` disks and another as
-    an oriented box, < 0 where they overlap.
+    """Returns the signed gap [...] m between a vehicle as disks and another as an
+    oriented box, < 0 where they overlap. Leading dimensions are broadcast.
 
-    states, other [..., 4], sizes [..., 2], leading dims broadcast. The disks are as
-    wide as the vehicle and lie along its centreline from bumper to bumper; the gap is
-    that of the nearest one.
+    Args:
+        states: [..., 4], the vehicle's.
+        size: [..., 2] m.
+        other: [..., 4].
+        other_size: [..., 2] m.
+        disks: as wide as the vehicle, along its centreline from bumper to bumper; the
+            gap is that of the nearest one.
     """
     along = torch.linspace(-0.5, 0.5, disks, device=states.device)
     shift = (size[..., :1] - size[..., 1:]).clamp(min=0) * along
@@ -173,11 +177,10 @@ def _overlap_term(states: Tensor, context: PotentialContext) -> Tensor:
     over steps, their sum [B, V]."""
     size = context.scene["size"][:, : states.shape[1]]
     index, near = _neighbours(states, context, size=size)
-    scene, own, rank = near.nonzero(
-        as_tuple=True
-    )  # most of the nearest are too far to cost anything
-    mine = (scene, own)
-    them = (scene, index[scene, own, rank])
+    # Most of the nearest are too far to cost anything.
+    scene, vehicle, rank = near.nonzero(as_tuple=True)
+    mine = (scene, vehicle)
+    them = (scene, index[scene, vehicle, rank])
     gap = box_gap(
         states[mine],
         size[mine][:, None],
@@ -278,9 +281,14 @@ def adversarial_potential(
     """Returns V_adv [B, V] of decoded states [B, V, H', 4] at SAMPLED_STEPS: low where
     a vehicle meets its own target.
 
-    Soft minimum over time of the distance between the centres (temperature in m,
-    default `narrow`), TTC cost and closing speed, all against the detached target. 0
-    outside the coalition.
+    Soft minimum over time of the distance between the centres, TTC cost and closing
+    speed, all against the detached target. 0 outside the coalition.
+
+    Args:
+        states: [B, V, H', 4].
+        context: what stays fixed while a plan is denoised.
+        settings: weights.
+        temperature: m, of the soft minimum (None: `narrow`).
     """
     states = with_ego(states, context)
     index = context.target.clamp(min=0)

@@ -262,11 +262,16 @@ def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
 def scored(
     candidates: _Candidates, accel: Tensor, target: _Target, limits: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10] of
-    accelerations accel [B, M, R, A] within limits [2].
+    """Returns cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10].
 
     Time gap: distance to the target over speed, least over the steps at which the
     target is on the candidate.
+
+    Args:
+        candidates: routes of the vehicles.
+        accel: [B, M, R, A] m/s^2, accelerations to hold.
+        target: on the candidates.
+        limits: [2] m/s^2, least and largest acceleration.
     """
     knots = _knots(candidates, accel, limits=limits)
     v, travelled = _decode(candidates, knots)

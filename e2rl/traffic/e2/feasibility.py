@@ -208,7 +208,7 @@ def find_conflicts(
         acceleration=EGO_ACCELERATION,
     )
     ego = _Samples(*(value[b] for value in ego))
-    own = _sample(
+    vehicle = _sample(
         scene["route_points"][place],
         own_s[place],
         end=scene["route_length"][place],
@@ -216,13 +216,13 @@ def find_conflicts(
         length=length[b, v],
         acceleration=MAX_ACCELERATION,
     )
-    meeting = _meeting(own, ego, settings=settings)
+    meeting = _meeting(vehicle, ego, settings=settings)
     row = torch.arange(len(b), device=b.device)
     on_own = (row, meeting.own)
     on_ego = (row, meeting.ego)
-    conflict_s = own.s[on_own] + _to_intersection(
-        own.xy[on_own],
-        own.heading[on_own],
+    conflict_s = vehicle.s[on_own] + _to_intersection(
+        vehicle.xy[on_own],
+        vehicle.heading[on_own],
         ego=ego.xy[on_ego],
         ego_heading=ego.heading[on_ego],
     )

@@ -124,7 +124,12 @@ def _contacts(
     steps = path.shape[1] - 1
     population = Population(path.new_tensor(DELAYS), path.new_tensor(BRAKING))
     pace = path[..., 3].abs()
-    planned = (pace.diff(dim=1) / DT).T[..., None].expand(steps, *pairs).flatten(1)
+    planned = (
+        (pace.diff(dim=1) / DT)
+        .T[..., None]
+        .expand(steps, *along.rear.shape[1:])
+        .flatten(1)
+    )
     length, speed, since = (
         value[:, None].expand(pairs).flatten() for value in (length, pace[:, 0], since)
     )

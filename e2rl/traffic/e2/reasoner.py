@@ -156,8 +156,15 @@ def _next_light(
 def describe(
     scene: TensorDictBase, world: World, conflicts: Conflicts, row: int
 ) -> tuple[str, dict[int, str]]:
-    """The ego of scene `row` and its mission in words, and every present vehicle that
-    is not parked, by its index."""
+    """Returns the ego of a scene and its mission in words, and every present vehicle
+    that is not parked, by its index.
+
+    Args:
+        scene: B scenes.
+        world: the scenes now.
+        conflicts: by the rules.
+        row: which scene.
+    """
     vehicles = scene["route_points"].shape[1]
     present = (
         (world.valid[row, :vehicles] & ~scene["parked"][row, :vehicles])
@@ -183,8 +190,16 @@ def describe(
 def describe_vehicle(
     scene: TensorDictBase, world: World, conflicts: Conflicts, row: int, vehicle: int
 ) -> str:
-    """Position and motion of a vehicle, and where its routes meet the ego's by the
-    rules, whose verdict is not told."""
+    """Returns position and motion of a vehicle, and where its routes meet the ego's by
+    the rules, whose verdict is not told.
+
+    Args:
+        scene: B scenes.
+        world: the scenes now.
+        conflicts: by the rules.
+        row: which scene.
+        vehicle: its row.
+    """
     rows = slice(row, row + 1)
     here = slice(vehicle, vehicle + 1)
     state = world.states[row, vehicle]

@@ -142,13 +142,17 @@ def _within_hops(adjacency: Tensor, hops: int) -> Tensor:
 
 
 class _Graph(NamedTuple):
-    """The risk graph of one step: adjacency and weights [V, V]; relevant nodes [V] bool;
-    distance [V] of each vehicle to the ego in m."""
+    """Risk graphs [...]: adjacency and weights [..., V, V]; relevant nodes [..., V]
+    bool; distance [..., V] of each vehicle to the ego in m."""
 
     adjacency: np.ndarray
     relevant: np.ndarray
     weight: np.ndarray
     distance: np.ndarray
+
+    def at(self, scene: int, step: int) -> "_Graph":
+        """The graph of one step of a scene."""
+        return _Graph(*(value[scene, step] for value in self))
 
 
 def _trim(clique: Clique, graph: _Graph, limit: int) -> Clique:
@@ -211,13 +215,15 @@ def topological_candidates(
     relevant = _within_hops(adjacency, HOPS)
     nodes = _within_hops(adjacency, HOPS + 1)
     adjacency = adjacency & nodes[..., :, None] & nodes[..., None, :]
-    arrays = [
-        value.cpu().numpy()
-        for value in (adjacency.to(torch.uint8), relevant, weights, distance)
-    ]
+    graphs = _Graph(
+        adjacency=adjacency.to(torch.uint8).cpu().numpy(),
+        relevant=relevant.cpu().numpy(),
+        weight=weights.cpu().numpy(),
+        distance=distance.cpu().numpy(),
+    )
     cliques = [
-        [_top_cliques(_Graph(*step), settings) for step in zip(*scene, strict=True)]
-        for scene in zip(*arrays, strict=True)
+        [_top_cliques(graphs.at(scene, step), settings) for step in range(len(steps))]
+        for scene in range(len(states))
     ]
     score = torch.zeros(states.shape[0], states.shape[2])
     for row, scene in zip(score, cliques, strict=True):
