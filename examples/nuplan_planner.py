@@ -266,7 +266,8 @@ class Scene:
         times = np.array([state.time_point.time_us for state in planned])
         if not times[0] - STEP_US <= now <= times[-1] - STEP_US:
             raise ValueError(
-                f"the trajectory is of {(times[0] - now) / 1e6:g} to {(times[-1] - now) / 1e6:g} s from now"
+                f"the trajectory is of {(times[0] - now) / 1e6:g} to "
+                f"{(times[-1] - now) / 1e6:g} s from now"
             )
         axles = [
             (one.rear_axle, one.dynamic_car_state.rear_axle_velocity_2d.x)
@@ -294,7 +295,8 @@ class Scene:
                 abs(driven - told) > 2.0 + 0.25 * driven
             ):  # e2rl follows poses and speeds
                 raise ValueError(
-                    f"the trajectory's poses move {driven:.1f} m, its rear-axle velocities {told:.1f} m"
+                    f"the trajectory's poses move {driven:.1f} m, its rear-axle "
+                    f"velocities {told:.1f} m"
                 )
         else:
             speed = speeds_of(x, y, heading, ego[5])

@@ -28,7 +28,8 @@ def main(num_scenes: str = "48") -> None:
     traffic = {name: e2rl.make_traffic(name, e2rl.load_prior()) for name in METHODS}
     prepare_fused(OmegaConf.create({"compile": True, "device": "cpu"}))
     print(
-        "| traffic | rollouts | median | 90% | 95% | largest difference, m | above 3 mm | other contacts |"
+        "| traffic | rollouts | median | 90% | 95% | largest difference, m | above 3 "
+        "mm | other contacts |"
     )
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for name, eta in METHODS.items():
@@ -43,7 +44,8 @@ def main(num_scenes: str = "48") -> None:
         )
         contacts = int((compiled.contact != eager.contact).sum())
         print(
-            f"| {name} | {len(distance)} | {quantiles} | {int((distance > CLOSE).sum())} | {contacts} |",
+            f"| {name} | {len(distance)} | {quantiles} | "
+            f"{int((distance > CLOSE).sum())} | {contacts} |",
             flush=True,
         )
 

@@ -100,7 +100,8 @@ def main() -> None:
             f"{split}: {len(maps)} nets, {len(scenes)} scenes, {len(content) / 1e6:.2f} MB"
         )
         print(
-            f'    "{split}": "{hashlib.sha256(content).hexdigest()}",  # SHA256 of e2rl/scenes/bundled.py'
+            f'    "{split}": "{hashlib.sha256(content).hexdigest()}",  # SHA256 of '
+            "e2rl/scenes/bundled.py"
         )
     print(f"refused {dict(refusals)}; {time.time() - began:.0f} s")
 

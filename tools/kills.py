@@ -43,10 +43,13 @@ STAGES = {
     "prior": f"{TRAINED} stage=prior num_scenes=40 prior.network.width=32 stage.steps=60"
     " stage.validate_every=10 stage.route_steps=50",
     "imitation": f"{TRAINED} stage=imitation num_scenes=8 stage.epochs=20 stage.minibatch=64",
-    "evolution": f"{TRAINED} prior.sampler.steps=2 num_scenes=4 rounds=3 batch=4 learner.round.scenes=4"
-    " learner.collect.batch=4 learner.collect.iterations=1 measure.scenes=4 measure.seeds=[0] measure.eta=2",
+    "evolution": f"{TRAINED} prior.sampler.steps=2 num_scenes=4 rounds=3 batch=4 "
+    "learner.round.scenes=4"
+    " learner.collect.batch=4 learner.collect.iterations=1 measure.scenes=4 "
+    "measure.seeds=[0] measure.eta=2",
     "evaluation": f"{TESTED} num_scenes=4 seeds=[0,1] batch=2 processes=2",
-    "table1": f"{TESTED} experiment=table1 methods=[e2,e2_pursuit,nominal,ctg_adv] num_scenes=2 seeds=[0,1] batch=1",
+    "table1": f"{TESTED} experiment=table1 methods=[e2,e2_pursuit,nominal,ctg_adv] "
+    "num_scenes=2 seeds=[0,1] batch=1",
 }
 WORKING = {
     ".hydra",

@@ -82,7 +82,8 @@ class Driven(NamedTuple):
         egos = list(dict.fromkeys(row["ego_policy"] for row in rows))
         if ego not in egos and (ego or len(egos) != 1):
             raise InputError(
-                f"{run}: has the egos {', '.join(egos) or 'none'}; name one by --ego, or two by --egos"
+                f"{run}: has the egos {', '.join(egos) or 'none'}; name one by --ego, "
+                "or two by --egos"
             )
         ego = ego or egos[0]
         driven = cls(
@@ -196,7 +197,8 @@ def check_complete(driven: Driven) -> None:
         ]
         if absent:
             shown = ", ".join(f"{scene} seed {seed}" for scene, seed in absent[:SHOWN])
-            count = f"{len(absent)} of {len(scenes) * len(settings['seeds'])} rollouts of {method} η={eta:g}"
+            expected = len(scenes) * len(settings["seeds"])
+            count = f"{len(absent)} of {expected} rollouts of {method} η={eta:g}"
             raise InputError(
                 f"{driven.run / TABLE}: lacks {count} ({shown}); go on with resume={driven.run}"
             )

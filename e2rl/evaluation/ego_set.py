@@ -146,7 +146,8 @@ def build_egos(config: DictConfig, name: str) -> EgoSet:
         ]
         if taken:
             raise InputError(
-                f"egos.{entry}: {', '.join(taken)} is the name of another ego, too; choose another name"
+                f"egos.{entry}: {', '.join(taken)} is the name of another ego, too; "
+                "choose another name"
             )
         egos |= {
             own: one_ego(config, entry, changes=changes)
@@ -155,7 +156,8 @@ def build_egos(config: DictConfig, name: str) -> EgoSet:
     counts = {len(members) for members in trainings.values()}
     if len(counts) > 1:
         raise InputError(
-            f"egos: {' and '.join(trainings)} have different numbers of checkpoints; give as many of each"
+            f"egos: {' and '.join(trainings)} have different numbers of checkpoints; "
+            "give as many of each"
         )
     return EgoSet(
         egos, list(map(str, config.egos)), pairs=compared(config), trainings=trainings
@@ -173,7 +175,8 @@ def trainings_of(config: DictConfig, name: str) -> dict[str, dict[str, Any]]:
         )
     if not isinstance(entry, DictConfig) or "ego" not in entry:
         raise InputError(
-            f"{where}={entry!r}: expected a file of conf/ego and changes, such as {{ego: idm, headway: 2}}"
+            f"{where}={entry!r}: expected a file of conf/ego and changes, such as "
+            f"{{ego: idm, headway: 2}}"
         )
     several = entry.get("checkpoints") or []
     if not isinstance(several, list | ListConfig):
@@ -241,15 +244,18 @@ def compared(config: DictConfig) -> list[tuple[str, str]]:
     for role in ROLES:
         if roles.get(role) not in names:
             raise InputError(
-                f"policy_learning.{role}={roles.get(role)}: none of egos ({', '.join(names)}); name one"
+                f"policy_learning.{role}={roles.get(role)}: none of egos "
+                f"({', '.join(names)}); name one"
             )
     if "nominal" not in row_names(config):
         raise InputError(
-            f"methods={list(config.methods)}: policy_learning compares nominal driving; name nominal, too"
+            f"methods={list(config.methods)}: policy_learning compares nominal "
+            "driving; name nominal, too"
         )
     if roles.after in (roles.before, roles.planner):
         raise InputError(
-            f"policy_learning: after is {roles.after}, and before or planner, too; name another of egos"
+            f"policy_learning: after is {roles.after}, and before or planner, too; "
+            "name another of egos"
         )
     others = [name for name in names if name not in (roles.before, roles.after)]
     return [(roles.after, roles.before), *((roles.after, name) for name in others)]

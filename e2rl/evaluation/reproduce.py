@@ -138,7 +138,8 @@ def _move(
     ]
     if wrong := [name for name in names if name not in (*MOVED, *WRITTEN, *files)]:
         raise InputError(
-            f"{where}: is made again as it was; leave out {', '.join(wrong)} (only {', '.join(MOVED)} and files of "
+            f"{where}: is made again as it was; leave out {', '.join(wrong)} (only "
+            f"{', '.join(MOVED)} and files of "
             "weights can be others)"
         )
     if (
@@ -180,7 +181,8 @@ def _check_weights(
             )
         if now[key] != value:
             raise InputError(
-                f"{where}: {key} is another file than the run's {name} (SHA-256 {_short(now[key])} instead of "
+                f"{where}: {key} is another file than the run's {name} (SHA-256 "
+                f"{_short(now[key])} instead of "
                 f"{_short(value)}); give the one that it used, by {mend}"
             )
 

@@ -26,7 +26,8 @@ from e2rl.traffic.traffic import Traffic
 SOUGHT = ("cfr_preventable", "cfr_clean", "cfr_counted", "cfr")
 MEASURED = (*SOUGHT, "aor_step", "cfr_bg", "real", "real_adv", "nfe")
 ERRORED = 0.01  # fraction of rollouts that an attack may lose
-NOMINAL = "nominal"  # after a metric's name: its value in the traffic that the budget is held against
+# After a metric's name: its value in the traffic that the budget is held against.
+NOMINAL = "nominal"
 DRIVING = ("collision", "comfort", "progress")
 COLLISIONS = (
     "cfr",
@@ -131,9 +132,9 @@ class PlannerTrials:
         METHOD@ETA`, and `errored`.
 
         collision: fraction of rollouts in which the ego touches something or leaves the
-        road; comfort: mean
-        |acceleration| [m/s^2]; progress [m]; errored: fraction in which the planner raised, of those that the traffic
-        did not lose; `errored: REASON`: fraction of all that errored for each reason.
+        road; comfort: mean |acceleration| [m/s^2]; progress [m]; errored: fraction in
+        which the planner raised, of those that the traffic did not lose; `errored:
+        REASON`: fraction of all that errored for each reason.
         """
         setup = replace(self.setup, ego=self.make(parameters), evasions=False)
         work = Work(processes=self.processes)

@@ -117,7 +117,8 @@ def search(
                 if name.startswith(("errored: ", "errored_")) and part
             ]
             raise InputError(
-                f"tuning: {parameters} yield NaN metrics ({', '.join(reasons) or 'check the scenes'})"
+                f"tuning: {parameters} yield NaN metrics "
+                f"({', '.join(reasons) or 'check the scenes'})"
             )
         rows.append(
             {
@@ -150,7 +151,8 @@ def read_study(
             name for name in {*known, *task} if known.get(name) != task.get(name)
         ):
             raise InputError(
-                f"tuning.study={file}: a study that differs in {', '.join(differ)}; name another file"
+                f"tuning.study={file}: a study that differs in {', '.join(differ)}; "
+                "name another file"
             )
         return [
             _row(

@@ -223,9 +223,11 @@ class Fused:
                 except (
                     Exception
                 ) as error:  # not pickled between processes, and hundreds of lines long
-                    why = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+                    first = str(error).partition("\n")[0]
+                    why = f"{type(error).__name__}: {first}"
                     raise InputError(
-                        f"compile=true: torch {torch.__version__} cannot compile {self.name} ({why}); take "
+                        f"compile=true: torch {torch.__version__} cannot compile "
+                        f"{self.name} ({why}); take "
                         f"torch {COMPILES}, with which all were compiled, or set compile=false"
                     ) from None
 
@@ -331,7 +333,8 @@ def check_compiler(option: str) -> None:
     """Raises InputError without a C++ compiler."""
     if not has_compiler():
         raise InputError(
-            f"{option}=true: no C++ compiler found (CXX, {', '.join(COMPILERS)}); install one, or set false"
+            f"{option}=true: no C++ compiler found (CXX, {', '.join(COMPILERS)}); "
+            "install one, or set false"
         )
 
 

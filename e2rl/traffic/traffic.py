@@ -12,10 +12,12 @@ brakes to a halt:
         def replan(self, state, world, ego_plan):
             now = world.states[:, : world.scene["route_log"].shape[1], None]        # [B, V, 1, 4]
             time = DT * torch.arange(1, HORIZON + 1, device=now.device)              # [H]
-            time = torch.minimum(time, now[..., 3] / self.braking)                   # [B, V, H], until the halt
+            time = torch.minimum(time, now[..., 3] / self.braking)  # [B, V, H]
             distance = now[..., 3] * time - self.braking * time**2 / 2
-            xy = now[..., :2] + distance[..., None] * torch.stack([now[..., 2].cos(), now[..., 2].sin()], -1)
-            rest = torch.stack([now[..., 2].expand_as(distance), now[..., 3] - self.braking * time], -1)
+            heading = now[..., 2].expand_as(distance)
+            ahead = torch.stack([heading.cos(), heading.sin()], -1)
+            xy = now[..., :2] + distance[..., None] * ahead
+            rest = torch.stack([heading, now[..., 3] - self.braking * time], -1)
             present = world.valid[:, : distance.shape[1], None].expand_as(distance)
             return state, TrafficPlan(torch.cat([xy, rest], -1), present)
 """
@@ -40,7 +42,9 @@ REPLAN_STEPS = 5  # steps of DT between two replans: 0.5 s, for every method
 POINT_STEPS = (
     5  # steps between two points of a plan that are kept in a rollout's file: 0.5 s
 )
-State = Any  # of B running scenes: a tensor, a TensorDict or a (nested) dataclass of them, batch first; or None
+# Of B running scenes: a tensor, a TensorDict or a (nested) dataclass of them, batch
+# first; or None.
+State = Any
 
 
 @dataclass

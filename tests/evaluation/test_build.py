@@ -59,7 +59,8 @@ def test_variants_share_the_prior_but_for_what_they_change_and_differ_in_nothing
         "eta=1",
         "+variants.far={synthesizer: {skeleton: {far: 2}, reselect: 0}}",
         "+variants.same={}",
-        "+variants.blind={synthesizer: ctg_adv, synthesizer.knowledge: predicted, synthesizer.responsibility: full}",
+        "+variants.blind={synthesizer: ctg_adv, synthesizer.knowledge: predicted, "
+        "synthesizer.responsibility: full}",
         "+variants.cold={prior.sampler.temperature: 0.5}",
         prior=prior,
     )

@@ -188,8 +188,8 @@ def test_a_planner_that_always_raises_is_rated_as_any_other(tmp_path):
         " ".join(answer_lines([row], rollouts=read_rows(tmp_path / TABLE))).split()
     )
     assert (
-        "preventable failures, or it raised, in 1 of 1 scene; preventable failures in 0 of 1; it raised in 1"
-        in text
+        "preventable failures, or it raised, in 1 of 1 scene; preventable failures in "
+        "0 of 1; it raised in 1" in text
     )
     assert "ZeroDivisionError: no way out (2 under replay)" in text
     assert "per 1,000 km" not in text

@@ -23,7 +23,8 @@ SCORER = Path(__file__).resolve().parents[3] / "shared" / "tools" / "score_rollo
 def test_rows_and_summary_agree_with_the_independent_scorer(tmp_path):
     if not SCORER.is_file():
         pytest.skip(
-            f"needs the independent scorer at {SCORER.parent.name}/{SCORER.name} beside the repository"
+            f"needs the independent scorer at {SCORER.parent.name}/{SCORER.name} "
+            "beside the repository"
         )
     pytest.importorskip(
         "pandas", reason="the independent scorer reads tables with pandas"

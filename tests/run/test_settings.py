@@ -15,7 +15,8 @@ def conf(tmp_path, monkeypatch):
     """A folder of configuration of its own."""
     (tmp_path / "driver").mkdir()
     (tmp_path / "driver" / "calm.yaml").write_text(
-        "name: calm\nreach:\n  look: 2.5\n  gap: 4\n  curve: true\n  kind: wide\n  times: [1, 2]\n  most: null\n"
+        "name: calm\nreach:\n  look: 2.5\n  gap: 4\n  curve: true\n  kind: wide\n  "
+        "times: [1, 2]\n  most: null\n"
     )
     for other in ("train.yaml", "sim/default.yaml"):  # whose values others may name
         (tmp_path / other).parent.mkdir(exist_ok=True)

@@ -67,7 +67,8 @@ def write_demand(
     rows.sort()
     lines = ["<routes>", *[vehicle_type(rng, name) for name in types]]
     lines += [
-        f'  <trip id="v{k}" type="{kind}" depart="{depart:.1f}" from="{start}" to="{end}" departLane="best" '
+        f'  <trip id="v{k}" type="{kind}" depart="{depart:.1f}" from="{start}" '
+        f'to="{end}" departLane="best" '
         'departSpeed="max"/>'
         for k, (depart, start, end, kind) in enumerate(rows)
     ]

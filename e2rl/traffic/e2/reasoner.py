@@ -46,7 +46,7 @@ lane offers, and where and when each route meets the ego's route. Judge every ve
 - can_meet_ego: one of its routes conflicts with the ego's route or overlaps it, and both can be there at the same time.
 - moving_or_blocking: it moves, or it stands in the ego's route closely ahead.
 Take the numbers as given and do not guess what is not described. Answer for every vehicle of the list once, by its
-number, in the JSON format asked for."""
+number, in the JSON format asked for."""  # noqa: E501
 
 CRITERIA = ("on_lane", "can_meet_ego", "moving_or_blocking")
 Verdicts = dict[int, tuple[bool, ...]]  # of each vehicle: the CRITERIA in order
@@ -206,7 +206,8 @@ def describe_vehicle(
     ego = world.states[row, 0]
     size = scene["size"][row, vehicle].tolist()
     sentences = [
-        f"Vehicle {vehicle} ({size[0]:.1f} x {size[1]:.1f} m) is {_position(to_frame(state[:2], ego))}, "
+        f"Vehicle {vehicle} ({size[0]:.1f} x {size[1]:.1f} m) is "
+        f"{_position(to_frame(state[:2], ego))}, "
         f"{_heading(float(state[2] - ego[2]))}, at {state[3]:.1f} m/s."
     ]
     s, d, error = (
@@ -228,7 +229,8 @@ def describe_vehicle(
         meeting = "; does not meet the ego's route in time"
         if conflicts.exists[at]:
             meeting = (
-                f"; meets the ego's route in {conflicts.s[at] - s[candidate]:.0f} m, both can be there "
+                f"; meets the ego's route in {conflicts.s[at] - s[candidate]:.0f} m, "
+                "both can be there "
                 f"{conflicts.earliest[at]:.1f} to {conflicts.latest[at]:.1f} s from now, "
                 f"{conflicts.time_gap[at]:.1f} s apart at present speeds"
             )
@@ -278,7 +280,10 @@ class LanguageReasoner:
                 max_retries=settings.retries,
             )
         except openai.OpenAIError as error:
-            reason = f"{str(error).splitlines()[0]} (for an endpoint without keys any OPENAI_API_KEY will do)"
+            reason = (
+                f"{str(error).splitlines()[0]} (for an endpoint without keys any "
+                "OPENAI_API_KEY will do)"
+            )
             raise InputError(f"{where}: {reason}") from error
         self._failures = (openai.OpenAIError, ValueError)
         self.settings = settings
