@@ -140,7 +140,7 @@ def find_failures(
     planner = make_ego(ego) if isinstance(ego, str) else ego
     traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
     names = [
-        each if isinstance(each, str) else type(each).__name__ for each in (ego, method)
+        part if isinstance(part, str) else type(part).__name__ for part in (ego, method)
     ]
     setup = Setup(scenes, planner, ego_name=names[0], sim=SimSettings())
     turns = [

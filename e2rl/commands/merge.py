@@ -31,9 +31,9 @@ def merge(runs: Sequence[Path], into: Path) -> int:
     """Copies the batches of shards that are done into a new run's folder; returns how
     many there are. Raises InputError where a folder is no run, `into` is there, or runs
     differ in scenes, inputs or settings."""
-    begun = [read_provenance(run) for run in runs]
-    first = begun[0]
-    for run, other in zip(runs, begun, strict=True):
+    provenances = [read_provenance(run) for run in runs]
+    first = provenances[0]
+    for run, other in zip(runs, provenances, strict=True):
         names = changed(first["inputs"], other["inputs"])
         names += changed(first["settings"], other["settings"])
         if names:
@@ -59,7 +59,7 @@ def merge(runs: Sequence[Path], into: Path) -> int:
                 with opened(source, run) as content, copy.open("wb") as file:
                     shutil.copyfileobj(content, file)
         versions: list[dict] = []
-        for provenance in begun:
+        for provenance in provenances:
             for version in provenance["versions"]:
                 if version not in versions:
                     versions.append(version)

@@ -102,10 +102,10 @@ class Driven(NamedTuple):
 
     def traffic(self) -> dict[tuple[str, float], list[dict]]:
         """The rows of rollouts by method and intensity, errored ones, too."""
-        found: dict[tuple[str, float], list[dict]] = {}
+        groups: dict[tuple[str, float], list[dict]] = {}
         for row in self.rows:
-            found.setdefault((row["method"], row["eta"]), []).append(row)
-        return found
+            groups.setdefault((row["method"], row["eta"]), []).append(row)
+        return groups
 
     def rollouts(self) -> dict[tuple, list[dict]]:
         """The rows of each PAIR: one, or of a search its tries; without those that the
@@ -223,8 +223,8 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
         for key in ours
         if key in theirs
     ]
-    found = [pair for pair in pairs if pair]
-    found.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))
+    matched = [pair for pair in pairs if pair]
+    matched.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))
     for (method, eta), rows in first.units().items():
         other = others.get((method, eta), [])
         values = difference(other, rows)
@@ -236,7 +236,9 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
                 column not in OTHERS or any(row[column] == 1 for row in (*rows, *other))
             )
         ]
-        own = [pair for pair in found if (pair["method"], pair["eta"]) == (method, eta)]
+        own = [
+            pair for pair in matched if (pair["method"], pair["eta"]) == (method, eta)
+        ]
         changes = [(pair["change"], pair["preventable"]) for pair in own]
         groups.append(
             {"method": method, "eta": eta, "unit": first.unit}
@@ -245,7 +247,7 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
             | {"preventable": {name: changes.count((name, True)) for name in CHANGES}}
             | {"differences": {name: values[RATES[name]] for name in shown}}
         )
-    return groups, found
+    return groups, matched
 
 
 def difference(
@@ -261,29 +263,30 @@ def difference(
 def check_shared(first: Driven, second: Driven) -> None:
     """Raises InputError, saying what differs, where the rollouts of two runs are no
     pairs."""
-    known = [read_provenance(one.run) for one in (first, second)]
-    each = [{**one["settings"], **one["inputs"]} for one in known]
+    provenances = [read_provenance(one.run) for one in (first, second)]
+    inputs_of_runs = [{**one["settings"], **one["inputs"]} for one in provenances]
     names = [
         name
-        for name in changed(*each)
+        for name in changed(*inputs_of_runs)
         if re.split("[.=]", name)[0] in SHARED and not name.startswith("scenes=")
     ]
     names.sort(key=lambda name: SHARED.index(re.split("[.=]", name)[0]))
-    told = [
-        f"{name} ({' and '.join(str(one.get(name))[:20] for one in each)})"
+    differences = [
+        f"{name} ({' and '.join(str(one.get(name))[:20] for one in inputs_of_runs)})"
         for name in names
     ]
     if names[:1] == ["scenes"]:
         ours, theirs = (
             {row["scene_id"] for row in one.rows} for one in (first, second)
         )
-        told[0] = (
+        differences[0] = (
             f"scenes ({len(ours)} and {len(theirs)}, {len(ours & theirs)} of one id)"
         )
-    if told:
+    if differences:
         mend = "run both with the same scenes, seeds, traffic and prior"
         raise InputError(
-            f"{second.run}: no pairs with {first.run}, which has other {', '.join(told)}; {mend}"
+            f"{second.run}: no pairs with {first.run}, which has other "
+            f"{', '.join(differences)}; {mend}"
         )
 
 
@@ -304,12 +307,12 @@ def pair_of(
     first, second = (max(each, key=nearness) for each in (tries, others))
     ways = [{cell_of(row) for row in each} - {None} for each in (tries, others)]
     crashed = [any(map(raised, each)) for each in (tries, others)]
-    found = (
+    failing = (
         [bool(each) for each in ways]
         if searched
         else [is_failure(first), is_failure(second)]
     )
-    failed = [one or other for one, other in zip(found, crashed, strict=True)]
+    failed = [one or other for one, other in zip(failing, crashed, strict=True)]
     differs = {
         "verdict": any(
             cell(first[name]) != cell(second[name])
@@ -326,14 +329,18 @@ def pair_of(
             "ending": crashed[0] != crashed[1],
             "way": searched and differs["way"],
         }
-    what = [name for name, there in differs.items() if there] if all(failed) else []
+    changes = [name for name, there in differs.items() if there] if all(failed) else []
     change = (
-        ("moved" if what else "same") if all(failed) else "gone" if failed[0] else "new"
+        ("moved" if changes else "same")
+        if all(failed)
+        else "gone"
+        if failed[0]
+        else "new"
     )
     preventable = any(map(bool, ways)) or any(crashed)
     about = {
         "change": change,
-        "what": what,
+        "what": changes,
         "preventable": preventable,
         **dict(zip(PAIR, key, strict=True)),
     }

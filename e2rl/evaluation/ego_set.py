@@ -68,10 +68,12 @@ class EgoSet:
         SECOND` of their `paired`. references, fields: see
         `e2rl.evaluation.summary.metric_rows`.
         """
-        pooled, more = pool_trainings(rows, features, trainings=self.trainings)
+        pooled, pooled_features = pool_trainings(
+            rows, features, trainings=self.trainings
+        )
         result = metric_rows(
             rows + pooled,
-            features + more,
+            features + pooled_features,
             egos=self.pairs,
             references=references,
             **fields,
@@ -106,15 +108,15 @@ def pool_trainings(
 def recorded_acceleration(scenes: SceneSet) -> float:
     """Returns the mean |acceleration| [m/s^2] of the recorded egos, by the rule of the
     metric `macc`."""
-    found = []
+    members_of = []
     for part in scenes.parts():
         stop = torch.full((len(part),), scenes.steps)
-        found.append(
+        members_of.append(
             mean_acceleration(
                 *ego_path(part["logged"].double(), part["logged_valid"], stop=stop)
             )
         )
-    return torch.cat(found).nanmean().item()
+    return torch.cat(members_of).nanmean().item()
 
 
 # --- from the configuration

@@ -59,10 +59,12 @@ def record(
     """
     modes = find_modes(scored.rows)
     write_rollouts(folder, scored.rows, scored.errored)
-    known = summarise(scored.rows, scored.samples)
+    summary = summarise(scored.rows, scored.samples)
     rows = []
-    for row in [*known, *empty_rows(known, scored.errored)]:
-        errored = [each for each in scored.errored if group_of(each) == group_of(row)]
+    for row in [*summary, *empty_rows(summary, scored.errored)]:
+        errored = [
+            attempt for attempt in scored.errored if group_of(attempt) == group_of(row)
+        ]
         rows.append({"errored": count_reasons(errored)} | row)
     if folder is not None:
         write_tables(folder, rows, modes=modes, atlas=find_atlas(scored.rows))

@@ -79,7 +79,7 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     whole = config.copy()
     whole.failure = None
     saved = saved_configuration(whole, old, where=where)
-    known = read_provenance(old)
+    provenance = read_provenance(old)
     if missing := [
         name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()
     ]:
@@ -89,14 +89,14 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     read_metrics(old / METRICS_FILE)  # what is damaged is told now, and not at the end
     files = {
         name: value
-        for name, value in known["inputs"].items()
+        for name, value in provenance["inputs"].items()
         if "=" in name and isinstance(value, str)
     }
     _move(
         config,
         saved,
         files=[_key(name) for name in files],
-        choices=known["choices"],
+        choices=provenance["choices"],
         where=where,
     )
     check_written(saved, old, where, config, load_config())
@@ -106,8 +106,8 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     saved.scenes = str(old / SCENES)
     saved.failure = config.failure or saved.failure
     _check_weights(config, saved, files=files, where=where)
-    _tell_versions(saved, known, where=where)
-    return Run(saved, Run.of(config).folder, choices=known["choices"])
+    _tell_versions(saved, provenance, where=where)
+    return Run(saved, Run.of(config).folder, choices=provenance["choices"])
 
 
 def files_of_run(config: DictConfig) -> str:
@@ -128,13 +128,15 @@ def _move(
     where: str,
 ) -> None:
     """Set in `saved` what the command line may set anew."""
-    given = [
+    changed_keys = [
         item.lstrip("+~").partition("=")[::2]
         for item in HydraConfig.get().overrides.task
     ]
     free = ("reproduce", "failure", *ALWAYS)
     names = [
-        name for name, value in given if name not in free and choices.get(name) != value
+        name
+        for name, value in changed_keys
+        if name not in free and choices.get(name) != value
     ]
     if wrong := [name for name in names if name not in (*MOVED, *WRITTEN, *files)]:
         raise InputError(
@@ -166,7 +168,7 @@ def _check_weights(
 ) -> None:
     """InputError where a file that the run's configuration named is another one now, or
     not there; files: hash of each {key=path: SHA-256}."""
-    now = {name.partition("=")[0]: value for name, value in inputs(saved)}
+    present = {name.partition("=")[0]: value for name, value in inputs(saved)}
     for name, value in files.items():
         key = name.partition("=")[0]
         setting = _key(name)
@@ -175,14 +177,14 @@ def _check_weights(
         mend = (
             f"{'++' if OmegaConf.select(config, setting) is None else ''}{setting}=FILE"
         )
-        if key not in now:
+        if key not in present:
             raise InputError(
                 f"{where}: {name}: not there; say where the file lies that the run used, by {mend}"
             )
-        if now[key] != value:
+        if present[key] != value:
             raise InputError(
                 f"{where}: {key} is another file than the run's {name} (SHA-256 "
-                f"{_short(now[key])} instead of "
+                f"{_short(present[key])} instead of "
                 f"{_short(value)}); give the one that it used, by {mend}"
             )
 
@@ -190,11 +192,11 @@ def _check_weights(
 def _tell_versions(saved: DictConfig, known: Mapping[str, Any], where: str) -> None:
     """Tell on stderr which versions, and which files in conf/ of methods and egos, are
     others than the run's."""
-    then = known["versions"][-1]
-    now = versions(saved)
-    told = [
-        f"{name} {_short(then.get(name))} then, {_short(now.get(name))} now"
-        for name in changed(then, now)
+    recorded = known["versions"][-1]
+    installed = versions(saved)
+    differing = [
+        f"{name} {_short(recorded.get(name))} then, {_short(installed.get(name))} now"
+        for name in changed(recorded, installed)
     ]
     before = {
         name: value
@@ -202,13 +204,13 @@ def _tell_versions(saved: DictConfig, known: Mapping[str, Any], where: str) -> N
         if not isinstance(value, str)
     }
     here = json.loads(json.dumps(dict(inputs(saved))))
-    told += [
+    differing += [
         f"conf/{name.replace('=', '/')}.yaml"
         for name, value in before.items()
         if here.get(name) != value
     ]
-    if told:
-        print(f"{where}: versions differ: {'; '.join(told)}", file=sys.stderr)
+    if differing:
+        print(f"{where}: versions differ: {'; '.join(differing)}", file=sys.stderr)
 
 
 def _short(value: Any) -> str:
@@ -271,12 +273,12 @@ class Comparison:
             f"  {name}: {_shown(then)} then, {_shown(now)} now"
             for name, then, now in self.different[:SHOWN]
         ]
-        more = len(self.different) - len(lines)
+        left_over = len(self.different) - len(lines)
         return "\n".join(
             [
                 f"{said}; {len(self.different):,} differ:",
                 *lines,
-                *([f"  and {more:,} more"] * (more > 0)),
+                *([f"  and {left_over:,} more"] * (left_over > 0)),
             ]
         )
 
@@ -284,18 +286,18 @@ class Comparison:
 def compared_with_run(config: DictConfig, folder: Path) -> Comparison:
     """Returns the table in `folder` beside that of the run that it reproduces; also as
     reproduced.json in `folder`."""
-    found = compare_tables(
+    comparison = compare_tables(
         read_metrics(Path(config.reproduce) / METRICS_FILE),
         read_metrics(folder / METRICS_FILE),
     )
     content = {
         "run": config.reproduce,
-        "equal": found.equal,
-        "close": found.close,
-        "different": found.different,
+        "equal": comparison.equal,
+        "close": comparison.close,
+        "different": comparison.different,
     }
     write_json(folder / RESULT, content)
-    return found
+    return comparison
 
 
 def compare_tables(then: Sequence[Mapping], now: Sequence[Mapping]) -> Comparison:

@@ -145,17 +145,17 @@ def read_run(run: Path) -> list[dict]:
     rows = read_rows(run / TABLE)
     file = run / ERRORED_FILE
     entries = (
-        read_json(file, lambda found: misfit(found, [ENTRY]), printable=False)
+        read_json(file, lambda found: misfit(missing, [ENTRY]), printable=False)
         if file.is_file()
         else []
     )
     place = {row["scene_id"]: row["location"] for row in rows}
-    known = set(map(_identity, rows))
-    found = [
+    identities = set(map(_identity, rows))
+    missing = [
         errored_row({"location": place.get(entry["scene_id"], "")} | entry)
         for entry in entries
     ]
-    return rows + [row for row in found if _identity(row) not in known]
+    return rows + [row for row in missing if _identity(row) not in identities]
 
 
 def _identity(row: dict) -> tuple:
@@ -206,8 +206,8 @@ def read_metrics(path: Path) -> list[dict]:
     """The rows of a metrics.json, null as NaN inside `metrics` and `paired`."""
 
     def wrong(rows: Any) -> str | None:
-        if found := misfit(rows, [METRICS_ROW]):
-            return found
+        if problem := misfit(rows, [METRICS_ROW]):
+            return problem
         others = (
             {name: shape for name, shape in SOMETIMES.items() if name in row}
             for row in rows
@@ -236,18 +236,20 @@ def read_json(
         printable: its texts hold no control characters, as those of a traceback do.
     """
     try:
-        found = json.loads(
+        content = json.loads(
             read_regular(path, MAX_JSON, within=path.parent), parse_int=_whole
         )
-        if reason := wrong(found):
+        if reason := wrong(content):
             raise ValueError(reason)
-        if printable and (odd := next(filter(UNPRINTABLE.search, _texts(found)), None)):
+        if printable and (
+            odd := next(filter(UNPRINTABLE.search, _texts(content)), None)
+        ):
             raise ValueError(f"{odd[:40]!r} holds control characters")
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: cannot be read ({cause(error)}); give the folder of a finished run"
         ) from error
-    return found
+    return content
 
 
 def _whole(digits: str) -> int:
@@ -309,8 +311,8 @@ def add_errored(path: Path, number: int, errored: Sequence[dict]) -> None:
     those of earlier rounds; a resumed run repeats some. A damaged file is begun anew.
     """
     try:
-        known = json.loads(read_regular(path, MAX_JSON, within=path.parent))
-        earlier = [entry for entry in known if entry["round"] < number]
+        content = json.loads(read_regular(path, MAX_JSON, within=path.parent))
+        earlier = [entry for entry in content if entry["round"] < number]
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
         earlier = []
     write_errored(path, [*earlier, *errored])

@@ -146,7 +146,7 @@ def paired_with_methods(
             others.append(other)
     paired = {}
     for other in others[:1] if only_first else others:
-        etas = {each[4] for each in groups if each[:4] == other[:4]}
+        etas = {group[4] for group in groups if group[:4] == other[:4]}
         name = other[2] if len(etas) == 1 else f"{other[2]}@{other[4]:g}"
         paired[name] = paired_differences(
             groups[key][0],
@@ -231,8 +231,8 @@ def scene_metrics(rows: Sequence[Mapping], draws: int) -> dict[str, dict[str, fl
     samples = [NO_SAMPLES] * len(scenes)
     metrics = summarise(scenes, samples, draws=draws, realism_draws=0)
     per_distance = [name for name, metric in METRICS.items() if metric.per]
-    known = {name: metrics[name] for name in events()}
-    return known | dict.fromkeys(per_distance, UNKNOWN)
+    event_metrics = {name: metrics[name] for name in events()}
+    return event_metrics | dict.fromkeys(per_distance, UNKNOWN)
 
 
 def empty_rows(known: Sequence[dict], errored: Sequence[dict]) -> list[dict]:

@@ -63,8 +63,8 @@ class PlannerObjective:
         errored = metrics.get("errored", 0.0) - reference.get("errored", 0.0)
         progress = metrics["progress"] / max(reference["progress"], 1e-6)
         rougher = metrics["comfort"] / max(reference["comfort"], 1e-6)
-        lost = self.progress * max(0.0, 1 - progress)
-        value = metrics["collision"] + self.comfort * metrics["comfort"] + lost
+        progress_lost = self.progress * max(0.0, 1 - progress)
+        value = metrics["collision"] + self.comfort * metrics["comfort"] + progress_lost
         excess = (
             max(0.0, self.progress_floor - progress)
             + max(0.0, rougher - self.comfort_ceiling)
@@ -138,15 +138,15 @@ class PlannerTrials:
         """
         setup = replace(self.setup, ego=self.make(parameters), evasions=False)
         work = Work(processes=self.processes)
-        found = drive_all([setup], self.methods, seeds=self.seeds, work=work)
+        driven_rows = drive_all([setup], self.methods, seeds=self.seeds, work=work)
         jobs = [
             (f"{number}", batch._replace(setup=setup))
             for number, batch in enumerate(self.failures)
         ]
         for scored in score_all(jobs, work, cost=lambda job: len(job[1].tasks)):
-            found.add(scored)
-        every = found.rows
-        errored = found.errored
+            driven_rows.add(scored)
+        every = driven_rows.rows
+        errored = driven_rows.errored
         rows = [row for row in every if row["errored"] != 1]
         metrics = driving(rows)
         driven = [*self.methods, *(method for _, method, _ in self.failures)]
@@ -202,8 +202,8 @@ class AttackTrials:
 
     @cached_property
     def reference(self) -> dict[str, float]:
-        found = self.measure(self.nominal)
-        return {f"{name} {NOMINAL}": found[name] for name in (*MEASURED, "errored")}
+        measured = self.measure(self.nominal)
+        return {f"{name} {NOMINAL}": measured[name] for name in (*MEASURED, "errored")}
 
     def measure(self, method: Method) -> dict[str, float]:
         """Returns the metrics of a method; InputError where all rollouts errored."""
@@ -213,12 +213,12 @@ class AttackTrials:
         )
         rows = scored.rows
         require_rows([row for row in rows if row["errored"] != 1], scored.errored)
-        kept = [k for k, row in enumerate(rows) if not lost(row)]
-        found = summarise(*scored.where(kept), realism_draws=0)
-        metrics = {name: found[name]["mean"] for name in MEASURED}
-        metrics["errored"] = 1 - len(kept) / len(rows)
+        counted = [k for k, row in enumerate(rows) if not lost(row)]
+        summary = summarise(*scored.where(counted), realism_draws=0)
+        metrics = {name: summary[name]["mean"] for name in MEASURED}
+        metrics["errored"] = 1 - len(counted) / len(rows)
         return metrics | {
-            f"{name}_{end}": found[name][end]
+            f"{name}_{end}": summary[name][end]
             for name in SOUGHT
             for end in ("low", "high")
         }

@@ -87,7 +87,7 @@ def search(
         told: called with all rows after each trial.
     """
     ranges = distributions(present, space)
-    given = [
+    fixed = [
         {name: present[name] for name in space},
         *sweep(present, space, count=settings.sweep),
     ]
@@ -102,8 +102,8 @@ def search(
     rows = read_study(file, task, ranges=ranges, objective=objective)
     for number in range(len(rows), settings.trials):
         parameters = (
-            given[number]
-            if number < len(given)
+            fixed[number]
+            if number < len(fixed)
             else proposal(rows, ranges, settings=settings, objective=objective)
         )
         metrics = dict(evaluate(present | parameters))
@@ -281,7 +281,7 @@ def distributions(present: Parameters, space: Space) -> dict:
         raise InputError(
             "tuning.space: no ranges; name one of each parameter to tune, {NAME: [low, high]}"
         )
-    found = {}
+    values_of = {}
     for name, (low, high, *scale) in space.items():
         where = f"tuning.space.{name}={[low, high, *scale]}"
         if name not in present:
@@ -300,8 +300,8 @@ def distributions(present: Parameters, space: Space) -> dict:
             if whole
             else optuna.distributions.FloatDistribution
         )
-        found[name] = kind(low, high, log=bool(scale))
-    return found
+        values_of[name] = kind(low, high, log=bool(scale))
+    return values_of
 
 
 def proposal(

@@ -80,8 +80,8 @@ def number(row: Row, column: str, unknown: float) -> float:
 def atlas_of(rows: Iterable[Row]) -> dict[Cell, list[Row]]:
     """The atlas of rows of rollouts.csv: the failures in each cell, the likeliest
     first, as are the cells. The order of the rows does not matter."""
-    found: dict[Cell, list[Row]] = {}
+    cells: dict[Cell, list[Row]] = {}
     for row in sorted(rows, key=by_likelihood):
         if (cell := cell_of(row)) is not None:
-            found.setdefault(cell, []).append(row)
-    return found
+            cells.setdefault(cell, []).append(row)
+    return cells

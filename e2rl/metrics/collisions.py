@@ -69,8 +69,10 @@ class Collisions:
         known one."""
         step = end[:, None] + torch.arange(-steps, 1)
         present = self.known_at(step).all(-1)
-        known = (present.flip(1).long().cumprod(1).sum(1) - 1).clamp(min=0)
-        return self.states_at(torch.maximum(step, (end - known)[:, None])), known
+        last_present = (present.flip(1).long().cumprod(1).sum(1) - 1).clamp(min=0)
+        return self.states_at(
+            torch.maximum(step, (end - last_present)[:, None])
+        ), last_present
 
     def column(self, values: Tensor, unknown: float) -> Tensor:
         """Column [B] (or [B, ...]) of values [C] (or [C, ...]), `unknown` in the other

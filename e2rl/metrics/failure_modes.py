@@ -96,8 +96,8 @@ def feature_vectors(failures: Sequence[Row]) -> np.ndarray:
                 columns.append([weight / 2 * (pair[part] == value) for pair in words])
     for name in SPEEDS:
         speeds = np.array([float(row.get(name, math.nan)) for row in failures])
-        known = speeds[~np.isnan(speeds)]
-        speeds[np.isnan(speeds)] = known.mean() if len(known) else 0.0
+        finite = speeds[~np.isnan(speeds)]
+        speeds[np.isnan(speeds)] = finite.mean() if len(finite) else 0.0
         columns.append(list(SPEED_WEIGHT * speeds))
     return np.array(columns).T
 
@@ -112,12 +112,12 @@ def cluster_failures(failures: Sequence[Row]) -> list[int]:
         range(len(failures)),
         key=lambda index: (*vectors[index], *identity(failures[index])),
     )
-    found = [1]
+    labels = [1]
     if len(order) > 1:
         tree = linkage(pdist(vectors[order], "cityblock"), "average")
-        found = fcluster(tree, THRESHOLD * (1 + 1e-9), "distance").tolist()
+        labels = fcluster(tree, THRESHOLD * (1 + 1e-9), "distance").tolist()
     sizes = Counter(
-        found
+        labels
     )  # keeps the order of first appearance, which decides between equal sizes
     number = {
         cluster: place for place, (cluster, _) in enumerate(sizes.most_common(), 1)
@@ -127,7 +127,7 @@ def cluster_failures(failures: Sequence[Row]) -> list[int]:
         for _, cluster in sorted(
             zip(
                 order,
-                found,
+                labels,
                 strict=True,
             )
         )

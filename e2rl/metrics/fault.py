@@ -83,9 +83,9 @@ def has_stood(collisions: Collisions) -> Tensor:
     """Bool [C, 2]: a vehicle has stood for the STOOD steps before the contact, or for
     as long as it is known."""
     window = collisions.before[:, None] - torch.arange(STOOD + 1)
-    known = collisions.known_at(window)
+    present = collisions.known_at(window)
     speed = collisions.states_at(window.clamp(min=0))[..., 3].abs()
-    return known[:, 0] & ~((speed > STANDING) & known).any(1)
+    return present[:, 0] & ~((speed > STANDING) & present).any(1)
 
 
 def enters_path(collisions: Collisions, steps: int) -> Tensor:
@@ -96,7 +96,7 @@ def enters_path(collisions: Collisions, steps: int) -> Tensor:
     ahead of the last of them.
     """
     window = collisions.stop[:, None] + torch.arange(-steps, 1)
-    known = collisions.known_at(window)[..., PARTNER] & (
+    present = collisions.known_at(window)[..., PARTNER] & (
         window < collisions.stop[:, None]
     )
     states = collisions.states_at(window.clamp(min=0))
@@ -108,7 +108,7 @@ def enters_path(collisions: Collisions, steps: int) -> Tensor:
         second_size=path_size[:, None],
     )
     later = torch.ones(gap.shape[-2:], dtype=torch.bool).triu()
-    return (known & ~((gap <= 0) & later).any(-1)).any(-1)
+    return (present & ~((gap <= 0) & later).any(-1)).any(-1)
 
 
 def path_boxes(states: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:

@@ -68,6 +68,8 @@ def contact_margin(batch: Batch) -> Tensor:
     the contact; 0 where the ego hardly moves."""
     row = torch.arange(len(batch["stop"]), device=batch["stop"].device)
     speed = batch["states"][row, batch["before"], 0, 3].abs()
-    lost = 1 - batch["driver"][row, batch["before"], 3] / speed.clamp(min=CREEPING)
-    lost = (lost.nan_to_num(0.0) * (speed > CREEPING)).clamp(0, 1)
-    return torch.where(batch["preventable"] == 1, PREVENTED, lost)
+    speed_lost = 1 - batch["driver"][row, batch["before"], 3] / speed.clamp(
+        min=CREEPING
+    )
+    speed_lost = (speed_lost.nan_to_num(0.0) * (speed > CREEPING)).clamp(0, 1)
+    return torch.where(batch["preventable"] == 1, PREVENTED, speed_lost)

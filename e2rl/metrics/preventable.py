@@ -95,12 +95,12 @@ def preventions(
     )
     result = {}
     for name, driver in drivers.items():
-        found = prevention(
+        preventions = prevention(
             driver,
             collision,
             along=along,
         )
-        result[name] = found._replace(states=found.states[:, :length])
+        result[name] = preventions._replace(states=preventions.states[:, :length])
     return result
 
 

@@ -78,15 +78,15 @@ def motion_columns(batch: Batch) -> Batch:
     states = batch["states"]
     valid = batch["valid"]
     stop = batch["stop"]
-    seen = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
-    seen[..., 0] = False
+    counted = valid & valid[..., :1] & steps_until(stop, states.shape[1])[..., None]
+    counted[..., 0] = False
     gap = distance(
         states[:, :, :1],
         batch["size"][:, None, :1],
         second=states,
         second_size=batch["size"][:, None],
     )
-    gap = gap.masked_fill(~seen, torch.inf).flatten(1).amin(-1)
+    gap = gap.masked_fill(~counted, torch.inf).flatten(1).amin(-1)
     moving = velocity(states)
     cost = closest_approach_cost(
         states[..., :2] - states[..., :1, :2], moving - moving[..., :1, :]
@@ -101,8 +101,8 @@ def motion_columns(batch: Batch) -> Batch:
         "min_dtc": gap.masked_fill(gap.isinf(), torch.nan).masked_fill(
             batch["hit"], 0.0
         ),
-        "ttc_c": mean_worst_cost(cost, seen & batch["adversaries"][:, None]),
-        "ttc_c_all": mean_worst_cost(cost, seen),
+        "ttc_c": mean_worst_cost(cost, counted & batch["adversaries"][:, None]),
+        "ttc_c_all": mean_worst_cost(cost, counted),
         "macc": mean_acceleration(path, count),
         "progress": driven,
         "driven_km": driven / 1000,
@@ -118,9 +118,9 @@ def motion_columns(batch: Batch) -> Batch:
 def mean_worst_cost(cost: Tensor, counted: Tensor) -> Tensor:
     """Mean [B] of each step's largest counted cost [B, T+1, N] over the steps that have
     one; NaN where none has."""
-    known = counted.any(-1)
+    any_counted = counted.any(-1)
     worst = (cost * counted).amax(-1)
-    return (worst * known).sum(-1) / known.sum(-1)  # 0 / 0 is NaN
+    return (worst * any_counted).sum(-1) / any_counted.sum(-1)  # 0 / 0 is NaN
 
 
 def ego_path(states: Tensor, valid: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
@@ -182,13 +182,14 @@ def route_completion(
         logged_valid: [B, T+1, N] bool.
     """
     steps = torch.full_like(count, logged.shape[1] - 1)
-    recorded, known = ego_path(
+    recorded, has_path = ego_path(
         logged,
         logged_valid,
         stop=steps,
     )
     piece = (
-        torch.arange(recorded.shape[1] - 1, device=path.device) < (known - 1)[:, None]
+        torch.arange(recorded.shape[1] - 1, device=path.device)
+        < (has_path - 1)[:, None]
     )
     length = recorded[..., :2].diff(dim=1).norm(dim=-1) * piece
     end = length.cumsum(-1)
@@ -301,12 +302,12 @@ def standing_columns(batch: Batch) -> Batch:
     counted = batch["traffic"] & batch["logged_valid"].all(1)
     parked = counted & batch["parked"]
     standing = counted & ~batch["parked"] & (states[:, 0, :, 3].abs() < STANDING)
-    now = moved(states, batch["valid"])
+    motion = moved(states, batch["valid"])
     log = moved(batch["logged"], batch["logged_valid"])
     found = {
-        "parked_moved": (parked & now).sum(-1) / parked.sum(-1),
+        "parked_moved": (parked & motion).sum(-1) / parked.sum(-1),
         "parked_vehicles": parked.sum(-1),
-        "starters": (standing & now).sum(-1),
+        "starters": (standing & motion).sum(-1),
         "starters_log": (standing & log).sum(-1),
     }
     return {name: value.to(states.dtype) for name, value in found.items()}

@@ -99,8 +99,8 @@ def kinematic_samples(
     )
     agents = agents & (fastest > MOVING)
     whole = torch.arange(blocks, device=stop.device) < (stop // BLOCK)[:, None]
-    known = by_block(both).all(2) & agents[:, None] & whole[..., None]
-    twice = known[:, 1:] & known[:, :-1]
+    complete = by_block(both).all(2) & agents[:, None] & whole[..., None]
+    twice = complete[:, 1:] & complete[:, :-1]
     thrice = twice[:, 1:] & twice[:, :-1]
     pair = [block_kinematics(track) for track in (states, logged)]
     result: list[Samples] = [{} for _ in range(len(states))]

@@ -61,12 +61,12 @@ def recorded_columns(batch: Batch) -> Batch:
         "seconds",
         "nfe",
     )
-    known = {
+    shared = {
         name: batch[name].to(batch["states"].dtype) for name in names if name in batch
     }
-    known |= {name: batch[name] for name in ("left_out",) if name in batch}
-    return known | (
-        {"transport": known[names[0]] + known[names[1]]} if names[0] in known else {}
+    shared |= {name: batch[name] for name in ("left_out",) if name in batch}
+    return shared | (
+        {"transport": shared[names[0]] + shared[names[1]]} if names[0] in shared else {}
     )
 
 
@@ -83,10 +83,10 @@ def score_rollouts(rollouts: Rollouts) -> tuple[list[dict], list[Samples]]:
     drivers = []
     for begin in range(0, len(rollouts), CHUNK):
         part = rollouts[begin : begin + CHUNK]
-        found, features, driver = score_batch(as_doubles(part))
+        columns, features, driver = score_batch(as_doubles(part))
         identity = {name: part.get(name) for name in (*SOURCE, *IDENTITY)}
         rows += plain_rows(
-            found
+            columns
             | {name: value for name, value in identity.items() if value is not None},
             len(part),
         )

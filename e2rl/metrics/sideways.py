@@ -120,17 +120,17 @@ def lane_headings(collisions: Collisions, window: Tensor, every: int) -> Tensor:
 
     Where there is no lane, the vehicle's direction at the window's start.
     """
-    heading, known = lanes_along(collisions, window[:, ::every])
-    heading = torch.where(known, heading, travel_heading(window[:, :1]))
+    heading, on_lane = lanes_along(collisions, window[:, ::every])
+    heading = torch.where(on_lane, heading, travel_heading(window[:, :1]))
     return heading.repeat_interleave(every, 1)[:, : window.shape[1]]
 
 
 def last_lane_headings(collisions: Collisions, window: Tensor) -> Tensor:
     """`lane_headings` of every step; where there is none, that of the lane which the
     vehicle left last."""
-    heading, known = lanes_along(collisions, window)
+    heading, on_lane = lanes_along(collisions, window)
     step = torch.arange(window.shape[1])[:, None]
-    last = torch.where(known, step, -1).cummax(1).values
+    last = torch.where(on_lane, step, -1).cummax(1).values
     last_heading = heading.gather(1, last.clamp(min=0))
     return torch.where(last >= 0, last_heading, travel_heading(window[:, :1]))
 

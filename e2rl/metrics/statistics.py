@@ -118,11 +118,11 @@ def resampled_medians(values: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
 
     NaN values are left out; a draw without any value is NaN.
     """
-    known = ~values.isnan()
-    values, order = values[known].sort()
+    finite = ~values.isnan()
+    values, order = values[finite].sort()
     if not len(values):
         return draws.new_full((len(draws),), torch.nan)
-    reached = draws[:, cluster[known][order]].cumsum(1)
+    reached = draws[:, cluster[finite][order]].cumsum(1)
     half = reached[:, -1:] / 2
     low = values[(reached >= half).long().argmax(1)]
     high = values[(reached > half).long().argmax(1)]
@@ -144,11 +144,11 @@ def resampled_labels(
         draws: [D, C]; NaN where a draw has fewer than `places` clusters.
         places: how many clusters are picked.
     """
-    known = ~labels.isnan()
-    values, index = labels[known].unique(return_inverse=True)
+    labelled = ~labels.isnan()
+    values, index = labels[labelled].unique(return_inverse=True)
     counts = draws.new_zeros(draws.shape[1], len(values))
     counts.index_put_(
-        (cluster[known], index),
+        (cluster[labelled], index),
         draws.new_ones(len(index)),
         accumulate=True,
     )
@@ -328,8 +328,8 @@ class Bootstrap:
         """Exact bounds of a metric whose estimate is `mean`; NaN from too few places,
         and for what is no fraction of places."""
         column = row_metrics().index(metric)
-        known = ~table.totals[:, column].isnan() & (table.weights[:, column] > 0)
-        places = self.places(known)
+        counted = ~table.totals[:, column].isnan() & (table.weights[:, column] > 0)
+        places = self.places(counted)
         if places < LEAST or metric.per:
             return UNKNOWN
         return exact_interval(
@@ -425,15 +425,15 @@ def summarise(
         realism_draws=realism_draws,
     )
     table = MetricTable.of(rows, row_metrics())
-    known = known_rollouts(~table.totals.isnan() & (table.weights > 0), samples)
+    counted = known_rollouts(~table.totals.isnan() & (table.weights > 0), samples)
     values = bootstrap.resampled(table, samples)
-    result = bootstrap.intervals(values, known)
+    result = bootstrap.intervals(values, counted)
     for column, metric in enumerate(row_metrics()):
         name = metric.name
         bounds = bootstrap.agreed(
             metric,
             values[name],
-            known=known[name],
+            known=counted[name],
             least=0.0,
         )
         if bounds is None and bootstrap.is_rare(
@@ -510,10 +510,10 @@ def paired_differences(
     values = bootstrap.resampled(table, samples)
     others = bootstrap.resampled(other_table, other_samples)
     known_rows = ~table.totals.isnan() | ~other_table.totals.isnan()
-    known = known_rollouts(known_rows, samples)
+    counted = known_rollouts(known_rows, samples)
     other_known = known_rollouts(known_rows, other_samples)
     differences = {name: values[name] - others[name] for name in METRICS}
-    both = {name: known[name] & other_known[name] for name in METRICS}
+    both = {name: counted[name] & other_known[name] for name in METRICS}
     result = bootstrap.intervals(differences, both)
     for column, metric in enumerate(row_metrics()):
         name = metric.name
@@ -548,19 +548,19 @@ def paired_differences(
                     strict=True,
                 )
             )
-    found = {
+    intervals = {
         name: {"difference": value.pop("mean"), **value}
         for name, value in result.items()
     }
     if relative:
         quotients = bootstrap.intervals(ratios(differences, others), both)
         for name, value in quotients.items():
-            found[name] |= {
+            intervals[name] |= {
                 "relative": value["mean"],
                 "relative_low": value["low"],
                 "relative_high": value["high"],
             }
-    return found
+    return intervals
 
 
 def ratios(

@@ -167,7 +167,7 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
     if alone:
         scenes = plural(summary.scenes, "scene")
         reason += f": these alone break the limit, in {summary.raised} of {scenes}"
-    more = None
+    scenes_needed = None
     if outcome == UNDECIDED:
         places = cluster_index(
             [row["location"] for row in rows], [row["scene_id"] for row in rows]
@@ -178,10 +178,10 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
             places=places,
             fraction=metric.fraction and not rule.change,
         )
-        more = factor and max(1, math.ceil(count * (factor - 1)))
+        scenes_needed = factor and max(1, math.ceil(count * (factor - 1)))
         advice = "no number decides, the estimate is at the limit"
-        if more:
-            advice = f"about {more} more, at further places"
+        if scenes_needed:
+            advice = f"about {scenes_needed} more, at further places"
         if places < LEAST:
             advice += f" ({places} places, an interval needs {LEAST})"
         elif math.isnan(low):
@@ -193,7 +193,7 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
         "rule": text,
         "outcome": outcome,
         "reason": f"{outcome}: {reason}",
-        "more": more,
+        "more": scenes_needed,
         "unit": driven.unit,
         "value": value,
         "low": low,

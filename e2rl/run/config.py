@@ -66,7 +66,7 @@ def load_choice(group: str, name: str) -> DictConfig:
     further = HydraConfig.get().overrides.hydra if HydraConfig.initialized() else ()
     changes = [
         f"+{group}={name}",
-        *(each for each in further if each.startswith("hydra.searchpath")),
+        *(override for override in further if override.startswith("hydra.searchpath")),
     ]
     with _hydra() as hydra:
         try:
@@ -75,9 +75,9 @@ def load_choice(group: str, name: str) -> DictConfig:
                 None, changes, RunMode.RUN, validate_sweep_overrides=False
             )[group]
         except HydraException as error:
-            known = ", ".join(choices(group))
+            names = ", ".join(choices(group))
             raise InputError(
-                f"{group}={name}: none of {known}; add a file to the group in conf/"
+                f"{group}={name}: none of {names}; add a file to the group in conf/"
             ) from error
 
 
@@ -122,7 +122,7 @@ def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
     settings = {key: value for key, value in config.items() if key != "name"}
     target = settings.get("_target_")
     try:
-        made = instantiate(settings, _partial_=True, _convert_="all")(**given)
+        instance = instantiate(settings, _partial_=True, _convert_="all")(**given)
     except (InputError, MemoryError, torch.OutOfMemoryError):
         raise
     except SystemExit as error:  # of outside code, perhaps as it is imported
@@ -139,11 +139,11 @@ def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
         raise InputError(
             f"{reason}; check the class path and its arguments in conf/{where}"
         ) from error
-    if not isinstance(made, kind):
+    if not isinstance(instance, kind):
         raise InputError(
             f"{where}={target}: is no {kind.__module__}.{kind.__name__}; subclass it"
         )
-    return made
+    return instance
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Machine:
 def machine_of(config: DictConfig) -> Machine:
     """Returns these settings of a run; InputError for impossible ones."""
     return settings_of(
-        Machine, {each.name: config.get(each.name) for each in fields(Machine)}
+        Machine, {setting.name: config.get(setting.name) for setting in fields(Machine)}
     )
 
 

@@ -30,12 +30,12 @@ def requirements(extra: str) -> list[str]:
         lines = requires("e2rl") or []
     except PackageNotFoundError:
         lines = []
-    found = [
+    missing = [
         match
         for match in map(EXTRA.fullmatch, lines)
         if match and match["extra"] == extra
     ]
-    return [match["requirement"] for match in found]
+    return [match["requirement"] for match in missing]
 
 
 def quoted(text: str) -> str:

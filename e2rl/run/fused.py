@@ -98,16 +98,16 @@ class Fused:
         if not self._fits(flat[:varied]):
             return self.function(*given)
         read = [
-            each.laid_out(value)
-            for each, value in zip(self.declared, flat[:varied], strict=False)
+            tensor.laid_out(value)
+            for tensor, value in zip(self.declared, flat[:varied], strict=False)
         ]
-        found = self._run(read + flat[varied:])
+        results = self._run(read + flat[varied:])
         return (
-            found[0]
+            results[0]
             if self.returns is Tensor
-            else self.returns(*found)
+            else self.returns(*results)
             if _made(self.returns)
-            else tuple(found)
+            else tuple(results)
         )
 
     def _fits(self, flat: list[Tensor]) -> bool:
@@ -141,18 +141,18 @@ class Fused:
 
     @cached_property
     def _types(self) -> list[torch.dtype]:
-        return [each.kind for each in self.declared]
+        return [tensor.kind for tensor in self.declared]
 
     @cached_property
     def kinds(self) -> list[Any]:
         """The type of each argument."""
-        found = [
+        kinds = [
             kind
             for name, kind in get_type_hints(self.function).items()
             if name != "return"
         ]
-        return found + found[-1:] * (
-            len(self.shapes) - len(found)
+        return kinds + kinds[-1:] * (
+            len(self.shapes) - len(kinds)
         )  # the last may be any number of tensors
 
     @cached_property
@@ -163,9 +163,11 @@ class Fused:
     @cached_property
     def declared(self) -> list["_Declared"]:
         """What is said of each tensor."""
-        found = []
-        for given, kind in zip(self.shapes, self.kinds, strict=True):
-            for shape in (given,) * _count(kind) if isinstance(given, str) else given:
+        declared = []
+        for shapes, kind in zip(self.shapes, self.kinds, strict=True):
+            for shape in (
+                (shapes,) * _count(kind) if isinstance(shapes, str) else shapes
+            ):
                 sizes, _, name = shape.removesuffix("!").partition(":")
                 names = [
                     int(size) if size.isdigit() else size for size in sizes.split()
@@ -177,7 +179,7 @@ class Fused:
                     and shape[-1] != "!"
                 )
                 truth = name == "bool" and shape[-1] != "!"
-                found.append(
+                declared.append(
                     _Declared(
                         names,
                         getattr(torch, name or "float32"),
@@ -185,7 +187,7 @@ class Fused:
                         truth=truth,
                     )
                 )
-        return found
+        return declared
 
     @cached_property
     def file(self) -> Path:
@@ -235,8 +237,8 @@ class Fused:
         free = sorted(
             {
                 name
-                for given in self.declared
-                for name in given.sizes
+                for tensor in self.declared
+                for name in tensor.sizes
                 if isinstance(name, str)
             }
         )
@@ -348,8 +350,8 @@ class _Module(nn.Module):
     def forward(self, *flat: Tensor) -> Any:
         rest = iter(
             [
-                given.as_given(value)
-                for value, given in zip(flat, self.fused.declared, strict=True)
+                tensor.as_given(value)
+                for value, tensor in zip(flat, self.fused.declared, strict=True)
             ]
         )
         return tuple(
@@ -397,7 +399,7 @@ def _count(kind: Any) -> int:
 
 def _built(kind: Any, rest: Iterator[Tensor]) -> Any:
     return (
-        kind(*(_built(each, rest) for each in _kinds(kind)))
+        kind(*(_built(part, rest) for part in _kinds(kind)))
         if _made(kind)
         else next(rest)
     )
@@ -406,7 +408,7 @@ def _built(kind: Any, rest: Iterator[Tensor]) -> Any:
 def _tensors(value: Any) -> list[Tensor]:
     if isinstance(value, Tensor):
         return [value]
-    found = []
+    tensors = []
     kind: Any = type(value)
     for part in (
         [getattr(value, name) for name in _names(kind)]
@@ -414,17 +416,17 @@ def _tensors(value: Any) -> list[Tensor]:
         else value
     ):
         if isinstance(part, Tensor):
-            found.append(part)
+            tensors.append(part)
         else:
-            found += _tensors(part)
-    return found
+            tensors += _tensors(part)
+    return tensors
 
 
 @cache
 def _names(kind: Any) -> list[str]:
     """The names of what a dataclass or a named tuple holds."""
     return (
-        [each.name for each in fields(kind)]
+        [part.name for part in fields(kind)]
         if is_dataclass(kind)
         else list(kind._fields)
     )

@@ -26,10 +26,10 @@ READERS = {  # of data sets
 def check_keys(config: DictConfig, name: str) -> None:
     """Raises InputError for keys that conf/<name>.yaml does not have, which do nothing:
     added by +, or by an experiment of another command."""
-    known = [*map(str, load_config(name)), *groups_of(name)]
-    unknown = [str(key) for key in config if key not in known]
+    keys = [*map(str, load_config(name)), *groups_of(name)]
+    unknown = [str(key) for key in config if key not in keys]
     if unknown:
-        reasons = [no_such(key, nearest(key, known)) for key in unknown]
+        reasons = [no_such(key, nearest(key, keys)) for key in unknown]
         raise InputError(f"{'; '.join(reasons)} ({' '.join(program())})")
 
 
@@ -83,9 +83,9 @@ def wrong_option(name: str, arguments: Sequence[str], message: str) -> str:
         return message
     key = match[1]
     groups = {} if any(further_folders(arguments)) else groups_of(name)
-    chosen = [each for each in arguments if each.split("=")[0] in groups]
-    known = keys_of(load_config(name, chosen))
-    if key in known:
+    chosen = [argument for argument in arguments if argument.split("=")[0] in groups]
+    keys = keys_of(load_config(name, chosen))
+    if key in keys:
         return f"{key}: what it does not have yet is added by +: '+{key}=...'"
     group = key.partition(".")[0]
     if group in groups:
@@ -96,19 +96,19 @@ def wrong_option(name: str, arguments: Sequence[str], message: str) -> str:
         ]
         if with_it:
             return no_such(key, [f"{key} with {', '.join(with_it)}"])
-    return no_such(key, nearest(key, known))
+    return no_such(key, nearest(key, keys))
 
 
 def wrong_choice(group: str, file: str) -> str:
     """Returns what is said of a file that a group does not have."""
-    known = choices(group)
-    near = get_close_matches(file, known, 1, 0.5)
+    names = choices(group)
+    near = get_close_matches(file, names, 1, 0.5)
     if group == "data" and file in READERS:
         near = [READERS[file]]
     if near:
         return no_such(f"{group}={file}", [f"{group}={near[0]}"])
     return (
-        f"{group}={file}: there is no such option; of {', '.join(known)}; one of your "
+        f"{group}={file}: there is no such option; of {', '.join(names)}; one of your "
         f"own is FOLDER/{group}/{file}.yaml, with --config-dir FOLDER"
     )
 

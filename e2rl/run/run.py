@@ -252,7 +252,7 @@ def origin_of(folder: Path) -> dict[str, Any]:
     if not (Path(folder) / PROVENANCE).is_file():
         return {"git": git_commit(), "command": command_line()}
     provenance = read_provenance(folder)
-    commits = dict.fromkeys(each["git"] for each in provenance["versions"])
+    commits = dict.fromkeys(version["git"] for version in provenance["versions"])
     return {"git": ", ".join(commits), "command": provenance["command"]}
 
 

@@ -66,12 +66,13 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
         build = kind.__init__  # type: ignore[misc]
         signature = inspect.signature(build)
         takes_any = any(
-            each.kind is each.VAR_KEYWORD for each in signature.parameters.values()
+            parameter.kind is parameter.VAR_KEYWORD
+            for parameter in signature.parameters.values()
         )
 
         @wraps(build)
         def filled(self: Any, *positional: Any, **named: Any) -> None:
-            given = {
+            named_arguments = {
                 *signature.bind_partial(self, *positional, **named).arguments,
                 *named,
             }
@@ -84,7 +85,7 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
             missing = {
                 name: value
                 for name, value in values.items()
-                if name in wanted and name not in given
+                if name in wanted and name not in named_arguments
             }
             build(self, *positional, **named, **missing)
             if is_dataclass(kind):
@@ -102,9 +103,9 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
 def file_values(file: str, part: str = "") -> dict[str, Any]:
     """Returns the plain values of conf/<file>.yaml, or of one mapping in it; lists are
     tuples."""
-    own = _loaded(file)
+    group = _loaded(file)
     plain = OmegaConf.to_container(
-        OmegaConf.select(own, part) if part else own, resolve=True
+        OmegaConf.select(group, part) if part else group, resolve=True
     )
     assert isinstance(plain, dict)
     return {
@@ -146,36 +147,36 @@ def settings_of(kind: type[Settings], values: Mapping, where: str = "") -> Setti
             f"{_dotted(where, key)}{value}: {reason}; compare it with its file in conf/"
         ) from error
     assert isinstance(plain, dict)
-    known = {
+    names = {
         str(key): value
         for key, value in plain.items()
         if not (isinstance(value, str) and value == "???")
     }
-    made = kind(
+    instance = kind(
         **{
             key: tuple(value) if isinstance(value, list) else value
-            for key, value in known.items()
+            for key, value in names.items()
         }
     )
-    check_settings(made, where)
-    return made
+    check_settings(instance, where)
+    return instance
 
 
 def check_settings(made: Any, where: str) -> None:
     """Raises InputError where a `setting` of a dataclass has a value that it must not
     have."""
-    for each in fields(made):
-        value = getattr(made, each.name)
-        rule = each.metadata
+    for part in fields(made):
+        value = getattr(made, part.name)
+        rule = part.metadata
         if "low" not in rule or (value is None and rule["optional"]):
             continue
         if rule["choices"]:
-            check_choice(_dotted(where, each.name), value, choices=rule["choices"])
+            check_choice(_dotted(where, part.name), value, choices=rule["choices"])
             continue
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, int | float):
                 check_range(
-                    _dotted(where, each.name),
+                    _dotted(where, part.name),
                     number,
                     low=rule["low"],
                     high=rule["high"],

@@ -26,7 +26,7 @@ def column_groups(sizes: Sequence[int], width: int) -> list[list[int]]:
     for column in range(1, len(sizes)):
         if (
             len(groups[-1]) > 1
-            and sum(sizes[each] + 2 for each in groups[-1]) + sizes[column] > width
+            and sum(sizes[index] + 2 for index in groups[-1]) + sizes[column] > width
         ):
             groups.append([0])
         groups[-1].append(column)

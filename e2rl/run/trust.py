@@ -156,7 +156,7 @@ def check_written(
 def written_outside(saved: DictConfig, folder: Path, *trusted: DictConfig) -> list[str]:
     """Returns the options for Hydra that name where `saved` writes outside of the
     folder, links followed, and how much, other than the trusted configurations."""
-    known = {
+    hashes = {
         (key.rpartition(".")[2], _place(value))
         for config in trusted
         for key, value in _written(config)
@@ -164,7 +164,7 @@ def written_outside(saved: DictConfig, folder: Path, *trusted: DictConfig) -> li
     options = []
     for key, value in _written(saved):
         inside = isinstance(value, str) and leads_into(Path(value), folder)
-        trusted_value = (key.rpartition(".")[2], _place(value)) in known
+        trusted_value = (key.rpartition(".")[2], _place(value)) in hashes
         if value is not None and not inside and not trusted_value:
             name = next((name for name in WRITTEN if key.endswith(name)), key)
             options.append(assigned(name, value))

@@ -102,10 +102,12 @@ class Spending:
         with Bar(total=self.budget, desc=title) as bar:
             while active := len(search.active()):
                 order = torch.randperm(len(self.scenes), generator=generator).tolist()
-                asked = sorted(search.ask(), key=lambda attempt: order[attempt.scene])
+                attempts = sorted(
+                    search.ask(), key=lambda attempt: order[attempt.scene]
+                )
                 outcomes: list[Outcome] = []
-                while len(outcomes) < len(asked):
-                    tries = account.affordable(asked[len(outcomes) :], active)
+                while len(outcomes) < len(attempts):
+                    tries = account.affordable(attempts[len(outcomes) :], active)
                     if not tries:
                         return spent
                     scored = yield self.batches(tries)
@@ -114,8 +116,8 @@ class Spending:
                     if len(charged) < len(tries) or self.untimed(spent):
                         return spent
                     bar.update(min(account.spent[self.unit], self.budget) - bar.n)
-                search.tell(asked, outcomes)
-                if not asked:
+                search.tell(attempts, outcomes)
+                if not attempts:
                     break
         return spent
 
@@ -177,11 +179,11 @@ class Spending:
                 line = try_line(row, attempt.family, outcome)
                 spent.tries.append(line | account.spent)
         rows, samples = scored.where(sorted(chosen))
-        kept = {(row["scene_id"], row["seed"]) for row in rows}
+        finished = {(row["scene_id"], row["seed"]) for row in rows}
         errored = [
             entry
             for entry in scored.errored
-            if (entry["scene_id"], entry["seed"]) in kept
+            if (entry["scene_id"], entry["seed"]) in finished
         ]
         spent.scored.add(Scored(rows, samples, errored))
         return outcomes
@@ -265,9 +267,9 @@ def search_all(
     """
     for method in methods:
         free = {
-            each.name
-            for each in method.traffic.values()
-            if not isinstance(getattr(each.traffic, "prior", None), Prior)
+            traffic.name
+            for traffic in method.traffic.values()
+            if not isinstance(getattr(traffic.traffic, "prior", None), Prior)
         }
         if unit == "nfe" and free:
             raise InputError(
@@ -315,11 +317,11 @@ def spend_together(searches: Sequence[Spending], work: Work = HERE) -> list[Spen
         following = {}
         for number, batches in rounds.items():
             driven[number] += sum(len(batch.tasks) for batch in batches)
-            found = Scored()
+            total = Scored()
             for _ in batches:
-                found.add(next(scored))
+                total.add(next(scored))
             try:
-                following[number] = running[number].send(found)
+                following[number] = running[number].send(total)
             except StopIteration as end:
                 results[number] = end.value
         rounds = following

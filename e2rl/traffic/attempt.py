@@ -105,9 +105,9 @@ def _finite(rollouts: Batch, tasks: Sequence[Task]) -> tuple[Parts, Errored]:
         (tasks[row], why | {"raised_by": TRAFFIC if of_traffic[row] else EGO})
         for row in (~good).nonzero()[:, 0].tolist()
     ]
-    kept = [tasks[row] for row in good.nonzero()[:, 0].tolist()]
+    remaining = [tasks[row] for row in good.nonzero()[:, 0].tolist()]
     rest = rollouts[good.cpu()] if errored else rollouts
-    return ([(kept, rest)] if kept else []), errored
+    return ([(remaining, rest)] if remaining else []), errored
 
 
 def raiser(error: BaseException) -> str:

@@ -31,8 +31,8 @@ def fused_functions() -> list[Fused]:
     network = DenoiserSettings()
     sampler = SamplerSettings()
     configured = {
-        each.name: each
-        for each in (
+        function.name: function
+        for function in (
             fused_encoding(network),
             fused_estimate(network),
             fused_step(sampler, SIZE, limited=False),

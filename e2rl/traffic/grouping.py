@@ -41,12 +41,15 @@ def put_rows(value: Value, rows: Tensor, new: Value) -> Value:
 def map_tensors(function: Callable, value: Any, *others: Any) -> Any:
     """Map function over every tensor or TensorDict of a value and its counterparts in
     others; the rest is kept."""
-    values = (value, *others)
     if isinstance(value, Tensor | TensorDictBase | SceneRows):
-        return function(*values)
+        return function(value, *others)
+    values = (value, *others)
     if isinstance(value, tuple):  # a named tuple
-        parts = zip(*values, strict=True)
-        return type(value)(*(map_tensors(function, *part) for part in parts))
+        parts = (
+            map_tensors(function, *(whole[index] for whole in values))
+            for index in range(len(value))
+        )
+        return type(value)(*parts)
     if not is_dataclass(value) or isinstance(value, type):
         return value
     changes = {
@@ -80,7 +83,7 @@ def noise_of(
         uniform: in [0, 1), else standard normal.
     """
     sample = torch.rand if uniform else torch.randn
-    rows = [torch.empty(0, *shape)]
+    rows = [torch.empty((0, *shape))]
     for value, number in torch.stack([seed, draw], -1).tolist():
         generator = torch.Generator().manual_seed((value * PRIME + number) % (2**63))
         rows.append(sample((1, *shape), generator=generator))

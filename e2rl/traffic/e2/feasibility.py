@@ -124,7 +124,7 @@ class _Meeting(NamedTuple):
     """The samples at which each candidate [Q] meets the mission: index on both,
     earliest, latest and time gap [s], inf for none."""
 
-    own: Tensor
+    candidate: Tensor
     ego: Tensor
     earliest: Tensor
     latest: Tensor
@@ -218,11 +218,11 @@ def find_conflicts(
     )
     meeting = _meeting(vehicle, ego, settings=settings)
     row = torch.arange(len(b), device=b.device)
-    on_own = (row, meeting.own)
+    on_candidate = (row, meeting.candidate)
     on_ego = (row, meeting.ego)
-    conflict_s = vehicle.s[on_own] + _to_intersection(
-        vehicle.xy[on_own],
-        vehicle.heading[on_own],
+    conflict_s = vehicle.s[on_candidate] + _to_intersection(
+        vehicle.xy[on_candidate],
+        vehicle.heading[on_candidate],
         ego=ego.xy[on_ego],
         ego_heading=ego.heading[on_ego],
     )

@@ -306,9 +306,8 @@ class LanguageReasoner:
             describe(scene, world, conflicts=rules.conflicts, row=row)
             for row in range(len(world.step))
         ]
-        egos, others = zip(*descriptions, strict=True)
         with ThreadPoolExecutor(self.settings.workers) as pool:
-            answers = pool.map(self._verdicts, egos, others)
+            answers = pool.map(self._verdicts, descriptions)
             for row, verdicts in enumerate(answers):
                 if verdicts:
                     values = torch.tensor(list(verdicts.values()))
@@ -319,9 +318,10 @@ class LanguageReasoner:
         mask[:, 0] = False
         return replace(rules, mask=mask)
 
-    def _verdicts(self, ego: str, vehicles: dict[int, str]) -> Verdicts | None:
-        """Verdicts on one scene, from the cache or the endpoint; None where both
-        failed."""
+    def _verdicts(self, scene: tuple[str, dict[int, str]]) -> Verdicts | None:
+        """Verdicts on one scene as `describe` has it, from the cache or the endpoint;
+        None where both failed."""
+        ego, vehicles = scene
         if not vehicles:
             return {}
         self._count("lm_scenes")
