@@ -35,7 +35,7 @@ LATE = Family("late", "e2", ranges={"patience": 2.0})
 
 def setup_of():
     return Setup(
-        scenes(3, steps=30),
+        scenes(3),
         IDMEgo(),
         ego_name="idm",
         sim=SimSettings(),
@@ -45,7 +45,7 @@ def setup_of():
 
 
 def plan_of():
-    on = Method("e2", synthesizer(), eta=2.0)
+    on = Method("e2", synthesizer(kernels={"samples": 2}), eta=2.0)
     settings = replace(SearchSettings(), cover=1)
     return SearchMethod(
         "search", [RULE, LATE], traffic={"rule": on, "late": on}, settings=settings
