@@ -8,6 +8,7 @@ from e2rl.scenes.boxes import overlap
 from e2rl.scenes.drivable_area import CELL
 from e2rl.scenes.recording import DT, LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.route import SPACING, interpolate
+from e2rl.traffic.e2 import interception
 from e2rl.traffic.e2.interception import InterceptionSettings, cubic, intercept
 from e2rl.traffic.motion import constant_speed_states
 from tests.traffic.e2.crossing import decoded, make_world, wish_of
@@ -209,3 +210,48 @@ def test_nobody_is_sent_past_its_own_red_light(line, finite):
     assert met(None, world=world)[0].cost.isfinite().all()
     world.scene["light_state"][:] = LIGHT_GREEN
     assert met(None, world=world, halt_at_red=True)[0].cost.isfinite().all()
+
+
+def test_what_an_interception_weighs_in_seconds():
+    """0.2 s for 1 m/s^2, 0.1 s for each second, and 1 s for each second beside the
+    moment that is wished for; a straight path has no lateral acceleration."""
+    count = interception.SAMPLES
+    points = torch.zeros(1, 1, 1, count, 2)
+    points[..., 0] = torch.linspace(0, 30, count)
+    zero = torch.zeros(1, 1, 1)
+    paths = interception._Paths(
+        points=points,
+        tangents=torch.tensor([1.0, 0.0]).expand(1, 1, 1, count, 2),
+        length=points[..., 0],
+        bearing=zero,
+        turn=zero,
+        end_heading=zero,
+    )
+    drive = interception._Drive(zero + 10.0, zero - 2.0, time=zero + 3.0)
+    anytime = interception._cost(paths, drive, wish=wish_of(1))
+    assert float(anytime) == pytest.approx(0.2 * 2 + 0.1 * 3)
+    later = interception._cost(paths, drive, wish=wish_of(1, moment=4.5))
+    assert float(later - anytime) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(("radius", "possible"), [(12.0, True), (8.0, False)])
+def test_lateral_acceleration_on_an_arc_is_its_speed_squared_over_the_radius(
+    radius, possible
+):
+    """At 7 m/s an arc of 12 m takes 4.1 m/s^2, one of 8 m 6.1: 5 are allowed."""
+    count = interception.SAMPLES
+    angle = torch.linspace(0, 1.0, count)
+    points = radius * torch.stack([angle.sin(), 1 - angle.cos()], -1)
+    zero = torch.zeros(1, 1, 1)
+    paths = interception._Paths(
+        points=points.expand(1, 1, 1, count, 2),
+        tangents=torch.stack([angle.cos(), angle.sin()], -1).expand(1, 1, 1, count, 2),
+        length=(radius * angle).expand(1, 1, 1, count),
+        bearing=zero,
+        turn=zero + 1.0,
+        end_heading=zero + 1.0,
+    )
+    drive = interception._Drive(zero + 7.0, zero, time=zero + 3.0)
+    limits = replace(FREE, lateral=5.0)
+    within = interception._within_limits(paths, drive, zero + 1.0, limits)
+    assert bool(within) == possible

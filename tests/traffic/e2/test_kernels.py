@@ -1,6 +1,7 @@
 """Importance kernels: nothing is drawn for nothing, and what is drawn pays."""
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -89,3 +90,44 @@ def test_a_budget_below_the_price_of_a_choice_draws_nobody_and_none_is_the_prior
     _, none = replanned(synthesizer(control={"transport_budget": 0.0}), scene, eta=3.0)
     assert torch.equal(none.states, prior.states)
     assert not none.adversary.any()
+
+
+def with_kernels(*vehicles, speed=8.0):
+    """Which of vehicles (x, y) that drive along x have kernels, beside an ego at the
+    origin that drives along x, too."""
+    count = 1 + len(vehicles)
+    states = torch.tensor([(0.0, 0.0), *vehicles])
+    states = torch.cat(
+        [states, torch.zeros(count, 1), torch.full((count, 1), speed)], 1
+    )
+    world = World.at_start(scenes(1).scenes)
+    world = replace(world, states=states[None])
+    plan = states[None, :, None].repeat(1, 1, 50, 1)
+    ego_plan = plan[:, 0].clone()
+    ego_plan[..., 0] = torch.linspace(0, 100, 50)
+    free = torch.ones(1, count, dtype=torch.bool)
+    free[:, 0] = False
+    attack = KernelAttack.of(
+        world,
+        free,
+        ego_plan=ego_plan,
+        plan=plan,
+        since=torch.zeros(1, count),
+        settled=torch.zeros(1, count, dtype=torch.bool),
+    )
+    return attack.vehicle.tolist()
+
+
+def test_who_has_kernels_is_within_60_m_of_the_ego_and_10_m_of_its_path():
+    assert with_kernels((59.0, 0.0), (61.0, 0.0)) == [1]
+    assert with_kernels((20.0, 9.5), (20.0, 11.0)) == [1]
+
+
+def test_who_stands_for_all_of_its_plan_has_no_kernels():
+    assert with_kernels((20.0, 0.0), speed=0.9) == []
+    assert with_kernels((20.0, 0.0), speed=1.1) == [1]
+
+
+def test_the_ten_nearest_have_kernels():
+    row = [(5.0 + 4.0 * number, 0.0) for number in range(12)]
+    assert with_kernels(*row) == list(range(1, 11))

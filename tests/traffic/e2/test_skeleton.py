@@ -280,3 +280,11 @@ def test_any_candidate_route_may_lead_to_the_target():
         world, 2, candidate=3, heading=math.atan2(32.0, 20.0)
     )  # towards where the first will be
     assert skeleton_of(world, mask(world, 1, 2), near=1, tau_long=60.0).far.any()
+
+
+@pytest.mark.parametrize(("last", "far"), [(-74.0, 4), (-74.4, 3)])
+def test_a_chain_begins_no_farther_than_80_m_from_the_ego(last, far):
+    world = make_world([EGO, *COLUMN, (30.0, last, UP, 8.0)])
+    support = mask(world, 1, 2, 3, 4)
+    result = skeleton_of(world, support, near=1, max_chain=5, tau_long=25.0)
+    assert result.far.nonzero().tolist() == [[0, far]]
