@@ -46,9 +46,12 @@ def rates(bench: Bench) -> tuple[float, float]:
         build_ego(config),
         bench.scenes,
         build_sim(config),
+        device="cpu",
+        rounds=config.rounds,
         collect=collect,
         ppo=ppo,
-        rounds=config.rounds,
+        teacher=config.learner.teacher,
+        teaching=config.learner.teaching,
     )
     collected = []
     whole = []

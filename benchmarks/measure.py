@@ -21,6 +21,8 @@ from e2rl.run.config import load_config
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes
 from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.rollouts import Rollouts
+from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.traffic import Traffic
 
 
@@ -129,6 +131,21 @@ class Bench:
         env = DrivingEnv(self.scenes, self.sim, len(index))
         env.reset(TensorDict({"scene_index": index[:, None]}, batch_size=[len(index)]))
         return env
+
+    def roll_out(
+        self, index: Tensor, eta: Tensor, traffic: Traffic | None = None
+    ) -> Rollouts:
+        """Rollouts of scenes index [B] at intensities eta [B], in the bench's traffic
+        by default; the index is the seed, too."""
+        return roll_out(
+            self.scenes,
+            index,
+            index,
+            eta,
+            ego=self.ego,
+            traffic=self.traffic if traffic is None else traffic,
+            sim=self.sim,
+        )
 
     def row(
         self,

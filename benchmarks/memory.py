@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_traffic
 from e2rl.learning.rounds.policy import PolicyImprovement
 from e2rl.run.config import load_choice
-from e2rl.traffic.rollout import roll_out
 
 WORK = (
     ("simulator", 512),
@@ -63,7 +62,7 @@ def _peak(bench: Bench, name: str, batch: int) -> tuple[float, float]:
             else bench.traffic
         )
         eta = torch.full((batch,), 0.0 if nominal else 2.0)
-        roll_out(bench.scenes, index, index, eta, bench.ego, traffic, bench.sim)
+        bench.roll_out(index, eta, traffic)
     return alone, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -76,8 +75,12 @@ def _learn(bench: Bench, batch: int) -> None:
         build_ego(config),
         bench.scenes,
         build_sim(config),
+        device="cpu",
+        rounds=config.rounds,
         collect=collect,
         ppo=ppo,
+        teacher=config.learner.teacher,
+        teaching=config.learner.teaching,
     )
     for _ in range(2):
         improve.learner.update(improve.collected())

@@ -12,7 +12,6 @@ from measure import Bench, Row
 from tensordict import TensorDict
 
 from e2rl.run.processes import in_processes
-from e2rl.traffic.rollout import roll_out
 
 SCENES = 64, 512, 2048, 10_000
 STEPS = 20
@@ -39,12 +38,12 @@ def scaling(bench: Bench) -> Iterator[Row]:
 
     def work(index: torch.Tensor) -> None:
         eta = torch.full((len(index),), 2.0)
-        roll_out(bench.scenes, index, index, eta, bench.ego, bench.traffic, bench.sim)
+        bench.roll_out(index, eta)
 
     work(parts[0])
     for processes in (1, 2, 1, 2):  # in turn: the machine's load changes
         begin = time.perf_counter()
-        list(in_processes(work, parts, processes, cost=len))
+        list(in_processes(work, parts, processes=processes, cost=len))
         seconds[processes] = min(
             time.perf_counter() - begin, seconds.get(processes, torch.inf)
         )

@@ -9,7 +9,7 @@ from measure import Bench, Row
 from torch import arange
 
 from e2rl.driving.setup import Setup
-from e2rl.evaluation.build import build_searches
+from e2rl.evaluation.build import build_prior, build_searches
 from e2rl.search.search import Search
 from e2rl.search.spending import SearchMethod, Spending, spend_together
 from e2rl.search.tries import Try
@@ -25,7 +25,7 @@ def searched_rollouts(bench: Bench) -> Iterator[Row]:
     index = arange(scenes)
     only = range(scenes)
     setup = Setup(bench.scenes, bench.ego, "lane_graph", bench.sim, 32, "cpu")
-    method = build_searches(bench.config, bench.traffic.prior, 2.0)[0]
+    method = build_searches(bench.config, build_prior(bench.config)[0], 2.0)[0]
     tries, talk = searched(setup, method, only)
     count = len(tries)
 

@@ -20,7 +20,6 @@ from e2rl.sim.env import DrivingEnv
 from e2rl.traffic import nominal
 from e2rl.traffic.e2 import coalition, e2, feasibility, interception, paper
 from e2rl.traffic.e2 import kernels as importance
-from e2rl.traffic.rollout import roll_out
 
 PARTS = {  # each without the others that it calls
     "encoding": [(prior.Prior, "encode")],
@@ -56,9 +55,7 @@ def synthesized_rollout(bench: Bench) -> Iterator[Row]:
 
         def run(eta: float, index: torch.Tensor = index) -> Any:
             etas = torch.full((len(index),), eta)
-            return roll_out(
-                bench.scenes, index, index, etas, bench.ego, bench.traffic, bench.sim
-            )
+            return bench.roll_out(index, etas)
 
         for compiled in (False, True) if bench.compile else (False,):
             fused.switch(compiled)

@@ -25,7 +25,6 @@ SHORT = [
     "learner.collect.steps=80",
     "learner.collect.iterations=1",
     "learner.ppo.epochs=1",
-    "learner.recorded=false",
     "measure.scenes=1",
     "measure.budget=0",
 ]

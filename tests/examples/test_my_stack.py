@@ -103,7 +103,6 @@ def test_the_curriculum_runs_a_round(tmp_path):
         "learner.round.scenes=1",
         "learner.collect.batch=2",
         "learner.collect.iterations=1",
-        "learner.recorded=false",
         "measure.scenes=1",
         "measure.seeds=[0]",
         "measure.budget=0",
