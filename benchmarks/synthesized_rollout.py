@@ -18,14 +18,13 @@ from e2rl.prior import prior
 from e2rl.run import fused
 from e2rl.sim.env import DrivingEnv
 from e2rl.traffic import nominal
-from e2rl.traffic.e2 import coalition, e2, feasibility, interception, paper
+from e2rl.traffic.e2 import coalition, e2, feasibility, interception
 from e2rl.traffic.e2 import kernels as importance
 
 PARTS = {  # each without the others that it calls
     "encoding": [(prior.Prior, "encode")],
     "denoising": [(prior.Prior, "denoise")],
     "decoding": [(prior.Prior, "decode")],
-    "V_adv and V_feas": [(paper.MaskedGuidance, "_gradients")],
     "control, and steps of the SDE": [(prior.Prior, "sample")],
     "bounds": [(prior, "bounded")],
     "foresight": [(importance, "foresee"), (interception, "foresee")],

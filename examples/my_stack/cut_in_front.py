@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import torch
 
-from e2rl.run.settings import setting
+from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.traffic.potentials import LENGTH, PotentialSettings, with_ego
 
 
+@configured("synthesizer/e2_paper", "potentials")  # what a YAML file leaves out
 @dataclass(frozen=True)
 class CutInFront(PotentialSettings):
     """V_adv is the mean distance to the place `ahead` m in front of the target, in

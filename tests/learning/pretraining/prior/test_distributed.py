@@ -22,7 +22,7 @@ from e2rl.prior.checkpoint import load_prior
 from e2rl.run.errors import InputError
 from tests.prior.small import curved_scenes, small_prior
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 SETTINGS = TrainingSettings(steps=6, batch=4, bf16=False)
 
 
