@@ -145,7 +145,7 @@ def read_run(run: Path) -> list[dict]:
     rows = read_rows(run / TABLE)
     file = run / ERRORED_FILE
     entries = (
-        read_json(file, lambda found: misfit(missing, [ENTRY]), printable=False)
+        read_json(file, lambda found: misfit(found, [ENTRY]), printable=False)
         if file.is_file()
         else []
     )
