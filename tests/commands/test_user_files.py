@@ -137,7 +137,7 @@ def test_commands_write_into_their_folder_and_the_cache_alone(world, tmp_path):
     }
     before = contents(home, here, world)
     asked = commands(world)
-    assert len(asked) >= 6
+    assert len(asked) >= 5
     assert "hydra.run.dir=" in str(asked[0])
     assert "hydra.run.dir=" not in str(asked[-1])
     for number, command in enumerate(asked):
