@@ -154,9 +154,10 @@ def places_of(batch: Batch) -> Places:
     )
     lanes = order[:, :most]
     slot = (is_used.long().cumsum(1) - 1)[point // count, lane]
-    inside = states.new_zeros(len(states) * count, most)
+    width = lanes.shape[1]  # 0 where the map has no lane
+    inside = states.new_zeros(len(states) * count, width)
     inside[point, slot] = 1.0
-    inside = inside.view(*points.shape[:-1], most)
+    inside = inside.view(*points.shape[:-1], width)
     together = connected(inside[..., :4, :], follows=linked(batch, lanes))
     return Places(loose=~together, crossing=inside[..., 4, :].sum(-1) > 1)
 

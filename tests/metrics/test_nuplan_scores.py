@@ -513,3 +513,13 @@ def test_terms_are_in_0_to_1_and_rows_do_not_depend_on_the_batch():
         assert {name: alone[name] for name in alone} == pytest.approx(
             {name: value[index].item() for name, value in found.items()}, nan_ok=True
         )
+
+
+def test_a_map_without_lanes_has_scores():
+    rollouts = scene(course(0, 0, heading=0, speed=10), AWAY)
+    rollouts = rollouts.replace(
+        lane_points=torch.zeros(1, 0, 2),
+        lane_index=torch.zeros(1, 0, dtype=torch.int64),
+        lane_width=torch.zeros(1, 0),
+    )
+    assert set(TERMS) <= set(terms(rollouts))
