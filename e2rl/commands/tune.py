@@ -102,7 +102,7 @@ def tune(run: Run) -> dict:
         objective=objective,
         file=Path(tuning.study or folder / STUDY_FILE),
         about=about,
-        told=show,
+        after_trial=show,
     )
     result = save(rows, folder)
     best = "no trial keeps within the limits\n"

@@ -67,12 +67,13 @@ class SearchSettings:
 def search(
     evaluate: Evaluate,
     present: Parameters,
+    *,
     space: Space,
     settings: SearchSettings,
     objective: Objective,
     file: Path | None = None,
     about: Mapping | None = None,
-    told: Callable[[list[dict]], None] = lambda rows: None,
+    after_trial: Callable[[list[dict]], None] = lambda rows: None,
 ) -> list[dict]:
     """Returns a row a trial: parameters, metrics, objective, admissible.
 
@@ -81,10 +82,15 @@ def search(
     study of another task, and where the present parameters have no metrics.
 
     Args:
+        evaluate: parameters -> metrics.
+        present: all parameters, as they are.
+        space: low and high of those that are varied.
+        settings: how many trials, and what proposes them.
+        objective: what is lowered, and what is admissible.
         file: of the study; one that is there goes on, as it would have gone on without
             the interruption.
         about: what the study must agree in besides, such as its scenes.
-        told: called with all rows after each trial.
+        after_trial: called with all rows.
     """
     ranges = distributions(present, space)
     fixed = [
@@ -130,7 +136,7 @@ def search(
         )
         if file is not None:
             write_atomically(file, json.dumps(nulls({"task": task, "trials": rows})))
-        told(rows)
+        after_trial(rows)
     return rows
 
 

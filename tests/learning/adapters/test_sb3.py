@@ -246,6 +246,7 @@ def test_wrappers_of_the_batch_that_change_nothing_are_passed_through(
 ):
     model = trained(wrap(e2rl.make_sb3_env(4, **given)), "ppo")
     e2rl.save_policy(model, tmp_path / "policy.pt")
+    assert (tmp_path / "policy.pt").is_file()
 
 
 @pytest.mark.parametrize(
@@ -254,9 +255,9 @@ def test_wrappers_of_the_batch_that_change_nothing_are_passed_through(
 def test_wrappers_of_gymnasium_that_change_nothing_are_passed_through(
     given, tmp_path, wrap
 ):
-    e2rl.save_policy(
-        trained(wrap(e2rl.make_gym_env(**given)), "one"), tmp_path / "policy.pt"
-    )
+    model = trained(wrap(e2rl.make_gym_env(**given)), "one")
+    e2rl.save_policy(model, tmp_path / "policy.pt")
+    assert (tmp_path / "policy.pt").is_file()
 
 
 def test_a_model_of_another_environment_is_refused(given, tmp_path):
