@@ -9,18 +9,11 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 
 # isort: split
 import math
-import sys
 
 from e2rl.evaluation.build import build_ego, build_prior, build_traffic
 from e2rl.evaluation.rollout_files import ERRORED_FILE, add_errored
-from e2rl.learning.logging import RunLogger
 from e2rl.learning.pretraining.bits import run_bits_stage
 from e2rl.learning.pretraining.imitation import run_imitation_stage
-from e2rl.learning.pretraining.prior.distributed import (
-    follower_overrides,
-    follows,
-    started_by_torchrun,
-)
 from e2rl.learning.pretraining.prior.stage import run_prior_stage
 from e2rl.learning.rounds.build import (
     build_evolution,
@@ -35,15 +28,13 @@ from e2rl.learning.rounds.checkpoint import (
     save_checkpoint,
 )
 from e2rl.learning.rounds.evolution import Evolution
+from e2rl.learning.rounds.progress import round_line
 from e2rl.report.answer import compared_answer
 from e2rl.report.caption import caption
-from e2rl.report.rounds import round_line, save_videos
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.run.command import run_command
 from e2rl.run.config import set_up
-from e2rl.run.errors import InputError
 from e2rl.run.run import Run
-from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 from e2rl.traffic.fusing import prepare_fused
@@ -104,8 +95,6 @@ def evolve(task: Run) -> None:
             logger.log(metrics, number, run.choices)
             add_errored(folder / ERRORED_FILE, number, run.errored)
             save_checkpoint(folder, run, config.keep_last)
-            if config.logger.videos:
-                show_videos(run, scenes, task=task, logger=logger)
         progress.say(round_line(metrics, number + 1, config.rounds))
     logger.close()
     with progress.phase("measurement"):
@@ -120,31 +109,9 @@ def evolve(task: Run) -> None:
     print("", *answer, run.improve.outcome(folder), sep="\n")
 
 
-def show_videos(
-    run: Evolution, scenes: SceneSet, *, task: Run, logger: RunLogger
-) -> None:
-    """Write and log `logger.videos` videos of attacks of the last round."""
-    videos = save_videos(
-        run.memory.rounds[-1].traffic,
-        scenes,
-        number=run.round,
-        method=task.config.synthesizer.name,
-        folder=task.folder,
-        count=task.config.logger.videos,
-    )
-    for place, video in enumerate(videos, start=1):
-        logger.show(f"synthesizer/video_{place}", video, run.round - 1)
-
-
 def train_prior(task: Run) -> None:
     """Train a prior and print its nominal closed loop on held-out logs."""
-    logger = None  # the leader alone writes
-    if not follows():
-        logger = build_logger(task.config, task.folder)
-    outcome = run_prior_stage(task, logger)
-    if outcome is None:
-        return  # another process of torchrun is the leader and reports
-    path, rows = outcome
+    path, rows = run_prior_stage(task, build_logger(task.config, task.folder))
     print_tables(
         metric_tables(
             rows, f"nominal closed loop of {path.name} on held-out logs, ego replayed"
@@ -200,23 +167,16 @@ STAGES = {
 def train(task: Run) -> None:
     """One stage of training, as configured."""
     config = task.config
-    if started_by_torchrun() and config.stage.name != "prior":
-        raise InputError(
-            f"torchrun: stage={config.stage.name} runs in one process, "
-            "started with python"
-        )
     set_up(config)
     check_training(config)
-    if not follows():
-        print(purpose(task), flush=True)
+    print(purpose(task), flush=True)
     prepare_fused(config)
     STAGES[config.stage.name](task)
 
 
 def main() -> None:
-    """The command, in this process or in one of torchrun's."""
-    sys.argv += follower_overrides()
-    run_command("train", train, MAY_CHANGE, alone=not follows())
+    """The command."""
+    run_command("train", train, MAY_CHANGE)
 
 
 if __name__ == "__main__":

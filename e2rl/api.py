@@ -236,8 +236,7 @@ def make_sb3_env(num_envs: int = 16, **settings: Any) -> Any:
 
 
 def save_policy(policy: Any, path: str | Path, env: Any = None) -> Path:
-    """Writes POLICY.onnx, or POLICY.pt of TorchScript, for ego=policy_file; returns its
-    path.
+    """Writes POLICY.pt, TorchScript, for ego=policy_file; returns its path.
 
     Args:
         policy: a Stable-Baselines3 model trained here, or a module of such a map

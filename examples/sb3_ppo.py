@@ -1,5 +1,5 @@
 """Stable-Baselines3's PPO in attacked traffic: `python examples/sb3_ppo.py [STEPS]
-[POLICY.onnx]` (extras gym, onnx).
+[POLICY.pt]` (extra gym).
 
 Half of the episodes are nominal, half attacked by e2 at an intensity of 1; an action
 lasts 0.2 s. POLICY.monitor.csv gets return, length and end of every episode.
@@ -14,13 +14,13 @@ import e2rl
 
 
 def main(
-    steps: str = "100000", file: str = "ppo.onnx", num_envs: int = 64, **settings
+    steps: str = "100000", file: str = "ppo.pt", num_envs: int = 64, **settings
 ) -> None:
     """Train a new policy and write it; settings: of e2rl.make_env."""
     env = e2rl.make_sb3_env(num_envs, hold=2, **settings)
     env = VecMonitor(
         env,
-        file.removesuffix(".onnx"),
+        file.removesuffix(".pt"),
         info_keywords=("contact", "off_road", "progress", "eta"),
     )
     narrow = {

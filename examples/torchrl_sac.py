@@ -1,5 +1,5 @@
 """TorchRL's SAC in attacked traffic: `python examples/torchrl_sac.py [STEPS]
-[POLICY.onnx]` (extra onnx).
+[POLICY.pt]`.
 
 Half of the episodes are nominal, half attacked by e2 at an intensity of 1; an action
 lasts 0.2 s. POLICY.monitor.csv gets return, length and end of every episode.
@@ -59,7 +59,7 @@ def note(monitor: TextIO, batch: TensorDictBase) -> None:
 
 
 def main(
-    steps: str = "100000", file: str = "sac.onnx", num_envs: int = 64, **settings
+    steps: str = "100000", file: str = "sac.pt", num_envs: int = 64, **settings
 ) -> None:
     """Train a new policy and write it; settings: of e2rl.make_env."""
     torch.manual_seed(0)

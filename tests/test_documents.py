@@ -30,9 +30,9 @@ FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 # The commands of e2rl that have a configuration.
-HYDRA = "evaluate|train|tune|prior-tables|skeleton"
+HYDRA = "evaluate|train|tune"
 COMMAND = re.compile(
-    rf"((?:python|torchrun[^`\n]*?) (?:evaluate|train)\.py|e2rl (?:{HYDRA}))(?![\w-])"
+    rf"(python (?:evaluate|train)\.py|e2rl (?:{HYDRA}))(?![\w-])"
     r"((?:\\\n|[^`\n])*)"
 )
 CODE = re.compile(r"^```.*?^```$|`[^`\n]+`|^ {4}.+$", re.MULTILINE | re.DOTALL)

@@ -113,11 +113,9 @@ def test_a_budget_has_a_row_for_the_search_and_for_every_rival(evaluated):
 
 def test_egos_before_and_after_are_rated_in_one_run(evaluated):
     """An untrained actor and a planner in its place."""
-    roles = "{before: before, after: after, planner: before}"
     egos = (
         "+egos.before={ego: actor}",
         "+egos.after={ego: lane_graph}",
-        f"policy_learning={roles}",
     )
     run = evaluated("methods=[nominal,e2]", *egos)
     rows = read_metrics(run / "metrics.json")
@@ -131,11 +129,6 @@ def test_egos_before_and_after_are_rated_in_one_run(evaluated):
     }
     text = (run / "tables.md").read_text()
     assert "Difference of each ego to before" in text
-    assert "Guards of after" in text
-    assert {path.name for path in run.glob("policy_learning.*")} == {
-        "policy_learning.png",
-        "policy_learning.pdf",
-    }
 
 
 def test_table_4_has_a_row_for_every_ego_in_three_formats(evaluated):

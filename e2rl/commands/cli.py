@@ -33,7 +33,7 @@ COMMANDS = {  # module, and what the command does
     ),
     "export-policy": (
         "e2rl.commands.export_policy",
-        "a trained actor as ONNX or TorchScript",
+        "a trained actor as a TorchScript file",
     ),
     "inspect": (
         "e2rl.commands.inspect",
@@ -48,18 +48,6 @@ COMMANDS = {  # module, and what the command does
         "whether a run keeps within limits, for continuous integration",
     ),
     "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
-    "policy-figure": (
-        "e2rl.commands.policy_figure",
-        "what training was worth, of one or several splits",
-    ),
-    "prior-tables": (
-        "e2rl.commands.prior_tables",
-        "the prior as traffic: closed loop, spread of its samples",
-    ),
-    "skeleton": (
-        "e2rl.commands.skeleton",
-        "the figure of risks, skeleton and chain",
-    ),
 }
 EXAMPLES = """examples:
   e2rl try LOGS --planner my_planner.py:MyPlanner --scenes 12

@@ -1,9 +1,8 @@
-"""`e2rl export-policy RUN_DIR POLICY.onnx|POLICY.pt`: a trained actor as a policy's
-file.
+"""`e2rl export-policy RUN_DIR POLICY.pt`: a trained actor as a policy's file.
 
 It maps observations [B, 326] to the actor's most central actions [B, 2], with the
 normalisation and the reference inside, and drives e2rl by `ego=policy_file
-ego.file=POLICY.onnx` (docs/guide/policies.md).
+ego.file=POLICY.pt` (docs/guide/policies.md).
 """
 
 import argparse
@@ -12,7 +11,7 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from e2rl.planners.network import ActorNetwork, find_weights, read_actor
-from e2rl.planners.policy_file import ONNX, TORCHSCRIPT, write_policy
+from e2rl.planners.policy_file import write_policy
 from e2rl.run.endings import ending
 
 
@@ -28,8 +27,7 @@ class Deterministic(nn.Module):
 
 
 def export_actor(checkpoint: str, file: Path) -> None:
-    """Write the actor that `find_weights` finds as ONNX or TorchScript, told by the
-    suffix; raises InputError."""
+    """Write the actor that `find_weights` finds as TorchScript; raises InputError."""
     write_policy(Deterministic(read_actor(find_weights(checkpoint)).network), file)
 
 
@@ -44,8 +42,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "file",
         type=Path,
-        metavar="FILE",
-        help=f"to write: {ONNX}, or {TORCHSCRIPT} for TorchScript",
+        metavar="POLICY.pt",
+        help="to write, as TorchScript",
     )
     options = parser.parse_args(arguments)
     with ending():

@@ -34,7 +34,7 @@ from e2rl.scenes.recording import (
 from e2rl.scenes.source import Row, Source, source_of
 from e2rl.sim.rollouts import road_of
 
-GROUPS = ("scenarionet", "commonroad", "argoverse2", "py123d")  # of data, of a path
+GROUPS = ("scenarionet", "commonroad", "argoverse2")  # of data, of a path
 SIDE = 900  # points, of a picture
 HEAD = 34  # points, of its header
 FOOT = 30  # points, of its legend

@@ -186,10 +186,6 @@ def check_compared(config: DictConfig, settings: EvaluationSettings) -> None:
             raise InputError(
                 f"{where}: a table with a row a method has one eta; name one"
             )
-    elif config.policy_learning is not None:
-        raise InputError(
-            f"{where}: policy_learning has tables of its own; leave one of the two"
-        )
     elif len(names) != 1 or names[0] not in config.egos:
         raise InputError(
             f"{where}: expected one of egos, {', '.join(map(str, config.egos))}"

@@ -20,15 +20,12 @@ from torch import Tensor
 
 from e2rl.driving.setup import Setup
 from e2rl.evaluation.build import build_ego
-from e2rl.evaluation.check import as_list, row_names
+from e2rl.evaluation.check import as_list
 from e2rl.evaluation.summary import metric_rows
-from e2rl.metrics.proximity import ego_path, mean_acceleration
 from e2rl.planners.ego import Ego
 from e2rl.run.config import load_choice
 from e2rl.run.errors import InputError
-from e2rl.scenes.scene import SceneSet
 
-ROLES = ("before", "after", "planner")  # of policy_learning: names of `egos`
 NAME = re.compile(r"[A-Za-z0-9._+-]+")  # what a file name may hold
 
 
@@ -105,20 +102,6 @@ def pool_trainings(
     return pooled
 
 
-def recorded_acceleration(scenes: SceneSet) -> float:
-    """Returns the mean |acceleration| [m/s^2] of the recorded egos, by the rule of the
-    metric `macc`."""
-    members_of = []
-    for part in scenes.parts():
-        stop = torch.full((len(part),), scenes.steps)
-        members_of.append(
-            mean_acceleration(
-                *ego_path(part["logged"].double(), part["logged_valid"], stop=stop)
-            )
-        )
-    return torch.cat(members_of).nanmean().item()
-
-
 # --- from the configuration
 
 
@@ -130,10 +113,6 @@ def build_egos(config: DictConfig, name: str) -> EgoSet:
     ego, a field or a checkpoint that is not there, and for names that collide.
     """
     if not config.egos:
-        if config.policy_learning is not None:
-            raise InputError(
-                "policy_learning: names no egos; set egos too, as experiment=policy_learning does"
-            )
         return EgoSet({name: build_ego(config)}, [name])
     egos: dict[str, Ego] = {}
     trainings: dict[str, list[str]] = {}
@@ -235,29 +214,8 @@ def one_ego(config: DictConfig, name: str, changes: Mapping[str, Any]) -> Ego:
 
 
 def compared(config: DictConfig) -> list[tuple[str, str]]:
-    """Returns pairs of names whose difference is of interest: `policy_learning.after`
-    with each other ego, `before` first; or without `policy_learning` each ego with
-    `compare`, or with the first."""
+    """Returns pairs of names whose difference is of interest: each ego with `compare`,
+    or with the first."""
     names = [str(name) for name in config.egos]
-    roles = config.policy_learning
-    if roles is None:
-        reference = (as_list(config.compare) or names)[0]
-        return [(name, reference) for name in names if name != reference]
-    for role in ROLES:
-        if roles.get(role) not in names:
-            raise InputError(
-                f"policy_learning.{role}={roles.get(role)}: none of egos "
-                f"({', '.join(names)}); name one"
-            )
-    if "nominal" not in row_names(config):
-        raise InputError(
-            f"methods={list(config.methods)}: policy_learning compares nominal "
-            "driving; name nominal, too"
-        )
-    if roles.after in (roles.before, roles.planner):
-        raise InputError(
-            f"policy_learning: after is {roles.after}, and before or planner, too; "
-            "name another of egos"
-        )
-    others = [name for name in names if name not in (roles.before, roles.after)]
-    return [(roles.after, roles.before), *((roles.after, name) for name in others)]
+    reference = (as_list(config.compare) or names)[0]
+    return [(name, reference) for name in names if name != reference]

@@ -185,7 +185,6 @@ def paired_with_egos(
                 groups[other][1],
                 draws=draws,
                 realism_draws=0,
-                relative=True,
             )
     return paired
 

@@ -1,12 +1,10 @@
-"""Logs a run's scalars and pictures to CSV files, TensorBoard or offline wandb, and a
+"""Logs a run's scalars to CSV files, TensorBoard or offline wandb, and a
 curriculum's choices."""
 
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from PIL import Image
 from torchrl.record.loggers import CSVLogger, TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
 
@@ -21,7 +19,7 @@ CHOICES = "curriculum.csv"
 
 
 class RunLogger:
-    """Writes {group/name: number} at steps, and pictures; NaN is omitted."""
+    """Writes {group/name: number} at steps; NaN is omitted."""
 
     def __init__(
         self, kind: str, folder: Path, project: str = "e2rl", name: str | None = None
@@ -58,7 +56,9 @@ class RunLogger:
             if not math.isnan(value)
         }
         if isinstance(self._logger, WandbLogger):
-            self._write_row(numbers, step)
+            # wandb's own step has to be told: by default TorchRL counts steps of each
+            # group beside it, and wandb takes every number for a row of its own.
+            self._logger.log_metrics(numbers, step=step, override_global_step=True)
         else:
             for name, value in numbers.items():
                 self._logger.log_scalar(name, value, step=step)
@@ -71,45 +71,6 @@ class RunLogger:
                 for row in choices
             ]
             write_atomically(path, "".join([header, *earlier, csv_text(rows)]))
-
-    def show(self, name: str, path: Path, step: int) -> None:
-        """Put a picture (PNG) or video (GIF) on the dashboard, if there is one; name:
-        as of a scalar."""
-        if isinstance(self._logger, WandbLogger):
-            import wandb
-
-            moving = path.suffix == ".gif"
-            media = (
-                wandb.Video(str(path), format="gif")
-                if moving
-                else wandb.Image(str(path))
-            )
-            self._write_row({name: media}, step)
-        elif isinstance(self._logger, TensorboardLogger):
-            from tensorboard.compat.proto.summary_pb2 import Summary
-
-            with Image.open(path) as image:
-                picture = Summary.Image(
-                    encoded_image_string=path.read_bytes(),  # a video moves there, too
-                    width=image.width,
-                    height=image.height,
-                    colorspace=3,
-                )
-            value = Summary.Value(tag=name, image=picture)
-            self._logger.experiment.file_writer.add_summary(
-                Summary(value=[value]), step
-            )
-
-    def _write_row(self, values: Mapping[str, Any], step: int) -> None:
-        """Add values to wandb's row of a step. It stays open until a later step, or the
-        end, writes it.
-
-        wandb's own step has to be told. By default TorchRL counts steps of each group
-        beside it, and wandb takes every number for a row of its own, so that a picture
-        of step 1 comes to a row that is written already, and is lost.
-        """
-        assert isinstance(self._logger, WandbLogger)
-        self._logger.log_metrics(dict(values), step=step, override_global_step=True)
 
     def forget(self, step: int) -> None:
         """Remove the scalars of a step and of later ones from the CSV files, and a line

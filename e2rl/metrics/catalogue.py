@@ -106,8 +106,6 @@ LATER: dict[str, float | str] = {  # last columns, and what rows that lack them 
     "cfr_object": math.nan,
     "left_out": math.nan,  # vehicles that come near, neither driven nor replayed
 }
-SPREAD_STAGE = "spread"
-STAGES: dict[str, tuple[Metric, ...]] = {}  # parts of a run with metrics of their own
 
 
 def declare(

@@ -465,7 +465,6 @@ def paired_differences(
     *,
     draws: int = DRAWS,
     realism_draws: int = REALISM_DRAWS,
-    relative: bool = False,
 ) -> dict[str, dict[str, float]]:
     """{metric: {difference, low, high, n}} of this group minus the other, over the n
     (scene, seed) both have.
@@ -479,8 +478,6 @@ def paired_differences(
         other_rows, other_samples: of the other.
         draws: of the bootstrap.
         realism_draws: of the bootstrap of realism.
-        relative: also give `relative`, `relative_low` and `relative_high`, the
-            difference over the other's value.
     """
     pairs = matched(rows, other_rows)
     rows = [rows[index] for index, _ in pairs]
@@ -548,32 +545,10 @@ def paired_differences(
                     strict=True,
                 )
             )
-    intervals = {
+    return {
         name: {"difference": value.pop("mean"), **value}
         for name, value in result.items()
     }
-    if relative:
-        quotients = bootstrap.intervals(ratios(differences, others), both)
-        for name, value in quotients.items():
-            intervals[name] |= {
-                "relative": value["mean"],
-                "relative_low": value["low"],
-                "relative_high": value["high"],
-            }
-    return intervals
-
-
-def ratios(
-    differences: Mapping[str, Tensor], others: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
-    """Differences [D] over |others| [D], by name. Where a draw has none, the ratio has
-    no bound: no draw is known."""
-    result = {}
-    for name, difference in differences.items():
-        result[name] = difference / others[name].abs()
-        if (others[name][1:] == 0).any():
-            result[name][1:] = torch.nan
-    return result
 
 
 def matched(rows: Sequence[Row], other_rows: Sequence[Row]) -> list[tuple[int, int]]:

@@ -1,43 +1,34 @@
-"""ego=policy_file: the policy of an ONNX or TorchScript file, by the observation
+"""ego=policy_file: the policy of a TorchScript file, by the observation
 (docs/guide/policies.md).
 
-An ONNX file holds arithmetic. A TorchScript file is a program, which may write files:
-run those that you trust.
+Such a file is a program, which may write files: run those that you trust.
 """
 
 import io
-import logging
 import warnings
 from collections.abc import Callable
-from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from e2rl.planners.actor import ObservingEgo
-from e2rl.planners.onnx_policy import OnnxPolicy
 from e2rl.planners.plausibility import finite
-from e2rl.run.config import library
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_regular, write_atomically
 from e2rl.run.settings import configured, setting
 from e2rl.sim.observation import OBSERVATION_SIZE
 
-ONNX = ".onnx"
-TORCHSCRIPT = ".pt"
+SUFFIX = ".pt"
 MAPS = (
     f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] for every B "
     "(docs/guide/policies.md)"
 )
-Policy = Callable[[Tensor], Any]
 PROBED = (1, 3)  # batches that a file is tried with
 MAX_FILE = 1 << 26  # bytes: 16 million weights
-SECONDS = 20.0  # to open and try a file
 EXAMPLE = 2  # observations that a network is traced with
 
 
@@ -53,14 +44,10 @@ class PolicyFileEgo(ObservingEgo):
     max_yaw_rate: float = setting()
 
     def __post_init__(self) -> None:
-        """Raises InputError where the file is none, maps other shapes, or takes longer
-        than SECONDS to find out."""
+        """Raises InputError where the file is none or maps other shapes."""
         self.low = torch.tensor([-self.max_braking, -self.max_yaw_rate])
         self.high = torch.tensor([self.max_acceleration, self.max_yaw_rate])
-        where = f"ego.file={self.file}"
-        self.policy = within_time(
-            partial(open_policy, Path(self.file or ""), where), where
-        )
+        self.policy = open_policy(Path(self.file or ""), f"ego.file={self.file}")
 
     def decide(self, observation: Tensor) -> Tensor:
         """The file's action [B, 2] at the observation; raises NotFinite where it is NaN
@@ -69,27 +56,30 @@ class PolicyFileEgo(ObservingEgo):
         return torch.clamp(action, self.low, self.high).to(observation)
 
 
-def within_time(work: Callable[[], Any], where: str) -> Any:
-    """What work() returns or raises; raises InputError where it goes on for longer than
-    SECONDS."""
-    result: Future = Future()
-
-    def run() -> None:
-        try:
-            result.set_result(work())
-        except BaseException as error:
-            result.set_exception(error)
-
-    Thread(target=run, daemon=True).start()  # what does not end is left behind
-    if wait([result], SECONDS).not_done:
+def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
+    """Returns the function of a policy's file, tried; raises InputError."""
+    try:
+        content = read_regular(file, MAX_FILE)
+    except OSError as error:
         raise InputError(
-            f"{where}: opening it takes longer than {SECONDS} s; give a smaller policy"
-        )
-    return result.result()
+            f"{where}: cannot be read ({error.strerror}); pass a file of a policy"
+        ) from error
+    try:
+        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0][:200]
+        raise InputError(
+            f"{where}: no TorchScript archive ({reason}); write one by "
+            "e2rl.save_policy or torch.jit.save"
+        ) from error
+    policy = torch.no_grad()(module)
+    for count in PROBED:
+        probe(policy, where, count=count)
+    return policy
 
 
 def probe(
-    policy: Policy,
+    policy: Callable[[Tensor], Any],
     where: str,
     count: int,
 ) -> None:
@@ -109,76 +99,12 @@ def probe(
         ) from error
 
 
-def open_policy(file: Path, where: str) -> Policy:
-    """The function of a policy's file, told by the file's suffix and tried."""
-    kinds: dict[str, Callable[[bytes, str], Policy]] = {
-        ONNX: OnnxPolicy,
-        TORCHSCRIPT: torchscript_policy,
-    }
-    if file.suffix not in kinds:
-        raise InputError(
-            f"{where}: no kind of policy; pass POLICY{ONNX}, or POLICY{TORCHSCRIPT} of "
-            "TorchScript"
-        )
-    try:
-        content = read_regular(file, MAX_FILE)
-    except OSError as error:
-        raise InputError(
-            f"{where}: cannot be read ({error.strerror}); pass a file of a policy"
-        ) from error
-    policy = kinds[file.suffix](content, where)
-    for count in PROBED:
-        probe(policy, where, count=count)
-    return policy
-
-
-def torchscript_policy(content: bytes, where: str) -> Policy:
-    """The module of a TorchScript archive."""
-    try:
-        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
-    except (RuntimeError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0][:200]
-        raise InputError(
-            f"{where}: no TorchScript archive ({reason}); write one by torch.jit.save"
-        ) from error
-    return torch.no_grad()(module)
-
-
 def write_policy(policy: nn.Module, file: Path) -> None:
-    """Write a module of such a map, whose argument is `observation`, as the suffix
-    says; raises InputError."""
-    writers = {ONNX: _write_onnx, TORCHSCRIPT: _write_torchscript}
-    if file.suffix not in writers:
-        raise InputError(
-            f"{file}: no kind of policy; name it {ONNX}, or {TORCHSCRIPT} for TorchScript"
-        )
-    if file.suffix == ONNX:
-        library(
-            "onnxscript",
-            str(file),
-            extra="onnx",
-        )
+    """Writes a module of such a map, whose argument is `observation`; raises InputError
+    where the file has another suffix."""
+    if file.suffix != SUFFIX:
+        raise InputError(f"{file}: name the policy's file POLICY{SUFFIX}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        write_atomically(file, partial(writers[file.suffix], policy.eval()))
-
-
-def _write_torchscript(policy: nn.Module, file: Path) -> None:
-    traced = torch.jit.trace(policy, torch.zeros(EXAMPLE, OBSERVATION_SIZE))
-    torch.jit.save(traced, file)
-
-
-def _write_onnx(policy: nn.Module, file: Path) -> None:
-    # It tells which packages it does without.
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    program = torch.onnx.export(
-        policy,
-        (torch.zeros(EXAMPLE, OBSERVATION_SIZE),),
-        input_names=["observation"],
-        output_names=["action"],
-        dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
-        dynamo=True,
-        verbose=False,
-    )
-    assert program is not None
-    file.write_bytes(program.model_proto.SerializeToString())
+        traced = torch.jit.trace(policy.eval(), torch.zeros(EXAMPLE, OBSERVATION_SIZE))
+        write_atomically(file, partial(torch.jit.save, traced))

@@ -26,7 +26,7 @@ from e2rl.report.headline import (
     traffic_name,
     unit_of,
 )
-from e2rl.report.tables import UNKNOWN, closed_loop, number
+from e2rl.report.tables import UNKNOWN, number
 from e2rl.run.terminal import column_groups, terminal_width
 
 LINES = 25
@@ -78,7 +78,7 @@ def answer_lines(
         rollouts: of rollouts.csv, of which those that errored, or touched people or
             objects, are named.
     """
-    driven = [row for row in closed_loop(rows) if row["n_rollouts"]]
+    driven = [row for row in rows if row["n_rollouts"]]
     driven.sort(key=lambda row: not row["eta"])  # attacks before nominal traffic
     attacks = sum(1 for row in driven if row["eta"])
     egos = {row["ego"] for row in driven}
@@ -114,10 +114,10 @@ def compared_answer(
             searched for.
         folder: of the run, which holds tables.md.
     """
-    earlier = {(row["method"], row["eta"]): row for row in closed_loop(before)}
+    earlier = {(row["method"], row["eta"]): row for row in before}
     pairs = [
         (earlier[row["method"], row["eta"]], row)
-        for row in closed_loop(after)
+        for row in after
         if (row["method"], row["eta"]) in earlier
     ]
     last = closing(after, folder)
@@ -443,7 +443,7 @@ def measured(rows: Sequence[dict]) -> str:
     """Where the numbers come from, and what they lack."""
     if not rows:
         return "No rollout was scored."
-    first = max(closed_loop(rows) or rows, key=lambda row: row["n_rollouts"])
+    first = max(rows, key=lambda row: row["n_rollouts"])
     text = (
         f"Measured: {first['dataset']}/{first['split']}, "
         f"{plural(first['n_scenes'], 'scene')}, {plural(first['n_seeds'], 'seed')}"

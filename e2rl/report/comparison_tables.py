@@ -1,17 +1,15 @@
 """Tables that compare methods or egos: a row each, with their differences to some of
-them (tables 1 and 4); and whether an ego that was trained still drives as it should."""
+them (tables 1 and 4)."""
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from e2rl.metrics.catalogue import METRICS, Metric, table_metrics
+from e2rl.metrics.catalogue import Metric, table_metrics
 from e2rl.report.tables import (
     MEANS,
     PAIRED,
     UNKNOWN,
     Table,
-    closed_loop,
     column_names,
     counts,
     difference_cell,
@@ -31,9 +29,6 @@ TRAININGS = (
     "places, with replacement, and with few trainings are too narrow rather than too "
     "wide."
 )
-COLLISIONS = 0.01  # fraction of rollouts that training may add
-PROGRESS = 0.97  # of the planner's that it must keep
-ROUGHNESS = 1.25  # of the recorded egos' that it may reach
 
 
 def method_tables(
@@ -53,22 +48,21 @@ def method_tables(
         table: of the catalogue, whose metrics are the columns, but for those that no
             row knows.
     """
-    group = closed_loop(rows)
-    names = column_names(group)
-    text = f"{origin(group[0])}. {counts(group, names)}"
+    names = column_names(rows)
+    text = f"{origin(rows[0])}. {counts(rows, names)}"
     labels = Table(
         f"{text} {MEANS} Knowledge: the ego's plan, or its motion predicted; duty: what "
         f"adversaries owe the ego. {settings}",
         ["method", "knowledge", "duty"],
         rows=[
             [name, *(term or UNKNOWN for term in terms.get(row["method"], ("", "")))]
-            for name, row in zip(names, group, strict=True)
+            for name, row in zip(names, rows, strict=True)
         ],
         title="Methods",
     )
     return with_metrics(
         labels,
-        group,
+        rows,
         metrics=table_metrics(table),
         references={name: name for name in references},
         difference=f"{text} Difference of each method to {' and to '.join(references)}",
@@ -92,7 +86,7 @@ def planner_tables(
         settings: for the captions.
         table: of the catalogue, whose metrics are the columns.
     """
-    cells = by_ego(closed_loop(rows), names)
+    cells = by_ego(rows, names)
     group = list(cells.values())
     drives = [f"{ego} under {traffic}" for ego, traffic in cells]
     text = f"{group[0]['dataset']}/{group[0]['split']}. "
@@ -181,78 +175,3 @@ def by_ego(rows: Sequence[dict], names: Sequence[str]) -> dict[tuple[str, str], 
         for label, row in zip(column_names(group), group, strict=True):
             cells[name, label] = row
     return cells
-
-
-def relative_cell(change: Mapping) -> str:
-    """Such as `-31 [-42, -17]*`, per cent; the interval is unknown where a draw has
-    nothing to divide by."""
-    if not math.isfinite(change["relative"]):
-        return UNKNOWN
-    centre, low, high = (
-        f"{100 * change[f'relative{end}']:+.0f}" for end in ("", "_low", "_high")
-    )
-    if math.isnan(change["relative_low"]):
-        return centre
-    star = "*" * (change["relative_low"] > 0 or change["relative_high"] < 0)
-    return f"{centre} [{low}, {high}]{star}"
-
-
-def guard_table(
-    rows: Sequence[dict], before: str, *, after: str, planner: str, recorded: float
-) -> Table:
-    """Returns whether `after` still drives well in nominal traffic. Estimates decide;
-    intervals stand beside them.
-
-    Args:
-        rows: of metrics.json.
-        before: ego before training.
-        after: ego after training.
-        planner: ego that both are measured by.
-        recorded: mean |acceleration| [m/s^2] of the recorded egos.
-
-    Returns:
-        Each guard with its limit, what was measured, and whether it is met.
-    """
-    row = by_ego(rows, [after])[after, "nominal"]
-
-    def change(metric: str, ego: str, most: float) -> list[str]:
-        paired = row["paired"][f"ego {ego}"][metric]
-        return [
-            f"{metric} over {ego} [points]",
-            f"≤ {100 * most:.0f}",
-            difference_cell(METRICS[metric], paired),
-            verdict(paired["difference"], most),
-        ]
-
-    progress = row["paired"][f"ego {planner}"]["progress"]
-    ceiling = ROUGHNESS * recorded
-    lines = [
-        change("cfr", before, most=COLLISIONS),
-        change("cfr", planner, most=0.0),
-        [
-            f"progress against {planner} [%]",
-            f"≥ {100 * (PROGRESS - 1):.0f}",
-            relative_cell(progress),
-            verdict(-progress["relative"], 1 - PROGRESS),
-        ],
-        [
-            f"macc [m/s²], recorded egos: {recorded:.2f}",
-            f"≤ {ceiling:.2f}",
-            mean_cell(METRICS["macc"], row),
-            verdict(row["metrics"]["macc"]["mean"], ceiling),
-        ],
-        change("ego_off_road", before, most=0.0),
-    ]
-    text = (
-        f"Guards of {after}, in nominal traffic: what must not be given up for fewer "
-        "collisions. The estimate decides, the 95% interval stands beside it; "
-        "differences are paired by (scene, seed)."
-    )
-    return Table(text, ["", "limit", "found", ""], rows=lines)
-
-
-def verdict(value: float, most: float) -> str:
-    """met, missed, or unknown."""
-    if math.isnan(value):
-        return UNKNOWN
-    return "met" if value <= most + 1e-12 else "missed"

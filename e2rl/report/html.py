@@ -46,7 +46,6 @@ from e2rl.report.headline import (
 )
 from e2rl.report.tables import (
     Table,
-    closed_loop,
     column_names,
     metric_tables,
     mode_tables,
@@ -277,7 +276,7 @@ def page_content(
                     if row["metrics"].get(name, {}).get("n")
                 }
             }
-            for row in closed_loop(metrics)
+            for row in metrics
         ],
         "about": {metric.name: metric.about for metric in METRICS.values()},
     }
@@ -293,7 +292,7 @@ def rates(group: Mapping, metrics: Sequence[dict], searched: bool) -> dict[str, 
     """
     return {
         name: f"{share(row, name)} {unit_of(row)} ({rate(row, name)})"
-        for row in closed_loop(metrics)
+        for row in metrics
         if group_key(row | {"ego_policy": row["ego"]}) == group_key(group)
         and row.get("searched", False) == searched
         for name in RATES

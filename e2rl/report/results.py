@@ -4,7 +4,6 @@ lines that answer it."""
 from collections.abc import Sequence
 
 from e2rl.evaluation.check import ALL
-from e2rl.evaluation.ego_set import recorded_acceleration
 from e2rl.evaluation.modes import read_modes
 from e2rl.evaluation.plan import Evaluation
 from e2rl.evaluation.rollout_files import MODES_FILE, TABLE, read_rows
@@ -13,7 +12,6 @@ from e2rl.report.answer import answer_lines
 from e2rl.report.caption import caption, terms_by_method
 from e2rl.report.comparison_tables import (
     EGOS,
-    guard_table,
     method_tables,
     planner_tables,
     save_compared,
@@ -21,8 +19,6 @@ from e2rl.report.comparison_tables import (
 from e2rl.report.drawing import save_figure
 from e2rl.report.html import write_report
 from e2rl.report.picture import intensity_figure, intensity_sweep
-from e2rl.report.policy_figure import NAME as POLICY_FIGURE
-from e2rl.report.policy_figure import policy_figure
 from e2rl.report.tables import (
     Table,
     metric_tables,
@@ -82,8 +78,7 @@ def evaluation_tables(
     """Returns the tables of metrics, and those that compare several egos.
 
     With `compare` the first have a row a method or an ego, and become files of their
-    own; else the second do. With `policy_learning` the second have its guards, and what
-    training changed is drawn.
+    own; else the second do.
 
     Args:
         run: whose folder is written to.
@@ -91,7 +86,6 @@ def evaluation_tables(
         rows: of metrics.json.
         text: settings, for the captions.
     """
-    config = run.config
     compared = plan.settings.compare
     egos = plan.egos
     table = MAIN if plan.settings.metrics == ALL else plan.settings.metrics
@@ -114,19 +108,4 @@ def evaluation_tables(
     if compared:
         save_compared(run.folder, tables, name=EGOS)
         return tables, []
-    if config.policy_learning is not None:
-        before = config.policy_learning.before
-        after = config.policy_learning.after
-        figure = policy_figure(
-            rows, before, after=after, method=config.synthesizer.name
-        )
-        save_figure(run.folder / POLICY_FIGURE, figure)
-        guards = guard_table(
-            rows,
-            before,
-            after=after,
-            planner=config.policy_learning.planner,
-            recorded=recorded_acceleration(plan.scenes),
-        )
-        tables.append(guards)
     return metric_tables(rows, text, table=table), tables

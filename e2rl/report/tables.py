@@ -15,8 +15,6 @@ from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from e2rl.metrics.catalogue import (
     METRICS,
-    SPREAD_STAGE,
-    STAGES,
     Metric,
     table_metrics,
 )
@@ -26,10 +24,6 @@ from e2rl.run.files import write_atomically
 from e2rl.run.terminal import column_groups, terminal_width
 
 UNKNOWN = "–"
-COUNTED = {  # what the count (n) of a stage's cells counts, and how it is computed
-    SPREAD_STAGE: "(n) vehicles: others than the ego, faster than 1 m/s at the start; "
-    "samples on one route each.",
-}
 MEANS = "Mean [95% interval, by location or scene]; (n) rollouts where fewer count."
 PAIRED = "[95% interval], paired by (scene, seed); * the interval leaves out 0."
 LATEX = str.maketrans(LATEX_ESCAPE_RULES)
@@ -114,32 +108,18 @@ def metric_tables(
     means of each method, and their differences where there are several.
 
     Args:
-        rows: of metrics.json; those of the stage `spread` have their own table and
-            metrics.
+        rows: of metrics.json.
         settings: text for every caption, such as the prior and its sampler.
         table: of the catalogue, whose metrics the closed-loop tables show; a caption
             names those that no row knows.
     """
-    groups = grouped(
-        rows, lambda row: (row["dataset"], row["split"], row["ego"], prior_stage(row))
-    )
+    groups = grouped(rows, lambda row: (row["dataset"], row["split"], row["ego"]))
+    metrics = table_metrics(table)
     tables = []
-    for (*_, stage), group in groups.items():
-        metrics = STAGES[stage] if stage else table_metrics(table)
+    for group in groups.values():
         tables.append(means_table(group, settings, metrics=metrics))
         tables.append(paired_table(group, metrics))
     return [table for table in tables if table.rows]
-
-
-def prior_stage(row: Mapping) -> str | None:
-    """The stage of a row that measures the prior; None for rows of rollouts."""
-    stage = row.get("stage")
-    return stage if stage in STAGES else None
-
-
-def closed_loop(rows: Iterable[dict]) -> list[dict]:
-    """The rows of rollouts, without those of the stages that measure the prior."""
-    return [row for row in rows if prior_stage(row) is None]
 
 
 def means_table(
@@ -150,11 +130,10 @@ def means_table(
     shown = known_metrics(group, metrics)
     names = column_names(group)
     unknown = [metric.name for metric in metrics if metric not in shown]
-    counted = COUNTED.get(group[0].get("stage", ""))
     sentences = [
         f"{origin(group[0])}.",
         counts(group, names),
-        f"{MEANS.partition(';')[0]}; {counted}" if counted else MEANS,
+        MEANS,
         notes_on(group),
         f"{settings.rstrip('.')}." if settings else "",
         f"Not computable here: {', '.join(unknown)}." if unknown else "",
@@ -260,7 +239,7 @@ def column_names(group: Sequence[Mapping]) -> list[str]:
     names = []
     for row in group:
         etas = {other["eta"] for other in group if other["method"] == row["method"]}
-        stage = "" if prior_stage(row) else row.get("stage") or ""
+        stage = row.get("stage") or ""
         eta = f"η={row['eta']:g}" if row["eta"] or len(etas) > 1 else ""
         names.append(" ".join(filter(None, (stage, row["method"], eta))))
     return names
@@ -423,10 +402,7 @@ def print_tables(tables: Iterable[Table]) -> None:
 
 def legend() -> str:
     """One line per metric: its name and what it means."""
-    metrics = [*METRICS.values()]
-    for stage in STAGES.values():
-        metrics += stage
-    width = max(len(metric.name) for metric in metrics)
+    width = max(map(len, METRICS))
     return "\n".join(
-        f"{metric.name.ljust(width)}  {metric.about}" for metric in metrics
+        f"{metric.name.ljust(width)}  {metric.about}" for metric in METRICS.values()
     )

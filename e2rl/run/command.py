@@ -33,7 +33,6 @@ def run_command(
     work: Callable[[Run], object],
     may_change: Sequence[str] = (),
     begun: Callable[[DictConfig, Sequence[str]], Run] = Run.of,
-    alone: bool = True,
 ) -> None:
     """Do the work of a command that Hydra configures by conf/<name>.yaml; with -m, a
     sweep, in a run for each job.
@@ -46,7 +45,6 @@ def run_command(
         work: of a run.
         may_change: keys that may be others when a run is resumed.
         begun: makes the run of a configuration.
-        alone: no other process may be at work in the run's folder.
     """
     sys.argv[1:] = map(with_path, sys.argv[1:])
     arguments = sys.argv[1:]
@@ -63,11 +61,8 @@ def run_command(
         with sweep.job(), ending(lambda: how_to_go_on(config)):
             check_keys(config, name)
             run = begun(config, may_change)
-            if alone:
-                with alone_in(run.folder):
-                    run.enter()
-                    work(run)
-            else:
+            with alone_in(run.folder):
+                run.enter()
                 work(run)
 
     @hydra.main(

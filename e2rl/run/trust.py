@@ -41,7 +41,7 @@ WRITTEN = (
     "synthesizer.reasoner.cache",
 )
 EXTERNAL = "e2rl.planners.external"  # starts a command or connects to an address
-PROGRAM = "e2rl.planners.policy_file"  # runs files of policies, programs all but ONNX
+PROGRAM = "e2rl.planners.policy_file"  # runs files of policies, which are programs
 
 
 def saved_configuration(config: DictConfig, folder: Path, where: str) -> DictConfig:
@@ -242,7 +242,7 @@ def starting_modules(plain: Any) -> set[str]:
     for key, value in leaves(plain):
         if value and ("command" in key or "address" in key):
             modules.add(EXTERNAL)
-        if value and "file" in key and not str(value).endswith(".onnx"):
+        if value and "file" in key:
             modules.add(PROGRAM)
     return modules
 

@@ -13,14 +13,8 @@ from collections.abc import (
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from e2rl.run.errors import InputError
-from e2rl.scenes.paths import (
-    direction,
-    resample,
-    stacked,
-)
 from e2rl.scenes.recording import (
     VEHICLE,
     Lane,
@@ -30,10 +24,6 @@ from e2rl.scenes.recording import (
 RECORDED = "recorded"  # the log itself
 MARK = "~"  # stands before the version in the ids of all others
 MOVES = 1.0  # m between places of a track from which on it moves
-BESIDE = 1.5  # m from every centreline, beyond which a vehicle that stands is parked
-HEADING_NOISE = 0.05  # rad, standard deviation of disturbed headings
-SHIFT = 0.5  # m by which a shifted map lies beside its tracks
-CROP = 50.0  # m from the ego's path within which a lane of a cropped map comes
 
 
 def check_versions(names: Sequence[str]) -> None:
@@ -105,73 +95,6 @@ def unlit(recording: Recording) -> Recording:
     return replace(recording, lights={})
 
 
-def unparked(recording: Recording) -> Recording:
-    """Without vehicles that never move and stand beside the lanes."""
-    xy = recording.states[..., :2]
-    valid = recording.valid[..., None]
-    low = np.where(valid, xy, np.inf).min(0)
-    high = np.where(valid, xy, -np.inf).max(0)
-    stands = np.linalg.norm(high - low, axis=-1) <= MOVES
-    lanes = recording.lanes.values()
-    lines = [resample(lane.points, 1.0) for lane in lanes if len(lane.points) > 1]
-    place = np.where(stands[:, None], low, 0.0)
-    parked = stands & (cKDTree(stacked(lines)).query(place)[0] > BESIDE)
-    keep = ~(parked & (recording.agent_type == VEHICLE))
-    keep[recording.all_egos()] = True
-    track = np.where(keep, np.cumsum(keep) - 1, -1).tolist() + [-1]
-    heights = recording.heights
-    return replace(
-        recording,
-        states=recording.states[:, keep],
-        valid=recording.valid[:, keep],
-        heights=None if heights is None else heights[:, keep],
-        size=recording.size[keep],
-        agent_type=recording.agent_type[keep],
-        ego=track[recording.ego],
-        egos={start: track[ego] for start, ego in recording.egos.items()},
-    )
-
-
-def turned(recording: Recording) -> Recording:
-    """With the others' headings off by HEADING_NOISE, the same all along a track."""
-    agents = recording.valid.shape[1]
-    noise = np.asarray(_draws(recording).normal(0.0, HEADING_NOISE, agents))
-    noise[recording.all_egos()] = 0.0
-    states = recording.states.copy()
-    states[..., 2] += noise
-    return replace(recording, states=states)
-
-
-def shifted(recording: Recording) -> Recording:
-    """With a map that lies SHIFT beside its tracks, in a direction that depends on the
-    log."""
-    step = SHIFT * direction(_draws(recording).uniform(0.0, 2 * np.pi))
-    moved = _lanes(lambda lane: replace(lane, points=lane.points + step))(recording)
-    return replace(moved, drivable=[ring[:, :2] + step for ring in recording.drivable])
-
-
-def cropped(recording: Recording) -> Recording:
-    """With the lanes alone that come within CROP of the egos' paths."""
-    egos = recording.all_egos()
-    path = recording.states[:, egos, :2][recording.valid[:, egos]]
-    if not len(path):
-        return recording
-    tree = cKDTree(path)
-    lanes = {}
-    for name, lane in recording.lanes.items():
-        points = lane.points
-        if len(points) > 1:
-            points = resample(points, CROP / 2)
-        if tree.query(points)[0].min(initial=np.inf) < CROP:
-            lanes[name] = lane
-    lights = {name: light for name, light in recording.lights.items() if name in lanes}
-    return replace(
-        recording,
-        lanes=lanes,
-        lights=lights,
-    )
-
-
 def other_ego(recording: Recording) -> Recording | None:
     """With another vehicle as ego: that which drives farthest of those recorded
     throughout. None where none of them moves."""
@@ -203,14 +126,5 @@ VERSIONS: dict[str, Callable[[Recording], Recording | None]] = {
     "unlit": unlit,
     "unlimited": _lanes(lambda lane: replace(lane, speed_limit=0.0)),
     "unmeasured": _lanes(lambda lane: replace(lane, width=0.0)),
-    "unparked": unparked,
-    "turned": turned,
-    "shifted": shifted,
-    "cropped": cropped,
     "other_ego": other_ego,
 }
-
-
-def _draws(recording: Recording) -> np.random.Generator:
-    """Random numbers of a log's own."""
-    return np.random.default_rng(list(recording.scene_id.encode()))

@@ -23,7 +23,7 @@ brakes to a halt:
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -79,8 +79,7 @@ class Traffic(Extension, ABC):
     states [G, V, HORIZON, 4]) -> [G, HORIZON, 4]; knowledge, responsibility: what it
     knows of the ego and owes it, in
     words for captions ("": nothing to say); tuned: ranges (low, high[, "log"]) of the
-    settings that a tuning varies, by dotted name, the gain first; on_decision: called
-    with what the method decides, if it tells (e2: a `Selection` of adversaries).
+    settings that a tuning varies, by dotted name, the gain first.
     """
 
     adversarial = False
@@ -89,7 +88,6 @@ class Traffic(Extension, ABC):
     knowledge = ""
     responsibility = ""
     tuned: Mapping[str, tuple] = {}
-    on_decision: Callable[[Any], None] | None = None
 
     def __init__(self, prior: Prior | None = None) -> None:  # noqa: B027
         """prior: the frozen prior of the run; methods without a prior ignore it."""

@@ -47,9 +47,7 @@ def test_every_command_is_a_module_with_a_main():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["evaluate", "train", "prior-tables", "skeleton", "tune"]
-)
+@pytest.mark.parametrize("name", ["evaluate", "train", "tune"])
 def test_a_command_shows_its_configuration_in_an_empty_folder(name, tmp_path):
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
     code += "from e2rl.commands.cli import main; main()"

@@ -15,7 +15,7 @@ SETTINGS = {
     "prior": {"checkpoint": "bundled"},
     "processes": 1,
 }
-INPUTS = {"scenes": "ab12", "synthesizer=e2": {"gain": 1.0}, "ego.file=a.onnx": "cd34"}
+INPUTS = {"scenes": "ab12", "synthesizer=e2": {"gain": 1.0}, "ego.file=a.pt": "cd34"}
 HIT = {
     **{
         "cfr": 1.0,

@@ -172,7 +172,7 @@ def test_another_planner_version_or_machine_may_differ(tmp_path):
         tmp_path / "two",
         [row_of(0, ego="b")],
         settings={"ego": {"x": 1}, "processes": 8},
-        inputs={"ego.file=b.onnx": "9"},
+        inputs={"ego.file=b.pt": "9"},
     )
     assert compared(Driven.read(one), Driven.read(two))[0][0]["of"] == 1
 

@@ -43,7 +43,7 @@ def test_torchrl_trains_the_actor(settings, tmp_path, capsys):
 def test_a_policy_of_theirs_is_an_ego(settings, tmp_path, capsys, name):
     """It is written with the log of its episodes, whose steps are at most those asked
     for."""
-    file = tmp_path / "policy.onnx"
+    file = tmp_path / "policy.pt"
     module = example(name)
     module.UPDATES = 1
     module.main("256", str(file), num_envs=8, **settings | {"method": "replay"})

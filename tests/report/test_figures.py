@@ -1,10 +1,9 @@
-"""Figures: intensity and skeleton, what stands where in pixels of the image; PNG and
+"""The figure of intensities: what stands where in pixels of the image; PNG and
 PDF files."""
 
 import math
 
 import numpy as np
-import pytest
 import torch
 
 from e2rl.metrics.score import score_rollouts
@@ -12,10 +11,7 @@ from e2rl.report import drawing
 from e2rl.report.drawing import new_figure, save_figure
 from e2rl.report.picture import SIDE, Replay, best_sweep, intensity_figure, worth
 from e2rl.report.picture import SWEEP_GAP as GAP
-from e2rl.report.skeleton import SkeletonPicture
 from e2rl.sim.rollout_file import Failure
-from e2rl.traffic.e2.skeleton import Selection
-from e2rl.traffic.e2.topology import TopologySettings, pair_weights
 from tests.metrics.test_contact import course, scene
 
 EGO = course(0, 0, heading=0, speed=10)
@@ -53,54 +49,6 @@ def test_panels_stand_by_eta_at_their_contacts_and_without_one_at_the_first_of_t
         assert different.mean() < 1e-4, (
             "where a panel stands changes the rounding of its edges"
         )
-
-
-@pytest.fixture(scope="module")
-def shown():
-    """Vehicle 2 acts on 1, which acts on the ego; 3 stands aside and is a candidate
-    that was not taken."""
-    rollout = replay_of(EGO, AHEAD, FAR, ASIDE).rollout
-    settings = TopologySettings()
-    reference = torch.as_tensor(rollout.states[:50:5])[None]
-    size = torch.as_tensor(rollout.size)[None, None].expand(*reference.shape[:3], 2)
-    weights = pair_weights(
-        reference,
-        torch.ones(reference.shape[:3], dtype=torch.bool),
-        size=size,
-        settings=settings,
-    )
-    coalition, candidates = (
-        torch.tensor([[False, True, True, third]]) for third in (False, True)
-    )
-    zero = torch.tensor([0])
-    moments = 0.5 * torch.arange(10.0)[None]
-    target = torch.tensor([[-1, 0, 1, -1]])
-    who = candidates, coalition, coalition, target
-    return SkeletonPicture(
-        rollout, Selection(zero, zero, reference, moments, weights, *who, settings)
-    )
-
-
-def test_the_moment_is_that_of_the_greatest_risk_and_times_are_those_of_the_weights(
-    shown,
-):
-    own = shown.selection.weights[0, :, 1, 0] + shown.selection.weights[0, :, 2, 1]
-    assert shown.time == pytest.approx(0.5 * int(own.argmax()))
-    assert own.max() > own[0]
-    assert shown.nodes() == [0, 1, 2]
-    for ttc in (0.0, 0.7, 3.0, 7.5):
-        weight = 1 / (
-            1 + math.exp((ttc - shown.settings.tau_max) / shown.settings.beta)
-        )
-        assert shown.ttc(weight) == pytest.approx(ttc)
-
-
-def test_vehicles_have_the_colour_of_their_part(shown):
-    assert [shown.colour(agent) for agent in (0, 1, 3)] == [
-        drawing.EGO,
-        drawing.ADVERSARY,
-        drawing.VULNERABLE,
-    ]
 
 
 def test_the_same_figure_is_written_as_the_same_pixels_and_vectors_and_no_name_is_a_formula(

@@ -52,7 +52,7 @@ def test_help_has_every_line_of_the_files_that_are_chosen(tmp_path):
         (
             "evaluate.py",
             "data.path=x.zip",
-            "data.path with data=argoverse2, data=commonroad, data=py123d, data=scenar",
+            "data.path with data=argoverse2, data=commonroad, data=scenar",
         ),
         (
             "evaluate.py",

@@ -68,14 +68,6 @@ def test_every_file_of_ones_own_goes_on(tmp_path, group):
         assert reading(tmp_path, own, config=TRAIN) == own, name
 
 
-def test_a_policy_that_holds_arithmetic_goes_on():
-    check_code(
-        changed(EVALUATE, {"ego": {"_target_": POLICY_FILE, "file": "x.onnx"}}),
-        [],
-        where="x",
-    )
-
-
 @pytest.mark.parametrize(
     "changes",
     [

@@ -46,7 +46,6 @@ class Supervised(ABC):
         self.history: list[dict[str, float]] = []
         self.best: dict[str, float] = {}
         self.chosen: dict[str, Tensor] = {}
-        self.writes = True  # whether this process logs and keeps the state
 
     @abstractmethod
     def turn(self) -> dict[str, float]:
@@ -82,8 +81,6 @@ class Supervised(ABC):
         if (state := parts.load(STATE, about)) is not None:
             self.load_state_dict(state)
         first = len(self.history)
-        if not self.writes:
-            logger = None
         if logger is not None:
             logger.forget(first)
         bar = Bar(range(first, turns), name, turns, initial=first, unit="turn")
@@ -96,9 +93,7 @@ class Supervised(ABC):
                 }
             self.history.append(row)
             bar.set_postfix({key: f"{value:.3f}" for key, value in row.items()})
-            state = self.state_dict()
-            if self.writes:
-                parts.save(STATE, about, state)
+            parts.save(STATE, about, self.state_dict())
             if logger is not None:
                 logger.log(
                     {f"train/{name}_{key}": value for key, value in row.items()},

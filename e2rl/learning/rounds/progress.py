@@ -1,8 +1,8 @@
-"""How long the rest of a training takes."""
+"""How long the rest of a training takes, and a round in one line."""
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from statistics import mean
 
@@ -45,3 +45,21 @@ class Progress:
         """Print a line with the time left, where it is known, above any progress bar."""
         with Bar.external_write_mode():
             print("; ".join(filter(None, [text, self.left()])), flush=True)
+
+
+def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
+    """A round in one line of at most 100 characters, errored rollouts apart."""
+    hit = metrics.get("synthesizer/contact", float("nan"))
+    left_out = metrics["synthesizer/left_out"]
+    reasons = ", ".join(
+        f"{count:.0f} {name.partition('/errored_')[2].replace('_', ' ')}"
+        for name, count in metrics.items()
+        if "/errored_" in name
+    )
+    errored = f", without a score: {reasons}" if reasons else ""
+    left = f", {left_out:.0f} left out" if left_out else ""
+    return (
+        f"round {number}/{rounds}: the attacks hit in {hit:.0%} of "
+        f"{metrics['synthesizer/scenes']:.0f} scenes{left} "
+        f"(eta {metrics['synthesizer/eta']:.2f}); {metrics['time/improve']:.0f} s learning{errored}"
+    )

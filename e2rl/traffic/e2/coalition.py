@@ -22,7 +22,6 @@ from e2rl.traffic.e2.feasibility import Feasibility, FeasibilitySettings
 from e2rl.traffic.e2.interception import InterceptionSettings, Wish
 from e2rl.traffic.e2.skeleton import (
     STEP,
-    Selection,
     Skeleton,
     SkeletonSettings,
     build_skeleton,
@@ -53,7 +52,7 @@ class Selector:
     feasible (S = S_top and F), topology (S_top alone) or random (as many as there are
     near agents), the ablations of table 2; reselect: replans between two choices, 0:
     one choice; feasible_vehicles: the rules of feasibility.py or a language model;
-    budget: nats a rollout, None: any; on_decision: called with every `Selection`.
+    budget: nats a rollout, None: any.
     """
 
     prior: Prior
@@ -76,7 +75,6 @@ class Selector:
         world: World,
         ego_plan: Tensor,
         reference: Reference,
-        on_decision: Callable[[Selection], None] | None = None,
     ) -> tuple[E2State, Anchor]:
         """Returns states and proposals, with a new coalition in scenes whose choice is
         due and in which no member of the present one can meet its target any more.
@@ -86,7 +84,6 @@ class Selector:
             world: the scenes now.
             ego_plan: [B, >= HORIZON, 4], the ego's expected states.
             reference: the prior's plan without control.
-            on_decision: is called with what the choice rested on.
         """
         due = state.replans == 0
         if self.reselect > 0:
@@ -98,11 +95,7 @@ class Selector:
             return state, anchor
         world = take_rows(world, rows)
         ego_plan = ego_plan[rows]
-        chosen, selection = self._choose(
-            take_rows(state, rows), world, ego_plan, reference
-        )
-        if on_decision is not None:
-            on_decision(selection)
+        chosen = self._choose(take_rows(state, rows), world, ego_plan, reference)
         world = replace(world, route=chosen.routed.route)
         proposals = self._anchor(chosen, world, ego_plan)
         return put_rows(state, rows, chosen), put_rows(anchor, rows, proposals)
@@ -161,10 +154,9 @@ class Selector:
 
     def _choose(
         self, state: E2State, world: World, ego_plan: Tensor, reference: Reference
-    ) -> tuple[E2State, Selection]:
-        """States with new coalitions, and what they rest on: topology on a reference
-        rollout, feasibility, skeleton; members take the routes that meet their
-        targets."""
+    ) -> E2State:
+        """States with new coalitions by topology on a reference rollout, feasibility and
+        skeleton; members take the routes that meet their targets."""
         scene = world.scene
         vehicles = state.routed.route.shape[1]
         nominal = reference(state, world, ego_plan)
@@ -191,24 +183,11 @@ class Selector:
             target=torch.where(members, skeleton.target, -1),
             path_kl=state.path_kl + nats * members,
         )
-        selection = Selection(
-            seed=state.seed,
-            step=world.step,
-            reference=expected.transpose(1, 2)[:, topology.steps],
-            moments=(DT * (topology.steps + 1)).expand(len(expected), -1),
-            weights=topology.weights,
-            candidates=topology.candidates,
-            feasible=feasible,
-            coalition=state.coalition,
-            target=state.target,
-            settings=self.topology,
-        )
         route = torch.where(members, anchor.route, state.routed.route)
         nobody = torch.zeros_like(members)
-        state = on_paths(
+        return on_paths(
             state, world, route=route, off_lane=nobody, paths=anchor.off_lane_path
         )
-        return state, selection
 
     def _support(
         self, state: E2State, world: World, candidates: Tensor, feasible: Tensor

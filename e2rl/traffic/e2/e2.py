@@ -182,9 +182,7 @@ class E2(NominalTraffic):
 
         # Select C* where a choice is due, and propose how its members meet their
         # targets, on a lane or by an interception, whose nats are booked.
-        state, anchor = self.selector.select(
-            state, world, ego_plan, self._reference, on_decision=self.on_decision
-        )
+        state, anchor = self.selector.select(state, world, ego_plan, self._reference)
         state, anchor = self._onto_interceptions(state, world, anchor)
         context = self.encode(state, world, ego_plan=ego_plan, known=replan.before)
         anchored = anchor.feasible & state.coalition

@@ -17,7 +17,6 @@ from torch import Tensor
 from e2rl.run.settings import configured, setting
 from e2rl.scenes.route import project
 from e2rl.sim.world import World
-from e2rl.traffic.e2.topology import TopologySettings
 from e2rl.traffic.motion import (
     compact,
     direction,
@@ -323,28 +322,3 @@ def build_skeleton(
     )
     far = put(torch.zeros_like(support), index, mask=present, rows=viable)
     return Skeleton(target >= 0, target, depth=chain_depth(target), near=near, far=far)
-
-
-@dataclass(frozen=True)
-class Selection:
-    """What a choice of coalitions in B scenes rested on, for whoever listens
-    (`Traffic.on_decision`).
-
-    seed [B]: of the scene's noise, which names the rollout; step [B]: of the choice;
-    reference [B, T', V, 4]: states of the reference rollout at the steps looked at,
-    moments [B, T'] s after the choice; weights [B, T', V, V]: pair risks there, eq.
-    (ttc_weight_t); candidates, feasible [B, V] bool: S_top and F; coalition, target [B,
-    V]: C* and whom each of it acts on (0 the ego, -1: in no coalition); settings: of
-    the risk graphs.
-    """
-
-    seed: Tensor
-    step: Tensor
-    reference: Tensor
-    moments: Tensor
-    weights: Tensor
-    candidates: Tensor
-    feasible: Tensor
-    coalition: Tensor
-    target: Tensor
-    settings: TopologySettings

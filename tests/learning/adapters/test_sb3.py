@@ -97,19 +97,18 @@ def test_it_is_the_batch_of_gymnasium(given):
 
 
 @pytest.mark.parametrize(
-    ("kind", "suffix"),
-    [("ppo", "pt"), ("ppo", "onnx"), ("sac", "onnx"), ("one", "onnx")],
+    "kind",
+    ["ppo", "sac", "one"],
 )
-def test_a_saved_policy_does_what_the_model_predicts(given, tmp_path, kind, suffix):
-    """Statistics of VecNormalize and the scale of the actions included; the file holds
-    arithmetic, no pickle."""
+def test_a_saved_policy_does_what_the_model_predicts(given, tmp_path, kind):
+    """Statistics of VecNormalize and the scale of the actions included."""
     model = trained(
         e2rl.make_gym_env(**given) if kind == "one" else e2rl.make_sb3_env(4, **given),
         kind,
     )
     training = model.policy.training
     ego = e2rl.make_ego(
-        "policy_file", file=str(e2rl.save_policy(model, tmp_path / f"policy.{suffix}"))
+        "policy_file", file=str(e2rl.save_policy(model, tmp_path / "policy.pt"))
     )
     observation = 3 * np.random.default_rng(0).normal(
         size=(200, OBSERVATION_SIZE)
@@ -129,9 +128,9 @@ def test_a_saved_model_says_its_bounds_itself(given, tmp_path):
     """Loaded without an environment; with one of other bounds it is refused."""
     model = trained(e2rl.make_sb3_env(4, **given, max_acceleration=2.0), "ppo_plain")
     model.save(tmp_path / "model.zip")
-    here = e2rl.save_policy(model, tmp_path / "here.onnx")
+    here = e2rl.save_policy(model, tmp_path / "here.pt")
     loaded = e2rl.save_policy(
-        PPO.load(tmp_path / "model.zip", device="cpu"), tmp_path / "loaded.onnx"
+        PPO.load(tmp_path / "model.zip", device="cpu"), tmp_path / "loaded.pt"
     )
     assert same_actions(here, loaded, high=[2.0, 1.6])
     for other in (
@@ -142,7 +141,7 @@ def test_a_saved_model_says_its_bounds_itself(given, tmp_path):
     ):
         with pytest.raises(InputError, match="-8 to 2 m.*-8 to 5 m"):
             e2rl.save_policy(
-                other, tmp_path / "policy.onnx", env=e2rl.make_sb3_env(1, **given)
+                other, tmp_path / "policy.pt", env=e2rl.make_sb3_env(1, **given)
             )
 
 
@@ -152,20 +151,18 @@ def test_a_saved_model_takes_its_normalisation_along(given, tmp_path):
     model = trained(e2rl.make_sb3_env(4, **given), "ppo")
     model.save(tmp_path / "model.zip")
     model.get_vec_normalize_env().save(tmp_path / "normalize.pkl")
-    here = e2rl.save_policy(model, tmp_path / "here.onnx")
+    here = e2rl.save_policy(model, tmp_path / "here.pt")
     env = VecNormalize.load(tmp_path / "normalize.pkl", e2rl.make_sb3_env(1, **given))
     loaded = PPO.load(tmp_path / "model.zip", device="cpu")
-    assert same_actions(
-        here, e2rl.save_policy(loaded, tmp_path / "loaded.onnx", env=env)
-    )
+    assert same_actions(here, e2rl.save_policy(loaded, tmp_path / "loaded.pt", env=env))
     with pytest.raises(
         InputError, match="with normalised observations: pass the VecNormalize"
     ):
-        e2rl.save_policy(loaded, tmp_path / "policy.onnx")
+        e2rl.save_policy(loaded, tmp_path / "policy.pt")
     with pytest.raises(InputError, match="with other statistics"):
         e2rl.save_policy(
             loaded,
-            tmp_path / "policy.onnx",
+            tmp_path / "policy.pt",
             env=VecNormalize(e2rl.make_sb3_env(1, **given)),
         )
     with pytest.raises(
@@ -174,13 +171,13 @@ def test_a_saved_model_takes_its_normalisation_along(given, tmp_path):
         attached = PPO.load(
             tmp_path / "model.zip", env=e2rl.make_sb3_env(1, **given), device="cpu"
         )
-        e2rl.save_policy(attached, tmp_path / "policy.onnx")
+        e2rl.save_policy(attached, tmp_path / "policy.pt")
     plain = trained(e2rl.make_sb3_env(4, **given), "ppo_plain")
     plain.save(tmp_path / "plain.zip")
     with pytest.raises(InputError, match="with other statistics"):
         e2rl.save_policy(
             PPO.load(tmp_path / "plain.zip", device="cpu"),
-            tmp_path / "policy.onnx",
+            tmp_path / "policy.pt",
             env=env,
         )
 
@@ -196,7 +193,7 @@ def test_statistics_of_several_normalisers_are_applied_in_turn(given, tmp_path):
         seed=0,
     ).learn(64)
     ego = e2rl.make_ego(
-        "policy_file", file=str(e2rl.save_policy(model, tmp_path / "policy.onnx"))
+        "policy_file", file=str(e2rl.save_policy(model, tmp_path / "policy.pt"))
     )
     observation = (
         np.random.default_rng(0).normal(size=(50, OBSERVATION_SIZE)).astype(np.float32)
@@ -236,7 +233,7 @@ def test_what_a_file_cannot_carry_is_refused(given, tmp_path, name):
         device="cpu",
     ).learn(8)
     with pytest.raises(InputError, match=message):
-        e2rl.save_policy(model, tmp_path / "policy.onnx")
+        e2rl.save_policy(model, tmp_path / "policy.pt")
     assert not list(tmp_path.iterdir()), "nothing half-written"
 
 
@@ -265,7 +262,7 @@ def test_a_model_of_another_environment_is_refused(given, tmp_path):
         "MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu"
     ).learn(8)
     with pytest.raises(InputError, match=r"\[3\] numbers, not the 326"):
-        e2rl.save_policy(model, tmp_path / "policy.onnx")
+        e2rl.save_policy(model, tmp_path / "policy.pt")
     with pytest.raises(InputError, match="no kind of policy"):
         e2rl.save_policy(
             trained(e2rl.make_sb3_env(4, **given), "ppo"), tmp_path / "policy.zip"

@@ -1,1 +1,1 @@
-"""Training of the prior: windows of logs, loss, optimisation, distributed processes."""
+"""Training of the prior: windows of logs, loss, optimisation."""

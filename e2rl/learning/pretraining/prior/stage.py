@@ -8,7 +8,6 @@ from typing import Any
 from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.record import run_protocol
 from e2rl.learning.logging import RunLogger
-from e2rl.learning.pretraining.prior.distributed import process_group
 from e2rl.learning.pretraining.prior.training import (
     TrainingSettings,
     held_out,
@@ -30,71 +29,60 @@ from e2rl.sim.env import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
 
 
-def run_prior_stage(
-    run: Run, logger: RunLogger | None
-) -> tuple[Path, list[dict]] | None:
+def run_prior_stage(run: Run, logger: RunLogger) -> tuple[Path, list[dict]]:
     """Train a prior; returns its checkpoint's path and the metrics rows of the nominal
-    closed loop on held-out scenes, the ego replayed. None in processes other than the
-    leader."""
+    closed loop on held-out scenes, the ego replayed."""
     config = run.config
     settings = stage_settings(config, TrainingSettings)
-    with process_group(config.device) as (processes, device):
-        folder = processes.from_leader(lambda: run.folder)
-        options = config.prior
-        prior = Prior(  # whose first weights follow the run's seed
-            settings_of(DenoiserSettings, options.network, where="prior.network"),
-            settings_of(SamplerSettings, options.sampler, where="prior.sampler"),
-            bounds=settings_of(BoundSettings, options.bounds, where="prior.bounds"),
-        ).to(device)
-        scenes = processes.leader_first(
-            lambda: load_scenes(
-                config.data,
-                config.num_scenes,
-                split="train",
-                starts=list(settings.starts),
-                scenes=config.scenes,
-            )
-        )
-        processes.from_leader(lambda: run.begin({"scenes": listed(scenes)}))
-        data = hashlib.sha256("\n".join(scene_hashes(scenes)).encode()).hexdigest()[:16]
-        about = {
-            "data": f"{scenes.dataset}/{scenes.split}",
-            "scenes": len(scenes),
-            "fingerprint": data,
-        }
-        origin = about | origin_of(folder) | {"settings": vars(settings)}
-        parts = Parts(folder, "training", about=data)
-        path = train_prior(
-            prior,
-            scenes,
-            settings=settings,
-            folder=folder,
-            origin=origin,
-            processes=processes,
-            logger=logger,
-            parts=parts,
-        )
-        if path is None:
-            return None
-        fields: dict[str, Any] = {
-            "stage": "prior",
-            "parts": Parts(folder, "prior", about=path.name),
-            **origin_of(folder),
-        }
-        setup = Setup(
-            _first_starts(scenes),
-            ReplayEgo(),
-            ego_name="replay",
-            sim=SimSettings(),
-            device=device,
-        )
-        return path, run_protocol(
-            setup,
-            [Method("nominal", NominalTraffic(prior))],
-            seeds=[0],
-            folder=folder,
-            **fields,
-        )
+    folder = run.folder
+    options = config.prior
+    prior = Prior(  # whose first weights follow the run's seed
+        settings_of(DenoiserSettings, options.network, where="prior.network"),
+        settings_of(SamplerSettings, options.sampler, where="prior.sampler"),
+        bounds=settings_of(BoundSettings, options.bounds, where="prior.bounds"),
+    ).to(config.device)
+    scenes = load_scenes(
+        config.data,
+        config.num_scenes,
+        split="train",
+        starts=list(settings.starts),
+        scenes=config.scenes,
+    )
+    run.begin({"scenes": listed(scenes)})
+    data = hashlib.sha256("\n".join(scene_hashes(scenes)).encode()).hexdigest()[:16]
+    about = {
+        "data": f"{scenes.dataset}/{scenes.split}",
+        "scenes": len(scenes),
+        "fingerprint": data,
+    }
+    path = train_prior(
+        prior,
+        scenes,
+        settings=settings,
+        folder=folder,
+        origin=about | origin_of(folder) | {"settings": vars(settings)},
+        logger=logger,
+        parts=Parts(folder, "training", about=data),
+    )
+    fields: dict[str, Any] = {
+        "stage": "prior",
+        "parts": Parts(folder, "prior", about=path.name),
+        **origin_of(folder),
+    }
+    setup = Setup(
+        _first_starts(scenes),
+        ReplayEgo(),
+        ego_name="replay",
+        sim=SimSettings(),
+        device=config.device,
+    )
+    return path, run_protocol(
+        setup,
+        [Method("nominal", NominalTraffic(prior))],
+        seeds=[0],
+        folder=folder,
+        **fields,
+    )
 
 
 def _first_starts(scenes: SceneSet) -> SceneSet:

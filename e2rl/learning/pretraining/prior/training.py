@@ -14,11 +14,9 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 
 from e2rl.learning.logging import RunLogger
-from e2rl.learning.pretraining.prior.distributed import ALONE, Processes
 from e2rl.learning.pretraining.prior.loss import (
     CONSTANT_STD,
     MIN_STD,
@@ -45,7 +43,7 @@ WARM_UP = 50  # steps
 WEIGHT_DECAY = 0.1
 EMA = 0.998  # highest decay of the weights' average; first (1 + step) / (10 + step)
 CAUSAL = 0.4  # fraction of windows whose start states are a causal observer's estimates
-RANK_SEED = 1_000_003  # difference of the generator seeds of consecutive ranks
+DROPOUT_SEED = 1_000_003  # difference of the dropout's seeds of consecutive steps
 
 
 @configured("stage/prior")
@@ -73,10 +71,6 @@ class PriorTraining(Supervised):
     """The training of a prior: a turn is `validate_every` steps and a validation of the
     averaged weights.
 
-    Each process draws its part of a step's windows and noise, and gradients are
-    averaged. Hence weights and moving averages are equal in all processes, and a run is
-    determined by its seed and the number of processes.
-
     The held-out loss selects: thousands of windows at fixed noise make it precise.
     Closed-loop metrics on a few scenes would not: their noise exceeds the differences
     between turns.
@@ -88,30 +82,18 @@ class PriorTraining(Supervised):
         windows: TensorDictBase,
         test: TensorDictBase,
         settings: TrainingSettings,
-        processes: Processes = ALONE,
     ):
-        """windows, test: to train on and held out. Raises InputError if the processes
-        cannot share a batch evenly."""
+        """windows, test: to train on and held out."""
         super().__init__(settings)
-        if settings.batch % processes.count:
-            raise InputError(
-                f"stage.batch={settings.batch}: {processes.count} processes share the "
-                "windows of a step evenly; choose a multiple of their number"
-            )
         self.prior = prior
         self.windows = windows
         self.test = test
-        self.processes = processes
-        self.writes = processes.leader
         self.done = 0
-        self.part = settings.batch // processes.count
         self.routes: TensorDictBase | None = None  # scenes to train the route choice on
         self.accuracy = math.nan  # of the route choice
         self.device = next(prior.parameters()).device
         self.bf16 = has_bf16(self.device) if settings.bf16 is None else settings.bf16
-        self.generator = torch.Generator(self.device).manual_seed(
-            settings.seed + RANK_SEED * processes.rank
-        )
+        self.generator = torch.Generator(self.device).manual_seed(settings.seed)
         nodes = windows["nodes"][windows["present"]]
         std = nodes.std(0)
         prior.denoiser.node_mean.copy_(nodes.mean(0))
@@ -122,8 +104,6 @@ class PriorTraining(Supervised):
         kinds = (causal.nonzero()[:, 0], (~causal).nonzero()[:, 0])
         self.rows = [rows for rows in kinds if len(rows)]
         loss: nn.Module = DenoisingLoss(prior.denoiser)
-        if processes.count > 1:  # the leader's first weights, and averaged gradients
-            loss = DistributedDataParallel(loss, broadcast_buffers=False)
         self.loss = torch.compile(loss) if settings.compile else loss
         self.optimiser = torch.optim.AdamW(
             prior.denoiser.parameters(),
@@ -142,15 +122,13 @@ class PriorTraining(Supervised):
         return settings.learning_rate * warm * 0.5 * cosine
 
     def turn(self) -> dict[str, float]:
-        """Steps up to the next validation, and that; followers return no losses."""
+        """Steps up to the next validation, and that."""
         settings = self.settings
         if self.routes is not None and not self.done:
             self.accuracy = train_route_choice(
                 self.prior, self.routes, settings=settings
             )
         row = self.train(min(self.done + settings.validate_every, settings.steps))
-        if not self.processes.leader:
-            return row | {"held_out_loss": math.nan}
         with self.averaged() as prior:
             loss = held_out_loss(prior, self.test, batch=settings.batch)
         return row | {"step": float(self.done), "held_out_loss": loss}
@@ -164,30 +142,27 @@ class PriorTraining(Supervised):
             batch = augment(self.windows[self.pick()].to(self.device), self.generator)
             terms = self.update(batch, draw(batch, self.generator))
             if self.done % 20 == 0:
-                values = self.processes.mean(terms).tolist()
-                for name, value in zip(("action", "trajectory"), values, strict=True):
+                values = zip(("action", "trajectory"), terms.tolist(), strict=True)
+                for name, value in values:
                     means[name] = 0.9 * means.get(name, value) + 0.1 * value
                 bar.set_postfix({name: f"{value:.3f}" for name, value in means.items()})
         return means
 
     def pick(self) -> Tensor:
-        """Indices [part] of a step's windows: a fraction CAUSAL of them with estimated
+        """Indices [B] of a step's windows: a fraction CAUSAL of them with estimated
         starts, if both kinds exist."""
         uniform = torch.rand(
-            2, self.part, generator=self.generator, device=self.device
+            2, self.settings.batch, generator=self.generator, device=self.device
         ).to(self.rows[0].device)
         picks = [rows[(uniform[1] * len(rows)).long()] for rows in self.rows]
         return torch.where(uniform[0] < CAUSAL, picks[0], picks[-1])
 
     def update(self, batch: TensorDictBase, drawn: TensorDictBase) -> Tensor:
-        """One step on this process's windows with the random numbers of `loss.draw`;
+        """One step on windows with the random numbers of `loss.draw`;
         returns the loss's terms [2]."""
-        # Dropout is seeded by step and rank, so a resumed run repeats it.
-        torch.manual_seed(
-            self.settings.seed
-            + RANK_SEED * (self.done * self.processes.count + self.processes.rank)
-        )
-        total = self.processes.mean(loss_weight(batch, drawn).sum()).clamp(min=1)
+        # Dropout is seeded by step, so a resumed run repeats it.
+        torch.manual_seed(self.settings.seed + DROPOUT_SEED * self.done)
+        total = loss_weight(batch, drawn).sum().clamp(min=1)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
             loss, action, trajectory = self.loss(batch, drawn, total)
         for group in self.optimiser.param_groups:
@@ -232,12 +207,12 @@ class PriorTraining(Supervised):
         self.prior.load_state_dict(weights)
 
     def state_dict(self) -> dict:
-        """All that later turns depend on. Collective: all processes must call it."""
+        """All that later turns depend on."""
         return {
             **super().state_dict(),
             "done": self.done,
             "accuracy": self.accuracy,
-            "draws": self.processes.gather(self.generator.get_state().cpu()),
+            "draws": self.generator.get_state().cpu(),
             **{name: part.state_dict() for name, part in self._stateful().items()},
         }
 
@@ -250,20 +225,13 @@ class PriorTraining(Supervised):
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Restore a `state_dict`. Raises InputError if the number of processes differs."""
-        count = self.processes.count
-        draws = state["draws"]
-        if len(draws) != count:
-            raise InputError(
-                f"the run was begun by {len(draws)} processes, this is {count}; "
-                "resume with as many"
-            )
+        """Restore a `state_dict`."""
         super().load_state_dict(state)
         for name, part in self._stateful().items():
             part.load_state_dict(state[name])
         self.done = state["done"]
         self.accuracy = state["accuracy"]
-        self.generator.set_state(draws[self.processes.rank].cpu())
+        self.generator.set_state(state["draws"].cpu())
 
 
 def has_bf16(device: torch.device) -> bool:
@@ -353,12 +321,10 @@ def train_prior(
     settings: TrainingSettings,
     folder: Path,
     origin: dict,
-    processes: Processes = ALONE,
     logger: RunLogger | None = None,
     parts: Parts = NO_PARTS,
-) -> Path | None:
-    """Train a prior; returns the path of its checkpoint, None in processes other than
-    the leader.
+) -> Path:
+    """Train a prior; returns the path of its checkpoint.
 
     Args:
         prior: that is trained, in place.
@@ -368,7 +334,6 @@ def train_prior(
             held-out loss.
         origin: data and command, for the checkpoint's header, which also has the
             results of the training.
-        processes: that train together.
         logger: of the losses.
         parts: of the run, from which an interrupted training goes on exactly.
 
@@ -379,14 +344,10 @@ def train_prior(
     validation = held_out(scenes)
     windows = windows_of(scenes, ~validation, "training")
     test = windows_of(scenes, validation, "held-out")
-    run = PriorTraining(
-        prior, windows, test=test, settings=settings, processes=processes
-    )
+    run = PriorTraining(prior, windows, test=test, settings=settings)
     run.routes = scenes.batch((~validation).nonzero()[:, 0])
     turns = -(-settings.steps // settings.validate_every)
     best = run.fit("prior", turns, parts, logger=logger)
-    if not processes.leader:
-        return None
     results = {
         "windows": len(windows),
         "held_out_windows": len(test),
@@ -394,7 +355,6 @@ def train_prior(
         "held_out_loss": best["held_out_loss"],
         "step": int(best["step"]),
         "route_accuracy": run.accuracy,
-        "processes": processes.count,
         "device": str(run.device),
         "versions": {"python": platform.python_version(), "torch": torch.__version__},
         "seconds": {"training": round(time.perf_counter() - begin, 1)},
