@@ -263,7 +263,7 @@ def test_a_model_of_another_environment_is_refused(given, tmp_path):
     ).learn(8)
     with pytest.raises(InputError, match=r"\[3\] numbers, not the 326"):
         e2rl.save_policy(model, tmp_path / "policy.pt")
-    with pytest.raises(InputError, match="no kind of policy"):
+    with pytest.raises(InputError, match="name the policy.s file POLICY.pt"):
         e2rl.save_policy(
             trained(e2rl.make_sb3_env(4, **given), "ppo"), tmp_path / "policy.zip"
         )
