@@ -6,7 +6,15 @@ import torch
 from tensordict import TensorDict
 
 from e2rl.metrics import evasion
-from e2rl.metrics.evasion import add_avoidable, find_evasions, spliced
+from e2rl.metrics.evasion import (
+    Knots,
+    add_avoidable,
+    executed,
+    find_evasions,
+    spliced,
+)
+from e2rl.metrics.evasion_scene import EvasionScene
+from e2rl.metrics.manoeuvre import knot_count
 from e2rl.scenes.boxes import separation
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.rollouts import Rollouts
@@ -214,3 +222,45 @@ def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkey
         assert row["evasion_accel"] == 3.0
     assert torch.equal(rollouts.evasion[0, :31], scene["logged"][0, :31, 0])
     assert (rollouts.evasion[0, 31:] == 7).all()
+
+
+def violation(monkeypatch, width=2.0, shift=0.0):
+    """m by which an ego fails that keeps its lane past a standing vehicle in the next
+    one, `width` m wide, and later drives `shift` m beside it."""
+    scene = make_scenes(
+        1, vehicles=[(0, 0, 10.0), (20, 1, 0.0)], num_vrus=0, steps=60, **SIZES
+    ).scenes
+    scene["size"][:, 1, 1] = width
+    states = scene["logged"][:, None, 1:, 0].clone()
+    states[:, :, 40:, 1] += shift
+    monkeypatch.setattr(evasion, "execute", lambda *_, **__: (states[..., :2], states))
+    knots = torch.zeros(1, 1, knot_count(60))
+    trial = executed(
+        EvasionScene.after(
+            torch.tensor([0]),
+            scene,
+            states=scene["logged"],
+            valid=scene["logged_valid"],
+        ),
+        Knots(
+            route=torch.zeros(1, 1, dtype=torch.int64),
+            accel=knots,
+            shift=knots,
+            batch_size=[1, 1],
+        ),
+        SimSettings(),
+    )
+    return trial.violation.item()
+
+
+@pytest.mark.parametrize(("gap", "clean"), [(0.045, False), (0.055, True)])
+def test_an_evasion_leaves_five_centimetres_to_everybody(gap, clean, monkeypatch):
+    """Beside a vehicle in the next lane, 3.5 m to the left; the ego is 2 m wide."""
+    width = 2 * (3.5 - 1.0 - gap)
+    assert (violation(monkeypatch, width=width) == 0) is clean
+
+
+@pytest.mark.parametrize(("shift", "clean"), [(-2.2, True), (-2.3, False)])
+def test_an_evasion_stays_half_a_metre_within_the_border(shift, clean, monkeypatch):
+    """The lane is 3.5 m wide, and the border 1 m beyond it: 2.75 m to the right."""
+    assert (violation(monkeypatch, shift=shift) == 0) is clean

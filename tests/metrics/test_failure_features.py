@@ -228,3 +228,40 @@ def test_the_acceleration_is_that_of_the_last_second(first, word):
     speed[first:] = 9.5
     speed[first + 1 :] = 8.0
     assert word_of(speed) == word
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("sideways", "veers"), [(0.45, False), (0.55, True)])
+def test_who_moves_half_a_metre_a_second_across_its_lane_veers(sideways, veers, sign):
+    window = torch.zeros(1, 21, 2, 4, dtype=torch.float64)
+    window[..., 3] = 10.0
+    lanes = torch.full((1, 21, 2), -sign * math.asin(sideways / 10)).double()
+    index = manoeuvre(window, torch.tensor([20]), lanes=lanes)
+    side = "left" if sign > 0 else "right"
+    expected = f"veers {side}" if veers else "keeps speed"
+    assert MANOEUVRES[index[0, 0].item()] == expected
+
+
+@pytest.mark.parametrize(
+    ("speed", "word"), [(15.0, "keeps speed"), (18.0, "veers left")]
+)
+def test_a_bend_s_direction_is_looked_up_every_0_4_s(speed, word):
+    """The vehicle turns by 0.2 rad/s and is 0.15 s ahead of the last look, in the mean:
+    it seems to move across its lane by 0.15 s times its lateral acceleration of 3.0 or
+    3.6 m/s^2."""
+    radius = speed / 0.2
+    angle = torch.linspace(-0.2, 2.0, 2000, dtype=torch.float64)
+    lane = radius * torch.stack([angle.sin(), 1 - angle.cos()], -1)
+    start = 4.0 * (speed - 4.0) / radius
+    ahead = drive(
+        radius * math.sin(start),
+        radius * (1 - math.cos(start)),
+        start,
+        4.0,
+        turn=lambda _: 4.0 / radius,
+    )
+    rollouts = scene(drive(0, 0, EAST, speed, turn=lambda _: 0.2), ahead).replace(
+        lane_points=lane[None].float(),
+        lane_index=torch.zeros(1, len(lane), dtype=torch.int64),
+    )
+    assert score_rollouts(rollouts)[0][0]["ego_manoeuvre"] == word

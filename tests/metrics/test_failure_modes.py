@@ -1,6 +1,7 @@
 """Failure modes: what belongs together, how it is named, and that the order of the
 failures does not matter."""
 
+import math
 import random
 from functools import partial
 
@@ -16,11 +17,13 @@ from e2rl.metrics.failure_modes import (
     mode_name,
     split_side,
 )
+from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.statistics import (
     MetricTable,
     bootstrap_draws,
     resampled_labels,
     row_metrics,
+    summarise,
 )
 
 REAR_END = {
@@ -234,3 +237,23 @@ def test_coverage_is_the_expected_number_of_modes_at_so_many_places():
     ]
     assert weights.sum(0).tolist() == [36, 12]
     assert set((totals / weights)[0].tolist()) == {3.0}
+
+
+@pytest.mark.parametrize(("brake", "named"), [(6, False), (7, True)])
+def test_a_word_that_two_thirds_share_is_in_the_name(brake, named):
+    """Of ten failures, six or seven brake."""
+    others = ["stands", "turns left", "turns right", "keeps speed"]
+    moves = (["brakes"] * brake + others)[:10]
+    members = [failure(CROSSING, ego_manoeuvre=move) for move in moves]
+    assert ("ego brakes" in mode_name(members)) is named
+
+
+@pytest.mark.parametrize(("places", "known"), [(9, False), (10, True)])
+def test_coverage_is_of_ten_places(places, known):
+    rows = [
+        failure(CROSSING, scene=str(index), mode=1.0, counted=1.0)
+        for index in range(places)
+    ]
+    samples = [NO_SAMPLES] * places
+    found = summarise(rows, samples, draws=2, realism_draws=2)["mode_coverage"]
+    assert (not math.isnan(found["mean"])) is known

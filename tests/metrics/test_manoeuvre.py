@@ -1,6 +1,7 @@
 """Manoeuvres obey the simulator's limits and follow routes; what counts against them is
 what DrivingEnv counts."""
 
+import pytest
 import torch
 
 from e2rl.metrics.evasion_scene import AWAY, EvasionScene, violations
@@ -196,3 +197,40 @@ def test_nothing_counts_behind_the_map_s_end_or_after_the_episode():
         )[..., 10:]
         == 0
     ).all()
+
+
+@pytest.mark.parametrize(("speed", "slowest"), [(1.0, 2.0), (1.8, 2.0), (2.2, 2.2)])
+def test_below_two_metres_a_second_a_shift_is_slower_than_its_knots(speed, slowest):
+    """The tangent of the heading is the shift's rate over the speed; a vehicle at v
+    below 2 m/s shifts (v / 2)^2 times as fast."""
+    knots = 0.1 * torch.arange(KNOTS).double()
+    start = torch.tensor([0.0, 0.0, 0.0, speed]).double()
+    route = SPACING * torch.arange(150).double()
+    _, states = execute(
+        start,
+        torch.stack([route, 0 * route], -1),
+        accel=0 * knots,
+        shift=knots,
+        steps=STEPS,
+        sim=LIMITS,
+    )
+    _, rate = shifts(knots, STEPS)
+    expected = rate[40] * speed / slowest**2
+    torch.testing.assert_close(states[39, 2].tan(), expected, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("offset", "inner"), [(15.0, 0.5), (22.5, 0.25), (25.0, 0.2)])
+def test_inside_a_bend_a_path_is_at_least_a_fifth_as_long_as_its_route(offset, inner):
+    """At d m inside a bend of 30 m a vehicle turns by v / (30 - d) a second, as on a
+    circle of 6 m at least."""
+    speed = 2.0
+    ramp = (torch.arange(KNOTS).double() / 12).clamp(max=1)
+    actions, _ = execute(
+        torch.tensor([0.0, 0.0, 0.0, speed]).double(),
+        arc(30.0).double(),
+        accel=0 * ramp,
+        shift=offset * ramp,
+        steps=STEPS,
+        sim=LIMITS,
+    )
+    assert actions[-1, 1].item() == pytest.approx(speed / (30 * inner), rel=0.01)

@@ -7,7 +7,12 @@ import pytest
 import torch
 
 from e2rl.metrics.contact import first_contact
-from e2rl.metrics.nuplan_scores import MULTIPLIERS, WEIGHTS, nuplan_columns
+from e2rl.metrics.nuplan_scores import (
+    MULTIPLIERS,
+    WEIGHTS,
+    comfort,
+    nuplan_columns,
+)
 from e2rl.metrics.score import as_doubles
 from e2rl.scenes.recording import CYCLIST, OTHER, VEHICLE
 from tests.metrics.random_rollouts import random_rollouts
@@ -523,3 +528,96 @@ def test_a_map_without_lanes_has_scores():
         lane_width=torch.zeros(1, 0),
     )
     assert set(TERMS) <= set(terms(rollouts))
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(148, 0), (152, 1)])
+def test_who_comes_from_more_than_150_degrees_is_behind(degrees, expected):
+    """Measured at the rear axle of an ego in two lanes, whose rear corner is hit."""
+    axle = -1.461 / 5.176 * 4.8
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    x = axle + 1.5 / math.tan(math.radians(degrees)) + 10 * time
+    y = torch.where(time < 0.05, 40.0, 2.0 + 1.5)
+    two = [([[-500, 0], [500, 0]], 4), ([[-500, 4], [500, 4]], 4)]
+    found = scores(
+        course(0, 2, heading=0, speed=10),
+        track(x, y, heading=0 * time, speed=10.0 + 0 * time),
+        lanes=two,
+    )
+    assert found["no_ego_at_fault_collisions"] == expected
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(0.45, 1), (0.55, 0)])
+def test_a_lane_follows_another_within_half_a_metre(gap, expected):
+    """The road is cut into pieces of 7 m less a gap; one lane all the while, or two."""
+    ego = course(0, 2, heading=0, speed=10)
+    other = course(0.5, 9, heading=-0.35, speed=10.2)
+    pieces = [([[x, 2], [x + 7 - gap, 2]], 8) for x in range(-21, 200, 7)]
+    found = scores(ego, other, lanes=pieces)
+    assert found["no_ego_at_fault_collisions"] == expected
+
+
+@pytest.mark.parametrize(("speed", "expected"), [(0.0045, 1), (0.0055, 0)])
+def test_time_to_collision_has_an_ego_faster_than_5_mm_per_s(speed, expected):
+    time = torch.arange(81, dtype=torch.float64) * 0.1
+    near = track(
+        10 + 0 * time,
+        0 * time,
+        heading=math.pi + 0 * time,
+        speed=torch.where(time < 0.05, 9.0, 0.0),
+    )
+    found = scores(course(0, 0, heading=0, speed=speed), near)
+    assert found["time_to_collision_within_bound"] == expected
+
+
+def comfort_of(accel, yaw_rate=None, length=0.0):
+    """Whether accelerations m/s^2 and yaw rates rad/s of steps [T] are comfortable, of
+    a vehicle of a length."""
+    ego = torch.zeros(1, len(accel) + 1, 4, dtype=torch.float64)
+    if yaw_rate is not None:
+        ego[0, 1:, 2] = 0.1 * yaw_rate.cumsum(0)
+    ego[0, 1:, 3] = 0.1 * accel.cumsum(0)
+    ego[..., 3] += 20.0
+    return comfort(ego, torch.tensor([length], dtype=torch.float64)).item()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("rate", "expected"), [(1.9, 1), (1.96, 0)])
+def test_a_yaw_rate_changes_by_up_to_1_93_rad_s2(rate, expected, sign):
+    """From -0.75 to 0.75 rad/s or back; the centre is the rear axle."""
+    time = 0.1 * torch.arange(8, dtype=torch.float64)
+    yaw_rate = sign * rate * (time - 0.35)
+    assert comfort_of(0 * time, yaw_rate) == expected
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("jerk", "expected"), [(4.0, 1), (4.3, 0)])
+def test_an_acceleration_along_the_vehicle_changes_by_up_to_4_13_m_s3(
+    jerk, expected, sign
+):
+    """Straight on, from braking to accelerating or back, for as long as the filter's
+    window of 1.5 s."""
+    time = 0.1 * torch.arange(45, dtype=torch.float64)
+    accel = (jerk * (time - 1.5) - 3.9).clamp(-3.9, 2.2)
+    if sign < 0:
+        accel = accel.flip(0)
+    assert comfort_of(accel) == expected
+
+
+@pytest.mark.parametrize(("jerk", "expected"), [(8.2, 1), (8.8, 0)])
+def test_an_acceleration_grows_by_up_to_8_37_m_s3(jerk, expected):
+    """At the rear axle of a vehicle whose turn takes back, 5 m ahead at its centre,
+    what the axle gains."""
+    time = 0.1 * torch.arange(9, dtype=torch.float64)
+    accel = jerk * time
+    yaw_rate = 0.4 - 0.1 * accel.cumsum(0) / 5
+    assert comfort_of(accel, yaw_rate, length=5 * 5.176 / 1.461) == expected
+
+
+@pytest.mark.parametrize(("jerk", "expected"), [(8.2, 1), (9.2, 0)])
+def test_a_braking_eases_by_up_to_8_37_m_s3(jerk, expected):
+    """The same vehicle, whose braking of 3.9 m/s^2 ends within half a second; the
+    filter overshoots where it ends."""
+    time = 0.1 * torch.arange(7, dtype=torch.float64)
+    accel = (jerk * time - 3.9).clamp(max=0)
+    yaw_rate = -0.1 * (accel + 3.9).cumsum(0) / 5
+    assert comfort_of(accel, yaw_rate, length=5 * 5.176 / 1.461) == expected

@@ -276,14 +276,14 @@ def test_the_partner_and_the_fifteen_nearest_others_are_there(nearer, avoided):
 
 
 def test_a_chain_has_two_followers():
-    """Two brake in time one behind the other; the third, which tailgates, is not
+    """Two brake in time one behind the other; the third, which could not, is not
     looked at."""
     case = collision(
         track(14.0),
         cut_in(14.0, 14.0, other_speed=6.0),
         follower(20.0),
         follower(35.3),
-        follower(44.8),
+        follower(40.0),
     )
     result = human(case)
     assert result.followers.item() == 2
@@ -311,3 +311,19 @@ def test_a_path_goes_on_straight_beyond_its_end():
     crossing = others(track(0.0, math.pi / 2, start=(75.0, 0.0)))
     along = along_path(standing, SIZE[:, 1], others=crossing)
     assert along.rear[0, 0, 0].item() == pytest.approx(74.0)
+
+
+class Asleep:
+    """A driver who sees nothing."""
+
+    def step(self, state, observation):
+        return state, torch.full_like(observation.gap, torch.inf)
+
+
+@pytest.mark.parametrize(("speed", "struck"), [(0.45, True), (0.55, False)])
+def test_a_driver_who_creeps_at_half_a_metre_a_second_is_struck(speed, struck):
+    """Head-on, by a partner at 3 m/s."""
+    oncoming = track(3.0, math.pi, start=(20.0, 0.0))
+    case = collision(track(speed), oncoming)
+    result = preventions(case, {"asleep": Asleep()})["asleep"]
+    assert result.struck.item() is struck

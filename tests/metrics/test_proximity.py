@@ -195,3 +195,17 @@ def test_moved_means_farther_than_the_limit_at_a_step_where_it_is_there():
     states[0, 2, 1, 0] = 2.0
     states[0, 2, 2, 0], valid[0, 2, 2] = 9.0, False
     assert moved(states, valid)[0].tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize(("recorded", "known"), [(0.95, False), (1.05, True)])
+def test_of_a_recorded_path_below_a_metre_no_fraction_is_known(recorded, known):
+    path = course(0, 0, heading=0, speed=recorded / 8)
+    assert (not math.isnan(completion(path, path))) is known
+
+
+@pytest.mark.parametrize(("speed", "starters"), [(0.45, 1), (0.55, 0)])
+def test_a_vehicle_stands_at_the_start_below_half_a_metre_a_second(speed, starters):
+    batch = rollouts()
+    batch["states"] = batch["states"].clone()
+    batch["states"][0, 0, STARTS, 3] = speed
+    assert values(batch)["starters"] == starters

@@ -131,3 +131,34 @@ def test_a_constant_turn_has_its_lateral_acceleration():
         sample["a_lon"][0], torch.full((15,), 0.5, dtype=torch.float64)
     )
     assert sample["jerk"].abs().max() < 1e-9
+
+
+def samples_of(speed, yaw_rate=0.0):
+    """The samples of one vehicle at speeds [81] that turns at a yaw rate."""
+    states = torch.zeros(1, 81, 2, 4, dtype=torch.float64)
+    states[0, :, 1, 2] = 0.1 * yaw_rate * torch.arange(81)
+    states[0, :, 1, 3] = speed
+    valid = torch.ones(1, 81, 2, dtype=torch.bool)
+    return kinematic_samples(
+        states,
+        valid,
+        logged=states,
+        logged_valid=valid,
+        agents=torch.tensor([[False, True]]),
+        stop=torch.tensor([80]),
+    )[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "largest"), [("a_lon", 10.0), ("a_lat", 10.0), ("jerk", 20.0)]
+)
+def test_a_glitch_counts_as_10_m_s2_or_20_m_s3(name, largest):
+    """In a bend of 1 rad/s the speed jumps from 5 to 35 m/s: 60 m/s^2 along, 35 m/s^2
+    across, and 120 m/s^3."""
+    speed = torch.where(torch.arange(81) < 41, 5.0, 35.0)
+    assert samples_of(speed, yaw_rate=1.0)[name].max() == largest
+
+
+@pytest.mark.parametrize(("speed", "count"), [(0.45, 0), (0.55, 15)])
+def test_who_drives_at_half_a_metre_a_second_moves(speed, count):
+    assert samples_of(torch.full((81,), speed))["a_lon"].shape[1] == count

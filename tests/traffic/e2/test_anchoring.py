@@ -176,6 +176,23 @@ def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
     assert (speed[inside] < 1.1 * math.sqrt(4.0 * radius)).all()
 
 
+def free_candidate(speed):
+    """One vehicle at the start of a long straight candidate without bends."""
+    one = torch.ones(1, 1, 1)
+    return anchoring._Candidates(
+        one.long(),
+        one,
+        usable=one.bool(),
+        end=200 * one,
+        s=0 * one,
+        d=0 * one,
+        bend_bound=torch.full((1, 1, 1, anchoring.BEND_VERTICES), 1e4),
+        speed=torch.full((1, 1), speed),
+        accel=torch.zeros(1, 1),
+        size=torch.tensor([[[4.0, 2.0]]]),
+    )
+
+
 @pytest.mark.parametrize(
     ("beside", "crossing", "slack"),
     [(1.0, 0.2, 0.0), (-1.5, 0.1, 0.0), (0.0, 0.3, 3.0)],
@@ -185,22 +202,8 @@ def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_sti
 ):
     """At 10 m/s to a target that stays 30.5 m ahead: the nearest steps are half a metre
     off it. Acceleration and offset from the route have prices of their own."""
+    candidates = free_candidate(speed=10.0)
     one = torch.ones(1, 1, 1)
-    speed = torch.full((1, 1), 10.0)
-    ample = torch.full((1, 1, 1, anchoring.BEND_VERTICES), 1e4)
-    size = torch.tensor([[[4.0, 2.0]]])
-    candidates = anchoring._Candidates(
-        one.long(),
-        one,
-        usable=one.bool(),
-        end=200 * one,
-        s=0 * one,
-        d=0 * one,
-        bend_bound=ample,
-        speed=speed,
-        accel=0 * speed,
-        size=size,
-    )
     steps = torch.ones(1, 1, 1, 50)
     limits = torch.tensor((-3.0, 2.0))
     target = anchoring._Target(
@@ -219,3 +222,27 @@ def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_sti
         shifted, torch.full((1, 1, 1, 1), -1.5), target, limits
     )
     assert (cost - gap).item() == pytest.approx(0.2 * 1.5 + 0.05 * 0.4, abs=1e-5)
+
+
+def test_a_knot_is_the_mean_acceleration_over_0_4_s():
+    """From 2.7 m/s at -3 m/s^2 it stands after 0.9 s: 0.3 m/s are lost between 0.8 and
+    1.2 s."""
+    knots = anchoring._knots(
+        free_candidate(speed=2.7),
+        torch.full((1, 1, 1, 1), -3.0),
+        limits=torch.tensor((-3.0, 2.0)),
+    )
+    expected = [-3.0, -0.3 / 0.4, *[0.0] * 8]
+    assert knots.flatten().tolist() == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(("before", "squared_speed"), [(-2.0, 100.0), (18.0, 208.0)])
+def test_a_bend_takes_4_m_s2_and_its_approach_brakes_by_3(before, squared_speed):
+    """40 m straight on, then a circle of R = 25 m, whose curvature a polyline of 2 m
+    has from 42 m on: 4 R, and 2 * 3 m/s^2 for each metre before that."""
+    arc = 2.0 * torch.arange(150)
+    angle = (arc - 40).clamp(min=0) / 25
+    x = arc.clamp(max=40) + 25 * angle.sin()
+    route = torch.stack([x, 25 * (1 - angle.cos())], -1)
+    bound = anchoring._bend_bound(route, torch.tensor(42.0 - before))
+    assert bound[0].item() == pytest.approx(squared_speed, rel=1e-3)

@@ -234,16 +234,13 @@ def test_what_an_interception_weighs_in_seconds():
     assert float(later - anytime) == pytest.approx(1.5)
 
 
-@pytest.mark.parametrize(("radius", "possible"), [(12.0, True), (8.0, False)])
-def test_lateral_acceleration_on_an_arc_is_its_speed_squared_over_the_radius(
-    radius, possible
-):
-    """At 7 m/s an arc of 12 m takes 4.1 m/s^2, one of 8 m 6.1: 5 are allowed."""
+def arc_path(radius=20.0):
+    """A path of 1 rad on a circle."""
     count = interception.SAMPLES
     angle = torch.linspace(0, 1.0, count)
     points = radius * torch.stack([angle.sin(), 1 - angle.cos()], -1)
     zero = torch.zeros(1, 1, 1)
-    paths = interception._Paths(
+    return interception._Paths(
         points=points.expand(1, 1, 1, count, 2),
         tangents=torch.stack([angle.cos(), angle.sin()], -1).expand(1, 1, 1, count, 2),
         length=(radius * angle).expand(1, 1, 1, count),
@@ -251,7 +248,67 @@ def test_lateral_acceleration_on_an_arc_is_its_speed_squared_over_the_radius(
         turn=zero + 1.0,
         end_heading=zero + 1.0,
     )
-    drive = interception._Drive(zero + 7.0, zero, time=zero + 3.0)
+
+
+def within_limits(path, limits=FREE, speed=5.0, accel=0.0):
+    """Whether it keeps the limits of intensity 1."""
+    zero = torch.zeros(1, 1, 1)
+    drive = interception._Drive(zero + speed, zero + accel, time=zero + 3.0)
+    return bool(interception._within_limits(path, drive, zero + 1.0, limits))
+
+
+@pytest.mark.parametrize(("turn", "possible"), [(1.35, True), (-1.45, False)])
+def test_a_path_turns_by_1_4_rad_at_most(turn, possible):
+    path = arc_path()._replace(turn=torch.full((1, 1, 1), turn))
+    assert within_limits(path) == possible
+
+
+@pytest.mark.parametrize(("bearing", "possible"), [(-1.0, True), (1.1, False)])
+def test_a_target_lies_within_60_degrees_of_the_heading(bearing, possible):
+    path = arc_path()._replace(bearing=torch.full((1, 1, 1), bearing))
+    assert within_limits(path) == possible
+
+
+@pytest.mark.parametrize(
+    ("accel", "possible"), [(1.45, True), (1.55, False), (-1.15, True), (-1.25, False)]
+)
+def test_by_default_it_pushes_by_1_5_and_brakes_by_1_2_m_s2_per_intensity(
+    accel, possible
+):
+    limits = replace(InterceptionSettings(), lateral=5.0)
+    assert within_limits(arc_path(), limits=limits, accel=accel) == possible
+
+
+@pytest.mark.parametrize(("radius", "possible"), [(12.0, True), (8.0, False)])
+def test_lateral_acceleration_on_an_arc_is_its_speed_squared_over_the_radius(
+    radius, possible
+):
+    """At 7 m/s an arc of 12 m takes 4.1 m/s^2, one of 8 m 6.1: 5 are allowed."""
     limits = replace(FREE, lateral=5.0)
-    within = interception._within_limits(paths, drive, zero + 1.0, limits)
-    assert bool(within) == possible
+    assert within_limits(arc_path(radius), limits=limits, speed=7.0) == possible
+
+
+def test_lateral_acceleration_weighs_0_2_s_each_m_s2():
+    """At 5 m/s on an arc of 20 m, for 3 s."""
+    zero = torch.zeros(1, 1, 1)
+    drive = interception._Drive(zero + 5.0, zero, time=zero + 3.0)
+    cost = interception._cost(arc_path(20.0), drive, wish=wish_of(1))
+    assert float(cost) == pytest.approx(0.2 * 5.0**2 / 20 + 0.1 * 3, rel=1e-4)
+
+
+def test_what_only_the_competent_driver_survives_is_2_s_cheaper(monkeypatch):
+    costs = []
+    for worth in (0.0, 1.0):
+        monkeypatch.setattr(
+            interception,
+            "_worth",
+            lambda *_, possible, worth=worth, **__: worth * possible.float(),
+        )
+        costs.append(met([EGO, BESIDE])[0].cost.item())
+    assert costs[0] - costs[1] == pytest.approx(2.0, abs=1e-5)
+
+
+def test_by_default_an_interception_is_preferred_to_a_lane_by_2_s():
+    plain = met([EGO, BESIDE], settings=replace(FREE, preference=0.0))[0].cost
+    default = met([EGO, BESIDE], settings=FREE)[0].cost
+    assert (plain - default).item() == pytest.approx(2.0, abs=1e-5)

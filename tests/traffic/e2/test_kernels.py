@@ -2,11 +2,14 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
+import pytest
 import torch
 
 from e2rl.prior.lane_relative import SIZE
 from e2rl.sim.world import World
+from e2rl.traffic.e2 import kernels
 from e2rl.traffic.e2.choice import DRAWN
 from e2rl.traffic.e2.kernels import KernelAttack, displacements, propose_kernels
 from e2rl.traffic.e2.pull import nats
@@ -47,14 +50,14 @@ def proposed(gain, count=5):
 
 
 def test_kernels_are_shifts_of_moving_vehicles_that_gain_more_than_they_cost():
-    mean, world, kernels = proposed(300.0)
-    assert kernels.goal.shape == (3, 5, SIZE)
-    assert (kernels.vehicle >= 0).any()
-    assert (kernels.vehicle != 0).all()
+    mean, world, chosen = proposed(300.0)
+    assert chosen.goal.shape == (3, 5, SIZE)
+    assert (chosen.vehicle >= 0).any()
+    assert (chosen.vehicle != 0).all()
     parked = world.scene["parked"]
-    for b, n in (kernels.vehicle >= 0).nonzero().tolist():
-        vehicle = int(kernels.vehicle[b, n])
-        shift = kernels.goal[b, n] - mean[b, vehicle]
+    for b, n in (chosen.vehicle >= 0).nonzero().tolist():
+        vehicle = int(chosen.vehicle[b, n])
+        shift = chosen.goal[b, n] - mean[b, vehicle]
         assert not parked[b, vehicle]
         assert world.valid[b, vehicle]
         assert (displacements(CPU) - shift).abs().amax(-1).min() < 1e-5
@@ -131,3 +134,24 @@ def test_who_stands_for_all_of_its_plan_has_no_kernels():
 def test_the_ten_nearest_have_kernels():
     row = [(5.0 + 4.0 * number, 0.0) for number in range(12)]
     assert with_kernels(*row) == list(range(1, 11))
+
+
+@pytest.mark.parametrize(("apart", "drawn"), [(5.9, [1, -1]), (6.1, [1, 1])])
+def test_two_kernels_of_a_vehicle_are_6_nats_apart(apart, drawn, monkeypatch):
+    """One kernel is no shift, the other one of so many nats; both gain as much."""
+    shift = torch.zeros(SIZE)
+    shift[-1] = 1.0
+    table = torch.stack([0 * shift, shift * (apart / nats(shift)) ** 0.5])
+    value = torch.full((1, 3, 2), -torch.inf)
+    value[0, 1] = 1.0
+    monkeypatch.setattr(kernels, "displacements", lambda _: table)
+    monkeypatch.setattr(kernels, "_values", lambda *_, **__: value)
+    found = propose_kernels(
+        SimpleNamespace(row=torch.tensor([0])),
+        None,
+        points=None,
+        mean=torch.zeros(1, 3, SIZE),
+        gain=torch.tensor([1.0]),
+        count=2,
+    )
+    assert found.vehicle[0].tolist() == drawn
