@@ -1,16 +1,12 @@
-"""The code of a data source: the modules that its class comes from, and what a user's
-ones import from beside them.
+"""The code of a data source: the modules that its class comes from, and what lies
+beside those of a user.
 
 The cache of scenes is keyed by it, so that an edited reader does not get the scenes of
 the old one; and messages name the line of it that failed.
 """
 
-import ast
 import hashlib
 import sys
-from collections.abc import Iterator
-from importlib.machinery import PathFinder
-from importlib.util import resolve_name
 from pathlib import Path
 from types import TracebackType
 
@@ -24,22 +20,22 @@ def code_hash(kind: type) -> str | None:
 
     Of the package's own modules it holds those in which the class and its bases are
     defined: what these call is covered by the version of the scene builder. Of others
-    it also holds all that they import, at whatever depth, from the folder in which
-    their top-level module or package lies.
+    it also holds all Python files of their package, or those beside a lone module.
 
     Args:
         kind: a class; its bases from the standard library do not count.
     """
-    files: dict[str, Path | None] = {}
-    for name in _modules(kind):
-        files[name] = _loaded_file(name)
-        if not _is_own(name):
-            files |= _imported_files(name, files[name])
-    digest = hashlib.sha256()
-    for name, file in sorted(files.items()):
+    files: set[Path] = set()
+    for module in _modules(kind):
+        file = _loaded_file(module)
         if file is None or not file.is_file():
             return None
-        digest.update(name.encode() + hashlib.sha256(file.read_bytes()).digest())
+        files.add(file)
+        if not _is_own(module):
+            files.update(_folder(module, file).glob(_pattern(module)))
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 
 
@@ -54,14 +50,13 @@ def failed_line(kind: type, trace: TracebackType | None) -> str:
     names = [name for name in _modules(kind) if not _is_own(name)]
     files = {name: file for name in names if (file := _loaded_file(name))}
     folders = [_folder(name, file) for name, file in files.items()]
-    paths = set(map(str, files.values()))
     line = ""
     while trace is not None:
         code = trace.tb_frame.f_code.co_filename
         module = trace.tb_frame.f_globals.get("__name__", "")
-        beside = any(_is_inside(Path(code), folder) for folder in folders)
         interactive = code.startswith("<") and not _is_standard(module)
-        if code in paths or ((beside or interactive) and not _is_own(module)):
+        beside = any(_is_inside(Path(code), folder) for folder in folders)
+        if (beside or interactive) and not _is_own(module):
             line = f"{code}:{trace.tb_lineno}"
         trace = trace.tb_next
     return line
@@ -96,73 +91,12 @@ def _loaded_file(module: str) -> Path | None:
 
 
 def _folder(module: str, file: Path) -> Path:
-    """Returns the folder in which the top-level module or package of a module lies; of
-    a library, the package."""
+    """Returns the folder of a module's top-level package, or of a lone module."""
     depth = module.count(".") + (file.name == "__init__.py")
-    folder = file.parents[depth]
-    return file.parents[max(depth - 1, 0)] if folder.name in INSTALLED else folder
+    return file.parents[max(depth - 1, 0)]
 
 
-def _imported_files(module: str, file: Path | None) -> dict[str, Path | None]:
-    """Returns the files, by module, that a module imports from its folder, and what
-    these import from it."""
-    if file is None:
-        return {}
-    folder = _folder(module, file)
-    files: dict[str, Path | None] = {module: file}
-    waiting = [(module, file)]
-    while waiting:
-        name, path = waiting.pop()
-        if path.suffix != ".py":
-            continue
-        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        for imported, place in _located(_imports(path, package)):
-            inside = _is_inside(place, folder) and not _is_own(imported)
-            if inside and imported not in files:
-                files[imported] = place
-                waiting.append((imported, place))
-    return files
-
-
-def _imports(file: Path, package: str) -> Iterator[str]:
-    """Yields the dotted names that a file may import, from anywhere in it; none of one
-    that is no Python.
-
-    A relative import that leads out of its package is none: files that catch its error
-    name another.
-    """
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError):  # whoever imports it may catch that
-        return
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = "." * node.level + (node.module or "")
-            try:
-                name = resolve_name(base, package) if node.level else base
-            except ImportError:
-                continue
-            yield from (name, *(f"{name}.{alias.name}" for alias in node.names))
-
-
-def _located(names: Iterator[str]) -> Iterator[tuple[str, Path]]:
-    """Yields the modules that dotted names stand for, with the packages around them,
-    and their files."""
-    for name in names:
-        if _is_standard(name):
-            continue
-        parts = name.split(".")
-        folders = None
-        for depth in range(len(parts)):
-            part = ".".join(parts[: depth + 1])
-            loaded = getattr(sys.modules.get(part), "__spec__", None)
-            spec = loaded or PathFinder.find_spec(part, folders)
-            if spec is None:
-                break
-            if spec.has_location and spec.origin:
-                yield spec.name, Path(spec.origin).resolve()
-            folders = spec.submodule_search_locations
-            if folders is None:
-                break
+def _pattern(module: str) -> str:
+    """Returns which files of that folder belong to a module."""
+    is_package = hasattr(sys.modules[module.partition(".")[0]], "__path__")
+    return "**/*.py" if is_package else "*.py"

