@@ -16,7 +16,7 @@ WARM_UP = 2  # iterations that are not counted: the first updates fit the critic
 
 def learning(bench: Bench) -> Iterator[Row]:
     """Simulator steps of 0.1 s per second of CPU: of collecting a batch, and of
-    collecting and updating; the best of the repeats, without cloning, eager and
+    collecting and updating; the best of the repeats, eager and
     compiled."""
     for fast in (False, True) if bench.compile else (False,):
         fused.switch(fast)
@@ -41,7 +41,7 @@ def rates(bench: Bench) -> tuple[float, float]:
     config = bench.configured("train")
     torch.manual_seed(0)
     collect = dict(config.learner.collect)
-    ppo = {**config.learner.ppo, "cloning": 0.0}
+    ppo = config.learner.ppo
     improve = PolicyImprovement(
         build_ego(config),
         bench.scenes,

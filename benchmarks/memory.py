@@ -69,7 +69,7 @@ def _peak(bench: Bench, name: str, batch: int) -> tuple[float, float]:
 def _learn(bench: Bench, batch: int) -> None:
     """Collect and update twice, in recorded traffic."""
     config = bench.configured("train")
-    ppo = {**config.learner.ppo, "cloning": 0.0}
+    ppo = config.learner.ppo
     collect = {**config.learner.collect, "batch": batch}
     improve = PolicyImprovement(
         build_ego(config),

@@ -1,4 +1,4 @@
-"""One PPO update on a collected batch of the default size, without cloning."""
+"""One PPO update on a collected batch of the default size."""
 
 from collections.abc import Iterator
 
@@ -28,7 +28,7 @@ def ppo_update(bench: Bench) -> Iterator[Row]:
     source.shutdown()
     learner = Learner(
         network,
-        instantiate(config.learner.ppo, critic_warmup=0, cloning=0.0, target_kl=1e9),
+        instantiate(config.learner.ppo, critic_warmup=0, target_kl=1e9),
     )
     seconds = bench.best(lambda: learner.update(data))
     yield bench.row("ppo_update", "update", bench.pick(batch), seconds, "s")

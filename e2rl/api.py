@@ -253,7 +253,7 @@ def save_policy(policy: Any, path: str | Path, env: Any = None) -> Path:
 
 
 def save_video(failure: Failure, path: str | Path) -> Path:
-    """Writes the video of a failure, FILE.gif or FILE.mp4; returns its path."""
+    """Writes the video of a failure, FILE.gif; returns its path."""
     save_animation(Path(path), Replay(failure.rollout, failure.row).frames())
     return Path(path)
 

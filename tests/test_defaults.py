@@ -17,7 +17,6 @@ OPTIONAL = {
     "commonroad_writer",
     "openscenario",
     "opendrive",
-    "mcap",
     "gym_env",
     "sb3",
 }  # they need libraries of extras

@@ -23,7 +23,6 @@ FORMATS = {
     "commonroad": "commonroad_writer",
     "openscenario": "openscenario",
     "scenarionet": "scenarionet_writer",
-    "mcap": "mcap",
     "npz": "archive",
 }
 OPEN_EGO = ("commonroad", "openscenario")  # in which the ego's place may be left open

@@ -64,12 +64,6 @@ def main(arguments: list[str] | None = None) -> None:
         "--modes", action="store_true", help="instead, a typical failure of each mode"
     )
     parser.add_argument(
-        "--to",
-        choices=("gif", "mp4"),
-        default="gif",
-        help="kind of file (default %(default)s)",
-    )
-    parser.add_argument(
         "--out", type=Path, help="folder to write to (default: RUN_DIR/replays)"
     )
     parser.add_argument(
@@ -89,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
         run = options.run.parent if options.run.is_file() else options.run
         folder = options.out or own_folder(run, "replays")
         for title, failure in chosen(options.run, options.failures, options.modes):
-            name = f"{failure.rollout.name.removesuffix('.npz')}.{options.to}"
+            name = f"{failure.rollout.name.removesuffix('.npz')}.gif"
             path = folder / name if options.out else own_folder(folder, name)
             replay = Replay(
                 failure.rollout,

@@ -14,7 +14,6 @@ from e2rl.run.processes import cores
 from e2rl.run.settings import check_choice, setting, settings_of
 from e2rl.search.spending import UNITS
 
-FIGURES = ("intensity",)
 SEARCH = "search"  # the method whose tries are drawn from families
 DEFAULT_BUDGET = 640.0  # NFE a scene: a rollout of CCDiff
 ALL = "all"  # metrics
@@ -38,7 +37,6 @@ class EvaluationSettings:
     shard: tuple[int, ...] = setting(low=0)
     metrics: str
     compare: tuple[str, ...]
-    figure: str | None = setting(choices=FIGURES, optional=True)
     tries: int | None = setting(low=1, optional=True)
     budget: float | None = setting(low=0.01, optional=True)
     budget_unit: str = setting(choices=UNITS)
@@ -62,7 +60,7 @@ def evaluation_settings(config: DictConfig) -> EvaluationSettings:
         if not getattr(settings, name):
             raise InputError(f"{name}=[]: name at least one, such as [{example}]")
     check_shard(settings)
-    check_figure(settings)
+    check_budget(settings)
     check_rows(config, settings)
     check_compared(config, settings)
     processes_of(config)
@@ -126,21 +124,12 @@ def check_shard(settings: EvaluationSettings) -> None:
         )
 
 
-def check_figure(settings: EvaluationSettings) -> None:
-    """Raises InputError for a figure that cannot be drawn of this run."""
-    figure = settings.figure
-    if settings.budget and (figure or settings.compare or settings.shard[1] > 1):
+def check_budget(settings: EvaluationSettings) -> None:
+    """Raises InputError for what tries on a budget cannot be."""
+    if settings.budget and (settings.compare or settings.shard[1] > 1):
         raise InputError(
-            "budget: tries are no pairs and no parts; leave out figure, compare and "
-            "shard, or set tries=1"
-        )
-    if figure and len(settings.eta) < 2:
-        raise InputError(
-            f"figure={figure}: name several intensities, such as eta=[0,1,2,3]"
-        )
-    if figure and not settings.save_rollouts:
-        raise InputError(
-            f"figure={figure}: drawn from the rollouts' files; set save_rollouts=true"
+            "budget: tries are no pairs and no parts; leave out compare and shard, or "
+            "set tries=1"
         )
 
 

@@ -66,8 +66,7 @@ def answer_lines(
     """Returns the lines that say what an evaluation found: the headline of each traffic
     first.
 
-    One attack on one ego is told in sentences. Several egos, methods or intensities
-    have a table of one row each.
+    Then a table with a row for each ego, method and intensity.
 
     Args:
         rows: of metrics.json.
@@ -80,16 +79,11 @@ def answer_lines(
     """
     driven = [row for row in rows if row["n_rollouts"]]
     driven.sort(key=lambda row: not row["eta"])  # attacks before nominal traffic
-    attacks = sum(1 for row in driven if row["eta"])
-    egos = {row["ego"] for row in driven}
     texts = list(map(row_headline, driven[:HEADLINES]))
     texts += errored_lines(rollouts)
     texts += touched_lines(rollouts, shown=report is not None)
     lines = paragraphs(texts)
-    if len(egos) == 1 and attacks <= 1 and len(driven) - attacks <= 1:
-        nominal = driven[1] if len(driven) > 1 else None
-        lines += paragraphs(sentences(driven[0], nominal))
-    elif driven:
+    if driven:
         lines += comparison(driven)
     if modes and driven:
         lines += weaknesses(modes)
@@ -124,20 +118,14 @@ def compared_answer(
     lines = atlas_lines(before=atlases[0], after=atlases[1]) if atlases else []
     if pairs:
         last = wrapped(COUNTS) + last
-        old, new = max(pairs, key=lambda pair: pair[1]["eta"])
-        lines += wrapped(
-            f"After training, {new['ego']} was {outcome(old, new)} in "
-            f"{share(new, 'cfr')} rollouts {under(new)} "
-            f"{bracketed(rate(new, 'cfr'), split(new))}; before it in "
-            f"{share(old, 'cfr')} {bracketed(rate(old, 'cfr'), split(old))}.",
-        )
         metrics = CHANGES | {
             title: name
             for title, name in OTHERS.items()
             if any(tally(row, name) for row in (*before, *after))
         }
         if atlases:  # which leave room for the traffic at the ends
-            pairs = [pair for pair in pairs if pair[1]["eta"] in (0, new["eta"])]
+            strongest = max(new["eta"] for _, new in pairs)
+            pairs = [pair for pair in pairs if pair[1]["eta"] in (0, strongest)]
         table = [["", "before", "after", "difference"]]
         for title, name in metrics.items():
             for old, new in pairs:
@@ -182,47 +170,7 @@ def atlas_lines(before: Mapping, after: Mapping) -> list[str]:
     return lines
 
 
-# --- one attack on one ego
-
-
-def sentences(row: dict, nominal: dict | None = None) -> list[str]:
-    """Sentences about one row of metrics.json, beside the nominal traffic where that
-    was driven."""
-    if row.get("searched"):  # of whose tries there are numbers and no rates
-        hits = contacts(row)
-        text = f"Tries end in {hits} contacts. {verdict(row)}"
-        tries = text if hits else "No try ends in a contact."
-        return [tries, cost(row, nominal)] if nominal else [tries]
-    kind = "attacked rollouts" if row["eta"] else "rollouts"
-    text = (
-        f"{row['ego']} was {outcome(row, nominal or row)} in {share(row, 'cfr')} {kind} "
-        f"{bracketed(rate(row, 'cfr'), split(row))}"
-    )
-    if not nominal:
-        return [f"{text}.", verdict(row), per_distance(row)]
-    text += f", {share(nominal, 'cfr')} nominal {bracketed(split(nominal))}"
-    return [
-        f"{text.strip()}.",
-        verdict(row),
-        per_distance(row, nominal),
-        effect(row, nominal),
-        cost(row, nominal),
-    ]
-
-
-def per_distance(*rows: dict) -> str:
-    """The failures that count per distance, attacked and in nominal traffic, and how
-    many rollouts, in which the planner raised, are not in it."""
-    rates = [value(row, "counted_per_km") for row in rows]
-    if rates[0] == UNKNOWN:
-        return ""
-    text = f"Failures that count per 1,000 km driven: {rates[0]}"
-    if len(rows) > 1:
-        text += f" attacked, {rates[1]} nominal"
-    raised = sum(tally(row, "errored") for row in rows)
-    if raised:
-        text += f"; without {plural(raised, 'rollout')} in which it raised"
-    return f"{text}."
+# --- egos, methods and intensities
 
 
 def under(row: dict) -> str:
@@ -230,88 +178,6 @@ def under(row: dict) -> str:
     if row["eta"]:
         return f"attacked by {traffic_name(row)}"
     return f"in {row['method']} traffic"
-
-
-def outcome(*rows: dict) -> str:
-    """What rollouts that count in `cfr` have come to."""
-    return "hit, or raised," if any(tally(row, "errored") for row in rows) else "hit"
-
-
-def split(row: dict) -> str:
-    """How many of the rollouts that count in `cfr` came to which of the two, "" where
-    the planner never raised."""
-    raised = tally(row, "errored")
-    return f"hit in {tally(row, 'cfr') - raised}, raised in {raised}" if raised else ""
-
-
-def bracketed(*parts: str) -> str:
-    """The parts that say something in brackets, "" where none does."""
-    text = "; ".join(filter(None, parts))
-    return f"({text})" if text else ""
-
-
-def contacts(row: dict) -> int:
-    """Rollouts that ended in a contact with a vehicle, whose verdicts are known."""
-    return row["metrics"].get("counted", {}).get("n", 0)
-
-
-def verdict(row: dict) -> str:
-    """How many of the collisions were preventable, clean, and count; how many a search
-    could have avoided."""
-    hits = contacts(row)
-    if not hits:
-        return ""
-    counted = tally(row, "counted")
-    preventable = tally(row, "preventable")
-    fault = tally(row, "at_fault")
-    text = (
-        "A careful and competent driver would have prevented "
-        f"{preventable or 'none'} of the {hits}"
-    )
-    if preventable and not row.get("searched"):
-        clean = tally(row, "cfr_clean") - tally(row, "errored")
-        text += f" ({clean} clean: nobody else did wrong)"
-    text += f"; the ego was {f'at fault in {fault}' if fault else 'never at fault'}."
-    text += f" So {counted or 'none'} count{'s' if counted == 1 else ''}."
-    searched = row["metrics"].get("avoidable", {}).get("n", 0)
-    if searched:
-        avoided = tally(row, "avoidable")
-        text += f" A search found a way out of {avoided} of {searched}."
-    return text
-
-
-def effect(row: dict, nominal: dict) -> str:
-    """The difference of the attack to the nominal traffic."""
-    change = (row["paired"].get(nominal["method"]) or {}).get("cfr")
-    if not change or math.isnan(change["difference"]):
-        return ""
-    raised = tally(row, "errored") or tally(nominal, "errored")
-    text = (
-        f"Attack minus nominal: {100 * change['difference']:+.0f} points of "
-        f"{'failures' if raised else 'collisions'} over the same scenes and seeds"
-    )
-    if not math.isnan(change["low"]):
-        low = f"{100 * change['low']:+.0f}"
-        text += f" (95% interval {low} to {100 * change['high']:+.0f})"
-    return f"{text}."
-
-
-def cost(row: dict, nominal: dict) -> str:
-    """What the attack costs in realism, "" where no rollout of either ended."""
-    if value(row, "real") == value(nominal, "real") == UNKNOWN:
-        return ""
-    alone = value(row, "real_adv")
-    adversaries = f", of the adversaries alone {alone}" if alone != UNKNOWN else ""
-    return (
-        f"What it costs: realism {value(row, 'real')}{adversaries} (nominal "
-        f"{value(nominal, 'real')}; 1 is like the recordings); "
-        f"{value(row, 'aor_step')}% of the driving off the road (nominal "
-        f"{value(nominal, 'aor_step')}%); other vehicles collide in "
-        f"{share(row, 'cfr_bg')} (nominal {share(nominal, 'cfr_bg')})."
-    )
-
-
-# --- several egos, methods or intensities
 
 
 def comparison(rows: Sequence[dict]) -> list[str]:

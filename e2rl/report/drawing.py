@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 from PIL import Image
 
-from e2rl.run.files import write_atomically, write_beside
+from e2rl.run.files import write_atomically
 from e2rl.sim.rollout_file import Road
 
 Colour = str | tuple[str, float]  # of matplotlib: a name, or a name with its opacity
@@ -37,7 +36,6 @@ REPLAYED = "#b3bcc8"
 VULNERABLE = "#f0950c"
 CONTACT = "#dc2f3c"
 CLEAR = (0, 0, 0, 0)
-UNDATED = {"CreationDate": None, "Producer": None, "Creator": None}  # of a PDF
 # m added to a lane's drawn width: the gap between neighbouring lanes is road, too.
 VERGE = 0.8
 
@@ -211,9 +209,7 @@ def new_figure(width: float, height: float, dpi: float = 72) -> Figure:
     return Figure((width / 72, height / 72), dpi, facecolor=PANEL)
 
 
-def add_legend(
-    figure: Figure | SubFigure, colours: Mapping[str, Colour], size: float
-) -> None:
+def add_legend(figure: Figure, colours: Mapping[str, Colour], size: float) -> None:
     """What the colours mean, in one row at the figure's lower left; font of `size`."""
     handles = [Patch(facecolor=colour, label=text) for text, colour in colours.items()]
     style = {
@@ -242,12 +238,5 @@ def image_of(figure: Figure) -> Image.Image:
 
 
 def save_figure(path: Path, figure: Figure) -> None:
-    """Write a figure as PNG and, beside it, as PDF: vectors with their fonts. The same
-    figure makes the same bytes."""
+    """Write a figure as PNG."""
     write_atomically(path, partial(image_of(figure).save, format="PNG", optimize=True))
-    with rc_context({"pdf.fonttype": 42}):  # TrueType, which journals ask for
-        write_beside(
-            path,
-            ".pdf",
-            content=partial(figure.savefig, format="pdf", metadata=UNDATED),
-        )

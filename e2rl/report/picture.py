@@ -1,21 +1,18 @@
-"""One rollout as pictures: any moment of it, and all frames of its replay; one scene at
-several intensities."""
+"""One rollout as pictures: any moment of it, and all frames of its replay."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 from scipy.signal import savgol_filter
 from tqdm import tqdm
 
-from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.report import drawing
 from e2rl.report.drawing import (
     Shape,
@@ -25,18 +22,14 @@ from e2rl.report.drawing import (
     image_of,
     new_figure,
 )
-from e2rl.report.headline import grouped
 from e2rl.scenes.boxes import corners, to_frame
-from e2rl.sim.rollout_file import Failure, Rollout
+from e2rl.sim.rollout_file import Rollout
 
 TRAIL = 2.0  # s
 SMOOTHING = 41  # steps over which the camera's path is smoothed
 SLOW = 0.6  # s before contact that are played at half speed
 FREEZE = 14  # frames that hold the contact
 SIDE = 720  # points, of a picture
-SWEEP_METRES = 60.0  # side of a panel of several intensities
-SWEEP_GAP = 10  # points between panels
-SWEEP_COLUMNS = 2
 LEGEND = {
     "ego": drawing.EGO,
     "adversary": drawing.ADVERSARY,
@@ -97,7 +90,6 @@ class Replay:
         """The moment at `time` [steps, fractions interpolate]; `phase` from 0 to 1
         marks the contact."""
         self.panel.show(time, phase)
-        assert isinstance(self.panel.figure, Figure)
         return image_of(self.panel.figure)
 
     def frames(self) -> Iterator[Image.Image]:
@@ -170,7 +162,7 @@ class Panel:
     """A replay on a square figure of SIDE, with a header, a map and a legend; `show`
     moves it to another moment."""
 
-    def __init__(self, replay: Replay, figure: Figure | SubFigure) -> None:
+    def __init__(self, replay: Replay, figure: Figure) -> None:
         self.replay = replay
         self.figure = figure
         rollout = replay.rollout
@@ -284,59 +276,3 @@ def shorten(name: str, limit: int = 42) -> str:
     if len(name) <= limit:
         return name
     return f"{name[: limit // 2 - 1]}…{name[-limit // 2 :]}"
-
-
-# --- one scene and seed at several intensities
-
-
-def intensity_figure(sweep: Sequence[Failure]) -> Figure:
-    """Returns a panel for each rollout, in the order of intensity, at the moment of its
-    contact; one without contact is shown when the next one that has a contact has it,
-    else at its end."""
-    replays = [
-        Replay(failure.rollout, failure.row, metres=SWEEP_METRES) for failure in sweep
-    ]
-    rows = math.ceil(len(replays) / SWEEP_COLUMNS)
-    wide = [SIDE, *[SWEEP_GAP, SIDE] * (SWEEP_COLUMNS - 1)]
-    high = [SIDE, *[SWEEP_GAP, SIDE] * (rows - 1)]
-    figure = new_figure(sum(wide), sum(high))
-    places = figure.add_gridspec(
-        len(high), len(wide), width_ratios=wide, height_ratios=high
-    )
-    for index, replay in enumerate(replays):
-        row, column = divmod(index, SWEEP_COLUMNS)
-        contacts = (
-            other.contact for other in replays[index:] if other.contact is not None
-        )
-        phase = None if replay.contact is None else 0.25
-        panel = Panel(replay, figure.add_subfigure(places[2 * row, 2 * column]))
-        panel.show(next(contacts, replay.last), phase)
-    return figure
-
-
-def intensity_sweep(folder: Path) -> list[Failure]:
-    """Returns the rollouts of `best_sweep` of a run's folder."""
-    rows = [row for row in read_rows(folder / TABLE) if row["errored"] != 1]
-    return [Failure.read(folder, row) for row in best_sweep(rows)]
-
-
-def best_sweep(rows: Sequence[dict]) -> list[dict]:
-    """Returns the rows, by eta, of the one (method, scene, seed) that best shows the
-    effect of eta: no contact at the lowest eta, contact at as many others as possible,
-    earlier at greater eta, late at first."""
-    names = ("method", "ego_policy", "scene_id", "seed")
-    groups = grouped(
-        sorted(rows, key=lambda row: row["eta"]),
-        lambda row: tuple(row[name] for name in names),
-    )
-    most = max(map(len, groups.values()))
-    return max((sweep for sweep in groups.values() if len(sweep) == most), key=worth)
-
-
-def worth(sweep: Sequence[dict]) -> tuple[float, ...]:
-    """Score of rows of rollouts by eta for `best_sweep`; greater is better."""
-    hits = [row["cfr"] == 1 for row in sweep]
-    times = [row["contact_time"] for row in sweep if row["cfr"] == 1]
-    falls = sum(np.diff(times) < 0)
-    reach = times[0] - times[-1] if times else -sweep[-1]["min_dtc"]
-    return not hits[0], hits == sorted(hits), len(times), falls, reach

@@ -16,9 +16,7 @@ from e2rl.report.comparison_tables import (
     planner_tables,
     save_compared,
 )
-from e2rl.report.drawing import save_figure
 from e2rl.report.html import write_report
-from e2rl.report.picture import intensity_figure, intensity_sweep
 from e2rl.report.tables import (
     Table,
     metric_tables,
@@ -60,8 +58,6 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
     save_tables(folder / "tables.md", tables)
     if settings.metrics == ALL:
         print_tables(tables)
-    if settings.figure:
-        save_figure(folder / "intensity.png", intensity_figure(intensity_sweep(folder)))
     rollouts = read_rows(folder / TABLE)
     failed = modes["failures"] or any(row["errored"] == 1 for row in rollouts)
     page = None

@@ -1,7 +1,5 @@
-"""Videos: a rollout as an animated GIF or as MP4, and which failures of a run are worth
-one."""
+"""Videos: a rollout as an animated GIF, and which failures of a run are worth one."""
 
-import subprocess
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,7 +9,6 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from e2rl.report import drawing
-from e2rl.run.config import library
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
 
@@ -25,29 +22,15 @@ KEYS = (  # always in the palette
     drawing.VULNERABLE,
     drawing.INK,
 )
-# H.264 as all players take it; the file names the matrix of its colours, since players
-# guess another.
-MP4 = (
-    f"-y -v error -f rawvideo -pix_fmt rgb24 -s {{}}x{{}} -r {1000 / FRAME_MS:g} -i - "
-    "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart -f mp4 "
-    "-vf crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt709"
-)
 
 
 def save_animation(
     path: Path, frames: Iterable[Image.Image], colours: int = COLOURS
 ) -> None:
-    """Write a video at 10 Hz, by the ending of its path an endless GIF, or an MP4
-    without an odd row or column; raises InputError for other endings, and where MP4
-    needs what is not installed."""
-    if path.suffix not in (".gif", ".mp4"):
-        raise InputError(
-            f"{path}: no such kind of video; choose a name that ends in .gif or .mp4"
-        )
-    if path.suffix == ".mp4":
-        library("imageio_ffmpeg", str(path), extra="mp4")  # before the frames are drawn
-    write = write_mp4 if path.suffix == ".mp4" else partial(write_gif, colours=colours)
-    write_atomically(path, partial(write, list(frames)))
+    """Write an endless GIF at 10 Hz; raises InputError for another ending of its path."""
+    if path.suffix != ".gif":
+        raise InputError(f"{path}: choose a name that ends in .gif")
+    write_atomically(path, partial(write_gif, list(frames), colours=colours))
 
 
 def write_gif(frames: Sequence[Image.Image], path: Path, colours: int) -> None:
@@ -68,27 +51,6 @@ def write_gif(frames: Sequence[Image.Image], path: Path, colours: int) -> None:
         loop=0,
         duration=[FRAME_MS] * len(others) + [LAST_MS],
     )
-
-
-def write_mp4(frames: Sequence[Image.Image], path: Path) -> None:
-    """Write an MP4 by the program of imageio-ffmpeg, or another that it finds."""
-    try:
-        command = [
-            library("imageio_ffmpeg", "MP4", extra="mp4").get_ffmpeg_exe(),
-            *MP4.format(*frames[0].size).split(),
-            path,
-        ]
-        subprocess.run(
-            command,
-            input=b"".join(map(Image.Image.tobytes, frames)),
-            capture_output=True,
-            check=True,
-        )
-    except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", b"").decode(errors="replace") or str(error)
-        raise InputError(
-            f"MP4: ffmpeg failed ({said.splitlines()[-1]}); mend that, or write a GIF"
-        ) from error
 
 
 def found_failures(rows: Sequence[dict], count: int) -> list[dict]:

@@ -1,10 +1,5 @@
-"""Versions of a log: as recorded, mirrored, or with what other converters leave out or
-get wrong (`data.versions`).
-
-A policy that learns one converter's conventions fails on another's. Each version takes
-one thing away, so that a measurement shows what a policy leans on, and a training on
-several leans on none.
-"""
+"""Versions of a log: as recorded, mirrored, or with another vehicle as ego
+(`data.versions`), so that what a policy learns carries over to other maps."""
 
 from collections.abc import (
     Callable,
@@ -17,7 +12,6 @@ import numpy as np
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import (
     VEHICLE,
-    Lane,
     Recording,
 )
 
@@ -35,23 +29,17 @@ def check_versions(names: Sequence[str]) -> None:
             f"{all_names}"
         )
     for name in names:
-        for part in name.split("+") if name != RECORDED else ():
-            if part not in VERSIONS:
-                raise InputError(
-                    f"data.versions: {part!r} is none of {all_names}; a+b is b of a, "
-                    f"of those but {RECORDED}"
-                )
+        if name not in (RECORDED, *VERSIONS):
+            raise InputError(f"data.versions: {name!r} is none of {all_names}")
 
 
 def version_of(recording: Recording, name: str) -> Recording | None:
-    """The version of a log, whose id ends in its name unless it is the log itself;
-    `a+b` is b of a. None where there is no such version of it. Raises InputError for a
-    log that makes no scene."""
+    """The version of a log, whose id ends in its name unless it is the log itself; None
+    where there is no such version of it. Raises InputError for a log that makes no
+    scene."""
     if name == RECORDED:
         return recording
-    version: Recording | None = recording.validate_log()
-    for part in name.split("+"):
-        version = version and VERSIONS[part](version)
+    version = VERSIONS[name](recording.validate_log())
     if version is None:
         return None
     scene_id = f"{recording.scene_id}{MARK}{name}"
@@ -80,21 +68,6 @@ def mirrored(recording: Recording) -> Recording:
     )
 
 
-def _lanes(change: Callable[[Lane], Lane]) -> Callable[[Recording], Recording]:
-    def changed(recording: Recording) -> Recording:
-        return replace(
-            recording,
-            lanes={name: change(lane) for name, lane in recording.lanes.items()},
-        )
-
-    return changed
-
-
-def unlit(recording: Recording) -> Recording:
-    """Without traffic lights."""
-    return replace(recording, lights={})
-
-
 def other_ego(recording: Recording) -> Recording | None:
     """With another vehicle as ego: that which drives farthest of those recorded
     throughout. None where none of them moves."""
@@ -111,20 +84,7 @@ def other_ego(recording: Recording) -> Recording | None:
     )
 
 
-# by name; `unconnected`: lanes without successors and neighbours, `unlimited`: without
-# speed limits, `unmeasured`: without widths
 VERSIONS: dict[str, Callable[[Recording], Recording | None]] = {
     "mirrored": mirrored,
-    "unconnected": _lanes(
-        lambda lane: replace(
-            lane,
-            exits=[],
-            left=[],
-            right=[],
-        )
-    ),
-    "unlit": unlit,
-    "unlimited": _lanes(lambda lane: replace(lane, speed_limit=0.0)),
-    "unmeasured": _lanes(lambda lane: replace(lane, width=0.0)),
     "other_ego": other_ego,
 }

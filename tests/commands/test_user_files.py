@@ -18,7 +18,6 @@ pytestmark = pytest.mark.slow
 MINE = [
     "study.json",
     "scene.png",
-    "scene.pdf",
     "tables.md",
     "metrics.json",
     "failures.html",

@@ -136,18 +136,13 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(
             "variants.idm: idm is a row already",
         ),
         (["eta=nan"], "eta=nan: expected"),
-        (["tries=1", "figure=intensity"], "figure=intensity: name several"),
-        (
-            ["tries=1", "figure=intensity", "eta=[1,2]", "save_rollouts=false"],
-            "figure=intensity: .*save_rollouts=true",
-        ),
         (
             ["processes=2", "threads=2"],
             "processes=2, threads=2, device=cpu: .*processes=1",
         ),
         (["shard=[4,4]"], r"shard=\[4, 4\]: expected \[k, n\] with k from 0 to n - 1"),
         (["tries=1", "compare=[e2,ctg]"], "no row of the name ctg"),
-        (["compare=[search]"], "leave out figure, compare and shard, or set tries=1"),
+        (["compare=[search]"], "leave out compare and shard, or set tries=1"),
         (
             ["synthesizer=ctg"],
             "synthesizer=ctg: search does not begin with it; set tries=1",

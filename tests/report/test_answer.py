@@ -82,22 +82,9 @@ MODES = modes_of(
 
 def test_an_attack_is_told_with_its_numbers_and_the_weaknesses_that_count():
     attack = row("e2", 2.0, cfr=0.25)
-    attack["metrics"]["cfr"] = value(0.25, 12, low=0.055, high=0.572)
-    attack["paired"] = {
-        "nominal": {"cfr": {"difference": 0.17, "low": 0.02, "high": 0.31, "n": 12}}
-    }
     text = " ".join(" ".join(answer_lines([row(cfr=1 / 12), attack], MODES)).split())
-    for part in (
-        "3 of 12 attacked rollouts (25%, 95% interval 5.5 to 57%), 1 of 12 nominal",
-        "prevented 1 of the 3 (1 ",
-    ):
-        assert part in text
-    for part in (
-        "the ego was at fault in 3. So 3 count.",
-        "5,000 attacked, 1,667 nominal",
-        "(95% interval +2 to +31)",
-    ):
-        assert part in text
+    assert "hit in 3 of 12 rollouts, of them 1 preventable, 1 clean; 3 count." in text
+    assert "nominal 8.3% (1 of 12)" in text
     assert "1. oncoming (2 of 8 failures, 2 count)" in text
     assert "rear (" not in text
     assert "other (" not in text
@@ -279,8 +266,7 @@ def test_a_search_is_told_by_its_scenes_and_none_of_its_tries_rates():
         "in 8 ways, within 4.2 tries (630 NFE)"
     )
     assert text.startswith(said)
-    assert "%" not in text.partition("What it costs")[0]
-    assert "per 1,000 km" not in text
+    assert "hit in 5 of 12 scenes" in text
 
 
 def test_nominal_failures_are_not_among_those_of_an_attack():
@@ -321,21 +307,7 @@ def test_rollouts_in_which_the_planner_raised_are_failures_and_named():
     }
     rollouts = [about | {"scene_id": f"place_{k}"} for k in range(6)]
     text = " ".join(" ".join(answer_lines([crashed], rollouts=rollouts)).split())
-    assert (
-        "lane_graph was hit, or raised, in 9 of 12 attacked rollouts (75%; hit in 3, raised in 6)."
-        in text
-    )
-    assert "per 1,000 km driven: 15,000; without 6 rollouts in which it raised." in text
-    nominal = row(cfr=1 / 12)
-    nominal["metrics"]["errored"] = value(1 / 12)
-    text = " ".join(" ".join(answer_lines([nominal, row("e2", 2.0, cfr=0.5)])).split())
-    assert (
-        "was hit, or raised, in 6 of 12 attacked rollouts (50%), 1 of 12 nominal "
-        "(hit in 0, raised in 1)." in text
-    )
-    assert (
-        "10,000 attacked, 1,667 nominal; without 1 rollout in which it raised." in text
-    )
+    assert "fails most in the traffic of e2 η=2: hit or raised in 9 of 12" in text
     text = " ".join(answer_lines([row("a", 1.0, cfr=0.5), crashed], rollouts=rollouts))
     assert (
         "Rates per 1,000 km are without 6 rollouts in which a planner raised."
@@ -366,7 +338,7 @@ def test_people_touched_are_told_and_named_where_there_is_no_page(report):
             answer_lines([row("e2", 2.0)], rollouts=rollouts, report=report)
         ).split()
     )
-    assert "lane_graph was hit in 0 of 12 attacked rollouts" in text
+    assert "hit in 0 of 12 rollouts" in text
     assert "an object" not in text
     assert (
         "lane_graph touched a pedestrian or cyclist in 1 of 12 rollouts under e2 at η=2"

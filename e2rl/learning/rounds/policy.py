@@ -1,4 +1,4 @@
-"""The update of a learned ego: PPO and behaviour cloning on episodes collected in the
+"""The update of a learned ego: PPO on episodes collected in the
 round's pool."""
 
 import copy
@@ -11,12 +11,11 @@ from typing import Any
 
 import torch
 from omegaconf import OmegaConf
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
-from e2rl.learning.pretraining.imitation import recorded_demonstrations
 from e2rl.learning.rounds.episodes import Episodes, finished_episodes, outcomes
 from e2rl.learning.rounds.improvement import Improvement
 from e2rl.learning.rounds.scheduler import CurriculumScheduler
@@ -85,7 +84,7 @@ class PolicyImprovement(Improvement):
             ego: an actor.
             scenes: of the pools.
             sim: settings of the simulator.
-            seed: of the draws of rows and of the demonstrations.
+            seed: of the draws of rows.
             device: where the policy drives and learns.
             rounds: of the run, over which the learning rate falls.
             collect: of CollectSettings.
@@ -118,10 +117,7 @@ class PolicyImprovement(Improvement):
         self.learner = Learner(network, update, total=rounds * self.settings.iterations)
         self.frames = 0
         placed = scenes.to(device)
-        self.demonstrations: TensorDict | None = None
         self.teacher: Teacher | None = None
-        if update.cloning > 0:
-            self.demonstrations = recorded_demonstrations(scenes, sim, seed=seed)
         if update.teaching > 0:
             planner = (
                 teacher
@@ -192,7 +188,7 @@ class PolicyImprovement(Improvement):
             driven.append(outcomes(data))
             watched = self._watch(data, pool.adversarial)
             labels = None if self.teacher is None else self.teacher.labelled
-            row = self.learner.update(data, self.demonstrations, labels)
+            row = self.learner.update(data, labels)
             metrics.append(row | watched)
             bar.set_postfix(
                 reward=f"{data['next', 'reward'].mean().item():.3f}",

@@ -1,5 +1,4 @@
-"""The policy's update: PPO on collected episodes, behaviour cloning and a teacher's
-labels, by one optimiser."""
+"""The policy's update: PPO on collected episodes and a teacher's labels, by one optimiser."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -12,14 +11,7 @@ from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from e2rl.learning.pretraining.cloning import (
-    INPUT_NOISE,
-    LAST_ACTION_NOISE,
-    cloning_loss,
-    mirrored_labels,
-    sampled,
-    teaching_loss,
-)
+from e2rl.learning.pretraining.cloning import mirrored_labels, sampled, teaching_loss
 from e2rl.learning.pretraining.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
 from e2rl.run.settings import configured, setting
@@ -30,7 +22,7 @@ PRICED_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is m
 PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
 CRITIC = 0.5  # weight of the critic's loss
 MAX_GRAD_NORM = 0.5
-CLONED = 256  # demonstrations, and labels of a teacher, of an optimiser step
+TAUGHT = 256  # labels of a teacher of an optimiser step
 
 
 @configured("learner/ppo_bc", "ppo")
@@ -51,7 +43,6 @@ class UpdateSettings:
     critic_warmup: int = setting(low=0)
     action_penalty: float = setting(low=0)
     teaching: float = setting(low=0)
-    cloning: float = setting(low=0)
 
 
 class Learner:
@@ -87,7 +78,6 @@ class Learner:
     def update(
         self,
         data: TensorDictBase,
-        demonstrations: TensorDictBase | None = None,
         labels: TensorDictBase | None = None,
     ) -> dict[str, float]:
         """One PPO iteration on a Collector's batch [B, T]; returns means of the losses
@@ -98,8 +88,7 @@ class Learner:
         updated at the end, so they are equal in collection and update.
 
         Args:
-            demonstrations: [M] (e2rl/learning/pretraining/cloning.py), cloned.
-            labels: of a teacher, [M].
+            labels: of a teacher, [M] (e2rl/learning/pretraining/cloning.py).
         """
         settings = self.settings
         normaliser = self.network.normaliser
@@ -126,7 +115,7 @@ class Learner:
                 if warming:
                     losses = self._fit_critic(minibatch)
                 else:
-                    losses = self._step(minibatch, demonstrations, labels)
+                    losses = self._step(minibatch, labels)
                 divergence.append(losses["kl"])
                 for name, value in losses.items():
                     columns[name].append(value)
@@ -225,7 +214,6 @@ class Learner:
     def _step(
         self,
         minibatch: TensorDictBase,
-        demonstrations: TensorDictBase | None,
         labels: TensorDictBase | None,
     ) -> dict[str, Tensor]:
         """One optimiser step; the losses and diagnostics."""
@@ -238,14 +226,8 @@ class Learner:
             penalty = action_penalty(network, minibatch[:PRICED_FRAMES])
             losses["action_penalty"] = penalty
             total = total + settings.action_penalty * penalty
-        if demonstrations is not None:
-            shown = sampled(demonstrations, CLONED).to(self.network.device)
-            with network.noisy(INPUT_NOISE, LAST_ACTION_NOISE):
-                loss = cloning_loss(self.network.actor, shown)
-            losses["loss_cloning"] = loss
-            total = total + settings.cloning * loss
         if labels is not None:
-            drawn = sampled(labels, CLONED).to(self.network.device)
+            drawn = sampled(labels, TAUGHT).to(self.network.device)
             both = torch.cat([mirrored_labels(drawn[::2]), drawn[1::2]])
             losses["loss_teaching"] = teaching_loss(network, both)
             total = total + settings.teaching * losses["loss_teaching"]

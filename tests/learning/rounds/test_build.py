@@ -24,7 +24,7 @@ CURRICULA = {
     "linear": LinearCurriculum,
     "constant": ConstantCurriculum,
 }
-POLICY = ["ego.hidden=[16]", "learner.ppo.cloning=0.1"]
+POLICY = ["ego.hidden=[16]"]
 POLICY += [
     f"learner.collect.{setting}" for setting in ("batch=4", "steps=20", "iterations=1")
 ]

@@ -52,13 +52,6 @@ def begun(std=None, **changes):
     return ego, Learner(ego.network, settings_of(**changes)), batch_of(ego)
 
 
-def demonstrations_of(data, action):
-    """Demonstrations of all frames: one action."""
-    labels = labels_of(data, action)
-    shown = {"observation": labels["observation"], "action": labels["action"][:, 0]}
-    return TensorDict(shown, labels.batch_size)
-
-
 def labels_of(data, action):
     """A teacher's labels of all frames: one action."""
     observation = data["observation"].reshape(-1, data["observation"].shape[-1])
@@ -164,7 +157,7 @@ def test_the_action_penalty_counts_calm_frames_alone():
 def test_the_first_updates_fit_the_critic_alone():
     ego, learner, data = begun(critic_warmup=1)
     before = {key: value.clone() for key, value in ego.network.weights().items()}
-    learner.update(data, demonstrations_of(data, [1.0, 0.0]))
+    learner.update(data)
     changed = {
         key
         for key, value in ego.network.weights().items()
@@ -172,7 +165,7 @@ def test_the_first_updates_fit_the_critic_alone():
     }
     assert changed
     assert all(key.startswith(("critic", "normaliser")) for key in changed)
-    learner.update(data, demonstrations_of(data, [1.0, 0.0]))
+    learner.update(data)
     assert not torch.equal(
         ego.network.weights()["network.trunk.last.weight"],
         before["network.trunk.last.weight"],
@@ -289,24 +282,17 @@ def test_what_is_not_finite_is_refused():
         learner.update(data)
 
 
-@pytest.mark.parametrize("name", ["cloning", "teaching"])
-def test_what_is_shown_counts_by_its_weight(name):
+def test_what_is_taught_counts_by_its_weight():
     """One step with a weight that is next to nothing is the step without; with a weight
     of 1 it is nearer to it."""
 
     def after(weight):
-        others = {"cloning": 0.0, "teaching": 0.0, name: weight}
         ego, learner, data = begun(
-            critic_warmup=0, epochs=1, minibatch=10_000, **others
+            critic_warmup=0, epochs=1, minibatch=10_000, teaching=weight
         )
         labels = labels_of(data, (1.0, 0.5))
-        shown = demonstrations_of(data, (1.0, 0.5))
         torch.manual_seed(1)
-        learner.update(
-            data,
-            shown if name == "cloning" else None,
-            labels if name == "teaching" else None,
-        )
+        learner.update(data, labels)
         with torch.no_grad():
             missed = (
                 (
