@@ -20,7 +20,7 @@ class Element:
 
     def __init__(self, name: str, *_: Any) -> None:
         self.name = name
-        self.order = "="
+        self.order: Any = "="
 
     def __setstate__(self, state: tuple) -> None:
         self.order = "=" if state[1] == "|" else state[1]
