@@ -11,6 +11,7 @@ from e2rl.metrics.evasion import (
     add_avoidable,
     executed,
     find_evasions,
+    lateral_targets,
     spliced,
 )
 from e2rl.metrics.evasion_scene import EvasionScene
@@ -264,3 +265,21 @@ def test_an_evasion_leaves_five_centimetres_to_everybody(gap, clean, monkeypatch
 def test_an_evasion_stays_half_a_metre_within_the_border(shift, clean, monkeypatch):
     """The lane is 3.5 m wide, and the border 1 m beyond it: 2.75 m to the right."""
     assert (violation(monkeypatch, shift=shift) == 0) is clean
+
+
+@pytest.mark.parametrize(
+    ("routes", "expected"),
+    [
+        (1, [(0, 1.5), (0, -1.5), (0, 3.5), (0, -3.5), (0, 2.5), (0, -2.5)]),
+        (2, [(0, 1.5), (0, -1.5), (1, 0), (0, 3.5), (0, -3.5), (0, 2.5), (0, -2.5)]),
+        (9, [(0, 1.5), (0, -1.5), (1, 0), (2, 0), (3, 0), (4, 0), (5, 0)]),
+    ],
+)
+def test_a_profile_is_tried_on_up_to_eight_lateral_targets(routes, expected):
+    """(Route, m beside it): the mission, half a lane beside it, the other routes, more
+    of a lane beside the mission."""
+    valid = torch.arange(9)[None] < routes
+    route, shift = lateral_targets(valid, torch.tensor([0]))
+    targets = list(zip(route[0].tolist(), shift[0].tolist(), strict=True))
+    assert len(targets) == 8
+    assert targets[: 1 + len(expected)] == [(0, 0.0), *expected]

@@ -157,3 +157,20 @@ def test_without_learning_nothing_that_was_told_changes_the_choice():
     torch.testing.assert_close(
         mean_worth(found, 4000), torch.full((2, 2), 0.5).double(), atol=0.03, rtol=0
     )
+
+
+def test_after_two_tries_in_a_scene_the_next_has_half_the_chance():
+    """Of a family that has not been tried there."""
+    found = portfolio(nfe=(100.0, 100.0))
+    for _ in range(2):
+        found.tell(0, 0, reward=0.0, margin=0.0, nfe=100.0)
+    near = nearness(torch.tensor(0.0))
+    assert close(found.share()[0, 1].item(), near.item() / 2)
+
+
+def test_after_four_tries_of_a_family_in_a_scene_it_has_half_of_another_s_chance():
+    found = portfolio(nfe=(100.0, 100.0))
+    for _ in range(4):
+        found.tell(0, 0, reward=0.0, margin=0.0, nfe=100.0)
+    tried, other = found.share()[0].tolist()
+    assert close(tried, other / 2)

@@ -65,3 +65,10 @@ def test_traffic_that_lacks_something_is_refused(missing):
     del traffic[missing]
     with pytest.raises(InputError, match=missing):
         TrafficPool.stored(traffic, 2.0)
+
+
+def test_neither_recorded_nor_live_rows_are_positions_in_stored_traffic():
+    sources = [set(pool.source.tolist()) for pool in (stored(), recorded(), live())]
+    assert sources[0].isdisjoint(sources[1])
+    assert sources[0].isdisjoint(sources[2])
+    assert sources[1].isdisjoint(sources[2])
