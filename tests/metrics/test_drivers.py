@@ -255,3 +255,10 @@ def test_the_human_driver_needs_its_stopping_gap_and_no_more(closing):
     assert least(way + 1.0) == pytest.approx(least(way) + 1.0, abs=0.02), (
         "it does not brake harder when there is less"
     )
+
+
+@pytest.mark.parametrize(("more", "brakes"), [(0.9e-4, True), (1.1e-4, False)])
+def test_a_tenth_of_a_millimetre_decides_a_tie_in_the_time_to_collision(more, brakes):
+    """Two seconds and a step at 10 m/s are 21 m."""
+    action = drive(HumanDriver(), [observe(gap=21.0 + more)])
+    assert (action < 0).item() is brakes

@@ -12,6 +12,7 @@ from e2rl.metrics.evasion import (
     executed,
     find_evasions,
     lateral_targets,
+    profiles,
     spliced,
 )
 from e2rl.metrics.evasion_scene import EvasionScene
@@ -283,3 +284,24 @@ def test_a_profile_is_tried_on_up_to_eight_lateral_targets(routes, expected):
     targets = list(zip(route[0].tolist(), shift[0].tolist(), strict=True))
     assert len(targets) == 8
     assert targets[: 1 + len(expected)] == [(0, 0.0), *expected]
+
+
+def test_brakings_begin_every_second_and_are_held():
+    """By 2, 4, 6 and 8 m/s^2, from now on or 1 to 4 s later."""
+    knots = profiles(torch.zeros(1, 60))[0]
+    time = 0.5 * torch.arange(knots.shape[1])
+    for level in (2.0, 4.0, 6.0, 8.0):
+        for begin in range(5):
+            held = -level * (time >= begin)
+            assert (knots == held).all(1).any(), (level, begin)
+
+
+def test_pulses_last_one_or_two_seconds():
+    """Braking by 3 or 6 m/s^2, or 2 s of accelerating by 2 or 4 m/s^2."""
+    knots = profiles(torch.zeros(1, 60))[0]
+    time = 0.5 * torch.arange(knots.shape[1])
+    pulses = [(3.0, 1), (3.0, 2), (6.0, 1), (6.0, 2), (-2.0, 2), (-4.0, 2)]
+    for level, duration in pulses:
+        for begin in range(5):
+            pulse = -level * ((time >= begin) & (time < begin + duration))
+            assert (knots == pulse).all(1).any(), (level, duration, begin)

@@ -3,6 +3,8 @@
 import pytest
 import torch
 
+from e2rl.traffic.e2 import e2
+from e2rl.traffic.e2.pull import Pull
 from tests.traffic.e2.traffic_scenes import replanned, scenes, synthesizer
 
 
@@ -40,3 +42,16 @@ def test_the_transport_budget_of_a_rollout_holds_and_is_used(sampler, samples):
     assert (capped > (0.99 if samples == 1 else 0.4) * limit).all()
     assert (spent(0.0) == 0).all()
     torch.testing.assert_close(spent(2 * float(free.max())), free, rtol=1e-3, atol=1e-4)
+
+
+def test_by_default_an_anchor_pulls_by_8_per_unit_of_intensity(monkeypatch):
+    strengths = []
+
+    class Spy(Pull):
+        def __call__(self, x0, level):
+            strengths.extend(self.strength.tolist())
+            return super().__call__(x0, level)
+
+    monkeypatch.setattr(e2, "Pull", Spy)
+    replanned(synthesizer(kernels={"samples": 1}), scenes(1).scenes, eta=1.5)
+    assert set(strengths) == {12.0}
