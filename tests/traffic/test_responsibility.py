@@ -92,3 +92,18 @@ def test_less_responsibility_binds_only_those_behind_or_nobody(responsibility, e
     assert duty.exempt[0, 1:3].tolist() == exempt
     assert not duty.yields.any()
     assert not duty.patience.any()
+
+
+def test_by_default_patience_is_1_m_s2_per_intensity_up_to_2():
+    world, coalition = world_of((40.0, 0.0, math.pi, 8.0))
+    found = [
+        duty_of(
+            "full",
+            YieldingSettings(),
+            world=world,
+            coalition=coalition,
+            eta=torch.tensor([eta]),
+        ).patience[0, 1]
+        for eta in (0.5, 1.5, 3.0)
+    ]
+    assert found == [0.5, 1.5, 2.0]

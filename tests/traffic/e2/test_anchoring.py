@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from e2rl.prior.lane_relative import lateral_horizon
 from e2rl.scenes.recording import DT
 from e2rl.traffic.e2 import anchoring
 from e2rl.traffic.e2.anchoring import AnchorSettings, propose
@@ -69,7 +70,7 @@ def test_both_arrive_at_the_crossing_at_once(ahead, way, speed):
     assert not anchor.off_lane.any()
 
 
-@pytest.mark.parametrize(("late", "finite"), [(4.0, True), (9.0, True), (14.0, False)])
+@pytest.mark.parametrize(("late", "finite"), [(4.0, True), (10.0, True), (10.5, False)])
 def test_a_crossing_that_is_missed_costs_the_time_gap(late, finite):
     """Without acceleration both keep 10 m/s: `late` m behind the crossing it misses by
     late / 10 s, 1 s at most."""
@@ -246,3 +247,42 @@ def test_a_bend_takes_4_m_s2_and_its_approach_brakes_by_3(before, squared_speed)
     route = torch.stack([x, 25 * (1 - angle.cos())], -1)
     bound = anchoring._bend_bound(route, torch.tensor(42.0 - before))
     assert bound[0].item() == pytest.approx(squared_speed, rel=1e-3)
+
+
+def usable(offset=0.0, turn=0.0):
+    """Whether a vehicle at 8 m/s may take another route than its own, that begins at
+    `offset` m to its left and turns off."""
+    world = make_world([EGO, (40.0, -30.0, 0.0, 8.0)])
+    add_route(world, 1, candidate=2, heading=turn)
+    world.scene["route_points"][:, 1, 2, :, 1] += offset
+    index = torch.tensor([[1]])
+    candidates = anchoring._candidates(
+        world, index, keep_route=False, halt_at_red=False
+    )
+    return candidates.usable[0, 0, 2].item()
+
+
+@pytest.mark.parametrize(("offset", "expected"), [(4.4, True), (-4.6, False)])
+def test_a_vehicle_may_change_to_a_route_4_5_m_beside_it(offset, expected):
+    assert usable(offset=offset) is expected
+
+
+@pytest.mark.parametrize(("swing", "expected"), [(0.95, True), (1.05, False)])
+def test_a_vehicle_may_swing_out_by_a_metre_where_it_turns_in(swing, expected):
+    """A fifth of the slope times the lateral horizon."""
+    horizon = lateral_horizon(torch.tensor(8.0)).item()
+    assert usable(turn=math.atan(swing / (0.2 * horizon))) is expected
+
+
+def test_by_default_a_lane_is_driven_at_minus_3_to_2_m_s2(monkeypatch):
+    tried = []
+    scored = anchoring.scored
+
+    def spy(candidates, accel, *arguments):
+        tried.append(accel)
+        return scored(candidates, accel, *arguments)
+
+    monkeypatch.setattr(anchoring, "scored", spy)
+    anchored(make_world([EGO, (40.0, -30.0, UP, 8.0)]), 1)
+    assert [float(accel.min()) for accel in tried[:1]] == [-3.0]
+    assert [float(accel.max()) for accel in tried[:1]] == [2.0]

@@ -44,14 +44,32 @@ def test_the_transport_budget_of_a_rollout_holds_and_is_used(sampler, samples):
     torch.testing.assert_close(spent(2 * float(free.max())), free, rtol=1e-3, atol=1e-4)
 
 
-def test_by_default_an_anchor_pulls_by_8_per_unit_of_intensity(monkeypatch):
-    strengths = []
+@pytest.fixture
+def pulls_and_kernels(monkeypatch):
+    """The strengths of the pulls, and the gain and number of kernels, in a replan by
+    default at intensity 1.5."""
+    strengths = set()
+    kernels = []
+    propose = e2.propose_kernels
 
     class Spy(Pull):
         def __call__(self, x0, level):
-            strengths.extend(self.strength.tolist())
+            strengths.update(self.strength.tolist())
             return super().__call__(x0, level)
 
+    def proposed(*arguments, gain, count, **options):
+        kernels.append((gain.tolist(), count))
+        return propose(*arguments, gain=gain, count=count, **options)
+
     monkeypatch.setattr(e2, "Pull", Spy)
-    replanned(synthesizer(kernels={"samples": 1}), scenes(1).scenes, eta=1.5)
-    assert set(strengths) == {12.0}
+    monkeypatch.setattr(e2, "propose_kernels", proposed)
+    replanned(synthesizer(), scenes(1).scenes, eta=1.5)
+    return strengths, kernels
+
+
+def test_by_default_anchors_pull_by_8_and_kernels_by_6_per_intensity(pulls_and_kernels):
+    assert pulls_and_kernels[0] == {8 * 1.5, 6 * 1.5}
+
+
+def test_by_default_five_kernels_gain_100_nats_per_intensity(pulls_and_kernels):
+    assert pulls_and_kernels[1] == [([100 * 1.5], 5)]

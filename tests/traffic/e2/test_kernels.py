@@ -7,7 +7,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from e2rl.prior.lane_relative import SIZE
+from e2rl.prior.lane_relative import (
+    ACCEL_SCALE,
+    BEND_SCALE,
+    HORIZON,
+    KNOTS,
+    OFFSET_SCALE,
+    SIZE,
+)
 from e2rl.sim.world import World
 from e2rl.traffic.e2 import kernels
 from e2rl.traffic.e2.choice import DRAWN
@@ -155,3 +162,68 @@ def test_two_kernels_of_a_vehicle_are_6_nats_apart(apart, drawn, monkeypatch):
         count=2,
     )
     assert found.vehicle[0].tolist() == drawn
+
+
+def test_a_kernel_accelerates_by_up_to_2_and_brakes_by_up_to_3_m_s2():
+    accel = ACCEL_SCALE * displacements(CPU)[:, 2:KNOTS]
+    expected = [-3.0, -2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0]
+    assert accel.unique().tolist() == pytest.approx(expected)
+
+
+def test_a_kernel_has_0_4_and_0_8_of_its_acceleration_at_the_first_knots():
+    accel = displacements(CPU)[:, :KNOTS]
+    torch.testing.assert_close(accel[:, 0], 0.4 * accel[:, 2])
+    torch.testing.assert_close(accel[:, 1], 0.8 * accel[:, 2])
+
+
+def test_a_kernel_shifts_to_either_side_by_up_to_a_lane_and_a_half():
+    offset = OFFSET_SCALE * displacements(CPU)[:, -1]
+    to_left = [0.8, 1.6, 2.5, 3.5, 4.5]
+    expected = [-value for value in to_left[::-1]] + [0.0] + to_left
+    assert offset.unique().tolist() == pytest.approx(expected)
+
+
+def test_half_of_the_kernels_have_come_half_of_the_way_early():
+    """The last two coordinates: what the offset is beside the path at half of the
+    lateral horizon, in its own unit, and at the end."""
+    *_, bend, offset = displacements(CPU).unbind(-1)
+    early = 2 * BEND_SCALE * bend / (OFFSET_SCALE * offset)
+    assert early[offset != 0].unique().tolist() == pytest.approx([0.0, 0.5])
+
+
+def impossible(*, lateral=0.0, gap=100.0, inside=5.0):
+    """Whether a plan straight on is impossible that takes a lateral acceleration,
+    passes another vehicle by `gap` m and comes to `inside` m inside the road."""
+    world = World.at_start(scenes(1).scenes)
+    states = world.states.clone()
+    states[0, :3] = torch.tensor([[0.0, 0, 0, 8], [30, 0, 0, 8], [30, gap, 0, 8]])
+    scene = world.scene.clone()
+    scene["field"].fill_(-inside)
+    valid = torch.zeros_like(world.valid)
+    valid[0, :3] = True
+    world = replace(world, scene=scene, states=states, valid=valid)
+    plan = states[:, :8, None].repeat(1, 1, HORIZON, 1)
+    attack = KernelAttack(
+        row=torch.tensor([0]),
+        vehicle=torch.tensor([1]),
+        world=world,
+        ego_plan=plan[:, 0],
+        plan=plan,
+        since=torch.zeros(1),
+        settled=torch.zeros(1, dtype=torch.bool),
+    )
+    return attack.impossible(
+        plan[:, 1:2],
+        torch.full((1, 1), lateral),
+        time=torch.full((1, 1), torch.inf),
+    ).item()
+
+
+@pytest.mark.parametrize(("lateral", "expected"), [(3.9, False), (4.1, True)])
+def test_a_kernel_takes_4_m_s2_to_the_side_at_most(lateral, expected):
+    assert impossible(lateral=lateral) is expected
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(2.3, False), (2.1, True)])
+def test_a_kernel_keeps_2_2_m_between_its_centre_and_another_s(gap, expected):
+    assert impossible(gap=gap) is expected

@@ -288,3 +288,40 @@ def test_a_chain_begins_no_farther_than_80_m_from_the_ego(last, far):
     support = mask(world, 1, 2, 3, 4)
     result = skeleton_of(world, support, near=1, max_chain=5, tau_long=25.0)
     assert result.far.nonzero().tolist() == [[0, far]]
+
+
+def test_by_default_three_act_on_the_ego():
+    row = [(30.0, -20.0 - 18 * k, UP, 8.0) for k in range(5)]
+    world = make_world([EGO, *row])
+    found = skeleton_of(world, mask(world, *range(1, 6)), far=0)
+    assert found.near.nonzero()[:, 1].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(("distance", "far"), [(14.5, False), (15.5, True)])
+def test_by_default_a_vehicle_is_distant_from_15_m_on(distance, far):
+    """It follows the near one, which crosses 8 m ahead of the ego."""
+    behind = -math.sqrt(distance**2 - 8.0**2)
+    vehicles = [(0.0, 0.0, 0.0, 4.0), (8.0, -4.0, UP, 8.0), (8.0, behind, UP, 8.0)]
+    world = make_world(vehicles)
+    found = skeleton_of(world, mask(world, 1, 2), near=1)
+    assert bool(found.far.any()) is far
+
+
+def column(gap, count):
+    """So many vehicles at 8 m/s one behind the other, towards the ego's path."""
+    return [(30.0, -20.0 - gap * k, UP, 8.0) for k in range(count)]
+
+
+@pytest.mark.parametrize(("gap", "linked"), [(19.5, True), (20.5, False)])
+def test_by_default_a_vehicle_acts_on_another_up_to_20_m_ahead(gap, linked):
+    world = make_world([EGO, *column(gap, 2)])
+    found = skeleton_of(world, mask(world, 1, 2), near=1)
+    assert bool(found.far.any()) is linked
+
+
+@pytest.mark.parametrize(("count", "linked"), [(4, True), (5, False)])
+def test_by_default_a_chain_has_four_vehicles(count, linked):
+    """12 m apart, so that each acts on the one ahead of it alone."""
+    world = make_world([EGO, *column(12.0, count)])
+    found = skeleton_of(world, mask(world, *range(1, 1 + count)), near=1)
+    assert bool(found.far.any()) is linked

@@ -180,7 +180,7 @@ def test_scores_and_candidates_are_those_of_the_definition(seed, nodes, monkeypa
     assert result.candidates[0].nonzero()[:, 0].tolist() == sorted(order[:3])
 
 
-def candidates_of(pairs, vehicles, monkeypatch):
+def candidates_of(pairs, vehicles, monkeypatch, **settings):
     """Candidates where just these pairs are at risk, of vehicles 10 m apart in a row
     from the ego on."""
     weight = torch.zeros(vehicles, vehicles)
@@ -195,7 +195,7 @@ def candidates_of(pairs, vehicles, monkeypatch):
         states,
         torch.ones(1, 1, vehicles, dtype=torch.bool),
         size=torch.tensor([4.0, 2.0]).expand(1, vehicles, 2),
-        settings=TopologySettings(top_cliques=100, candidates=100),
+        settings=TopologySettings(**settings),
     )
     return result.candidates[0].nonzero()[:, 0].tolist()
 
@@ -203,9 +203,65 @@ def candidates_of(pairs, vehicles, monkeypatch):
 def test_a_queue_counts_up_to_three_vehicles_from_the_ego(monkeypatch):
     """Cliques need a member within two edges: 2 and 3 are one, 3 and 4 are none."""
     queue = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
-    assert candidates_of(queue, 6, monkeypatch) == [1, 2, 3]
+    found = candidates_of(queue, 6, monkeypatch, top_cliques=100)
+    assert found == [1, 2, 3]
 
 
 def test_graphs_have_the_ego_and_the_23_vehicles_nearest_to_it(monkeypatch):
     star = [(0, vehicle) for vehicle in range(1, 30)]
-    assert candidates_of(star, 30, monkeypatch) == list(range(1, 24))
+    found = candidates_of(star, 30, monkeypatch, top_cliques=100, candidates=100)
+    assert found == list(range(1, 24))
+
+
+def star(vehicles):
+    """The ego at risk with each of so many vehicles, which are not with each other."""
+    return [(0, vehicle) for vehicle in range(1, 1 + vehicles)]
+
+
+def test_by_default_the_members_of_three_cliques_score(monkeypatch):
+    """Of equally heavy pairs the nearest to the ego."""
+    assert candidates_of(star(8), 9, monkeypatch) == [1, 2, 3]
+
+
+def test_by_default_a_clique_has_four_members(monkeypatch):
+    """Of a graph in which all are at risk with each other: the ego and three more."""
+    everybody = list(combinations(range(8), 2))
+    assert candidates_of(everybody, 8, monkeypatch) == [1, 2, 3]
+
+
+def test_by_default_there_are_ten_candidates(monkeypatch):
+    found = candidates_of(star(15), 16, monkeypatch, top_cliques=100)
+    assert found == list(range(1, 11))
+
+
+def risk(time):
+    """The weight by default of a vehicle whose box, grown by 3 m, is met after so many
+    seconds at 10 m/s."""
+    states = torch.tensor([[0.0, 0, 0, 10], [4.0 + 3.0 + 10.0 * time, 0, 0, 0]])
+    return pair_weights(
+        states,
+        torch.tensor([True, True]),
+        size=torch.tensor([4.0, 2.0]).expand(2, 2),
+        settings=TopologySettings(),
+    )[0, 1].item()
+
+
+def test_by_default_half_is_the_weight_of_three_seconds():
+    assert risk(3.0) == pytest.approx(0.5)
+
+
+def test_by_default_the_weight_has_a_softness_of_a_second():
+    assert risk(4.0) == pytest.approx(1 / (1 + math.e))
+
+
+@pytest.mark.parametrize(("time", "candidates"), [(5.15, [1]), (5.25, [])])
+def test_by_default_a_pair_is_at_risk_up_to_5_2_s(time, candidates):
+    """sigma(3 - 5.2) is a tenth."""
+    states = torch.tensor([[0.0, 0, 0, 10], [7.0 + 10.0 * time, 0, 0, 0]])
+    result = topological_candidates(
+        states[None, None],
+        torch.ones(1, 1, 2, dtype=torch.bool),
+        size=torch.tensor([4.0, 2.0]).expand(1, 2, 2),
+        settings=TopologySettings(),
+    )
+    assert result.candidates[0].nonzero()[:, 0].tolist() == candidates
