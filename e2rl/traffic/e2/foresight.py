@@ -29,7 +29,6 @@ WEIGHTS = (0.4, 0.3, 0.15, 0.1, 0.05)  # of the failures of all but the first
 # ego's front.
 FRONT_GAP = 0.8
 MOVING = 1.0  # m/s: slower drivers do not run into anybody
-REACTION = -1.0  # m/s^2 asked for by a driver who has begun to react
 STEPS = 5  # of DT in one fused function
 SOON = 0.1  # share of the worth that a failure at the end of the horizon loses
 
@@ -203,7 +202,7 @@ def meet(
             other_length=ahead.length[step].expand_as(gap),
         )
         memory, wanted = drivers.step(memory, observation)
-        reacts = reacts | (wanted < REACTION)
+        reacts = reacts | (wanted < 0)
         accel = planned[step].expand_as(speed)
         accel = torch.where(reacts, torch.minimum(wanted, accel), accel)
         after = (speed + DT * accel).clamp(min=0)
