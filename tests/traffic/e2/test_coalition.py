@@ -1,6 +1,7 @@
 """Coalitions: who is chosen, who acts through whom, and on which routes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -121,3 +122,17 @@ def test_the_other_supports_choose_a_coalition_too(support):
     assert not (
         plan.adversary & (scene["parked"] | ~scene["valid"])[:, :vehicles]
     ).any()
+
+
+@pytest.mark.parametrize(("gap", "nats"), [(1.0, 20.0), (2.4, 48.0), (2.6, 50.0)])
+def test_a_new_route_costs_its_log_probability_up_to_50_nats(gap, nats):
+    """Of two routes, the other one by `gap` more likely, at the least temperature of
+    0.05."""
+    prior = SimpleNamespace(
+        sampler=SimpleNamespace(route_temperature=0.0),
+        route_choice=lambda _: torch.tensor([[[0.0, gap]]]),
+    )
+    found = coalition.Selector._route_nats(
+        SimpleNamespace(prior=prior), None, torch.tensor([[0]])
+    )
+    assert found.item() == pytest.approx(nats, abs=1e-3)

@@ -140,3 +140,10 @@ def test_arrival_windows_solve_the_equations_of_motion():
         9.0, abs=1e-4
     )
     assert arrival_window(torch.tensor(-3.0), torch.tensor(7.0))[1] == 0
+
+
+@pytest.mark.parametrize(("x", "conflicting"), [(79.0, True), (83.0, False)])
+def test_by_default_routes_meet_within_five_seconds(x, conflicting):
+    """The ego, flat out at 2 m/s^2 from 10 m/s, drives 75 m; both have a length."""
+    found = judge((x, -30.0, UP, 10.0))[0]
+    assert found.conflicting[0, 1].item() is conflicting

@@ -192,3 +192,11 @@ def test_the_competent_driver_reacts_after_0_75_s_and_brakes_by_0_774_g(
 ):
     gap = needed_gap(0.75, 7.59, 15.0) + more
     assert bool(standing(gap, speed=15.0)().prevented) is prevented
+
+
+@pytest.mark.parametrize(("speed", "counts"), [(0.95, False), (1.05, True)])
+def test_who_is_slower_than_a_metre_a_second_runs_into_nobody(speed, counts):
+    """Who never reacts, 2 m behind a vehicle that stands."""
+    foresight = standing(2.0, speed=speed)()
+    assert foresight.time.isfinite().item()
+    assert (foresight.worth > 0).item() is counts

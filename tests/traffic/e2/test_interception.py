@@ -312,3 +312,21 @@ def test_by_default_an_interception_is_preferred_to_a_lane_by_2_s():
     plain = met([EGO, BESIDE], settings=replace(FREE, preference=0.0))[0].cost
     default = met([EGO, BESIDE], settings=FREE)[0].cost
     assert (plain - default).item() == pytest.approx(2.0, abs=1e-5)
+
+
+@pytest.mark.parametrize(("radius", "possible"), [(12.8, True), (12.2, False)])
+def test_by_default_it_takes_2_m_s2_to_the_side_per_intensity(radius, possible):
+    """25 m^2/s^2 over the radius."""
+    path = arc_path(radius)
+    assert within_limits(path, limits=InterceptionSettings(), speed=5.0) == possible
+
+
+@pytest.mark.parametrize(("off", "possible"), [(0.45, True), (0.55, False)])
+def test_a_path_may_leave_the_road_by_half_a_metre(off, possible):
+    """Over a kerb between two lanes."""
+    world = make_world([EGO, BESIDE])
+    cells = world.scene["field"].shape[-1]
+    y = world.scene["field_origin"][0, 1] + CELL * torch.arange(cells)
+    world.scene["field"][:, :, (y > 0.8) & (y < 2.6)] = off
+    found = met([EGO, BESIDE], world=world)[0]
+    assert found.cost.isfinite().item() is possible

@@ -15,6 +15,7 @@ from e2rl.prior.lane_relative import (
     OFFSET_SCALE,
     SIZE,
 )
+from e2rl.scenes.drivable_area import CELL
 from e2rl.sim.world import World
 from e2rl.traffic.e2 import kernels
 from e2rl.traffic.e2.choice import DRAWN
@@ -192,17 +193,20 @@ def test_half_of_the_kernels_have_come_half_of_the_way_early():
 
 
 def impossible(*, lateral=0.0, gap=100.0, inside=5.0):
-    """Whether a plan straight on is impossible that takes a lateral acceleration,
-    passes another vehicle by `gap` m and comes to `inside` m inside the road."""
+    """Whether a plan is impossible that takes a lateral acceleration, passes another
+    vehicle by `gap` m and comes from 5 m to `inside` m inside the road."""
     world = World.at_start(scenes(1).scenes)
     states = world.states.clone()
     states[0, :3] = torch.tensor([[0.0, 0, 0, 8], [30, 0, 0, 8], [30, gap, 0, 8]])
     scene = world.scene.clone()
-    scene["field"].fill_(-inside)
+    x = scene["field_origin"][0, 0] + CELL * torch.arange(scene["field"].shape[1])
+    scene["field"].fill_(-5.0)
+    scene["field"][:, x > 45] = -inside
     valid = torch.zeros_like(world.valid)
     valid[0, :3] = True
     world = replace(world, scene=scene, states=states, valid=valid)
     plan = states[:, :8, None].repeat(1, 1, HORIZON, 1)
+    plan[:, 1:, :, 0] += 30.0
     attack = KernelAttack(
         row=torch.tensor([0]),
         vehicle=torch.tensor([1]),
@@ -227,3 +231,8 @@ def test_a_kernel_takes_4_m_s2_to_the_side_at_most(lateral, expected):
 @pytest.mark.parametrize(("gap", "expected"), [(2.3, False), (2.1, True)])
 def test_a_kernel_keeps_2_2_m_between_its_centre_and_another_s(gap, expected):
     assert impossible(gap=gap) is expected
+
+
+@pytest.mark.parametrize(("inside", "expected"), [(0.35, False), (0.25, True)])
+def test_a_kernel_stays_0_3_m_inside_the_road(inside, expected):
+    assert impossible(inside=inside) is expected

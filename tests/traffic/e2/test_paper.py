@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
+from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.errors import InputError
 from e2rl.traffic.e2 import paper
 from e2rl.traffic.e2.control import SparseControl
@@ -12,6 +13,7 @@ from e2rl.traffic.e2.paper import (
     LiteralAnchor,
     MaskedGuidance,
     clip_rows,
+    gradient_weight,
 )
 from e2rl.traffic.potentials import (
     SAMPLED_STEPS,
@@ -211,3 +213,11 @@ def test_without_feasibility_guidance_only_adversaries_leave_the_prior():
 def test_eq_14_without_guidance_is_refused():
     with pytest.raises(InputError, match="e2_paper"):
         synthesizer(control={"anchoring": "literal"})
+
+
+def test_at_full_noise_a_gradient_counts_as_if_a_twentieth_of_the_signal_were_left():
+    schedule = NoiseSchedule()
+    level = torch.tensor(1.0)
+    assert schedule.alpha(level) < 0.05
+    weight = gradient_weight(schedule, level, "score")
+    assert weight.item() == pytest.approx(20 * schedule.sigma(level).item() ** 2)
