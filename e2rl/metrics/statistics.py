@@ -41,7 +41,6 @@ REALISM_DRAWS = 400  # each costs a pass over all samples
 SAME = 1e-9  # of the values of draws that agree, but for rounding
 LEVEL = 0.95
 LEVELS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
-Z = 1.959964  # standard deviations to either side that hold LEVEL of a normal law
 LEAST = 10  # places
 Row = Mapping[str, Any]
 Bounds = tuple[float, float]
@@ -173,20 +172,6 @@ def interval(values: Tensor, places: int) -> dict[str, float]:
         low, high = values[1:].nanquantile(values.new_tensor(LEVELS)).tolist()
         low, high = UNKNOWN if low == high else (low, high)
     return {"mean": values[0].item(), "low": low, "high": high}
-
-
-def jackknife(values: Tensor) -> dict[str, float]:
-    """{mean, low, high} of a statistic, values [1 + P]: of all P places, then without
-    each of them (Efron 1982). No interval (NaN) from fewer than LEAST places, or where
-    one of the values is not finite."""
-    mean, *_ = values.where(values.isfinite(), torch.nan).tolist()
-    others = values[1:]
-    count = len(others)
-    half = math.nan
-    if count >= LEAST and values.isfinite().all():
-        squares = (others - others.mean()).square().sum()
-        half = Z * ((count - 1) / count * squares).sqrt().item() or math.nan
-    return {"mean": mean, "low": mean - half, "high": mean + half}
 
 
 def exact_interval(fraction: float, places: float, level: float = LEVEL) -> Bounds:

@@ -48,7 +48,6 @@ from e2rl.report.tables import (
     Table,
     column_names,
     metric_tables,
-    mode_tables,
 )
 from e2rl.run.config import assigned
 from e2rl.run.errors import InputError
@@ -128,7 +127,7 @@ def write_report(
     if modes is None:
         modes = read_modes(run / MODES_FILE)
     if tables is None:
-        tables = [*metric_tables(metrics), *mode_tables(modes)]
+        tables = metric_tables(metrics)
     content = page_content(run, metrics, modes=modes, methods=methods)
     rows = content.pop("rows")
     entries = content["failures"]

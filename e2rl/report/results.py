@@ -20,7 +20,6 @@ from e2rl.report.html import write_report
 from e2rl.report.tables import (
     Table,
     metric_tables,
-    mode_tables,
     print_tables,
     save_tables,
 )
@@ -54,7 +53,7 @@ def write_results(run: Run, plan: Evaluation, rows: Sequence[dict]) -> list[str]
     about = caption(run.config, plan.origin, methods=methods)
     text = "; ".join([about, search_effort(plan.scenes.steps), *notes])
     means, egos = evaluation_tables(run, plan, rows=rows, text=text)
-    tables = [*means, *mode_tables(modes), *egos]
+    tables = [*means, *egos]
     save_tables(folder / "tables.md", tables)
     if settings.metrics == ALL:
         print_tables(tables)

@@ -1,8 +1,8 @@
 """Tables of metrics from the rows of metrics.json, for a terminal, Markdown, LaTeX and
 CSV. Fractions are in per cent.
 
-A run has a table with a row for each metric and a column for each method, one with the
-differences to the first, and one of its failure modes, from its modes.json.
+A run has a table with a row for each metric and a column for each method, and one with
+the differences to the first.
 """
 
 import math
@@ -18,7 +18,6 @@ from e2rl.metrics.catalogue import (
     Metric,
     table_metrics,
 )
-from e2rl.metrics.failure_modes import LEAST, MANY
 from e2rl.report.headline import grouped, plural
 from e2rl.run.files import write_atomically
 from e2rl.run.terminal import column_groups, terminal_width
@@ -38,13 +37,6 @@ SYMBOLS = str.maketrans(
         "≥": r"$\ge$",
     }
 )
-VERDICTS = {
-    "preventable": "preventable",
-    "counted": "counts",
-    "at_fault": "at fault",
-    "avoidable": "avoidable",
-}
-SPEEDS = {"ego_speed": "ego [m/s]", "partner_speed": "partner [m/s]"}
 
 
 @dataclass
@@ -243,82 +235,6 @@ def column_names(group: Sequence[Mapping]) -> list[str]:
         eta = f"η={row['eta']:g}" if row["eta"] or len(etas) > 1 else ""
         names.append(" ".join(filter(None, (stage, row["method"], eta))))
     return names
-
-
-# --- failure modes
-
-
-def mode_tables(modes: Mapping) -> list[Table]:
-    """Returns a table of failure modes for each ego: a row for each mode, with its
-    fraction of the failures of each method and intensity, verdicts and mean speeds; no
-    table without failures.
-
-    Of several egos the modes are common, and so are their verdicts and speeds.
-    """
-    egos = dict.fromkeys(group["ego_policy"] for group in modes["groups"])
-    tables = [mode_table(modes, ego, several=len(egos) > 1) for ego in egos]
-    return [table for table in tables if table.rows]
-
-
-def mode_table(modes: Mapping, ego: str, several: bool) -> Table:
-    """The table of one ego; several: there are other egos in the run."""
-    places = [
-        place
-        for place, group in enumerate(modes["groups"])
-        if group["ego_policy"] == ego
-    ]
-    groups = [modes["groups"][place] for place in places]
-    verdicts = {
-        name: title
-        for name, title in VERDICTS.items()
-        if any(mode[name] is not None for mode in modes["modes"])
-    }
-    rows = []
-    failures = 0
-    for mode in modes["modes"]:
-        of_groups = [mode["groups"][place] for place in places]
-        count = sum(group["count"] for group in of_groups)
-        if not count:
-            continue
-        failures += count
-        fractions = [group["fraction"] for group in of_groups]
-        fractions += [mode[name] for name in verdicts]
-        other = mode["name"] == "other"
-        rows.append(
-            [
-                mode["name"] if other else f"{mode['mode']}. {mode['name']}",
-                str(count),
-                *(mode_cell(fraction, scale=100) for fraction in fractions),
-                *(mode_cell(mode[name], decimals=1) for name in SPEEDS),
-            ]
-        )
-    if rows:
-        totals = [
-            f"{group['failures']} in {plural(group['modes'], 'mode')}"
-            for group in groups
-        ]
-        empty = [""] * (len(verdicts) + len(SPEEDS))
-        rows.append(["all failures", str(failures), *totals, *empty])
-    columns = [*column_names(groups), *verdicts.values()]
-    head = ["", "failures", *(f"{name} [%]" for name in columns), *SPEEDS.values()]
-    text = (
-        f"Failure modes of {ego}: fraction of each method's collisions; verdicts and "
-        "mean speeds just before contact, of the mode's collisions"
-        f"{' with any ego' if several else ''}. Each word holds for two thirds of "
-        f"them; other: modes of less than {LEAST:.0%}, or of one collision of {MANY} "
-        "or more. `e2rl replay RUN_DIR --modes` draws a typical one of each."
-    )
-    if modes["unknown"]:
-        unknown = ", ".join(modes["unknown"])
-        text += f" Grouped without {unknown}, which the rollouts do not know."
-    absent = [title for name, title in VERDICTS.items() if name not in verdicts]
-    if absent:
-        text += f" Not computable here: {', '.join(absent)}."
-    return Table(text, head, rows=rows)
-
-
-def mode_cell(value: float | None, scale: float = 1, decimals: int = 0) -> str:
-    return UNKNOWN if value is None else f"{scale * value:.{decimals}f}"
 
 
 # --- cells

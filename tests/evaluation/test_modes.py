@@ -7,7 +7,6 @@ import pytest
 
 from e2rl.evaluation.modes import find_modes, read_modes
 from e2rl.evaluation.rollout_files import MODES_FILE, write_json
-from e2rl.report.tables import mode_tables
 from e2rl.sim.rollout_file import rollout_name
 from tests.metrics.test_failure_modes import CROSSING, REAR_END, failure
 
@@ -84,38 +83,6 @@ def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):
         ]
         assert [row["mode"] for row in same] == [mode["mode"]]
         assert typical["file"] == rollout_name(same[0])
-
-
-def test_the_table_has_a_row_for_each_mode_and_says_what_is_missing():
-    (table,) = mode_tables(find_modes(run_rows()))
-    assert table.head[:5] == [
-        "",
-        "failures",
-        "e2 η=2 [%]",
-        "random η=2 [%]",
-        "nominal [%]",
-    ]
-    assert table.head[5:] == [
-        "preventable [%]",
-        "counts [%]",
-        "at fault [%]",
-        "ego [m/s]",
-        "partner [m/s]",
-    ]
-    first, second, last = table.rows
-    assert first[0].startswith("1. crossing")
-    assert first[1:7] == [
-        "8",
-        "100",
-        "33",
-        "–",
-        "100",
-        "75",
-    ]
-    assert second[1:] == ["4", "0", "67", "–", "0", "100", "100", "10.0", "5.0"]
-    assert last[1:5] == ["12", "6 in 1 mode", "6 in 2 modes", "0 in 0 modes"]
-    assert "without duty" in table.caption
-    assert "avoidable" in table.caption
 
 
 def test_small_modes_are_gathered_but_keep_their_numbers():

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest
 
 from e2rl.metrics.realism import KINEMATICS, OF_ADVERSARIES
 from e2rl.metrics.statistics import (
@@ -12,7 +12,6 @@ from e2rl.metrics.statistics import (
     cluster_index,
     exact_interval,
     interval,
-    jackknife,
     paired_differences,
     resampled_means,
     resampled_medians,
@@ -346,13 +345,3 @@ def test_paired_ratios_compare_the_two_groups_own_collisions():
     result = paired_differences(*ours, *theirs, draws=300, realism_draws=2)["rir"]
     assert result["difference"] == pytest.approx(0.5)
     assert result["n"] == 3
-
-
-def test_a_jackknife_has_the_interval_of_the_normal_law():
-    """Of a mean of n values: s / sqrt(n) times its quantile at 97.5%, to either side."""
-    values = torch.tensor([3.0, 1, 4, 1, 5, 9, 2, 6, 5, 3, 5]).double()
-    count = len(values)
-    without = (values.sum() - values) / (count - 1)
-    found = jackknife(torch.cat([values.mean()[None], without]))
-    half = norm.ppf(0.975) * values.std() / count**0.5
-    assert found["high"] - found["mean"] == pytest.approx(half.item(), rel=1e-6)
