@@ -6,11 +6,11 @@ import math
 import xml.etree.ElementTree as ET
 
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from e2rl.commands.gate import main
 from e2rl.metrics.errored import errored_row
-from e2rl.metrics.statistics import LEAST, Z, exact_interval
+from e2rl.metrics.statistics import LEAST, exact_interval
 from e2rl.report.gate import growth
 from e2rl.search.tries_file import TRIES_FILE
 from tests.evaluation.constructed_runs import row_of, run_of
@@ -54,7 +54,7 @@ def test_of_many_places_the_number_is_that_of_the_normal_law(value, limit):
     ends = exact_interval(value, 100)
     needed = 100 * growth((value, *ends), limit, places=100, fraction=True)
     assert needed == pytest.approx(
-        Z**2 * value * (1 - value) / (limit - value) ** 2, rel=0.05
+        norm.ppf(0.975) ** 2 * value * (1 - value) / (limit - value) ** 2, rel=0.05
     )
     assert exact_interval(value, needed)[value < limit] == pytest.approx(
         limit, abs=1e-6
