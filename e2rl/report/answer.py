@@ -39,13 +39,20 @@ KINDS = {  # of failures, the first leads
     "clean": "cfr_clean",
     "count": "cfr_counted",
 }
+PER_DISTANCE = "count per 1,000 km"
+COLUMNS = {  # of a comparison
+    "hit": "cfr",
+    **KINDS,
+    "realism": "real",
+    PER_DISTANCE: "counted_per_km",
+}
 CHANGES = {  # rows of the comparison of before and after
     "hit": "cfr",
     "preventable": "cfr_preventable",
     "count": "cfr_counted",
     "progress [m]": "progress",
     "clean": "cfr_clean",
-    "count per 1,000 km": "counted_per_km",
+    PER_DISTANCE: "counted_per_km",
 }
 OTHERS = {"people touched": "cfr_vru", "objects touched": "cfr_object"}
 COUNTS = (
@@ -216,16 +223,21 @@ def comparison(rows: Sequence[dict]) -> list[str]:
         f"{share(first, name).partition(' ')[0]} {kind}" for kind, name in KINDS.items()
     )
     lead += f", of them {preventable}, {clean}; {counted}."
-    table = [["ego", "traffic", "hit", *KINDS, "realism", "count per 1,000 km"]]
-    shown = ("cfr", *KINDS.values(), "real", "counted_per_km")
+    shown = {
+        title: name
+        for title, name in COLUMNS.items()
+        if any(value(row, name) != UNKNOWN for row in rows)
+    }
+    table = [["ego", "traffic", *shown]]
     for key in ranked[:MOST_ROWS]:
-        table.append([*key, *(cell(cells[key], name) for name in shown)])
+        table.append([*key, *(cell(cells[key], name) for name in shown.values())])
     lines = wrapped(lead)
     lines += columns(table if several else [line[1:] for line in table])
     if len(ranked) > MOST_ROWS:
         lines.append(f"... and {len(ranked) - MOST_ROWS} more in tables.md")
     text = COUNTS
-    if without := sum(tally(row, "errored") for row in cells.values()):
+    without = sum(tally(row, "errored") for row in cells.values())
+    if without and PER_DISTANCE in shown:
         text += (
             f" Rates per 1,000 km are without {plural(without, 'rollout')} in which "
         )
