@@ -22,6 +22,10 @@ COMMANDS = {  # module, and what the command does
         "improve a policy on the failures that are found; train a prior",
     ),
     "tune": ("e2rl.commands.tune", "tune the parameters of an adversary or a planner"),
+    "rate": (
+        "e2rl.commands.rate",
+        "how often an ego fails in traffic as the prior has it",
+    ),
     "report": (
         "e2rl.commands.report",
         "the page with a replay of every failure of a run",

@@ -90,9 +90,7 @@ class NominalTraffic(Traffic):
 
     def reset(self, scenes: TensorDictBase, seed: Tensor, eta: Tensor) -> State:
         """Returns the states of scenes [B] with routes drawn from the prior."""
-        vehicles = scenes["route_valid"].shape[1]
-        first = torch.zeros_like(seed)
-        uniform = noise_of(seed, first, shape=(vehicles,), uniform=True)
+        uniform = self.route_noise(seed, scenes["route_valid"].shape[1])
         scenes = self.as_seen(World.at_start(scenes)).scene
         routes = self.prior.choose_routes(scenes, uniform)
         routed, lane = self.prior.start(scenes, routes)

@@ -1,0 +1,92 @@
+"""Intervals of a probability from independent estimates of it, and of a rate over
+scenes."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+LEVEL = 0.95
+DRAWS = 2000  # of the bootstrap
+LEAST_VARIANCE = 1e-4  # of log(probability): estimates may happen to be equal
+
+
+class Bounds(NamedTuple):
+    """An estimate with its interval of 95%."""
+
+    value: float
+    low: float
+    high: float
+
+
+def of_logs(logs: Tensor) -> Bounds:
+    """Returns the probability of which exp(logs [R]), R >= 2, are unbiased, log-normal
+    estimates (Cox's method: Zhou and Gao 1997).
+
+    Its logarithm is mean + variance / 2, with the variance s^2 / R + s^4 / (2 (R - 1)).
+    """
+    count = len(logs)
+    variance = float(logs.var().clamp(min=LEAST_VARIANCE))
+    centre = float(logs.mean()) + variance / 2
+    spread = math.sqrt(variance / count + variance**2 / (2 * (count - 1)))
+    half = spread * float(stats.t.ppf((1 + LEVEL) / 2, count - 1))
+    return Bounds(*(min(math.exp(centre + sign * half), 1.0) for sign in (0, -1, 1)))
+
+
+def of_counts(hits: int, count: int) -> Bounds:
+    """Returns the fraction of hits in independent rollouts (Clopper and Pearson 1934)."""
+    interval = stats.binomtest(hits, count).proportion_ci(LEVEL, "exact")
+    return Bounds(hits / count, float(interval.low), float(interval.high))
+
+
+Side = tuple[Sequence[Tensor], Tensor]  # estimates [R] of S scenes, and exposure [S]
+
+
+def of_ratio(estimates: Sequence[Tensor], exposure: Tensor) -> Bounds:
+    """Returns sum over scenes of probability / sum of exposure, with an interval over
+    scenes and repetitions: a bootstrap that draws scenes, and in each of these its
+    repetitions, with replacement.
+
+    Args:
+        estimates: of each of S scenes, of R repetitions, [R].
+        exposure: [S], such as km driven.
+    """
+    return bounded(*drawn_ratios((estimates, exposure)))
+
+
+def ratio_of_ratios(first: Side, second: Side) -> Bounds:
+    """Returns the quotient of two `of_ratio` in the same scenes, which are drawn
+    together."""
+    value, draws = drawn_ratios(first)
+    other, other_draws = drawn_ratios(second)
+    return bounded(value / other, draws / other_draws)
+
+
+def bounded(value: Tensor, draws: Tensor) -> Bounds:
+    """Returns a value with the interval of its draws [DRAWS], of those that are known."""
+    known = draws[~draws.isnan()]
+    if not len(known):
+        return Bounds(float(value), math.nan, math.nan)
+    tails = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
+    low, high = (float(known.quantile(tail, interpolation="nearest")) for tail in tails)
+    return Bounds(float(value), low, high)
+
+
+def drawn_ratios(side: Side) -> tuple[Tensor, Tensor]:
+    """Returns `of_ratio`'s value, and DRAWS of it; the scenes drawn depend on their
+    number alone."""
+    estimates, exposure = side
+    count = len(estimates)
+    generator = torch.Generator().manual_seed(0)
+    scenes = torch.randint(count, (DRAWS, count), generator=generator)
+    drawn = torch.empty(DRAWS, count, dtype=torch.float64)
+    for scene, values in enumerate(estimates):
+        chosen = scenes == scene
+        shape = (int(chosen.sum()), len(values))
+        again = torch.randint(len(values), shape, generator=generator)
+        drawn[chosen] = values.double()[again].mean(1)
+    value = torch.stack([values.mean() for values in estimates]).sum() / exposure.sum()
+    return value, drawn.sum(1) / exposure[scenes].sum(1)

@@ -1,0 +1,76 @@
+"""How near a rollout comes to a failure: one number, continuous, of which the failure
+is a set of highest values.
+
+A rollout without a contact has minus the least clearance, in m: over the time from the
+first replan's end on (before, the noise has not acted) and over the moving vehicles, the
+gap of the boxes now, or at constant velocities up to LOOK s ahead, where every second
+ahead counts as AHEAD m. A contact has 0 to 1, by what the competent driver in the ego's
+place makes of it: the mean of the fraction of speed that it has lost by then, and of
+1 / (1 + relative speed / GENTLE). A preventable one has PREVENTED.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from e2rl.metrics.geometry import velocity
+from e2rl.scenes.boxes import separation
+from e2rl.scenes.recording import VEHICLE
+from e2rl.sim.rollouts import Rollouts
+from e2rl.traffic.traffic import REPLAN_STEPS
+
+CONTACT = 0.0  # the level of every contact, at least
+PREVENTED = 2.0  # of a preventable one
+TARGETS = {"contact": CONTACT, "preventable": PREVENTED}
+LOOK = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)  # s
+AHEAD = 2.0  # m a second
+FARTHEST = 100.0  # m: nobody moves near
+MOVING = 0.5  # m/s: who has been slower all the time stands
+GENTLE = 5.0  # m/s, relative speed of a contact that counts half
+
+
+def levels(rollouts: Rollouts, rows: Sequence[dict]) -> Tensor:
+    """Returns the levels [B] of rollouts, float64.
+
+    Args:
+        rollouts: B of them.
+        rows: their metrics; a rollout in which the planner raised has none, and is no
+            part of this.
+    """
+    result = -clearance(rollouts).double().clamp(min=torch.finfo(torch.float64).tiny)
+    for index, row in enumerate(rows):
+        if row["cfr"] == 1:
+            result[index] = contact_level(row)
+    return result
+
+
+def contact_level(row: dict) -> float:
+    """Returns the level of a rollout with a contact, given its metrics."""
+    if row["cfr_preventable"] == 1:
+        return PREVENTED
+    lost = min(max(row["margin"], 0.0), 1.0)
+    gentle = 1 / (1 + row["relvel"] / GENTLE)
+    return CONTACT + (lost + gentle) / 2
+
+
+def clearance(rollouts: Rollouts) -> Tensor:
+    """Returns the least clearance [B] m of the ego to vehicles that move."""
+    begin = REPLAN_STEPS
+    states = rollouts.states[:, begin:]
+    moves = (rollouts.states[..., 3].abs() * rollouts.valid).amax(1) > MOVING
+    counted = rollouts.valid[:, begin:] & rollouts.valid[:, begin:, :1]
+    counted &= ((rollouts.agent_type == VEHICLE) & moves)[:, None]
+    counted[..., 0] = False
+    speed = velocity(states)
+    least = torch.full_like(states[..., 0], FARTHEST)
+    for ahead in LOOK:
+        moved = torch.cat([states[..., :2] + ahead * speed, states[..., 2:]], -1)
+        gap = separation(
+            moved[:, :, :1],
+            rollouts.size[:, None, :1],
+            second=moved,
+            second_size=rollouts.size[:, None],
+        )
+        least = torch.minimum(least, gap.clamp(min=0) + AHEAD * ahead)
+    return least.masked_fill(~counted, FARTHEST).flatten(1).amin(1)

@@ -1,0 +1,305 @@
+"""How often an ego fails in scenes, in traffic as the prior has it: populations of
+rollouts, a few scenes at a time."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from e2rl.driving.batches import Work, split_tasks
+from e2rl.driving.setup import Method, Setup, Task
+from e2rl.metrics.errored import errored_row, raised
+from e2rl.metrics.score import score_rollouts
+from e2rl.run.processes import in_processes
+from e2rl.run.settings import configured, setting
+from e2rl.run.terminal import Bar
+from e2rl.scenes.recording import VEHICLE
+from e2rl.sim.rollouts import Rollouts
+from e2rl.tail.level import CONTACT, FARTHEST, TARGETS, levels
+from e2rl.tail.moves import Moves
+from e2rl.tail.noise import ChosenNoise, NoiseLayout
+from e2rl.tail.subset import EXTINCT, REACHED, Driven, Subset, SubsetSettings, Tally
+from e2rl.traffic.attempt import attempt
+from e2rl.traffic.nominal import NominalTraffic
+
+TAIL = "tail"  # the method of these rollouts in tables and files
+ALONE = "alone"  # no vehicle is driven by the prior, so nothing is left to chance
+NEARBY = 20.0  # m from the ego at which a vehicle is moved alone half as often
+SEED_STEP = 1_000_003  # between the seeds of two repetitions
+UNKNOWN = -10 * FARTHEST  # the level of a rollout in which the traffic raised
+
+
+@configured("rate", "rate")
+@dataclass(frozen=True)
+class RateSettings:
+    """What is estimated, and how often; conf/rate.yaml explains each."""
+
+    target: str = setting(choices=TARGETS)
+    repetitions: int = setting(low=1)
+    particles: int = setting(low=4)
+    killed: float = setting(low=0.05, high=0.95)
+    moves: int = setting(low=1)
+    rollouts: int = setting(low=4)
+    least: float = setting(low=0, high=1)
+    together: int = setting(low=1)
+
+    @property
+    def subset(self) -> SubsetSettings:
+        """Those of one population."""
+        names = [field.name for field in fields(SubsetSettings)]
+        return SubsetSettings(**{name: getattr(self, name) for name in names})
+
+
+class Estimate(NamedTuple):
+    """What one population says of a scene.
+
+    Args:
+        scene: its position.
+        repetition: of the population.
+        tally: the probabilities.
+        km: that the ego drives in a rollout, on average.
+        raised: rollouts in which the planner raised, which count as failures.
+        lost: rollouts in which the traffic raised, which are none.
+        failures: rows of the rollouts that reached the target, each with its weight.
+    """
+
+    scene: int
+    repetition: int
+    tally: Tally
+    km: float
+    raised: int
+    lost: int
+    failures: list[dict]
+
+
+class Job(NamedTuple):
+    """Populations that are driven together: of some scenes, in one repetition."""
+
+    name: str
+    scenes: tuple[int, ...]
+    repetition: int
+
+
+@dataclass
+class Rating:
+    """The estimates of one ego.
+
+    Args:
+        setup: scenes, ego and simulator.
+        traffic: whose tail is drawn.
+        settings: what is estimated.
+        seed: of all draws.
+    """
+
+    setup: Setup
+    traffic: NominalTraffic
+    settings: RateSettings
+    seed: int = 0
+
+    def estimates(self, work: Work) -> list[Estimate]:
+        """Returns the estimates of all scenes: one population of each, then
+        `repetitions` of those whose failures the first did not find out of reach.
+
+        Args:
+            work: processes, scenes, parts on disk, and the folder of rollouts.
+        """
+        scenes = list(work.scenes(self.setup))
+        settings = self.settings
+        total = len(scenes) * settings.repetitions
+        with Bar(total=total, desc="populations", unit="population") as bar:
+            first = list(self._all(self._jobs(scenes, [0]), work, bar))
+            reached = [part.scene for part in first if part.tally.end == REACHED]
+            jobs = self._jobs(reached, range(1, settings.repetitions))
+            return first + list(self._all(jobs, work, bar))
+
+    def _jobs(self, scenes: Sequence[int], repetitions: Sequence[int]) -> list[Job]:
+        parts = split_tasks(scenes, self.settings.together) if scenes else []
+        return [
+            Job(f"rate-{repetition}-{part[0]:06}", tuple(part), repetition)
+            for repetition in repetitions
+            for part in parts
+        ]
+
+    def _all(self, jobs: Sequence[Job], work: Work, bar: Bar) -> Iterator[Estimate]:
+        def result_of(job: Job) -> list[tuple]:
+            identity = [
+                self.setup.ego_name,
+                asdict(self.settings),
+                self.seed,
+                list(job.scenes),
+                job.repetition,
+            ]
+            drive = partial(self._drive, job, work.into)
+            return work.parts.result(job.name, identity, drive)
+
+        for results in in_processes(
+            result_of,
+            jobs,
+            processes=work.processes,
+            cost=lambda job: len(job.scenes),
+            ended=lambda job: bar.update(len(job.scenes)),
+        ):
+            for scene, repetition, tally, *rest in results:
+                yield Estimate(scene, repetition, Tally(**tally), *rest)
+
+    def _drive(self, job: Job, folder: Path | None) -> list[tuple]:
+        """The estimates of a job, of plain values."""
+        scene = self.setup.scenes.batch(job.scenes)
+        layout = NoiseLayout.of(
+            self.traffic.prior,
+            vehicles=scene["route_valid"].shape[1],
+            horizon=scene["logged"].shape[1] - 1,
+        )
+        populations = [
+            Population.begin(self, layout, number, job.repetition)
+            for number in job.scenes
+        ]
+        traffic = ChosenNoise(
+            self.traffic.prior, layout, knowledge=self.traffic.knowledge
+        )
+        while active := [part for part in populations if not part.subset.ended]:
+            asked = [part.subset.ask() for part in active]
+            traffic.normals = torch.cat(asked)
+            scenes = [
+                part.scene
+                for part, normals in zip(active, asked, strict=True)
+                for _ in normals
+            ]
+            driven = self._roll_out(traffic, scenes, job.repetition)
+            begin = 0
+            for part, normals in zip(active, asked, strict=True):
+                part.tell(driven[begin : begin + len(normals)])
+                begin += len(normals)
+        return [part.result(folder) for part in populations]
+
+    def _roll_out(
+        self, traffic: ChosenNoise, scenes: Sequence[int], repetition: int
+    ) -> list["OneRollout"]:
+        """What becomes of rollouts with the traffic's normals, in their order."""
+        method = Method(TAIL, traffic)
+        tasks = [Task(scene, repetition, noise=row) for row, scene in enumerate(scenes)]
+        results: dict[int, OneRollout] = {}
+        for batch in split_tasks(tasks, self.setup.batch):
+            parts, errored = attempt(partial(self.setup.roll_out, method), batch)
+            for driven, rollouts in parts:
+                rows, _ = score_rollouts(rollouts)
+                level = levels(rollouts, rows).tolist()
+                for index, task in enumerate(driven):
+                    assert task.noise is not None
+                    fails = level[index] >= CONTACT
+                    results[task.noise] = OneRollout(
+                        level[index], rows[index], rollouts[[index]] if fails else None
+                    )
+            for task, reason in errored:
+                assert task.noise is not None
+                row = errored_row(
+                    self.setup.source(method)
+                    | {"eta": 0.0, "scene_id": self.setup.scenes.scene_id[task.scene]}
+                    | {"location": self.setup.scenes.location[task.scene]}
+                    | {"seed": task.seed}
+                    | reason
+                )
+                level_of = max(TARGETS.values()) if raised(row) else UNKNOWN
+                results[task.noise] = OneRollout(level_of, row, None)
+        return [results[row] for row in range(len(tasks))]
+
+
+class OneRollout(NamedTuple):
+    """A rollout with its level and metrics; itself where it has a contact."""
+
+    level: float
+    row: dict
+    rollouts: Rollouts | None
+
+
+@dataclass
+class Population:
+    """The particles of one scene, and what they showed."""
+
+    scene: int
+    repetition: int
+    subset: Subset
+    alone: bool
+    km: float = 0.0
+    raised: int = 0
+    lost: int = 0
+
+    @classmethod
+    def begin(
+        cls, rating: Rating, layout: NoiseLayout, scene: int, repetition: int
+    ) -> "Population":
+        """Returns the population of a scene before its first rollout."""
+        number = rating.setup.scenes.number[scene]
+        seed = (rating.seed * SEED_STEP + repetition) * SEED_STEP + number
+        weight = vehicle_weight(rating.setup, scene)
+        moves = Moves(
+            weight, layout.replan_of(), torch.Generator().manual_seed(seed % 2**63)
+        )
+        subset = Subset(
+            target=TARGETS[rating.settings.target],
+            settings=rating.settings.subset,
+            moves=moves,
+            shape=(layout.vehicles, layout.numbers),
+        )
+        return cls(scene, repetition, subset, alone=not bool(weight.any()))
+
+    def tell(self, driven: Sequence[OneRollout]) -> None:
+        """Take what became of the rollouts that were asked for last."""
+        first = not self.subset.tally.rollouts
+        rows = [rollout.row for rollout in driven]
+        if first:
+            km = [row["driven_km"] for row in rows if row["errored"] == 0]
+            self.km = sum(km) / max(len(km), 1)
+        self.raised += sum(map(raised, rows))
+        self.lost += sum(rollout.level == UNKNOWN for rollout in driven)
+        counted = [row["cfr_counted"] == 1 or raised(row) for row in rows]
+        self.subset.tell(
+            Driven(
+                torch.tensor([part.level for part in driven], dtype=torch.float64),
+                torch.tensor(counted),
+                list(driven),
+            )
+        )
+        if first and self.alone and self.subset.tally.end in ("", EXTINCT):
+            self.subset.tally.end = ALONE
+            self.subset.tally.bound = 0.0
+
+    def result(self, folder: Path | None) -> tuple:
+        """Returns the fields of Estimate, and writes the failures' files."""
+        tally = self.subset.tally
+        failures = self.subset.failures() if tally.end == REACHED else []
+        rows = []
+        for index, failure in enumerate(failures):
+            seed = self.repetition * self.subset.settings.particles + index
+            row = failure.row | {"seed": seed}
+            row["weight"] = tally.probability / len(failures)
+            if failure.rollouts is not None and folder is not None:
+                failure.rollouts.seed = torch.tensor([seed])
+                failure.rollouts.to_npz(folder)
+            rows.append(row)
+        return (
+            self.scene,
+            self.repetition,
+            asdict(tally),
+            self.km,
+            self.raised,
+            self.lost,
+            rows,
+        )
+
+
+def vehicle_weight(setup: Setup, scene: int) -> Tensor:
+    """Returns how often each vehicle [V] of a scene is moved alone: more the nearer it
+    begins to the ego; 0 for the ego and whom the prior does not drive."""
+    batch = setup.scenes.batch([scene])
+    vehicles = batch["route_valid"].shape[1]
+    start = batch["start"][0, :vehicles]
+    distance = (start[:, :2] - start[:1, :2]).norm(dim=-1)
+    driven = batch["valid"] & ~batch["parked"] & (batch["agent_type"] == VEHICLE)
+    driven = driven[0, :vehicles].clone()
+    driven[0] = False
+    return driven / (1 + distance / NEARBY)

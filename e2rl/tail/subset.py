@@ -1,0 +1,201 @@
+"""Subset simulation (Au and Beck 2001): the probability of a rare failure as a product
+of probabilities that are not rare.
+
+Particles are rollouts' noise. In each stage those below a level, of which there are a
+fixed fraction, are replaced by copies of others, and all copies are moved above that
+level. With levels that no two particles share the estimate is unbiased (Brehier et al.
+2015); particles at the level itself are counted as below it, and where all are, the
+population is extinct.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from e2rl.run.settings import configured, setting
+from e2rl.tail.level import CONTACT
+from e2rl.tail.moves import Moves, Proposal
+
+# why a population ended
+REACHED = "reached"  # enough particles fail
+EXTINCT = "extinct"  # all particles are at one level
+LEAST = "least"  # the target is less likely than `least`
+SPENT = "spent"  # the budget of rollouts
+
+
+@configured("rate", "rate")
+@dataclass(frozen=True)
+class SubsetSettings:
+    """How the particles of a population are spent; conf/rate.yaml explains each."""
+
+    particles: int = setting(low=4)
+    killed: float = setting(low=0.05, high=0.95)
+    moves: int = setting(low=1)
+    rollouts: int = setting(low=4)
+    least: float = setting(low=0, high=1)
+
+
+@dataclass
+class Tally:
+    """The estimate of one population.
+
+    Args:
+        probability: of the target; 0 unless `end` is REACHED.
+        bound: estimate of the probability of `level`, of which the target is a part.
+        variance: of log(probability), were all particles independent.
+        contact: probability of a contact.
+        counted: probability of a failure that counts.
+        rollouts: that were driven.
+        end: why it ended.
+        level: that all particles exceed.
+    """
+
+    probability: float = 0.0
+    bound: float = 1.0
+    variance: float = 0.0
+    contact: float = 0.0
+    counted: float = 0.0
+    rollouts: int = 0
+    end: str = ""
+    level: float = -math.inf
+
+
+class Driven(NamedTuple):
+    """What became of M rollouts.
+
+    Args:
+        level: [M] float64.
+        counted: [M] bool, failures that count.
+        result: of each, what is to be kept.
+    """
+
+    level: Tensor
+    counted: Tensor
+    result: list[Any]
+
+
+class Subset:
+    """A population of particles of one scene: `ask` for noise to drive, `tell` what
+    became of it."""
+
+    def __init__(
+        self,
+        *,
+        target: float,
+        settings: SubsetSettings,
+        moves: Moves,
+        shape: tuple[int, int],
+    ) -> None:
+        """Begin a population.
+
+        Args:
+            target: level of the failure.
+            settings: how particles are spent.
+            moves: in this scene; its generator draws everything.
+            shape: (V, D) of a rollout's normals.
+        """
+        self.target = target
+        self.settings = settings
+        self.moves = moves
+        self.shape = shape
+        self.tally = Tally()
+        self.normals = torch.empty(0, *shape)  # [N, V, D]
+        self.particles = Driven(torch.empty(0), torch.empty(0), [])
+        self._moving = torch.empty(0, dtype=torch.int64)  # particles
+        self._left = 0  # moves of this stage
+        self._asked = Proposal(self.normals, self._moving)
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more is asked for."""
+        return bool(self.tally.end)
+
+    def ask(self) -> Tensor:
+        """Returns the normals [M, V, D] of the next rollouts, none once it has ended."""
+        if self.ended:
+            return self.normals[:0]
+        if len(self.normals):
+            self._asked = self.moves.propose(self.normals[self._moving])
+        else:
+            shape = (self.settings.particles, *self.shape)
+            first = torch.randn(shape, generator=self.moves.generator)
+            self._asked = Proposal(first, torch.empty(0))
+        return self._asked.normals
+
+    def tell(self, driven: Driven) -> None:
+        """Take what became of the rollouts that were asked for last."""
+        self.tally.rollouts += len(driven.level)
+        if len(self.normals):
+            self._accept(driven)
+        else:
+            self.normals = self._asked.normals
+            self.particles = driven
+        if self._left == 0:
+            self._select()
+
+    def failures(self) -> list[Any]:
+        """Returns the results of the particles that reached the target, one for each
+        rollout among them."""
+        reached = (self.particles.level >= self.target).nonzero()[:, 0].tolist()
+        distinct = {id(self.particles.result[row]): row for row in reached}
+        return [self.particles.result[row] for row in distinct.values()]
+
+    def _accept(self, driven: Driven) -> None:
+        accepted = driven.level > self.tally.level
+        self.moves.learn(self._asked.kind, accepted)
+        rows = self._moving[accepted]
+        self.normals[rows] = self._asked.normals[accepted]
+        self.particles.level[rows] = driven.level[accepted]
+        self.particles.counted[rows] = driven.counted[accepted]
+        for row, index in zip(rows, accepted.nonzero()[:, 0], strict=True):
+            self.particles.result[row] = driven.result[index]
+        self._left -= 1
+
+    def _select(self) -> None:
+        """Begin the next stage, or end."""
+        tally = self.tally
+        level = self.particles.level
+        count = len(level)
+        if tally.level < CONTACT:
+            tally.contact = tally.bound * float((level >= CONTACT).double().mean())
+            tally.counted = tally.bound * float(self.particles.counted.double().mean())
+        killed = math.ceil(self.settings.killed * count)
+        threshold = float(level.sort().values[killed - 1])
+        if threshold >= self.target:
+            fraction = float((level >= self.target).double().mean())
+            tally.probability = tally.bound * fraction
+            tally.variance += (1 - fraction) / (fraction * count)
+            tally.end = REACHED
+            return
+        survivors = (level > threshold).nonzero()[:, 0]
+        if not len(survivors):
+            tally.end = EXTINCT
+            return
+        fraction = len(survivors) / count
+        tally.bound *= fraction
+        tally.variance += (1 - fraction) / (fraction * count)
+        tally.level = threshold
+        self._moving = (level <= threshold).nonzero()[:, 0]
+        self._left = self.settings.moves
+        needed = self._left * len(self._moving)
+        if tally.bound < self.settings.least:
+            tally.end = LEAST
+        elif tally.rollouts + needed > self.settings.rollouts:
+            tally.end = SPENT
+        else:
+            self._copy(survivors)
+
+    def _copy(self, survivors: Tensor) -> None:
+        """Replace the particles to be moved by copies of survivors."""
+        drawn = torch.randint(
+            len(survivors), (len(self._moving),), generator=self.moves.generator
+        )
+        parents = survivors[drawn]
+        self.normals[self._moving] = self.normals[parents]
+        self.particles.level[self._moving] = self.particles.level[parents]
+        self.particles.counted[self._moving] = self.particles.counted[parents]
+        for row, parent in zip(self._moving, parents, strict=True):
+            self.particles.result[row] = self.particles.result[parent]

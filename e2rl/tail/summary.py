@@ -1,0 +1,179 @@
+"""What populations say of an ego: the probability in each scene, the rate over scenes,
+and the likeliest failures (docs/guide/rate.md)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from e2rl.scenes.recording import DT
+from e2rl.scenes.scene import SceneSet
+from e2rl.tail.interval import Bounds, of_logs, of_ratio, ratio_of_ratios
+from e2rl.tail.rate import Estimate
+from e2rl.tail.subset import REACHED
+
+EVENTS = ("contact", "preventable", "counted")
+HOUR = 3600.0  # s
+KM = 1000.0
+
+
+@dataclass(frozen=True)
+class SceneRate:
+    """What is known of one scene.
+
+    Args:
+        scene_id: of the scene.
+        probability: of each event in each repetition, {event: [R]}.
+        bounds: of the target's probability.
+        at_most: estimate of what an unresolved target's probability is below.
+        km: that the ego drives in a rollout.
+        rollouts: that were driven.
+        end: of the first population.
+        raised: rollouts in which the planner raised.
+        lost: rollouts in which the traffic raised.
+        failures: rows of failures drawn, each with its weight.
+    """
+
+    scene_id: str
+    probability: dict[str, Tensor]
+    bounds: Bounds
+    at_most: float
+    km: float
+    rollouts: int
+    end: str
+    raised: int
+    lost: int
+    failures: list[dict]
+
+    @property
+    def nats(self) -> float:
+        """-log P(failure | scene): the least that any control of the traffic costs."""
+        return -math.log(self.bounds.value) if self.bounds.value > 0 else math.inf
+
+
+class Rate(NamedTuple):
+    """A rate of an event over scenes.
+
+    Args:
+        event: of EVENTS.
+        scene: per scene.
+        hour: per hour driven.
+        distance: per 1,000 km driven.
+    """
+
+    event: str
+    scene: Bounds
+    hour: Bounds
+    distance: Bounds
+
+
+def scene_rates(
+    estimates: Sequence[Estimate], scenes: SceneSet, target: str
+) -> list[SceneRate]:
+    """Returns the scenes of some estimates, the likeliest failure first.
+
+    Args:
+        estimates: of one ego.
+        scenes: whose positions they count.
+        target: of the populations.
+    """
+    by_scene: dict[int, list[Estimate]] = {}
+    for estimate in estimates:
+        by_scene.setdefault(estimate.scene, []).append(estimate)
+    rates = [
+        scene_rate(scenes.scene_id[scene], parts, target)
+        for scene, parts in by_scene.items()
+    ]
+    return sorted(rates, key=lambda rate: (-rate.bounds.value, -rate.at_most))
+
+
+def scene_rate(scene_id: str, parts: Sequence[Estimate], target: str) -> SceneRate:
+    """Returns what the populations of one scene say."""
+    tallies = [part.tally for part in parts]
+
+    def column(values: Sequence[float]) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64)
+
+    probability = {
+        "contact": column([tally.contact for tally in tallies]),
+        "counted": column([tally.counted for tally in tallies]),
+    }
+    probability[target] = column([tally.probability for tally in tallies])
+    reached = all(tally.end == REACHED for tally in tallies)
+    unresolved = [0.0 if t.end == REACHED else t.bound for t in tallies]
+    at_most = sum(unresolved) / len(parts)
+    value = float(probability[target].mean())
+    bounds = Bounds(value, 0.0, min(1.0, value + at_most))
+    if reached and len(parts) > 1:
+        bounds = of_logs(probability[target].log())
+    failures = [row for part in parts for row in part.failures]
+    for row in failures:
+        row["weight"] /= len(parts)
+    return SceneRate(
+        scene_id,
+        probability,
+        bounds=bounds,
+        at_most=at_most,
+        km=sum(part.km for part in parts) / len(parts),
+        rollouts=sum(tally.rollouts for tally in tallies),
+        end=tallies[0].end,
+        raised=sum(part.raised for part in parts),
+        lost=sum(part.lost for part in parts),
+        failures=failures,
+    )
+
+
+def rates_of(scenes: Sequence[SceneRate], steps: int) -> list[Rate]:
+    """Returns the rate of each event that all scenes know, over scenes of so many
+    steps."""
+    km = torch.tensor([scene.km for scene in scenes], dtype=torch.float64)
+    ones = torch.ones_like(km)
+    hours = ones * steps * DT / HOUR
+    rates = []
+    for event in EVENTS:
+        if event in scenes[0].probability:
+            estimates = [scene.probability[event] for scene in scenes]
+            exposures = (ones, hours, km / KM)
+            rates.append(Rate(event, *(of_ratio(estimates, e) for e in exposures)))
+    return rates
+
+
+def ratio(
+    first: Sequence[SceneRate], second: Sequence[SceneRate], event: str
+) -> Bounds:
+    """Returns the rate of an event per km of the first ego over that of the second,
+    paired by scene."""
+    other = {scene.scene_id: scene for scene in second}
+    pairs = [(scene, other[scene.scene_id]) for scene in first]
+    sides = [
+        (
+            [pair[side].probability[event] for pair in pairs],
+            torch.tensor([pair[side].km for pair in pairs], dtype=torch.float64),
+        )
+        for side in (0, 1)
+    ]
+    return ratio_of_ratios(*sides)
+
+
+def as_json(scene: SceneRate) -> dict[str, Any]:
+    """Returns the row of rates.json of a scene."""
+    return {
+        "scene_id": scene.scene_id,
+        "probability": scene.bounds.value,
+        "low": scene.bounds.low,
+        "high": scene.bounds.high,
+        "at_most": scene.at_most,
+        "nats": scene.nats if scene.bounds.value > 0 else None,
+        "repetitions": {
+            name: values.tolist() for name, values in scene.probability.items()
+        },
+        "km": scene.km,
+        "rollouts": scene.rollouts,
+        "end": scene.end,
+        "raised": scene.raised,
+        "lost": scene.lost,
+        "failures": len(scene.failures),
+    }
