@@ -2,11 +2,12 @@
 is a set of highest values.
 
 A rollout without a contact has minus the least clearance, in m: over the time from the
-first replan's end on (before, the noise has not acted) and over the moving vehicles, the
-gap of the boxes now, or at constant velocities up to LOOK s ahead, where every second
-ahead counts as AHEAD m. A contact has 0 to 1, by what the competent driver in the ego's
-place makes of it: the mean of the fraction of speed that it has lost by then, and of
-1 / (1 + relative speed / GENTLE). A preventable one has PREVENTED.
+first replan's end on (before, the noise has not acted) and over the moving vehicles,
+the gap of the boxes now, or at constant velocities up to LOOK s ahead, where every
+second ahead counts as AHEAD m; who would touch the ego has the seconds until then. A
+contact has 0 to 1, by what the competent driver in the ego's place makes of it: the mean
+of the fraction of speed that it has lost by then, and of 1 / (1 + relative speed /
+GENTLE). A preventable one has PREVENTED.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,9 @@ from e2rl.traffic.traffic import REPLAN_STEPS
 CONTACT = 0.0  # the level of every contact, at least
 PREVENTED = 2.0  # of a preventable one
 TARGETS = {"contact": CONTACT, "preventable": PREVENTED}
-LOOK = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)  # s
+LOOK_STEP = 0.5  # s
+LOOK = tuple(LOOK_STEP * step for step in range(7))  # s
+TINY = 1e-6  # m
 AHEAD = 2.0  # m a second
 FARTHEST = 100.0  # m: nobody moves near
 MOVING = 0.5  # m/s: who has been slower all the time stands
@@ -64,6 +67,7 @@ def clearance(rollouts: Rollouts) -> Tensor:
     counted[..., 0] = False
     speed = velocity(states)
     least = torch.full_like(states[..., 0], FARTHEST)
+    before = least  # the gap at the horizon before
     for ahead in LOOK:
         moved = torch.cat([states[..., :2] + ahead * speed, states[..., 2:]], -1)
         gap = separation(
@@ -72,5 +76,10 @@ def clearance(rollouts: Rollouts) -> Tensor:
             second=moved,
             second_size=rollouts.size[:, None],
         )
-        least = torch.minimum(least, gap.clamp(min=0) + AHEAD * ahead)
+        # They touch between two horizons, by interpolation.
+        share = before.clamp(min=0) / (before - gap).clamp(min=TINY)
+        touch = (ahead - LOOK_STEP * (1 - share.clamp(max=1))).clamp(min=0)
+        cost = torch.where(gap > 0, gap + AHEAD * ahead, AHEAD * touch)
+        least = torch.minimum(least, cost)
+        before = gap
     return least.masked_fill(~counted, FARTHEST).flatten(1).amin(1)

@@ -1,0 +1,66 @@
+"""Intervals, where their coverage is known."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.tail.interval import of_counts, of_logs, of_ratio, ratio_of_ratios
+
+COVERED = 0.93  # of 400 experiments, at least, for an interval of 95%
+
+
+def test_intervals_of_log_normal_estimates_cover_their_mean():
+    generator = torch.Generator().manual_seed(0)
+    spread = 0.8
+    logs = torch.randn(400, 6, generator=generator) * spread - spread**2 / 2
+    bounds = [of_logs(row + math.log(1e-4)) for row in logs]
+    covered = [bound.low < 1e-4 < bound.high for bound in bounds]
+    assert sum(covered) / len(covered) > COVERED
+
+
+def test_no_probability_is_above_one():
+    assert of_logs(torch.tensor([-0.01, -1.0])).high == 1
+
+
+def test_no_hit_in_n_rollouts_bounds_by_clopper_and_pearson():
+    bounds = of_counts(0, 100)
+    assert bounds.value == 0
+    assert bounds.low == 0
+    assert bounds.high == pytest.approx(1 - 0.025 ** (1 / 100))
+
+
+def test_a_ratio_is_the_sum_of_probabilities_over_the_sum_of_exposure():
+    estimates = [torch.tensor([0.1, 0.3]), torch.tensor([0.0])]
+    bounds = of_ratio(estimates, torch.tensor([2.0, 3.0]))
+    assert bounds.value == pytest.approx(0.2 / 5)
+    assert bounds.low < bounds.value < bounds.high
+
+
+def test_ratios_over_scenes_cover_the_population_s():
+    generator = torch.Generator().manual_seed(0)
+    covered = 0
+    for _ in range(200):
+        scene = torch.rand(60, generator=generator)  # mean 0.5
+        noise = torch.rand(60, 4, generator=generator) - 0.5
+        estimates = list(scene[:, None] + noise * scene[:, None])
+        bounds = of_ratio(estimates, torch.full((60,), 2.0))
+        covered += bounds.low < 0.25 < bounds.high
+    assert covered / 200 > 0.9
+
+
+def test_the_quotient_of_equal_egos_is_one_without_an_interval():
+    estimates = [torch.tensor([0.1]), torch.tensor([0.2]), torch.tensor([0.0])]
+    exposure = torch.tensor([1.0, 2.0, 1.0])
+    bounds = ratio_of_ratios((estimates, exposure), (estimates, exposure))
+    assert bounds == (1, 1, 1)
+
+
+def test_scenes_are_paired():
+    generator = torch.Generator().manual_seed(0)
+    first = [torch.rand(1, generator=generator) for _ in range(30)]
+    second = [2 * value for value in first]
+    exposure = torch.ones(30)
+    bounds = ratio_of_ratios((second, exposure), (first, exposure))
+    assert bounds.low == pytest.approx(2)
+    assert bounds.high == pytest.approx(2)

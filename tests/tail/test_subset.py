@@ -1,0 +1,96 @@
+"""Subset simulation, on failures of known probability."""
+
+import math
+
+import pytest
+import torch
+
+from e2rl.tail.interval import of_logs
+from e2rl.tail.moves import Moves
+from e2rl.tail.subset import (
+    EXTINCT,
+    LEAST,
+    REACHED,
+    SPENT,
+    Driven,
+    Subset,
+    SubsetSettings,
+)
+from tests.tail.closed_forms import corner, linear, quantile, tally, union
+
+SETTINGS = SubsetSettings(
+    particles=64, killed=0.5, moves=3, rollouts=100_000, least=1e-12
+)
+P = 1e-3
+FORMS = {
+    "linear": (linear, quantile(P)),
+    "union": (union, quantile(P / 2)),
+    "corner": (corner, quantile(math.sqrt(P))),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_interval_of_repetitions_holds_the_closed_form(form):
+    level, threshold = FORMS[form]
+    tallies = [
+        tally(level, threshold, numbers=400, seed=seed, settings=SETTINGS)
+        for seed in range(8)
+    ]
+    logs = torch.tensor([each.probability for each in tallies]).log()
+    bounds = of_logs(logs)
+    assert bounds.low < P < bounds.high
+    assert bounds.high / bounds.low < 6
+
+
+def test_a_likely_failure_is_counted_in_the_first_stage():
+    result = tally(linear, quantile(0.8), numbers=40, seed=0, settings=SETTINGS)
+    assert result.end == REACHED
+    assert result.rollouts == SETTINGS.particles
+    assert (result.probability * SETTINGS.particles) % 1 == 0
+
+
+def test_equal_levels_are_an_extinction_and_no_estimate():
+    result = tally(
+        lambda x: torch.zeros(len(x), dtype=torch.float64),
+        1.0,
+        numbers=40,
+        seed=0,
+        settings=SETTINGS,
+    )
+    assert result.end == EXTINCT
+    assert result.probability == 0
+    assert result.bound == 1
+
+
+def test_it_spends_no_more_rollouts_than_asked_for():
+    settings = SubsetSettings(
+        particles=64, killed=0.5, moves=3, rollouts=300, least=1e-12
+    )
+    result = tally(linear, 8.0, numbers=40, seed=0, settings=settings)
+    assert result.end == SPENT
+    assert result.rollouts <= 300
+
+
+def test_it_stops_below_the_least_probability():
+    settings = SubsetSettings(
+        particles=64, killed=0.5, moves=1, rollouts=100_000, least=0.1
+    )
+    result = tally(linear, 8.0, numbers=40, seed=0, settings=settings)
+    assert result.end == LEAST
+    assert 0.05 < result.bound < 0.1
+
+
+def test_failures_are_distinct_rollouts_that_reached_the_target():
+    generator = torch.Generator().manual_seed(0)
+    moves = Moves(torch.ones(4), torch.zeros(10, dtype=torch.int64), generator)
+    subset = Subset(
+        target=quantile(0.01), settings=SETTINGS, moves=moves, shape=(4, 10)
+    )
+    while not subset.ended:
+        level = linear(subset.ask())
+        subset.tell(Driven(level, level > 0, [[value] for value in level.tolist()]))
+    failures = [value for (value,) in subset.failures()]
+    assert min(failures) >= quantile(0.01)
+    assert len(set(failures)) == len(failures)
+    reached = (subset.particles.level >= quantile(0.01)).sum()
+    assert 1 < len(failures) <= reached
