@@ -23,6 +23,7 @@ ORDER = (  # of the rooms
         "traffic",
         "driving",
         "search",
+        "tail",
         "evaluation",
     ),
     *("learning", "report", "api", "commands"),

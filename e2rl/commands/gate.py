@@ -17,6 +17,8 @@ from e2rl.evaluation.comparison import Driven, check_shared
 from e2rl.evaluation.rollout_files import write_json
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED, judged, junit
 from e2rl.report.headline import errored_lines, touched_lines
+from e2rl.report.rate_gate import RateRun, judged_rate
+from e2rl.report.rates import RATES_FILE
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
@@ -28,7 +30,10 @@ def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl gate", description=__doc__)
     parser.add_argument(
-        "run", type=Path, metavar="RUN", help="folder of a run of evaluate.py"
+        "run",
+        type=Path,
+        metavar="RUN",
+        help="folder of a run of evaluate.py or e2rl rate",
     )
     parser.add_argument(
         "rules",
@@ -47,17 +52,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the values")
     options = parser.parse_intermixed_args(arguments)
     with ending():
-        driven = Driven.read(options.run, options.ego)
-        former = None
-        if options.against is not None:
-            former = Driven.read(options.against, options.ego)
-            check_shared(former, driven)
-            if not any(re.search("=[+-]", rule) for rule in options.rules):
-                raise InputError(
-                    "--against: no rule is on a change; write one as 'counted<=+0.02'"
-                )
-        results = [judged(rule, driven, former) for rule in options.rules]
-        events = [*errored_lines(driven.rows, named=0), *touched_lines(driven.rows)]
+        if (options.run / RATES_FILE).is_file():
+            results = rate_results(options)
+            events: list[str] = []
+        else:
+            results, events = rollout_results(options)
         if options.junit is not None:
             xml = junit(results, run=str(options.run), events=events)
             write_atomically(options.junit, xml)
@@ -67,3 +66,32 @@ def main(arguments: list[str] | None = None) -> None:
             print(line)
     outcomes = {result["outcome"] for result in results}
     sys.exit(next(status for name, status in STATUS.items() if name in outcomes))
+
+
+def rollout_results(options: argparse.Namespace) -> tuple[list[dict], list[str]]:
+    """Returns what becomes of rules on a run of evaluate.py, and lines about the run."""
+    driven = Driven.read(options.run, options.ego)
+    former = None
+    if options.against is not None:
+        former = Driven.read(options.against, options.ego)
+        check_shared(former, driven)
+        if not any(re.search("=[+-]", rule) for rule in options.rules):
+            raise InputError(
+                "--against: no rule is on a change; write one as 'counted<=+0.02'"
+            )
+    results = [judged(rule, driven, former) for rule in options.rules]
+    return results, [*errored_lines(driven.rows, named=0), *touched_lines(driven.rows)]
+
+
+def rate_results(options: argparse.Namespace) -> list[dict]:
+    """Returns what becomes of rules on a run of `e2rl rate`."""
+    run = RateRun.read(options.run, options.ego)
+    former = None
+    if options.against is not None:
+        former = RateRun.read(options.against, options.ego)
+        if not any("=x" in rule for rule in options.rules):
+            raise InputError(
+                "--against: no rule is on a ratio; write one as "
+                "'preventable_per_1000km<=x1.2'"
+            )
+    return [judged_rate(rule, run, former) for rule in options.rules]

@@ -19,6 +19,7 @@ from e2rl.tail.summary import SceneRate, as_json, rates_of, ratio
 RATES_FILE = "rates.json"
 TABLES_FILE = "rates.md"
 TAIL_FILE = "tail.csv"
+UNITS = {"scene": "scene", "hour": "hour", "1000km": "distance"}  # fields of Rate
 LIKELIEST = 10  # scenes whose failures are named
 ENDS = {
     REACHED: "failures drawn",
@@ -58,8 +59,7 @@ def write_rates(folder: Path, egos: Sequence[EgoRates]) -> None:
             "target": ego.target,
             "rates": {
                 rate.event: {
-                    unit: getattr(rate, unit)._asdict()
-                    for unit in ("scene", "hour", "distance")
+                    unit: getattr(rate, unit)._asdict() for unit in UNITS.values()
                 }
                 for rate in rates_of(ego.scenes, ego.steps)
             },

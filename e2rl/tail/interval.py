@@ -23,17 +23,20 @@ class Bounds(NamedTuple):
 
 
 def of_logs(logs: Tensor) -> Bounds:
-    """Returns the probability of which exp(logs [R]), R >= 2, are unbiased, log-normal
-    estimates (Cox's method: Zhou and Gao 1997).
+    """Returns the probability of which exp(logs [R]), R >= 2, are unbiased estimates:
+    their mean, with the interval of log-normal ones (Cox's method: Zhou and Gao 1997).
 
-    Its logarithm is mean + variance / 2, with the variance s^2 / R + s^4 / (2 (R - 1)).
+    It is around mean + s^2 / 2 of the logarithms, whose variance s^2 / R + s^4 / (2 (R
+    - 1)) is that of a t law.
     """
     count = len(logs)
     variance = float(logs.var().clamp(min=LEAST_VARIANCE))
     centre = float(logs.mean()) + variance / 2
     spread = math.sqrt(variance / count + variance**2 / (2 * (count - 1)))
     half = spread * float(stats.t.ppf((1 + LEVEL) / 2, count - 1))
-    return Bounds(*(min(math.exp(centre + sign * half), 1.0) for sign in (0, -1, 1)))
+    value = float(logs.exp().mean())
+    low = min(math.exp(centre - half), value)
+    return Bounds(value, low, high=min(max(math.exp(centre + half), value), 1.0))
 
 
 def of_counts(hits: int, count: int) -> Bounds:

@@ -189,6 +189,11 @@ class NominalTraffic(Traffic):
         plans = self.prior.decode(self.prior.estimate(context), context)
         return plans.states()[:, 0], context
 
+    def route_noise(self, seed: Tensor, vehicles: int) -> Tensor:
+        """Returns uniform numbers [B, V] that draw the routes of `vehicles`."""
+        first = torch.zeros_like(seed)
+        return noise_of(seed, first, shape=(vehicles,), uniform=True)
+
     def noise(self, state: State) -> Tensor:
         """Returns standard normal noise [K, B, V, SIZE] of the next replan."""
         shape = (self.prior.sampler.steps, state.routed.route.shape[1], SIZE)

@@ -1,0 +1,112 @@
+"""Rates of an ego in synthetic scenes: the same over processes, and after a kill."""
+
+import pytest
+import torch
+
+from e2rl.api import load_prior, make_ego, make_traffic
+from e2rl.driving.batches import Work
+from e2rl.driving.setup import Setup
+from e2rl.planners.ego import Ego
+from e2rl.run.parts import Parts
+from e2rl.sim.env import SimSettings
+from e2rl.tail.rate import ALONE, RateSettings, Rating, vehicle_weight
+from e2rl.tail.subset import REACHED
+from e2rl.tail.summary import rates_of, scene_rates
+from tests.synthetic import make_scenes
+
+SETTINGS = RateSettings(
+    target="contact",
+    repetitions=2,
+    particles=8,
+    moves=1,
+    rollouts=24,
+    least=1e-3,
+    together=1,
+)
+
+
+def rating(scenes, ego=None, settings=SETTINGS):
+    setup = Setup(
+        scenes,
+        ego or make_ego("idm"),
+        ego_name="idm",
+        sim=SimSettings(),
+        batch=8,
+    )
+    prior = load_prior(sampler={"steps": 2})
+    return Rating(setup, make_traffic("nominal", prior), settings)
+
+
+class Crash(Ego):
+    """Raises in every rollout."""
+
+    def act(self, observation):
+        raise RuntimeError("no plan")
+
+    plan = act
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return make_scenes(2)
+
+
+@pytest.fixture(scope="module")
+def estimates(scenes):
+    return rating(scenes).estimates(Work())
+
+
+def test_every_scene_has_a_population(scenes, estimates):
+    assert {part.scene for part in estimates} == {0, 1}
+    assert all(part.tally.end for part in estimates)
+    assert all(part.tally.rollouts <= SETTINGS.rollouts for part in estimates)
+
+
+def test_processes_do_not_change_it(scenes, estimates):
+    assert rating(scenes).estimates(Work(processes=2)) == estimates
+
+
+def test_what_is_on_disk_is_not_driven_again(scenes, estimates, tmp_path, monkeypatch):
+    work = Work(parts=Parts(tmp_path, "rate", "inputs"))
+    assert rating(scenes).estimates(work) == estimates
+    monkeypatch.setattr(Rating, "_drive", lambda *_: pytest.fail("driven again"))
+    assert rating(scenes).estimates(work) == estimates
+
+
+def test_a_planner_that_raises_fails_surely(scenes):
+    parts = rating(scenes, Crash()).estimates(Work())
+    rates = scene_rates(parts, scenes, target="contact")
+    assert [scene.bounds.value for scene in rates] == [1, 1]
+    assert all(scene.end == REACHED for scene in rates)
+    assert all(scene.raised == scene.rollouts for scene in rates)
+
+
+def test_scenes_without_driven_vehicles_leave_nothing_to_chance(scenes):
+    alone = make_scenes(1)
+    alone.scenes["valid"][:, 1:] = False
+    alone.scenes["logged_valid"][:, :, 1:] = False
+    assert not vehicle_weight(rating(alone).setup, 0).any()
+    (part,) = rating(alone).estimates(Work())
+    assert part.tally.end == ALONE
+    assert part.tally.bound == 0
+
+
+def test_vehicles_nearer_to_the_ego_are_moved_more_often(scenes):
+    weight = vehicle_weight(rating(scenes).setup, 0)
+    start = scenes.batch([0])["start"][0, : len(weight)]
+    distance = (start[:, :2] - start[:1, :2]).norm(dim=-1)
+    moved = weight > 0
+    assert moved.any()
+    assert not moved[0]
+    order = distance[moved].argsort()
+    assert (weight[moved][order].diff() <= 0).all()
+
+
+def test_rates_are_sums_over_scenes_per_exposure(scenes, estimates):
+    rates = scene_rates(estimates, scenes, target="contact")
+    contact = next(r for r in rates_of(rates, steps=80) if r.event == "contact")
+    mean = sum(scene.probability["contact"].mean() for scene in rates) / 2
+    torch.testing.assert_close(torch.tensor(contact.scene.value).double(), mean)
+    torch.testing.assert_close(
+        torch.tensor(contact.hour.value).double(), mean * 3600 / 8
+    )
