@@ -7,11 +7,10 @@ Writes rates.json, rates.md, tail.csv and, of failures, rollouts.csv and rollout
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
-from omegaconf import OmegaConf
-
 from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.report.rates import EgoRates, rate_lines, write_rates
 from e2rl.run.command import run_command
+from e2rl.run.config import resolved
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
 from e2rl.run.settings import settings_of
@@ -25,9 +24,7 @@ MAY_CHANGE = ("processes",)  # when a run is resumed
 def rate(run: Run) -> None:
     """Drive what is not on disk yet, write the rates, and print them."""
     config = run.config
-    settings = settings_of(
-        RateSettings, OmegaConf.to_container(config.rate), where="rate"
-    )
+    settings = settings_of(RateSettings, resolved(config.rate), where="rate")
     plan = begin(run)
     traffic = nominal_traffic(plan)
     (seed,) = plan.settings.seeds

@@ -117,9 +117,13 @@ class Rating:
             return first + list(self._all(jobs, work, bar))
 
     def _jobs(self, scenes: Sequence[int], repetitions: Sequence[int]) -> list[Job]:
-        parts = split_tasks(scenes, self.settings.together) if scenes else []
+        together = self.settings.together
+        parts = [
+            tuple(scenes[begin : begin + together])
+            for begin in range(0, len(scenes), together)
+        ]
         return [
-            Job(f"rate-{repetition}-{part[0]:06}", tuple(part), repetition)
+            Job(f"rate-{repetition}-{part[0]:06}", part, repetition)
             for repetition in repetitions
             for part in parts
         ]
