@@ -1,0 +1,72 @@
+"""`e2rl rate` on two short bundled scenes, and the gate on what it writes."""
+
+import csv
+import json
+
+import pytest
+
+from tests.scripts import SHORT, call, error_line
+
+SMALL = [
+    "rate.particles=8",
+    "rate.rollouts=16",
+    "rate.repetitions=2",
+    "rate.target=contact",
+    "processes=1",
+]
+
+
+@pytest.fixture
+def rate(tmp_path, monkeypatch, capsys):
+    """Runs the command in a folder of its own; returns it, or if `wrong` the error."""
+    folder = tmp_path / "run"
+
+    def run(*options, wrong=False):
+        options = [*SHORT, *SMALL, f"hydra.run.dir={folder}", *options]
+        status, output = call(
+            "e2rl/commands/cli.py",
+            ["rate", *options],
+            monkeypatch=monkeypatch,
+            capsys=capsys,
+        )
+        assert status == (2 if wrong else 0), output
+        return error_line(output) if wrong else folder
+
+    return run
+
+
+def test_two_egos_are_rated_and_gated(rate, monkeypatch, capsys):
+    run = rate("+egos.a.ego=idm", "+egos.b.ego=lane_graph")
+    entries = json.loads((run / "rates.json").read_text())
+    assert [entry["ego"] for entry in entries] == ["a", "b"]
+    assert all(len(entry["scenes"]) == 2 for entry in entries)
+    assert "ratio per km" in (run / "rates.md").read_text()
+    with (run / "tail.csv").open() as file:
+        weights = {}
+        for row in csv.DictReader(file):
+            key = (row["ego_policy"], row["scene_id"])
+            weights[key] = weights.get(key, 0) + float(row["weight"])
+    for entry in entries:
+        for scene in entry["scenes"]:
+            weight = weights.get((entry["ego"], scene["scene_id"]), 0)
+            assert weight == pytest.approx(scene["probability"])
+    status, output = call(
+        "e2rl/commands/cli.py",
+        ["gate", str(run), "--ego", "a", "contact_per_scene<=1"],
+        monkeypatch=monkeypatch,
+        capsys=capsys,
+    )
+    assert status == 0, output
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("methods=[nominal,e2]", "rates are of the prior's own traffic"),
+        ("seeds=[0,1]", "one seed gives all draws"),
+        ("rate.target=scratch", "rate.target=scratch"),
+        ("rate.killed=1.5", "rate.killed=1.5"),
+    ],
+)
+def test_what_cannot_be_rated_is_refused(rate, option, message):
+    assert message in rate(option, wrong=True)
