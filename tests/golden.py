@@ -89,12 +89,17 @@ def scenes_and_prior() -> tuple:
     return e2rl.load_scenes("bundled", num_scenes=SCENES), e2rl.load_prior()
 
 
-def rollouts_of(method: str, ego: str) -> Record:
-    """Returns the record of a method against an ego in all scenes."""
+@cache
+def rollouts_of(method: str, ego: str) -> Rollouts:
+    """Returns the rollouts of a method against an ego in all scenes."""
     scenes, prior = scenes_and_prior()
     traffic = e2rl.make_traffic(method, prior)
-    rollouts = e2rl.roll_out(scenes, e2rl.make_ego(ego), traffic=traffic, eta=ETA)
-    return rollouts_record(rollouts)
+    return e2rl.roll_out(scenes, e2rl.make_ego(ego), traffic=traffic, eta=ETA)
+
+
+def record_of(method: str, ego: str) -> Record:
+    """Returns the record of a method against an ego in all scenes."""
+    return rollouts_record(rollouts_of(method, ego))
 
 
 def rollouts_record(rollouts: Rollouts) -> Record:
@@ -156,10 +161,10 @@ def command(script: str, *overrides: str) -> None:
 
 CASES: dict[str, Callable[[], Record]] = {
     **{
-        f"{method}, lane_graph": partial(rollouts_of, method, "lane_graph")
+        f"{method}, lane_graph": partial(record_of, method, "lane_graph")
         for method in METHODS
     },
-    **{f"e2, {ego}": partial(rollouts_of, "e2", ego) for ego in EGOS},
+    **{f"e2, {ego}": partial(record_of, "e2", ego) for ego in EGOS},
     "search": searched,
     "training": trained,
 }

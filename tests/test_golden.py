@@ -1,5 +1,5 @@
 """Golden rollouts (tests/golden.py): what methods, egos, training and search do is what
-they did, bit for bit.
+they did, bit for bit, and whoever drives moves as fast as it says.
 
 On another processor than golden.json was written on, bits differ and rollouts part:
 there most end where they did.
@@ -10,9 +10,12 @@ import json
 import pytest
 import torch
 
-from tests.golden import CASES, FILE, processor
+from e2rl.scenes.recording import DT
+from e2rl.sim.dynamics import wrap
+from tests.golden import CASES, FILE, METHODS, processor, rollouts_of
 
 STORED = json.loads(FILE.read_text())
+SLACK = 0.03  # m a step: who stands is held where it is, whatever it says below 0.5 m/s
 APART = 1.0  # m, in the sum of all places of a scene
 
 
@@ -31,10 +34,35 @@ def test_nothing_has_changed(name):
         assert record["size"] == pytest.approx(stored["size"], rel=0.02)
     elif name == "search":
         hits = [
-            torch.tensor(each["hits"]).double().mean().item()
-            for each in (record, stored)
+            torch.tensor(case["hits"]).double().mean().item()
+            for case in (record, stored)
         ]
         assert hits[0] == pytest.approx(hits[1], abs=0.25)
     else:
         places = torch.tensor(record["places"]) - torch.tensor(stored["places"])
         assert (places.abs() < APART).sum() >= 5
+
+
+def deviations(rollouts):
+    """Distance [n] m by which steps of vehicles differ from the mean speed along the
+    mean heading, but of those on their recording, which begins at an estimate of it."""
+    states = rollouts.states.double()
+    logged = rollouts.logged.double()
+    both = rollouts.valid[:, 1:] & rollouts.valid[:, :-1] & rollouts.simulated[:, None]
+    both[..., 0] = False
+    replays = (states - logged)[..., :2].norm(dim=-1) < 1e-3
+    replays[:, 0] = True
+    both &= ~(replays[:, 1:] & replays[:, :-1])
+    turn = wrap(states[:, 1:, :, 2] - states[:, :-1, :, 2])
+    heading = states[:, :-1, :, 2] + turn / 2
+    speed = (states[:, 1:, :, 3] + states[:, :-1, :, 3]) / 2
+    expected = DT * speed[..., None] * torch.stack([heading.cos(), heading.sin()], -1)
+    return (states[..., :2].diff(dim=1) - expected).norm(dim=-1)[both]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [name for name in METHODS if name != "replay"])
+def test_every_vehicle_moves_as_fast_as_it_says(method):
+    distances = deviations(rollouts_of(method, "lane_graph"))
+    assert len(distances) > 100
+    assert distances.max() < SLACK

@@ -234,6 +234,21 @@ class Fused:
                     ) from None
 
     def _compile(self) -> None:
+        package = io.BytesIO()
+        settings = {"cpp.threads": 1}  # processes run beside each other
+        with _tracing():
+            torch._inductor.aoti_compile_and_package(
+                self.traced(), package_path=package, inductor_configs=settings
+            )
+        with zipfile.ZipFile(
+            package
+        ) as whole:  # the library alone: packages are unpacked anew by every process
+            (library,) = (name for name in whole.namelist() if name.endswith(".so"))
+            write_atomically(self.file, whole.read(library))
+
+    def traced(self) -> torch.export.ExportedProgram:
+        """Returns the function as a graph of tensors, as they are laid out, of every
+        size."""
         free = sorted(
             {
                 name
@@ -259,23 +274,20 @@ class Fused:
                 }
             )
         module = _Module(self)
-        package = io.BytesIO()
-        sizes_of_1 = torch.fx.experimental._config.patch(backed_size_oblivious=True)  # type: ignore[attr-defined]
-        with torch.no_grad(), sizes_of_1, warnings.catch_warnings(action="ignore"):
+        with _tracing():
             with switched_off():
                 module(*examples)  # fills the caches of constants
-            graph = torch.export.export(
+            return torch.export.export(
                 module, tuple(examples), dynamic_shapes=(tuple(dynamic),)
             )
-            settings = {"cpp.threads": 1}  # processes run beside each other
-            torch._inductor.aoti_compile_and_package(
-                graph, package_path=package, inductor_configs=settings
-            )
-        with zipfile.ZipFile(
-            package
-        ) as whole:  # the library alone: packages are unpacked anew by every process
-            (library,) = (name for name in whole.namelist() if name.endswith(".so"))
-            write_atomically(self.file, whole.read(library))
+
+
+@contextmanager
+def _tracing() -> Iterator[None]:
+    """Tensors of size 1 are like others, and nothing is said of what is slow."""
+    sizes_of_1 = torch.fx.experimental._config.patch(backed_size_oblivious=True)  # type: ignore[attr-defined]
+    with torch.no_grad(), sizes_of_1, warnings.catch_warnings(action="ignore"):
+        yield
 
 
 def fused(*shapes: Shape) -> Callable[[Callable[..., Any]], Fused]:

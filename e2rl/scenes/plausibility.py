@@ -359,6 +359,11 @@ def _largest(values: ndarray) -> float:
     return float(values.max()) if len(values) else np.nan
 
 
+def _median(values: ndarray) -> float:
+    """The median of values [K]; NaN of none."""
+    return float(np.median(values)) if len(values) else np.nan
+
+
 def _medians(values: ndarray, group: ndarray) -> ndarray:
     """The (lower) median of the values [K] of each group 0 .. G-1, of group [K]; NaN
     for a group without any."""
@@ -385,7 +390,7 @@ def map_fit(recording: Recording, graph: LaneGraph) -> dict[str, float]:
     turn = graph.heading[np.where(exists, near, 0)] - pose[:, 2:]
     on = (exists & (np.abs(wrap(turn)) < LANE_ANGLE)).any(-1)
     return {
-        "lane_distance": float(np.median(graph.tree.query(ego)[0])),
+        "lane_distance": _median(graph.tree.query(ego)[0]),
         "on_lanes": float(on.mean()) if len(on) >= ENOUGH else np.nan,
         "lane_spacing": lane_spacing(graph),
     }

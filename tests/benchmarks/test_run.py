@@ -30,24 +30,29 @@ SHORT = [
 ]
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The rows of all benchmarks, which load the scenes once."""
+    path = tmp_path_factory.mktemp("benchmarks") / "rows.json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("searched_rollouts.TRIES", 1)
+        run.main(["--json", str(path), *SMALL, *SHORT])
+    return json.loads(path.read_text())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(run.BENCHMARKS))
-def test_every_benchmark_runs(name, tmp_path, monkeypatch):
-    path = tmp_path / "rows.json"
-    monkeypatch.setattr("searched_rollouts.TRIES", 1)
-    run.main(["--json", str(path), "--only", name, *SMALL, *SHORT])
-    rows = json.loads(path.read_text())
+def test_every_benchmark_runs(name, written):
+    rows = [row for row in written if row["benchmark"] == name]
     assert rows
-    assert {row["benchmark"] for row in rows} == {name}
     if name.startswith("peer_"):  # they are not installed where the tests run
         assert all(
             row["value"] or row["variant"].startswith("absent: ") for row in rows
         )
         return
-    assert all(
-        row["value"] > 0 and row["threads"] == 1 and row["versions"]["torch"]
-        for row in rows
-    )
+    assert min(row["value"] for row in rows) > 0
+    assert {row["threads"] for row in rows} == {1}
+    assert all(row["versions"]["torch"] for row in rows)
     assert len(
         {(row["variant"], row["batch"], row["unit"], row["processes"]) for row in rows}
     ) == len(rows)

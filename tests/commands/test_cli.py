@@ -46,14 +46,35 @@ def test_every_command_is_a_module_with_a_main():
     assert PROJECT["scripts"] == {"e2rl": f"{cli.__name__}:main"}
 
 
+CONFIGURED = ["evaluate", "train", "tune"]
+SHOW = f"""
+import sys
+sys.path.insert(0, {str(ROOT)!r})
+from hydra.core.global_hydra import GlobalHydra
+from e2rl.commands.cli import main
+for name in {CONFIGURED}:
+    print("COMMAND")
+    sys.argv = ["e2rl", name, "--cfg", "job"]
+    main()
+    GlobalHydra.instance().clear()
+"""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["evaluate", "train", "tune"])
-def test_a_command_shows_its_configuration_in_an_empty_folder(name, tmp_path):
-    code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-    code += "from e2rl.commands.cli import main; main()"
-    command = [sys.executable, "-c", code, name, "--cfg", "job"]
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=300
+def test_commands_show_their_configuration_in_an_empty_folder(tmp_path):
+    """One after the other in one process."""
+    process = subprocess.run(
+        [sys.executable, "-c", SHOW],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
-    assert done.returncode == 0
-    assert "_target_: e2rl.traffic.e2.e2.E2" in done.stdout, done.stderr
+    assert process.returncode == 0, process.stderr
+    shown = process.stdout.split("COMMAND\n")[1:]
+    without = [
+        name
+        for name, text in zip(CONFIGURED, shown, strict=True)
+        if "_target_: e2rl.traffic.e2.e2.E2" not in text
+    ]
+    assert without == []

@@ -113,8 +113,10 @@ def run(ego, folder=None, batch=64, processes=1, count=4):
     )
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize(
+    ("name", "processes"),
+    [*((name, 1) for name in FAULTS), ("PlannerExited", 2), ("NotFinite", 2)],
+)
 def test_the_others_are_scored_and_the_count_stands_everywhere(
     tmp_path, name, processes
 ):
@@ -143,9 +145,13 @@ def test_the_others_are_scored_and_the_count_stands_everywhere(
     }
     assert ends == {(scene_set().scene_id[2], seed, "ego") for seed in (0, 1)}
     assert all(re.search(detail, row["error"]) for row in rows if row["errored"] == 1)
-    (whole,) = run(IDMEgo(), tmp_path, batch=4, processes=processes)
-    assert whole["errored"] == {}
-    assert whole["n_rollouts"] == 8
+
+
+def test_a_run_in_which_nobody_raises_leaves_no_list_of_an_earlier_run(tmp_path):
+    (tmp_path / ERRORED_FILE).write_text("[]")
+    (row,) = run(IDMEgo(), tmp_path, count=1)
+    assert row["errored"] == {}
+    assert row["n_rollouts"] == 2
     assert not (tmp_path / ERRORED_FILE).exists()
 
 

@@ -38,7 +38,7 @@ def run(tmp_path_factory):
     on = synthesizer()
     methods = [Method("nominal", on), Method("e2", on, eta=3.0)]
     rows = run_protocol(
-        setup_of(scenes(SCENES, steps=80), 3),
+        setup_of(scenes(SCENES, steps=40), 3),
         methods,
         seeds=SEEDS,
         folder=folder,
@@ -75,7 +75,7 @@ def test_a_row_for_each_method_and_a_line_and_a_file_for_each_rollout(run):
     for file in files:
         assert file.seed in SEEDS
         assert file.ego_policy == "idm"
-        assert file.states.shape[0] == 81
+        assert file.states.shape[0] == 41
         assert file.adversaries.any() == (file.method == "e2")
         assert not file.adversaries[0]
 
@@ -94,7 +94,7 @@ def test_methods_share_the_noise_of_a_scene_and_seed():
 
 def test_processes_change_nothing_but_the_time(tmp_path):
     """Two forked processes give the rows, tables and rollouts of one, bit for bit."""
-    scene_set = scenes(3, steps=20)
+    scene_set = scenes(2, steps=20)
     folders = (tmp_path / "one", tmp_path / "two")
     for processes, folder in enumerate(folders, 1):
         methods = [
@@ -122,9 +122,9 @@ class Stopped(Setup):
         if self.left == 0:
             raise KeyboardInterrupt
         self.left -= 1
-        found = super().score(method, tasks, folder, begins)
+        scored = super().score(method, tasks, folder, begins)
         self.done += [(method.name, task.scene, task.seed) for task in tasks]
-        return found
+        return scored
 
 
 def stopping_run(folder, stops, scene_set):

@@ -25,21 +25,24 @@ def test_the_workflow_drives_and_gates(tmp_path):
         if "name" in step
     }
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    done = [
+    processes = [
         subprocess.run(
-            ["bash", "-ec", steps[name]["run"] + more],
+            ["bash", "-ec", steps[name]["run"] + overrides],
             cwd=ROOT,
             env=os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)},
             capture_output=True,
             text=True,
             timeout=600,
         )
-        for name, more in (("drive", " num_scenes=3 processes=1"), ("gate", ""))
+        for name, overrides in (
+            ("drive", " num_scenes=3 processes=1 prior.sampler.steps=2"),
+            ("gate", ""),
+        )
     ]
-    assert [each.returncode for each in done] == [0, 3], (
-        done[-1].stderr + done[0].stderr
+    assert [process.returncode for process in processes] == [0, 3], (
+        processes[-1].stderr + processes[0].stderr
     )
-    assert "an interval needs 10" in done[1].stdout
-    kept = steps["keep what was found"]["with"]["path"].split()
-    assert len(kept) == 3
-    assert all(Path(each).is_file() for each in kept if not each.endswith(".html"))
+    assert "an interval needs 10" in processes[1].stdout
+    paths = steps["keep what was found"]["with"]["path"].split()
+    assert len(paths) == 3
+    assert all(Path(path).is_file() for path in paths if not path.endswith(".html"))

@@ -14,6 +14,7 @@ import torch
 import e2rl
 from e2rl.scenes.recording import DT
 from e2rl.traffic.potentials import SAMPLED_STEPS, PotentialSettings
+from tests.scripts import SHORT
 from tests.traffic.test_potentials import situation
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +32,7 @@ def run(script, folder, *overrides):
         f"hydra.run.dir={folder}",
     ]
     path = os.pathsep.join([str(EXAMPLES), str(ROOT)])
-    done = subprocess.run(
+    process = subprocess.run(
         [*command, *overrides],
         cwd=folder.parent,
         env=os.environ | {"PYTHONPATH": path},
@@ -39,8 +40,8 @@ def run(script, folder, *overrides):
         text=True,
         timeout=600,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert process.returncode == 0, process.stderr
+    return process.stdout
 
 
 @pytest.mark.slow
@@ -55,6 +56,7 @@ def test_adversary_ego_source_and_metric_share_a_table_with_e2(tmp_path):
         "experiment=hard_braking",
         "seeds=[0]",
         "data.workers=1",
+        "prior.sampler.steps=2",
     )
     rows = {
         row["method"]: row
@@ -76,18 +78,21 @@ def test_adversary_ego_source_and_metric_share_a_table_with_e2(tmp_path):
 @pytest.mark.slow
 def test_somebody_else_s_optimiser_spends_the_tries(tmp_path):
     pytest.importorskip("cma")
-    asked = (
+    run(
+        "evaluate.py",
+        tmp_path / "run",
+        *SHORT,
         "search=evolution",
         "methods=[search]",
-        "budget=12",
+        "budget=8",
         "budget_unit=tries",
-        "num_scenes=2",
         "seeds=[0]",
+        "report=false",
+        "save_rollouts=false",
     )
-    run("evaluate.py", tmp_path / "run", *asked, "report=false", "save_rollouts=false")
     with open(tmp_path / "run" / "tries.csv") as file:
         tries = list(csv.DictReader(file))
-    assert len(tries) == 24
+    assert len(tries) == 16
     assert len({row["family"] for row in tries}) > 4
 
 
@@ -96,10 +101,10 @@ def test_the_curriculum_runs_a_round(tmp_path):
     out = run(
         "train.py",
         tmp_path / "run",
+        *SHORT,
         "curriculum=staircase",
         "curriculum.stairs=[1.5]",
         "rounds=1",
-        "num_scenes=2",
         "learner.round.scenes=1",
         "learner.collect.batch=2",
         "learner.collect.iterations=1",
@@ -166,14 +171,15 @@ def test_the_objective_is_least_in_front_of_the_target(monkeypatch):
 @pytest.mark.slow
 def test_an_objective_of_one_s_own_steers_e2_elsewhere(tmp_path):
     """The same coalition and noise, and other paths of its members."""
-    small = [
+    run(
+        "evaluate.py",
+        tmp_path / "run",
+        *SHORT,
         "methods=[e2,cut_in_front]",
-        "num_scenes=2",
-        "data.split=tune",
         "seeds=[0]",
         "processes=1",
-    ]
-    run("evaluate.py", tmp_path / "run", *small, "report=false")
+        "report=false",
+    )
     with open(tmp_path / "run" / "rollouts.csv") as file:
         rows = list(csv.DictReader(file))
     assert {row["method"] for row in rows} == {"e2", "cut_in_front"}

@@ -38,9 +38,25 @@ LIGHTS = ("UNKNOWN", "RED", "YELLOW", "GREEN")  # by state
 @pytest.fixture
 def nuplan(monkeypatch, tmp_path):
     """Returns the ego of a planner of nuplan_planners.py, with arguments."""
+    return maker(monkeypatch, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def bundled(tmp_path_factory):
+    """The bundled scenes, and what a Witness sees at their start."""
+    folder = tmp_path_factory.mktemp("bundled")
+    scenes = e2rl.load_scenes(num_scenes=24).scenes
+    with pytest.MonkeyPatch.context() as patch:
+        ego = maker(patch, folder)("--planner nuplan_planners:Witness")
+        ego.plan(World.at_start(scenes))
+    return scenes, written(folder)
+
+
+def maker(patch, folder):
+    """Makes egos of planners, whose Witness writes into a folder."""
     path = os.pathsep.join([str(HERE / "nuplan_stand_in"), str(HERE)])
-    monkeypatch.setenv("PYTHONPATH", path)
-    monkeypatch.setenv("E2RL_WITNESS", str(tmp_path / "seen"))
+    patch.setenv("PYTHONPATH", path)
+    patch.setenv("E2RL_WITNESS", str(folder / "seen"))
 
     def ego(planner, replan_every=1):
         return ExternalEgo(
@@ -185,17 +201,10 @@ def written(folder):
     return [json.loads(line) for line in (folder / "seen").read_text().splitlines()]
 
 
-def bundled_seen(nuplan, tmp_path):
-    """The bundled scenes, and what a Witness sees at their start."""
-    scenes = e2rl.load_scenes().scenes
-    nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes))
-    return scenes, written(tmp_path)
-
-
-def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(nuplan, tmp_path):
-    scenes, seen = bundled_seen(nuplan, tmp_path)
+def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(bundled):
+    scenes, seen = bundled
     mission = mission_of(scenes)
-    assert len(seen) == len(scenes) == 48
+    assert len(seen) == len(scenes) == 24
     for row, one in enumerate(seen):
         assert one["on"]
         assert set(one["on"]) <= set(one["near"])
@@ -212,8 +221,8 @@ def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(nuplan, tmp_path
     assert all(min(abs(limit - k) for k in given) < 1e-4 for limit in limits - {None})
 
 
-def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(nuplan, tmp_path):
-    scenes, seen = bundled_seen(nuplan, tmp_path)
+def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(bundled):
+    scenes, seen = bundled
     mission = mission_of(scenes)
     checked = 0
     for row, column in (mission.light >= 0).nonzero().tolist():
@@ -229,7 +238,7 @@ def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(nuplan, tmp
         ]
         assert not lanes or LIGHTS[state] in [status.get(lane["id"]) for lane in lanes]
         checked += bool(lanes)
-    assert checked >= 9
+    assert checked >= 4
 
 
 def test_lanes_side_by_side_are_a_roadblock(nuplan, tmp_path):

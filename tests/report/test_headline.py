@@ -31,8 +31,10 @@ class Fragile(LaneGraphEgo):
 """
 SMALL = [
     "num_scenes=4",
+    "data.build.steps=40",
+    "prior.sampler.steps=2",
     "seeds=[0]",
-    "tries=3",
+    "tries=2",
     "processes=1",
     "data.workers=1",
     "compile=false",
@@ -57,9 +59,14 @@ def test_scenes_count_once_however_often_they_fail_and_errors_stand_apart():
         errored(4, raised_by="traffic"),
         row_of(5, hit={"approach": "rear"}),
     ]
-    found = headline(rows, searched=False)
-    assert (found.scenes, found.preventable, found.raised, found.failed) == (5, 2, 2, 4)
-    assert headline_text(found, "a", traffic="e2") == (
+    counts = headline(rows, searched=False)
+    assert (counts.scenes, counts.preventable, counts.raised, counts.failed) == (
+        5,
+        2,
+        2,
+        4,
+    )
+    assert headline_text(counts, "a", traffic="e2") == (
         "a under e2: preventable failures, or it raised, in 4 of 5 scenes; preventable "
         "failures in 2 of 5, in 2 ways; "
         "it raised in 2 of 5."
@@ -75,8 +82,8 @@ def test_tries_are_counted_a_scene_and_search():
         for seed in range(2)
         for k in range(3)
     ]
-    found = headline(rows + [errored(0, 3)], searched=True)
-    assert (found.searches, found.tries, found.nfe) == (2, 25 / 8, 300.0)
+    counts = headline(rows + [errored(0, 3)], searched=True)
+    assert (counts.searches, counts.tries, counts.nfe) == (2, 25 / 8, 300.0)
 
 
 @pytest.mark.parametrize("named", [0, 2])
@@ -143,10 +150,10 @@ def answered(tmp_path_factory):
     (folder / "planners_of_mine.py").write_text(PLANNER)
     settings = (ROOT / "conf" / "ego" / "lane_graph.yaml").read_text()
     (folder / "conf" / "ego").mkdir(parents=True)
-    own = settings.replace(
+    changed = settings.replace(
         "e2rl.planners.lane_graph_planner.LaneGraphEgo", "planners_of_mine.Fragile"
     )
-    (folder / "conf" / "ego" / "fragile.yaml").write_text(own)
+    (folder / "conf" / "ego" / "fragile.yaml").write_text(changed)
     run = folder / "run"
     command = [
         sys.executable,
@@ -157,36 +164,48 @@ def answered(tmp_path_factory):
         *SMALL,
     ]
     path = os.pathsep.join([str(ROOT), str(folder)])
-    done = subprocess.run(
+    process = subprocess.run(
         [*command, f"hydra.run.dir={run}"],
         env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         timeout=600,
     )
-    assert done.returncode == 0, done.stderr
-    return run, done.stdout
+    assert process.returncode == 0, process.stderr
+    return run, process.stdout
+
+
+@pytest.fixture(scope="module")
+def derived(answered, tmp_path_factory):
+    """The folder of what gate and compare make of the run, and what they print."""
+    run, _ = answered
+    folder = tmp_path_factory.mktemp("derived")
+    rules = ["search:preventable<=1", "search:contacts<=0.1"]
+    reports = ["--json", folder / "gate.json", "--junit", folder / "gate.xml"]
+    gated = cli("gate", run, *rules, *reports)
+    return folder, gated, cli("compare", run, run, "--out", folder / "compare.html")
 
 
 def cli(*arguments):
     """What a command of e2rl prints."""
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "e2rl.commands.cli", *map(str, arguments)],
         capture_output=True,
     )
-    return done.stdout.decode()
+    return process.stdout.decode()
 
 
 @pytest.mark.slow
-def test_screen_page_rows_json_gate_and_comparison_say_the_same(answered, tmp_path):
-    run, said = answered
+def test_screen_page_rows_json_gate_and_comparison_say_the_same(answered, derived):
+    run, printed = answered
+    folder, gated, compared = derived
     rows = [row for row in read_rows(run / TABLE) if row["method"] == "search"]
     scenes = {row["scene_id"] for row in rows}
     preventable = {row["scene_id"] for row in rows if row["cfr_preventable"] == 1}
     raised = {row["scene_id"] for row in rows if row["errored"] == 1}
     assert len(scenes) == 4
     assert raised == {"arterial_015_0280"}
-    assert len(rows) <= 3 * 4
+    assert len(rows) <= 2 * 4
     sentence = headline_text(
         headline(rows, searched=True), "fragile", traffic="search at η=2"
     )
@@ -209,12 +228,10 @@ def test_screen_page_rows_json_gate_and_comparison_say_the_same(answered, tmp_pa
         if group["method"] == "search"
     ]
     assert group["summary"][0] == sentence
-    gated = cli("gate", run, "search:preventable<=1", "--json", tmp_path / "gate.json")
-    (rule,) = json.loads((tmp_path / "gate.json").read_text())
+    rule, _ = json.loads((folder / "gate.json").read_text())
     assert rule["headline"] == metrics["headline"]
     assert rule["value"] == rate["mean"]
-    compared = cli("compare", run, run, "--out", tmp_path / "compare.html")
-    for text in (said, gated, compared.replace(f"fragile of {run}", "fragile")):
+    for text in (printed, gated, compared.replace(f"fragile of {run}", "fragile")):
         assert sentence in " ".join(text.split())
 
 
@@ -225,26 +242,17 @@ def data_of(page: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_planner_that_raises_is_named_everywhere(answered, tmp_path):
-    run, said = answered
+def test_a_planner_that_raises_is_named_everywhere(answered, derived):
+    run, printed = answered
+    folder, _, compared = derived
     names = ("arterial_015_0280", "RuntimeError: no feasible trajectory")
-    cli(
-        "gate",
-        run,
-        "search:contacts<=0.1",
-        "--json",
-        tmp_path / "gate.json",
-        "--junit",
-        tmp_path / "gate.xml",
-    )
-    compared = cli("compare", run, run, "--out", tmp_path / "compare.html")
     with (run / "failures.csv").open(newline="") as file:
         listed = [row for row in csv.DictReader(file) if row["errored"] == "1"]
     assert listed
     assert all((row["scene_id"], row["error"]) == names for row in listed)
     files = [
         run / "failures.html",
-        *(tmp_path / name for name in ("gate.json", "gate.xml", "compare.html")),
+        *(folder / name for name in ("gate.json", "gate.xml", "compare.html")),
     ]
-    for text in (said, compared, *(file.read_text() for file in files)):
+    for text in (printed, compared, *(file.read_text() for file in files)):
         assert all(name in " ".join(text.split()) for name in names)

@@ -17,10 +17,10 @@ from e2rl.prior.free_space import decode_plans
 from e2rl.prior.lane_relative import SIZE, LaneState
 from e2rl.run import fused
 from e2rl.run.errors import InputError
-from e2rl.run.fused import FUSED, Fused, has_compiler, is_on, switched_off
+from e2rl.run.fused import FUSED, Fused, has_compiler, is_on, switch, switched_off
 from e2rl.scenes.route import SPACING
 from e2rl.sim.observation import OBSERVATION_SIZE
-from e2rl.traffic.fusing import prepare_fused
+from e2rl.traffic.fusing import fused_functions, prepare_fused
 from tests.traffic.e2.traffic_scenes import drive, scenes, synthesizer
 
 
@@ -53,69 +53,93 @@ def test_whatever_is_fused_is_prepared():
     assert fused <= set(fresh.stdout.split())
 
 
+def traced(function, names):
+    """Runs a fused function by its graph, and adds its name to those that ran. A guard
+    would refuse sizes of 1, which compiled code takes."""
+    graphs = []
+
+    def run(flat):
+        if function.name not in names:
+            names.add(function.name)
+            graphs.append(function.traced().module(check_guards=False))
+        return list(graphs[0](*flat))
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def compared():
+    """Eager rollouts, those of the graphs that would be compiled, the names of the
+    functions that ran as graphs, and a network that learned from one of them."""
+    scene_set = scenes(steps=20)
+    method = synthesizer()
+    names = set()
+    with pytest.MonkeyPatch.context() as patch, switched_off():
+        eager = drive(scene_set, method, 2.0, ego=LaneGraphEgo())
+        for function in fused_functions():
+            patch.setitem(vars(function), "_run", traced(function, names))
+        switch(True)
+        graphs = drive(scene_set, method, 2.0, ego=LaneGraphEgo())
+        actor = ActorEgo()
+        drive(scenes(1, steps=5), method, 2.0, ego=actor)
+        trunk = actor.network.network.trunk
+        trunk(torch.zeros(2, OBSERVATION_SIZE)).sum().backward()
+        yield eager, graphs, names, trunk
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
-def test_compiled_rollouts_are_the_eager_ones_to_millimetres(capsys):
-    scene_set = scenes(steps=40)
-    on = synthesizer()
-    called = set()
-    ego = LaneGraphEgo()
-    eager = drive(scene_set, on, 2.0, ego=ego)
-    assert prepared(True)
-    assert is_on()
-    for each in FUSED.values():
-        run = each._run
-        each.__dict__["_run"] = lambda flat, run=run, name=each.name: (
-            called.add(name) or run(flat)
-        )
-    fast = drive(scene_set, on, 2.0, ego=ego)
+def test_the_graphs_of_fused_functions_drive_as_they_do_to_millimetres(compared):
+    eager, graphs, _, _ = compared
+    assert torch.equal(eager.valid, graphs.valid)
+    assert torch.equal(eager.adversaries, graphs.adversaries)
+    assert (eager.states[..., :2] - graphs.states[..., :2]).abs().max() < 2e-3
+    torch.testing.assert_close(
+        eager.transport_adversary, graphs.transport_adversary, rtol=1e-3, atol=1e-3
+    )
+
+
+@pytest.mark.slow
+def test_the_graph_of_a_plan_is_the_plan(compared):
+    """In free space, which no rollout needs."""
     torch.manual_seed(0)
-    x = torch.rand(1, 2, SIZE)
     points = SPACING * torch.arange(40.0)
-    moving = LaneState(*torch.rand(10, 1, 2))
-    given = (
-        x,
-        moving,
+    arguments = (
+        torch.rand(1, 2, SIZE),
+        LaneState(*torch.rand(10, 1, 2)),
         torch.stack([points, 0 * points], -1).expand(1, 2, -1, -1),
         torch.tensor([[True, False]]),
     )
-    for one, other in zip(
-        *(
-            vars(decode(*given)).values()
-            for decode in (decode_plans, decode_plans.function)
-        ),
-        strict=True,
-    ):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
-    actor = ActorEgo()
-    drive(scene_set, on, 2.0, ego=actor)
-    actor.network.network.trunk(torch.zeros(2, OBSERVATION_SIZE)).sum().backward()
-    assert torch.equal(eager.valid, fast.valid)
-    assert torch.equal(eager.adversaries, fast.adversaries)
-    assert (eager.states[..., :2] - fast.states[..., :2]).abs().max() < 2e-3
-    torch.testing.assert_close(
-        eager.transport_adversary, fast.transport_adversary, rtol=1e-3, atol=1e-3
-    )
-    missing = {
+    switch(True)
+    values = vars(decode_plans(*arguments))
+    expected = vars(decode_plans.function(*arguments))
+    for name, value in values.items():
+        torch.testing.assert_close(value, expected[name], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_no_fused_function_is_left_out(compared):
+    registered = {
         name for name in FUSED if name.startswith("e2rl.") and "<locals>" not in name
-    } - called
-    assert not missing, "they never ran compiled"
-    again = prepared("auto")
-    assert again is True
-    assert is_on(), "all are there now"
-    capsys.readouterr()
+    }
+    assert registered - compared[2] == set(), "they never ran as graphs"
+
+
+@pytest.mark.slow
+def test_a_fused_network_still_learns(compared):
+    weights = list(compared[3].parameters())
+    assert any(bool(weight.grad.any()) for weight in weights if weight.grad is not None)
 
 
 def test_functions_that_are_not_compiled_are_left_off_unless_they_are_asked_for(
     monkeypatch, tmp_path, capsys
 ):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    for each in list(FUSED.values()):
-        monkeypatch.delitem(each.__dict__, "file", raising=False)
+    for function in list(FUSED.values()):
+        monkeypatch.delitem(function.__dict__, "file", raising=False)
     assert prepared("auto") is False
     assert not is_on()
-    told = capsys.readouterr().err
-    assert ("compile=true" in told) == has_compiler()
+    message = capsys.readouterr().err
+    assert ("compile=true" in message) == has_compiler()
     assert not list(tmp_path.rglob("*.so"))
     assert prepared(False) is False
     assert prepared("auto", "cuda") is False
@@ -124,6 +148,10 @@ def test_functions_that_are_not_compiled_are_left_off_unless_they_are_asked_for(
     monkeypatch.setattr(fused.shutil, "which", lambda name: "/usr/bin/c++")
     assert prepared(True) is True
     assert is_on()
+    switch(False)
+    monkeypatch.setattr(Fused, "file", Path(__file__))
+    assert prepared("auto") is True
+    assert is_on(), "all are there now"
     with pytest.raises(
         InputError, match="compile=maybe: choose one of auto, true, false"
     ):

@@ -34,9 +34,9 @@ def given():
 
 @pytest.fixture(scope="module")
 def bundled():
-    """All bundled test scenes, so that two draws of several are hardly ever alike."""
+    """So many bundled scenes that two draws of several are hardly ever alike."""
     return {
-        "scenes": e2rl.load_scenes("bundled"),
+        "scenes": e2rl.load_scenes("bundled", 16),
         "method": "replay",
         "eta": 0.0,
         "compile": False,
@@ -222,12 +222,12 @@ def test_torchrl_is_pointed_to_its_own_environment(given):
 def test_actions_are_scaled_about_keeping_speed_and_heading(given):
     low = torch.tensor([-8.0, -1.6])
     high = torch.tensor([5.0, 1.6])
-    found = in_units(
+    scaled = in_units(
         torch.tensor([[-2.0, -1.0], [-0.5, 0.0], [0.0, 0.5], [1.0, 3.0]]),
         low,
         high=high,
     )
-    assert found.tolist() == [
+    assert scaled.tolist() == [
         pytest.approx(row)
         for row in ([-8.0, -1.6], [-4.0, 0.0], [0.0, 0.8], [5.0, 1.6])
     ]

@@ -1,7 +1,6 @@
 """The pull is the exact posterior, and its price is booked."""
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,7 +18,6 @@ from tests.prior.test_prior import MEAN, STD, gaussian_prior
 from tests.traffic.e2.traffic_scenes import EGO, begin
 
 CPU = torch.device("cpu")
-TUNE = Path(__file__).parents[4] / "shared" / "data" / "waymo" / "tune.zip"
 
 
 def test_the_covariance_is_one_and_the_price_is_its_quadratic_form():
@@ -104,19 +102,11 @@ def test_what_a_pull_costs_goes_to_the_divergence_of_the_tilted_gaussian(monkeyp
     assert sample.x0.var().item() == pytest.approx((1 - w) * STD**2, rel=0.1)
 
 
-@pytest.mark.parametrize("recorded", [False, True])
 @pytest.mark.slow
-def test_importance_weights_of_pulled_paths_average_1(recorded):
+def test_importance_weights_of_pulled_paths_average_1():
     """24 scenes, the shipped prior: in each the nearest vehicle that moves is pulled 1
     m/s^2 below its mean."""
-    if recorded and not TUNE.exists():
-        pytest.skip(
-            "needs waymo/tune.zip in ../shared/data, which is not in the repository"
-        )
-    options = (
-        {"data": "scenarionet", "path": str(TUNE)} if recorded else {"data": "bundled"}
-    )
-    scene = e2rl.load_scenes(**options, num_scenes=24).scenes
+    scene = e2rl.load_scenes("bundled", num_scenes=24).scenes
     on = e2rl.make_traffic("e2", e2rl.load_prior())
     state = begin(on, scene, eta=1.0)
     world = World.at_start(scene)

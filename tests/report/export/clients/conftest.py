@@ -55,14 +55,8 @@ def places(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def commonroad_files(tmp_path_factory):
-    """Exports a run to CommonRoad: its files, in the order of scenes. Its library's
-    pins do not fit the project's."""
-    library = environment(
-        "commonroad-io",
-        "commonroad-io==2026.1",
-        "iso3166==2.1.1",
-        options=("--no-deps",),
-    )
+    """Exports a run to CommonRoad: its files, in the order of scenes."""
+    library = environment("commonroad-io")
     (packages,) = library.glob("lib/python*/site-packages")
 
     def files(run, name):
@@ -82,13 +76,13 @@ def commonroad_files(tmp_path_factory):
             "--to",
             "commonroad",
         ]
-        done = subprocess.run(
+        process = subprocess.run(
             [str(part) for part in command],
             env=variables,
             capture_output=True,
             text=True,
         )
-        assert done.returncode == 0, done.stderr[-3000:]
+        assert process.returncode == 0, process.stderr[-3000:]
         return sorted(
             out.glob("*.xml"),
             key=lambda path: int(path.stem.split("-")[1].split("_")[0]),

@@ -15,7 +15,7 @@ HISTORY = 10  # frames before the start
 
 @pytest.fixture(scope="module")
 def metadrive():
-    return environment("metadrive", "metadrive-simulator==0.4.3")
+    return environment("metadrive")
 
 
 def test_contacts_are_at_the_same_step_and_summaries_the_same(run, metadrive, tmp_path):

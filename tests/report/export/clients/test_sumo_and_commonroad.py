@@ -21,13 +21,13 @@ pytestmark = [pytest.mark.slow, pytest.mark.clients]
 @pytest.fixture(scope="module")
 def sumo():
     """The folder of SUMO's programs."""
-    return environment("sumo", "eclipse-sumo==1.28.0") / "bin"
+    return environment("sumo") / "bin"
 
 
 @pytest.fixture(scope="module")
 def tools():
-    """commonroad-sumo and the drivability checker come with the designer."""
-    return environment("commonroad", "commonroad-scenario-designer==0.8.5")
+    """commonroad-sumo and the drivability checker."""
+    return environment("commonroad")
 
 
 def lane_pairs(lanes, outside):
