@@ -63,7 +63,7 @@ class Bench:
 
     largest: scenes at once at most, None: as many as the benchmark wants; train:
     overrides of conf/train.yaml; compile: measure compiled steps too; peers: the
-    interpreter that has the peers.
+    interpreter that has the peers; settings: overrides of both configurations.
     """
 
     data: str | None
@@ -73,6 +73,7 @@ class Bench:
     train: tuple[str, ...] = ()
     compile: bool = True
     peers: str = sys.executable
+    settings: tuple[str, ...] = ()
 
     @cached_property
     def config(self) -> DictConfig:
@@ -81,7 +82,7 @@ class Bench:
 
     def configured(self, name: str) -> DictConfig:
         """Configuration `name` on the data and prior under test."""
-        overrides = self.train if name == "train" else ()
+        overrides = [*self.settings, *(self.train if name == "train" else ())]
         data = (
             ["data=scenarionet", f"data.path={self.data}"]
             if self.data

@@ -64,11 +64,18 @@ def main(arguments: list[str]) -> None:
         help="scenes at once at most; default: as many as a benchmark wants",
     )
     parser.add_argument(
+        "--set",
+        nargs="*",
+        default=[],
+        metavar="KEY=VALUE",
+        help="overrides of conf/evaluate.yaml and conf/train.yaml",
+    )
+    parser.add_argument(
         "--train",
         nargs="*",
         default=[],
         metavar="KEY=VALUE",
-        help="overrides of conf/train.yaml",
+        help="overrides of conf/train.yaml alone",
     )
     parser.add_argument(
         "--no-compile",
@@ -95,6 +102,7 @@ def main(arguments: list[str]) -> None:
         tuple(options.train),
         options.compile,
         options.peers,
+        settings=tuple(options.set),
     )
     rows = []
     line = "{:20} {:60} {:>5} {:>6} {:>10} {:>12} {:18} {:>5}"

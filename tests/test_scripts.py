@@ -153,7 +153,6 @@ def test_rounds_of_evolution_from_the_first_command_to_tables_and_a_resume(
     again = [
         f"resume={run}",
         "rounds=2",
-        "measure.budget=0",
         f"data.cache={tmp_path / 'cache'}",
         f"hydra.run.dir={tmp_path / 'again'}",
     ]

@@ -15,14 +15,24 @@ import run  # noqa: E402
 
 from e2rl.run.errors import InputError  # noqa: E402
 
-SMALL = ["--repeats", "1", "--largest", "1", "--no-compile"]
+SMALL = [
+    "--repeats",
+    "1",
+    "--largest",
+    "1",
+    "--no-compile",
+    "--set",
+    "data.build.steps=20",
+    "data.build.field_cells=128",
+    "prior.sampler.steps=2",
+]
 SHORT = [
     "--train",
     "num_scenes=2",
     "batch=2",
     "learner.round.scenes=1",
     "learner.collect.batch=2",
-    "learner.collect.steps=80",
+    "learner.collect.steps=20",
     "learner.collect.iterations=1",
     "learner.ppo.epochs=1",
     "measure.scenes=1",

@@ -250,7 +250,13 @@ def test_the_command_of_a_failure_drives_the_same_contact(
 ):
     """In its folder's failures.csv; also that of the run that it makes."""
     (tmp_path / "list.csv").write_text("scene_id,number\nallway_stop_043_0200,7\n")
-    given = [f"scenes={tmp_path / 'list.csv'}", "seeds=[0]", "processes=1", *more]
+    given = [
+        f"scenes={tmp_path / 'list.csv'}",
+        "prior.sampler.steps=4",
+        "seeds=[0]",
+        "processes=1",
+        *more,
+    ]
     assert (
         call(
             "evaluate.py",

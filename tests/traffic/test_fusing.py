@@ -149,7 +149,8 @@ def test_functions_that_are_not_compiled_are_left_off_unless_they_are_asked_for(
     assert prepared(True) is True
     assert is_on()
     switch(False)
-    monkeypatch.setattr(Fused, "file", Path(__file__))
+    for function in fused_functions():
+        monkeypatch.setitem(vars(function), "file", Path(__file__))
     assert prepared("auto") is True
     assert is_on(), "all are there now"
     with pytest.raises(
