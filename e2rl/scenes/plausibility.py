@@ -359,11 +359,6 @@ def _largest(values: ndarray) -> float:
     return float(values.max()) if len(values) else np.nan
 
 
-def _median(values: ndarray) -> float:
-    """The median of values [K]; NaN of none."""
-    return float(np.median(values)) if len(values) else np.nan
-
-
 def _medians(values: ndarray, group: ndarray) -> ndarray:
     """The (lower) median of the values [K] of each group 0 .. G-1, of group [K]; NaN
     for a group without any."""
@@ -379,6 +374,7 @@ def map_fit(recording: Recording, graph: LaneGraph) -> dict[str, float]:
     """Whether the vehicles drive where the lanes are, and the lanes lie as far apart as
     lanes do."""
     ego = recording.states[recording.valid[:, recording.ego], recording.ego, :2]
+    distance = graph.tree.query(ego)[0]
     driven = displacements(recording)
     pose = driven.pose[np.linalg.norm(driven.moved, axis=-1) > MOVED]
     near = graph.tree.query(
@@ -390,7 +386,7 @@ def map_fit(recording: Recording, graph: LaneGraph) -> dict[str, float]:
     turn = graph.heading[np.where(exists, near, 0)] - pose[:, 2:]
     on = (exists & (np.abs(wrap(turn)) < LANE_ANGLE)).any(-1)
     return {
-        "lane_distance": _median(graph.tree.query(ego)[0]),
+        "lane_distance": float(np.median(distance)) if len(distance) else np.nan,
         "on_lanes": float(on.mean()) if len(on) >= ENOUGH else np.nan,
         "lane_spacing": lane_spacing(graph),
     }
