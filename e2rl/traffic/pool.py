@@ -58,7 +58,7 @@ class TrafficPool:
         """Stored states [b, T+1, N, 4] and valid [b, T+1, N] at positions [b]; only
         these are read."""
         first = self.parts[0]
-        number = torch.bucketize(position, self._ends, right=True)
+        number = torch.bucketize(position.contiguous(), self._ends, right=True)
         states = first.states.new_empty(len(position), *first.states.shape[1:])
         valid = first.valid.new_empty(len(position), *first.valid.shape[1:])
         for k in number.unique().tolist():

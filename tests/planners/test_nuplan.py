@@ -45,7 +45,7 @@ def nuplan(monkeypatch, tmp_path):
 def bundled(tmp_path_factory):
     """The bundled scenes, and what a Witness sees at their start."""
     folder = tmp_path_factory.mktemp("bundled")
-    scenes = e2rl.load_scenes(num_scenes=24).scenes
+    scenes = e2rl.load_scenes().scenes
     with pytest.MonkeyPatch.context() as patch:
         ego = maker(patch, folder)("--planner nuplan_planners:Witness")
         ego.plan(World.at_start(scenes))
@@ -204,7 +204,7 @@ def written(folder):
 def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(bundled):
     scenes, seen = bundled
     mission = mission_of(scenes)
-    assert len(seen) == len(scenes) == 24
+    assert len(seen) == len(scenes) == 48
     for row, one in enumerate(seen):
         assert one["on"]
         assert set(one["on"]) <= set(one["near"])
@@ -238,7 +238,7 @@ def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(bundled):
         ]
         assert not lanes or LIGHTS[state] in [status.get(lane["id"]) for lane in lanes]
         checked += bool(lanes)
-    assert checked >= 4
+    assert checked >= 9
 
 
 def test_lanes_side_by_side_are_a_roadblock(nuplan, tmp_path):
