@@ -33,8 +33,8 @@ def evaluate(run: Run) -> None:
             f"{run.folder}; e2rl merge joins all of them"
         )
         return
-    rows = plan.record(driven, run.folder)
-    print("", *write_results(run, plan, rows), sep="\n")
+    record = plan.record(driven)
+    print("", *write_results(plan, record), sep="\n")
     if failure is not None:
         print(f"{config.failure}: {outcome(failure, driven.scored.rows[0])}")
     elif config.reproduce:

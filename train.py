@@ -29,7 +29,7 @@ from e2rl.learning.rounds.checkpoint import (
 )
 from e2rl.learning.rounds.evolution import Evolution
 from e2rl.learning.rounds.progress import round_line
-from e2rl.report.answer import compared_answer
+from e2rl.report.before_after import compared_answer
 from e2rl.report.caption import caption
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.run.command import run_command

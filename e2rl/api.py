@@ -33,8 +33,13 @@ from e2rl.planners.policy_file import write_policy
 from e2rl.prior.prior import Prior
 from e2rl.report.picture import Replay
 from e2rl.report.videos import save_animation
-from e2rl.run.config import library, load_choice, with_changes
-from e2rl.run.settings import check_choice, check_range
+from e2rl.run.config import (
+    check_choice,
+    check_range,
+    library,
+    load_choice,
+    with_changes,
+)
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings

@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import e2rl
-from e2rl.run.settings import conf_folder, file_values
+from e2rl.run.config import conf_folder, file_values
 
 FILES = sorted(conf_folder().glob("*/*.yaml"))
 OPTIONAL = {

@@ -10,10 +10,9 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.report.rates import EgoRates, rate_lines, write_rates
 from e2rl.run.command import run_command
-from e2rl.run.config import resolved
+from e2rl.run.config import resolved, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
-from e2rl.run.settings import settings_of
 from e2rl.tail.rate import RateSettings, Rating
 from e2rl.tail.summary import scene_rates
 from e2rl.traffic.nominal import NominalTraffic
@@ -29,7 +28,7 @@ def rate(run: Run) -> None:
     traffic = nominal_traffic(plan)
     (seed,) = plan.settings.seeds
     egos = []
-    for setup in plan.egos.setups(plan.setup):
+    for setup in plan.setups:
         rating = Rating(setup, traffic, settings, seed=seed)
         scenes = scene_rates(
             rating.estimates(plan.work), plan.scenes, target=settings.target

@@ -23,7 +23,7 @@ from e2rl.evaluation.build import (
     build_traffic,
     method_config,
 )
-from e2rl.evaluation.check import SEARCH, processes_of
+from e2rl.evaluation.check import SEARCH
 from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.evaluation.trials import (
     NOMINAL,
@@ -43,10 +43,9 @@ from e2rl.evaluation.tuning import (
     yaml_of,
 )
 from e2rl.run.command import run_command
-from e2rl.run.config import resolved, with_changes
+from e2rl.run.config import check_choice, resolved, settings_of, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
-from e2rl.run.settings import check_choice, settings_of
 from e2rl.search.tries_file import TRIES_FILE, failures_of
 
 MAY_CHANGE = ("processes",)  # when a run is resumed
@@ -73,7 +72,7 @@ def tune(run: Run) -> dict:
         )
         failures = tuned_failures(config, plan)
         trials = planner_trials(config, plan, failures)
-        ranges = plan.setup.ego.tuned
+        ranges = plan.setups[0].ego.tuned
         methods = [f"{method.name}@{method.eta:g}" for method in plan.methods]
     else:
         objective = settings_of(AttackObjective, tuning.attack, where="tuning.attack")
@@ -122,9 +121,9 @@ def tuned_failures(config: DictConfig, plan: Evaluation) -> list[Batch]:
     method = build_search(SEARCH, config, plan.prior, eta=max(plan.settings.eta))
     return failures_of(
         Path(config.tuning.failures) / TRIES_FILE,
-        plan.setup.ego_name,
+        plan.setups[0].ego_name,
         method=method,
-        setup=plan.setup,
+        setup=plan.setups[0],
     )
 
 
@@ -139,11 +138,11 @@ def planner_trials(
         return build_ego(OmegaConf.create({"ego": ego}))
 
     return PlannerTrials(
-        plan.setup,
+        plan.setups[0],
         plan.methods,
         seeds=plan.settings.seeds,
         make=make,
-        processes=processes_of(config),
+        processes=plan.settings.processes,
         failures=failures,
     )
 
@@ -175,12 +174,12 @@ def attack_trials(config: DictConfig, plan: Evaluation) -> tuple[AttackTrials, M
         )
     nominal = Method(NOMINAL, build_traffic(method_config(config, NOMINAL), plan.prior))
     trials = AttackTrials(
-        plan.setup,
+        plan.setups[0],
         nominal,
         eta=etas[0],
         seeds=plan.settings.seeds,
         make=make,
-        processes=processes_of(config),
+        processes=plan.settings.processes,
     )
     return trials, present.tuned
 

@@ -8,16 +8,20 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from e2rl.driving.batches import WHOLE
 from e2rl.metrics.catalogue import table_names
-from e2rl.run.config import check_list, choices, machine_of
+from e2rl.run.config import (
+    check_choice,
+    choices,
+    machine_of,
+    setting,
+    settings_of,
+)
 from e2rl.run.errors import InputError
 from e2rl.run.processes import cores
-from e2rl.run.settings import check_choice, setting, settings_of
 from e2rl.search.spending import UNITS
 
 SEARCH = "search"  # the method whose tries are drawn from families
 DEFAULT_BUDGET = 640.0  # NFE a scene: a rollout of CCDiff
 ALL = "all"  # metrics
-LISTS = ("methods", "eta", "seeds", "compare", "shard")
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,7 @@ class EvaluationSettings:
     Args:
         shard: (k, n), only every n-th batch from the k-th on.
         budget: of a search a scene; None: one rollout for each seed.
+        processes: that rollouts are spread over.
     """
 
     methods: tuple[str, ...]
@@ -42,18 +47,18 @@ class EvaluationSettings:
     budget_unit: str = setting(choices=UNITS)
     save_rollouts: bool
     report: bool
+    processes: int
 
 
 def evaluation_settings(config: DictConfig) -> EvaluationSettings:
     """Returns what a configuration asks for; InputError for what cannot be run."""
     values = {field.name: config[field.name] for field in fields(EvaluationSettings)}
-    for name in LISTS:
-        check_list(name, values[name])
     for name in ("eta", "seeds", "compare"):
         values[name] = as_list(values[name])
     values |= budget_of(config)
     values["methods"] = row_names(config)
     values["shard"] = config.shard or WHOLE
+    values["processes"] = processes_of(config)
     settings = settings_of(EvaluationSettings, values)
     check_choice("metrics", settings.metrics, choices=(*table_names(), ALL))
     for name, example in (("methods", "nominal,e2"), ("eta", "2"), ("seeds", "0")):
@@ -63,7 +68,6 @@ def evaluation_settings(config: DictConfig) -> EvaluationSettings:
     check_budget(settings)
     check_rows(config, settings)
     check_compared(config, settings)
-    processes_of(config)
     return settings
 
 

@@ -6,17 +6,17 @@ budget, scenes are: one fails where a try ends in a preventable failure, and has
 where the two searches share no way of failing (cell of the atlas).
 """
 
-import math
 import re
-import sys
 from collections.abc import Sequence
+from itertools import product
+from math import inf, isnan
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from e2rl.evaluation.rollout_files import TABLE, cell, read_run
+from e2rl.evaluation.rollout_files import TABLE, cell, read_rows
 from e2rl.evaluation.summary import scene_rows
 from e2rl.metrics.atlas import cell_of
-from e2rl.metrics.catalogue import LATER, METRICS
+from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.failure_modes import Row, is_failure
 from e2rl.metrics.realism import NO_SAMPLES
@@ -30,42 +30,44 @@ from e2rl.search.tries_file import TRIES_FILE
 PAIR = ("method", "eta", "scene_id", "seed")
 CHANGES = ("new", "gone", "moved", "same")
 SHARED = (  # settings and inputs without which rollouts are no pairs
-    *(
-        "scenes",
-        "scene",
-        "seeds",
-        "eta",
-        "methods",
-        "variants",
-        "tries",
-        "budget",
-        "budget_unit",
-    ),
-    *("prior", "sim", "synthesizer", "search"),
+    "scenes",
+    "scene",
+    "seeds",
+    "eta",
+    "methods",
+    "variants",
+    "tries",
+    "budget",
+    "budget_unit",
+    "prior",
+    "sim",
+    "synthesizer",
+    "search",
 )
 SHOWN = 3  # rollouts that a message names
 DELAY = 0.5  # s from which on a contact has moved: a replan
 RATES = {  # what is compared, and the columns of the tables
-    **{
-        "contacts": "cfr",
-        "counted": "cfr_counted",
-        "preventable": "cfr_preventable",
-        "clean": "cfr_clean",
-    },
-    **{
-        "contacts_vru": "cfr_vru",
-        "contacts_object": "cfr_object",
-        "progress": "progress",
-    },
+    "contacts": "cfr",
+    "counted": "cfr_counted",
+    "preventable": "cfr_preventable",
+    "clean": "cfr_clean",
+    "contacts_vru": "cfr_vru",
+    "contacts_object": "cfr_object",
+    "progress": "progress",
 }
-OTHERS = (
-    "cfr_vru",
-    "cfr_object",
-)  # contacts with others than vehicles, compared where there are any
+# contacts with others than vehicles, compared where there are any
+OTHERS = ("cfr_vru", "cfr_object")
 
 
 class Driven(NamedTuple):
-    """The rollouts of one ego in one run; searched: they are the tries of searches."""
+    """The rollouts of one ego in one run.
+
+    Args:
+        run: its folder.
+        ego: its name.
+        rows: of rollouts.csv.
+        searched: the rollouts are tries of searches.
+    """
 
     run: Path
     ego: str
@@ -74,10 +76,10 @@ class Driven(NamedTuple):
 
     @classmethod
     def read(cls, run: Path, ego: str | None = None) -> "Driven":
-        """The rollouts of a run's ego, None: of its only one; InputError where it is
-        not there, and where the run's table lacks rollouts or holds values that no
-        rollout has."""
-        rows = read_run(run)
+        """Returns the rollouts of a run's ego, None: of its only one; InputError where
+        it is not there, and where the run's table lacks rollouts or holds values that
+        no rollout has."""
+        rows = read_rows(run / TABLE)
         check_values(run, rows)
         egos = list(dict.fromkeys(row["ego_policy"] for row in rows))
         if ego not in egos and (ego or len(egos) != 1):
@@ -86,12 +88,8 @@ class Driven(NamedTuple):
                 "or two by --egos"
             )
         ego = ego or egos[0]
-        driven = cls(
-            run,
-            ego,
-            [row for row in rows if row["ego_policy"] == ego],
-            (run / TRIES_FILE).is_file(),
-        )
+        rows = [row for row in rows if row["ego_policy"] == ego]
+        driven = cls(run, ego, rows, searched=(run / TRIES_FILE).is_file())
         check_complete(driven)
         return driven
 
@@ -101,74 +99,53 @@ class Driven(NamedTuple):
         return "searches of a scene" if self.searched else "rollouts"
 
     def traffic(self) -> dict[tuple[str, float], list[dict]]:
-        """The rows of rollouts by method and intensity, errored ones, too."""
+        """Returns the rows of rollouts by method and intensity, errored ones, too."""
         groups: dict[tuple[str, float], list[dict]] = {}
         for row in self.rows:
             groups.setdefault((row["method"], row["eta"]), []).append(row)
         return groups
 
     def rollouts(self) -> dict[tuple, list[dict]]:
-        """The rows of each PAIR: one, or of a search its tries; without those that the
-        traffic lost."""
-        found: dict[tuple, list[dict]] = {}
-        for row in (row for row in self.rows if not lost(row)):
-            key = (
-                row["method"],
-                row["eta"],
-                row["scene_id"],
-                row["seed"] // (TRIES if self.searched else 1),
-            )
-            found.setdefault(key, []).append(row)
-        return found
+        """Returns the rows of each PAIR: one, or of a search its tries; without those
+        that the traffic lost."""
+        step = TRIES if self.searched else 1
+        groups: dict[tuple, list[dict]] = {}
+        for row in self.rows:
+            if not lost(row):
+                key = (*(row[name] for name in PAIR[:3]), row["seed"] // step)
+                groups.setdefault(key, []).append(row)
+        return groups
 
     def units(self) -> dict[tuple[str, float], list[dict]]:
-        """The rows that rates are of, by method and intensity: rollouts that the
-        traffic did not lose, or of a search its scenes, 1 where any try has what is
+        """Returns the rows that rates are of, by method and intensity: rollouts that
+        the traffic did not lose, or of a search its scenes, 1 where any try has what is
         counted."""
         names = [column for column in RATES.values() if METRICS[column].event]
-        if self.searched:
-            return {
-                key: scene_rows(rows, names) for key, rows in self.traffic().items()
-            }
-        return {
-            key: [row for row in rows if not lost(row)]
-            for key, rows in self.traffic().items()
-        }
+        units = {}
+        for key, rows in self.traffic().items():
+            counted = [row for row in rows if not lost(row)]
+            units[key] = scene_rows(rows, names) if self.searched else counted
+        return units
 
 
 def check_values(run: Path, rows: Sequence[Row]) -> None:
     """Raises InputError, naming it, for a value of RATES that no rollout has: a
     fraction outside of [0, 1], an infinite distance (it is negative where the ego
-    reverses), a contact without a verdict; or where no rollout has a value of a column
-    that earlier versions wrote, too."""
+    reverses), a contact without a verdict; or where no rollout has a value."""
     ended = [row for row in rows if row["errored"] != 1]
+    mend = f"restore {TABLE}, or run evaluate.py again"
     for column in RATES.values():
-        low, high = (
-            (0.0, 1.0)
-            if METRICS[column].fraction
-            else (-sys.float_info.max, sys.float_info.max)
-        )
-        wrong = [
-            row
-            for row in ended
-            if not (low <= row[column] <= high or math.isnan(row[column]))
-        ]
-        unknown = [
-            row
-            for row in ended
-            if row["cfr"] == 1 and math.isnan(row[column]) and column not in LATER
-        ]
-        mend = f"restore {TABLE}, or run evaluate.py again"
-        for row in (wrong or unknown)[:1]:
-            place = f"{row['scene_id']}, seed {row['seed']}"
-            raise InputError(
-                f"{run / TABLE}: {column} of {place} is {cell(row[column]) or 'empty'}; {mend}"
-            )
-        if (
-            ended
-            and column not in LATER
-            and all(math.isnan(row[column]) for row in ended)
-        ):
+        for row in ended:
+            value = row[column]
+            possible = 0 <= value <= 1 if METRICS[column].fraction else abs(value) < inf
+            if isnan(value):
+                possible = row["cfr"] != 1
+            if not possible:
+                raise InputError(
+                    f"{run / TABLE}: {column} of {row['scene_id']}, seed {row['seed']} "
+                    f"is {cell(value) or 'empty'}; {mend}"
+                )
+        if ended and all(isnan(row[column]) for row in ended):
             raise InputError(f"{run / TABLE}: the column {column} is empty; {mend}")
 
 
@@ -176,38 +153,28 @@ def check_complete(driven: Driven) -> None:
     """Raises InputError, naming some, where scenes and seeds of the run are not in its
     table; of a search nothing is known of scenes that it did not come to."""
     settings = read_provenance(driven.run)["settings"]
-    if (
-        driven.searched
-        or settings.get("failure")
-        or not (driven.run / SCENES).is_file()
-    ):
+    listed = (driven.run / SCENES).is_file()
+    if driven.searched or settings.get("failure") or not listed:
         return
-    scenes = (
-        [settings["scene"]]
-        if settings.get("scene")
-        else [line.scene_id for line in read_list(driven.run)]
-    )
+    scenes = [line.scene_id for line in read_list(driven.run)]
+    if settings.get("scene"):
+        scenes = [settings["scene"]]
+    expected = list(product(scenes, settings["seeds"]))
     for (method, eta), rows in driven.traffic().items():
-        known = {(row["scene_id"], row["seed"]) for row in rows}
-        absent = [
-            (scene, seed)
-            for scene in scenes
-            for seed in settings["seeds"]
-            if (scene, seed) not in known
-        ]
+        present = {(row["scene_id"], row["seed"]) for row in rows}
+        absent = [pair for pair in expected if pair not in present]
         if absent:
             shown = ", ".join(f"{scene} seed {seed}" for scene, seed in absent[:SHOWN])
-            expected = len(scenes) * len(settings["seeds"])
-            count = f"{len(absent)} of {expected} rollouts of {method} η={eta:g}"
             raise InputError(
-                f"{driven.run / TABLE}: lacks {count} ({shown}); go on with resume={driven.run}"
+                f"{driven.run / TABLE}: lacks {len(absent)} of {len(expected)} rollouts "
+                f"of {method} η={eta:g} ({shown}); go on with resume={driven.run}"
             )
 
 
 def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
-    """What has changed in each traffic, and the pairs of rollouts of which one has
-    failed (`pair_of`), in the order of CHANGES. Raises InputError, saying what differs,
-    where the two are no pairs.
+    """Returns what has changed in each traffic, and the pairs of rollouts of which one
+    has failed (`pair_of`), in the order of CHANGES. Raises InputError, saying what
+    differs, where the two are no pairs.
 
     A traffic has the number `of` units that both have, the numbers of CHANGES and of
     `preventable` ones among them, and paired `differences` of RATES, second minus
@@ -216,82 +183,88 @@ def compared(first: Driven, second: Driven) -> tuple[list[dict], list[dict]]:
     check_shared(first, second)
     ours = first.rollouts()
     theirs = second.rollouts()
-    others = second.units()
+    shared = [key for key in ours if key in theirs]
+    pairs = []
+    for key in shared:
+        pair = pair_of(key, ours[key], others=theirs[key], searched=first.searched)
+        if pair:
+            pairs.append(pair)
+    pairs.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))
     groups = []
-    pairs = [
-        pair_of(key, ours[key], others=theirs[key], searched=first.searched)
-        for key in ours
-        if key in theirs
-    ]
-    matched = [pair for pair in pairs if pair]
-    matched.sort(key=lambda pair: (CHANGES.index(pair["change"]), -pair["preventable"]))
-    for (method, eta), rows in first.units().items():
-        other = others.get((method, eta), [])
-        values = difference(other, rows)
-        shown = [
-            name
-            for name, column in RATES.items()
-            if values[column]["n"]
-            and (
-                column not in OTHERS or any(row[column] == 1 for row in (*rows, *other))
-            )
+    units = second.units()
+    for key, rows in first.units().items():
+        others = units.get(key, [])
+        values = difference(others, rows)
+        differences = {}
+        for name, column in RATES.items():
+            shown = values[column]["n"] > 0
+            if column in OTHERS:
+                shown &= any(row[column] == 1 for row in (*rows, *others))
+            if shown:
+                differences[name] = values[column]
+        changes = [
+            (pair["change"], pair["preventable"])
+            for pair in pairs
+            if (pair["method"], pair["eta"]) == key
         ]
-        own = [
-            pair for pair in matched if (pair["method"], pair["eta"]) == (method, eta)
-        ]
-        changes = [(pair["change"], pair["preventable"]) for pair in own]
-        groups.append(
-            {"method": method, "eta": eta, "unit": first.unit}
-            | {"of": sum(key[:2] == (method, eta) and key in theirs for key in ours)}
-            | {name: sum(change == name for change, _ in changes) for name in CHANGES}
-            | {"preventable": {name: changes.count((name, True)) for name in CHANGES}}
-            | {"differences": {name: values[RATES[name]] for name in shown}}
-        )
-    return groups, matched
+        group: dict[str, Any] = {
+            "method": key[0],
+            "eta": key[1],
+            "unit": first.unit,
+            "of": sum(pair[:2] == key for pair in shared),
+        }
+        for name in CHANGES:
+            group[name] = sum(change == name for change, _ in changes)
+        group["preventable"] = {name: changes.count((name, True)) for name in CHANGES}
+        groups.append(group | {"differences": differences})
+    return groups, pairs
 
 
 def difference(
     rows: Sequence[Row], others: Sequence[Row]
 ) -> dict[str, dict[str, float]]:
-    """Paired differences of all metrics that need no samples (`paired_differences`)."""
-    samples = [[NO_SAMPLES] * len(each) for each in (rows, others)]
+    """Returns paired differences of all metrics that need no samples (`paired_differences`)."""
     return paired_differences(
-        rows, samples[0], other_rows=others, other_samples=samples[1], realism_draws=0
+        rows,
+        [NO_SAMPLES] * len(rows),
+        other_rows=others,
+        other_samples=[NO_SAMPLES] * len(others),
+        realism_draws=0,
     )
 
 
 def check_shared(first: Driven, second: Driven) -> None:
     """Raises InputError, saying what differs, where the rollouts of two runs are no
     pairs."""
-    provenances = [read_provenance(one.run) for one in (first, second)]
-    inputs_of_runs = [{**one["settings"], **one["inputs"]} for one in provenances]
-    names = [
-        name
-        for name in changed(*inputs_of_runs)
-        if re.split("[.=]", name)[0] in SHARED and not name.startswith("scenes=")
-    ]
-    names.sort(key=lambda name: SHARED.index(re.split("[.=]", name)[0]))
-    differences = [
-        f"{name} ({' and '.join(str(one.get(name))[:20] for one in inputs_of_runs)})"
-        for name in names
-    ]
-    if names[:1] == ["scenes"]:
-        ours, theirs = (
-            {row["scene_id"] for row in one.rows} for one in (first, second)
+    provenances = [read_provenance(driven.run) for driven in (first, second)]
+    ours, theirs = ({**run["settings"], **run["inputs"]} for run in provenances)
+    differing = {}
+    for name in changed(ours, theirs):
+        setting = re.split("[.=]", name)[0]
+        if setting in SHARED and not name.startswith("scenes="):
+            differing[name] = SHARED.index(setting)
+    texts = {
+        name: f"{name} ({str(ours.get(name))[:20]} and {str(theirs.get(name))[:20]})"
+        for name in sorted(differing, key=lambda name: differing[name])
+    }
+    if "scenes" in texts:
+        scenes = [
+            {row["scene_id"] for row in driven.rows} for driven in (first, second)
+        ]
+        texts["scenes"] = (
+            f"scenes ({len(scenes[0])} and {len(scenes[1])}, "
+            f"{len(scenes[0] & scenes[1])} of one id)"
         )
-        differences[0] = (
-            f"scenes ({len(ours)} and {len(theirs)}, {len(ours & theirs)} of one id)"
-        )
-    if differences:
-        mend = "run both with the same scenes, seeds, traffic and prior"
+    if texts:
         raise InputError(
             f"{second.run}: no pairs with {first.run}, which has other "
-            f"{', '.join(differences)}; {mend}"
+            f"{', '.join(texts.values())}; run both with the same scenes, seeds, traffic "
+            "and prior"
         )
 
 
 def nearness(row: Row) -> tuple[bool, float]:
-    """Sorts tries of a scene: the nearest to a preventable failure last, those that
+    """Returns what sorts tries of a scene: the nearest to a preventable failure last, those that
     errored first."""
     return row["margin"] == row["margin"], row["margin"]
 
@@ -299,49 +272,55 @@ def nearness(row: Row) -> tuple[bool, float]:
 def pair_of(
     key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched: bool
 ) -> dict[str, Any] | None:
-    """Two rollouts of one PAIR of which one has failed, None: none has; of a search the
-    tries that are nearest to a preventable failure. `change` is of CHANGES, `what`
-    differs between two failures: verdict, side of the ego, counterpart, time by DELAY;
-    of searches way; ending, where the planner raised in one of them. `preventable`:
-    whether one is, as one in which the planner raised is."""
-    first, second = (max(each, key=nearness) for each in (tries, others))
-    ways = [{cell_of(row) for row in each} - {None} for each in (tries, others)]
-    crashed = [any(map(raised, each)) for each in (tries, others)]
-    failing = (
-        [bool(each) for each in ways]
-        if searched
-        else [is_failure(first), is_failure(second)]
-    )
-    failed = [one or other for one, other in zip(failing, crashed, strict=True)]
-    differs = {
-        "verdict": any(
-            cell(first[name]) != cell(second[name])
-            for name in ("counted", "at_fault", "preventable")
-        ),
-        "side": first["contact_type"] != second["contact_type"],
-        "counterpart": first["partner"] != second["partner"],
-        "time": abs(first["contact_time"] - second["contact_time"]) > DELAY + 1e-9,
-    }
-    if searched:
-        differs = {"way": all(ways) and not ways[0] & ways[1]}
+    """Returns two rollouts of one PAIR of which one has failed; None: none has.
+
+    `change` is of CHANGES, `what` differs between two failures: verdict, side of the
+    ego, counterpart, time by DELAY; of searches way; ending, where the planner raised
+    in one of them. `preventable`: whether one is, as one in which the planner raised
+    is.
+
+    Args:
+        key: values of PAIR.
+        tries: of the first; of a search those that are nearest to a preventable failure
+            are shown.
+        others: of the second.
+        searched: the rollouts are tries of searches.
+    """
+    first = max(tries, key=nearness)
+    second = max(others, key=nearness)
+    ways = [{cell_of(row) for row in rows} - {None} for rows in (tries, others)]
+    crashed = [any(map(raised, rows)) for rows in (tries, others)]
+    failing = ways if searched else [is_failure(first), is_failure(second)]
+    failed = [bool(failing[k] or crashed[k]) for k in range(2)]
+    if not any(failed):
+        return None
+    way = searched and all(ways) and not ways[0] & ways[1]
     if any(crashed):
+        differs = {"ending": crashed[0] != crashed[1], "way": way}
+    elif searched:
+        differs = {"way": way}
+    else:
+        verdicts = ("counted", "at_fault", "preventable")
+        delay = abs(first["contact_time"] - second["contact_time"])
         differs = {
-            "ending": crashed[0] != crashed[1],
-            "way": searched and differs["way"],
+            "verdict": any(
+                cell(first[name]) != cell(second[name]) for name in verdicts
+            ),
+            "side": first["contact_type"] != second["contact_type"],
+            "counterpart": first["partner"] != second["partner"],
+            "time": delay > DELAY + 1e-9,
         }
-    changes = [name for name, there in differs.items() if there] if all(failed) else []
-    change = (
-        ("moved" if changes else "same")
-        if all(failed)
-        else "gone"
-        if failed[0]
-        else "new"
-    )
-    preventable = any(map(bool, ways)) or any(crashed)
-    about = {
+    changes = [name for name, differing in differs.items() if differing]
+    if all(failed):
+        change = "moved" if changes else "same"
+    else:
+        change = "gone" if failed[0] else "new"
+        changes = []
+    return {
         "change": change,
         "what": changes,
-        "preventable": preventable,
+        "preventable": any(map(bool, ways)) or any(crashed),
         **dict(zip(PAIR, key, strict=True)),
+        "first": first,
+        "second": second,
     }
-    return about | {"first": first, "second": second} if any(failed) else None

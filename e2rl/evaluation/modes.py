@@ -3,12 +3,12 @@ atlas.json (docs/reference/metrics.md)."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 from types import NoneType
 
 from e2rl.evaluation.rollout_files import read_json
-from e2rl.evaluation.summary import GROUP, group_of
 from e2rl.metrics.atlas import CELL, Cell, atlas_of, cell_of
 from e2rl.metrics.errored import lost
 from e2rl.metrics.failure_modes import (
@@ -24,6 +24,8 @@ from e2rl.metrics.failure_modes import (
 from e2rl.run.files import misfit
 from e2rl.sim.rollout_file import rollout_name
 
+GROUP = ("dataset", "split", "method", "ego_policy", "eta")
+key_of = itemgetter(*GROUP)  # of a row of rollouts.csv
 OTHER = 0  # number of the small modes together
 VERDICTS = (
     "counted",
@@ -79,7 +81,7 @@ def find_modes(rows: Sequence[dict]) -> dict:
         members[OTHER] = [row for row in failures if row["mode"] not in large]
     groups = [
         dict(zip(GROUP, key, strict=True))
-        for key in dict.fromkeys(group_of(row) for row in rows)
+        for key in dict.fromkeys(key_of(row) for row in rows)
     ]
     counts = [group_counts(group, rows, members=members) for group in groups]
     return {
@@ -98,13 +100,13 @@ def group_counts(
 ) -> dict:
     """A group (dataset, split, method, ego_policy, eta) with its rollouts, failures,
     and modes other than the small ones that have one of its failures."""
-    key = tuple(group.values())
+    key = key_of(group)
     ours = {
-        number: sum(group_of(row) == key for row in failures)
+        number: sum(key_of(row) == key for row in failures)
         for number, failures in members.items()
     }
     modes = sum(count > 0 for number, count in ours.items() if number != OTHER)
-    rollouts = sum(group_of(row) == key and not lost(row) for row in rows)
+    rollouts = sum(key_of(row) == key and not lost(row) for row in rows)
     return group | {
         "rollouts": rollouts,
         "failures": sum(ours.values()),
@@ -116,12 +118,12 @@ def describe(mode: int, members: Sequence[Row], groups: Sequence[dict]) -> dict:
     """A mode of modes.json: its number, name, failures and their fraction of each
     group's, verdicts, mean speeds [m/s], and its most typical rollout. Fractions and
     means are over the members that know the value, None without any."""
-    keys = [group_of(row) for row in members]
-    by_group = [keys.count(tuple(group[name] for name in GROUP)) for group in groups]
+    keys = [key_of(row) for row in members]
+    by_group = [keys.count(key_of(group)) for group in groups]
     counting = [
         key for key, row in zip(keys, members, strict=True) if row.get("counted") == 1
     ]
-    counts = [counting.count(tuple(group[name] for name in GROUP)) for group in groups]
+    counts = [counting.count(key_of(group)) for group in groups]
     total = sum(group["failures"] for group in groups)
     typical = members[medoid(members)]
     return {
@@ -185,7 +187,7 @@ def find_atlas(rows: Sequence[dict]) -> dict:
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
         if not lost(row):
-            groups.setdefault(group_of(row), []).append(row)
+            groups.setdefault(key_of(row), []).append(row)
     return {
         "groups": [
             dict(zip(GROUP, key, strict=True)) | group_atlas(ours)

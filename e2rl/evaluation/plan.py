@@ -3,21 +3,25 @@ in every scene and seed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from e2rl.driving.batches import Batch, Work, drive_all, score_all
 from e2rl.driving.setup import Method, Setup, Task
-from e2rl.evaluation.build import build_methods, build_prior, build_searches, build_sim
-from e2rl.evaluation.check import EvaluationSettings, evaluation_settings, processes_of
-from e2rl.evaluation.ego_set import EgoSet, build_egos
-from e2rl.evaluation.record import record
+from e2rl.evaluation.build import (
+    EgoSet,
+    build_egos,
+    build_rows,
+    build_sim,
+)
+from e2rl.evaluation.check import EvaluationSettings, evaluation_settings
+from e2rl.evaluation.record import Record, record
 from e2rl.evaluation.reproduce import files_of_run
 from e2rl.prior.prior import Prior
 from e2rl.run.config import set_up
 from e2rl.run.errors import InputError
-from e2rl.run.run import Run, origin_of
+from e2rl.run.parts import Parts
+from e2rl.run.run import Run
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
@@ -35,51 +39,46 @@ class Evaluation:
     """The objects of an evaluation.
 
     Args:
+        run: with the configuration and the folder.
+        origin: `git` and `command` of the run's rows.
         settings: keys of conf/evaluate.yaml.
         egos: that are rated.
         prior: of all methods.
-        origin: of the prior, from its checkpoint.
+        prior_origin: from the prior's checkpoint.
         methods: that are driven once a seed; none where there is a budget.
         searches: that are driven with a budget.
-        setup: scenes, simulator and the first of `egos`.
-        only: positions of the scenes to drive (None: all).
+        scenes: of which `work.only` may be a part.
+        setups: scenes and simulator with each of `egos`.
         work: how rollouts are driven.
     """
 
+    run: Run
+    origin: Mapping[str, str]
     settings: EvaluationSettings
     egos: EgoSet
     prior: Prior
-    origin: Mapping[str, Any]
+    prior_origin: Mapping[str, Any]
     methods: list[Method]
     searches: list[SearchMethod]
-    setup: Setup
-    only: list[int] | None
+    scenes: SceneSet
+    setups: list[Setup]
     work: Work
-
-    @property
-    def scenes(self) -> SceneSet:
-        """The scenes, of which `only` may be a part."""
-        return self.setup.scenes
-
-    @property
-    def references(self) -> tuple[str, ...] | None:
-        """The methods that all are compared with; None: each with every other."""
-        compared = self.settings.compare
-        return (*compared, NOMINAL) if compared and not self.egos.pairs else None
 
     def drive(self) -> Spent:
         """Returns what all rollouts score; of searches also their tries."""
-        setups = self.egos.setups(self.setup)
-        seeds = self.settings.seeds
-        if not self.searches:
-            return Spent(drive_all(setups, self.methods, seeds=seeds, work=self.work))
-        assert self.settings.budget is not None
+        settings = self.settings
+        if settings.budget is None:
+            return Spent(
+                drive_all(
+                    self.setups, self.methods, seeds=settings.seeds, work=self.work
+                )
+            )
         return search_all(
-            setups,
+            self.setups,
             self.searches,
-            budget=self.settings.budget,
-            unit=self.settings.budget_unit,
-            seeds=seeds,
+            budget=settings.budget,
+            unit=settings.budget_unit,
+            seeds=settings.seeds,
             work=self.work,
         )
 
@@ -95,9 +94,7 @@ class Evaluation:
         """Returns the rollout of a row in the table of a run as a batch; raises as
         `drive_again`."""
         (setup,) = (
-            setup
-            for setup in self.egos.setups(self.setup)
-            if setup.ego_name == row["ego_policy"]
+            setup for setup in self.setups if setup.ego_name == row["ego_policy"]
         )
         wanted = (self.scenes.index(row["scene_id"]), row["seed"])
         batches = [
@@ -118,19 +115,24 @@ class Evaluation:
             "folder of the run"
         )
 
-    def record(self, driven: Spent, folder: Path) -> list[dict]:
-        """Writes the tables of rollouts into a run's folder; returns the rows of
-        metrics.json."""
-        summarise = partial(
-            self.egos.metric_rows,
-            references=self.references,
-            searched=bool(driven.tries),
-            **origin_of(folder),
-        )
-        rows = record(driven.scored, folder, summarise)
+    def record(self, driven: Spent) -> Record:
+        """Returns what the rollouts come to, and writes it into the run's folder."""
+        folder = self.run.folder
+        compared = self.settings.compare
         if driven.tries:
             write_tries(folder / TRIES_FILE, driven.tries)
-        return rows
+        return record(
+            driven.scored,
+            folder,
+            config=self.run.config,
+            searched=bool(driven.tries),
+            egos=self.egos.pairs,
+            trainings=self.egos.trainings,
+            references=(
+                (*compared, NOMINAL) if compared and not self.egos.pairs else None
+            ),
+            **self.origin,
+        )
 
 
 def begin(run: Run) -> Evaluation:
@@ -144,43 +146,43 @@ def begin(run: Run) -> Evaluation:
     print(purpose(run, settings, egos=list(egos.egos)), flush=True)
     prepare_fused(config)
     # before the scenes, which take longer than a wrong path
-    prior, origin = build_prior(config, config.device)
-    methods = [] if settings.budget else build_methods(config, prior)
-    searches = build_searches(config, prior, settings.eta[0]) if settings.budget else []
+    prior, prior_origin, methods, searches = build_rows(config, settings)
     sim = build_sim(config)
     scenes = load_scenes(
         config.data,
         settings.num_scenes,
         scenes=config.scenes,
-        files=files_of_run(config),
+        files=files_of_run(Path(config.reproduce)) if config.reproduce else "",
     )
-    only = None if config.scene is None else [scenes.index(config.scene)]
-    name, ego = next(iter(egos.egos.items()))
-    setup = Setup(
-        scenes,
-        ego,
-        ego_name=name,
-        sim=sim,
-        batch=config.batch,
-        device=config.device,
-    )
+    setups = [
+        Setup(
+            scenes,
+            ego,
+            ego_name=name,
+            sim=sim,
+            batch=config.batch,
+            device=config.device,
+        )
+        for name, ego in egos.egos.items()
+    ]
     work = Work(
         into=run.folder / ROLLOUTS if settings.save_rollouts else None,
-        processes=processes_of(config),
-        only=only,
-        parts=run.parts(),
+        processes=settings.processes,
+        only=None if config.scene is None else [scenes.index(config.scene)],
+        parts=Parts(run.folder),
         shard=settings.shard,
     )
-    run.begin({"scenes": listed(scenes)})
     return Evaluation(
-        settings,
-        egos,
+        run,
+        run.begin({"scenes": listed(scenes)}),
+        settings=settings,
+        egos=egos,
         prior=prior,
-        origin=origin,
+        prior_origin=prior_origin,
         methods=methods,
         searches=searches,
-        setup=setup,
-        only=only,
+        scenes=scenes,
+        setups=setups,
         work=work,
     )
 

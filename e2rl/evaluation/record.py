@@ -1,19 +1,68 @@
-"""The closed-loop protocol: methods x scenes x seeds with one ego, and the files of a
-run (docs/reference/metrics.md)."""
+"""What a run leaves: the rows of its tables, written as they come, and read again by
+other commands (docs/reference/metrics.md)."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from omegaconf import DictConfig
+
 from e2rl.driving.batches import Work, drive_all
 from e2rl.driving.setup import Method, Scored, Setup
-from e2rl.evaluation.modes import find_atlas, find_modes
-from e2rl.evaluation.rollout_files import write_rollouts, write_tables
-from e2rl.evaluation.summary import empty_rows, group_of, metric_rows
+from e2rl.evaluation.modes import find_atlas, find_modes, read_modes
+from e2rl.evaluation.rollout_files import (
+    ERRORED_FILE,
+    METRICS_FILE,
+    MODES_FILE,
+    TABLE,
+    read_metrics,
+    read_rows,
+    write_tables,
+)
+from e2rl.evaluation.summary import metric_rows
+from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
+from e2rl.run.trust import CONFIG, read_yaml
+from e2rl.search.tries_file import TRIES_FILE
 from e2rl.sim.rollout_file import ROLLOUTS
-from e2rl.traffic.attempt import count_reasons
+
+
+@dataclass(frozen=True)
+class Record:
+    """What a run found.
+
+    Args:
+        rollouts: rows of rollouts.csv.
+        metrics: rows of metrics.json.
+        modes: content of modes.json.
+        searched: the rollouts are tries.
+        config: of the evaluation, if it is one.
+    """
+
+    rollouts: list[dict]
+    metrics: list[dict]
+    modes: dict
+    searched: bool = False
+    config: DictConfig | None = None
+
+    @classmethod
+    def read(cls, run: Path) -> "Record":
+        """Returns the record in a run's folder; InputError where files are missing or
+        damaged."""
+        if not (run / METRICS_FILE).is_file():
+            raise InputError(
+                f"{run}: no {METRICS_FILE}: the run is not finished, or none of its "
+                f"rollouts could be scored, as {ERRORED_FILE} says then; `e2rl gate` "
+                f"and `e2rl compare` read its {TABLE}"
+            )
+        return cls(
+            metrics=read_metrics(run / METRICS_FILE),
+            modes=read_modes(run / MODES_FILE),
+            rollouts=read_rows(run / TABLE),
+            searched=(run / TRIES_FILE).is_file(),
+            config=read_yaml(run / CONFIG) if (run / CONFIG).is_file() else None,
+        )
 
 
 def run_protocol(
@@ -44,28 +93,44 @@ def run_protocol(
     into = folder and folder / ROLLOUTS
     work = Work(into=into, processes=processes, parts=parts)
     scored = drive_all([setup], methods, seeds=seeds, work=work)
-    return record(scored, folder, partial(metric_rows, **fields))
+    return record(scored, folder, **fields).metrics
 
 
 def record(
-    scored: Scored, folder: Path | None, summarise: Callable[..., list[dict]]
-) -> list[dict]:
-    """Returns the rows of metrics.json: summarise(rows, samples), with the counts of
-    what errored where they have none.
+    scored: Scored,
+    folder: Path | None,
+    *,
+    config: DictConfig | None = None,
+    searched: bool = False,
+    **fields: Any,
+) -> Record:
+    """Returns what rollouts come to, and writes it into a folder: rollouts.csv,
+    errored.json where rollouts errored, metrics.json, modes.json, atlas.json.
 
-    Writes rollouts.csv, modes.json, atlas.json, metrics.json and, where rollouts
-    errored, errored.json into a folder. A method of which the traffic lost all rollouts
-    has a row too, without metrics. Raises InputError where it lost those of all.
+    Args:
+        scored: of all rollouts.
+        folder: of the files (None: nothing is written).
+        config: of the evaluation, if it is one.
+        searched: the rollouts are tries.
+        fields: further arguments of `metric_rows`.
+
+    Raises:
+        InputError: where the traffic lost all rollouts.
     """
     modes = find_modes(scored.rows)
-    write_rollouts(folder, scored.rows, scored.errored)
-    summary = summarise(scored.rows, scored.samples)
-    rows = []
-    for row in [*summary, *empty_rows(summary, scored.errored)]:
-        errored = [
-            attempt for attempt in scored.errored if group_of(attempt) == group_of(row)
-        ]
-        rows.append({"errored": count_reasons(errored)} | row)
-    if folder is not None:
-        write_tables(folder, rows, modes=modes, atlas=find_atlas(scored.rows))
-    return rows
+    metrics = metric_rows(
+        scored.rows,
+        scored.samples,
+        errored=scored.errored,
+        searched=searched,
+        **fields,
+    )
+    rollouts = write_tables(
+        folder,
+        scored.rows,
+        scored.errored,
+        modes=modes,
+        atlas=find_atlas(scored.rows),
+        metrics=metrics,
+    )
+    return Record(rollouts, metrics, modes=modes, searched=searched, config=config)

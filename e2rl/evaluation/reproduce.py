@@ -110,14 +110,9 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     return Run(saved, Run.of(config).folder, choices=provenance["choices"])
 
 
-def files_of_run(config: DictConfig) -> str:
-    """Returns the SHA-256 of the data files of the run that is reproduced, "" where it
-    is not known."""
-    return (
-        str(read_provenance(Path(config.reproduce))["files"].get(LISTED, ""))
-        if config.reproduce
-        else ""
-    )
+def files_of_run(run: Path) -> str:
+    """Returns the SHA-256 of a run's data files, "" where it is not known."""
+    return str(read_provenance(run)["files"].get(LISTED, ""))
 
 
 def _move(

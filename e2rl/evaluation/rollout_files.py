@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from types import NoneType
-from typing import IO, Any
+from typing import Any
 
 from e2rl.metrics.catalogue import LATER, SOURCE, WORDS, row_columns
-from e2rl.metrics.errored import errored_row, lost
+from e2rl.metrics.errored import lost
 from e2rl.run.errors import InputError
 from e2rl.run.files import (
     CsvReader,
@@ -32,10 +32,9 @@ METRICS_FILE = "metrics.json"
 ERRORED_FILE = "errored.json"
 MODES_FILE = "modes.json"
 ATLAS_FILE = "atlas.json"
-MAX_JSON, MOST_ROWS = (
-    48 << 20,
-    300_000,
-)  # bytes and lines that take less than 2 GB of memory
+# bytes and lines that take less than 2 GB of memory
+MAX_JSON = 48 << 20
+MOST_ROWS = 300_000
 DIGITS = 15  # of a whole number: more would not fit a float
 NUMBER = (int, float, NoneType)
 INTERVAL = {"low": NUMBER, "high": NUMBER, "n": NUMBER, ...: NUMBER}
@@ -58,10 +57,6 @@ TEXTS = (
     *WORDS,
     *(name for name, value in LATER.items() if value == ""),
 )
-ENTRY = {  # what readers of errored.json need
-    **dict.fromkeys((*SOURCE, "scene_id", "reason", "detail"), str),
-    **{"eta": (int, float), "seed": int},
-}
 
 
 def table_columns() -> tuple[str, ...]:
@@ -69,29 +64,51 @@ def table_columns() -> tuple[str, ...]:
     return (*SOURCE, *row_columns())
 
 
+def write_tables(
+    folder: Path | None,
+    rows: Sequence[dict],
+    errored: Sequence[dict],
+    **tables: object,
+) -> list[dict]:
+    """Write rollouts.csv, errored.json where rollouts errored, and the others; returns
+    the rows as `read_rows` gives them.
+
+    Args:
+        folder: of the run; None: nothing is written.
+        rows: of the rollouts.
+        errored: entries of errored.json.
+        tables: further contents, NAME of NAME.json.
+
+    Raises:
+        InputError: where the traffic lost all rollouts; then the others are not
+            written.
+    """
+    counted = [row for row in rows if not lost(row)]
+    if folder is not None:
+        texts = {TABLE: rows_text(rows)}
+        for name, content in tables.items() if counted else ():
+            texts[f"{name}.json"] = json_text(content)
+        for name, text in texts.items():
+            write_atomically(folder / name, text)
+        write_errored(folder / ERRORED_FILE, errored)
+    require_rows(counted, errored, folder)
+    columns = table_columns()
+    return [
+        {name: value_of(name, str(cell(row.get(name, math.nan)))) for name in columns}
+        for row in rows
+    ]
+
+
 def write_rows(path: Path, rows: Sequence[dict]) -> None:
-    """Write rollouts.csv: one line per row of `score_rollouts`, NaN as an empty cell."""
+    """Write rollouts.csv."""
+    write_atomically(path, rows_text(rows))
+
+
+def rows_text(rows: Sequence[dict]) -> str:
+    """Returns rollouts.csv: one line per row of `score_rollouts`, NaN as an empty cell."""
     columns = table_columns()
     lines = ([cell(row.get(column, math.nan)) for column in columns] for row in rows)
-    write_atomically(path, csv_text([columns, *lines]))
-
-
-def write_rollouts(
-    folder: Path | None, rows: Sequence[dict], errored: Sequence[dict]
-) -> None:
-    """Write rollouts.csv and, where rollouts errored, errored.json into a folder (None:
-    nothing is written). Raises InputError where the traffic lost all rollouts."""
-    if folder is not None:
-        write_errored(folder / ERRORED_FILE, errored)
-        write_rows(folder / TABLE, rows)
-    require_rows([row for row in rows if not lost(row)], errored, folder)
-
-
-def write_tables(folder: Path, rows: Sequence[dict], modes: dict, atlas: dict) -> None:
-    """Write modes.json, atlas.json and metrics.json, whose rows are given."""
-    write_json(folder / MODES_FILE, modes)
-    write_json(folder / ATLAS_FILE, atlas)
-    write_json(folder / METRICS_FILE, rows)
+    return csv_text([columns, *lines])
 
 
 def cell(value: object) -> object:
@@ -101,29 +118,31 @@ def cell(value: object) -> object:
     return "" if isinstance(value, float) and math.isnan(value) else value
 
 
-def read_rows(path: Path) -> list[dict]:
-    """The rows of a rollouts.csv: text columns as text, seed and partner as int, all
-    others as float (empty: NaN).
+def value_of(column: str, text: str) -> str | int | float:
+    """Returns the value of a cell: of text columns text, of seed and partner a whole
+    number, of all others a number, NaN where the cell is empty."""
+    if column in TEXTS:
+        return text
+    return int(text) if column in ("seed", "partner") else float(text or "nan")
 
-    LATER columns, which tables of earlier versions lack, are filled. Raises InputError
-    for a file that is no such table.
-    """
+
+def read_rows(path: Path) -> list[dict]:
+    """The rows of a rollouts.csv, with values as in `value_of`; InputError for a file
+    that is no such table."""
     path = Path(path)
     try:
-        with opened(path) as file:
-            rows = CsvReader(file)
-            missing = [
-                name for name in table_columns() if name not in (rows.fieldnames or ())
+        file = open_regular(path, within=path.parent)
+        with io.TextIOWrapper(file, "utf-8", newline="") as lines:
+            rows = CsvReader(lines)
+            heads = rows.fieldnames or ()
+            if missing := [name for name in table_columns() if name not in heads]:
+                raise ValueError(f"no column {missing[0]}")
+            content = [
+                row_of(rows.line_num, row) for row in islice(rows, MOST_ROWS + 1)
             ]
-            if wrong := [name for name in missing if name not in LATER]:
-                raise ValueError(f"no column {wrong[0]}")
-            later = {name: LATER[name] for name in missing}
-            found = [
-                _row(rows.line_num, row) | later for row in islice(rows, MOST_ROWS + 1)
-            ]
-        if len(found) > MOST_ROWS:
+        if len(content) > MOST_ROWS:
             raise ValueError(f"more than {MOST_ROWS:,} rows")
-        return found
+        return content
     except FileNotFoundError as error:
         mend = "give the folder of a run of evaluate.py; shards are merged first"
         if (path.parent / PARTS).is_dir():
@@ -138,58 +157,22 @@ def read_rows(path: Path) -> list[dict]:
         ) from error
 
 
-def read_run(run: Path) -> list[dict]:
-    """The rows of a run's rollouts.csv, and one for each rollout of its errored.json
-    that the table lacks, as tables of earlier versions do. Raises InputError where
-    either is damaged."""
-    rows = read_rows(run / TABLE)
-    file = run / ERRORED_FILE
-    entries = (
-        read_json(file, lambda found: misfit(found, [ENTRY]), printable=False)
-        if file.is_file()
-        else []
-    )
-    place = {row["scene_id"]: row["location"] for row in rows}
-    identities = set(map(_identity, rows))
-    missing = [
-        errored_row({"location": place.get(entry["scene_id"], "")} | entry)
-        for entry in entries
-    ]
-    return rows + [row for row in missing if _identity(row) not in identities]
-
-
-def _identity(row: dict) -> tuple:
-    return tuple(row[name] for name in (*SOURCE, "eta", "scene_id", "seed"))
-
-
-def opened(path: Path) -> IO[str]:
-    """A table of a run, to read; raises OSError as `open_regular` does."""
-    return io.TextIOWrapper(open_regular(path, within=path.parent), "utf-8", newline="")
+def row_of(number: int, cells: dict[str, Any]) -> dict:
+    """Returns a line of the table with its values; ValueError where it has other cells
+    than the head."""
+    if None in cells or None in cells.values():
+        raise ValueError(f"line {number} has other cells than the head")
+    if odd := [name for name in TEXTS if UNPRINTABLE.search(cells.get(name, ""))]:
+        raise ValueError(f"line {number}: {odd[0]} holds control characters")
+    try:
+        return {name: value_of(name, text) for name, text in cells.items()}
+    except ValueError as error:
+        raise ValueError(f"line {number}: {error}") from error
 
 
 def cause(error: Exception) -> str:
     """What an error says, without the path and number of one of the file system."""
     return str(isinstance(error, OSError) and error.strerror or error)
-
-
-def _row(line: int, row: dict[str, Any]) -> dict:
-    """A line of the table with its values; ValueError where it has other cells than the
-    head."""
-    if None in row or None in row.values():
-        raise ValueError(f"line {line} has other cells than the head")
-    if odd := [name for name in TEXTS if UNPRINTABLE.search(row.get(name, ""))]:
-        raise ValueError(f"line {line}: {odd[0]} holds control characters")
-    try:
-        return {
-            key: value
-            if key in TEXTS
-            else int(value)
-            if key in ("seed", "partner")
-            else float(value or "nan")
-            for key, value in row.items()
-        }
-    except ValueError as error:
-        raise ValueError(f"line {line}: {error}") from error
 
 
 def write_json(path: Path, content: object) -> None:
@@ -224,26 +207,16 @@ def read_metrics(path: Path) -> list[dict]:
     ]
 
 
-def read_json(
-    path: Path, wrong: Callable[[Any], str | None], printable: bool = True
-) -> Any:
-    """The content of a JSON file of a run; raises InputError where it is none, or has
-    something wrong.
-
-    Args:
-        path: of the file.
-        wrong: says what is wrong with its content, if anything is.
-        printable: its texts hold no control characters, as those of a traceback do.
-    """
+def read_json(path: Path, wrong: Callable[[Any], str | None]) -> Any:
+    """The content of a JSON file of a run; raises InputError where it is none, has
+    texts with control characters, or `wrong` says what is wrong with it."""
     try:
         content = json.loads(
             read_regular(path, MAX_JSON, within=path.parent), parse_int=_whole
         )
         if reason := wrong(content):
             raise ValueError(reason)
-        if printable and (
-            odd := next(filter(UNPRINTABLE.search, _texts(content)), None)
-        ):
+        if odd := next(filter(UNPRINTABLE.search, _texts(content)), None):
             raise ValueError(f"{odd[:40]!r} holds control characters")
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(

@@ -1,13 +1,14 @@
 """The rows of metrics.json: one per (dataset, split, method, ego, eta), with paired
-differences to other methods."""
+differences to other methods; and the headline of each, which is counted nowhere else."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from e2rl.evaluation.headline import headline
+from e2rl.evaluation.modes import GROUP, key_of
+from e2rl.metrics.atlas import cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.realism import NO_SAMPLES
@@ -15,22 +16,23 @@ from e2rl.metrics.statistics import DRAWS, REALISM_DRAWS, paired_differences, su
 from e2rl.run.endings import command_line
 from e2rl.run.run import git_commit
 from e2rl.search.tries import TRIES
+from e2rl.traffic.attempt import count_reasons
 
-GROUP = ("dataset", "split", "method", "ego_policy", "eta")
 Key = tuple  # values of GROUP
 Scores = tuple[list[dict], list[dict[str, Tensor]]]  # rows and samples
 UNKNOWN = {"mean": math.nan, "low": math.nan, "high": math.nan, "n": 0}
 
 
-def group_of(row: Mapping) -> Key:
-    """Returns the values of GROUP of a row of metrics.json, of rollouts.csv or of
-    errored.json."""
-    ego = row["ego"] if "ego" in row else row["ego_policy"]
-    return row["dataset"], row["split"], row["method"], ego, row["eta"]
-
-
 def metric_row(
-    key: Key, *, scenes: int, seeds: int, rollouts: int, metrics: Mapping, **fields: Any
+    key: Key,
+    *,
+    scenes: int,
+    seeds: int,
+    rollouts: int,
+    metrics: Mapping,
+    git: str | None = None,
+    command: str | None = None,
+    **fields: Any,
 ) -> dict:
     """Returns a row of metrics.json.
 
@@ -40,11 +42,16 @@ def metric_row(
         seeds: number of seeds.
         rollouts: number of rollouts.
         metrics: means and intervals.
+        git: commit of the run; None: the present one.
+        command: of the run; None: the present one.
         fields: override or extend the row.
     """
     identity = dict(zip(("dataset", "split", "method", "ego", "eta"), key, strict=True))
     counts = {"n_scenes": scenes, "n_seeds": seeds, "n_rollouts": rollouts}
-    origin = {"git": git_commit(), "command": command_line()}
+    origin = {
+        "git": git_commit() if git is None else git,
+        "command": command_line() if command is None else command,
+    }
     return identity | counts | origin | {"metrics": metrics, "paired": {}} | fields
 
 
@@ -52,9 +59,11 @@ def metric_rows(
     rows: Sequence[dict],
     samples: Sequence[dict[str, Tensor]],
     *,
+    errored: Sequence[dict] = (),
     draws: int = DRAWS,
     realism_draws: int = REALISM_DRAWS,
     egos: Sequence[tuple[str, str]] = (),
+    trainings: Mapping[str, Sequence[str]] | None = None,
     references: Collection[str] | None = None,
     searched: bool = False,
     **fields: Any,
@@ -63,16 +72,19 @@ def metric_rows(
 
     Rollouts that the traffic lost take no part. A row's `paired` compares it with every
     other method (or eta) on the same dataset, split and ego over the shared (scene,
-    seed); a method there with several etas is named method@eta.
+    seed); a method there with several etas is named method@eta. A group of which the
+    traffic lost all rollouts has a row too, without metrics.
 
     Args:
         rows: of rollouts.
         samples: of realism, one for each row.
+        errored: entries of errored.json, which are counted by their reasons.
         draws: of the bootstrap.
         realism_draws: of the bootstrap of realism.
         egos: pairs of egos of which the first is also compared with the second in the
             same traffic, under `ego SECOND`, realism without intervals; as these are
             many, a method is then compared with the first other one of its ego only.
+        trainings: by name, the egos whose rollouts are pooled under it, too.
         references: the methods that others are compared with (None: all; of many rows,
             the differences cost more than the means).
         searched: the rollouts are tries. Events are those of `scene_rows`, as rates of
@@ -80,10 +92,14 @@ def metric_rows(
             what it has found.
         fields: extend each row.
     """
+    trainings = trainings or {}
     groups: dict[Key, Scores] = {}
-    for row, sample in zip(rows, samples, strict=True):
+    for row, sample in [
+        *zip(rows, samples, strict=True),
+        *pooled(rows, samples, trainings),
+    ]:
         if not lost(row):
-            group = groups.setdefault(group_of(row), ([], []))
+            group = groups.setdefault(key_of(row), ([], []))
             group[0].append(row)
             group[1].append(sample)
     result = []
@@ -115,8 +131,38 @@ def metric_rows(
             **fields,
         )
         counts = headline(group_rows, searched)._asdict()
-        result.append(row | {"searched": searched, "headline": counts})
-    return result
+        row |= {"searched": searched, "headline": counts}
+        if row["ego"] in trainings:
+            row["n_trainings"] = len(trainings[row["ego"]])
+        result.append(row)
+    reasons: dict[Key, list[dict]] = {key: [] for key in groups}
+    for entry in errored:
+        reasons.setdefault(key_of(entry), []).append(entry)
+    unknown = dict.fromkeys(METRICS, UNKNOWN)
+    for key in list(reasons)[len(result) :]:
+        row = metric_row(key, scenes=0, seeds=0, rollouts=0, metrics=unknown, **fields)
+        result.append(row)
+    return [
+        {"errored": count_reasons(entries)} | row
+        for entries, row in zip(reasons.values(), result, strict=True)
+    ]
+
+
+def pooled(
+    rows: Sequence[dict],
+    samples: Sequence[dict[str, Tensor]],
+    trainings: Mapping[str, Sequence[str]],
+) -> list[tuple[dict, dict[str, Tensor]]]:
+    """Returns copies of the rows of several trainings under their common name, with the
+    number of their `training`, each with its sample."""
+    copies = []
+    for name, members in trainings.items():
+        for row, sample in zip(rows, samples, strict=True):
+            if row["ego_policy"] in members:
+                training = list(members).index(row["ego_policy"])
+                copy = row | {"ego_policy": name, "training": training}
+                copies.append((copy, sample))
+    return copies
 
 
 def paired_with_methods(
@@ -234,25 +280,66 @@ def scene_metrics(rows: Sequence[Mapping], draws: int) -> dict[str, dict[str, fl
     return event_metrics | dict.fromkeys(per_distance, UNKNOWN)
 
 
-def empty_rows(known: Sequence[dict], errored: Sequence[dict]) -> list[dict]:
-    """Returns rows of metrics.json of the groups of which every rollout errored: no
-    metric is known. known: the rows of the others, of which the first lends the fields
-    that all have."""
-    first = known[0] if known else {}
-    shared = {
-        name: first[name] for name in ("git", "command", "stage") if name in first
-    }
-    present = {group_of(row) for row in known}
-    absent = dict.fromkeys(group_of(entry) for entry in errored)
-    return [
-        metric_row(
-            key,
-            scenes=0,
-            seeds=0,
-            rollouts=0,
-            metrics=dict.fromkeys(METRICS, UNKNOWN),
-            **shared,
-        )
-        for key in absent
-        if key not in present
-    ]
+# --- the headline
+
+
+class Headline(NamedTuple):
+    """In how many scenes one ego in one traffic fails preventably, and in how many it
+    raised.
+
+    Args:
+        scenes: driven in; those of which the traffic lost all rollouts do not count.
+        preventable: scenes with a preventable failure.
+        raised: scenes in which the planner raised.
+        failed: scenes with one of the two.
+        ways: different ways of failing preventably, cells of the atlas.
+        searches: of a scene, by how many seeds; 0: it was not searched.
+        tries: of a search of a scene in the mean.
+        nfe: of a search of a scene in the mean, without tries that errored.
+    """
+
+    scenes: int
+    preventable: int
+    raised: int
+    failed: int
+    ways: int
+    searches: int
+    tries: float
+    nfe: float
+
+
+def headline(rows: Sequence[Mapping[str, Any]], searched: bool) -> Headline:
+    """Returns the headline of rows of rollouts of one ego, method and intensity;
+    `searched`: they are tries."""
+    scenes = set()
+    preventable = set()
+    crashed = set()
+    cells = set()
+    seeds = set()
+    tries = 0
+    nfe = 0.0
+    for row in rows:
+        if lost(row):
+            continue
+        scene = row["scene_id"]
+        scenes.add(scene)
+        seeds.add(row["seed"] // TRIES)
+        tries += 1
+        cost = row.get("nfe", 0.0)
+        nfe += cost if cost == cost else 0.0
+        if raised(row):
+            crashed.add(scene)
+        elif row.get("cfr_preventable") == 1:
+            preventable.add(scene)
+            cells.add(cell_of(row))
+    searches = max(len(scenes) * len(seeds), 1)
+    return Headline(
+        scenes=len(scenes),
+        preventable=len(preventable),
+        raised=len(crashed),
+        failed=len(preventable | crashed),
+        ways=len(cells - {None}),
+        searches=len(seeds) if searched else 0,
+        tries=tries / searches if searched else 0.0,
+        nfe=nfe / searches if searched else 0.0,
+    )

@@ -14,24 +14,23 @@ from typing import Any, ClassVar, Protocol
 from omegaconf import OmegaConf
 
 from e2rl.evaluation.rollout_files import nans, nulls, write_json
-from e2rl.run.config import library
+from e2rl.run.config import configured, library, setting
 from e2rl.run.errors import InputError
 from e2rl.run.files import misfit, read_regular, write_atomically
-from e2rl.run.settings import configured, setting
+from e2rl.run.run import changed
 
 Parameters = dict[str, Any]
-Space = Mapping[
-    str, Sequence
-]  # {name: (low, high) or (low, high, "log")} of some parameters; whole numbers stay whole
+# {name: (low, high) or (low, high, "log")} of some parameters; whole numbers stay whole
+Space = Mapping[str, Sequence]
 Evaluate = Callable[[Parameters], Mapping[str, float]]  # the metrics of a trial
-REFUSED = 10.0  # added to the objective of refused trials, so that the sampler leaves their region
+# added to the objective of refused trials, so that the sampler leaves their region
+REFUSED = 10.0
 UNKNOWN = 2 * REFUSED  # of trials in which no rollout has a score
-STUDY = {
+NUMBER = int | float
+STUDY = {  # its file
     "task": dict,
-    "trials": [
-        {"parameters": {...: int | float}, "metrics": {...: int | float | None}}
-    ],
-}  # its file
+    "trials": [{"parameters": {...: NUMBER}, "metrics": {...: NUMBER | None}}],
+}
 MAX_STUDY = 1 << 24  # bytes of it
 STUDY_FILE = "study.json"
 TUNING_FILE = "tuning.json"
@@ -78,8 +77,7 @@ def search(
     """Returns a row a trial: parameters, metrics, objective, admissible.
 
     The present parameters come first, then a sweep over the first one of the space,
-    then optuna's proposals. Raises InputError for a space that does not fit, for a
-    study of another task, and where the present parameters have no metrics.
+    then optuna's proposals.
 
     Args:
         evaluate: parameters -> metrics.
@@ -91,87 +89,104 @@ def search(
             the interruption.
         about: what the study must agree in besides, such as its scenes.
         after_trial: called with all rows.
+
+    Raises:
+        InputError: for a space that does not fit, for a study of another task, and
+            where the present parameters have no metrics.
     """
     ranges = distributions(present, space)
-    fixed = [
+    planned = [
         {name: present[name] for name in space},
         *sweep(present, space, count=settings.sweep),
     ]
     task = {
-        "space": {name: list(space[name]) for name in space},
+        "space": {name: list(limits) for name, limits in space.items()},
         "parameters": present,
         "sweep": settings.sweep,
+        "objective": vars(objective),
+        **(about or {}),
     }
-    task = json.loads(
-        json.dumps(nulls(task | {"objective": vars(objective)} | dict(about or {})))
-    )
+    task = json.loads(json.dumps(nulls(task)))
     rows = read_study(file, task, ranges=ranges, objective=objective)
-    for number in range(len(rows), settings.trials):
-        parameters = (
-            fixed[number]
-            if number < len(fixed)
-            else proposal(rows, ranges, settings=settings, objective=objective)
-        )
+    while len(rows) < settings.trials:
+        if len(rows) < len(planned):
+            parameters = planned[len(rows)]
+        else:
+            parameters = proposal(rows, ranges, settings=settings, objective=objective)
         metrics = dict(evaluate(present | parameters))
-        value, excess = objective.judge(
-            metrics, rows[0]["metrics"] if rows else metrics
-        )
+        row, excess = judged(parameters, metrics, rows=rows, objective=objective)
         if math.isinf(excess) and not rows:
             reasons = [
                 name
-                for name, part in metrics.items()
-                if name.startswith(("errored: ", "errored_")) and part
+                for name, value in metrics.items()
+                if name.startswith(("errored: ", "errored_")) and value
             ]
             raise InputError(
                 f"tuning: {parameters} yield NaN metrics "
                 f"({', '.join(reasons) or 'check the scenes'})"
             )
-        rows.append(
-            {
-                "parameters": parameters,
-                "metrics": metrics,
-                "objective": value,
-                "admissible": excess == 0,
-            }
-        )
+        rows.append(row)
         if file is not None:
             write_atomically(file, json.dumps(nulls({"task": task, "trials": rows})))
         after_trial(rows)
     return rows
 
 
+def judged(
+    parameters: Parameters,
+    metrics: Mapping[str, float],
+    rows: Sequence[dict],
+    objective: Objective,
+) -> tuple[dict, float]:
+    """Returns the row of a trial, and its excess.
+
+    Args:
+        parameters: of the trial.
+        metrics: of the trial.
+        rows: of the trials before it, the first one the present parameters'.
+        objective: that judges.
+    """
+    reference = rows[0]["metrics"] if rows else metrics
+    value, excess = objective.judge(metrics, reference)
+    row = {
+        "parameters": parameters,
+        "metrics": metrics,
+        "objective": value,
+        "admissible": excess == 0,
+    }
+    return row, excess
+
+
 def read_study(
     file: Path | None, task: Mapping, ranges: Mapping, objective: Objective
 ) -> list[dict]:
-    """Returns the rows of a study's file, none where there is none; InputError where it
-    is no study, or of another task."""
+    """Returns the rows of a study's file, none where there is none.
+
+    Args:
+        file: of the study.
+        task: that it must be of.
+        ranges: that its parameters must be in.
+        objective: that judges its trials.
+
+    Raises:
+        InputError: where it is no study, or of another task.
+    """
     if file is None or not os.path.lexists(file):
         return []
+    rows: list[dict] = []
     try:
         study = json.loads(read_regular(file, MAX_STUDY))
-        if wrong := misfit(study, STUDY):
-            raise ValueError(wrong)
-        known = study["task"]
-        rows = [nans(row) for row in study["trials"]]
-        if differ := sorted(
-            name for name in {*known, *task} if known.get(name) != task.get(name)
-        ):
-            raise InputError(
-                f"tuning.study={file}: a study that differs in {', '.join(differ)}; "
-                "name another file"
-            )
-        return [
-            _row(
-                row["parameters"],
-                row["metrics"],
-                reference=rows[0]["metrics"],
-                ranges=ranges,
-                objective=objective,
-            )
-            for row in rows
-        ]
-    except InputError:
-        raise
+        if reason := misfit(study, STUDY):
+            raise ValueError(reason)
+        differing = changed(study["task"], task)
+        if not differing:
+            for trial in map(nans, study["trials"]):
+                parameters = trial["parameters"]
+                check_inside(parameters, ranges)
+                metrics = trial["metrics"]
+                list(map(float, metrics.values()))  # OverflowError of endless numbers
+                row, _ = judged(parameters, metrics, rows=rows, objective=objective)
+                rows.append(row)
     except (
         OSError,
         ValueError,
@@ -183,32 +198,24 @@ def read_study(
         raise InputError(
             f"tuning.study={file}: no study, or a damaged one ({error}); name another file"
         ) from error
+    if differing:
+        raise InputError(
+            f"tuning.study={file}: a study that differs in {', '.join(differing)}; "
+            "name another file"
+        )
+    return rows
 
 
-def _row(
-    parameters: Parameters,
-    metrics: Mapping,
-    reference: Mapping,
-    ranges: Mapping,
-    objective: Objective,
-) -> dict:
-    """The row of a trial in a study's file; ValueError for parameters out of their
-    ranges."""
-    inside = parameters.keys() == ranges.keys() and all(
-        isinstance(value, type(ranges[name].low) | int)
-        and ranges[name].low <= value <= ranges[name].high
-        for name, value in parameters.items()
-    )
-    if not inside:
-        raise ValueError("a trial out of its ranges")
-    list(map(float, metrics.values()))  # raises OverflowError for an endless number
-    value, excess = objective.judge(metrics, reference)
-    return {
-        "parameters": parameters,
-        "metrics": metrics,
-        "objective": value,
-        "admissible": excess == 0,
-    }
+def check_inside(parameters: Parameters, ranges: Mapping) -> None:
+    """Raises ValueError for parameters that are not those of the ranges, or out of
+    them."""
+    if parameters.keys() != ranges.keys():
+        raise ValueError("a trial of other parameters")
+    for name, value in parameters.items():
+        limits = ranges[name]
+        number = isinstance(value, type(limits.low) | int)
+        if not (number and limits.low <= value <= limits.high):
+            raise ValueError("a trial out of its ranges")
 
 
 def best_of(rows: Sequence[dict]) -> dict | None:
@@ -237,9 +244,8 @@ def yaml_of(parameters: Parameters) -> str:
     before its dot."""
     tree = OmegaConf.create()
     for name, value in parameters.items():
-        OmegaConf.update(
-            tree, name, float(f"{value:.4g}") if isinstance(value, float) else value
-        )
+        short = float(f"{value:.4g}") if isinstance(value, float) else value
+        OmegaConf.update(tree, name, short)
     return OmegaConf.to_yaml(tree)
 
 
@@ -261,33 +267,35 @@ def sweep(present: Parameters, space: Space, count: int) -> list[Parameters]:
     evenly spaced over its range (on its scale), both ends included; without the present
     value itself, which is the first trial."""
     name, (low, high, *scale) = next(iter(space.items()))
-    ends = (math.log(low), math.log(high)) if scale else (low, high)
-    values = [
-        ends[0] + step / max(count - 1, 1) * (ends[1] - ends[0])
-        for step in range(count)
-    ]
-    values = [
-        min(max(math.exp(value) if scale else value, low), high) for value in values
-    ]
-    if isinstance(low, int) and isinstance(high, int) and not scale:
-        values = [round(value) for value in values]
-    others = [
-        value
+    first, last = map(math.log, (low, high)) if scale else (low, high)
+    values = []
+    for step in range(count):
+        value = first + step / max(count - 1, 1) * (last - first)
+        values.append(min(max(math.exp(value) if scale else value, low), high))
+    if is_whole(low, high, scale):
+        values = list(map(round, values))
+    start = {key: present[key] for key in space}
+    return [
+        start | {name: value}
         for value in values
         if not math.isclose(value, present[name], rel_tol=1e-9)
     ]
-    return [{each: present[each] for each in space} | {name: value} for value in others]
+
+
+def is_whole(low: float, high: float, scale: Sequence[str]) -> bool:
+    """Returns whether the values of a range are whole numbers."""
+    return not scale and isinstance(low, int) and isinstance(high, int)
 
 
 def distributions(present: Parameters, space: Space) -> dict:
     """Returns optuna's distributions of a space; InputError for a name that is no
     parameter, and for a range that is none or leaves out the present value."""
-    optuna = _optuna()
+    kinds = optuna_library().distributions
     if not space:
         raise InputError(
             "tuning.space: no ranges; name one of each parameter to tune, {NAME: [low, high]}"
         )
-    values_of = {}
+    ranges = {}
     for name, (low, high, *scale) in space.items():
         where = f"tuning.space.{name}={[low, high, *scale]}"
         if name not in present:
@@ -300,14 +308,11 @@ def distributions(present: Parameters, space: Space) -> dict:
             )
         if not low <= present[name] <= high:
             raise InputError(f"{where}: leaves out the present value, {present[name]}")
-        whole = not scale and isinstance(low, int) and isinstance(high, int)
-        kind = (
-            optuna.distributions.IntDistribution
-            if whole
-            else optuna.distributions.FloatDistribution
-        )
-        values_of[name] = kind(low, high, log=bool(scale))
-    return values_of
+        if is_whole(low, high, scale):
+            ranges[name] = kinds.IntDistribution(low, high)
+        else:
+            ranges[name] = kinds.FloatDistribution(low, high, log=bool(scale))
+    return ranges
 
 
 def proposal(
@@ -317,28 +322,34 @@ def proposal(
     objective: Objective,
 ) -> Parameters:
     """Returns optuna's next parameters, which depend on nothing but the finished trials
-    and the seed."""
-    optuna = _optuna()
+    and the seed.
+
+    Args:
+        rows: of the finished trials.
+        ranges: optuna's distributions.
+        settings: of the search.
+        objective: that judges the trials.
+    """
+    optuna = optuna_library()
     sampler = optuna.samplers.TPESampler(
         seed=settings.seed + len(rows), n_startup_trials=settings.startup
     )
     study = optuna.create_study(sampler=sampler)
     for row in rows:
         value, excess = objective.judge(row["metrics"], rows[0]["metrics"])
-        value = (
-            UNKNOWN
-            if math.isinf(excess)
-            else value + (REFUSED + excess if excess else 0)
+        if math.isinf(excess):
+            value = UNKNOWN
+        elif excess:
+            value += REFUSED + excess
+        trial = optuna.create_trial(
+            params=row["parameters"], distributions=ranges, value=value
         )
-        study.add_trial(
-            optuna.create_trial(
-                params=row["parameters"], distributions=ranges, value=value
-            )
-        )
+        study.add_trial(trial)
     return study.ask(dict(ranges)).params
 
 
-def _optuna() -> Any:
+def optuna_library() -> Any:
+    """Returns the module optuna, which is silent."""
     optuna = library("optuna", "tuning", extra="tune")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

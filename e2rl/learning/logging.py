@@ -8,10 +8,9 @@ from pathlib import Path
 from torchrl.record.loggers import CSVLogger, TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
 
-from e2rl.run.config import library
+from e2rl.run.config import check_choice, library
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically
-from e2rl.run.settings import check_choice
 
 GROUPS = ("train", "eval", "curriculum", "synthesizer", "time")
 KINDS = ("csv", "tensorboard", "wandb", "none")

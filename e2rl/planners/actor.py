@@ -9,8 +9,8 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.network import ActorCritic, Architecture, find_weights, read_actor
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.mission import mission_of

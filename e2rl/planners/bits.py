@@ -22,7 +22,7 @@ from e2rl.planners.candidates import Candidates
 from e2rl.planners.chunks import PLANNER_KEYS
 from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import ScoringEgo
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.sim.mission import mission_of
 from e2rl.sim.observation import ELAPSED, features, placed_ego
 from e2rl.sim.static import static_scene

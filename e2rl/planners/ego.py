@@ -11,8 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from e2rl.run.config import Extension
-from e2rl.run.settings import check_range
+from e2rl.run.config import Extension, check_range
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics

@@ -22,8 +22,8 @@ from e2rl.planners.planner_messages import (
     scene_messages,
 )
 from e2rl.planners.plausibility import JUMPS, LARGEST, WILD, drivable
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.world import World

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath, look_up
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import MAX_SPEED, bounded_speed
 from e2rl.sim.leaders import IDMParameters, idm_acceleration, leaders

@@ -25,7 +25,7 @@ from e2rl.planners.profiles import (
     targets,
     upsample,
 )
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.sim.world import World
 
 FIRST_HALF = 12  # nodes towards the first speed target

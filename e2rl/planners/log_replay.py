@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 

@@ -18,7 +18,7 @@ from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath
 from e2rl.planners.pdm_score import SCORED_STEPS, Others, score
 from e2rl.planners.scoring import nearest
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.recording import DT, OTHER
 from e2rl.scenes.route import project

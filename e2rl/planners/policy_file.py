@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from e2rl.planners.actor import ObservingEgo
 from e2rl.planners.plausibility import finite
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
 from e2rl.run.files import read_regular, write_atomically
-from e2rl.run.settings import configured, setting
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 SUFFIX = ".pt"

@@ -19,7 +19,7 @@ from e2rl.planners.chunks import PLANNER_KEYS, chunks
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import BRAKING, MissionPath
 from e2rl.planners.scoring import Weights, forecast, nearest, score
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
 from e2rl.sim import dynamics

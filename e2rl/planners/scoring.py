@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from e2rl.planners.candidates import Candidates
-from e2rl.run.settings import setting
+from e2rl.run.config import setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import MAX_CURVATURE, constant_velocity, wrap

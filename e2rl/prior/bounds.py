@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, LaneState
+from e2rl.run.config import configured, setting
 from e2rl.run.fused import fused
-from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import constant_velocity

@@ -16,9 +16,9 @@ from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.prior import Prior
 from e2rl.prior.sde import SamplerSettings
+from e2rl.run.config import settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
-from e2rl.run.settings import settings_of
 from e2rl.run.weights import read_weights, unlike, weight_bytes
 
 FORMAT = "e2rl-prior/1"

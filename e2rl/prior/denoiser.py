@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import NoiseSchedule
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
 from e2rl.run.fused import Fused, is_on
-from e2rl.run.settings import configured, setting
 
 
 @configured("prior/default", "network")

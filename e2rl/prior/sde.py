@@ -15,8 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.run.config import configured, setting
 from e2rl.run.fused import Fused
-from e2rl.run.settings import configured, setting
 
 # Noise level of the last of `steps` steps, times steps, where levels are spaced by
 # log(alpha / sigma).

@@ -8,31 +8,24 @@ computes nothing.
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 from tabulate import tabulate
 
-from e2rl.evaluation.check import SEARCH
 from e2rl.evaluation.modes import OTHER
-from e2rl.evaluation.rollout_files import ATLAS_FILE, ERRORED_FILE
-from e2rl.metrics.atlas import CELL
+from e2rl.evaluation.rollout_files import ERRORED_FILE, TABLE
+from e2rl.evaluation.summary import Headline, headline
 from e2rl.metrics.catalogue import METRICS
+from e2rl.metrics.errored import lost, raised
 from e2rl.report.comparison_tables import by_ego
-from e2rl.report.headline import (
-    errored_lines,
-    plural,
-    row_headline,
-    touched_lines,
-    traffic_name,
-    unit_of,
-)
-from e2rl.report.tables import UNKNOWN, number
+from e2rl.report.tables import UNKNOWN, grouped, number, plural
 from e2rl.run.terminal import column_groups, terminal_width
 
 LINES = 25
 WEAKNESSES = 3  # lines of failure modes
 MOST_ROWS = 10  # of a comparison
-MOST_CELLS = 7  # of an atlas
 HEADLINES = 3  # of traffic and egos
 KINDS = {  # of failures, the first leads
     "preventable": "cfr_preventable",
@@ -46,19 +39,16 @@ COLUMNS = {  # of a comparison
     "realism": "real",
     PER_DISTANCE: "counted_per_km",
 }
-CHANGES = {  # rows of the comparison of before and after
-    "hit": "cfr",
-    "preventable": "cfr_preventable",
-    "count": "cfr_counted",
-    "progress [m]": "progress",
-    "clean": "cfr_clean",
-    PER_DISTANCE: "counted_per_km",
-}
-OTHERS = {"people touched": "cfr_vru", "objects touched": "cfr_object"}
 COUNTS = (
     "preventable: a careful and competent driver would have had none; clean: besides, "
     "nobody else did wrong; count: preventable, or the ego's fault."
 )
+NAMED = 12  # scenes of a message that a summary names
+MESSAGES = 3  # that a summary names
+TOUCHED = {"cfr_vru": "a pedestrian or cyclist", "cfr_object": "an object"}
+Row = Mapping[str, Any]  # of rollouts.csv
+RATES = ("cfr", "cfr_counted", "cfr_preventable")  # of a group, in words
+SEARCHED = "Tries go where failures are: rates of tries are no rates of the planner."
 FEW = "No intervals: they need scenes of at least ten places."
 
 
@@ -98,83 +88,183 @@ def answer_lines(
     return [*lines[: LINES - len(last)], *last]
 
 
-def compared_answer(
-    before: Sequence[dict],
-    after: Sequence[dict],
-    atlases: tuple[Mapping, Mapping] | None = None,
-    folder: Path | None = None,
-) -> list[str]:
-    """Returns the lines that say what training changed: the ego before and after it,
-    side by side.
+# --- the headline, and what errored
+
+
+def traffic_name(row: Row) -> str:
+    """Such as `e2 at η=2` or `nominal`."""
+    return f"{row['method']} at η={row['eta']:g}" if row["eta"] else row["method"]
+
+
+def headline_text(headline: Headline, ego: str, traffic: str) -> str:
+    """The headline of an ego in a traffic, in a sentence or two."""
+    where = f"{ego} under {traffic}"
+    scenes = plural(headline.scenes, "scene")
+    ways = f", in {plural(headline.ways, 'way')}" if headline.ways else ""
+    effort = ""
+    if headline.searches:
+        effort = f", within {headline.tries:.1f} tries ({headline.nfe:.0f} NFE) a scene"
+        if headline.searches > 1:
+            effort += f" and each of {headline.searches} searches"
+    if not headline.raised:
+        return (
+            f"{where}: preventable failures in {headline.preventable} of "
+            f"{scenes}{ways}{effort}."
+        )
+    return (
+        f"{where}: preventable failures, or it raised, in {headline.failed} of "
+        f"{scenes}{effort}; preventable failures in {headline.preventable} of "
+        f"{headline.scenes}{ways}; it raised in {headline.raised} of {headline.scenes}."
+    )
+
+
+def row_headline(row: Row) -> str:
+    """The headline of a row of metrics.json, "" where it has none."""
+    if not row.get("headline"):
+        return ""
+    headline = Headline(**row["headline"])
+    return headline_text(headline, row["ego"], traffic=traffic_name(row))
+
+
+def unit_of(row: Row, count: int = 2) -> str:
+    """What the rates of events of a row of metrics.json are of, for so many of them."""
+    if row.get("searched") and row["n_seeds"] > 1:
+        return "searches of a scene"
+    return ("scene" if row.get("searched") else "rollout") + "s" * (count != 1)
+
+
+def errored_lines(rows: Sequence[dict], named: int = NAMED) -> list[str]:
+    """What errored: how many rollouts, whose they are, and a line for each message and
+    traffic with its scenes.
 
     Args:
-        before: rows of metrics.json of the stage `before`.
-        after: rows of the stage `after`, which are paired with those before under the
-            name `before`.
-        atlases: of both stages (`evaluation.modes.group_atlas`); None: nothing was
-            searched for.
-        folder: of the run, which holds tables.md.
+        rows: of all rollouts.
+        named: so many scenes of each line, and MESSAGES of the messages; 0: all.
     """
-    earlier = {(row["method"], row["eta"]): row for row in before}
-    pairs = [
-        (earlier[row["method"], row["eta"]], row)
-        for row in after
-        if (row["method"], row["eta"]) in earlier
-    ]
-    last = closing(after, folder)
-    lines = atlas_lines(before=atlases[0], after=atlases[1]) if atlases else []
-    if pairs:
-        last = wrapped(COUNTS) + last
-        metrics = CHANGES | {
-            title: name
-            for title, name in OTHERS.items()
-            if any(tally(row, name) for row in (*before, *after))
-        }
-        if atlases:  # which leave room for the traffic at the ends
-            strongest = max(new["eta"] for _, new in pairs)
-            pairs = [pair for pair in pairs if pair[1]["eta"] in (0, strongest)]
-        table = [["", "before", "after", "difference"]]
-        for title, name in metrics.items():
-            for old, new in pairs:
-                label = f"{title}, {traffic_name(new)}"
-                table.append(
-                    [label, cell(old, name), cell(new, name), difference(new, name)]
-                )
-        lines += columns(table[: max(2, LINES - len(lines) - len(last))])
-    return [*lines[: LINES - len(last)], *last]
-
-
-def atlas_lines(before: Mapping, after: Mapping) -> list[str]:
-    """The cells of two atlases with their numbers of scenes, those of most scenes
-    before first."""
-    old, new = (
-        {tuple(cell[name] for name in CELL): cell["scenes"] for cell in atlas["atlas"]}
-        for atlas in (before, after)
-    )
-    cells = sorted(
-        {*old, *new}, key=lambda cell: (-old.get(cell, 0), -new.get(cell, 0), cell)
-    )
-    failed = [
-        f"{atlas['failed_scenes']} of {plural(atlas['scenes'], 'scene')}"
-        for atlas in (before, after)
-    ]
-    gone = sum(1 for cell in cells if not new.get(cell))
-    added = sum(1 for cell in cells if not old.get(cell))
-    lines = wrapped(
-        f"A search finds preventable failures in {failed[0]} before training, in "
-        f"{plural(before['cells'], 'way')}, and in {failed[1]} after it, in "
-        f"{plural(after['cells'], 'way')}: {gone} are gone, {added} are new.",
-    )
-    rows = [
-        [", ".join(filter(None, cell)), str(old.get(cell, 0)), str(new.get(cell, 0))]
-        for cell in cells[:MOST_CELLS]
-    ]
-    if rows:
-        lines += columns([["scenes that fail so", "before", "after"], *rows])
-    if len(cells) > MOST_CELLS:
-        rest = len(cells) - MOST_CELLS
-        lines.append(f"... and {rest} more in {{before,after}}/{SEARCH}/{ATLAS_FILE}")
+    lines = []
+    kinds = {
+        "The planner raised in {}, its failures:": raised,
+        "The traffic raised in {}, left out:": lost,
+    }
+    for text, is_kind in kinds.items():
+        errored = list(filter(is_kind, rows))
+        if not errored:
+            continue
+        share = f"{len(errored)} of {plural(len(rows), 'rollout')}"
+        lines.append(text.format(share))
+        groups = grouped(errored, lambda row: (row["error"], traffic_name(row)))
+        ranked = sorted(groups.items(), key=lambda item: -len(item[1]))
+        shown = MESSAGES if named else len(ranked)
+        for (message, traffic), group in ranked[:shown]:
+            scenes = scenes_text(group, named)
+            lines.append(f"{message} ({len(group)} under {traffic}): {scenes}")
+        if rest := len(ranked[shown:]):
+            lines.append(f"and {plural(rest, 'other message')} in {ERRORED_FILE}")
     return lines
+
+
+def touched_lines(rows: Iterable[dict], shown: bool = False) -> list[str]:
+    """In how many rollouts each ego touched a pedestrian or cyclist, or an object, a
+    line for each of the two where any did. Headlines, verdicts and failures are of
+    contacts with vehicles.
+
+    Args:
+        rows: of all rollouts.
+        shown: of a run with a failure report, which lacks them; else their scenes are
+            named.
+    """
+    egos = grouped(rows, itemgetter("ego_policy"))
+    return [
+        touched_text([row for row in group if row.get(column) in (0, 1)], column, shown)
+        for column in TOUCHED
+        for group in egos.values()
+        if any(row.get(column) == 1 for row in group)
+    ]
+
+
+def touched_text(rows: Sequence[dict], column: str, shown: bool) -> str:
+    """`touched_lines` of the rows of one ego, which know the column of TOUCHED."""
+    attacks_first = sorted(rows, key=lambda row: not row["eta"])
+    groups = grouped(attacks_first, traffic_name)
+    touching = {
+        name: [row for row in group if row[column] == 1]
+        for name, group in groups.items()
+    }
+    names = [name for name in groups if touching[name] or len(groups) <= 2]
+    counts = [
+        f"{len(touching[name])} of {plural(len(groups[name]), 'rollout')} under {name}"
+        for name in names
+    ]
+    text = f"{rows[0]['ego_policy']} touched {TOUCHED[column]} in {', '.join(counts)}"
+    if shown:
+        return f"{text}; the failure report lacks them, see {column} in {TABLE}."
+    named = NAMED if len(names) <= 2 else MESSAGES
+    places = [
+        f"{name} in " * (len(names) > 1) + scenes_text(touching[name], named, TABLE)
+        for name in names
+        if touching[name]
+    ]
+    return f"{text}: {'; '.join(places)}."
+
+
+def scenes_text(rows: Iterable[dict], named: int, file: str = ERRORED_FILE) -> str:
+    """The scenes of rows with the seeds of each, such as `a (seeds 0, 1), b (seed 0)`;
+    named: so many, 0: all; file: that has the others."""
+    scenes = grouped(rows, itemgetter("scene_id"))
+    most = named or None
+    texts = []
+    for scene, group in list(scenes.items())[:most]:
+        seeds = [str(row["seed"]) for row in group]
+        rest = ", ..." * (0 < named < len(seeds))
+        word = "seed" if len(seeds) == 1 else "seeds"
+        texts.append(f"{scene} ({word} {', '.join(seeds[:most])}{rest})")
+    others = len(scenes) - len(texts)
+    rest = f" and {plural(others, 'other scene')} in {file}" if others else ""
+    return ", ".join(texts) + rest
+
+
+def group_lines(
+    group: Row, rows: Sequence[dict], metrics: Sequence[dict], searched: bool
+) -> tuple[dict[str, str], list[str]]:
+    """Returns the RATES of one ego in one traffic in words, and the lines about it: its
+    headline, its rates and what to know of them.
+
+    Args:
+        group: of modes.json.
+        rows: of its rollouts.
+        metrics: rows of metrics.json; where they know the group in a pool only, its
+            rates are not known.
+        searched: the rollouts are tries.
+    """
+    traffic = traffic_name(group)
+    lines = [
+        headline_text(headline(rows, searched), group["ego_policy"], traffic=traffic)
+    ]
+    rates = {
+        name: f"{share(row, name)} {unit_of(row)} ({rate(row, name)})"
+        for row in metrics
+        if (row["ego"], row["method"], row["eta"])
+        == (group["ego_policy"], group["method"], group["eta"])
+        for name in RATES
+        if row["metrics"].get(name, {}).get("n")
+    }
+    crashed = any(map(raised, rows))
+    if "cfr" in rates:
+        lines.append(f"It was hit{', or raised,' * crashed} in {rates['cfr']}.")
+    if "cfr_counted" in rates:
+        lines.append(
+            f"It has a failure that counts in {rates['cfr_counted']}: its fault, or a "
+            f"competent driver prevents it{', or it raised' * crashed}."
+        )
+    if "interval" not in rates.get("cfr", "interval"):
+        lines.append(FEW)
+    if searched:
+        lines.append(SEARCHED)
+    lines += touched_lines(rows, shown=True)
+    lines += [
+        f"{line.rstrip(':')}." for line in errored_lines(rows) if line.endswith(":")
+    ]
+    return rates, lines
 
 
 # --- egos, methods and intensities
@@ -373,20 +463,6 @@ def cell(row: dict, name: str) -> str:
     if not METRICS[name].fraction or share(row, name) == UNKNOWN:
         return value(row, name)
     return f"{per_cent(row['metrics'][name]['mean'])} ({share(row, name)})"
-
-
-def difference(row: dict, name: str) -> str:
-    """The paired difference to `before`, such as `-20 [-28, -12]`: points of per cent,
-    or rates per 1,000 km."""
-    change = (row["paired"].get("before") or {}).get(name)
-    metric = METRICS[name]
-    if not change or math.isnan(change["difference"]):
-        return UNKNOWN
-    scale = 100 if metric.fraction else 1000 if metric.per else 1
-    middle, low, high = (
-        f"{scale * change[end]:+,.0f}" for end in ("difference", "low", "high")
-    )
-    return middle if math.isnan(change["low"]) else f"{middle} [{low}, {high}]"
 
 
 def value(row: dict, name: str) -> str:

@@ -8,18 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.evaluation.comparison import CHANGES, PAIR, RATES, Driven, compared
-from e2rl.evaluation.headline import headline
 from e2rl.evaluation.rollout_files import cell, json_text
+from e2rl.evaluation.summary import headline
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.failure_modes import Row, is_failure, mode_name
-from e2rl.report.answer import FEW, paragraphs
-from e2rl.report.failure_tracks import replay_data
-from e2rl.report.headline import (
+from e2rl.report.answer import (
+    FEW,
     errored_lines,
     headline_text,
+    paragraphs,
     touched_lines,
     traffic_name,
 )
+from e2rl.report.failure_tracks import replay_data
 from e2rl.report.html import ASSETS, COLUMNS, page, rounded
 from e2rl.report.tables import difference_cell
 from e2rl.run.files import csv_text, write_atomically, write_beside

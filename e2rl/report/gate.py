@@ -14,13 +14,13 @@ from typing import Any
 from scipy.optimize import brentq
 
 from e2rl.evaluation.comparison import RATES, Driven, difference
-from e2rl.evaluation.headline import headline
+from e2rl.evaluation.summary import headline
 from e2rl.metrics.catalogue import METRICS, Metric
 from e2rl.metrics.errored import raised
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.statistics import LEAST, cluster_index, exact_interval, summarise
-from e2rl.report.headline import headline_text, plural, traffic_name
-from e2rl.report.tables import estimate
+from e2rl.report.answer import headline_text, traffic_name
+from e2rl.report.tables import estimate, plural
 from e2rl.run.errors import InputError
 
 PASSED = "passed"
@@ -138,8 +138,8 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
     ended = [row[metric.source] for row in rows if not raised(row)]
     if not count or (ended and all(map(math.isnan, ended))):
         raise InputError(
-            f"{text}: {driven.run} knows no {rule.rate}; searches know no progress, "
-            "runs of earlier versions no contacts_object"
+            f"{text}: {driven.run} knows no {rule.rate}, as searches know no progress; "
+            "leave the rule out"
         )
     every = driven.traffic()[key]
     crashed = sum(map(raised, rows))

@@ -14,52 +14,39 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import repeat
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from e2rl.evaluation.headline import headline
-from e2rl.evaluation.modes import OTHER, read_modes
-from e2rl.evaluation.rollout_files import (
-    ERRORED_FILE,
-    METRICS_FILE,
-    MODES_FILE,
-    TABLE,
-    cell,
-    nulls,
-    own_folder,
-    read_metrics,
-    read_run,
-)
+from omegaconf import DictConfig
+
+from e2rl.evaluation.modes import OTHER
+from e2rl.evaluation.record import Record
+from e2rl.evaluation.rollout_files import TABLE, cell, nulls, own_folder
 from e2rl.metrics.atlas import CELL, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import raised
 from e2rl.metrics.failure_modes import is_failure
-from e2rl.report.answer import FEW, rate, share
+from e2rl.report.answer import group_lines
 from e2rl.report.failure_tracks import replay_data
-from e2rl.report.headline import (
-    errored_lines,
-    grouped,
-    headline_text,
-    touched_lines,
-    traffic_name,
-    unit_of,
-)
 from e2rl.report.tables import (
     Table,
     column_names,
+    grouped,
     metric_tables,
 )
 from e2rl.run.config import assigned
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically, write_beside
-from e2rl.run.trust import CONFIG, read_yaml
-from e2rl.search.tries_file import TRIES_FILE
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_key, rollout_name
 
 PAGE = "failures.html"
 REPLAYS = 300  # in the page at most
 ASSETS = Path(__file__).parents[1] / "assets" / "report"
 GROUP = ("ego_policy", "method", "eta")
+group_key = itemgetter(*GROUP)
 ENDINGS = ("errored", "raised_by", "error")  # of rollouts.csv, the last in failures.csv
 COLUMNS = (  # of rollouts.csv, in failures.csv and in the page's index and facts
     "scene_id",
@@ -88,14 +75,11 @@ COLUMNS = (  # of rollouts.csv, in failures.csv and in the page's index and fact
 )
 PLOTTED = ("cfr", "cfr_counted", "real", "real_adv")
 AGAIN = "Drive it again"
-RATES = ("cfr", "cfr_counted", "cfr_preventable")  # of a group, in words
-SEARCHED = "Tries go where failures are: rates of tries are no rates of the planner."
 
 
 def write_report(
     run: Path,
-    metrics: Sequence[dict] | None = None,
-    modes: Mapping | None = None,
+    record: Record | None = None,
     tables: Sequence[Table] | None = None,
     replays: int = REPLAYS,
     methods: Sequence[str] = (),
@@ -105,9 +89,8 @@ def write_report(
     file of the same name that ends in .csv; returns the page's path.
 
     Args:
-        run: the folder, with its rollouts and their table.
-        metrics: content of metrics.json; None: of the folder.
-        modes: content of modes.json; None: of the folder.
+        run: the folder, with its rollouts.
+        record: what the run found; None: as its folder says.
         tables: to show; None: those of the metrics and modes.
         replays: at most so many failures are shown moving.
         methods: only their failures; (): those of all.
@@ -116,27 +99,19 @@ def write_report(
     Raises:
         InputError: where files of the run are missing, or no method has the name.
     """
-    if metrics is None:
-        if not (run / METRICS_FILE).is_file():
-            raise InputError(
-                f"{run}: no {METRICS_FILE}: the run is not finished, or none of its "
-                f"rollouts could be scored, as {ERRORED_FILE} says then; `e2rl gate` "
-                f"and `e2rl compare` read its {TABLE}"
-            )
-        metrics = read_metrics(run / METRICS_FILE)
-    if modes is None:
-        modes = read_modes(run / MODES_FILE)
+    record = record or Record.read(run)
     if tables is None:
-        tables = metric_tables(metrics)
-    content = page_content(run, metrics, modes=modes, methods=methods)
+        tables = metric_tables(record.metrics)
+    content = page_content(run, record, methods)
     rows = content.pop("rows")
     entries = content["failures"]
     order = replay_order(entries)[:replays]
     for number, position in enumerate(order):
         entries[position]["replay"] = number
-    failures = ((Failure.read(run, rows[position]), None) for position in order)
+    shown = [rows[position] for position in order]
+    failures = map(partial(Failure.read, run), shown)  # one at a time in memory
     content["tables"] = list(map(vars, tables))
-    content |= replay_data(failures, len(order))
+    content |= replay_data(zip(failures, repeat(None)), len(order))
     path = path or own_folder(run, PAGE)
     write_beside(path, ".csv", content=failure_list(content, path.name))
     scripts = sorted(ASSETS.glob("*.js"), key=lambda file: file.stem == "page")
@@ -193,15 +168,12 @@ def page(
     return re.sub("{{([A-Z]+)}}", lambda field: parts[field[1]], whole)
 
 
-def page_content(
-    run: Path, metrics: Sequence[dict], *, modes: Mapping, methods: Sequence[str]
-) -> dict[str, Any]:
+def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str, Any]:
     """The data block without tables and replays.
 
     Args:
         run: the folder.
-        metrics: of metrics.json.
-        modes: of modes.json.
+        record: what the run found.
         methods: whose failures are shown; (): all.
 
     Returns:
@@ -210,6 +182,10 @@ def page_content(
     Raises:
         InputError: for a run without closed-loop rollouts, or an unknown method.
     """
+    metrics = record.metrics
+    modes = record.modes
+    every = record.rollouts
+    searched = record.searched
     names = dict.fromkeys(group["method"] for group in modes["groups"])
     if not (names and metrics):
         raise InputError(
@@ -222,8 +198,6 @@ def page_content(
                 f"--method {name}: not in {run / TABLE}; choose among "
                 f"{', '.join(names)}"
             )
-    searched = (run / TRIES_FILE).is_file()
-    every = read_run(run)
     rollouts = grouped(every, group_key)
     groups = {}
     for group, label in zip(
@@ -233,15 +207,12 @@ def page_content(
             continue
         key = group_key(group)
         rows = rollouts.get(key, [])
-        in_words = rates(group, metrics, searched=searched)
-        lead = headline_text(
-            headline(rows, searched), group["ego_policy"], traffic=traffic_name(group)
-        )
+        rates, lines = group_lines(group, rows, metrics=metrics, searched=searched)
         groups[key] = {
             "ego": group["ego_policy"],
             "label": label,
-            "rates": in_words,
-            "summary": [lead, *remarks(rows, in_words, searched=searched)],
+            "rates": rates,
+            "summary": lines,
             **{name: group[name] for name in ("method", "eta", "rollouts", "failures")},
             "raised": sum(map(raised, rows)),
         }
@@ -254,7 +225,11 @@ def page_content(
     facts = ("dataset", "split", "n_scenes", "git", "command")
     return {
         "run": {name: first[name] for name in facts} | {"stage": first.get("stage")},
-        "commands": commands(run, any("~" in rollout_key(row) for row in failures)),
+        "commands": commands(
+            run,
+            record.config,
+            quoted=any("~" in rollout_key(row) for row in failures),
+        ),
         "groups": list(groups.values()),
         "modes": mode_names,
         "cells": [dict(zip(CELL, cell, strict=True)) for cell in cells],
@@ -281,61 +256,16 @@ def page_content(
     }
 
 
-def group_key(row: Mapping) -> tuple:
-    return tuple(row[name] for name in GROUP)
-
-
-def rates(group: Mapping, metrics: Sequence[dict], searched: bool) -> dict[str, str]:
-    """The RATES of a group of modes.json in words; {} where metrics.json knows the
-    group in a pool only, or knows rates of its tries, as earlier versions wrote them.
-    """
-    return {
-        name: f"{share(row, name)} {unit_of(row)} ({rate(row, name)})"
-        for row in metrics
-        if group_key(row | {"ego_policy": row["ego"]}) == group_key(group)
-        and row.get("searched", False) == searched
-        for name in RATES
-        if row["metrics"].get(name, {}).get("n")
-    }
-
-
-def remarks(
-    rows: Sequence[dict], rates: Mapping[str, str], searched: bool
-) -> list[str]:
-    """The page's first lines about the rollouts of a group of modes.json, after its
-    headline: its rates and what to know of them; searched: they are tries."""
-    crashed = ", or it raised" if any(map(raised, rows)) else ""
-    lines = []
-    if "cfr" in rates:
-        raised_too = ", or raised," if crashed else ""
-        lines.append(f"It was hit{raised_too} in {rates['cfr']}.")
-    if "cfr_counted" in rates:
-        lines.append(
-            f"It has a failure that counts in {rates['cfr_counted']}: its fault, or a "
-            f"competent driver prevents it{crashed}."
-        )
-    if "interval" not in rates.get("cfr", "interval"):
-        lines.append(FEW)
-    if searched:
-        lines.append(SEARCHED)
-    lines += touched_lines(rows, shown=True)
-    lines += [
-        f"{line.rstrip(':')}." for line in errored_lines(rows) if line.endswith(":")
-    ]
-    return lines
-
-
-def commands(run: Path, quoted: bool) -> dict[str, str]:
-    """Commands about the failure @NAME@ of a run, by what they do; quoted: names that
-    Hydra takes in quotes only."""
+def commands(run: Path, config: DictConfig | None, quoted: bool) -> dict[str, str]:
+    """Commands about the failure @NAME@ of a run, by what they do; config: of the
+    evaluation, if it is one; quoted: names that Hydra takes in quotes only."""
     path = str(run)
     if run.resolve().is_relative_to(Path.cwd()):
         path = os.path.relpath(run)
     lines = {}
-    if (run / CONFIG).is_file():  # an evaluation's
-        saved = read_yaml(run / CONFIG)
+    if config is not None:
         # One failure, driven again, has no tries.
-        whole = saved.get("reproduce") if saved.get("failure") else path
+        whole = config.get("reproduce") if config.get("failure") else path
         name = 'failure="@NAME@"' if quoted else "failure=@NAME@"
         lines[AGAIN] = ["e2rl", "evaluate", assigned("reproduce", whole), name]
     export = ["e2rl", "export", path, "--to", "openscenario", "--failure", "@NAME@"]
@@ -364,10 +294,9 @@ def failure_entries(
         `typical`, and the `worst` of its group; its `cell`, a position in the atlas
         (None: not preventable), and `rank`, 0 for the likeliest of all.
     """
-    worst = {
-        rollout_key(max(group, key=severity))
-        for group in grouped(rows, group_key).values()
-    }
+    worst: dict[tuple, str] = {}
+    for row in sorted(rows, key=severity, reverse=True):
+        worst.setdefault(group_key(row), rollout_key(row))
     likeliest = sorted(
         range(len(rows)), key=lambda position: by_likelihood(rows[position])
     )
@@ -384,7 +313,7 @@ def failure_entries(
                 "replay": None,
                 "cell": cells.index(cell) if cell else None,
                 "rank": ranks[position],
-                "worst": rollout_key(row) in worst,
+                "worst": rollout_key(row) in worst.values(),
             }
         )
     return entries

@@ -7,9 +7,10 @@ the differences to the first.
 
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
@@ -18,10 +19,10 @@ from e2rl.metrics.catalogue import (
     Metric,
     table_metrics,
 )
-from e2rl.report.headline import grouped, plural
 from e2rl.run.files import write_atomically
 from e2rl.run.terminal import column_groups, terminal_width
 
+Key = TypeVar("Key")
 UNKNOWN = "–"
 MEANS = "Mean [95% interval, by location or scene]; (n) rollouts where fewer count."
 PAIRED = "[95% interval], paired by (scene, seed); * the interval leaves out 0."
@@ -322,3 +323,18 @@ def legend() -> str:
     return "\n".join(
         f"{metric.name.ljust(width)}  {metric.about}" for metric in METRICS.values()
     )
+
+
+# --- words and groups
+
+
+def plural(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 else 's'}"
+
+
+def grouped(rows: Iterable[dict], key: Callable[[dict], Key]) -> dict[Key, list[dict]]:
+    """The rows by their key, in the order of its first row."""
+    groups: dict[Key, list[dict]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups

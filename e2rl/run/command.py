@@ -17,12 +17,12 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from e2rl.run.config import conf_folder
 from e2rl.run.endings import REFUSED, ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import alone_in
 from e2rl.run.options import check_keys, help_text, wrong_option
 from e2rl.run.run import Run, how_to_go_on
-from e2rl.run.settings import conf_folder
 
 # elsewhere Hydra keeps backslashes as they are
 BEFORE_QUOTE = re.compile(r"(\\+)(?='|\Z)")

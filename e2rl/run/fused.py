@@ -18,7 +18,7 @@ import shutil
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache, cached_property, lru_cache
@@ -32,45 +32,96 @@ from torch import Tensor, nn
 from e2rl.run.errors import InputError
 from e2rl.run.files import cache_folder, locked, write_atomically
 
-Shape = (
-    str | tuple[str, ...]
-)  # of a tensor or of all of a dataclass, or of each of them
-
+# of a tensor, or of all of a dataclass, or of each of them
+Shape = str | tuple[str, ...]
 FUSED: dict[str, "Fused"] = {}
 """All fused functions of the modules that are imported, by name."""
 COMPILES = "2.13"  # the version of PyTorch that all fused functions were compiled with
 COMPILERS = ("c++", "g++", "clang++")
 VECTOR = 8  # components of a vector, at most
-SIZES = (
-    17,
-    19,
-    23,
-    29,
-    31,
-    37,
-    41,
-    43,
-    47,
-    53,
-    59,
-    61,
-)  # of tensors that a function is traced with: distinct primes
+# of tensors that a function is traced with: distinct primes
+SIZES = (17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61)
 _on = False
+
+
+class Declared(NamedTuple):
+    """What is declared of a tensor of a fused function.
+
+    Args:
+        sizes: names of those that vary, numbers of those that do not.
+        dtype: of its values.
+        apart: a vector, of which compiled code reads component by component.
+        truth: compiled code reads truth values as 0 and 1.
+    """
+
+    sizes: list[Any]
+    dtype: torch.dtype
+    apart: bool
+    truth: bool
+
+    @classmethod
+    def of(cls, shape: str) -> "Declared":
+        """Returns what one shape says (`Fused`)."""
+        names, _, dtype = shape.removesuffix("!").partition(":")
+        sizes = [int(size) if size.isdigit() else size for size in names.split()]
+        last = sizes[-1] if len(sizes) > 1 else None
+        as_it_lies = shape.endswith("!")
+        return cls(
+            sizes,
+            getattr(torch, dtype or "float32"),
+            apart=isinstance(last, int) and last <= VECTOR and not as_it_lies,
+            truth=dtype == "bool" and not as_it_lies,
+        )
+
+    def laid_out(self, value: Tensor) -> Tensor:
+        """Returns the tensor as compiled code reads it."""
+        if self.truth:
+            value = value.float()
+        if self.apart:
+            value = value.movedim(-1, 0)
+        return value.contiguous()
+
+    def restored(self, value: Tensor) -> Tensor:
+        """Returns the tensor that was laid out."""
+        if self.truth:
+            value = value > 0
+        return value.movedim(0, -1) if self.apart else value
+
+    def example(self, size: Mapping[Any, int]) -> Tensor:
+        """Returns zeros as compiled code reads them, of these sizes."""
+        sizes = [size.get(name, name) for name in self.sizes]
+        dtype = torch.float32 if self.truth else self.dtype
+        zeros = torch.zeros(sizes, dtype=dtype)
+        return zeros.movedim(-1, 0).contiguous() if self.apart else zeros
+
+    def dynamic(self) -> dict[int, Any]:
+        """Returns the dimensions that vary, as compiled code reads them."""
+        shift = int(self.apart)
+        return {
+            position + shift: torch.export.Dim.DYNAMIC
+            for position, name in enumerate(self.sizes)
+            if isinstance(name, str)
+        }
 
 
 class Fused:
     """A function of tensors, compiled where `switch` is on: on the CPU, of the types
     declared, without gradients.
 
-    shapes: of each argument, names of sizes that vary and numbers that do not, then ":"
-    and a type (float32 by default). Equal names are equal sizes. The shape of a
-    dataclass or a named tuple is that of all its tensors, or one for each, those of
-    what it holds in their order. Vectors, of few numbers, are copied component by
-    component, so that loops over rows are contiguous, and truth values as 0 and 1; "!"
-    leaves both as they lie, as is better for tables. Where a size is 0, or anything is
-    not as declared, the function runs as it is. settings: on which the function depends
-    besides, which their `repr` tells apart; constants: so many tensors at the end, such
-    as weights, are always as declared, and not looked at.
+    Where a size is 0, or anything is not as declared, the function runs as it is. It
+    takes tensors, and dataclasses and named tuples of them, by position.
+
+    Args:
+        function: returns a tensor, or a tuple, a named tuple or a dataclass of them.
+        shapes: of each argument, names of sizes that vary and numbers that do not, then
+            ":" and a type (float32 by default). Equal names are equal sizes. The shape
+            of a dataclass or a named tuple is that of all its tensors, or one for each,
+            those of what it holds in their order. Vectors, of few numbers, are copied
+            component by component, so that loops over rows are contiguous, and truth
+            values as 0 and 1; "!" leaves both as they lie, as is better for tables.
+        settings: on which the function depends besides, which their `repr` tells apart.
+        constants: so many tensors at the end, such as weights, are always as declared,
+            and not looked at.
     """
 
     def __init__(
@@ -88,36 +139,33 @@ class Fused:
         self.__doc__ = function.__doc__
         FUSED[self.name] = self
 
-    def __call__(self, *given: Any) -> Any:
-        """What the function returns: a tensor, or a tuple, a named tuple or a dataclass
-        of them."""
+    def __call__(self, *arguments: Any) -> Any:
+        """Returns what the function returns."""
         if not is_on():
-            return self.function(*given)
-        flat = _tensors(given)
-        varied = len(flat) - self.constants
-        if not self._fits(flat[:varied]):
-            return self.function(*given)
+            return self.function(*arguments)
+        tensors = tensors_of(arguments)
+        varied = len(tensors) - self.constants
+        if not self._fits(tensors[:varied]):
+            return self.function(*arguments)
         read = [
-            tensor.laid_out(value)
-            for tensor, value in zip(self.declared, flat[:varied], strict=False)
+            declared.laid_out(value)
+            for declared, value in zip(self.declared, tensors[:varied], strict=False)
         ]
-        results = self._run(read + flat[varied:])
-        return (
-            results[0]
-            if self.returns is Tensor
-            else self.returns(*results)
-            if _made(self.returns)
-            else tuple(results)
-        )
+        results = self._run(read + tensors[varied:])
+        returned = self.kinds["return"]
+        if returned is Tensor:
+            return results[0]
+        return returned(*results) if holds_tensors(returned) else tuple(results)
 
-    def _fits(self, flat: list[Tensor]) -> bool:
-        if [value.dtype for value in flat] != self._types[: len(flat)] or flat[
-            0
-        ].is_cuda:
+    def _fits(self, tensors: list[Tensor]) -> bool:
+        """Whether tensors are as declared."""
+        if [value.dtype for value in tensors] != self._types[: len(tensors)]:
             return False
-        if torch.is_grad_enabled() and any(value.requires_grad for value in flat):
+        if tensors[0].is_cuda:
             return False
-        return self._sizes_fit(tuple([value.shape for value in flat]))
+        if torch.is_grad_enabled() and any(value.requires_grad for value in tensors):
+            return False
+        return self._sizes_fit(tuple([value.shape for value in tensors]))
 
     @cached_property
     def _sizes_fit(self) -> Callable[[tuple[torch.Size, ...]], bool]:
@@ -126,14 +174,14 @@ class Fused:
 
         @lru_cache(4096)
         def fit(shapes: tuple[torch.Size, ...]) -> bool:
-            size: dict[Any, int] = {}
-            for shape, (names, *_) in zip(shapes, self.declared, strict=False):
-                if len(shape) != len(names):
+            size: dict[str, int] = {}
+            for shape, declared in zip(shapes, self.declared, strict=False):
+                if len(shape) != len(declared.sizes):
                     return False
-                for name, length in zip(names, shape, strict=True):
-                    if length == 0 or length != (
-                        name if isinstance(name, int) else size.setdefault(name, length)
-                    ):
+                for name, length in zip(declared.sizes, shape, strict=True):
+                    if isinstance(name, str):
+                        name = size.setdefault(name, length)
+                    if length == 0 or length != name:
                         return False
             return True
 
@@ -141,68 +189,38 @@ class Fused:
 
     @cached_property
     def _types(self) -> list[torch.dtype]:
-        return [tensor.kind for tensor in self.declared]
+        return [declared.dtype for declared in self.declared]
 
     @cached_property
-    def kinds(self) -> list[Any]:
-        """The type of each argument."""
-        kinds = [
-            kind
-            for name, kind in get_type_hints(self.function).items()
-            if name != "return"
-        ]
-        return kinds + kinds[-1:] * (
-            len(self.shapes) - len(kinds)
-        )  # the last may be any number of tensors
+    def kinds(self) -> dict[str, Any]:
+        """The type of each argument, and of what is returned."""
+        return get_type_hints(self.function)
 
     @cached_property
-    def returns(self) -> Any:
-        """The type of the result."""
-        return get_type_hints(self.function)["return"]
+    def taken(self) -> list[Any]:
+        """The type of each argument, of which the last may be any number of tensors."""
+        kinds = [kind for name, kind in self.kinds.items() if name != "return"]
+        return kinds + kinds[-1:] * (len(self.shapes) - len(kinds))
 
     @cached_property
-    def declared(self) -> list["_Declared"]:
-        """What is said of each tensor."""
-        declared = []
-        for shapes, kind in zip(self.shapes, self.kinds, strict=True):
-            for shape in (
-                (shapes,) * _count(kind) if isinstance(shapes, str) else shapes
-            ):
-                sizes, _, name = shape.removesuffix("!").partition(":")
-                names = [
-                    int(size) if size.isdigit() else size for size in sizes.split()
-                ]
-                apart = (
-                    len(names) > 1
-                    and isinstance(names[-1], int)
-                    and names[-1] <= VECTOR
-                    and shape[-1] != "!"
-                )
-                truth = name == "bool" and shape[-1] != "!"
-                declared.append(
-                    _Declared(
-                        names,
-                        getattr(torch, name or "float32"),
-                        apart=apart,
-                        truth=truth,
-                    )
-                )
+    def declared(self) -> list[Declared]:
+        """What is declared of each tensor."""
+        declared: list[Declared] = []
+        for shapes, kind in zip(self.shapes, self.taken, strict=True):
+            if isinstance(shapes, str):
+                shapes = (shapes,) * count_of(kind)
+            declared += map(Declared.of, shapes)
         return declared
 
     @cached_property
     def file(self) -> Path:
         """Where the compiled function lies."""
         mark = hashlib.sha256(repr((machine(), self.shapes, self.settings)).encode())
-        for module in sorted(
-            _sources(sys.modules[self.function.__module__]),
-            key=lambda module: module.__name__,
-        ):
+        modules = sources_of(sys.modules[self.function.__module__])
+        for module in sorted(modules, key=lambda module: module.__name__):
             mark.update(Path(str(module.__file__)).read_bytes())
-        return (
-            cache_folder()
-            / "fused"
-            / f"{self.function.__qualname__}-{mark.hexdigest()[:32]}.so"
-        )
+        name = f"{self.function.__qualname__}-{mark.hexdigest()[:32]}.so"
+        return cache_folder() / "fused" / name
 
     @cached_property
     def _run(self) -> Callable[[list[Tensor]], list[Tensor]]:
@@ -217,81 +235,62 @@ class Fused:
         check_compiler("compile")
         self.file.parent.mkdir(parents=True, exist_ok=True)
         with locked(self.file.with_suffix(".lock")):
-            if not self.file.exists():
-                try:
-                    self._compile()
-                except (InputError, OSError):  # of the cache
-                    raise
-                except (
-                    Exception
-                ) as error:  # not pickled between processes, and hundreds of lines long
-                    first = str(error).partition("\n")[0]
-                    why = f"{type(error).__name__}: {first}"
-                    raise InputError(
-                        f"compile=true: torch {torch.__version__} cannot compile "
-                        f"{self.name} ({why}); take "
-                        f"torch {COMPILES}, with which all were compiled, or set compile=false"
-                    ) from None
+            if self.file.exists():
+                return
+            try:
+                self._compile()
+            except (InputError, OSError):  # of the cache
+                raise
+            except Exception as error:  # which no process could send, of many lines
+                reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+                raise InputError(
+                    f"compile=true: torch {torch.__version__} cannot compile "
+                    f"{self.name} ({reason}); take torch {COMPILES}, with which all "
+                    "were compiled, or set compile=false"
+                ) from None
 
     def _compile(self) -> None:
         package = io.BytesIO()
         settings = {"cpp.threads": 1}  # processes run beside each other
-        with _tracing():
+        with tracing():
             torch._inductor.aoti_compile_and_package(
                 self.traced(), package_path=package, inductor_configs=settings
             )
-        with zipfile.ZipFile(
-            package
-        ) as whole:  # the library alone: packages are unpacked anew by every process
-            (library,) = (name for name in whole.namelist() if name.endswith(".so"))
-            write_atomically(self.file, whole.read(library))
+        # the library alone: packages are unpacked anew by every process
+        with zipfile.ZipFile(package) as archive:
+            (library,) = (name for name in archive.namelist() if name.endswith(".so"))
+            write_atomically(self.file, archive.read(library))
 
     def traced(self) -> torch.export.ExportedProgram:
         """Returns the function as a graph of tensors, as they are laid out, of every
         size."""
-        free = sorted(
-            {
-                name
-                for tensor in self.declared
-                for name in tensor.sizes
-                if isinstance(name, str)
-            }
-        )
-        size: dict[Any, int] = dict(zip(free, SIZES, strict=False))
-        examples = []
-        dynamic = []
-        for names, kind, apart, truth in self.declared:
-            names = [names[-1], *names[:-1]] if apart else names
-            kind = torch.float32 if truth else kind
-            examples.append(
-                torch.zeros([size.get(name, name) for name in names], dtype=kind)
-            )
-            dynamic.append(
-                {
-                    at: torch.export.Dim.DYNAMIC
-                    for at, name in enumerate(names)
-                    if name in size
-                }
-            )
+        names = {
+            name
+            for declared in self.declared
+            for name in declared.sizes
+            if isinstance(name, str)
+        }
+        size = dict(zip(sorted(names), SIZES, strict=False))
+        examples = tuple(declared.example(size) for declared in self.declared)
+        dynamic = tuple(declared.dynamic() for declared in self.declared)
         module = _Module(self)
-        with _tracing():
+        with tracing():
             with switched_off():
                 module(*examples)  # fills the caches of constants
-            return torch.export.export(
-                module, tuple(examples), dynamic_shapes=(tuple(dynamic),)
-            )
+            return torch.export.export(module, examples, dynamic_shapes=(dynamic,))
 
 
 @contextmanager
-def _tracing() -> Iterator[None]:
-    """Tensors of size 1 are like others, and nothing is said of what is slow."""
+def tracing() -> Iterator[None]:
+    """Let tensors of size 1 be like others in the block, and say nothing of what is
+    slow."""
     sizes_of_1 = torch.fx.experimental._config.patch(backed_size_oblivious=True)  # type: ignore[attr-defined]
     with torch.no_grad(), sizes_of_1, warnings.catch_warnings(action="ignore"):
         yield
 
 
 def fused(*shapes: Shape) -> Callable[[Callable[..., Any]], Fused]:
-    """Decorator: makes a Fused of a function of tensors of these shapes."""
+    """Returns a decorator that makes a Fused of a function of tensors of these shapes."""
     return lambda function: Fused(function, shapes)
 
 
@@ -303,7 +302,7 @@ def switch(on: bool) -> None:
 
 @contextmanager
 def switched_off() -> Iterator[None]:
-    """Fused functions run as plain PyTorch meanwhile."""
+    """Let fused functions run as plain PyTorch in the block."""
     before = _on
     switch(False)
     try:
@@ -313,34 +312,30 @@ def switched_off() -> Iterator[None]:
 
 
 def is_on() -> bool:
-    """Whether fused functions run compiled, now; what is being compiled is not in
-    parts."""
+    """Returns whether fused functions run compiled; what is being compiled does not,
+    part by part."""
     return _on and not torch.compiler.is_compiling()
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """`a.bmm(b)` of few numbers each, which is no call of its own in what is compiled."""
-    return (
-        (a[..., None] * b[:, None]).sum(2)
-        if torch.compiler.is_compiling()
-        else a.bmm(b)
-    )
+    """Returns `a.bmm(b)` of few numbers each, which is no call of its own in what is
+    compiled."""
+    if torch.compiler.is_compiling():
+        return (a[..., None] * b[:, None]).sum(2)
+    return a.bmm(b)
 
 
 def some(truths: Tensor) -> Tensor:
-    """`truths.any(1)`, by a maximum in what is compiled."""
-    return (
-        torch.where(truths, 1.0, 0.0).amax(1) > 0
-        if torch.compiler.is_compiling()
-        else truths.any(1)
-    )
+    """Returns `truths.any(1)`, by a maximum in what is compiled."""
+    if torch.compiler.is_compiling():
+        return torch.where(truths, 1.0, 0.0).amax(1) > 0
+    return truths.any(1)
 
 
 def has_compiler() -> bool:
-    """Whether there is a C++ compiler."""
-    return any(
-        name and shutil.which(name) for name in (os.environ.get("CXX"), *COMPILERS)
-    )
+    """Returns whether there is a C++ compiler."""
+    names = filter(None, (os.environ.get("CXX"), *COMPILERS))
+    return any(map(shutil.which, names))
 
 
 def check_compiler(option: str) -> None:
@@ -353,116 +348,95 @@ def check_compiler(option: str) -> None:
 
 
 class _Module(nn.Module):
-    """A fused function, from tensors to tensors."""
+    """A fused function, from tensors as compiled code reads them to tensors."""
 
     def __init__(self, fused: Fused) -> None:
         super().__init__()
         self.fused = fused
 
-    def forward(self, *flat: Tensor) -> Any:
-        rest = iter(
+    def forward(self, *tensors: Tensor) -> Any:
+        restored = iter(
             [
-                tensor.as_given(value)
-                for value, tensor in zip(flat, self.fused.declared, strict=True)
+                declared.restored(value)
+                for value, declared in zip(tensors, self.fused.declared, strict=True)
             ]
         )
-        return tuple(
-            _tensors(
-                self.fused.function(*(_built(kind, rest) for kind in self.fused.kinds))
-            )
-        )
+        arguments = [packed(kind, restored) for kind in self.fused.taken]
+        return tuple(tensors_of(self.fused.function(*arguments)))
 
 
-class _Declared(NamedTuple):
-    """A tensor of a fused function: its sizes, its type, and whether vectors come
-    component by component, and truth values as 0 and 1."""
-
-    sizes: list[Any]
-    kind: torch.dtype
-    apart: bool
-    truth: bool
-
-    def laid_out(self, value: Tensor) -> Tensor:
-        """The tensor as compiled code reads it."""
-        if self.apart or self.truth:
-            value = value.float() if self.truth else value
-            value = value.movedim(-1, 0) if self.apart else value
-        return value.contiguous()
-
-    def as_given(self, value: Tensor) -> Tensor:
-        """The tensor that was laid out."""
-        value = value > 0 if self.truth else value
-        return value.movedim(0, -1) if self.apart else value
+# --- dataclasses and named tuples of tensors
 
 
-def _made(kind: Any) -> bool:
-    """Whether a type is a dataclass or a named tuple."""
+def holds_tensors(kind: Any) -> bool:
+    """Returns whether a type is a dataclass or a named tuple."""
     return is_dataclass(kind) or hasattr(kind, "_fields")
 
 
-def _kinds(kind: Any) -> list[Any]:
-    """The types of what a dataclass or a named tuple holds."""
-    return [get_type_hints(kind)[name] for name in _names(kind)]
+@cache
+def names_of(kind: Any) -> tuple[str, ...]:
+    """Returns the names of what a dataclass or a named tuple holds."""
+    if is_dataclass(kind):
+        return tuple(part.name for part in fields(kind))
+    return kind._fields
 
 
-def _count(kind: Any) -> int:
-    return sum(map(_count, _kinds(kind))) if _made(kind) else 1
+def kinds_of(kind: Any) -> list[Any]:
+    """Returns the types of what a dataclass or a named tuple holds."""
+    hints = get_type_hints(kind)
+    return [hints[name] for name in names_of(kind)]
 
 
-def _built(kind: Any, rest: Iterator[Tensor]) -> Any:
-    return (
-        kind(*(_built(part, rest) for part in _kinds(kind)))
-        if _made(kind)
-        else next(rest)
-    )
+def count_of(kind: Any) -> int:
+    """Returns how many tensors a type holds."""
+    return sum(map(count_of, kinds_of(kind))) if holds_tensors(kind) else 1
 
 
-def _tensors(value: Any) -> list[Tensor]:
+def packed(kind: Any, tensors: Iterator[Tensor]) -> Any:
+    """Returns the next of some tensors as a type."""
+    if not holds_tensors(kind):
+        return next(tensors)
+    parts = [packed(part, tensors) for part in kinds_of(kind)]
+    return kind(*parts)
+
+
+def tensors_of(value: Any) -> list[Tensor]:
+    """Returns the tensors that a tensor, a tuple or a dataclass holds, in their order."""
     if isinstance(value, Tensor):
         return [value]
+    parts = value
+    if is_dataclass(value):
+        kind: Any = type(value)
+        parts = [getattr(value, name) for name in names_of(kind)]
     tensors = []
-    kind: Any = type(value)
-    for part in (
-        [getattr(value, name) for name in _names(kind)]
-        if is_dataclass(value)
-        else value
-    ):
+    for part in parts:
         if isinstance(part, Tensor):
             tensors.append(part)
         else:
-            tensors += _tensors(part)
+            tensors += tensors_of(part)
     return tensors
 
 
-@cache
-def _names(kind: Any) -> list[str]:
-    """The names of what a dataclass or a named tuple holds."""
-    return (
-        [part.name for part in fields(kind)]
-        if is_dataclass(kind)
-        else list(kind._fields)
-    )
+# --- what machine code depends on
 
 
 @cache
 def machine() -> tuple[str, ...]:
-    """What machine code depends on: PyTorch, the system and the processor's
-    instructions."""
+    """Returns PyTorch's version, the system and the processor's instructions."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
-    flags = next(
-        (line for line in lines if line.startswith("flags")), platform.processor()
-    )
-    return torch.__version__, platform.platform(), flags
+    flags = [line for line in lines if line.startswith("flags")]
+    return torch.__version__, platform.platform(), (*flags, platform.processor())[0]
 
 
-def _sources(
-    module: ModuleType, found: frozenset[ModuleType] = frozenset()
+def sources_of(
+    module: ModuleType, visited: frozenset[ModuleType] = frozenset()
 ) -> frozenset[ModuleType]:
-    """The package's modules whose names a module uses, itself and theirs among them."""
-    found |= {module}
+    """Returns the package's modules whose names a module uses, itself and theirs among
+    them, besides those that were visited."""
+    visited |= {module}
     names = {getattr(value, "__module__", None) for value in vars(module).values()}
-    for name in sorted(str(name) for name in names):
-        if name.split(".")[0] == "e2rl" and sys.modules[name] not in found:
-            found = _sources(sys.modules[name], found)
-    return found
+    for name in sorted(map(str, names)):
+        if name.split(".")[0] == "e2rl" and sys.modules[name] not in visited:
+            visited = sources_of(sys.modules[name], visited)
+    return visited

@@ -8,10 +8,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.run.config import as_a_list, choices, load_config
+from e2rl.run.config import as_a_list, choices, conf_folder, load_config
 from e2rl.run.endings import program
 from e2rl.run.errors import InputError
-from e2rl.run.settings import conf_folder
 from e2rl.run.trust import nodes
 
 READERS = {  # of data sets

@@ -38,7 +38,7 @@ from e2rl.run.files import (
     sha256_of,
     write_atomically,
 )
-from e2rl.run.parts import PARTS, Parts
+from e2rl.run.parts import PARTS
 from e2rl.run.trust import (
     ALWAYS,
     CONFIG,
@@ -142,13 +142,10 @@ class Run:
                 "hydra.run.dir=FOLDER"
             )
 
-    def parts(self, stage: str = "", about: str = "") -> Parts:
-        """Returns the parts of a stage that are on disk."""
-        return Parts(self.folder, stage, about=about)
-
-    def begin(self, scenes: Mapping[str, tuple[str, str]]) -> None:
+    def begin(self, scenes: Mapping[str, tuple[str, str]]) -> dict[str, str]:
         """Write what the run was begun with; or where it goes on, compare with that.
-        Other versions are told on stderr.
+        Other versions are told on stderr. Returns `git` and `command` of the run's
+        rows.
 
         Args:
             scenes: of each set of scenes, by its name, what
@@ -172,14 +169,16 @@ class Run:
             "files": {name: files for name, (_, files) in scenes.items()},
         }
         if self.config.resume:
-            self._compare(json.loads(json.dumps(provenance)))
-            return
-        write_atomically(self.folder / CONFIG, OmegaConf.to_yaml(self.config))
+            return self._compare(json.loads(json.dumps(provenance)))
+        files = {str(CONFIG): OmegaConf.to_yaml(self.config)}
         for name, (text, _) in scenes.items():
-            write_atomically(self.folder / f"{name.replace(' ', '_')}.csv", text)
-        self._write(provenance)
+            files[f"{name.replace(' ', '_')}.csv"] = text
+        files[PROVENANCE] = json.dumps(provenance, indent=1)
+        for name, text in files.items():
+            write_atomically(self.folder / name, text)
+        return _origin(provenance)
 
-    def _compare(self, present: Mapping[str, Any]) -> None:
+    def _compare(self, present: Mapping[str, Any]) -> dict[str, str]:
         provenance = read_provenance(self.folder)
         for kind in ("inputs", "settings"):
             if names := changed(provenance[kind], present[kind]):
@@ -198,10 +197,8 @@ class Run:
                 file=sys.stderr,
             )
             provenance["versions"].append(here)
-            self._write(provenance)
-
-    def _write(self, provenance: Mapping[str, Any]) -> None:
-        write_atomically(self.folder / PROVENANCE, json.dumps(provenance, indent=1))
+            write_atomically(self.folder / PROVENANCE, json.dumps(provenance, indent=1))
+        return _origin(provenance)
 
 
 def how_to_go_on(config: DictConfig) -> str:
@@ -246,12 +243,15 @@ def read_provenance(folder: Path) -> dict[str, Any]:
         ) from error
 
 
-def origin_of(folder: Path) -> dict[str, Any]:
+def origin_of(folder: Path) -> dict[str, str]:
     """Returns `git` and `command` of a run's rows: as it was begun; several commits
     where it went on with others."""
     if not (Path(folder) / PROVENANCE).is_file():
         return {"git": git_commit(), "command": command_line()}
-    provenance = read_provenance(folder)
+    return _origin(read_provenance(folder))
+
+
+def _origin(provenance: Mapping[str, Any]) -> dict[str, str]:
     commits = dict.fromkeys(version["git"] for version in provenance["versions"])
     return {"git": ", ".join(commits), "command": provenance["command"]}
 
@@ -299,7 +299,7 @@ def versions(config: DictConfig) -> dict[str, str]:
 def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
     """Yields (name, hash) of every file that a configuration names, (name, content) of
     files in conf/ that it names."""
-    plain = resolved(config)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
     for group in (*READ_OTHERWISE, "resume"):
         plain.pop(group, None)
     for key, value in leaves(plain):

@@ -14,11 +14,11 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 from tensordict import TensorDict
 
-from e2rl.run.errors import InputError
-from e2rl.run.settings import (
+from e2rl.run.config import (
     configured,
     setting,
 )
+from e2rl.run.errors import InputError
 from e2rl.scenes import boxes
 from e2rl.scenes.drivable_area import DrivableArea
 from e2rl.scenes.headings import (

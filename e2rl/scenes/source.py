@@ -53,7 +53,14 @@ import numpy as np
 from hydra.utils import get_class
 from tqdm import tqdm
 
-from e2rl.run.config import Extension
+from e2rl.run.config import (
+    Extension,
+    check_range,
+    check_settings,
+    file_values,
+    setting,
+    settings_of,
+)
 from e2rl.run.errors import InputError
 from e2rl.run.extras import how_to_install
 from e2rl.run.files import cache_folder
@@ -61,13 +68,6 @@ from e2rl.run.processes import (
     interrupts_held,
     without_main,
     worker_pool,
-)
-from e2rl.run.settings import (
-    check_range,
-    check_settings,
-    file_values,
-    setting,
-    settings_of,
 )
 from e2rl.run.terminal import Bar
 from e2rl.scenes.builder import (

@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import torch
 
-from e2rl.run.config import Extension
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import Extension, configured, setting
 from e2rl.search.portfolio import Portfolio
 from e2rl.search.tries import Family, Try
 
@@ -33,10 +32,8 @@ class SearchSettings:
 
     cover: int = setting(low=1)
     growth: float = setting(low=0, high=1)
-    stratified: bool = setting()
     bandit: bool = setting()
     again: float = setting(low=0, high=1)
-    climb: bool = setting()
 
 
 class Outcome(NamedTuple):
@@ -124,7 +121,10 @@ class Search(Extension):
         for position, family in pairs:
             scene = active[position]
             if left[scene] > 0:
-                drawn.append(self._draw(scene, family, number=tried[scene]))
+                attempt = self.families[family].draw(
+                    scene, tried[scene], seed=self.seed_of(scene)
+                )
+                drawn.append(attempt)
                 tried[scene] += 1
                 left[scene] -= 1
         return drawn
@@ -145,20 +145,19 @@ class Search(Extension):
     def tell(self, tries: Sequence[Try], outcomes: Sequence[Outcome]) -> None:
         """Learn what became of tries that were asked for."""
         families = [family.name for family in self._portfolio.families]
-        climb = self.settings.climb
         for attempt, outcome in zip(tries, outcomes, strict=True):
             scene = attempt.scene
             kind = outcome.kind
             failed = self._has_failure(scene)
             new = bool(kind) and (not failed or kind not in self.cells)
             reward = 1.0 if new else 0.0
-            if climb and not new and not failed:
+            if not new and not failed:
                 reward = NEAR * min(max(outcome.margin, 0.0), 1.0)
             self._portfolio.tell(
                 scene,
                 families.index(attempt.family),
                 reward=reward,
-                margin=outcome.margin if climb else 0.0,
+                margin=outcome.margin,
                 nfe=outcome.nfe,
             )
             if new and not failed:  # other failures of this scene are searched for
@@ -170,15 +169,6 @@ class Search(Extension):
 
     def _has_failure(self, scene: int) -> bool:
         return any(outcome.kind for outcome in self.outcomes[scene])
-
-    def _draw(self, scene: int, family: int, number: int) -> Try:
-        """The next try of a family in a scene, the scene's `number`-th."""
-        return self.families[family].draw(
-            scene,
-            number,
-            seed=self.seed_of(scene),
-            stratified=self.settings.stratified,
-        )
 
     def seed_of(self, scene: int) -> int:
         """Returns the seed of the draws of a scene."""

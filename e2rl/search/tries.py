@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from e2rl.run.config import check_choice
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_choice
 from e2rl.traffic.decisions import RULE, WHOM, Decisions
 
 TRIES = 10_000  # of a scene that have seeds of their own
@@ -59,24 +59,15 @@ class Family:
     chance: float = 0.1
     nfe: float = 160.0
 
-    def draw(self, scene: int, number: int, *, seed: int, stratified: bool) -> Try:
+    def draw(self, scene: int, number: int, seed: int) -> Try:
         """Returns the try `number` of a scene; reproducible from the seed of the
-        scene's search.
-
-        Args:
-            scene: its position.
-            number: of the try in the scene.
-            seed: of the scene's search.
-            stratified: the decisions of consecutive tries of a scene, of whatever
-                families, follow the additive recurrence of square roots of primes, and
-                so look elsewhere than those before.
-        """
-        draw_seed = seed if stratified else seed + 7919 * (number + 1)
-        generator = torch.Generator().manual_seed(draw_seed)
+        scene's search. The decisions of consecutive tries of a scene, of whatever
+        families, follow the additive recurrence of square roots of primes, and so look
+        elsewhere than those before."""
+        generator = torch.Generator().manual_seed(seed)
         draw = torch.rand(len(DRAWN), generator=generator, dtype=torch.float64)
-        if stratified:
-            steps = torch.tensor(PRIMES, dtype=torch.float64).sqrt()
-            draw = (draw + number * steps) % 1
+        steps = torch.tensor(PRIMES, dtype=torch.float64).sqrt()
+        draw = (draw + number * steps) % 1
         return self.attempt(scene, number, seed=seed, draw=draw)
 
     def attempt(self, scene: int, number: int, *, seed: int, draw: Tensor) -> Try:

@@ -88,12 +88,7 @@ def failures_of(
                 "make the whole search again"
             )
         scene = setup.scenes.index(scene_id)
-        drawn = families[family].draw(
-            scene,
-            number,
-            seed=search.seed_of(scene),
-            stratified=method.settings.stratified,
-        )
+        drawn = families[family].draw(scene, number, seed=search.seed_of(scene))
         tries.setdefault(seed, []).append(drawn)
     batches = []
     for seed, drawn_tries in tries.items():

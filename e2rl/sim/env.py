@@ -9,8 +9,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.mission import Mission, mission_of, start_place

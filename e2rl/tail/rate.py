@@ -14,8 +14,8 @@ from e2rl.driving.batches import Work, split_tasks
 from e2rl.driving.setup import Method, Setup, Task
 from e2rl.metrics.errored import errored_row, raised
 from e2rl.metrics.score import score_rollouts
+from e2rl.run.config import configured, setting
 from e2rl.run.processes import in_processes
-from e2rl.run.settings import configured, setting
 from e2rl.run.terminal import Bar
 from e2rl.scenes.recording import VEHICLE
 from e2rl.sim.rollouts import Rollouts

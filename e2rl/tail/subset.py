@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.tail.level import CONTACT
 from e2rl.tail.moves import Moves, Proposal
 

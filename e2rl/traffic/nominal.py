@@ -19,7 +19,7 @@ from torch import Tensor
 from e2rl.prior.lane_relative import HORIZON, SIZE, LaneState, locate, select
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.routes import Moment, RoutedScene, reroute
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.dynamics import wrap

@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.metrics.geometry import velocity
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.bounds import Duty
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World

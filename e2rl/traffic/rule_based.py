@@ -27,7 +27,7 @@ from e2rl.prior.lane_relative import (
 )
 from e2rl.prior.prior import STANDING_SPEED, Prior
 from e2rl.prior.routes import RoutedScene, on_map, route_scene, start_state
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.route import SPACING
 from e2rl.sim.leaders import FREE_GAP, IDMParameters, idm_acceleration, leaders
 from e2rl.sim.mission import light_state_at, stop_line_distance

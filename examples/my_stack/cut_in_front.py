@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.traffic.potentials import LENGTH, PotentialSettings, with_ego
 

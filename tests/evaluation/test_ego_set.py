@@ -2,16 +2,13 @@
 configuration."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
 from e2rl.driving.batches import Work, drive_all
 from e2rl.driving.setup import Method, Setup
-from e2rl.evaluation.ego_set import (
-    EgoSet,
-    build_egos,
-    pool_trainings,
-)
+from e2rl.evaluation.build import build_egos
 from e2rl.evaluation.record import record, run_protocol
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.evaluation.summary import metric_rows
@@ -42,22 +39,21 @@ def run(tmp_path_factory):
     """(rows, folder) of one ego, the same again, and two trainings of a faster one."""
     folder = tmp_path_factory.mktemp("run")
     egos = {"one": slow(), "same": slow(), "fast_0": slow(12.0), "fast_1": slow(9.0)}
-    pairs = [("same", "one"), ("fast", "one"), ("fast", "same")]
-    chosen = EgoSet(
-        egos,
-        ["one", "same", "fast"],
-        pairs=pairs,
-        trainings={"fast": ["fast_0", "fast_1"]},
-    )
     scenes = small_scenes(3)
     scenes.location[:] = ["a", "b", "c"]
     scored = drive_all(
-        chosen.setups(setup_of(scenes)),
+        [replace(setup_of(scenes), ego=egos[name], ego_name=name) for name in egos],
         METHODS,
         seeds=[0],
         work=Work(folder / ROLLOUTS),
     )
-    return record(scored, folder, chosen.metric_rows), folder
+    found = record(
+        scored,
+        folder,
+        egos=[("same", "one"), ("fast", "one"), ("fast", "same")],
+        trainings={"fast": ["fast_0", "fast_1"]},
+    )
+    return found.metrics, folder
 
 
 def test_every_ego_has_its_rows_and_files_and_drives_as_if_alone(run, tmp_path):
@@ -125,11 +121,11 @@ def test_trainings_that_differ_widen_the_interval_that_places_alone_do_not():
     second, more = rows_of([20 + 0.01 * place for place in range(-6, 7)], "a_1")
     rows = first + second
     samples = features + more
-    pooled, copies = pool_trainings(rows, samples, trainings={"a": ["a_0", "a_1"]})
+    pooled = {"a": ["a_0", "a_1"]}
     result = {
         row["ego"]: row["metrics"]["progress"]
         for row in metric_rows(
-            rows + pooled, samples + copies, draws=200, realism_draws=2
+            rows, samples, trainings=pooled, draws=200, realism_draws=2
         )
     }
     alone, both = (

@@ -7,7 +7,6 @@ import torch
 from e2rl.driving.setup import Scored
 from e2rl.evaluation.record import record
 from e2rl.evaluation.rollout_files import TABLE, read_rows, write_rows
-from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.metrics.score import score_rollouts
 from e2rl.sim.rollout_file import ROLLOUTS
@@ -41,11 +40,7 @@ def write_run(folder: Path, rollouts: dict[str, Rollouts]) -> Path:
         scores, samples = score_rollouts(driven)
         driven.to_npz(folder / ROLLOUTS)
         scored.add(Scored(scores, samples))
-    record(
-        scored,
-        folder,
-        lambda *given: metric_rows(*given, draws=20, realism_draws=2),
-    )
+    record(scored, folder, draws=20, realism_draws=2)
     return folder
 
 

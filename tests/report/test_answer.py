@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from e2rl.metrics.atlas import CELL
-from e2rl.report.answer import LINES, answer_lines, compared_answer
+from e2rl.report.answer import LINES, answer_lines
+from e2rl.report.before_after import compared_answer
 
 NAN = math.nan
 

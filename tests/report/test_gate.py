@@ -392,20 +392,6 @@ def test_people_and_objects_have_rates_of_their_own(tmp_path, capsys):
     )
 
 
-def test_a_run_that_knows_no_objects_is_gated_by_all_else(tmp_path, capsys):
-    """As those of earlier versions."""
-    run = run_of(
-        tmp_path, [row_of(k, cfr_object=math.nan) for k in range(40)] + [errored(40)]
-    )
-    assert gate(capsys, run, "contacts<=0.2", "contacts_vru<=0.2")[0] == 0
-    status, said = gate(capsys, run, "contacts_object<=0.2")
-    assert status == 2
-    assert (
-        "knows no contacts_object; searches know no progress, runs of earlier versions no"
-        in said
-    )
-
-
 def test_what_the_traffic_raised_is_named_and_counts_neither_way(tmp_path, capsys):
     driven = [row_of(k, hit=k < 8) for k in range(80)]
     run = run_of(tmp_path, driven + [errored(80 + k, "traffic") for k in range(40)])
@@ -415,41 +401,6 @@ def test_what_the_traffic_raised_is_named_and_counts_neither_way(tmp_path, capsy
     assert len(result["errored"]) == 40
     assert "The traffic raised in 40 of 120 rollouts, left out" in said
     assert "scene_119" in said
-
-
-def test_the_errored_rollouts_of_an_earlier_version_s_run_count_as_the_planner_s(
-    tmp_path, capsys
-):
-    """Whose table has no row for them."""
-    run = run_of(tmp_path, [row_of(k) for k in range(40)])
-    lines = (run / "rollouts.csv").read_text().splitlines()
-    (run / "rollouts.csv").write_text(
-        "\n".join(line.rsplit(",", 3)[0] for line in lines)
-    )
-    assert gate(capsys, run, "preventable<=0.3")[0] == 0
-    entries = [
-        row_of(40 + k)
-        | {"reason": "raised KeyError", "detail": "x", "traceback": "a\nb"}
-        for k in range(40)
-    ]
-    names = (
-        "dataset",
-        "split",
-        "method",
-        "ego_policy",
-        "eta",
-        "scene_id",
-        "seed",
-        "reason",
-        "detail",
-        "traceback",
-    )
-    (run / "errored.json").write_text(
-        json.dumps([{name: entry[name] for name in names} for entry in entries])
-    )
-    status, said = gate(capsys, run, "preventable<=0.3")
-    assert status == 1
-    assert "80 rollouts, in 40 of them the planner raised" in said
 
 
 @pytest.mark.parametrize("limit", ["5", "1.01", "41.7", "100", "00002"])

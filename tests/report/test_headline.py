@@ -10,10 +10,10 @@ import sys
 
 import pytest
 
-from e2rl.evaluation.headline import headline
 from e2rl.evaluation.rollout_files import METRICS_FILE, TABLE, read_metrics, read_rows
+from e2rl.evaluation.summary import headline
 from e2rl.metrics.errored import errored_row
-from e2rl.report.headline import errored_lines, headline_text, touched_lines
+from e2rl.report.answer import errored_lines, headline_text, touched_lines
 from e2rl.search.tries import TRIES
 from tests.evaluation.constructed_runs import row_of
 from tests.scripts import ROOT

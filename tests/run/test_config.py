@@ -4,10 +4,9 @@ is told."""
 import pytest
 
 from e2rl.planners.ego import Ego
-from e2rl.run.config import built, choices, load_choice, load_config
+from e2rl.run.config import built, choices, conf_folder, load_choice, load_config
 from e2rl.run.errors import InputError
 from e2rl.run.options import help_text
-from e2rl.run.settings import conf_folder
 from e2rl.traffic.traffic import keep_velocity
 from tests.scripts import call, error_line
 

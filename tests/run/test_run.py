@@ -15,6 +15,7 @@ from e2rl.run.command import new_folder
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 from e2rl.run.files import seal
+from e2rl.run.parts import Parts
 from e2rl.run.run import PROVENANCE, Run, assigned, inputs, origin_of, read_provenance
 from e2rl.run.trust import CONFIG
 from tests.prior.small import small_prior
@@ -43,7 +44,7 @@ def weights(tmp_path):
 
 def test_the_same_run_goes_on(tmp_path, weights):
     run = begin(tmp_path, prior={"checkpoint": str(weights)})
-    run.parts().save("a", [], 1)
+    Parts(run.folder).save("a", [], 1)
     begun = (tmp_path / PROVENANCE).read_bytes()
     again = begin(
         tmp_path,
@@ -53,7 +54,7 @@ def test_the_same_run_goes_on(tmp_path, weights):
         plugins=["json"],
     )
     assert (tmp_path / PROVENANCE).read_bytes() == begun
-    assert again.parts().load("a", []) == 1
+    assert Parts(again.folder).load("a", []) == 1
     assert OmegaConf.load(tmp_path / CONFIG) == run.config
     assert (tmp_path / "scenes.csv").read_text() == SCENES["scenes"][0]
     assert read_provenance(tmp_path)["files"] == {"scenes": "abc"}
@@ -205,11 +206,12 @@ def test_shards_are_joined_and_those_of_another_run_are_refused(tmp_path):
     free = ("processes", "shard")
     for number in range(2):
         run = begin(tmp_path / str(number), free=free, shard=[number, 2])
-        run.parts().save(f"rollouts-{number:06}", [number], number)
+        Parts(run.folder).save(f"rollouts-{number:06}", [number], number)
     assert merge([tmp_path / "0", tmp_path / "1"], tmp_path / "all") == 2
     whole = begin(tmp_path / "all", resume=True, free=free)
     assert [
-        whole.parts().load(f"rollouts-{number:06}", [number]) for number in range(2)
+        Parts(whole.folder).load(f"rollouts-{number:06}", [number])
+        for number in range(2)
     ] == [0, 1]
     begin(tmp_path / "other", free=free, shard=[1, 2], eta=1)
     with pytest.raises(InputError, match="began with another eta"):

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import pytest
 
-from e2rl.run import settings
+from e2rl.run import config
+from e2rl.run.config import configured, setting, settings_of
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting, settings_of
 
 
 @pytest.fixture(autouse=True)
@@ -21,10 +21,10 @@ def conf(tmp_path, monkeypatch):
     for other in ("train.yaml", "sim/default.yaml"):  # whose values others may name
         (tmp_path / other).parent.mkdir(exist_ok=True)
         (tmp_path / other).write_text("device: cpu\n")
-    monkeypatch.setattr(settings, "conf_folder", lambda: tmp_path)
-    settings._loaded.cache_clear()
+    monkeypatch.setattr(config, "conf_folder", lambda: tmp_path)
+    config._loaded.cache_clear()
     yield
-    settings._loaded.cache_clear()
+    config._loaded.cache_clear()
 
 
 @configured("driver/calm", "reach")

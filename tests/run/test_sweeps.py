@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from e2rl.evaluation.check import evaluation_settings
-from e2rl.run.config import check_list, load_config
+from e2rl.run.config import check_list, load_config, set_up
 from e2rl.run.errors import InputError
 from e2rl.run.options import wrong_option
 
@@ -39,7 +38,7 @@ def test_a_text_with_commas_is_refused_for_every_list(key):
     with pytest.raises(
         InputError, match=rf"{key}=1,2: several values are a list, '{key}=\[1,2\]'"
     ):
-        evaluation_settings(load_config("evaluate", [f"{key}='1,2'"]))
+        set_up(load_config("evaluate", [f"{key}='1,2'"]))
 
 
 SWEEP = """

@@ -82,7 +82,7 @@ def test_every_file_of_ones_own_goes_on(tmp_path, group):
             "ego": {"_target_": "e2rl.run.run.subprocess.Popen"}
         },  # by way of a module that imports it
         {
-            "ego": {"_target_": "e2rl.evaluation.ego_set.Ego"}
+            "ego": {"_target_": "e2rl.evaluation.build.Ego"}
         },  # an extension, but not where it is defined
         {"ego": {"_target_": "e2rl.scripts.train.run"}},
         {"ego": {"_target_": "e2rl.no.such.Class"}},

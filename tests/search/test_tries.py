@@ -1,6 +1,7 @@
 """Tries: reproducible from their seed, and spread over their ranges."""
 
 from dataclasses import replace
+from random import Random
 
 import pytest
 
@@ -11,22 +12,18 @@ from e2rl.traffic.decisions import RULE, WHOM, Decisions
 TIMED = Family("timed", "e2", ranges={"moment": (1.0, 5.0), "strength": (0.5, 1.5)})
 
 
-def drawn(count, stratified, family=TIMED, seed=7):
-    return [
-        family.draw(0, number, seed=seed, stratified=stratified)
-        for number in range(count)
-    ]
+def drawn(count, family=TIMED, seed=7):
+    return [family.draw(0, number, seed=seed) for number in range(count)]
 
 
-@pytest.mark.parametrize("stratified", [True, False])
-def test_a_try_is_reproducible_from_its_seed_and_number(stratified):
-    assert drawn(5, stratified) == drawn(5, stratified)
-    assert drawn(5, stratified) != drawn(5, stratified, seed=8)
-    assert len({one.seed for one in drawn(50, stratified)}) == 50
+def test_a_try_is_reproducible_from_its_seed_and_number():
+    assert drawn(5) == drawn(5)
+    assert drawn(5) != drawn(5, seed=8)
+    assert len({one.seed for one in drawn(50)}) == 50
 
 
 def test_decisions_lie_in_their_range_and_others_follow_the_rule():
-    for one in drawn(50, True):
+    for one in drawn(50):
         found = Decisions(*one.decisions)
         assert 1 <= found.moment <= 5
         assert 0.5 <= found.strength <= 1.5
@@ -35,28 +32,32 @@ def test_decisions_lie_in_their_range_and_others_follow_the_rule():
 
 def test_a_family_without_ranges_is_the_rule():
     assert [
-        one.decisions for one in drawn(3, True, family=Family("rule", "e2", ranges={}))
+        one.decisions for one in drawn(3, family=Family("rule", "e2", ranges={}))
     ] == [RULE] * 3
 
 
-def test_stratified_tries_look_elsewhere_than_those_before_of_whatever_family():
+def test_tries_look_elsewhere_than_those_before_of_whatever_family():
     """The largest gap between moments of ten tries of a scene, of two families in turn,
-    is below twice its least, and below that of independent draws."""
+    is below that of independent draws."""
     other = replace(TIMED, name="other")
 
-    def gap(stratified, seed):
-        each = [
-            drawn(10, stratified, family=family, seed=seed)[at::2]
-            for at, family in enumerate((TIMED, other))
-        ]
-        moments = sorted(
-            Decisions(*one.decisions).moment for tries in each for one in tries
-        )
-        return max(b - a for a, b in zip([1.0, *moments], [*moments, 5.0], strict=True))
+    def gap(moments):
+        ordered = sorted(moments)
+        return max(b - a for a, b in zip([1.0, *ordered], [*ordered, 5.0], strict=True))
 
-    spread, loose = ([gap(kind, seed) for seed in range(40)] for kind in (True, False))
-    assert sum(spread) / 40 < 0.8 * sum(loose) / 40
-    assert max(spread) < max(loose)
+    def spread(seed):
+        tries = [
+            drawn(10, family=family, seed=seed)[position::2]
+            for position, family in enumerate((TIMED, other))
+        ]
+        return [Decisions(*one.decisions).moment for one in sum(tries, [])]
+
+    draw = Random(0)
+    independent = [[draw.uniform(1.0, 5.0) for _ in range(10)] for _ in range(40)]
+    gaps = [gap(spread(seed)) for seed in range(40)]
+    loose = list(map(gap, independent))
+    assert sum(gaps) < 0.8 * sum(loose)
+    assert max(gaps) < max(loose)
 
 
 def test_a_family_is_read_from_its_configuration():

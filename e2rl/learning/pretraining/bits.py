@@ -29,9 +29,10 @@ from e2rl.planners.bits_network import (
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import RoutePath
 from e2rl.planners.reference import LAST_ACTION
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
+from e2rl.run.parts import Parts
 from e2rl.run.run import Run, origin_of
-from e2rl.run.settings import configured, setting
 from e2rl.run.terminal import Bar
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
@@ -303,7 +304,9 @@ def run_bits_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     data = windows(scenes, settings.seed)
     training = BitsTraining(network, data, settings=settings)
     run.begin({"scenes": listed(scenes)})
-    row = training.fit("bits", settings.epochs, run.parts("bits"), logger=logger)
+    row = training.fit(
+        "bits", settings.epochs, Parts(run.folder, "bits"), logger=logger
+    )
     origin = {
         "data": f"{scenes.dataset}/{scenes.split}",
         "scenes": len(scenes),

@@ -32,9 +32,10 @@ from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.planners.network import WEIGHTS, ActorCritic
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
+from e2rl.run.parts import Parts
 from e2rl.run.run import Run
-from e2rl.run.settings import configured, setting
 from e2rl.run.terminal import Bar
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
@@ -210,7 +211,7 @@ def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     training = Imitation(ego.network, shown, settings=settings)
     run.begin({"scenes": listed(scenes)})
     row = training.fit(
-        "imitation", settings.epochs, run.parts("imitation"), logger=logger
+        "imitation", settings.epochs, Parts(run.folder, "imitation"), logger=logger
     )
     ego.network.save(run.folder / WEIGHTS)
     return row

@@ -14,10 +14,9 @@ from torch import Tensor, nn
 
 from e2rl.learning.generators import generator_states, restore_generators
 from e2rl.learning.logging import RunLogger
-from e2rl.run.config import resolved
+from e2rl.run.config import Settings, resolved, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
-from e2rl.run.settings import Settings, settings_of
 from e2rl.run.terminal import Bar
 
 STATE = "turns"  # a part of the run

@@ -4,8 +4,8 @@ for the policies before and after it; and the atlas of what a search finds again
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 from e2rl.driving.batches import Work, drive_all
 from e2rl.driving.setup import Method, Setup
@@ -18,7 +18,6 @@ from e2rl.evaluation.rollout_files import (
     read_metrics,
     write_json,
 )
-from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.realism import Samples
 from e2rl.metrics.statistics import paired_differences
 from e2rl.planners.ego import Ego
@@ -61,9 +60,8 @@ class BeforeAfter:
         scored = drive_all([setup], self.methods, seeds=self.seeds, work=work)
         if self.search is not None:
             self._search(self.search, setup, work=work, folder=folder / SEARCH)
-        rows = record(
-            scored, folder, partial(metric_rows, stage=stage, **origin_of(self.folder))
-        )
+        fields: dict[str, Any] = {"stage": stage, **origin_of(self.folder)}
+        rows = record(scored, folder, **fields).metrics
         if stage == "before":
             measured.save(stage, None, (scored.rows, scored.samples))
         elif (before := measured.load("before", None)) is not None:
@@ -92,7 +90,7 @@ class BeforeAfter:
             seeds=self.seeds[:1],
             work=work,
         )
-        record(spent.scored, folder, partial(metric_rows, searched=True))
+        record(spent.scored, folder, searched=True)
         write_tries(folder / TRIES_FILE, spent.tries)
 
     def atlases(self) -> tuple[dict, dict] | None:

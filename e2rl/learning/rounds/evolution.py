@@ -27,7 +27,7 @@ from e2rl.learning.rounds.scheduler import (
 )
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.traffic.pool import TrafficPool
 
 TIMES = ("collect", "steps_per_second")  # of an improvement's metrics

@@ -23,9 +23,8 @@ from e2rl.learning.rounds.teaching import Teacher, TeachingSettings
 from e2rl.learning.rounds.update import Learner, UpdateSettings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
-from e2rl.run.config import built
+from e2rl.run.config import built, configured, setting, settings_of
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting, settings_of
 from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv, SimSettings

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from e2rl.learning.rounds.episodes import Episodes
-from e2rl.run.config import Extension
+from e2rl.run.config import Extension, check_range, configured
 from e2rl.run.errors import InputError
-from e2rl.run.settings import check_range, configured
 
 Choice = dict[str, int | float]  # a row of curriculum.csv
 TEMPERATURE = 2.0  # of ranks: the first tenth of the scenes has a quarter of the draws

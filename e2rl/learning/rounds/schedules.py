@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from e2rl.learning.rounds.scheduler import CurriculumScheduler
-from e2rl.run.settings import check_range, configured
+from e2rl.run.config import check_range, configured
 
 
 @configured("curriculum/constant")

@@ -17,8 +17,8 @@ from e2rl.learning.pretraining.cloning import clip_expert
 from e2rl.planners.ego import Ego
 from e2rl.planners.ego_policy import ask
 from e2rl.planners.sampling import ScoringEgo, ranked_actions
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import touches

@@ -14,7 +14,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from e2rl.learning.pretraining.cloning import mirrored_labels, sampled, teaching_loss
 from e2rl.learning.pretraining.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.sim.prospects import TIMES, time_to_contact
 
 VALUE_MEMORY = 0.95  # weight of the past in the returns' mean and variance, per update

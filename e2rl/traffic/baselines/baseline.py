@@ -10,7 +10,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import SIZE, locate, select
 from e2rl.prior.prior import Context
-from e2rl.run.settings import setting
+from e2rl.run.config import setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.world import World

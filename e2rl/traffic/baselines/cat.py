@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.prior import Context
-from e2rl.run.settings import check_range, configured, setting
+from e2rl.run.config import check_range, configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.baseline import replay_others

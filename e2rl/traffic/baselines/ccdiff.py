@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.baseline import BaselineState, replay_others

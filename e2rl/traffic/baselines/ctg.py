@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.traffic.baselines.baseline import BaselineState
 from e2rl.traffic.baselines.guidance import MeanGuided
 from e2rl.traffic.baselines.losses import (

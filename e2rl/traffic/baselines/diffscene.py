@@ -9,7 +9,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.route import project
 from e2rl.traffic.baselines.guidance import CleanGuidance, guided_samples
 from e2rl.traffic.baselines.losses import (

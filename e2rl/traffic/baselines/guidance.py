@@ -17,8 +17,8 @@ from torch import Tensor
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context, Control, Prior
 from e2rl.prior.sde import Past
+from e2rl.run.config import setting
 from e2rl.run.errors import InputError
-from e2rl.run.settings import setting
 from e2rl.traffic.baselines.baseline import Baseline
 from e2rl.traffic.baselines.view import View, folded, motion_of, pick, tiled
 from e2rl.traffic.nominal import Replan

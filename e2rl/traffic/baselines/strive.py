@@ -15,7 +15,7 @@ from torch import Tensor
 from e2rl.prior.lane_relative import LaneState
 from e2rl.prior.prior import Context, plan_to_x
 from e2rl.prior.sde import DDIM
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.boxes import overlap, to_frame
 from e2rl.scenes.recording import DT
 from e2rl.traffic.baselines.losses import (

@@ -21,8 +21,8 @@ from e2rl.prior.lane_relative import (
     speeds,
 )
 from e2rl.prior.routes import take_route
+from e2rl.run.config import check_range, configured, setting
 from e2rl.run.fused import fused
-from e2rl.run.settings import check_range, configured, setting
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap

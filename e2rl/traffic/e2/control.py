@@ -14,8 +14,8 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
 from e2rl.prior.prior import Context
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting
 from e2rl.traffic.e2.pull import Pull
 
 Denoise = Callable[[Tensor], Tensor]  # x [B, V, SIZE] -> clean estimate [B, V, SIZE]

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE
 from e2rl.prior.prior import Context, Plan, Sample
+from e2rl.run.config import configured, setting, settings_of
 from e2rl.run.errors import InputError
-from e2rl.run.settings import configured, setting, settings_of
 from e2rl.sim.world import World
 from e2rl.traffic.decisions import ANY, RULE, eligible
 from e2rl.traffic.e2.anchoring import Anchor, AnchorSettings

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.route import interpolate, project
 from e2rl.sim.mission import mission_of

@@ -18,8 +18,8 @@ from torch import Tensor
 from e2rl.prior import lane_relative
 from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState
 from e2rl.prior.routes import take_route
+from e2rl.run.config import configured, setting
 from e2rl.run.fused import fused
-from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import overlap
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.lane_graph import against_lanes

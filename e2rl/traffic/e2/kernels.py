@@ -23,7 +23,7 @@ from e2rl.prior.lane_relative import (
     SIZE,
     LaneState,
 )
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.lane_graph import against_lanes, packed
 from e2rl.scenes.recording import DT

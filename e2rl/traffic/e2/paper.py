@@ -15,7 +15,7 @@ from torch import Tensor
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
 from e2rl.prior.prior import Context, Prior
 from e2rl.prior.sde import NoiseSchedule
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.traffic.e2.control import Denoise
 from e2rl.traffic.potentials import (
     SAMPLED_STEPS,

@@ -21,10 +21,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from e2rl.run.config import library
+from e2rl.run.config import configured, library, setting
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically
-from e2rl.run.settings import configured, setting
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 from e2rl.scenes.route import SPACING, interpolate, project

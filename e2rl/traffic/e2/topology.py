@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from e2rl.run.settings import configured, setting
+from e2rl.run.config import configured, setting
 from e2rl.traffic.cliques import Clique, cliques_in, weight_of
 from e2rl.traffic.motion import smallest
 

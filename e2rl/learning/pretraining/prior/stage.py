@@ -19,9 +19,9 @@ from e2rl.prior.bounds import BoundSettings
 from e2rl.prior.denoiser import DenoiserSettings
 from e2rl.prior.prior import Prior
 from e2rl.prior.sde import SamplerSettings
+from e2rl.run.config import settings_of
 from e2rl.run.parts import Parts
 from e2rl.run.run import Run, origin_of
-from e2rl.run.settings import settings_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed, scene_hashes
 from e2rl.scenes.source import load_scenes

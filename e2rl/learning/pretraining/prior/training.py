@@ -32,9 +32,9 @@ from e2rl.prior.checkpoint import save_prior
 from e2rl.prior.denoiser import Denoiser
 from e2rl.prior.prior import Prior
 from e2rl.prior.routes import candidate_features, start_of
+from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
-from e2rl.run.settings import configured, setting
 from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
 
