@@ -35,7 +35,7 @@ LATE = Family("late", "e2", ranges={"patience": 2.0})
 
 def setup_of():
     return Setup(
-        scenes(3),
+        scenes(3, steps=10),
         IDMEgo(),
         ego_name="idm",
         sim=SimSettings(),

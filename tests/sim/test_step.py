@@ -1,4 +1,4 @@
-"""A compiled step and observation are the eager ones."""
+"""A compiled step, and the graph of the observation, are the eager ones."""
 
 import pytest
 import torch
@@ -9,6 +9,7 @@ from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import features
 from e2rl.sim.step import drive
 from tests.synthetic import make_scenes
+from tests.traffic.test_fusing import traced
 
 
 def outcomes(
@@ -46,12 +47,13 @@ def test_a_compiled_step_is_the_eager_one(
     monkeypatch,
 ):
     called = set()
-    for each in (features, drive):
-        monkeypatch.setitem(
-            each.__dict__,
-            "_run",
-            lambda flat, run=each._run, name=each.name: called.add(name) or run(flat),
-        )
+    compiled_step = drive._run
+    monkeypatch.setitem(
+        vars(drive),
+        "_run",
+        lambda flat: called.add(drive.name) or compiled_step(flat),
+    )
+    monkeypatch.setitem(vars(features), "_run", traced(features, called))
     eager, other = (
         outcomes(
             batch,
