@@ -9,7 +9,7 @@ fits a machine, is the command line's own.
 import json
 import math
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,28 +32,14 @@ from e2rl.run.trust import ALWAYS, WRITTEN, check_written, leaves, saved_configu
 from e2rl.scenes.scene_list import SCENES
 from e2rl.sim.rollout_file import rollout_key
 
-HERE = (
-    "processes",
-    "data.cache",
-    "data.cache_gb",
-    "data.workers",
-)  # of this machine: always the command line's
-MOVED = (
-    "device",
-    "data.path",
-    *HERE,
-)  # what the command line may set, besides files of weights
+# of this machine: always the command line's
+HERE = ("processes", "data.cache", "data.cache_gb", "data.workers")
+# what the command line may set, besides files of weights
+MOVED = ("device", "data.path", *HERE)
 RESULT = "reproduced.json"
 LISTED = "scenes"  # the name of the scenes in provenance.json
-IDENTITY = (
-    "stage",
-    "dataset",
-    "split",
-    "method",
-    "ego",
-    "eta",
-    "training",
-)  # of a row, as far as it has them
+# of a row, as far as it has them
+IDENTITY = ("stage", "dataset", "split", "method", "ego", "eta", "training")
 COUNTS = ("n_scenes", "n_seeds", "n_rollouts", "errored")
 CLOSE = 1e-6  # relative difference: rounding of another machine
 TIME = "seconds_per_rollout"  # the metric of wall time, which is never the same
@@ -64,7 +50,7 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     """Returns the run that the command line asks for; with `config.reproduce` the
     configuration of that run, in a new folder.
 
-    Tells on stderr where versions differ. Raises InputError where there is no finished
+    Says on stderr where versions differ. Raises InputError where there is no finished
     table, where its configuration names code (`e2rl.run.trust`), for weights that are
     others or not there, and for settings that cannot change.
     """
@@ -75,39 +61,40 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     if config.resume or not config.reproduce:
         return Run.of(config, free)
     where = f"reproduce={config.reproduce}"
-    old = Path(config.reproduce).resolve()
+    former = Path(config.reproduce).resolve()
     whole = config.copy()
     whole.failure = None
-    saved = saved_configuration(whole, old, where=where)
-    provenance = read_provenance(old)
-    if missing := [
-        name for name in (METRICS_FILE, SCENES) if not (old / name).is_file()
-    ]:
-        raise InputError(
-            f"{where}: {missing[0]} is missing; give a finished run of evaluate.py that has tables"
-        )
-    read_metrics(old / METRICS_FILE)  # what is damaged is told now, and not at the end
+    saved = saved_configuration(whole, former, where=where)
+    provenance = read_provenance(former)
+    for name in (METRICS_FILE, SCENES):
+        if not (former / name).is_file():
+            raise InputError(
+                f"{where}: {name} is missing; give a finished run of evaluate.py that "
+                "has tables"
+            )
+    read_metrics(former / METRICS_FILE)  # what is damaged is said now, not at the end
     files = {
         name: value
         for name, value in provenance["inputs"].items()
         if "=" in name and isinstance(value, str)
     }
-    _move(
-        config,
-        saved,
-        files=[_key(name) for name in files],
-        choices=provenance["choices"],
-        where=where,
-    )
-    check_written(saved, old, where, config, load_config())
+    choices = provenance["choices"]
+    keys = keys_to_move(config, files=files, choices=choices, where=where)
+    if "data.path" in keys and OmegaConf.select(saved, "data.split") is None:
+        saved.data.split = Path(str(saved.data.path)).stem  # which the path named
+    keys |= {key for key in HERE if OmegaConf.select(saved, key) is not None}
+    for key in keys:
+        OmegaConf.update(saved, key, OmegaConf.select(config, key))
+    check_written(saved, former, where, config, load_config())
     saved.plugins = config.plugins
     saved.resume = None
-    saved.reproduce = str(old)
-    saved.scenes = str(old / SCENES)
+    saved.reproduce = str(former)
+    saved.scenes = str(former / SCENES)
     saved.failure = config.failure or saved.failure
-    _check_weights(config, saved, files=files, where=where)
-    _tell_versions(saved, provenance, where=where)
-    return Run(saved, Run.of(config).folder, choices=provenance["choices"])
+    check_weights(config, saved, files=files, where=where)
+    if differing := other_versions(saved, provenance):
+        print(f"{where}: versions differ: {'; '.join(differing)}", file=sys.stderr)
+    return Run(saved, Run.of(config).folder, choices=choices)
 
 
 def files_of_run(run: Path) -> str:
@@ -115,100 +102,94 @@ def files_of_run(run: Path) -> str:
     return str(read_provenance(run)["files"].get(LISTED, ""))
 
 
-def _move(
+def keys_to_move(
     config: DictConfig,
-    saved: DictConfig,
     files: Collection[str],
     choices: Mapping[str, str],
     where: str,
-) -> None:
-    """Set in `saved` what the command line may set anew."""
-    changed_keys = [
-        item.lstrip("+~").partition("=")[::2]
-        for item in HydraConfig.get().overrides.task
-    ]
-    free = ("reproduce", "failure", *ALWAYS)
-    names = [
-        name
-        for name, value in changed_keys
-        if name not in free and choices.get(name) != value
-    ]
-    if wrong := [name for name in names if name not in (*MOVED, *WRITTEN, *files)]:
+) -> set[str]:
+    """Returns the keys that the command line sets anew.
+
+    Args:
+        config: that of the command line.
+        files: KEY=PATH of those that the run read.
+        choices: the file of each group of the run.
+        where: the option that names the run, for messages.
+
+    Raises:
+        InputError: for a key that cannot be another than the run's.
+    """
+    keys = set()
+    for override in HydraConfig.get().overrides.task:
+        key, _, value = override.lstrip("+~").partition("=")
+        if key not in ("reproduce", "failure", *ALWAYS) and choices.get(key) != value:
+            keys.add(key)
+    fixed = keys.difference(MOVED, WRITTEN, map(setting_of, files))
+    if fixed:
         raise InputError(
-            f"{where}: is made again as it was; leave out {', '.join(wrong)} (only "
-            f"{', '.join(MOVED)} and files of "
-            "weights can be others)"
+            f"{where}: is made again as it was; leave out {', '.join(sorted(fixed))} "
+            f"(only {', '.join(MOVED)} and files of weights can be others)"
         )
-    if (
-        "data.path" in names and OmegaConf.select(saved, "data.split") is None
-    ):  # which names the split otherwise
-        saved.data.split = Path(str(saved.data.path)).stem
-    for name in {
-        *names,
-        *(key for key in HERE if OmegaConf.select(saved, key) is not None),
-    }:
-        OmegaConf.update(saved, name, OmegaConf.select(config, name))
+    return keys
 
 
-def _key(name: str) -> str:
-    """The key of the configuration in the name of an input; of a list's entry the
-    list's."""
+def setting_of(name: str) -> str:
+    """Returns the key of the configuration in the name of an input, KEY=PATH; of a
+    list's entry the list's."""
     key = name.partition("=")[0]
     parent, _, last = key.rpartition(".")
     return parent if last.isdigit() else key
 
 
-def _check_weights(
+def check_weights(
     config: DictConfig, saved: DictConfig, files: Mapping[str, str], where: str
 ) -> None:
-    """InputError where a file that the run's configuration named is another one now, or
-    not there; files: hash of each {key=path: SHA-256}."""
+    """Raises InputError where a file that the run's configuration named is another one
+    now, or not there.
+
+    Args:
+        config: that of the command line.
+        saved: that of the run, with what the command line sets.
+        files: SHA-256 of each KEY=PATH.
+        where: the option that names the run, for messages.
+    """
     present = {name.partition("=")[0]: value for name, value in inputs(saved)}
     for name, value in files.items():
         key = name.partition("=")[0]
-        setting = _key(name)
-        if key == LISTED:
+        setting = setting_of(name)
+        if key == LISTED or present.get(key) == value:
             continue
-        mend = (
-            f"{'++' if OmegaConf.select(config, setting) is None else ''}{setting}=FILE"
-        )
+        plus = "++" if OmegaConf.select(config, setting) is None else ""
+        mend = f"by {plus}{setting}=FILE"
         if key not in present:
             raise InputError(
-                f"{where}: {name}: not there; say where the file lies that the run used, by {mend}"
+                f"{where}: {name}: not there; say where the file lies that the run used, {mend}"
             )
-        if present[key] != value:
-            raise InputError(
-                f"{where}: {key} is another file than the run's {name} (SHA-256 "
-                f"{_short(present[key])} instead of "
-                f"{_short(value)}); give the one that it used, by {mend}"
-            )
+        raise InputError(
+            f"{where}: {key} is another file than the run's {name} (SHA-256 "
+            f"{short(present[key])} instead of {short(value)}); give the one that it "
+            f"used, {mend}"
+        )
 
 
-def _tell_versions(saved: DictConfig, known: Mapping[str, Any], where: str) -> None:
-    """Tell on stderr which versions, and which files in conf/ of methods and egos, are
-    others than the run's."""
-    recorded = known["versions"][-1]
+def other_versions(saved: DictConfig, provenance: Mapping[str, Any]) -> list[str]:
+    """Returns which versions, and which files in conf/ of methods and egos, are others
+    than the run's."""
+    recorded = provenance["versions"][-1]
     installed = versions(saved)
     differing = [
-        f"{name} {_short(recorded.get(name))} then, {_short(installed.get(name))} now"
+        f"{name} {short(recorded.get(name))} then, {short(installed.get(name))} now"
         for name in changed(recorded, installed)
     ]
-    before = {
-        name: value
-        for name, value in known["inputs"].items()
-        if not isinstance(value, str)
-    }
-    here = json.loads(json.dumps(dict(inputs(saved))))
-    differing += [
-        f"conf/{name.replace('=', '/')}.yaml"
-        for name, value in before.items()
-        if here.get(name) != value
-    ]
-    if differing:
-        print(f"{where}: versions differ: {'; '.join(differing)}", file=sys.stderr)
+    present = json.loads(json.dumps(dict(inputs(saved))))
+    for name, content in provenance["inputs"].items():
+        if not isinstance(content, str) and present.get(name) != content:
+            differing.append(f"conf/{name.replace('=', '/')}.yaml")
+    return differing
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """Returns the beginning of a hash or a version."""
     return str(value)[:12] if value else "none"
 
 
@@ -226,20 +207,17 @@ def failure_row(run: Path, name: str) -> dict[str, Any]:
     return rows[name]
 
 
-def outcome(*rows: Mapping[str, Any]) -> str:
+def outcome(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     """Returns whether a failure, then and now, is the same: with whom the ego collides,
     and when."""
-    hits = [
-        f"agent {row['partner']} after {row['contact_time']:.1f} s"
-        if row["cfr"] == 1
-        else "none"
-        for row in rows
-    ]
-    return (
-        f"the same contact: {hits[0]}"
-        if hits[0] == hits[1]
-        else f"another contact: {hits[1]}; it was {hits[0]}"
-    )
+    contacts = ["none", "none"]
+    for position, row in enumerate((before, after)):
+        if row["cfr"] == 1:
+            time = f"{row['contact_time']:.1f} s"
+            contacts[position] = f"agent {row['partner']} after {time}"
+    if contacts[0] == contacts[1]:
+        return f"the same contact: {contacts[0]}"
+    return f"another contact: {contacts[1]}; it was {contacts[0]}"
 
 
 # --- tables
@@ -247,8 +225,13 @@ def outcome(*rows: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Numbers that are equal, that differ by CLOSE at most, and [name, then, now] of
-    those that differ more."""
+    """How the numbers of two tables agree.
+
+    Args:
+        equal: how many are equal.
+        close: how many differ by CLOSE at most.
+        different: (name, then, now) of the others.
+    """
 
     equal: int
     close: int
@@ -259,23 +242,21 @@ class Comparison:
         total = self.equal + self.close + len(self.different)
         if self.equal == total:
             return f"all {total:,} numbers of its tables are equal"
-        said = f"{self.equal:,} of {total:,} numbers of its tables are equal"
+        text = f"{self.equal:,} of {total:,} numbers of its tables are equal"
         if self.close:
-            said += f", {self.close:,} but for a millionth of them (another machine's rounding)"
+            text += f", {self.close:,} but for a millionth of them (another machine's rounding)"
         if not self.different:
-            return said
-        lines = [
-            f"  {name}: {_shown(then)} then, {_shown(now)} now"
-            for name, then, now in self.different[:SHOWN]
-        ]
-        left_over = len(self.different) - len(lines)
-        return "\n".join(
-            [
-                f"{said}; {len(self.different):,} differ:",
-                *lines,
-                *([f"  and {left_over:,} more"] * (left_over > 0)),
-            ]
-        )
+            return text
+        lines = [f"{text}; {len(self.different):,} differ:"]
+        for name, *values in self.different[:SHOWN]:
+            before, after = (
+                f"{value:.6g}" if isinstance(value, float) else value
+                for value in values
+            )
+            lines.append(f"  {name}: {before} then, {after} now")
+        if len(self.different) > SHOWN:
+            lines.append(f"  and {len(self.different) - SHOWN:,} more")
+        return "\n".join(lines)
 
 
 def compared_with_run(config: DictConfig, folder: Path) -> Comparison:
@@ -285,48 +266,39 @@ def compared_with_run(config: DictConfig, folder: Path) -> Comparison:
         read_metrics(Path(config.reproduce) / METRICS_FILE),
         read_metrics(folder / METRICS_FILE),
     )
-    content = {
-        "run": config.reproduce,
-        "equal": comparison.equal,
-        "close": comparison.close,
-        "different": comparison.different,
-    }
-    write_json(folder / RESULT, content)
+    write_json(folder / RESULT, {"run": config.reproduce} | vars(comparison))
     return comparison
 
 
-def compare_tables(then: Sequence[Mapping], now: Sequence[Mapping]) -> Comparison:
+def compare_tables(before: Sequence[Mapping], after: Sequence[Mapping]) -> Comparison:
     """Returns how the rows of two metrics.json agree: counts, metrics and paired
     differences, wall times apart."""
-    before, after = (
-        dict(number for row in rows for number in _numbers(row)) for rows in (then, now)
-    )
-    equal = close = 0
+    former = numbers_of(before)
+    present = numbers_of(after)
+    equal = 0
+    close = 0
     different = []
-    for name in dict.fromkeys([*before, *after]):
-        old = before.get(name, "missing")
-        new = after.get(name, "missing")
-        both = all(isinstance(value, int | float) for value in (old, new))
-        if old == new or (both and math.isnan(old) and math.isnan(new)):
+    for name in dict.fromkeys([*former, *present]):
+        old = former.get(name, "missing")
+        new = present.get(name, "missing")
+        numbers = all(isinstance(value, int | float) for value in (old, new))
+        if old == new or (numbers and math.isnan(old) and math.isnan(new)):
             equal += 1
-        elif both and math.isclose(old, new, rel_tol=CLOSE, abs_tol=1e-12):
+        elif numbers and math.isclose(old, new, rel_tol=CLOSE, abs_tol=1e-12):
             close += 1
         else:
             different.append((name, old, new))
     return Comparison(equal, close, different=different)
 
 
-def _numbers(row: Mapping) -> Iterator[tuple[str, Any]]:
-    """(name, value) of every number of a row."""
-    named = " ".join(str(row[key]) for key in IDENTITY if key in row)
-    parts = {key: row[key] for key in COUNTS if key in row} | {
-        "metrics": row["metrics"],
-        "paired": row["paired"],
-    }
-    for key, value in leaves(parts):
-        if TIME not in key:
-            yield f"{named}: {key.removeprefix('metrics.')}", value
-
-
-def _shown(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+def numbers_of(rows: Sequence[Mapping]) -> dict[str, Any]:
+    """Returns {name: value} of every number of some rows."""
+    numbers = {}
+    for row in rows:
+        identity = " ".join(str(row[name]) for name in IDENTITY if name in row)
+        parts = {name: row[name] for name in COUNTS if name in row}
+        parts |= {"metrics": row["metrics"], "paired": row["paired"]}
+        for name, value in leaves(parts):
+            if TIME not in name:
+                numbers[f"{identity}: {name.removeprefix('metrics.')}"] = value
+    return numbers
