@@ -2,11 +2,11 @@
 is a set of highest values.
 
 A rollout without a contact has minus the least clearance, in m: over the time from the
-first replan's end on (before, the noise has not acted) and over the moving vehicles,
-the gap of the boxes now, or at constant velocities up to LOOK s ahead, where every
-second ahead counts as AHEAD m; who would touch the ego has the seconds until then. A
-contact has 0 to 1, by what the competent driver in the ego's place makes of it: the mean
-of the fraction of speed that it has lost by then, and of 1 / (1 + relative speed /
+first replan's end on (before, the noise has not acted) and over the simulated vehicles
+that move, the gap of the boxes now, or at constant velocities up to LOOK s ahead, where
+every second ahead counts as AHEAD m; who would touch the ego has the seconds until then.
+A contact has 0 to 1, by what the competent driver in the ego's place makes of it: the
+mean of the fraction of speed that it has lost by then, and of 1 / (1 + relative speed /
 GENTLE). A preventable one has PREVENTED.
 """
 
@@ -58,12 +58,14 @@ def contact_level(row: dict) -> float:
 
 
 def clearance(rollouts: Rollouts) -> Tensor:
-    """Returns the least clearance [B] m of the ego to vehicles that move."""
+    """Returns the least clearance [B] m of the ego to simulated vehicles that move:
+    what is replayed comes equally near in all rollouts."""
     begin = REPLAN_STEPS
     states = rollouts.states[:, begin:]
     moves = (rollouts.states[..., 3].abs() * rollouts.valid).amax(1) > MOVING
     counted = rollouts.valid[:, begin:] & rollouts.valid[:, begin:, :1]
-    counted &= ((rollouts.agent_type == VEHICLE) & moves)[:, None]
+    driven = (rollouts.agent_type == VEHICLE) & rollouts.simulated
+    counted &= (driven & moves)[:, None]
     counted[..., 0] = False
     speed = velocity(states)
     least = torch.full_like(states[..., 0], FARTHEST)

@@ -4,8 +4,8 @@ of probabilities that are not rare.
 Particles are rollouts' noise. In each stage those below a level, of which there are a
 fixed fraction, are replaced by copies of others, and all copies are moved above that
 level. With levels that no two particles share the estimate is unbiased (Brehier et al.
-2015); particles at the level itself are counted as below it, and where all are, the
-population is extinct.
+2015); particles at the level itself are counted as below it; where all are, all are moved
+again, and the population is extinct where that does not help.
 """
 
 import math
@@ -21,9 +21,10 @@ from e2rl.tail.moves import Moves, Proposal
 
 # why a population ended
 REACHED = "reached"  # enough particles fail
-EXTINCT = "extinct"  # all particles are at one level
+EXTINCT = "extinct"  # all particles stay at one level
 LEAST = "least"  # the target is less likely than `least`
 SPENT = "spent"  # the budget of rollouts
+RETRIES = 5  # moves of all particles at one level, with ever smaller steps
 
 
 @configured("rate", "rate")
@@ -106,6 +107,7 @@ class Subset:
         self.particles = Driven(torch.empty(0), torch.empty(0), [])
         self._moving = torch.empty(0, dtype=torch.int64)  # particles
         self._left = 0  # moves of this stage
+        self._retries = RETRIES
         self._asked = Proposal(self.normals, self._moving)
 
     @property
@@ -172,21 +174,37 @@ class Subset:
             return
         survivors = (level > threshold).nonzero()[:, 0]
         if not len(survivors):
-            tally.end = EXTINCT
+            self._retry()
             return
+        self._retries = RETRIES
         fraction = len(survivors) / count
         tally.bound *= fraction
         tally.variance += (1 - fraction) / (fraction * count)
         tally.level = threshold
         self._moving = (level <= threshold).nonzero()[:, 0]
-        self._left = self.settings.moves
-        needed = self._left * len(self._moving)
         if tally.bound < self.settings.least:
             tally.end = LEAST
-        elif tally.rollouts + needed > self.settings.rollouts:
-            tally.end = SPENT
-        else:
+        elif self._affords(len(self._moving)):
             self._copy(survivors)
+
+    def _retry(self) -> None:
+        """Move all particles, which are at one level, once more; they may be copies
+        whose moves were all refused."""
+        if not self._retries:
+            self.tally.end = EXTINCT
+            return
+        self._retries -= 1
+        self._moving = torch.arange(len(self.normals))
+        self._affords(len(self._moving))
+
+    def _affords(self, moving: int) -> bool:
+        """Begin the moves of so many particles, or end where the budget is spent."""
+        self._left = self.settings.moves
+        needed = self._left * moving
+        if self.tally.rollouts + needed <= self.settings.rollouts:
+            return True
+        self.tally.end = SPENT
+        return False
 
     def _copy(self, survivors: Tensor) -> None:
         """Replace the particles to be moved by copies of survivors."""

@@ -81,6 +81,12 @@ def test_pedestrians_do_not_count():
     assert clearance(walking) > 50
 
 
+def test_who_is_replayed_does_not_count():
+    replayed = rollout(moving(0.0, 3.0, 10.0))
+    replayed.simulated[:, 1] = False
+    assert clearance(replayed) > 50
+
+
 def test_what_was_near_before_the_noise_acts_does_not_count():
     far = moving(0.0, 50.0, 10.0)
     near = far.clone()

@@ -93,3 +93,21 @@ def test_failures_are_distinct_rollouts_that_reached_the_target():
     assert len(set(failures)) == len(failures)
     reached = (subset.particles.level >= quantile(0.01)).sum()
     assert 1 < len(failures) <= reached
+
+
+def test_copies_whose_moves_were_refused_are_moved_again():
+    """A population of a single rollout and its copies goes on from it."""
+    generator = torch.Generator().manual_seed(0)
+    moves = Moves(torch.ones(4), torch.zeros(10, dtype=torch.int64), generator)
+    subset = Subset(target=3.0, settings=SETTINGS, moves=moves, shape=(4, 10))
+    subset.ask()
+    count = SETTINGS.particles
+    equal = torch.zeros(count, dtype=torch.float64)
+    subset.tell(Driven(equal, equal > 0, [None] * count))
+    assert not subset.ended
+    nearer = torch.arange(count, dtype=torch.float64) / count
+    for _ in range(SETTINGS.moves):
+        assert len(subset.ask()) == count
+        subset.tell(Driven(nearer, nearer > 1, [None] * count))
+    assert not subset.ended
+    assert subset.tally.bound == 0.5
