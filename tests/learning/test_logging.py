@@ -4,13 +4,16 @@ resume."""
 import json
 import math
 import struct
+import time
 
 import pytest
 
 from e2rl.learning.logging import CHOICES, RunLogger
 from e2rl.run.errors import InputError
 
-WANDB_HEADER, LEVELDB_BLOCK = 7, 1 << 15  # bytes
+WANDB_HEADER = 7  # bytes
+LEVELDB_BLOCK = 1 << 15  # bytes
+SECONDS = 30  # that wandb has to write
 FRAGMENT = struct.Struct("<IHB")
 
 
@@ -60,7 +63,11 @@ def test_wandb_has_scalars_of_a_step_in_one_row(tmp_path, monkeypatch):
         )
     logger.close()
     (file,) = tmp_path.rglob("run-*.wandb")
-    rows = history(file)
+    for _ in range(SECONDS):  # wandb's own process may write after finish() returns
+        rows = history(file)
+        if len(rows) == 2:
+            break
+        time.sleep(1)
     assert [row["_step"] for row in rows] == [0, 1]
     assert [row["train/return"] for row in rows] == [1.5, 2.5]
     assert all("train/unknown" not in row for row in rows)
