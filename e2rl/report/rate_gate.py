@@ -89,7 +89,7 @@ def judged_rate(rule: str, run: RateRun, former: RateRun | None) -> dict[str, An
     limit = float(match["limit"])
     if match["ratio"] and former is not None:
         sides = [part.side(event, run.scenes) for part in (run, former)]
-        bounds = ratio_of_ratios(*sides)
+        bounds = ratio_of_ratios(sides[0], sides[1])
         more_km = 0.0
     else:
         rates = run.entry["rates"].get(event)
@@ -99,7 +99,11 @@ def judged_rate(rule: str, run: RateRun, former: RateRun | None) -> dict[str, An
                 f"{run.entry['target']}"
             )
         values = rates[UNITS[match["unit"]]]
-        bounds = Bounds(*(float(values[name]) for name in Bounds._fields))
+        bounds = Bounds(
+            value=float(values["value"]),
+            low=float(values["low"]),
+            high=float(values["high"]),
+        )
         more_km = unresolved(run) * (match["unit"] == "1000km")
     high = bounds.high + more_km
     outcome = UNDECIDED

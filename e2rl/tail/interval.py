@@ -57,7 +57,8 @@ def of_ratio(estimates: Sequence[Tensor], exposure: Tensor) -> Bounds:
         estimates: of each of S scenes, of R repetitions, [R].
         exposure: [S], such as km driven.
     """
-    return bounded(*drawn_ratios((estimates, exposure)))
+    value, draws = drawn_ratios((estimates, exposure))
+    return bounded(value, draws)
 
 
 def ratio_of_ratios(first: Side, second: Side) -> Bounds:

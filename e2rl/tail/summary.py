@@ -136,8 +136,14 @@ def rates_of(scenes: Sequence[SceneRate], steps: int) -> list[Rate]:
     for event in EVENTS:
         if event in scenes[0].probability:
             estimates = [scene.probability[event] for scene in scenes]
-            exposures = (ones, hours, km / KM)
-            rates.append(Rate(event, *(of_ratio(estimates, e) for e in exposures)))
+            rates.append(
+                Rate(
+                    event,
+                    scene=of_ratio(estimates, ones),
+                    hour=of_ratio(estimates, hours),
+                    distance=of_ratio(estimates, km / KM),
+                )
+            )
     return rates
 
 
@@ -155,7 +161,7 @@ def ratio(
         )
         for side in (0, 1)
     ]
-    return ratio_of_ratios(*sides)
+    return ratio_of_ratios(sides[0], sides[1])
 
 
 def as_json(scene: SceneRate) -> dict[str, Any]:
