@@ -27,7 +27,9 @@ def _take(route: Tensor, index: Tensor) -> Tensor:
     """Vertices route [..., P, 2] at index [..., K] -> [..., K, 2], leading dims
     broadcast."""
     if route.shape[:-2] != index.shape[:-1]:
-        lead = torch.broadcast_shapes(route.shape[:-2], index.shape[:-1])
+        # of tensors: broadcast_shapes takes ten times as long
+        like, _ = torch.broadcast_tensors(route[..., :1, 0], index[..., :1])
+        lead = like.shape[:-1]
         route = route.expand(*lead, *route.shape[-2:])
         index = index.expand(*lead, index.shape[-1])
     return route.gather(-2, index[..., None].expand(*index.shape, 2))
@@ -99,8 +101,8 @@ def project(
         s, each [..., K].
     """
     lead = route.shape[:-2]
-    whole = torch.broadcast_shapes(points.shape[:-2], lead) == lead
-    if is_on() and hint is None and whole:
+    compiled = is_on() and hint is None
+    if compiled and torch.broadcast_shapes(points.shape[:-2], lead) == lead:
         rows = points.expand(*lead, *points.shape[-2:]).flatten(0, -3)
         pose = project_rows(rows, route.flatten(0, -3))
         return tuple(value.view(*lead, points.shape[-2]) for value in pose)

@@ -135,35 +135,38 @@ def passed(
     """
     states, present, *_ = near.agents
     velocity = relative_velocity(ego, states[:, None, :, 3], near.direction)
-    pace = velocity.norm(dim=1)
+    # forty times as fast as `norm` over two rows
+    pace = velocity.square().sum(1).sqrt()
     fast = present & (near.gap >= 0) & (pace > SLOWEST) & (near.gap < SLACK * DT * pace)
-    eager = not torch.compiler.is_compiling() and not fast.is_cuda
-    if eager and not bool(fast.any()):
-        return near
+    rows: Tensor | slice = slice(None)
+    if not torch.compiler.is_compiling() and not fast.is_cuda:
+        rows = fast.any(1).nonzero()[:, 0]
+        if not len(rows):
+            return near
     agent = torch.arange(1, fast.shape[1] + 1, device=fast.device)
-    at = static.row, before[:, None], agent
-    moved = states[..., :2] - tracks.states[at][..., :2]
-    x, y = (moved - (ego - ego_before)[:, None, :2]).unbind(-1)
-    cos = ego[:, 2:3].cos()
-    sin = ego[:, 2:3].sin()
+    at = static.row[rows], before[rows, None], agent
+    moved = states[rows, :, :2] - tracks.states[at][..., :2]
+    x, y = (moved - (ego - ego_before)[rows, None, :2]).unbind(-1)
+    cos = ego[:, 2:3].cos()[rows]
+    sin = ego[:, 2:3].sin()[rows]
     change = torch.stack([cos * x + sin * y, cos * y - sin * x])
-    position = near.position.transpose(0, 1)
-    half = (static.size / 2).T[..., None]
-    other = static.half_size.transpose(0, 1)
+    position = near.position[rows].transpose(0, 1)
+    half = (static.size[rows] / 2).T[..., None]
+    other = static.half_size[rows].transpose(0, 1)
     begin, end = time_inside(
         position - change,
         change,
-        direction=near.direction.transpose(0, 1),
+        direction=near.direction[rows].transpose(0, 1),
         own=half,
         other=other,
     )
     passes = is_fast(change, half, other) & tracks.valid[at] & (begin > 0)
-    passes = passes & (begin < end) & fast
+    passes = passes & (begin < end) & fast[rows]
     touch = torch.where(passes, position - (1 - begin) * change, position)
-    return near._replace(
-        position=touch.transpose(0, 1),
-        gap=torch.where(passes, TOUCHING, near.gap),
-    )
+    touching = near._replace(position=near.position.clone(), gap=near.gap.clone())
+    touching.position[rows] = touch.transpose(0, 1)
+    touching.gap[rows] = torch.where(passes, TOUCHING, near.gap[rows])
+    return touching
 
 
 def standing(
