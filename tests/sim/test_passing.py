@@ -126,15 +126,21 @@ def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
 def tiny_pass(displacement, speed, past):
     """Whether the ego, which stands, is passed by a box of its size, 10 cm, that moves
     `displacement` m along x to `past` m behind the ego's centre, at `speed` m/s."""
-    ego = torch.zeros(1, 4)
-    agent = torch.tensor([[[past, 0.0, 0.0, speed]]])
+    (passes,) = tiny_passes(displacement, [speed], past=past)
+    return passes
+
+
+def tiny_passes(displacement, speeds, past):
+    """`tiny_pass` for each of several egos, at once."""
+    count = len(speeds)
+    ego = torch.zeros(count, 4)
+    agent = torch.tensor([[[past, 0.0, 0.0, speed]] for speed in speeds])
     before = agent - torch.tensor([displacement, 0.0, 0.0, 0.0])
-    still = torch.zeros(1, 1)
-    first = torch.zeros(1, 1, dtype=torch.int64)
+    still = torch.zeros(count, 1)
     static = SimpleNamespace(
-        size=torch.tensor([[0.1, 0.1]]),
-        half_size=torch.full((1, 2, 1), 0.05),
-        row=first,
+        size=torch.full((count, 2), 0.1),
+        half_size=torch.full((count, 2, 1), 0.05),
+        row=torch.arange(count)[:, None],
     )
     agents = Agents(
         agent,
@@ -158,9 +164,14 @@ def tiny_pass(displacement, speed, past):
         ego_before=ego,
         tracks=tracks,
         static=static,
-        before=first[0],
+        before=torch.zeros(count, dtype=torch.int64),
     )
-    return bool(found.gap < 0)
+    return (found.gap[:, 0] < 0).tolist()
+
+
+def test_each_ego_is_passed_by_its_own_neighbours():
+    speeds = [1.9, 2.1, 1.9, 3.0]
+    assert tiny_passes(0.25, speeds, past=0.12) == [False, True, False, True]
 
 
 @pytest.mark.parametrize(("speed", "looked_at"), [(1.9, False), (2.1, True)])
