@@ -24,7 +24,10 @@ def rate(run: Run) -> None:
     """Drive what is not on disk yet, write the rates, and print them."""
     config = run.config
     settings = settings_of(RateSettings, resolved(config.rate), where="rate")
-    plan = begin(run)
+    plan = begin(
+        run,
+        f"up to {settings.repetitions} populations of {settings.rollouts} rollouts a scene",
+    )
     traffic = nominal_traffic(plan)
     (seed,) = plan.settings.seeds
     egos = []

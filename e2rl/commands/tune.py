@@ -62,7 +62,7 @@ def tune(run: Run) -> dict:
     settings = settings_of(
         SearchSettings, {name: tuning[name] for name in names}, where="tuning"
     )
-    plan = begin(run)
+    plan = begin(run, f"once a scene and seed in each of {settings.trials} trials")
     objective: Objective
     trials: PlannerTrials | AttackTrials
     failures: list[Batch] = []

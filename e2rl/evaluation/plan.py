@@ -135,15 +135,17 @@ class Evaluation:
         )
 
 
-def begin(run: Run) -> Evaluation:
+def begin(run: Run, often: str = "once a scene and seed") -> Evaluation:
     """Returns the plan of a run, which begins or goes on with it. Raises InputError for
     a configuration that cannot be run, and for inputs that changed since the run began.
+
+    often: in words, how often a scene is driven that has no budget.
     """
     config = run.config
     set_up(config)
     settings = evaluation_settings(config)
     egos = build_egos(config, ego_name(config.ego, run.choices["ego"]))
-    print(purpose(run, settings, egos=list(egos.egos)), flush=True)
+    print(purpose(run, settings, egos=list(egos.egos), often=often), flush=True)
     prepare_fused(config)
     # before the scenes, which take longer than a wrong path
     prior, prior_origin, methods, searches = build_rows(config, settings)
@@ -193,8 +195,17 @@ def ego_name(ego: Mapping[str, Any], choice: str) -> str:
     return str(ego["_target_"]).rpartition(".")[2] if choice == CLASS else choice
 
 
-def purpose(run: Run, settings: EvaluationSettings, egos: Sequence[str]) -> str:
-    """Returns what a run does, in a line."""
+def purpose(
+    run: Run, settings: EvaluationSettings, *, egos: Sequence[str], often: str
+) -> str:
+    """Returns what a run does, in a line.
+
+    Args:
+        run: with the configuration and the folder.
+        settings: keys of conf/evaluate.yaml.
+        egos: names of the planners.
+        often: a scene is driven that has no budget.
+    """
     config = run.config
     if config.failure is not None:
         return f"Drives the failure {config.failure} again, into {run.folder}."
@@ -205,7 +216,6 @@ def purpose(run: Run, settings: EvaluationSettings, egos: Sequence[str]) -> str:
         scenes = f"the first of {scenes}"
     elif settings.num_scenes is not None:
         scenes = f"the first {settings.num_scenes} {scenes}"
-    often = "once a scene and seed"
     if settings.budget:
         often = f"{settings.budget:g} {settings.budget_unit} a scene and seed"
     seeds = ", ".join(map(str, settings.seeds))

@@ -10,19 +10,19 @@ from typing import Any
 
 import torch
 
-from e2rl.evaluation.rollout_files import NUMBER, read_json
+from e2rl.evaluation.rollout_files import NUMBER, nans, read_json
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED
-from e2rl.report.rates import RATES_FILE, UNITS, text
+from e2rl.report.rates import RATES_FILE, text
 from e2rl.run.errors import InputError
 from e2rl.run.files import misfit
 from e2rl.tail.interval import Bounds, ratio_of_ratios
-from e2rl.tail.summary import EVENTS
+from e2rl.tail.summary import EVENTS, UNITS
 
 PATTERN = re.compile(
     rf"(?P<event>{'|'.join(EVENTS)})_per_(?P<unit>{'|'.join(UNITS)})"
     r"\s*<=\s*(?P<ratio>x?)(?P<limit>\d*\.?\d+(?:e-?\d+)?)"
 )
-BOUNDS = {"value": NUMBER, "low": NUMBER, "high": NUMBER}
+BOUNDS = {"value": NUMBER, "low": NUMBER, "high": NUMBER, "unresolved": NUMBER}
 SCENE = {"scene_id": str, "km": NUMBER, "repetitions": {...: [(int, float)]}}
 ENTRY = {"ego": str, "target": str, "rates": {...: {...: BOUNDS}}, "scenes": [SCENE]}
 Side = tuple[Sequence[torch.Tensor], torch.Tensor]
@@ -90,7 +90,6 @@ def judged_rate(rule: str, run: RateRun, former: RateRun | None) -> dict[str, An
     if match["ratio"] and former is not None:
         sides = [part.side(event, run.scenes) for part in (run, former)]
         bounds = ratio_of_ratios(sides[0], sides[1])
-        more_km = 0.0
     else:
         rates = run.entry["rates"].get(event)
         if rates is None:
@@ -98,16 +97,11 @@ def judged_rate(rule: str, run: RateRun, former: RateRun | None) -> dict[str, An
                 f"{rule}: {run.run} knows no rate of {event}; its target was "
                 f"{run.entry['target']}"
             )
-        values = rates[UNITS[match["unit"]]]
-        bounds = Bounds(
-            value=float(values["value"]),
-            low=float(values["low"]),
-            high=float(values["high"]),
-        )
-        more_km = unresolved(run) * (match["unit"] == "1000km")
-    high = bounds.high + more_km
+        values = nans(rates[match["unit"]])
+        high = values["high"] + values["unresolved"]
+        bounds = Bounds(values["value"], values["low"], high=high)
     outcome = UNDECIDED
-    if high <= limit:
+    if bounds.high <= limit:
         outcome = PASSED
     elif bounds.low > limit:
         outcome = FAILED
@@ -126,10 +120,3 @@ def judged_rate(rule: str, run: RateRun, former: RateRun | None) -> dict[str, An
         "high": bounds.high,
         "n": len(run.scenes),
     }
-
-
-def unresolved(run: RateRun) -> float:
-    """Returns what scenes in which no failure was drawn may add per 1,000 km."""
-    scenes = run.entry["scenes"]
-    at_most = sum(float(scene.get("at_most") or 0.0) for scene in scenes)
-    return at_most / sum(float(scene["km"]) for scene in scenes) * 1000

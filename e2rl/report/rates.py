@@ -13,13 +13,12 @@ from e2rl.evaluation.rollout_files import TABLE, write_json, write_rows
 from e2rl.run.files import csv_text, write_atomically
 from e2rl.tail.interval import Bounds
 from e2rl.tail.rate import ALONE
-from e2rl.tail.subset import EXTINCT, LEAST, REACHED, SPENT
-from e2rl.tail.summary import SceneRate, as_json, rates_of, ratio
+from e2rl.tail.sampler import EXTINCT, LEAST, REACHED, SPENT
+from e2rl.tail.summary import UNITS, SceneRate, as_json, rates_of, ratio
 
 RATES_FILE = "rates.json"
 TABLES_FILE = "rates.md"
 TAIL_FILE = "tail.csv"
-UNITS = {"scene": "scene", "hour": "hour", "1000km": "distance"}  # fields of Rate
 LIKELIEST = 10  # scenes whose failures are named
 ENDS = {
     REACHED: "failures drawn",
@@ -59,7 +58,8 @@ def write_rates(folder: Path, egos: Sequence[EgoRates]) -> None:
             "target": ego.target,
             "rates": {
                 rate.event: {
-                    unit: getattr(rate, unit)._asdict() for unit in UNITS.values()
+                    unit: bounds._asdict() | {"unresolved": rate.unresolved[unit]}
+                    for unit, bounds in rate.bounds.items()
                 }
                 for rate in rates_of(ego.scenes, ego.steps)
             },
@@ -106,10 +106,8 @@ def tables(egos: Sequence[EgoRates]) -> list[str]:
         [
             ego.ego,
             rate.event,
-            text(rate.scene),
-            text(rate.hour),
-            text(rate.distance),
-            text_of_unresolved(ego, rate.event),
+            *(text(rate.bounds[unit]) for unit in UNITS),
+            f"at most about {rate.unresolved['1000km']:.2g} more",
         ]
         for ego in egos
         for rate in rates_of(ego.scenes, ego.steps)
@@ -149,15 +147,6 @@ def likeliest(ego: EgoRates) -> list[list[str]]:
         for scene in ego.scenes[:LIKELIEST]
         if scene.bounds.value > 0
     ]
-
-
-def text_of_unresolved(ego: EgoRates, event: str) -> str:
-    """Returns what scenes in which the target was not drawn may add to its rate."""
-    if event != ego.target:
-        return ""
-    km = sum(scene.km for scene in ego.scenes)
-    more = sum(scene.at_most for scene in ego.scenes) / km * 1000
-    return f"at most about {more:.2g} more"
 
 
 def text(bounds: Bounds) -> str:

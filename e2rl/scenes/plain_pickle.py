@@ -6,6 +6,7 @@ elements of any address: an array's type is one of a plain element, by its name.
 """
 
 import pickle
+import pickletools
 import re
 from io import BytesIO
 from typing import Any
@@ -81,7 +82,19 @@ class PlainUnpickler(pickle.Unpickler):
         return NAMES[path]
 
 
+MOST_TUPLES = 100_000  # a log of 1.5 MB has 10,000
+TUPLE_CODES = (b"t", b"\x85", b"\x86", b"\x87")
+
+
 def load_plain(content: bytes) -> Any:
     """Returns the plain data in a pickle; raises ValueError, or what damaged bytes make
-    the standard library raise."""
+    the standard library raise.
+
+    Python hashes tuples in tuples without a bound on their depth, which is at most
+    their number.
+    """
+    if sum(map(content.count, TUPLE_CODES)) > MOST_TUPLES:
+        names = (code.name for code, _, _ in pickletools.genops(content))
+        if sum(name.startswith("TUPLE") for name in names) > MOST_TUPLES:
+            raise ValueError(f"holds more than {MOST_TUPLES:,} tuples")
     return PlainUnpickler(BytesIO(content), encoding="latin-1").load()

@@ -22,7 +22,16 @@ from e2rl.sim.rollouts import Rollouts
 from e2rl.tail.level import CONTACT, FARTHEST, TARGETS, levels
 from e2rl.tail.moves import Moves
 from e2rl.tail.noise import ChosenNoise, NoiseLayout
-from e2rl.tail.subset import EXTINCT, REACHED, Driven, Subset, SubsetSettings, Tally
+from e2rl.tail.plain import Plain
+from e2rl.tail.sampler import (
+    EXTINCT,
+    REACHED,
+    Driven,
+    Sampler,
+    SamplerSettings,
+    Tally,
+)
+from e2rl.tail.subset import Subset
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.nominal import NominalTraffic
 
@@ -30,6 +39,7 @@ TAIL = "tail"  # the method of these rollouts in tables and files
 ALONE = "alone"  # no vehicle is driven by the prior, so nothing is left to chance
 NEARBY = 20.0  # m from the ego at which a vehicle is moved alone half as often
 SEED_STEP = 1_000_003  # between the seeds of two repetitions
+METHODS: dict[str, type[Sampler]] = {"subset": Subset, "plain": Plain}
 UNKNOWN = -10 * FARTHEST  # the level of a rollout in which the traffic raised
 
 
@@ -38,6 +48,7 @@ UNKNOWN = -10 * FARTHEST  # the level of a rollout in which the traffic raised
 class RateSettings:
     """What is estimated, and how often; conf/rate.yaml explains each."""
 
+    method: str = setting(choices=METHODS)
     target: str = setting(choices=TARGETS)
     repetitions: int = setting(low=1)
     particles: int = setting(low=4)
@@ -48,10 +59,10 @@ class RateSettings:
     together: int = setting(low=1)
 
     @property
-    def subset(self) -> SubsetSettings:
+    def sampler(self) -> SamplerSettings:
         """Those of one population."""
-        names = [field.name for field in fields(SubsetSettings)]
-        return SubsetSettings(**{name: getattr(self, name) for name in names})
+        names = [field.name for field in fields(SamplerSettings)]
+        return SamplerSettings(**{name: getattr(self, name) for name in names})
 
 
 class Estimate(NamedTuple):
@@ -165,8 +176,8 @@ class Rating:
         traffic = ChosenNoise(
             self.traffic.prior, layout, knowledge=self.traffic.knowledge
         )
-        while active := [part for part in populations if not part.subset.ended]:
-            asked = [part.subset.ask() for part in active]
+        while active := [part for part in populations if not part.sampler.ended]:
+            asked = [part.sampler.ask() for part in active]
             traffic.normals = torch.cat(asked)
             scenes = [
                 part.scene
@@ -222,11 +233,11 @@ class OneRollout(NamedTuple):
 
 @dataclass
 class Population:
-    """The particles of one scene, and what they showed."""
+    """The sampler of one scene, and what its rollouts showed."""
 
     scene: int
     repetition: int
-    subset: Subset
+    sampler: Sampler
     alone: bool
     km: float = 0.0
     raised: int = 0
@@ -243,17 +254,17 @@ class Population:
         moves = Moves(
             weight, layout.replan_of(), torch.Generator().manual_seed(seed % 2**63)
         )
-        subset = Subset(
+        sampler = METHODS[rating.settings.method](
             target=TARGETS[rating.settings.target],
-            settings=rating.settings.subset,
+            settings=rating.settings.sampler,
             moves=moves,
             shape=(layout.vehicles, layout.numbers),
         )
-        return cls(scene, repetition, subset, alone=not bool(weight.any()))
+        return cls(scene, repetition, sampler, alone=not bool(weight.any()))
 
     def tell(self, driven: Sequence[OneRollout]) -> None:
         """Take what became of the rollouts that were asked for last."""
-        first = not self.subset.tally.rollouts
+        first = not self.sampler.tally.rollouts
         rows = [rollout.row for rollout in driven]
         if first:
             km = [row["driven_km"] for row in rows if row["errored"] == 0]
@@ -261,24 +272,24 @@ class Population:
         self.raised += sum(map(raised, rows))
         self.lost += sum(rollout.level == UNKNOWN for rollout in driven)
         counted = [row["cfr_counted"] == 1 or raised(row) for row in rows]
-        self.subset.tell(
+        self.sampler.tell(
             Driven(
                 torch.tensor([part.level for part in driven], dtype=torch.float64),
                 torch.tensor(counted),
                 list(driven),
             )
         )
-        if first and self.alone and self.subset.tally.end in ("", EXTINCT):
-            self.subset.tally.end = ALONE
-            self.subset.tally.bound = 0.0
+        if first and self.alone and self.sampler.tally.end in ("", EXTINCT):
+            self.sampler.tally.end = ALONE
+            self.sampler.tally.bound = 0.0
 
     def result(self, folder: Path | None) -> tuple:
         """Returns the fields of Estimate, and writes the failures' files."""
-        tally = self.subset.tally
-        failures = self.subset.failures() if tally.end == REACHED else []
+        tally = self.sampler.tally
+        failures = self.sampler.failures() if tally.end == REACHED else []
         rows = []
         for index, failure in enumerate(failures):
-            seed = self.repetition * self.subset.settings.particles + index
+            seed = self.repetition * self.sampler.settings.particles + index
             row = failure.row | {"seed": seed}
             row["weight"] = tally.probability / len(failures)
             if failure.rollouts is not None and folder is not None:

@@ -9,111 +9,45 @@ again, and the population is extinct where that does not help.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from e2rl.run.config import configured, setting
 from e2rl.tail.level import CONTACT
 from e2rl.tail.moves import Moves, Proposal
+from e2rl.tail.sampler import (
+    EXTINCT,
+    LEAST,
+    REACHED,
+    SPENT,
+    Driven,
+    Sampler,
+    SamplerSettings,
+)
 
-# why a population ended
-REACHED = "reached"  # enough particles fail
-EXTINCT = "extinct"  # all particles stay at one level
-LEAST = "least"  # the target is less likely than `least`
-SPENT = "spent"  # the budget of rollouts
 RETRIES = 5  # moves of all particles at one level, with ever smaller steps
 
 
-@configured("rate", "rate")
-@dataclass(frozen=True)
-class SubsetSettings:
-    """How the particles of a population are spent; conf/rate.yaml explains each."""
-
-    particles: int = setting(low=4)
-    killed: float = setting(low=0.05, high=0.95)
-    moves: int = setting(low=1)
-    rollouts: int = setting(low=4)
-    least: float = setting(low=0, high=1)
-
-
-@dataclass
-class Tally:
-    """The estimate of one population.
-
-    Args:
-        probability: of the target; 0 unless `end` is REACHED.
-        bound: estimate of the probability of `level`, of which the target is a part.
-        variance: of log(probability), were all particles independent.
-        contact: probability of a contact.
-        counted: probability of a failure that counts.
-        rollouts: that were driven.
-        end: why it ended.
-        level: that all particles exceed.
-    """
-
-    probability: float = 0.0
-    bound: float = 1.0
-    variance: float = 0.0
-    contact: float = 0.0
-    counted: float = 0.0
-    rollouts: int = 0
-    end: str = ""
-    level: float = -math.inf
-
-
-class Driven(NamedTuple):
-    """What became of M rollouts.
-
-    Args:
-        level: [M] float64.
-        counted: [M] bool, failures that count.
-        result: of each, what is to be kept.
-    """
-
-    level: Tensor
-    counted: Tensor
-    result: list[Any]
-
-
-class Subset:
-    """A population of particles of one scene: `ask` for noise to drive, `tell` what
-    became of it."""
+class Subset(Sampler):
+    """A population of particles of one scene."""
 
     def __init__(
         self,
         *,
         target: float,
-        settings: SubsetSettings,
+        settings: SamplerSettings,
         moves: Moves,
         shape: tuple[int, int],
     ) -> None:
-        """Begin a population.
-
-        Args:
-            target: level of the failure.
-            settings: how particles are spent.
-            moves: in this scene; its generator draws everything.
-            shape: (V, D) of a rollout's normals.
-        """
-        self.target = target
-        self.settings = settings
-        self.moves = moves
-        self.shape = shape
-        self.tally = Tally()
+        """Begin a population; arguments of `Sampler`."""
+        super().__init__(target=target, settings=settings, moves=moves, shape=shape)
         self.normals = torch.empty(0, *shape)  # [N, V, D]
         self.particles = Driven(torch.empty(0), torch.empty(0), [])
         self._moving = torch.empty(0, dtype=torch.int64)  # particles
         self._left = 0  # moves of this stage
         self._retries = RETRIES
         self._asked = Proposal(self.normals, self._moving)
-
-    @property
-    def ended(self) -> bool:
-        """Whether nothing more is asked for."""
-        return bool(self.tally.end)
 
     def ask(self) -> Tensor:
         """Returns the normals [M, V, D] of the next rollouts, none once it has ended."""
@@ -122,8 +56,7 @@ class Subset:
         if len(self.normals):
             self._asked = self.moves.propose(self.normals[self._moving])
         else:
-            shape = (self.settings.particles, *self.shape)
-            first = torch.randn(shape, generator=self.moves.generator)
+            first = self.fresh(self.settings.particles)
             self._asked = Proposal(first, torch.empty(0))
         return self._asked.normals
 
@@ -169,7 +102,6 @@ class Subset:
         if threshold >= self.target:
             fraction = float((level >= self.target).double().mean())
             tally.probability = tally.bound * fraction
-            tally.variance += (1 - fraction) / (fraction * count)
             tally.end = REACHED
             return
         survivors = (level > threshold).nonzero()[:, 0]
@@ -179,7 +111,6 @@ class Subset:
         self._retries = RETRIES
         fraction = len(survivors) / count
         tally.bound *= fraction
-        tally.variance += (1 - fraction) / (fraction * count)
         tally.level = threshold
         self._moving = (level <= threshold).nonzero()[:, 0]
         if tally.bound < self.settings.least:

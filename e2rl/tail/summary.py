@@ -11,13 +11,14 @@ from torch import Tensor
 
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
-from e2rl.tail.interval import Bounds, of_logs, of_ratio, ratio_of_ratios
+from e2rl.tail.interval import Bounds, of_counts, of_logs, of_ratio, ratio_of_ratios
 from e2rl.tail.rate import Estimate
-from e2rl.tail.subset import REACHED
+from e2rl.tail.sampler import REACHED
 
 EVENTS = ("contact", "preventable", "counted")
 HOUR = 3600.0  # s
-KM = 1000.0
+DISTANCE = 1000.0  # km
+UNITS = ("scene", "hour", "1000km")
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,10 @@ class SceneRate:
     Args:
         scene_id: of the scene.
         probability: of each event in each repetition, {event: [R]}.
-        bounds: of the target's probability.
-        at_most: estimate of what an unresolved target's probability is below.
+        bounds: of the target's probability; without an interval where it is of one
+            population.
+        at_most: estimate of what populations that ended before the target may add to
+            its probability.
         km: that the ego drives in a rollout.
         rollouts: that were driven.
         end: of the first population.
@@ -59,15 +62,14 @@ class Rate(NamedTuple):
 
     Args:
         event: of EVENTS.
-        scene: per scene.
-        hour: per hour driven.
-        distance: per 1,000 km driven.
+        bounds: of each of UNITS.
+        unresolved: of each of UNITS, estimate of what scenes may add in which the
+            populations ended before the target.
     """
 
     event: str
-    scene: Bounds
-    hour: Bounds
-    distance: Bounds
+    bounds: dict[str, Bounds]
+    unresolved: dict[str, float]
 
 
 def scene_rates(
@@ -102,13 +104,12 @@ def scene_rate(scene_id: str, parts: Sequence[Estimate], target: str) -> SceneRa
         "counted": column([tally.counted for tally in tallies]),
     }
     probability[target] = column([tally.probability for tally in tallies])
-    reached = all(tally.end == REACHED for tally in tallies)
-    unresolved = [0.0 if t.end == REACHED else t.bound for t in tallies]
-    at_most = sum(unresolved) / len(parts)
-    value = float(probability[target].mean())
-    bounds = Bounds(value, 0.0, min(1.0, value + at_most))
-    if reached and len(parts) > 1:
-        bounds = of_logs(probability[target].log())
+    unresolved = column([0.0 if t.end == REACHED else t.bound for t in tallies])
+    hits = [tally.hits for tally in tallies if tally.hits is not None]
+    if hits:
+        bounds = of_counts(sum(hits), sum(tally.rollouts for tally in tallies))
+    else:
+        bounds = target_bounds(probability[target], unresolved)
     failures = [row for part in parts for row in part.failures]
     for row in failures:
         row["weight"] /= len(parts)
@@ -116,7 +117,7 @@ def scene_rate(scene_id: str, parts: Sequence[Estimate], target: str) -> SceneRa
         scene_id,
         probability,
         bounds=bounds,
-        at_most=at_most,
+        at_most=float(unresolved.mean()),
         km=sum(part.km for part in parts) / len(parts),
         rollouts=sum(tally.rollouts for tally in tallies),
         end=tallies[0].end,
@@ -126,24 +127,42 @@ def scene_rate(scene_id: str, parts: Sequence[Estimate], target: str) -> SceneRa
     )
 
 
+def target_bounds(probability: Tensor, unresolved: Tensor) -> Bounds:
+    """Returns the target's probability in a scene with its interval.
+
+    Args:
+        probability: [R], estimates of populations, 0 of those that ended before.
+        unresolved: [R], what the probability may be in these.
+    """
+    value = float(probability.mean())
+    if len(probability) == 1:
+        return Bounds(value, math.nan, math.nan)
+    interval = of_logs((probability + unresolved).log())
+    low = 0.0 if bool(unresolved.any()) else interval.low
+    return Bounds(value, low, high=interval.high)
+
+
 def rates_of(scenes: Sequence[SceneRate], steps: int) -> list[Rate]:
     """Returns the rate of each event that all scenes know, over scenes of so many
     steps."""
     km = torch.tensor([scene.km for scene in scenes], dtype=torch.float64)
+    at_most = torch.tensor([scene.at_most for scene in scenes], dtype=torch.float64)
     ones = torch.ones_like(km)
-    hours = ones * steps * DT / HOUR
+    exposures = (ones, ones * steps * DT / HOUR, km / DISTANCE)
+    by_unit = dict(zip(UNITS, exposures, strict=True))
+    unresolved = {
+        unit: float(at_most.sum() / exposure.sum())
+        for unit, exposure in by_unit.items()
+    }
     rates = []
     for event in EVENTS:
         if event in scenes[0].probability:
             estimates = [scene.probability[event] for scene in scenes]
-            rates.append(
-                Rate(
-                    event,
-                    scene=of_ratio(estimates, ones),
-                    hour=of_ratio(estimates, hours),
-                    distance=of_ratio(estimates, km / KM),
-                )
-            )
+            bounds = {
+                unit: of_ratio(estimates, exposure)
+                for unit, exposure in by_unit.items()
+            }
+            rates.append(Rate(event, bounds, unresolved))
     return rates
 
 

@@ -10,8 +10,8 @@ from e2rl.report.rate_gate import RateRun, judged_rate
 from e2rl.report.rates import EgoRates, rate_lines, write_rates
 from e2rl.run.errors import InputError
 from e2rl.tail.rate import Estimate
-from e2rl.tail.subset import REACHED, SPENT, Tally
-from e2rl.tail.summary import scene_rates
+from e2rl.tail.sampler import REACHED, SPENT, Tally
+from e2rl.tail.summary import UNITS, rates_of, scene_rates
 
 COUNT = 40
 KM = 0.1
@@ -65,14 +65,21 @@ def test_undecided_rules_say_how_many_scenes_are_needed(run):
     assert "more scenes would tell" in result["reason"]
 
 
-def test_what_was_not_drawn_is_added_to_the_interval(run):
-    high = judged_rate("preventable_per_1000km<=1000", RateRun.read(run, None), None)[
-        "high"
+@pytest.mark.parametrize("unit", UNITS)
+def test_what_was_not_drawn_is_added_to_the_interval(run, unit):
+    """The limit is above the interval, and below it with what is unresolved."""
+    (rate,) = [
+        rate
+        for rate in rates_of(rates("mine").scenes, steps=80)
+        if rate.event == "preventable"
     ]
-    rule = f"preventable_per_1000km<={high + 0.4:.2f}"
-    assert judged_rate(rule, RateRun.read(run, None), None)["outcome"] == UNDECIDED
-    rule = f"preventable_per_1000km<={high + 0.6:.2f}"
-    assert judged_rate(rule, RateRun.read(run, None), None)["outcome"] == PASSED
+    high = rate.bounds[unit].high
+    more = rate.unresolved[unit]
+    for share, outcome in ((0.9, UNDECIDED), (1.1, PASSED)):
+        rule = f"preventable_per_{unit}<={high + share * more:.9f}"
+        result = judged_rate(rule, RateRun.read(run, None), None)
+        assert result["outcome"] == outcome
+        assert result["high"] == pytest.approx(high + more)
 
 
 def test_ratios_are_judged_against_a_former_run(run, tmp_path_factory):

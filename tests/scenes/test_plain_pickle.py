@@ -251,3 +251,14 @@ def test_a_type_of_structures_by_its_state_stays_one_of_plain_elements():
     state = b"(K\x03U\x01<N)}K\x08K\x08K\x00t"
     content = array(b"K\x01\x85", b"f8", data=b"C\x08" + bytes(8), state=state) + b"."
     assert load_plain(content).dtype == np.dtype("f8")
+
+
+def test_more_tuples_than_a_log_has_are_refused():
+    with pytest.raises(ValueError, match="more than 100,000 tuples"):
+        load_plain(pickle.dumps([(number,) for number in range(100_001)]))
+
+
+def test_bytes_that_look_like_tuples_are_none():
+    content = {"values": np.full(200_000, ord("t"), np.uint8)}
+    read = load_plain(pickle.dumps(content))
+    np.testing.assert_array_equal(read["values"], content["values"])

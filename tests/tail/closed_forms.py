@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from e2rl.tail.moves import Moves
-from e2rl.tail.subset import Driven, Subset, SubsetSettings, Tally
+from e2rl.tail.sampler import Driven, SamplerSettings, Tally
+from e2rl.tail.subset import Subset
 
 VEHICLES = 4
 REPLANS = 16
@@ -49,7 +50,7 @@ def tally(
     *,
     numbers: int,
     seed: int,
-    settings: SubsetSettings,
+    settings: SamplerSettings,
 ) -> Tally:
     """The tally of a population of x [VEHICLES, numbers / VEHICLES]."""
     each = numbers // VEHICLES

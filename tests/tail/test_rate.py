@@ -10,11 +10,13 @@ from e2rl.planners.ego import Ego
 from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
 from e2rl.tail.rate import ALONE, RateSettings, Rating, vehicle_weight
-from e2rl.tail.subset import REACHED
+from e2rl.tail.sampler import REACHED
 from e2rl.tail.summary import rates_of, scene_rates
 from tests.synthetic import make_scenes
 
+STEPS = 20
 SETTINGS = RateSettings(
+    method="subset",
     target="contact",
     repetitions=2,
     particles=8,
@@ -48,7 +50,7 @@ class Crash(Ego):
 
 @pytest.fixture(scope="module")
 def scenes():
-    return make_scenes(2)
+    return make_scenes(2, steps=STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +84,7 @@ def test_a_planner_that_raises_fails_surely(scenes):
 
 
 def test_scenes_without_driven_vehicles_leave_nothing_to_chance(scenes):
-    alone = make_scenes(1)
+    alone = make_scenes(1, steps=STEPS)
     alone.scenes["valid"][:, 1:] = False
     alone.scenes["logged_valid"][:, :, 1:] = False
     assert not vehicle_weight(rating(alone).setup, 0).any()
@@ -104,9 +106,11 @@ def test_vehicles_nearer_to_the_ego_are_moved_more_often(scenes):
 
 def test_rates_are_sums_over_scenes_per_exposure(scenes, estimates):
     rates = scene_rates(estimates, scenes, target="contact")
-    contact = next(r for r in rates_of(rates, steps=80) if r.event == "contact")
+    contact = next(r for r in rates_of(rates, steps=STEPS) if r.event == "contact")
     mean = sum(scene.probability["contact"].mean() for scene in rates) / 2
-    torch.testing.assert_close(torch.tensor(contact.scene.value).double(), mean)
     torch.testing.assert_close(
-        torch.tensor(contact.hour.value).double(), mean * 3600 / 8
+        torch.tensor(contact.bounds["scene"].value).double(), mean
+    )
+    torch.testing.assert_close(
+        torch.tensor(contact.bounds["hour"].value).double(), mean * 3600 / 2
     )

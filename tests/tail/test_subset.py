@@ -6,18 +6,11 @@ import pytest
 import torch
 
 from e2rl.tail.moves import Moves
-from e2rl.tail.subset import (
-    EXTINCT,
-    LEAST,
-    REACHED,
-    SPENT,
-    Driven,
-    Subset,
-    SubsetSettings,
-)
+from e2rl.tail.sampler import EXTINCT, LEAST, REACHED, SPENT, Driven, SamplerSettings
+from e2rl.tail.subset import Subset
 from tests.tail.closed_forms import corner, linear, quantile, tally, union
 
-SETTINGS = SubsetSettings(
+SETTINGS = SamplerSettings(
     particles=64, killed=0.5, moves=2, rollouts=100_000, least=1e-12
 )
 P = 1e-3
@@ -62,7 +55,7 @@ def test_equal_levels_are_an_extinction_and_no_estimate():
 
 
 def test_it_spends_no_more_rollouts_than_asked_for():
-    settings = SubsetSettings(
+    settings = SamplerSettings(
         particles=64, killed=0.5, moves=2, rollouts=300, least=1e-12
     )
     result = tally(linear, 8.0, numbers=40, seed=0, settings=settings)
@@ -71,7 +64,7 @@ def test_it_spends_no_more_rollouts_than_asked_for():
 
 
 def test_it_stops_below_the_least_probability():
-    settings = SubsetSettings(
+    settings = SamplerSettings(
         particles=64, killed=0.5, moves=1, rollouts=100_000, least=0.1
     )
     result = tally(linear, 8.0, numbers=40, seed=0, settings=settings)

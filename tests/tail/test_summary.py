@@ -4,9 +4,11 @@ import math
 from types import SimpleNamespace
 
 import pytest
+import torch
 
+from e2rl.tail.interval import of_counts, of_logs
 from e2rl.tail.rate import Estimate
-from e2rl.tail.subset import REACHED, SPENT, Tally
+from e2rl.tail.sampler import REACHED, SPENT, Tally
 from e2rl.tail.summary import rates_of, ratio, scene_rates
 
 SCENES = SimpleNamespace(scene_id=["a", "b", "c"])
@@ -45,9 +47,33 @@ def test_a_probability_is_the_mean_of_repetitions_and_its_nats_their_log(rates):
 
 
 def test_a_failure_not_drawn_is_bounded_by_the_last_level(rates):
-    assert rates[1].bounds == (0, 0, 1e-3)
+    assert rates[1].bounds.value == 0
+    assert math.isnan(rates[1].bounds.high)
     assert rates[1].at_most == 1e-3
     assert rates[0].at_most == 0
+
+
+def test_what_a_repetition_did_not_reach_is_part_of_the_interval():
+    ended = Estimate(0, 1, Tally(bound=0.02, rollouts=10, end=SPENT), 0.1, 0, 0, [])
+    (scene,) = scene_rates([reached(0, 0, 0.01), ended], SCENES, "preventable")
+    assert scene.bounds.value == pytest.approx(0.005)
+    assert scene.bounds.low == 0
+    assert scene.bounds.high == of_logs(torch.tensor([0.01, 0.02]).log()).high
+    assert scene.at_most == pytest.approx(0.01)
+
+
+def test_scenes_that_were_not_reached_may_add_their_bounds_in_every_unit(rates):
+    (contact, preventable, _) = rates_of(rates, STEPS)
+    assert preventable.unresolved["scene"] == pytest.approx(1.1e-3 / 3)
+    assert preventable.unresolved["hour"] == pytest.approx(1.1e-3 / 3 * 3600 / 8)
+    assert preventable.unresolved["1000km"] == pytest.approx(1.1e-3 / 0.3 * 1000)
+    assert contact.unresolved == preventable.unresolved
+
+
+def test_independent_rollouts_have_the_interval_of_their_counts():
+    tally = Tally(0.02, hits=2, rollouts=100, end=REACHED)
+    (scene,) = scene_rates([Estimate(0, 0, tally, 0.1, 0, 0, [])], SCENES, "contact")
+    assert scene.bounds == of_counts(2, 100)
 
 
 def test_weights_of_failures_sum_to_the_probability(rates):
@@ -57,10 +83,10 @@ def test_weights_of_failures_sum_to_the_probability(rates):
 def test_rates_are_per_scene_hour_and_1000_km(rates):
     by_event = {rate.event: rate for rate in rates_of(rates, STEPS)}
     preventable = by_event["preventable"]
-    assert preventable.scene.value == pytest.approx(0.02 / 3)
-    assert preventable.hour.value == pytest.approx(0.02 / 3 * 3600 / 8)
-    assert preventable.distance.value == pytest.approx(0.02 / 0.3 * 1000)
-    assert by_event["contact"].scene.value == pytest.approx(0.04 / 3)
+    assert preventable.bounds["scene"].value == pytest.approx(0.02 / 3)
+    assert preventable.bounds["hour"].value == pytest.approx(0.02 / 3 * 3600 / 8)
+    assert preventable.bounds["1000km"].value == pytest.approx(0.02 / 0.3 * 1000)
+    assert by_event["contact"].bounds["scene"].value == pytest.approx(0.04 / 3)
 
 
 def test_the_ratio_of_two_egos_is_that_of_their_rates(rates):
