@@ -10,12 +10,15 @@ mean of the fraction of speed that it has lost by then, and of 1 / (1 + relative
 GENTLE). A preventable one has PREVENTED.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
+from e2rl.metrics.contact import first_contact
 from e2rl.metrics.geometry import velocity
+from e2rl.metrics.proximity import ego_path, progress
+from e2rl.metrics.score import as_doubles
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.recording import VEHICLE
 from e2rl.sim.rollouts import Rollouts
@@ -33,19 +36,26 @@ MOVING = 0.5  # m/s: who has been slower all the time stands
 GENTLE = 5.0  # m/s, relative speed of a contact that counts half
 
 
-def levels(rollouts: Rollouts, rows: Sequence[dict]) -> Tensor:
+def levels(rollouts: Rollouts, rows: Mapping[int, dict]) -> Tensor:
     """Returns the levels [B] of rollouts, float64.
 
     Args:
         rollouts: B of them.
-        rows: their metrics; a rollout in which the planner raised has none, and is no
-            part of this.
+        rows: metrics of those with a contact, by their place among the B.
     """
     result = -clearance(rollouts).double().clamp(min=torch.finfo(torch.float64).tiny)
-    for index, row in enumerate(rows):
-        if row["cfr"] == 1:
-            result[index] = contact_level(row)
+    for index, row in rows.items():
+        result[index] = contact_level(row)
     return result
+
+
+def contacts(rollouts: Rollouts) -> tuple[Tensor, list[float]]:
+    """Returns in which rollouts [B] bool the ego touches a vehicle (`cfr`), and the km
+    that it drives until then in each (`driven_km`)."""
+    batch = as_doubles(rollouts)
+    contact = first_contact(batch)
+    path, count = ego_path(batch["states"], batch["valid"], stop=contact["stop"])
+    return contact["hit"], (progress(path, count) / 1000).tolist()
 
 
 def contact_level(row: dict) -> float:

@@ -1,6 +1,7 @@
 """How often an ego fails in scenes, in traffic as the prior has it: populations of
 rollouts, a few scenes at a time."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -12,14 +13,14 @@ from torch import Tensor
 
 from e2rl.driving.batches import Work, split_tasks
 from e2rl.driving.setup import Method, Setup, Task
-from e2rl.metrics.errored import errored_row, raised
+from e2rl.metrics.errored import errored_row, lost, raised
 from e2rl.metrics.score import score_rollouts
 from e2rl.run.config import configured, setting
 from e2rl.run.processes import in_processes
 from e2rl.run.terminal import Bar
 from e2rl.scenes.recording import VEHICLE
 from e2rl.sim.rollouts import Rollouts
-from e2rl.tail.level import CONTACT, FARTHEST, TARGETS, levels
+from e2rl.tail.level import FARTHEST, TARGETS, contacts, levels
 from e2rl.tail.moves import Moves
 from e2rl.tail.noise import ChosenNoise, NoiseLayout
 from e2rl.tail.plain import Plain
@@ -201,14 +202,10 @@ class Rating:
         for batch in split_tasks(tasks, self.setup.batch):
             parts, errored = attempt(partial(self.setup.roll_out, method), batch)
             for driven, rollouts in parts:
-                rows, _ = score_rollouts(rollouts)
-                level = levels(rollouts, rows).tolist()
-                for index, task in enumerate(driven):
+                judged = one_by_one(rollouts)
+                for task, rollout in zip(driven, judged, strict=True):
                     assert task.noise is not None
-                    fails = level[index] >= CONTACT
-                    results[task.noise] = OneRollout(
-                        level[index], rows[index], rollouts[[index]] if fails else None
-                    )
+                    results[task.noise] = rollout
             for task, reason in errored:
                 assert task.noise is not None
                 row = errored_row(
@@ -219,16 +216,42 @@ class Rating:
                     | reason
                 )
                 level_of = max(TARGETS.values()) if raised(row) else UNKNOWN
-                results[task.noise] = OneRollout(level_of, row, None)
+                results[task.noise] = OneRollout(level_of, math.nan, row, None)
         return [results[row] for row in range(len(tasks))]
 
 
 class OneRollout(NamedTuple):
-    """A rollout with its level and metrics; itself where it has a contact."""
+    """A rollout as its level tells it.
+
+    Args:
+        level: how near it comes to a failure.
+        km: that the ego drives; NaN where the planner or the traffic raised.
+        row: its metrics where there is a contact, and what was raised.
+        rollouts: itself where there is a contact.
+    """
 
     level: float
-    row: dict
+    km: float
+    row: dict | None
     rollouts: Rollouts | None
+
+
+def one_by_one(rollouts: Rollouts) -> list[OneRollout]:
+    """Returns each of some rollouts; only those with a contact are scored whole."""
+    hit, km = contacts(rollouts)
+    index = hit.nonzero()[:, 0].tolist()
+    scored = score_rollouts(rollouts[index])[0] if index else []
+    rows = dict(zip(index, scored, strict=True))
+    level = levels(rollouts, rows).tolist()
+    return [
+        OneRollout(
+            level[number],
+            km[number],
+            rows.get(number),
+            rollouts[[number]] if number in rows else None,
+        )
+        for number in range(len(rollouts))
+    ]
 
 
 @dataclass
@@ -265,13 +288,13 @@ class Population:
     def tell(self, driven: Sequence[OneRollout]) -> None:
         """Take what became of the rollouts that were asked for last."""
         first = not self.sampler.tally.rollouts
-        rows = [rollout.row for rollout in driven]
         if first:
-            km = [row["driven_km"] for row in rows if row["errored"] == 0]
+            km = [rollout.km for rollout in driven if not math.isnan(rollout.km)]
             self.km = sum(km) / max(len(km), 1)
+        rows = [rollout.row or {} for rollout in driven]
         self.raised += sum(map(raised, rows))
-        self.lost += sum(rollout.level == UNKNOWN for rollout in driven)
-        counted = [row["cfr_counted"] == 1 or raised(row) for row in rows]
+        self.lost += sum(map(lost, rows))
+        counted = [row.get("cfr_counted") == 1 or raised(row) for row in rows]
         self.sampler.tell(
             Driven(
                 torch.tensor([part.level for part in driven], dtype=torch.float64),

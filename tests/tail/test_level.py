@@ -5,9 +5,17 @@ import math
 import pytest
 import torch
 
+from e2rl.metrics.score import score_rollouts
 from e2rl.scenes.recording import AGENT_TYPES, PEDESTRIAN, VEHICLE
 from e2rl.sim.rollouts import Rollouts
-from e2rl.tail.level import AHEAD, CONTACT, PREVENTED, clearance, contact_level
+from e2rl.tail.level import (
+    AHEAD,
+    CONTACT,
+    PREVENTED,
+    clearance,
+    contact_level,
+    contacts,
+)
 
 STEPS = 20
 LENGTH = 4.0
@@ -105,3 +113,13 @@ def test_contacts_rank_by_what_the_driver_prevents():
     assert contact_level(contact(relvel=2.0)) > contact_level(contact(relvel=9.0))
     assert contact_level(contact(margin=1.0, relvel=0.0)) < PREVENTED
     assert contact_level(contact(relvel=math.inf)) == CONTACT
+
+
+@pytest.mark.parametrize("gap", [6.0, 60.0])
+def test_contacts_and_km_are_those_of_the_metrics(gap):
+    """The ego reaches a standing vehicle 6 m ahead, and none 60 m ahead."""
+    rollouts = rollout(moving(gap, 0.0, 0.0))
+    hit, km = contacts(rollouts)
+    ((row,), _) = score_rollouts(rollouts)
+    assert bool(hit) == (row["cfr"] == 1)
+    assert km == [row["driven_km"]]
