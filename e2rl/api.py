@@ -111,7 +111,11 @@ def roll_out(
     All are simulated at once. eta: adversarial intensity, 0 to 3.
     """
     setup = Setup(
-        scenes, ego, ego_name=type(ego).__name__, sim=SimSettings(), device=device
+        scenes,
+        ego,
+        ego_name=type(ego).__name__,
+        sim=SimSettings(),
+        device=device,
     )
     tasks = [Task(scene, seed) for seed in seeds for scene in range(len(scenes))]
     return setup.roll_out(
@@ -206,7 +210,9 @@ def make_env(
     prepare_fused(OmegaConf.create({"compile": compile, "device": "cpu"}))
     row = torch.arange(len(etas) * SEEDS * len(scenes))
     pool = TrafficPool.live(
-        row % len(scenes), etas.repeat_interleave(SEEDS * len(scenes)), seed=row
+        row % len(scenes),
+        etas.repeat_interleave(SEEDS * len(scenes)),
+        seed=row,
     )
     draw = RowDraw(torch.ones(len(row), dtype=torch.float64), seed)
     base = DrivingEnv(scenes, settings, num_envs, hold=hold)
@@ -251,7 +257,9 @@ def save_policy(policy: Any, path: str | Path, env: Any = None) -> Path:
     """
     if not isinstance(policy, torch.nn.Module):
         policy = library(
-            "e2rl.learning.adapters.sb3", "save_policy", extra="gym"
+            "e2rl.learning.adapters.sb3",
+            "save_policy",
+            extra="gym",
         ).Deterministic(policy, env)
     write_policy(policy, Path(path))
     return Path(path)
@@ -271,5 +279,8 @@ def score(rollouts: Rollouts) -> list[dict]:
 def _choice(group: str, name: str, settings: dict[str, Any]) -> DictConfig:
     """A file of the configuration with changes."""
     return with_changes(
-        load_choice(group, name), settings, where=f"{group}={name}", group=group
+        load_choice(group, name),
+        settings,
+        where=f"{group}={name}",
+        group=group,
     )

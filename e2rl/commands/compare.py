@@ -26,7 +26,10 @@ def main(arguments: list[str] | None = None) -> None:
         help="the one before, the one after; or one run",
     )
     parser.add_argument(
-        "--egos", nargs=2, metavar="NAME", help="the ego before and the one after"
+        "--egos",
+        nargs=2,
+        metavar="NAME",
+        help="the ego before and the one after",
     )
     parser.add_argument(
         "--out",

@@ -78,7 +78,10 @@ def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl export", description=__doc__)
     parser.add_argument(
-        "run", type=Path, metavar="RUN_DIR", help="folder of a run of evaluate.py"
+        "run",
+        type=Path,
+        metavar="RUN_DIR",
+        help="folder of a run of evaluate.py",
     )
     parser.add_argument(
         "--to",
@@ -94,10 +97,14 @@ def main(arguments: list[str] | None = None) -> None:
         help="at most so many failures (default: all)",
     )
     parser.add_argument(
-        "--failure", metavar="NAME", help="only this failure, as failures.csv names it"
+        "--failure",
+        metavar="NAME",
+        help="only this failure, as failures.csv names it",
     )
     parser.add_argument(
-        "--all", action="store_true", help="every rollout, not only failures"
+        "--all",
+        action="store_true",
+        help="every rollout, not only failures",
     )
     parser.add_argument("--method", metavar="NAME", help="rollouts in its traffic only")
     parser.add_argument(
@@ -142,7 +149,10 @@ def main(arguments: list[str] | None = None) -> None:
         rows = chosen_rows(options)
         episodes = tqdm(
             episodes_of(
-                options.run, rows, plugins=options.plugin, scene=not options.no_scene
+                options.run,
+                rows,
+                plugins=options.plugin,
+                scene=not options.no_scene,
             ),
             "exporting",
             total=len(rows),

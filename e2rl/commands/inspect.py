@@ -122,7 +122,9 @@ def limits_line(contents: Sequence[Content]) -> str:
 
 
 def report(
-    source: Source, rows: Sequence[Row], contents: Sequence[Content]
+    source: Source,
+    rows: Sequence[Row],
+    contents: Sequence[Content],
 ) -> list[str]:
     """The lines about a data set: `rows` of all its logs, `contents` of those that made
     a scene."""
@@ -178,7 +180,10 @@ def picture(scene: Scene, title: str, metres: float) -> Figure:
         if len(path) > 1:
             trails.append(Trail(path, colour, width=0.4))
         shapes += drawing.agent(
-            kind, scene["start"][agent], size=scene["size"][agent], colour=colour
+            kind,
+            scene["start"][agent],
+            size=scene["size"][agent],
+            colour=colour,
         )
     area = TrafficMap(axes, road_of(TensorDict(scene)), metres=metres)
     area.show(scene["start"][0, :2], trails, shapes)
@@ -264,7 +269,9 @@ def main(arguments: list[str] | None = None) -> None:
         help="file of conf/data that reads them (default: the one that can)",
     )
     parser.add_argument(
-        "--scene", metavar="ID", help="the scene that is drawn (default: the first)"
+        "--scene",
+        metavar="ID",
+        help="the scene that is drawn (default: the first)",
     )
     parser.add_argument(
         "--metres",
@@ -279,7 +286,10 @@ def main(arguments: list[str] | None = None) -> None:
         help="logs that must share no place with those at PATH",
     )
     parser.add_argument(
-        "--workers", type=int, default=2, help="processes (default %(default)s)"
+        "--workers",
+        type=int,
+        default=2,
+        help="processes (default %(default)s)",
     )
     parser.add_argument(
         "--out",

@@ -82,10 +82,17 @@ def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl merge", description=__doc__)
     parser.add_argument(
-        "runs", type=Path, nargs="+", metavar="RUN_DIR", help="folder of a shard"
+        "runs",
+        type=Path,
+        nargs="+",
+        metavar="RUN_DIR",
+        help="folder of a shard",
     )
     parser.add_argument(
-        "--into", type=Path, required=True, help="folder of the whole run, a new one"
+        "--into",
+        type=Path,
+        required=True,
+        help="folder of the whole run, a new one",
     )
     options = parser.parse_args(arguments)
     with ending():

@@ -51,7 +51,10 @@ def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(prog="e2rl replay", description=__doc__)
     parser.add_argument(
-        "run", type=Path, metavar="RUN_DIR", help="a run's folder, or one rollout .npz"
+        "run",
+        type=Path,
+        metavar="RUN_DIR",
+        help="a run's folder, or one rollout .npz",
     )
     parser.add_argument(
         "--failures",
@@ -61,10 +64,14 @@ def main(arguments: list[str] | None = None) -> None:
         help="how many failures (default %(default)s)",
     )
     parser.add_argument(
-        "--modes", action="store_true", help="instead, a typical failure of each mode"
+        "--modes",
+        action="store_true",
+        help="instead, a typical failure of each mode",
     )
     parser.add_argument(
-        "--out", type=Path, help="folder to write to (default: RUN_DIR/replays)"
+        "--out",
+        type=Path,
+        help="folder to write to (default: RUN_DIR/replays)",
     )
     parser.add_argument(
         "--metres",

@@ -55,7 +55,9 @@ def main(arguments: list[str] | None = None) -> None:
         help="its failures only; repeatable",
     )
     parser.add_argument(
-        "--out", type=Path, help=f"file to write (default: RUN_DIR/{PAGE})"
+        "--out",
+        type=Path,
+        help=f"file to write (default: RUN_DIR/{PAGE})",
     )
     options = parser.parse_args(arguments)
     with ending():

@@ -60,7 +60,9 @@ def tune(run: Run) -> dict:
     check_choice("tuning.group", tuning.group, choices=GROUPS)
     names = [field.name for field in fields(SearchSettings)]
     settings = settings_of(
-        SearchSettings, {name: tuning[name] for name in names}, where="tuning"
+        SearchSettings,
+        {name: tuning[name] for name in names},
+        where="tuning",
     )
     plan = begin(run, f"once a scene and seed in each of {settings.trials} trials")
     objective: Objective
@@ -68,7 +70,9 @@ def tune(run: Run) -> dict:
     failures: list[Batch] = []
     if tuning.group == "ego":
         objective = settings_of(
-            PlannerObjective, tuning.planner, where="tuning.planner"
+            PlannerObjective,
+            tuning.planner,
+            where="tuning.planner",
         )
         failures = tuned_failures(config, plan)
         trials = planner_trials(config, plan, failures)
@@ -128,7 +132,9 @@ def tuned_failures(config: DictConfig, plan: Evaluation) -> list[Batch]:
 
 
 def planner_trials(
-    config: DictConfig, plan: Evaluation, failures: list[Batch]
+    config: DictConfig,
+    plan: Evaluation,
+    failures: list[Batch],
 ) -> PlannerTrials:
     """Returns trials of the group `ego` against all of `config.methods`, and in the
     tries `failures`."""

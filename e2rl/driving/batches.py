@@ -145,7 +145,11 @@ def score_all(
         return parts.result(name, identity, score, valid=partial(has_files, into))
 
     for result in in_processes(
-        result_of, jobs, processes=work.processes, cost=cost, ended=ended
+        result_of,
+        jobs,
+        processes=work.processes,
+        cost=cost,
+        ended=ended,
     ):
         scored = Scored(*result)
         scored.rows += map(errored_row, scored.errored)

@@ -105,7 +105,11 @@ def build_searches(config: DictConfig, prior: Prior, eta: float) -> list[SearchM
 
 
 def build_search(
-    name: str, config: DictConfig, prior: Prior, *, eta: float
+    name: str,
+    config: DictConfig,
+    prior: Prior,
+    *,
+    eta: float,
 ) -> SearchMethod:
     """Returns the row of the group `search`, a portfolio of families.
 
@@ -287,7 +291,10 @@ def build_egos(config: DictConfig, name: str) -> EgoSet:
             "give as many of each"
         )
     return EgoSet(
-        egos, list(map(str, config.egos)), pairs=compared(config), trainings=trainings
+        egos,
+        list(map(str, config.egos)),
+        pairs=compared(config),
+        trainings=trainings,
     )
 
 

@@ -270,7 +270,10 @@ def nearness(row: Row) -> tuple[bool, float]:
 
 
 def pair_of(
-    key: Sequence, tries: Sequence[Row], others: Sequence[Row], searched: bool
+    key: Sequence,
+    tries: Sequence[Row],
+    others: Sequence[Row],
+    searched: bool,
 ) -> dict[str, Any] | None:
     """Returns two rollouts of one PAIR of which one has failed; None: none has.
 

@@ -96,7 +96,9 @@ def find_modes(rows: Sequence[dict]) -> dict:
 
 
 def group_counts(
-    group: dict, rows: Sequence[Row], members: Mapping[int, Sequence[Row]]
+    group: dict,
+    rows: Sequence[Row],
+    members: Mapping[int, Sequence[Row]],
 ) -> dict:
     """A group (dataset, split, method, ego_policy, eta) with its rollouts, failures,
     and modes other than the small ones that have one of its failures."""

@@ -70,7 +70,10 @@ class Evaluation:
         if settings.budget is None:
             return Spent(
                 drive_all(
-                    self.setups, self.methods, seeds=settings.seeds, work=self.work
+                    self.setups,
+                    self.methods,
+                    seeds=settings.seeds,
+                    work=self.work,
                 )
             )
         return search_all(

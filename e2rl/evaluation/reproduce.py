@@ -142,7 +142,10 @@ def setting_of(name: str) -> str:
 
 
 def check_weights(
-    config: DictConfig, saved: DictConfig, files: Mapping[str, str], where: str
+    config: DictConfig,
+    saved: DictConfig,
+    files: Mapping[str, str],
+    where: str,
 ) -> None:
     """Raises InputError where a file that the run's configuration named is another one
     now, or not there.

@@ -292,7 +292,9 @@ def add_errored(path: Path, number: int, errored: Sequence[dict]) -> None:
 
 
 def require_rows(
-    rows: Sequence, errored: Sequence[dict], folder: Path | None = None
+    rows: Sequence,
+    errored: Sequence[dict],
+    folder: Path | None = None,
 ) -> None:
     """InputError where all rollouts errored."""
     if rows or not errored:

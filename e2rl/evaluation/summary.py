@@ -116,7 +116,10 @@ def metric_rows(
             )
             paired |= paired_with_egos(key, groups, egos=egos, draws=draws)
         metrics = summarise(
-            group_rows, group_samples, draws=draws, realism_draws=realism_draws
+            group_rows,
+            group_samples,
+            draws=draws,
+            realism_draws=realism_draws,
         )
         if searched:
             metrics |= scene_metrics(group_rows, draws)

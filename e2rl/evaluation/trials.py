@@ -55,7 +55,9 @@ class PlannerObjective:
     comfort_ceiling: float = setting(low=0)
 
     def judge(
-        self, metrics: Mapping[str, float], reference: Mapping[str, float]
+        self,
+        metrics: Mapping[str, float],
+        reference: Mapping[str, float],
     ) -> tuple[float, float]:
         """See `Objective`. A trial in which the planner raised more often than in the
         reference is refused."""
@@ -96,7 +98,9 @@ class AttackObjective:
     realism: float | None = setting(low=0, high=1, optional=True)
 
     def judge(
-        self, metrics: Mapping[str, float], reference: Mapping[str, float]
+        self,
+        metrics: Mapping[str, float],
+        reference: Mapping[str, float],
     ) -> tuple[float, float]:
         """See `Objective`; each trial has its nominal metrics. One whose traffic loses
         more than ERRORED of its rollouts beyond nominal traffic's is refused: it would

@@ -43,7 +43,9 @@ class Objective(Protocol):
     shown: ClassVar[tuple[str, ...]]
 
     def judge(
-        self, metrics: Mapping[str, float], reference: Mapping[str, float]
+        self,
+        metrics: Mapping[str, float],
+        reference: Mapping[str, float],
     ) -> tuple[float, float]:
         """Returns (objective, excess) of a trial's metrics.
 
@@ -158,7 +160,10 @@ def judged(
 
 
 def read_study(
-    file: Path | None, task: Mapping, ranges: Mapping, objective: Objective
+    file: Path | None,
+    task: Mapping,
+    ranges: Mapping,
+    objective: Objective,
 ) -> list[dict]:
     """Returns the rows of a study's file, none where there is none.
 
@@ -342,7 +347,9 @@ def proposal(
         elif excess:
             value += REFUSED + excess
         trial = optuna.create_trial(
-            params=row["parameters"], distributions=ranges, value=value
+            params=row["parameters"],
+            distributions=ranges,
+            value=value,
         )
         study.add_trial(trial)
     return study.ask(dict(ranges)).params

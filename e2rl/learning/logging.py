@@ -21,7 +21,11 @@ class RunLogger:
     """Writes {group/name: number} at steps; NaN is omitted."""
 
     def __init__(
-        self, kind: str, folder: Path, project: str = "e2rl", name: str | None = None
+        self,
+        kind: str,
+        folder: Path,
+        project: str = "e2rl",
+        name: str | None = None,
     ) -> None:
         """kind: csv (folder/logs/scalars/<group>/<name>.csv), tensorboard
         (folder/tensorboard), wandb (offline, folder/wandb), none. Choices are in

@@ -140,7 +140,11 @@ def overlaps_from_birth(overlap: Tensor, valid: Tensor) -> Tensor:
 
 
 def states_at_contact(
-    before: Tensor, after: Tensor, *, sizes: Tensor, latest: Tensor
+    before: Tensor,
+    after: Tensor,
+    *,
+    sizes: Tensor,
+    latest: Tensor,
 ) -> Tensor:
     """States [C, 2, 4] of the ego and its partner at the moment when they first touch.
 

@@ -115,7 +115,9 @@ class HumanDriver(NamedTuple):
         return speed * (self.delay + build_up) + speed.square() / (2 * self.braking)
 
     def step(
-        self, state: DriverState, observation: Observation
+        self,
+        state: DriverState,
+        observation: Observation,
     ) -> tuple[DriverState, Tensor]:
         """Next state and acceleration."""
         gap = observation.gap
@@ -156,7 +158,9 @@ class RegulationLimit(NamedTuple):
     braking: float = LIMIT_BRAKING
 
     def step(
-        self, state: DriverState, observation: Observation
+        self,
+        state: DriverState,
+        observation: Observation,
     ) -> tuple[DriverState, Tensor]:
         """Next state and acceleration."""
         gap = observation.gap
@@ -171,7 +175,9 @@ class RegulationLimit(NamedTuple):
         )
         eases = leaves_its_lane & (closing > 0) & (gap > 0) & ~decided
         braking = torch.where(
-            time >= self.delay + self.lag, self.braking, self.release * eases.to(time)
+            time >= self.delay + self.lag,
+            self.braking,
+            self.release * eases.to(time),
         )
         return DriverState(
             time,
@@ -216,7 +222,9 @@ class ResponsibilitySensitiveSafety(NamedTuple):
         return self.lateral_margin + way.clamp(min=0)
 
     def step(
-        self, state: DriverState, observation: Observation
+        self,
+        state: DriverState,
+        observation: Observation,
     ) -> tuple[DriverState, Tensor]:
         """Next state and acceleration."""
         danger = (
@@ -267,7 +275,12 @@ class FuzzySafetyModel(NamedTuple):
         return ((safe + self.margin - gap) / (safe - unsafe)).clamp(0, 1)
 
     def critical(
-        self, gap: Tensor, speed: Tensor, *, acceleration: Tensor, other_speed: Tensor
+        self,
+        gap: Tensor,
+        speed: Tensor,
+        *,
+        acceleration: Tensor,
+        other_speed: Tensor,
     ) -> Tensor:
         """CFS [...]: what if the other keeps its speed.
 
@@ -291,7 +304,9 @@ class FuzzySafetyModel(NamedTuple):
         return torch.where(after > 0, fuzzy, sharp) * (closing > 0)
 
     def step(
-        self, state: DriverState, observation: Observation
+        self,
+        state: DriverState,
+        observation: Observation,
     ) -> tuple[DriverState, Tensor]:
         """Next state and acceleration."""
         gap = observation.gap

@@ -314,7 +314,11 @@ def mutated(parents: Knots, generator: torch.Generator) -> Knots:
 
 
 def add_avoidable(
-    rows: list[dict], rollouts: Rollouts, *, scene: TensorDictBase, sim: SimSettings
+    rows: list[dict],
+    rollouts: Rollouts,
+    *,
+    scene: TensorDictBase,
+    sim: SimSettings,
 ) -> None:
     """Search the collisions of the ego for evasions; what is found goes into the rows
     and into `rollouts.evasion`.

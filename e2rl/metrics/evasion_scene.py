@@ -33,7 +33,11 @@ class EvasionScene(TensorClass):
 
     @staticmethod
     def after(
-        moment: Tensor, scene: TensorDictBase, *, states: Tensor, valid: Tensor
+        moment: Tensor,
+        scene: TensorDictBase,
+        *,
+        states: Tensor,
+        valid: Tensor,
     ) -> "EvasionScene":
         """The scenes after a step.
 
@@ -77,7 +81,11 @@ class EvasionScene(TensorClass):
 
 
 def violations(
-    states: Tensor, scene: EvasionScene, *, clearance: float, road_margin: float
+    states: Tensor,
+    scene: EvasionScene,
+    *,
+    clearance: float,
+    road_margin: float,
 ) -> Tensor:
     """Metres [B, C, T] by which egos fail as evasions: what is missing of the clearance
     to everybody at each step, and what lies beyond the road from the first time on it;
@@ -109,7 +117,9 @@ def violations(
 
 
 def clearance_violation(
-    states: Tensor, scene: EvasionScene, clearance: float
+    states: Tensor,
+    scene: EvasionScene,
+    clearance: float,
 ) -> Tensor:
     """Metres [B, C, T] of missing clearance, summed over the agents nearer than it;
     exact box separation."""

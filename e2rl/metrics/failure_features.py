@@ -147,7 +147,11 @@ def manoeuvre(window: Tensor, known: Tensor, lanes: Tensor) -> Tensor:
 
 
 def approach(
-    window: Tensor, size: Tensor, *, stands: Tensor, ego_enters: Tensor
+    window: Tensor,
+    size: Tensor,
+    *,
+    stands: Tensor,
+    ego_enters: Tensor,
 ) -> Tensor:
     """Index [C] into APPROACHES.
 
@@ -204,7 +208,9 @@ def approach(
 
 
 def place_on_path(
-    window: Tensor, size: Tensor, step: int
+    window: Tensor,
+    size: Tensor,
+    step: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Whether the second vehicle of window [C, W, 2, 4] touches, at a step, the path of
     the first from that step on (its boxes, then a straight strip); whether it also runs

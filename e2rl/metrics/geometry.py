@@ -67,7 +67,10 @@ def pair_overlap(
 
 
 def overlap_area(
-    first: Tensor, first_size: Tensor, second: Tensor, second_size: Tensor
+    first: Tensor,
+    first_size: Tensor,
+    second: Tensor,
+    second_size: Tensor,
 ) -> Tensor:
     """Exact area [...] [m2] of two boxes' intersection.
 
@@ -98,7 +101,10 @@ def overlap_area(
 
 
 def edge_parts_inside(
-    box: Tensor, size: Tensor, other: Tensor, other_size: Tensor
+    box: Tensor,
+    size: Tensor,
+    other: Tensor,
+    other_size: Tensor,
 ) -> Tensor:
     """Length [..., 4] [m] of each of the box's edges (order `EDGES`) that lies inside
     the other box.
@@ -119,7 +125,11 @@ def edge_parts_inside(
 
 
 def _edges_in_frame(
-    box: Tensor, size: Tensor, other: Tensor, other_size: Tensor, zero: float
+    box: Tensor,
+    size: Tensor,
+    other: Tensor,
+    other_size: Tensor,
+    zero: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Start and change [..., 4, 2] of the box's edges in the frame of the other box,
     that box's half size [..., 1, 2], and the fractions [2, ..., 4, 2] of each edge at

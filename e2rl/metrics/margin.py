@@ -27,7 +27,9 @@ def margin_columns(batch: Batch) -> Batch:
     """margin [B]."""
     return {
         "margin": torch.where(
-            batch["hit"], contact_margin(batch), -approach_distance(batch).amin(1)
+            batch["hit"],
+            contact_margin(batch),
+            -approach_distance(batch).amin(1),
         )
     }
 

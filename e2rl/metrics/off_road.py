@@ -78,7 +78,9 @@ class Segments(NamedTuple):
 
 
 def near_segments(
-    points: Points, segments: Segments, reach: Tensor | float
+    points: Points,
+    segments: Segments,
+    reach: Tensor | float,
 ) -> tuple[Tensor, Tensor]:
     """Indices (point, segment) of all pairs of a rollout that are at most reach m (a
     number, or [m] of each segment) apart."""

@@ -163,7 +163,12 @@ class Leader(NamedTuple):
 
 
 def followers_brake(
-    leader: Leader, others: Tracks, touched: Tensor, *, counts: Tensor, avoided: Tensor
+    leader: Leader,
+    others: Tracks,
+    touched: Tensor,
+    *,
+    counts: Tensor,
+    avoided: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Whether collisions are still avoided once all followers brake as a competent
     driver does, and how many had to, each [B].
@@ -393,7 +398,11 @@ def along_path(states: Tensor, width: Tensor, others: Tracks) -> Along:
 
 @fused("B P 2", "B", "B T N 4", "B N 2", "B T N")
 def seen_along(
-    route: Tensor, width: Tensor, states: Tensor, size: Tensor, present: Tensor
+    route: Tensor,
+    width: Tensor,
+    states: Tensor,
+    size: Tensor,
+    present: Tensor,
 ) -> tuple[Tensor, ...]:
     """The fields of Along.
 

@@ -165,7 +165,10 @@ def progress(path: Tensor, count: Tensor) -> Tensor:
 
 
 def route_completion(
-    path: Tensor, count: Tensor, logged: Tensor, logged_valid: Tensor
+    path: Tensor,
+    count: Tensor,
+    logged: Tensor,
+    logged_valid: Tensor,
 ) -> Tensor:
     """Fraction [B] in [0, 1] of the recorded ego's path that lies behind the ego at the
     end of its path.
@@ -209,7 +212,11 @@ def route_completion(
 
 
 def _place_on(
-    points: Tensor, count: Tensor, way: Tensor, piece: Tensor, ends: Tensor
+    points: Tensor,
+    count: Tensor,
+    way: Tensor,
+    piece: Tensor,
+    ends: Tensor,
 ) -> Tensor:
     """Metres [B] along ways [B, P, 2] at which the last of `count` [B] points [B, T, 2]
     is.

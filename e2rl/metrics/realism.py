@@ -127,7 +127,9 @@ def traffic_samples(batch: dict[str, Tensor]) -> list[Samples]:
     tracks = batch["states"], batch["valid"], batch["logged"], batch["logged_valid"]
     everybody = kinematic_samples(*tracks, batch["traffic"], batch["stop"])
     adversaries = kinematic_samples(
-        *tracks, batch["traffic"] & batch["adversaries"], batch["stop"]
+        *tracks,
+        batch["traffic"] & batch["adversaries"],
+        batch["stop"],
     )
     return [
         samples
@@ -193,7 +195,9 @@ def wasserstein(pair: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
 
 
 def realism(
-    samples: list[Samples], cluster: Tensor, draws: Tensor
+    samples: list[Samples],
+    cluster: Tensor,
+    draws: Tensor,
 ) -> dict[str, Tensor]:
     """real, real_norm, w1_a_lon, w1_a_lat, w1_jerk and real_adv [D] of the pooled
     samples of rollouts.
@@ -218,7 +222,10 @@ def realism(
 
 
 def _pooled(
-    samples: list[Samples], cluster: Tensor, draws: Tensor, names: tuple[str, ...]
+    samples: list[Samples],
+    cluster: Tensor,
+    draws: Tensor,
+    names: tuple[str, ...],
 ) -> dict[str, Tensor]:
     """`realism` without real_adv, of the samples of these names."""
     distances = []
@@ -270,5 +277,7 @@ def quantile_of_sorted(values: Tensor, fraction: float) -> Tensor:
     position = fraction * (len(values) - 1)
     low = int(position)
     return torch.lerp(
-        values[low], values[min(low + 1, len(values) - 1)], position - low
+        values[low],
+        values[min(low + 1, len(values) - 1)],
+        position - low,
     )

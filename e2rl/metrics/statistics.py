@@ -93,7 +93,11 @@ def bootstrap_draws(clusters: int, draws: int = DRAWS, seed: int = 0) -> Tensor:
 
 
 def resampled_means(
-    totals: Tensor, weights: Tensor, *, cluster: Tensor, draws: Tensor
+    totals: Tensor,
+    weights: Tensor,
+    *,
+    cluster: Tensor,
+    draws: Tensor,
 ) -> Tensor:
     """Quotients [D, M] of the sums of totals and weights in each draw.
 
@@ -129,7 +133,11 @@ def resampled_medians(values: Tensor, cluster: Tensor, draws: Tensor) -> Tensor:
 
 
 def resampled_labels(
-    labels: Tensor, cluster: Tensor, *, draws: Tensor, places: int
+    labels: Tensor,
+    cluster: Tensor,
+    *,
+    draws: Tensor,
+    places: int,
 ) -> Tensor:
     """Expected number [D] of different labels of one rollout at each of several
     different clusters of a draw, picked at random.
@@ -263,7 +271,9 @@ class Bootstrap:
         self.realism_draws = crossed(realism_draws)
 
     def resampled(
-        self, table: MetricTable, samples: Sequence[Samples]
+        self,
+        table: MetricTable,
+        samples: Sequence[Samples],
     ) -> dict[str, Tensor]:
         """{metric: values [D] in each draw}."""
         means = resampled_means(
@@ -308,7 +318,12 @@ class Bootstrap:
         return min(self.places((weight > 0) & side) for side in sides) < LEAST
 
     def exact(
-        self, metric: Metric, table: MetricTable, *, mean: float, level: float
+        self,
+        metric: Metric,
+        table: MetricTable,
+        *,
+        mean: float,
+        level: float,
     ) -> Bounds:
         """Exact bounds of a metric whose estimate is `mean`; NaN from too few places,
         and for what is no fraction of places."""
@@ -324,7 +339,12 @@ class Bootstrap:
         )
 
     def agreed(
-        self, metric: Metric, values: Tensor, *, known: Tensor, least: float
+        self,
+        metric: Metric,
+        values: Tensor,
+        *,
+        known: Tensor,
+        least: float,
     ) -> Bounds | None:
         """Bounds of a mean of which all draws agree, LEAST places or more (see
         `bounds_of_alike`); None of others.
@@ -353,7 +373,9 @@ class Bootstrap:
         return mean, mean
 
     def intervals(
-        self, values: Mapping[str, Tensor], known: Mapping[str, Tensor]
+        self,
+        values: Mapping[str, Tensor],
+        known: Mapping[str, Tensor],
     ) -> dict[str, dict[str, float]]:
         """{metric: {mean, low, high, n}} in the catalogue's order; known [R] bool: the
         n rollouts that a value uses."""
@@ -422,7 +444,9 @@ def summarise(
             least=0.0,
         )
         if bounds is None and bootstrap.is_rare(
-            metric, table.totals[:, column], table.weights[:, column]
+            metric,
+            table.totals[:, column],
+            table.weights[:, column],
         ):
             mean = values[name][0].item()
             bounds = bootstrap.exact(

@@ -69,7 +69,12 @@ def traffic_contact_columns(batch: Batch) -> Batch:
 
 
 def near_pairs(
-    states: Tensor, size: Tensor, *, one: Tensor, two: Tensor, present: Tensor
+    states: Tensor,
+    size: Tensor,
+    *,
+    one: Tensor,
+    two: Tensor,
+    present: Tensor,
 ) -> tuple[Tensor, ...]:
     """Indices (rollout, step, pair) where both agents of a pair are present and their
     bounding circles meet.

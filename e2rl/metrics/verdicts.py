@@ -79,7 +79,9 @@ COLUMNS = (  # of collisions
 
 
 def judge(
-    batch: Batch, collisions: Collisions, moved_into: Tensor
+    batch: Batch,
+    collisions: Collisions,
+    moved_into: Tensor,
 ) -> tuple[Batch, Tensor]:
     """The verdicts on B rollouts, and the driver that they rest on.
 
@@ -117,7 +119,9 @@ def judge(
 
 
 def collision_verdicts(
-    batch: Batch, collisions: Collisions, moved_into: Tensor
+    batch: Batch,
+    collisions: Collisions,
+    moved_into: Tensor,
 ) -> tuple[Batch, Tensor, Prevention]:
     """COLUMNS [C] bool, duty [C] and the human driver's Prevention of C > 0 collisions;
     arguments as in `judge`."""

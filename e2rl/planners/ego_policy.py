@@ -103,7 +103,9 @@ class EgoPlanner(TensorDictModuleBase):
         start = self.scene["start"][:, :1]
         self._plan = torch.zeros_like(start).repeat(1, 1 + PLAN_STEPS, 1)
         self._planned_at = torch.full(
-            start.shape[:1], -PLAN_STEPS, device=start.device
+            start.shape[:1],
+            -PLAN_STEPS,
+            device=start.device,
         )  # step [B] of the last plan, which begins with the state then
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -152,20 +152,30 @@ class Denoiser(nn.Module):
         self.register_buffer("node_std", torch.ones(NODE))
         dropout = nn.Dropout(settings.dropout)
         self.encode_node = nn.Sequential(
-            nn.Linear(NODE, 2 * width), nn.GELU(), dropout, nn.Linear(2 * width, width)
+            nn.Linear(NODE, 2 * width),
+            nn.GELU(),
+            dropout,
+            nn.Linear(2 * width, width),
         )
         self.encode_pair = nn.Sequential(
-            nn.Linear(EDGE, 48), nn.GELU(), nn.Linear(48, settings.pair), nn.GELU()
+            nn.Linear(EDGE, 48),
+            nn.GELU(),
+            nn.Linear(48, settings.pair),
+            nn.GELU(),
         )
         self.bias = nn.Linear(settings.pair, settings.heads * settings.blocks)
         self.embed_x = nn.Linear(SIZE, width)
         self.embed_level = nn.Sequential(
-            nn.Linear(32, width), nn.GELU(), nn.Linear(width, width)
+            nn.Linear(32, width),
+            nn.GELU(),
+            nn.Linear(width, width),
         )
         scales = torch.tensor([0.0, 1.0, 0.0, 0.0, 1.0, 0.0]).repeat_interleave(width)
         self.register_buffer("unit_scale", scales, persistent=False)
         self.register_buffer(
-            "frequencies", torch.logspace(-0.3, 1.7, 16), persistent=False
+            "frequencies",
+            torch.logspace(-0.3, 1.7, 16),
+            persistent=False,
         )
         blocks = [
             Block(width, settings.heads, settings.pair, settings.dropout)
@@ -188,7 +198,10 @@ class Denoiser(nn.Module):
         if self._learns() or not is_on():
             return self.encoding(nodes, pairs, present=present)
         node, pair, *rest = fused_encoding(self.settings)(
-            nodes, pairs, present, *self._read
+            nodes,
+            pairs,
+            present,
+            *self._read,
         )
         return Encoding(
             node,

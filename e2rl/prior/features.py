@@ -168,7 +168,9 @@ def leaders_ahead(
 
 
 def _light_features(
-    routed: RoutedScene, state: LaneState, step: Tensor
+    routed: RoutedScene,
+    state: LaneState,
+    step: Tensor,
 ) -> list[Tensor]:
     """Of each light of the route: nearness, red, yellow, green, and the braking that
     stops at it."""

@@ -350,7 +350,9 @@ def polynomial(c: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def fit(
-    track: LaneState, known: Tensor | None, state: LaneState
+    track: LaneState,
+    known: Tensor | None,
+    state: LaneState,
 ) -> tuple[Tensor, Tensor]:
     """x [..., V, SIZE] that reproduces recorded motion, and its mean error [..., V] in
     m.

@@ -130,7 +130,9 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def start(
-        self, scene: TensorDictBase, chosen: Tensor
+        self,
+        scene: TensorDictBase,
+        chosen: Tensor,
     ) -> tuple[RoutedScene, LaneState]:
         """RoutedScene and start states of scenes [B] whose vehicles follow candidates
         chosen [B, V]."""

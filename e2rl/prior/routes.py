@@ -70,7 +70,9 @@ ROUTED = (
 def take_route(values: Tensor, route: Tensor) -> Tensor:
     """values [B, V, R, ...] at route [B, V] -> [B, V, ...]."""
     index = route.reshape(*route.shape, *[1] * (values.ndim - 2)).expand(
-        *route.shape, 1, *values.shape[3:]
+        *route.shape,
+        1,
+        *values.shape[3:],
     )
     return values.gather(2, index).squeeze(2)
 
@@ -267,7 +269,9 @@ def start_of(scene: TensorDictBase) -> Moment:
         device=scene["start"].device,
     )
     return Moment(
-        scene["start"][:, :vehicles], scene["start_yaw_rate"][:, :vehicles], step=step
+        scene["start"][:, :vehicles],
+        scene["start_yaw_rate"][:, :vehicles],
+        step=step,
     )
 
 

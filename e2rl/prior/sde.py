@@ -231,7 +231,9 @@ class SamplerSettings:
         return SAMPLERS[self.sampler](schedule, self.churn)
 
     def levels(
-        self, schedule: NoiseSchedule, device: torch.device | None = None
+        self,
+        schedule: NoiseSchedule,
+        device: torch.device | None = None,
     ) -> Tensor:
         """The noise levels [steps + 1] of a replan."""
         return schedule.levels(self.steps, device, self.spacing)
@@ -296,7 +298,12 @@ def fused_step(settings: SamplerSettings, size: int, limited: bool) -> Fused:
         before, high, low, noise = interval
         x0, nominal = clean
         moved, variance = sampler.step(
-            x, x0, high, low, noise, (past.controlled, before)
+            x,
+            x0,
+            high,
+            low,
+            noise,
+            (past.controlled, before),
         )
         plain, _ = sampler.step(x, nominal, high, low, noise, (past.nominal, before))
         variance = variance * temperature**2
@@ -313,7 +320,10 @@ def fused_step(settings: SamplerSettings, size: int, limited: bool) -> Fused:
             temperature=temperature,
         )
         return Moved(
-            moved, x0, account.kl + added, account.log_ratio + added + martingale
+            moved,
+            x0,
+            account.kl + added,
+            account.log_ratio + added + martingale,
         )
 
     rows = f"B V {size}"

@@ -224,7 +224,10 @@ def scenes_text(rows: Iterable[dict], named: int, file: str = ERRORED_FILE) -> s
 
 
 def group_lines(
-    group: Row, rows: Sequence[dict], metrics: Sequence[dict], searched: bool
+    group: Row,
+    rows: Sequence[dict],
+    metrics: Sequence[dict],
+    searched: bool,
 ) -> tuple[dict[str, str], list[str]]:
     """Returns the RATES of one ego in one traffic in words, and the lines about it: its
     headline, its rates and what to know of them.
@@ -485,7 +488,10 @@ def per_cent(fraction: float) -> str:
 def wrapped(text: str, indent: str = "") -> list[str]:
     """The text in lines of the terminal's width, the second and later ones indented."""
     return textwrap.wrap(
-        text.strip(), terminal_width(), subsequent_indent=indent, break_on_hyphens=False
+        text.strip(),
+        terminal_width(),
+        subsequent_indent=indent,
+        break_on_hyphens=False,
     )
 
 

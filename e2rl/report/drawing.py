@@ -95,7 +95,10 @@ class TrafficMap:
         # Agg clips lines without a fill at the canvas by their middle, which would cut
         # wide ones: hence a clear fill.
         surface = LineCollection(
-            lanes, linewidths=widths, colors=ROAD, facecolors=CLEAR
+            lanes,
+            linewidths=widths,
+            colors=ROAD,
+            facecolors=CLEAR,
         )
         surface.set(capstyle="round", joinstyle="round")
         self.trails = LineCollection([])
@@ -109,7 +112,10 @@ class TrafficMap:
         axes.add_collection(self.shapes)
 
     def show(
-        self, centre: np.ndarray, trails: Sequence[Trail], shapes: Sequence[Shape]
+        self,
+        centre: np.ndarray,
+        trails: Sequence[Trail],
+        shapes: Sequence[Shape],
     ) -> None:
         """Move the map's centre [2] m, and draw trails and then shapes, the last on
         top."""
@@ -134,7 +140,9 @@ class TrafficMap:
 
 
 def placed(
-    outline: Sequence[tuple[float, float]], state: np.ndarray, size: np.ndarray
+    outline: Sequence[tuple[float, float]],
+    state: np.ndarray,
+    size: np.ndarray,
 ) -> np.ndarray:
     """World points [k, 2] m of an outline at a state (x, y, heading, ...), for a size
     (length, width)."""
@@ -147,13 +155,19 @@ def placed(
 def vehicle(state: np.ndarray, size: np.ndarray, colour: Colour) -> list[Shape]:
     """A car's body, and its windscreen, which shows where its front is."""
     body = Shape(
-        placed(BODY, state, size=size), colour, edge=("black", 0.4), width=0.12
+        placed(BODY, state, size=size),
+        colour,
+        edge=("black", 0.4),
+        width=0.12,
     )
     return [body, Shape(placed(WINDSCREEN, state, size=size), ("black", 0.45))]
 
 
 def agent(
-    kind: str, state: np.ndarray, size: np.ndarray, colour: Colour
+    kind: str,
+    state: np.ndarray,
+    size: np.ndarray,
+    colour: Colour,
 ) -> list[Shape]:
     """A pedestrian as a disc, a cyclist as a slim box with a disc, and all others as
     vehicles.
@@ -190,7 +204,11 @@ def contact_mark(point: np.ndarray, phase: float) -> list[Shape]:
 
 
 def disc(
-    centre: np.ndarray, radius: float, fill: Colour, edge: Colour, width: float = 0.1
+    centre: np.ndarray,
+    radius: float,
+    fill: Colour,
+    edge: Colour,
+    width: float = 0.1,
 ) -> Shape:
     """A circle.
 
@@ -219,7 +237,11 @@ def add_legend(figure: Figure, colours: Mapping[str, Colour], size: float) -> No
         "columnspacing": 1.4,
     }
     figure.legend(
-        handles=handles, ncols=len(handles), loc="lower left", fontsize=size, **style
+        handles=handles,
+        ncols=len(handles),
+        loc="lower left",
+        fontsize=size,
+        **style,
     )
 
 

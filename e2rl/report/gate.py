@@ -207,7 +207,11 @@ def judged(text: str, driven: Driven, former: Driven | None) -> dict[str, Any]:
 
 
 def growth(
-    estimate: tuple[float, float, float], limit: float, places: int, *, fraction: bool
+    estimate: tuple[float, float, float],
+    limit: float,
+    places: int,
+    *,
+    fraction: bool,
 ) -> float | None:
     """By which factor places, and so rollouts, must grow until the interval ends at the
     limit if the value stays; without an interval, to LEAST places; None: none decides.
@@ -248,7 +252,9 @@ def growth(
 
 
 def junit(
-    results: Sequence[Mapping[str, Any]], run: str, events: Sequence[str]
+    results: Sequence[Mapping[str, Any]],
+    run: str,
+    events: Sequence[str],
 ) -> bytes:
     """JUnit's XML: a test case for each rule, a failure or, where rollouts are too few,
     an error; `events` are lines about the run."""

@@ -142,7 +142,10 @@ def failure_list(content: Mapping[str, Any], page_name: str) -> str:
 
 
 def page(
-    body: Path, title: str, scripts: Sequence[Path], content: Mapping[str, Any]
+    body: Path,
+    title: str,
+    scripts: Sequence[Path],
+    content: Mapping[str, Any],
 ) -> str:
     """The frame of all pages with a body, the report's style and that beside the body.
 
@@ -201,7 +204,9 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
     rollouts = grouped(every, group_key)
     groups = {}
     for group, label in zip(
-        modes["groups"], column_names(modes["groups"]), strict=True
+        modes["groups"],
+        column_names(modes["groups"]),
+        strict=True,
     ):
         if methods and group["method"] not in methods:
             continue

@@ -95,7 +95,9 @@ def escaped(text: str) -> str:
 
 
 def metric_tables(
-    rows: Sequence[dict], settings: str = "", table: str = "main"
+    rows: Sequence[dict],
+    settings: str = "",
+    table: str = "main",
 ) -> list[Table]:
     """Returns the tables of rows of metrics.json: for each data set, split and ego the
     means of each method, and their differences where there are several.
@@ -116,7 +118,9 @@ def metric_tables(
 
 
 def means_table(
-    group: Sequence[dict], settings: str, metrics: Sequence[Metric]
+    group: Sequence[dict],
+    settings: str,
+    metrics: Sequence[Metric],
 ) -> Table:
     """The mean and interval of each metric, with a column for each row of
     metrics.json."""

@@ -25,7 +25,9 @@ KEYS = (  # always in the palette
 
 
 def save_animation(
-    path: Path, frames: Iterable[Image.Image], colours: int = COLOURS
+    path: Path,
+    frames: Iterable[Image.Image],
+    colours: int = COLOURS,
 ) -> None:
     """Write an endless GIF at 10 Hz; raises InputError for another ending of its path."""
     if path.suffix != ".gif":

@@ -54,7 +54,10 @@ def run_command(
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors arrive here as they are
     sweep = Sweep()
     OmegaConf.register_new_resolver(
-        "new_folder", new_folder, replace=True, use_cache=True
+        "new_folder",
+        new_folder,
+        replace=True,
+        use_cache=True,
     )
 
     def job(config: DictConfig) -> None:
@@ -66,7 +69,9 @@ def run_command(
                 work(run)
 
     @hydra.main(
-        version_base="1.3", config_path=str(conf_folder().resolve()), config_name=name
+        version_base="1.3",
+        config_path=str(conf_folder().resolve()),
+        config_name=name,
     )
     def command(config: DictConfig) -> None:
         try:

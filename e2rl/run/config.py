@@ -86,7 +86,10 @@ def load_choice(group: str, name: str) -> DictConfig:
         try:
             loader = hydra.config_loader()
             return loader.load_configuration(
-                None, changes, RunMode.RUN, validate_sweep_overrides=False
+                None,
+                changes,
+                RunMode.RUN,
+                validate_sweep_overrides=False,
             )[group]
         except HydraException as error:
             names = ", ".join(choices(group))
@@ -102,7 +105,10 @@ def choices(group: str) -> list[str]:
 
 
 def with_changes(
-    config: DictConfig, changes: Mapping[str, Any], where: str, group: str
+    config: DictConfig,
+    changes: Mapping[str, Any],
+    where: str,
+    group: str,
 ) -> DictConfig:
     """Returns a copy of a configuration with changes of dotted keys; InputError where
     there is no such key in it."""
@@ -252,7 +258,9 @@ def _loaded(file: str) -> Any:
         conf_folder() / "train.yaml"
     )  # what the file's ${...} may refer to
     OmegaConf.update(
-        root, "sim", OmegaConf.load(conf_folder() / "sim" / "default.yaml")
+        root,
+        "sim",
+        OmegaConf.load(conf_folder() / "sim" / "default.yaml"),
     )
     OmegaConf.update(root, "own", OmegaConf.load(conf_folder() / f"{file}.yaml"))
     return root.own
@@ -326,7 +334,10 @@ def check_choice(where: str, value: object, choices: Collection[str]) -> None:
 
 
 def check_range(
-    where: str, value: float, low: float = float("-inf"), high: float = float("inf")
+    where: str,
+    value: float,
+    low: float = float("-inf"),
+    high: float = float("inf"),
 ) -> None:
     """Raises InputError where the number `where` is below `low`, above `high`, or NaN."""
     if not low <= value <= high:

@@ -90,7 +90,9 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
 
 
 def _told(
-    error: BaseException, arrived: list[int], go_on: Callable[[], str]
+    error: BaseException,
+    arrived: list[int],
+    go_on: Callable[[], str],
 ) -> tuple[str | None, int]:
     """The line that an error ends in, and the status; None where it is of the code."""
     if arrived:

@@ -63,7 +63,9 @@ def cache_folder() -> Path:
 
 
 def open_regular(
-    path: Path, limit: int = MAX_FILE, within: Path | None = None
+    path: Path,
+    limit: int = MAX_FILE,
+    within: Path | None = None,
 ) -> io.BufferedReader:
     """Open a regular file to read, which never blocks.
 
@@ -91,7 +93,9 @@ def open_regular(
 
 
 def read_regular(
-    path: Path, limit: int = MAX_FILE, within: Path | None = None
+    path: Path,
+    limit: int = MAX_FILE,
+    within: Path | None = None,
 ) -> bytes:
     """Returns the bytes of a file as `open_regular` opens it; raises as it does."""
     with open_regular(path, limit, within=within) as file:

@@ -254,7 +254,9 @@ class Fused:
         settings = {"cpp.threads": 1}  # processes run beside each other
         with tracing():
             torch._inductor.aoti_compile_and_package(
-                self.traced(), package_path=package, inductor_configs=settings
+                self.traced(),
+                package_path=package,
+                inductor_configs=settings,
             )
         # the library alone: packages are unpacked anew by every process
         with zipfile.ZipFile(package) as archive:

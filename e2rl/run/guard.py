@@ -23,7 +23,9 @@ def kill_group(leader: int, number: int = signal.SIGKILL) -> None:
 def main(command: list[str]) -> None:
     """Run the command; end as it ends."""
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, start_new_session=True
+        command,
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,
     )
 
     def end(*_: object) -> None:

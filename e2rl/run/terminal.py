@@ -55,7 +55,9 @@ class Bar(tqdm):
         self.as_lines = sys.stderr is None or not sys.stderr.isatty()
         self._line_due = time.monotonic() + FIRST
         super().__init__(
-            *args, disable=sys.stderr is None, **settings
+            *args,
+            disable=sys.stderr is None,
+            **settings,
         )  # as after `2>&-`
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:

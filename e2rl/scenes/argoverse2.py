@@ -290,7 +290,9 @@ def _map(static_map: Any) -> tuple[dict[str, Lane], list[ndarray]]:
         if segment.lane_type == LaneType.BIKE:
             continue
         points, width = compute_midpoint_line(
-            segment.left_lane_boundary.xyz, segment.right_lane_boundary.xyz, MID_POINTS
+            segment.left_lane_boundary.xyz,
+            segment.right_lane_boundary.xyz,
+            MID_POINTS,
         )
         lanes[str(key)] = Lane(
             points=points[:, :2],

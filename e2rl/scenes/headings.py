@@ -238,7 +238,9 @@ def _turned_round(states: ndarray, valid: ndarray) -> ndarray:
     costs = np.stack([cost * backwards, cost * (cosine > AGAINST) + turning], -1)
     turned = np.zeros(valid.shape, bool)
     turned[:, agents] = _least_cost(
-        heading[:, agents], valid[:, agents], costs[:, agents]
+        heading[:, agents],
+        valid[:, agents],
+        costs[:, agents],
     )
     drives = fast.any(0)
     whole = drives & ((turned & fast).sum(0) > 0.5 * fast.sum(0))

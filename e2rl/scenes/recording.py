@@ -164,7 +164,9 @@ class Recording:
         return list(range(HISTORY, frames - steps, steps + HISTORY + 1)) or [HISTORY]
 
     def windows(
-        self, starts: Sequence[int] | None, steps: int
+        self,
+        starts: Sequence[int] | None,
+        steps: int,
     ) -> Iterator["Recording"]:
         """Yields the recordings of `steps` simulated steps that this log makes.
 

@@ -51,7 +51,13 @@ class Portfolio:
         self.driven = torch.full_like(prior, CHANCE_TRIES)  # tries that spent that
 
     def tell(
-        self, scene: int, family: int, *, reward: float, margin: float, nfe: float
+        self,
+        scene: int,
+        family: int,
+        *,
+        reward: float,
+        margin: float,
+        nfe: float,
     ) -> None:
         """Learn from a try.
 

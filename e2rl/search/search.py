@@ -79,7 +79,9 @@ class Search(Extension):
         self.outcomes: list[list[Outcome]] = [[] for _ in self.numbers]
         self.cells: set[str] = set()
         self._portfolio = Portfolio(
-            self.families, len(self.numbers), learns=self.settings.bandit
+            self.families,
+            len(self.numbers),
+            learns=self.settings.bandit,
         )
         self._generator = torch.Generator().manual_seed(self.seed)
 
@@ -122,7 +124,9 @@ class Search(Extension):
             scene = active[position]
             if left[scene] > 0:
                 attempt = self.families[family].draw(
-                    scene, tried[scene], seed=self.seed_of(scene)
+                    scene,
+                    tried[scene],
+                    seed=self.seed_of(scene),
                 )
                 drawn.append(attempt)
                 tried[scene] += 1

@@ -311,7 +311,10 @@ def spend_together(searches: Sequence[Spending], work: Work = HERE) -> list[Spen
             for position, batch in enumerate(batches)
         ]
         scored = score_all(
-            jobs, work, cost=lambda job: len(job[1].tasks), begins=begins
+            jobs,
+            work,
+            cost=lambda job: len(job[1].tasks),
+            begins=begins,
         )
         begins = False
         following = {}

@@ -37,7 +37,11 @@ def write_tries(path: Path, tries: Sequence[Mapping]) -> None:
 
 
 def failures_of(
-    file: Path, ego_name: str, *, method: SearchMethod, setup: Setup
+    file: Path,
+    ego_name: str,
+    *,
+    method: SearchMethod,
+    setup: Setup,
 ) -> list[Batch]:
     """Returns the tries of a tries.csv that hit an ego, to be driven again.
 
@@ -93,7 +97,12 @@ def failures_of(
     batches = []
     for seed, drawn_tries in tries.items():
         spending = Spending(
-            setup, method, seed=seed, scenes=scenes, budget=0.0, unit="tries"
+            setup,
+            method,
+            seed=seed,
+            scenes=scenes,
+            budget=0.0,
+            unit="tries",
         )
         batches += spending.batches(drawn_tries)
     return batches

@@ -98,7 +98,9 @@ def rollout(start: Tensor, actions: Tensor) -> Tensor:
     halting = change.clamp(min=HALTING * DT)
     back = v0 + halting.cumsum(-1)
     speed = bounded_speed(
-        v0, torch.where(back < 0, halting, change), low=back.clamp(max=0)
+        v0,
+        torch.where(back < 0, halting, change),
+        low=back.clamp(max=0),
     )
     before = torch.cat([v0.expand_as(speed[..., :1]), speed[..., :-1]], -1)
     bound = yaw_rate_bound(((before + speed) / 2).abs())

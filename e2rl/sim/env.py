@@ -231,7 +231,11 @@ class DrivingEnv(EnvBase):
         begins = ego.step == 0
         agents = {}
         for key, start_key, mine, later in zip(
-            AGENT_KEYS, START_KEYS, of_ego, driven, strict=True
+            AGENT_KEYS,
+            START_KEYS,
+            of_ego,
+            driven,
+            strict=True,
         ):
             first = self.scene[start_key]
             begins = begins.view(-1, *[1] * (first.ndim - 1))
@@ -251,7 +255,9 @@ class DrivingEnv(EnvBase):
         chosen = request.get("scene_index", None)
         if chosen is None:
             rows = torch.randint(
-                len(self.scenes), (len(index),), generator=self._generator
+                len(self.scenes),
+                (len(index),),
+                generator=self._generator,
             )
         else:
             rows = chosen.view(batch)[index].cpu()

@@ -84,7 +84,9 @@ class EgoState(NamedTuple):
     inside: Tensor
 
     def merged(
-        self, other: "EgoState", function: Callable[[Tensor, Tensor], Tensor]
+        self,
+        other: "EgoState",
+        function: Callable[[Tensor, Tensor], Tensor],
     ) -> "EgoState":
         """An EgoState of function(own, other's) of every tensor."""
         pose = FrenetPose(*map(function, self.pose, other.pose))

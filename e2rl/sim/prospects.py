@@ -81,7 +81,9 @@ def travelled(speed: Tensor, accel: Tensor, time: Tensor) -> Tensor:
     """Distance [m] after `time` at constant acceleration, to the halt at most;
     broadcast."""
     moving = torch.where(
-        accel < 0, torch.minimum(time, speed / (-accel).clamp(min=1e-3)), time
+        accel < 0,
+        torch.minimum(time, speed / (-accel).clamp(min=1e-3)),
+        time,
     )
     return speed * moving + accel * moving**2 / 2
 

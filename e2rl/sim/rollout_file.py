@@ -201,7 +201,11 @@ def rollout_key(row: Mapping[str, Any]) -> str:
     eta = float(row["eta"])
     short = f"{eta:g}" if float(f"{eta:g}") == eta else eta
     return file_stem(
-        row["method"], row["ego_policy"], short, row["scene_id"], row["seed"]
+        row["method"],
+        row["ego_policy"],
+        short,
+        row["scene_id"],
+        row["seed"],
     )
 
 

@@ -268,10 +268,14 @@ def padded(values: Sequence[Tensor], fill: float) -> list[Tensor]:
 def road_of(scene: Rollouts | TensorDictBase) -> Road:
     """The map of one scene or rollout, without its padding."""
     lanes, lane_offsets, whole = polylines(
-        scene.get("lane_points"), scene.get("lane_index"), minimum=2
+        scene.get("lane_points"),
+        scene.get("lane_index"),
+        minimum=2,
     )
     rings, ring_offsets, _ = polylines(
-        scene.get("drivable_points"), scene.get("drivable_index"), minimum=3
+        scene.get("drivable_points"),
+        scene.get("drivable_index"),
+        minimum=3,
     )
     return Road(
         lane_points=lanes,
@@ -283,7 +287,9 @@ def road_of(scene: Rollouts | TensorDictBase) -> Road:
 
 
 def polylines(
-    points: Tensor, index: Tensor, minimum: int
+    points: Tensor,
+    index: Tensor,
+    minimum: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(points [M, 2] float32, offsets [L + 1] int64, line numbers [L]) of padded points
     [P, 2] with index [P].

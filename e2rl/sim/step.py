@@ -228,7 +228,9 @@ def _step(
         moved = ego.merged(
             moved,
             lambda old, new: torch.where(
-                stay.view(-1, *[1] * (new.ndim - 1)), old, new
+                stay.view(-1, *[1] * (new.ndim - 1)),
+                old,
+                new,
             ),
         )
     view = (observe if look else glance)(static, moved, others, moment / horizon)
@@ -260,7 +262,9 @@ def _step(
 
     conduct = Conduct(
         progress=rewarded_progress(
-            moved.pose.s - ego.pose.s, view.limit, static.top_speed
+            moved.pose.s - ego.pose.s,
+            view.limit,
+            static.top_speed,
         ),
         contact=touched,
         fault=own_fault(

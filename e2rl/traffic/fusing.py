@@ -67,7 +67,10 @@ def prepare_fused(config: DictConfig) -> None:
     elif on and missing:
         check_compiler("compile")
         compiled = in_processes(
-            Fused.compile, missing, processes=cores(), cost=lambda function: 1.0
+            Fused.compile,
+            missing,
+            processes=cores(),
+            cost=lambda function: 1.0,
         )
         for _ in Bar(compiled, "compiling", len(missing), unit="function"):
             pass

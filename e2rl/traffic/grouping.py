@@ -72,7 +72,10 @@ def mapped(context: Context, function: Callable[[Tensor], Tensor]) -> Context:
 
 
 def noise_of(
-    seed: Tensor, draw: Tensor, shape: tuple[int, ...], uniform: bool = False
+    seed: Tensor,
+    draw: Tensor,
+    shape: tuple[int, ...],
+    uniform: bool = False,
 ) -> Tensor:
     """Returns random numbers [B, *shape] that do not depend on the batch.
 
@@ -235,7 +238,10 @@ def crop_state(value: Any, group: Group, width: int, axes: int | None = 1) -> An
     if is_dataclass(value) and not isinstance(value, type):
         parts = {
             part.name: crop_state(
-                getattr(value, part.name), group, width=width, axes=axes_of(part)
+                getattr(value, part.name),
+                group,
+                width=width,
+                axes=axes_of(part),
             )
             for part in fields(value)
         }

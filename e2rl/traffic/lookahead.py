@@ -56,7 +56,10 @@ class Lookahead:
             if place is not None:
                 place = place + DT * driven[..., 3].sum(1)
             imagined = replace(
-                imagined, step=world.step + step, states=states, mission_s=place
+                imagined,
+                step=world.step + step,
+                states=states,
+                mission_s=place,
             )
         return torch.cat(pieces, 1)[:, :HORIZON]
 

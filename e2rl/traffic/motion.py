@@ -110,7 +110,10 @@ def constant_speed_states(scene: TensorDictBase, world: World, times: Tensor) ->
     speed = states[..., 3:]
     travelled = speed * times
     along = states_on_route(
-        route, s + travelled, d=d * remaining_offset(travelled, speed), speed=speed
+        route,
+        s + travelled,
+        d=d * remaining_offset(travelled, speed),
+        speed=speed,
     )
     xy = (
         states[:, :, None, :2]
@@ -121,7 +124,9 @@ def constant_speed_states(scene: TensorDictBase, world: World, times: Tensor) ->
 
 
 def arrival_window(
-    distance: Tensor, speed: Tensor, acceleration: float = MAX_ACCELERATION
+    distance: Tensor,
+    speed: Tensor,
+    acceleration: float = MAX_ACCELERATION,
 ) -> tuple[Tensor, Tensor]:
     """Earliest and latest time [s] at which a vehicle at `speed` can have driven
     `distance` m (0 for distances <= 0).
@@ -170,7 +175,9 @@ def distance_to_stop_line(world: World, index: Tensor, number: Tensor) -> Tensor
         number,
     )
     light = light_state_at(
-        scene["light_state"], scene["route_light"][at], step=world.step
+        scene["light_state"],
+        scene["route_light"][at],
+        step=world.step,
     )
     front = project(states[:, :, None, None, :2], scene["route_points"][at])[0][..., 0]
     front = front + take(scene["size"], index)[..., None, 0] / 2

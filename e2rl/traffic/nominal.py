@@ -97,7 +97,11 @@ class NominalTraffic(Traffic):
         return PriorState(seed, torch.zeros_like(seed), routed=routed, lane=lane)
 
     def replan(
-        self, state: State, world: World, ego_plan: Tensor, react: React | None = None
+        self,
+        state: State,
+        world: World,
+        ego_plan: Tensor,
+        react: React | None = None,
     ) -> tuple[State, TrafficPlan]:
         """Returns states and plans of the coming HORIZON steps; scenes of similar size
         are planned together.
@@ -138,7 +142,9 @@ class NominalTraffic(Traffic):
             part, x0, context = self.replan_group(replan)
             plan = self.prior.plan(x0, context)
             part = replace(
-                part, replans=part.replans + 1, lane=plan.after(REPLAN_STEPS)
+                part,
+                replans=part.replans + 1,
+                lane=plan.after(REPLAN_STEPS),
             )
             write_state(whole, part, group=group)
             states[rows, :vehicles] = plan.states()
@@ -172,7 +178,10 @@ class NominalTraffic(Traffic):
     def replan_group(self, replan: Replan) -> tuple[State, Tensor, Context]:
         """Returns state, joint sample x0 [G, V, SIZE] and context of a group."""
         context = self.encode(
-            replan.state, replan.world, ego_plan=replan.ego_plan, known=replan.before
+            replan.state,
+            replan.world,
+            ego_plan=replan.ego_plan,
+            known=replan.before,
         )
         return replan.state, self.prior.sample(context, replan.noise).x0, context
 
@@ -200,7 +209,11 @@ class NominalTraffic(Traffic):
         return noise_of(state.seed, 1 + state.replans, shape=shape).transpose(0, 1)
 
     def encode(
-        self, state: State, world: World, ego_plan: Tensor, known: Context | None = None
+        self,
+        state: State,
+        world: World,
+        ego_plan: Tensor,
+        known: Context | None = None,
     ) -> Context:
         """Returns the prior's context of a replan.
 
@@ -211,7 +224,11 @@ class NominalTraffic(Traffic):
             known: see `Prior.encode`.
         """
         return self.prior.encode(
-            state.routed, state.lane, world, ego_plan=ego_plan, known=known
+            state.routed,
+            state.lane,
+            world,
+            ego_plan=ego_plan,
+            known=known,
         )
 
     def lane_now(self, state: State, world: World, ego_plan: Tensor) -> LaneState:

@@ -193,5 +193,8 @@ class RowDraw:
             self._process = os.getpid()
             self._entropy = self.generator.seed()
         return torch.multinomial(
-            self.probability, count, replacement=True, generator=self.generator
+            self.probability,
+            count,
+            replacement=True,
+            generator=self.generator,
         )

@@ -65,11 +65,17 @@ class PotentialSettings:
     impact_speed: float = setting()
 
     def adversarial(
-        self, states: Tensor, context: "PotentialContext", temperature: Tensor | float
+        self,
+        states: Tensor,
+        context: "PotentialContext",
+        temperature: Tensor | float,
     ) -> Tensor:
         """Returns V_adv [B, V], which adversaries lower: see `adversarial_potential`."""
         return adversarial_potential(
-            states, context, settings=self, temperature=temperature
+            states,
+            context,
+            settings=self,
+            temperature=temperature,
         )
 
     def feasibility(self, states: Tensor, context: "PotentialContext") -> Tensor:
@@ -106,7 +112,9 @@ class PotentialContext:
     def start_off_road(self) -> Tensor:
         """Metres [B, V] off the drivable area at present."""
         return off_road(
-            self.start[..., :2], self.scene["field"], origin=self.scene["field_origin"]
+            self.start[..., :2],
+            self.scene["field"],
+            origin=self.scene["field_origin"],
         )
 
 
@@ -129,7 +137,11 @@ def _length(vector: Tensor) -> Tensor:
 
 
 def box_gap(
-    states: Tensor, size: Tensor, other: Tensor, other_size: Tensor, disks: int = DISKS
+    states: Tensor,
+    size: Tensor,
+    other: Tensor,
+    other_size: Tensor,
+    disks: int = DISKS,
 ) -> Tensor:
     """Returns the signed gap [...] m between a vehicle as disks and another as an
     oriented box, < 0 where they overlap. Leading dimensions are broadcast.
@@ -154,7 +166,9 @@ def box_gap(
 
 
 def _neighbours(
-    states: Tensor, context: PotentialContext, size: Tensor
+    states: Tensor,
+    context: PotentialContext,
+    size: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Index and mask [B, V, Q] of the vehicles that come nearest to each; adversary and
     target are no neighbours."""
@@ -200,7 +214,9 @@ def _overlap_term(states: Tensor, context: PotentialContext) -> Tensor:
 
 
 def _road_terms(
-    states: Tensor, context: PotentialContext, settings: PotentialSettings
+    states: Tensor,
+    context: PotentialContext,
+    settings: PotentialSettings,
 ) -> Tensor:
     """Weighted off-road, lateral and wrong-way terms [B, V]; what is no worse than at
     present costs nothing."""
@@ -230,7 +246,9 @@ def _road_terms(
 
 
 def _motion_terms(
-    states: Tensor, context: PotentialContext, settings: PotentialSettings
+    states: Tensor,
+    context: PotentialContext,
+    settings: PotentialSettings,
 ) -> Tensor:
     """Weighted squared excess of accelerations [m/s^2] and jerk [m/s^3] over their
     bounds [B, V]."""
@@ -255,7 +273,9 @@ def with_ego(states: Tensor, context: PotentialContext) -> Tensor:
 
 
 def feasibility_potential(
-    states: Tensor, context: PotentialContext, settings: PotentialSettings
+    states: Tensor,
+    context: PotentialContext,
+    settings: PotentialSettings,
 ) -> Tensor:
     """Returns V_feas [B, V] of decoded states [B, V, H', 4] at SAMPLED_STEPS; 0 for the
     ego and for absent vehicles.

@@ -245,7 +245,10 @@ def located(lane: LaneState, world: World, routed: RoutedScene) -> LaneState:
         hint=others.s,
     )
     others = replace(
-        others, s=located_others.s, d=located_others.d, d1=located_others.d1
+        others,
+        s=located_others.s,
+        d=located_others.d,
+        d1=located_others.d1,
     )
     return LaneState(
         **{

@@ -99,7 +99,10 @@ class Traffic(Extension, ABC):
 
     @abstractmethod
     def replan(
-        self, state: State, world: World, ego_plan: Tensor
+        self,
+        state: State,
+        world: World,
+        ego_plan: Tensor,
     ) -> tuple[State, TrafficPlan]:
         """Returns the new state and plan.
 

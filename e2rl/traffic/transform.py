@@ -113,7 +113,9 @@ class AdversarialSynthesizer(Transform):
             )
 
     def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+        self,
+        tensordict: TensorDictBase,
+        tensordict_reset: TensorDictBase,
     ) -> TensorDictBase:
         if self.traffic is not None:
             self._begin(tensordict_reset["timestep"][:, 0] == 0)
@@ -195,7 +197,9 @@ class AdversarialSynthesizer(Transform):
         self._env.write_traffic(rows, plan.states, plan.present)
 
     def _step(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+        self,
+        tensordict: TensorDictBase,
+        next_tensordict: TensorDictBase,
     ) -> TensorDictBase:
         return self._write(next_tensordict)
 
@@ -212,7 +216,9 @@ class AdversarialSynthesizer(Transform):
                 replayed = replayed[:, None, None, None]
                 keys["plan"] = torch.where(replayed, going_on, keys["plan"])
         tensordict["traffic"] = TensorDict(
-            keys, batch_size=tensordict.batch_size, device=device
+            keys,
+            batch_size=tensordict.batch_size,
+            device=device,
         )
         return tensordict
 
@@ -228,7 +234,9 @@ class AdversarialSynthesizer(Transform):
         return self._plan.transpose(1, 2)[row, ahead].transpose(1, 2)
 
     def _post_step_mdp_hooks(
-        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+        self,
+        tensordict: TensorDictBase,
+        tensordict_: TensorDictBase,
     ):
         """Pass the plan (0.8 kB per vehicle and step) to the policy only, without a
         spec and not stacked over time."""
@@ -244,6 +252,8 @@ class AdversarialSynthesizer(Transform):
         env = self._env
         row = Unbounded((*env.batch_size, 1), dtype=torch.int64, device=env.device)
         observation_spec["traffic"] = Composite(
-            row=row, shape=env.batch_size, device=env.device
+            row=row,
+            shape=env.batch_size,
+            device=env.device,
         )
         return observation_spec

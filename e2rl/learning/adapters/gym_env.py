@@ -57,11 +57,16 @@ class DrivingVectorEnv(VectorEnv):
         self.metadata = {"autoreset_mode": autoreset_mode}
         self.bounds = torch.stack([space.low, space.high])
         self.single_observation_space = Box(
-            -np.inf, np.inf, (OBSERVATION_SIZE,), np.float32
+            -np.inf,
+            np.inf,
+            (OBSERVATION_SIZE,),
+            np.float32,
         )
         self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
         self.driving = Driving(
-            low=space.low.tolist(), high=space.high.tolist(), steps=env.horizon
+            low=space.low.tolist(),
+            high=space.high.tolist(),
+            steps=env.horizon,
         )
         vars(self.single_action_space)["driving"] = self.driving
         self.observation_space = batch_space(
@@ -79,7 +84,10 @@ class DrivingVectorEnv(VectorEnv):
         )
 
     def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> tuple[np.ndarray, Info]:
         """New episodes; options: scene: id or position of the scene of all. InputError
         for one that is not there."""
@@ -112,7 +120,10 @@ class DrivingVectorEnv(VectorEnv):
         )
         if self.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP:
             return self._begun_in_next_step(
-                last, reward, terminated=terminated, truncated=truncated
+                last,
+                reward,
+                terminated=terminated,
+                truncated=truncated,
             )
         observation, info = self._shown(self._now)
         ended = terminated | truncated
@@ -177,7 +188,10 @@ class DrivingGymEnv(gymnasium.Env):
         self.driving = self._batch.driving
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, Info]:
         super().reset(seed=seed)
         observation, info = self._batch.reset(seed=seed, options=options)

@@ -23,7 +23,9 @@ class SB3Env(VecEnv):
     def __init__(self, batch: DrivingVectorEnv) -> None:
         self.batch = batch
         super().__init__(
-            batch.num_envs, batch.single_observation_space, batch.single_action_space
+            batch.num_envs,
+            batch.single_observation_space,
+            batch.single_action_space,
         )
 
     @property
@@ -198,7 +200,9 @@ def check_wrappers(env: VecEnv | None) -> None:
 
 
 def check_last_observation(
-    model: BaseAlgorithm, normalisers: list[tuple[Tensor, Tensor, float]], steps: int
+    model: BaseAlgorithm,
+    normalisers: list[tuple[Tensor, Tensor, float]],
+    steps: int,
 ) -> None:
     """Raises InputError where the last observation that a model holds was not
     normalised by these.

@@ -125,7 +125,9 @@ def world_at(scene: TensorDictBase, step: int) -> World:
 
 
 def windows(
-    scenes: SceneSet, seed: int, disturbed: Sequence[float] = DISTURBED
+    scenes: SceneSet,
+    seed: int,
+    disturbed: Sequence[float] = DISTURBED,
 ) -> TensorDict:
     """Returns windows [W] of all moving vehicles: observation [D], start [4], route [P,
     2], future [PLAN_STEPS, 4], scene_index, and the goal: distance along the route and
@@ -165,7 +167,9 @@ def moving_vehicles(scenes: TensorDictBase) -> Tensor:
 
 
 def _disturbed(
-    world: World, size: Sequence[float], generator: torch.Generator
+    world: World,
+    size: Sequence[float],
+    generator: torch.Generator,
 ) -> World:
     """Worlds whose egos are beside their recording, turned, and faster or slower; who
     stands stays."""
@@ -215,7 +219,9 @@ def _windows(world: World, scene: Tensor) -> TensorDict:
 
 
 def losses(
-    network: BitsNetwork, batch: TensorDictBase, noise: Tensor | None = None
+    network: BitsNetwork,
+    batch: TensorDictBase,
+    noise: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Mean losses of windows [W]: goal (cross-entropy of the recorded goal's cell,
     nats), residual (of the place in it, cells), trajectory (distance from the recording
@@ -249,7 +255,10 @@ class BitsTraining(Epochs):
     cosine."""
 
     def __init__(
-        self, network: BitsNetwork, data: TensorDictBase, settings: BitsSettings
+        self,
+        network: BitsNetwork,
+        data: TensorDictBase,
+        settings: BitsSettings,
     ) -> None:
         super().__init__(network, data, settings, network, WEIGHT_DECAY)
         steps = settings.epochs * -(-len(self.train) // settings.minibatch)
@@ -298,14 +307,20 @@ def run_bits_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     config = run.config
     settings = stage_settings(run.config, BitsSettings)
     scenes = load_scenes(
-        config.data, config.num_scenes, split="train", scenes=config.scenes
+        config.data,
+        config.num_scenes,
+        split="train",
+        scenes=config.scenes,
     )
     network = BitsNetwork(settings.hidden, DROPOUT).to(config.device)
     data = windows(scenes, settings.seed)
     training = BitsTraining(network, data, settings=settings)
     run.begin({"scenes": listed(scenes)})
     row = training.fit(
-        "bits", settings.epochs, Parts(run.folder, "bits"), logger=logger
+        "bits",
+        settings.epochs,
+        Parts(run.folder, "bits"),
+        logger=logger,
     )
     origin = {
         "data": f"{scenes.dataset}/{scenes.split}",

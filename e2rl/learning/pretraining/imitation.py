@@ -69,7 +69,11 @@ class ImitationSettings:
 
 
 def recorded_demonstrations(
-    scenes: SceneSet, sim: SimSettings, *, seed: int, drives: int = DRIVES
+    scenes: SceneSet,
+    sim: SimSettings,
+    *,
+    seed: int,
+    drives: int = DRIVES,
 ) -> TensorDict:
     """Returns demonstrations of the recorded egos.
 
@@ -104,7 +108,9 @@ def recorded_demonstrations(
 
 
 def shown(
-    env: DrivingEnv, scenes: Tensor, disturb: Disturbance | None = None
+    env: DrivingEnv,
+    scenes: Tensor,
+    disturb: Disturbance | None = None,
 ) -> TensorDict:
     """Demonstrations [M] of egos that follow their logs for an episode in scenes [B],
     of an environment's batch: what they executed, or under disturbances meant to."""
@@ -164,7 +170,10 @@ class Imitation(Epochs):
     """Behaviour cloning of an ActorCritic's actor from demonstrations."""
 
     def __init__(
-        self, network: ActorCritic, shown: TensorDictBase, settings: ImitationSettings
+        self,
+        network: ActorCritic,
+        shown: TensorDictBase,
+        settings: ImitationSettings,
     ) -> None:
         super().__init__(network, shown, settings, network.network, WEIGHT_DECAY)
 
@@ -205,13 +214,19 @@ def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
         raise InputError("stage=imitation trains ego=actor; set it")
     settings = stage_settings(config, ImitationSettings)
     scenes = load_scenes(
-        config.data, config.num_scenes, split="train", scenes=config.scenes
+        config.data,
+        config.num_scenes,
+        split="train",
+        scenes=config.scenes,
     )
     shown = recorded_demonstrations(scenes, build_sim(config), seed=settings.seed)
     training = Imitation(ego.network, shown, settings=settings)
     run.begin({"scenes": listed(scenes)})
     row = training.fit(
-        "imitation", settings.epochs, Parts(run.folder, "imitation"), logger=logger
+        "imitation",
+        settings.epochs,
+        Parts(run.folder, "imitation"),
+        logger=logger,
     )
     ego.network.save(run.folder / WEIGHTS)
     return row

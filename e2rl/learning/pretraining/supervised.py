@@ -151,7 +151,9 @@ class Epochs(Supervised):
         self.held_out = data[held_out].to(network.device)
         network.normaliser.observe(self.train["observation"])
         self.optimiser = torch.optim.AdamW(
-            parameters.parameters(), settings.learning_rate, weight_decay=weight_decay
+            parameters.parameters(),
+            settings.learning_rate,
+            weight_decay=weight_decay,
         )
 
     @abstractmethod
@@ -197,7 +199,9 @@ class Epochs(Supervised):
 
 
 def take_step(
-    optimiser: torch.optim.Optimizer, loss: Tensor, max_grad_norm: float
+    optimiser: torch.optim.Optimizer,
+    loss: Tensor,
+    max_grad_norm: float,
 ) -> None:
     """One step down the gradient of `loss`, its norm clipped; raises InputError if the
     loss is not finite."""

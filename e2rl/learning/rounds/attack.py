@@ -20,7 +20,9 @@ LATE = 20  # steps before the contact at which an evasion is to begin
 
 
 def solvable(
-    traffic: Mapping[str, Tensor], scenes: SceneSet, sim: SimSettings
+    traffic: Mapping[str, Tensor],
+    scenes: SceneSet,
+    sim: SimSettings,
 ) -> Tensor:
     """Bool [S]: synthesized traffic that enters D': the ego was not hit, or a search
     with full knowledge of the others' motion finds an evasion.
@@ -44,7 +46,10 @@ def solvable(
     again = (~evaded & (late > 0)).nonzero()[:, 0]
     if len(again):
         evaded[again] = find_evasions(
-            scene[again], states[again], valid=valid[again], sim=sim
+            scene[again],
+            states[again],
+            valid=valid[again],
+            sim=sim,
         ).found
     avoidable[hit] = evaded
     return avoidable
@@ -155,7 +160,9 @@ def _make_part(
         "attacked": traffic["adversaries"].any(-1),
         "contact": traffic["contact"],
         "entered": torch.zeros(len(rows), dtype=torch.bool).index_fill(
-            0, places[enters], True
+            0,
+            places[enters],
+            True,
         ),
         "errored": errored,
     }

@@ -78,7 +78,11 @@ class BeforeAfter:
         return others + rows
 
     def _search(
-        self, method: SearchMethod, setup: Setup, work: Work, folder: Path
+        self,
+        method: SearchMethod,
+        setup: Setup,
+        work: Work,
+        folder: Path,
     ) -> None:
         """Write the tries of a stage, their rollouts and their atlas into a folder."""
         work = replace(work, into=folder / ROLLOUTS)
@@ -105,7 +109,9 @@ class BeforeAfter:
 
 
 def _of_row(
-    row: dict, scores: list[dict], samples: list[Samples]
+    row: dict,
+    scores: list[dict],
+    samples: list[Samples],
 ) -> tuple[list[dict], list[Samples]]:
     """What the rollouts of a row of metrics.json scored."""
     places = [

@@ -86,7 +86,11 @@ def build_evolution(
         device=learner.pop("device", config.device),
     )
     synthesize = synthesize or synthesize_traffic(
-        scenes, traffic, sim=sim, batch=config.batch, device=config.device
+        scenes,
+        traffic,
+        sim=sim,
+        batch=config.batch,
+        device=config.device,
     )
     enters = partial(solvable, scenes=scenes, sim=sim)
     return Evolution(
@@ -201,7 +205,10 @@ def build_measure(
             data.split = None
     separate = options.path or source_of(data).has_splits
     nominal = built(
-        load_choice("synthesizer", "nominal"), "synthesizer", kind=Traffic, prior=prior
+        load_choice("synthesizer", "nominal"),
+        "synthesizer",
+        kind=Traffic,
+        prior=prior,
     )
     attacks = [Method(config.synthesizer.name, traffic, eta=eta) for eta in options.eta]
     search = None

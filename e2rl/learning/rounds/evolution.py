@@ -160,7 +160,10 @@ class Evolution:
         }
 
     def move_on(
-        self, order: Order, attack: RoundTraffic, learned: dict[str, float]
+        self,
+        order: Order,
+        attack: RoundTraffic,
+        learned: dict[str, float],
     ) -> dict[str, float]:
         """Move the curriculum by what became of the attacks; returns all metrics of the
         round, named by group (train/, curriculum/, synthesizer/, time/)."""

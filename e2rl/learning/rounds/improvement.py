@@ -18,7 +18,9 @@ class Improvement(Extension, ABC):
 
     @abstractmethod
     def __call__(
-        self, pool: TrafficPool, curriculum: CurriculumScheduler
+        self,
+        pool: TrafficPool,
+        curriculum: CurriculumScheduler,
     ) -> tuple[dict[str, float], Episodes]:
         """Learn from the pool; returns the metrics to log and the episodes that the ego
         drove."""

@@ -66,7 +66,10 @@ class Memory:
         return self.folder / f"round-{number:06d}.safetensors"
 
     def write(
-        self, number: int, traffic: Mapping[str, Tensor], errored: Sequence[dict] = ()
+        self,
+        number: int,
+        traffic: Mapping[str, Tensor],
+        errored: Sequence[dict] = (),
     ) -> None:
         """Write the traffic of a round, and its errored rows."""
         plain = {
@@ -130,5 +133,8 @@ class Memory:
                 f"{path}: damaged ({error}); restore it or begin a new run"
             ) from None
         return Remembered(
-            number, traffic, errored=errored, crc32=zlib.crc32(path.read_bytes())
+            number,
+            traffic,
+            errored=errored,
+            crc32=zlib.crc32(path.read_bytes()),
         )

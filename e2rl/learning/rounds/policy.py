@@ -130,7 +130,9 @@ class PolicyImprovement(Improvement):
                 high=network.high,
                 hold=self.settings.hold,
                 settings=settings_of(
-                    TeachingSettings, teaching, where="learner.teaching"
+                    TeachingSettings,
+                    teaching,
+                    where="learner.teaching",
                 ),
             )
         count = len(scenes)
@@ -159,7 +161,9 @@ class PolicyImprovement(Improvement):
         self._batches = iter(self._collector)
 
     def __call__(
-        self, pool: TrafficPool, curriculum: CurriculumScheduler
+        self,
+        pool: TrafficPool,
+        curriculum: CurriculumScheduler,
     ) -> tuple[dict[str, float], Episodes]:
         """Reset every environment; `iterations` times: collect [B, steps] decisions,
         update. `frames` are steps of 0.1 s."""

@@ -28,7 +28,9 @@ class Prefetch:
         for stream in filter(None, (sys.stdout, sys.stderr)):
             stream.flush()  # or the fork would write it once more
         self._worker = context.Process(
-            target=_run, args=(work, sender, os.getpid()), daemon=True
+            target=_run,
+            args=(work, sender, os.getpid()),
+            daemon=True,
         )
         self._worker.start()
         sender.close()

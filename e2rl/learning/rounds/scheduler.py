@@ -132,7 +132,12 @@ class CurriculumScheduler(Extension):
         return torch.full((len(scenes),), float(self.eta))
 
     def around(
-        self, count: int, spread: float, *, low: float = 0.0, high: float = math.inf
+        self,
+        count: int,
+        spread: float,
+        *,
+        low: float = 0.0,
+        high: float = math.inf,
     ) -> Tensor:
         """Returns intensities [count] around `eta`, drawn uniformly.
 
@@ -151,7 +156,9 @@ class CurriculumScheduler(Extension):
         would survive, 1 - p where that is unknown; NaN for scenes never driven in
         adversarial traffic."""
         return self._failing * torch.where(
-            self._survivable.isnan(), 1 - self._failing, self._survivable
+            self._survivable.isnan(),
+            1 - self._failing,
+            self._survivable,
         )
 
     def priority(self) -> Tensor:
@@ -175,7 +182,9 @@ class CurriculumScheduler(Extension):
         chosen = torch.arange(total).repeat(count // total)
         if count % total:
             rest = torch.multinomial(
-                self.priority().double(), count % total, generator=self._generator
+                self.priority().double(),
+                count % total,
+                generator=self._generator,
             )
             chosen = torch.cat([chosen, rest])
         self._drawn[chosen] = self.round
@@ -196,7 +205,9 @@ class CurriculumScheduler(Extension):
             mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
             before = average[scenes]
             average[scenes] = torch.where(
-                before.isnan(), mean, before + SMOOTHING * (mean - before)
+                before.isnan(),
+                mean,
+                before + SMOOTHING * (mean - before),
             )
 
     def leave_out(self, scenes: Tensor) -> None:

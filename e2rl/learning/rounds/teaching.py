@@ -120,7 +120,11 @@ class Teacher:
         return fraction
 
     def watch(
-        self, data: TensorDictBase, adversarial: Tensor, ego: Ego, count: int
+        self,
+        data: TensorDictBase,
+        adversarial: Tensor,
+        ego: Ego,
+        count: int,
     ) -> dict[str, float]:
         """Label critical decisions of adversarial episodes, drawn evenly.
 
@@ -164,7 +168,10 @@ class Teacher:
         settings = self.settings
         world = World.of(frames, self.scenes.batch(frames["scene_index"][:, 0]))
         action, cost = ranked_actions(
-            self.planner, world, count=CANDIDATES, hold=self.hold
+            self.planner,
+            world,
+            count=CANDIDATES,
+            hold=self.hold,
         )
         plan = ask(ego, "plan", world=world)[:, None]
         rated = self.planner.rated(world, plan)[:, 0]

@@ -53,7 +53,10 @@ class Learner:
     """
 
     def __init__(
-        self, network: ActorCritic, settings: UpdateSettings, total: int | None = None
+        self,
+        network: ActorCritic,
+        settings: UpdateSettings,
+        total: int | None = None,
     ) -> None:
         """total: updates of the whole run, over which the learning rate falls to
         final_lr of it; None: constant."""
@@ -62,7 +65,9 @@ class Learner:
         self.total = total
         self.updates = 0
         self.returns = PopArtValueNorm(
-            shape=1, beta=VALUE_MEMORY, device=network.device
+            shape=1,
+            beta=VALUE_MEMORY,
+            device=network.device,
         )
         self.peak = torch.zeros((), device=network.device)  # of |advantage|, running
         self.ppo = ClipPPOLoss(

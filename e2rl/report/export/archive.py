@@ -16,7 +16,9 @@ SCENES = "scenes"  # the folder of scenes, beside the one of rollouts
 
 
 def write(
-    episodes: Iterable[Episode], folder: Path, open_ego: bool = False
+    episodes: Iterable[Episode],
+    folder: Path,
+    open_ego: bool = False,
 ) -> Iterator[tuple[Episode, Path]]:
     """Write rollouts/NAME.npz, a copy, and scenes/SCENE_ID.npz of each episode: the
     arrays of its scene (e2rl/scenes/scene.py), the ids and speed limits [m/s] of its

@@ -83,7 +83,9 @@ Ids = Iterator[int]
 
 
 def write(
-    episodes: Iterable[Episode], folder: Path, open_ego: bool = False
+    episodes: Iterable[Episode],
+    folder: Path,
+    open_ego: bool = False,
 ) -> Iterator[tuple[Episode, Path]]:
     """Write ZAM_<place>-<n>_1_T-1.xml of each episode; open_ego: the ego is a planning
     problem only, no obstacle."""
@@ -344,7 +346,10 @@ def planning_problem(episode: Episode, number: int) -> Any:
     last = int(np.flatnonzero(rollout.logged_valid[:, 0])[-1])
     x, y, heading, _ = rollout.logged[last, 0].astype(float).tolist()
     place = RectOccupancy(
-        shapely.Point(x, y), GOAL_WIDTH, GOAL_LENGTH, float(wrap(heading))
+        shapely.Point(x, y),
+        GOAL_WIDTH,
+        GOAL_LENGTH,
+        float(wrap(heading)),
     )
     goal = CustomState(time_step=Interval(1, max(episode.steps, 1)), position=place)
     yaw_rate = 0.0

@@ -109,7 +109,10 @@ class Episode:
 
 
 def recorded_episode(
-    run: Path, row: Mapping, recording: Recording, build: BuildSettings
+    run: Path,
+    row: Mapping,
+    recording: Recording,
+    build: BuildSettings,
 ) -> Episode:
     """The episode of a row of rollouts.csv in the scene that a recording makes.
 

@@ -55,7 +55,9 @@ def road_network(episode: Episode) -> Any:
         for name in names:
             before, _ = plan.connecting[name]
             connection = xodr.Connection(
-                number[before], number[name], xodr.ContactPoint.start
+                number[before],
+                number[name],
+                xodr.ContactPoint.start,
             )
             connection.add_lanelink(LANE, LANE)
             junction.add_connection(connection)
@@ -64,7 +66,10 @@ def road_network(episode: Episode) -> Any:
 
 
 def road(
-    lanes: dict[str, Lane], plan: RoadPlan, name: str, number: dict[str, int]
+    lanes: dict[str, Lane],
+    plan: RoadPlan,
+    name: str,
+    number: dict[str, int],
 ) -> Any:
     """Returns the xodr.Road called `name`, with limits and widths from where each of
     its lanes begins.
@@ -113,7 +118,11 @@ def road(
 
 
 def add_links(
-    element: Any, driving: Any, plan: RoadPlan, name: str, number: dict[str, int]
+    element: Any,
+    driving: Any,
+    plan: RoadPlan,
+    name: str,
+    number: dict[str, int],
 ) -> None:
     """Link a road and its lane with what comes before and after it.
 
@@ -129,12 +138,16 @@ def add_links(
     after = after or next((b for a, b in plan.plain if a == name), None)
     if before is not None:
         element.add_predecessor(
-            xodr.ElementType.road, number[before], xodr.ContactPoint.end
+            xodr.ElementType.road,
+            number[before],
+            xodr.ContactPoint.end,
         )
         driving.add_link("predecessor", LANE)
     if after is not None:
         element.add_successor(
-            xodr.ElementType.road, number[after], xodr.ContactPoint.start
+            xodr.ElementType.road,
+            number[after],
+            xodr.ContactPoint.start,
         )
         driving.add_link("successor", LANE)
     for index, names in enumerate(plan.junctions, 1):

@@ -47,7 +47,9 @@ KINDS = {
 
 
 def write(
-    episodes: Iterable[Episode], folder: Path, open_ego: bool = False
+    episodes: Iterable[Episode],
+    folder: Path,
+    open_ego: bool = False,
 ) -> Iterator[tuple[Episode, Path]]:
     """Write NAME.xosc, and NAME.xodr where there are lanes; open_ego: the ego has a
     start, no trajectory."""
@@ -68,7 +70,9 @@ def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
     init = xosc.Init()
     act = xosc.Act("replay", at(0.0, "replay begins"))
     at_once = xosc.TransitionDynamics(
-        xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0
+        xosc.DynamicsShapes.step,
+        xosc.DynamicsDimension.time,
+        0,
     )
     for row in episode.agents:
         name = name_of(row)

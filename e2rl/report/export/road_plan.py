@@ -182,7 +182,9 @@ class LaneChains:
             through -= undone
 
     def cut_ends(
-        self, links: list[tuple[Chain, Chain]], through: set[Chain]
+        self,
+        links: list[tuple[Chain, Chain]],
+        through: set[Chain],
     ) -> tuple[dict[Chain, Span], dict[Chain, Span]]:
         """The heads and the tails that are cut off chains, so that each of `links` has
         a piece; `through` are connecting roads as they are.

@@ -38,7 +38,9 @@ LIGHTS = {
 
 
 def write(
-    episodes: Iterable[Episode], folder: Path, open_ego: bool = False
+    episodes: Iterable[Episode],
+    folder: Path,
+    open_ego: bool = False,
 ) -> Iterator[tuple[Episode, Path]]:
     """Write sd_NAME.pkl of each episode, then the summary and the mapping that
     MetaDrive reads a folder by."""
@@ -101,7 +103,10 @@ def description(episode: Episode) -> dict[str, Any]:
 
 
 def track(
-    episode: Episode, row: int, history: int, past: np.ndarray | None
+    episode: Episode,
+    row: int,
+    history: int,
+    past: np.ndarray | None,
 ) -> dict[str, Any]:
     """The track of an agent, zero where it is absent.
 
@@ -165,7 +170,9 @@ def object_summary(name: str, entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def number_summary(
-    objects: dict[str, dict], lights: dict[str, dict], lanes: int
+    objects: dict[str, dict],
+    lights: dict[str, dict],
+    lanes: int,
 ) -> dict[str, Any]:
     """Returns what ScenarioNet's filters know of a scenario: how many there are of
     everything.

@@ -21,7 +21,10 @@ WITHOUT = "or pass --no-scene, for the lanes of the rollout files alone"
 
 
 def episodes_of(
-    run: Path, rows: Sequence[Mapping], plugins: Sequence[str], scene: bool
+    run: Path,
+    rows: Sequence[Mapping],
+    plugins: Sequence[str],
+    scene: bool,
 ) -> Iterator[Episode]:
     """The episodes of rows of rollouts.csv, scene by scene; scene=False: of the rollout
     files alone."""

@@ -71,7 +71,9 @@ class AnchorSettings:
 
     def __post_init__(self) -> None:
         check_range(
-            "synthesizer.anchor.max_accel", self.max_accel, low=self.min_accel + 0.1
+            "synthesizer.anchor.max_accel",
+            self.max_accel,
+            low=self.min_accel + 0.1,
         )
 
 
@@ -141,7 +143,10 @@ def _bend_bound(route: Tensor, s: Tensor) -> Tensor:
 
 
 def _candidates(
-    world: World, index: Tensor, keep_route: bool, halt_at_red: bool
+    world: World,
+    index: Tensor,
+    keep_route: bool,
+    halt_at_red: bool,
 ) -> _Candidates:
     """The candidate routes of vehicles index [B, M]; arguments of `propose`."""
     scene = world.scene
@@ -189,7 +194,11 @@ def _along(candidates: _Candidates, path: Tensor, size: Tensor) -> _Target:
     slack = 0.8 * touch[..., 0, None, None] * cosine.clamp(min=0) ** 2
     crossing_time = (1 - cosine**2) / path[:, :, None, :, 3].clamp(min=1.0)
     return _Target(
-        s, d, slack=slack, crossing_time=crossing_time, corridor=touch[..., 1]
+        s,
+        d,
+        slack=slack,
+        crossing_time=crossing_time,
+        corridor=touch[..., 1],
     )
 
 
@@ -211,7 +220,9 @@ def _knots(candidates: _Candidates, accel: Tensor, limits: Tensor) -> Tensor:
         shape = (*travelled.shape[:-1], BEND_VERTICES)
         table = candidates.bend_bound[..., None, :].expand(shape)
         bound = torch.lerp(
-            table.gather(-1, low), table.gather(-1, low + 1), vertex - low
+            table.gather(-1, low),
+            table.gather(-1, low + 1),
+            vertex - low,
         )
         speed = torch.maximum(torch.minimum(free, bound.clamp(min=0).sqrt()), braking)
     knot = KNOT_STEPS * torch.arange(1, KNOTS + 1, device=accel.device)
@@ -260,7 +271,10 @@ def _decode(candidates: _Candidates, knots: Tensor) -> tuple[Tensor, Tensor]:
     "2",
 )
 def scored(
-    candidates: _Candidates, accel: Tensor, target: _Target, limits: Tensor
+    candidates: _Candidates,
+    accel: Tensor,
+    target: _Target,
+    limits: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Returns cost and time gap [s] (both [B, M, R, A]) and knots [B, M, R, A, 10].
 
@@ -313,7 +327,10 @@ class _OnLane(NamedTuple):
 
 
 def _on_lane(
-    candidates: _Candidates, path: Tensor, size: Tensor, settings: AnchorSettings
+    candidates: _Candidates,
+    path: Tensor,
+    size: Tensor,
+    settings: AnchorSettings,
 ) -> _OnLane:
     """How vehicles best meet targets on their candidates; path [B, M, H, 4] and size
     [B, M, 2]: the targets'."""
@@ -380,7 +397,10 @@ def propose(
         index, present = compact(skeleton.depth == depth)
         target = skeleton.target.gather(1, index).clamp(min=0)
         candidates = _candidates(
-            world, index, keep_route=keep_route, halt_at_red=halt_at_red
+            world,
+            index,
+            keep_route=keep_route,
+            halt_at_red=halt_at_red,
         )
         best = _on_lane(
             candidates,

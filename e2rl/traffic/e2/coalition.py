@@ -108,7 +108,11 @@ class Selector:
             by_rule = (state.decisions.whom != LEADER)[:, None]
             depth = depth.masked_fill(followed & by_rule, 0)
         skeleton = Skeleton(
-            state.coalition, state.target, depth=depth, near=depth == 1, far=depth > 1
+            state.coalition,
+            state.target,
+            depth=depth,
+            near=depth == 1,
+            far=depth > 1,
         )
         anchor = self._propose(skeleton, state, world, ego_plan, keep_route=True)
         return self._held(anchor, state, world) if self.lawful else anchor
@@ -128,7 +132,9 @@ class Selector:
             route=torch.where(held, present.route, anchor.route),
             off_lane=torch.where(held, state.off_lane, anchor.off_lane),
             off_lane_path=torch.where(
-                held[..., None, None], present.points, anchor.off_lane_path
+                held[..., None, None],
+                present.points,
+                anchor.off_lane_path,
             ),
         )
 
@@ -153,7 +159,11 @@ class Selector:
         )
 
     def _choose(
-        self, state: E2State, world: World, ego_plan: Tensor, reference: Reference
+        self,
+        state: E2State,
+        world: World,
+        ego_plan: Tensor,
+        reference: Reference,
     ) -> E2State:
         """States with new coalitions by topology on a reference rollout, feasibility and
         skeleton; members take the routes that meet their targets."""
@@ -170,11 +180,19 @@ class Selector:
         )
         feasible = self.feasible_vehicles(scene, world, self.feasibility).mask
         support, fallback = self._support(
-            state, world, candidates=topology.candidates, feasible=feasible
+            state,
+            world,
+            candidates=topology.candidates,
+            feasible=feasible,
         )
         may_act = eligible(world, state.decisions.whom, lawful=self.lawful)
         skeleton, anchor = self._skeleton(
-            state, world, ego_plan, expected, support & may_act, fallback & may_act
+            state,
+            world,
+            ego_plan,
+            expected,
+            support & may_act,
+            fallback & may_act,
         )
         members, nats = self._members(state, scene, skeleton, anchor)
         state = replace(
@@ -186,11 +204,19 @@ class Selector:
         route = torch.where(members, anchor.route, state.routed.route)
         nobody = torch.zeros_like(members)
         return on_paths(
-            state, world, route=route, off_lane=nobody, paths=anchor.off_lane_path
+            state,
+            world,
+            route=route,
+            off_lane=nobody,
+            paths=anchor.off_lane_path,
         )
 
     def _support(
-        self, state: E2State, world: World, candidates: Tensor, feasible: Tensor
+        self,
+        state: E2State,
+        world: World,
+        candidates: Tensor,
+        feasible: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """S [B, V] and who may take its place where it is empty, by `support` (Sec.
         IV-A2)."""
@@ -237,7 +263,11 @@ class Selector:
         return skeleton, anchor
 
     def _members(
-        self, state: E2State, scene: TensorDictBase, skeleton: Skeleton, anchor: Anchor
+        self,
+        state: E2State,
+        scene: TensorDictBase,
+        skeleton: Skeleton,
+        anchor: Anchor,
     ) -> tuple[Tensor, Tensor]:
         """Who of C* takes part [B, V], and the nats [B, V] of their new routes.
 
@@ -271,7 +301,11 @@ class Selector:
 
 
 def on_paths(
-    state: E2State, world: World, route: Tensor, off_lane: Tensor, paths: Tensor
+    state: E2State,
+    world: World,
+    route: Tensor,
+    off_lane: Tensor,
+    paths: Tensor,
 ) -> E2State:
     """Returns states with vehicles on routes or interceptions, and with their poses
     there. A vehicle that was off its lane and no longer is returns to its route.

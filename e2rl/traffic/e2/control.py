@@ -44,7 +44,12 @@ class Guidance(Protocol):
     """What moves a sample before the pulls do (`paper.MaskedGuidance`)."""
 
     def blend(
-        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+        self,
+        x: Tensor,
+        level: Tensor,
+        k: int,
+        context: Context,
+        denoise: Denoise,
     ) -> Tensor:
         """Returns x after anchoring; arguments of `SparseControl`.
 
@@ -57,7 +62,12 @@ class Guidance(Protocol):
         """
 
     def estimate(
-        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+        self,
+        x: Tensor,
+        level: Tensor,
+        k: int,
+        context: Context,
+        denoise: Denoise,
     ) -> tuple[Tensor, Tensor]:
         """Returns the clean estimate x0 and the guided one, [B, V, SIZE] each.
 
@@ -86,7 +96,12 @@ class SparseControl:
     raw: Tensor | None = None
 
     def __call__(
-        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+        self,
+        x: Tensor,
+        level: Tensor,
+        k: int,
+        context: Context,
+        denoise: Denoise,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns x after anchoring, the clean estimate x0 and the controlled one.
 
@@ -103,7 +118,11 @@ class SparseControl:
         else:
             x = self.guidance.blend(x, level, k=k, context=context, denoise=denoise)
             x0, guided = self.guidance.estimate(
-                x, level, k=k, context=context, denoise=denoise
+                x,
+                level,
+                k=k,
+                context=context,
+                denoise=denoise,
             )
         if k == 1:
             return x, x0, self._with_raw_proposals(x0)

@@ -152,7 +152,11 @@ class E2(NominalTraffic):
         )
 
     def replan(
-        self, state: E2State, world: World, ego_plan: Tensor, react: React | None = None
+        self,
+        state: E2State,
+        world: World,
+        ego_plan: Tensor,
+        react: React | None = None,
     ) -> tuple[E2State, TrafficPlan]:
         """Returns states and plans of the coming HORIZON steps.
 
@@ -222,7 +226,10 @@ class E2(NominalTraffic):
         return self.prior.plan(self.prior.estimate(context), context)
 
     def _onto_interceptions(
-        self, state: E2State, world: World, anchor: Anchor
+        self,
+        state: E2State,
+        world: World,
+        anchor: Anchor,
     ) -> tuple[E2State, Anchor]:
         """States on the interceptions under way, with their nats booked; those beyond
         the budget are off."""
@@ -245,7 +252,11 @@ class E2(NominalTraffic):
             nats = nats * affordable
         state = replace(state, path_kl=state.path_kl + nats)
         state = on_paths(
-            state, world, route=route, off_lane=off_lane, paths=anchor.off_lane_path
+            state,
+            world,
+            route=route,
+            off_lane=off_lane,
+            paths=anchor.off_lane_path,
         )
         return state, anchor
 
@@ -302,7 +313,11 @@ class E2(NominalTraffic):
         return self._booked(state, nats[pick], control, pick), sample.x0[pick]
 
     def _kernel_tries(
-        self, state: E2State, world: World, ego_plan: Tensor, context: Context
+        self,
+        state: E2State,
+        world: World,
+        ego_plan: Tensor,
+        context: Context,
     ) -> tuple[KernelAttack, Tries]:
         """What kernels are valued by, and the joint samples to draw: to the best
         kernels of vehicles that have no proposal under way."""
@@ -340,7 +355,11 @@ class E2(NominalTraffic):
         return state.attacked & (left > drawn_nats(self.kernels.samples - 1))
 
     def _worth(
-        self, attack: KernelAttack, contexts: Context, x0: Tensor, scenes: Tensor
+        self,
+        attack: KernelAttack,
+        contexts: Context,
+        x0: Tensor,
+        scenes: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """What `foresee` makes of samples x0 [C, V, SIZE] of scenes [C]: worth and
         prevented [C, V]."""

@@ -164,7 +164,10 @@ def _meeting(own: _Samples, ego: _Samples, settings: FeasibilitySettings) -> _Me
 
 
 def _to_intersection(
-    points: Tensor, heading: Tensor, ego: Tensor, ego_heading: Tensor
+    points: Tensor,
+    heading: Tensor,
+    ego: Tensor,
+    ego_heading: Tensor,
 ) -> Tensor:
     """Shift [Q] in m along a route from points [Q, 2] to where its tangent crosses that
     of the ego's route at near points `ego` [Q, 2]; 0 where they are near parallel.
@@ -175,13 +178,18 @@ def _to_intersection(
     cross = u[..., 0] * w[..., 1] - u[..., 1] * w[..., 0]
     crossing = cross.abs() > 0.3
     shift = (gap[..., 0] * w[..., 1] - gap[..., 1] * w[..., 0]) / torch.where(
-        crossing, cross, 1.0
+        crossing,
+        cross,
+        1.0,
     )
     return torch.where(crossing, shift, 0.0).clamp(-SAMPLE_SPACING, SAMPLE_SPACING)
 
 
 def find_conflicts(
-    scene: TensorDictBase, world: World, own_s: Tensor, settings: FeasibilitySettings
+    scene: TensorDictBase,
+    world: World,
+    own_s: Tensor,
+    settings: FeasibilitySettings,
 ) -> Conflicts:
     """Returns the conflict points of scenes with the ego's mission.
 
@@ -254,7 +262,9 @@ def blocks_ego(scene: TensorDictBase, world: World) -> Tensor:
 
 
 def feasible_vehicles(
-    scene: TensorDictBase, world: World, settings: FeasibilitySettings
+    scene: TensorDictBase,
+    world: World,
+    settings: FeasibilitySettings,
 ) -> Feasibility:
     """Returns the feasible set F of scenes [B] by the three criteria of Sec. IV-A2.
 

@@ -111,7 +111,10 @@ def foresee(
 
 
 def _contacts(
-    path: Tensor, length: Tensor, along: Along, since: Tensor
+    path: Tensor,
+    length: Tensor,
+    along: Along,
+    since: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Whether drivers [D, G, O] run their front into the plans, and when [G, O] s the
     one who does not react does. The competent driver counts any contact as its own.
@@ -150,7 +153,12 @@ def _contacts(
         moments = path.new_tensor([DT * (k + 1) for k in range(step, last)])
         ahead = Approach(*(value[step : step + STEPS + 1] for value in approach))
         encounter = meet(
-            population, moments, length, planned[step:last], encounter, ahead
+            population,
+            moments,
+            length,
+            planned[step:last],
+            encounter,
+            ahead,
         )
     hit = encounter.hit.unflatten(1, pairs) > 0
     front = encounter.front.unflatten(1, pairs) > 0

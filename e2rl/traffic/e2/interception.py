@@ -104,7 +104,11 @@ class _Drive(NamedTuple):
 
 
 def cubic(
-    start: Tensor, heading: Tensor, end: Tensor, end_heading: Tensor, u: Tensor
+    start: Tensor,
+    heading: Tensor,
+    end: Tensor,
+    end_heading: Tensor,
+    u: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Returns points and derivatives [..., U, 2] of the cubic Hermite curve between two
     poses.
@@ -179,7 +183,10 @@ def _lateral(paths: _Paths, drive: _Drive) -> tuple[Tensor, Tensor]:
 
 
 def _within_limits(
-    paths: _Paths, drive: _Drive, eta: Tensor, settings: InterceptionSettings
+    paths: _Paths,
+    drive: _Drive,
+    eta: Tensor,
+    settings: InterceptionSettings,
 ) -> Tensor:
     """Bool [B, M, O]: paths keep the limits of intensities eta [B, 1, 1]."""
     lateral, curvature = _lateral(paths, drive)
@@ -221,7 +228,12 @@ def _clear(paths: _Paths, travelled: Tensor, size: Tensor, others: _Others) -> T
     pose = torch.cat([points, heading, torch.zeros_like(heading)], -1)
     counts = others.counts.to(size.dtype)
     return ~touched(
-        pose, size + CLEARANCE, others.states, others.sizes, counts, travelled
+        pose,
+        size + CLEARANCE,
+        others.states,
+        others.sizes,
+        counts,
+        travelled,
     )
 
 
@@ -305,7 +317,12 @@ def intercept(
         against = _against_lanes(scene, meeting, end_heading=paths.end_heading)
         cost = torch.where(against, cost + wrong_way[:, None, None], cost)
     worth = _worth(
-        world, paths, drive, index=index, ego_plan=expected[:, 0], possible=possible
+        world,
+        paths,
+        drive,
+        index=index,
+        ego_plan=expected[:, 0],
+        possible=possible,
     )
     cost = cost - WORTH * worth - settings.preference
     cost, pick = cost.masked_fill(~possible, torch.inf).min(-1)
@@ -324,7 +341,12 @@ def intercept(
 
 
 def _drive(
-    paths: _Paths, meeting: Tensor, *, speed: Tensor, time: Tensor, both: Tensor
+    paths: _Paths,
+    meeting: Tensor,
+    *,
+    speed: Tensor,
+    time: Tensor,
+    both: Tensor,
 ) -> _Drive:
     """The constant acceleration that meets the target in time; boxes that move alike
     touch before their centres meet. both [B, M]: m of the lengths together."""
@@ -343,7 +365,12 @@ def _travelled(drive: _Drive, times: Tensor) -> Tensor:
 
 
 def _others(
-    world: World, index: Tensor, *, target: Tensor, expected: Tensor, steps: Tensor
+    world: World,
+    index: Tensor,
+    *,
+    target: Tensor,
+    expected: Tensor,
+    steps: Tensor,
 ) -> _Others:
     """Everybody at expected steps [W], of whom all count but the vehicle itself and its
     target; arguments of `intercept`."""
@@ -411,7 +438,9 @@ def _worth(
 
 
 def _against_lanes(
-    scene: TensorDictBase, meeting: Tensor, end_heading: Tensor
+    scene: TensorDictBase,
+    meeting: Tensor,
+    end_heading: Tensor,
 ) -> Tensor:
     """Bool [B, M, O]: paths end at meeting states [B, M, I, 4] with end_heading [B, M,
     O] against the lanes there."""
@@ -480,7 +509,11 @@ def interception_nats(
 
 @fused("Q 4", "Q", "Q P 2!", "Q P 2!", f"Q {KNOTS}")
 def lateral_nats(
-    states: Tensor, lane: LaneState, points: Tensor, path: Tensor, knots: Tensor
+    states: Tensor,
+    lane: LaneState,
+    points: Tensor,
+    path: Tensor,
+    knots: Tensor,
 ) -> Tensor:
     """Returns `interception_nats` [Q], compiled.
 
@@ -492,7 +525,10 @@ def lateral_nats(
         knots: [Q, KNOTS] m/s^2.
     """
     present = lane_relative.locate(
-        states, lane.a, yaw_rate=lane.kappa * lane.v, points=points
+        states,
+        lane.a,
+        yaw_rate=lane.kappa * lane.v,
+        points=points,
     )
     speed, travelled = lane_relative.speeds(present, knots)
     start = project(states[:, None, :2], path)[0]

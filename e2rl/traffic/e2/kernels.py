@@ -286,7 +286,12 @@ def propose_kernels(
 
 
 def _values(
-    attack: KernelAttack, lane: LaneState, *, points: Tensor, mean: Tensor, gain: Tensor
+    attack: KernelAttack,
+    lane: LaneState,
+    *,
+    points: Tensor,
+    mean: Tensor,
+    gain: Tensor,
 ) -> Tensor:
     """Value in nats [B, V, O] of the kernels of each vehicle, -inf of those that are
     impossible or against the lanes; arguments of `propose_kernels`."""

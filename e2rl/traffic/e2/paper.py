@@ -79,7 +79,11 @@ class LiteralAnchor:
         self.jump = self.noise.new_zeros(self.vehicles.shape)
 
     def __call__(
-        self, x: Tensor, x0: Tensor, level: Tensor, schedule: NoiseSchedule
+        self,
+        x: Tensor,
+        x0: Tensor,
+        level: Tensor,
+        schedule: NoiseSchedule,
     ) -> Tensor:
         """Returns x [B, V, SIZE] of a noise level after the blend; x0: its clean
         estimate, of which the proposals keep the lateral part."""
@@ -128,7 +132,12 @@ class MaskedGuidance:
         return self.anchor.jump
 
     def blend(
-        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+        self,
+        x: Tensor,
+        level: Tensor,
+        k: int,
+        context: Context,
+        denoise: Denoise,
     ) -> Tensor:
         """Returns x after eq. 14, where that is due.
 
@@ -146,7 +155,12 @@ class MaskedGuidance:
         return self.anchor(x, x0, level=level, schedule=self.prior.schedule)
 
     def estimate(
-        self, x: Tensor, level: Tensor, k: int, context: Context, denoise: Denoise
+        self,
+        x: Tensor,
+        level: Tensor,
+        k: int,
+        context: Context,
+        denoise: Denoise,
     ) -> tuple[Tensor, Tensor]:
         """Returns the clean estimate x0 and the one guided by eq. 16, [B, V, SIZE]
         each.
@@ -161,7 +175,11 @@ class MaskedGuidance:
         settings = self.settings
         with_feasibility = 1 < k <= self.feasibility_step
         x0, adversarial, feasibility = self._gradients(
-            x, level, with_feasibility, context=context, denoise=denoise
+            x,
+            level,
+            with_feasibility,
+            context=context,
+            denoise=denoise,
         )
         guided = x0
         weight = gradient_weight(self.prior.schedule, level, settings.scaling)
@@ -197,7 +215,9 @@ class MaskedGuidance:
             if self.has_coalition:
                 temperature = annealed_temperature(level, self.potentials)
                 value = self.potentials.adversarial(
-                    states, self.conditions, temperature=temperature
+                    states,
+                    self.conditions,
+                    temperature=temperature,
                 )
                 (adversarial,) = torch.autograd.grad(value.sum(), x0, retain_graph=True)
             if with_feasibility:

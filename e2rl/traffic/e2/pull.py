@@ -53,7 +53,11 @@ def nats(displacement: Tensor) -> Tensor:
 
 
 def pulled(
-    x0: Tensor, goal: Tensor, strength: Tensor, level: Tensor, schedule: NoiseSchedule
+    x0: Tensor,
+    goal: Tensor,
+    strength: Tensor,
+    level: Tensor,
+    schedule: NoiseSchedule,
 ) -> Tensor:
     """Returns the posterior means [..., SIZE] of clean estimates under a pull.
 
@@ -89,7 +93,11 @@ class Pull:
 
 @fused(f"B V {SIZE}", f"B V {SIZE}", "B V:bool", "B", "")
 def pull_to(
-    x0: Tensor, goal: Tensor, vehicles: Tensor, strength: Tensor, level: Tensor
+    x0: Tensor,
+    goal: Tensor,
+    vehicles: Tensor,
+    strength: Tensor,
+    level: Tensor,
 ) -> Tensor:
     """Returns x0 after a `Pull`, compiled.
 
@@ -103,6 +111,10 @@ def pull_to(
     goal = torch.where(goal.isnan(), x0, goal)
     schedule = NoiseSchedule()
     moved = pulled(
-        x0, goal, strength=strength[:, None, None], level=level, schedule=schedule
+        x0,
+        goal,
+        strength=strength[:, None, None],
+        level=level,
+        schedule=schedule,
     )
     return torch.where(vehicles[..., None], moved, x0)

@@ -142,7 +142,11 @@ def _course(route: Tensor, s: Tensor) -> str:
 
 
 def _next_light(
-    scene: TensorDictBase, step: Tensor, vehicle: int, candidate: int, s: float
+    scene: TensorDictBase,
+    step: Tensor,
+    vehicle: int,
+    candidate: int,
+    s: float,
 ) -> str:
     """The next light on a candidate route of scene [1] at step [1], where it is ahead
     of arc length s and known."""
@@ -153,7 +157,10 @@ def _next_light(
 
 
 def describe(
-    scene: TensorDictBase, world: World, conflicts: Conflicts, row: int
+    scene: TensorDictBase,
+    world: World,
+    conflicts: Conflicts,
+    row: int,
 ) -> tuple[str, dict[int, str]]:
     """Returns the ego of a scene and its mission in words, and every present vehicle
     that is not parked, by its index.
@@ -172,7 +179,11 @@ def describe(
     )
     texts = {
         vehicle: describe_vehicle(
-            scene, world, conflicts=conflicts, row=row, vehicle=vehicle
+            scene,
+            world,
+            conflicts=conflicts,
+            row=row,
+            vehicle=vehicle,
         )
         for vehicle in present
         if vehicle > 0
@@ -187,7 +198,11 @@ def describe(
 
 
 def describe_vehicle(
-    scene: TensorDictBase, world: World, conflicts: Conflicts, row: int, vehicle: int
+    scene: TensorDictBase,
+    world: World,
+    conflicts: Conflicts,
+    row: int,
+    vehicle: int,
 ) -> str:
     """Returns position and motion of a vehicle, and where its routes meet the ego's by
     the rules, whose verdict is not told.
@@ -292,7 +307,10 @@ class LanguageReasoner:
         )
 
     def __call__(
-        self, scene: TensorDictBase, world: World, settings: FeasibilitySettings
+        self,
+        scene: TensorDictBase,
+        world: World,
+        settings: FeasibilitySettings,
     ) -> Feasibility:
         """Feasible vehicles of scenes [B]: `mask` by the model's verdicts on the three
         criteria, or the rules' where it fails; never the ego nor parked ones. All else

@@ -196,7 +196,12 @@ class _Chain(NamedTuple):
 
 
 def _shortest_chain(
-    after: Tensor, start: Tensor, *, near: Tensor, blocked: Tensor, most_links: int
+    after: Tensor,
+    start: Tensor,
+    *,
+    near: Tensor,
+    blocked: Tensor,
+    most_links: int,
 ) -> _Chain:
     """The chain from slot start [B] to a near slot [B, M] that can still act on the
     ego, each link no earlier than the last; it does not pass blocked slots [B, M].
@@ -226,7 +231,10 @@ def _shortest_chain(
 
 
 def _link_chains(
-    after: Tensor, near: Tensor, far: Tensor, most_links: int
+    after: Tensor,
+    near: Tensor,
+    far: Tensor,
+    most_links: int,
 ) -> tuple[Tensor, Tensor]:
     """Targets [B, M] of slots (M: the ego, -1: none); far slots [B, M] with a chain of
     up to `most_links` links."""
@@ -239,7 +247,11 @@ def _link_chains(
         linked = target.gather(1, start[:, None])[:, 0] >= 0
         blocked = (target >= 0) & ~near
         chain = _shortest_chain(
-            after, start, near=near, blocked=blocked, most_links=most_links
+            after,
+            start,
+            near=near,
+            blocked=blocked,
+            most_links=most_links,
         )
         links = torch.where(starts & ~linked, chain.links, 0)
         arrives = (starts & (linked | (links > 0)))[:, None]
@@ -250,7 +262,9 @@ def _link_chains(
             active = links >= link
             parent = chain.parents[link - 1].gather(1, slot[:, None])
             acts_on = torch.where(
-                active[:, None], slot[:, None], target.gather(1, parent)
+                active[:, None],
+                slot[:, None],
+                target.gather(1, parent),
             )
             target = target.scatter(1, parent, acts_on)
             slot = torch.where(active, parent[:, 0], slot)
@@ -304,7 +318,11 @@ def build_skeleton(
     far = smallest(distant, -take(distance, index), count=settings.far)
     linked = present & far.any(1, keepdim=True)  # no far agent, no chain to look for
     acts = influence(
-        world, index=index, present=linked, expected=expected, settings=settings
+        world,
+        index=index,
+        present=linked,
+        expected=expected,
+        settings=settings,
     )
     slot_target, viable = _link_chains(
         first_after(acts),

@@ -58,7 +58,9 @@ class TopologyResult:
 
 
 def _overlap_interval(
-    offset: Tensor, closing: Tensor, extent: Tensor
+    offset: Tensor,
+    closing: Tensor,
+    extent: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Times during which |offset + closing t| <= extent; (inf, -inf) for never."""
     still = closing.abs() < 1e-6  # then the projections overlap always or never
@@ -66,13 +68,17 @@ def _overlap_interval(
     middle = -offset * inverse
     half = extent * inverse.abs()
     half = torch.where(
-        still, torch.where(offset.abs() <= extent, torch.inf, -torch.inf), half
+        still,
+        torch.where(offset.abs() <= extent, torch.inf, -torch.inf),
+        half,
     )
     return middle - half, middle + half
 
 
 def time_to_collision(
-    states: Tensor, size: Tensor, horizon: float = RISK_SECONDS
+    states: Tensor,
+    size: Tensor,
+    horizon: float = RISK_SECONDS,
 ) -> Tensor:
     """Time [s] to the first contact of oriented boxes at constant velocity and heading:
     states [..., N, 4], size [..., N, 2] -> [..., N, N].
@@ -115,7 +121,10 @@ def time_to_collision(
 
 
 def pair_weights(
-    states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings
+    states: Tensor,
+    valid: Tensor,
+    size: Tensor,
+    settings: TopologySettings,
 ) -> Tensor:
     """Returns risk weights [..., N, N] of eq. (ttc_weight_t), 0 on the diagonal.
 
@@ -183,7 +192,10 @@ def _top_cliques(graph: _Graph, settings: TopologySettings) -> list[Clique]:
 
 
 def topological_candidates(
-    states: Tensor, valid: Tensor, size: Tensor, settings: TopologySettings
+    states: Tensor,
+    valid: Tensor,
+    size: Tensor,
+    settings: TopologySettings,
 ) -> TopologyResult:
     """Returns the candidates S_top of a reference rollout (Sec. IV-A1, eqs. ttc_weight
     and temporal_scoring). Every STRIDE-th step is analysed and counts once.
@@ -236,8 +248,14 @@ def topological_candidates(
     scored[:, 0] = False
     tie = distance.amin(1).argsort(dim=-1, stable=True).argsort(-1)
     candidates = smallest(
-        scored, tie - score * score.shape[1], count=settings.candidates
+        scored,
+        tie - score * score.shape[1],
+        count=settings.candidates,
     )
     return TopologyResult(
-        score, candidates, weights=weights, steps=steps, cliques=cliques
+        score,
+        candidates,
+        weights=weights,
+        steps=steps,
+        cliques=cliques,
     )

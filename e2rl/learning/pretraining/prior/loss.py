@@ -110,7 +110,10 @@ class DenoisingLoss(nn.Module):
         self.feature_noise = feature_noise
 
     def forward(
-        self, batch: TensorDictBase, drawn: TensorDictBase, total: Tensor
+        self,
+        batch: TensorDictBase,
+        drawn: TensorDictBase,
+        total: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(loss, its action term, its trajectory term) of windows [W] with the random
         numbers of `draw`.
@@ -133,7 +136,9 @@ class DenoisingLoss(nn.Module):
         level = drawn["level"].T.reshape(-1, 1).expand(-1, weight.shape[1]).clone()
         level[:, 0] = torch.where(drawn["clean"].T.reshape(-1), EGO_LEVEL, level[:, 0])
         x = net.schedule.noised(
-            tiled["x0"], level[..., None], drawn["noise"].transpose(0, 1).flatten(0, 1)
+            tiled["x0"],
+            level[..., None],
+            drawn["noise"].transpose(0, 1).flatten(0, 1),
         )
         x0 = net(x, level, encoding).float()
         squared = (x0 - tiled["x0"]) ** 2 * tiled["knot_weight"]
@@ -172,7 +177,11 @@ def _trajectory_error(x0: Tensor, batch: TensorDictBase) -> Tensor:
 
 @torch.no_grad()
 def held_out_loss(
-    prior: Prior, windows: TensorDictBase, *, batch: int, batches: int = 20
+    prior: Prior,
+    windows: TensorDictBase,
+    *,
+    batch: int,
+    batches: int = 20,
 ) -> float:
     """Returns the denoising loss, with a fixed seed and without augmentation.
 

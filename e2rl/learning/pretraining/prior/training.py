@@ -126,7 +126,9 @@ class PriorTraining(Supervised):
         settings = self.settings
         if self.routes is not None and not self.done:
             self.accuracy = train_route_choice(
-                self.prior, self.routes, settings=settings
+                self.prior,
+                self.routes,
+                settings=settings,
             )
         row = self.train(min(self.done + settings.validate_every, settings.steps))
         with self.averaged() as prior:
@@ -152,7 +154,10 @@ class PriorTraining(Supervised):
         """Indices [B] of a step's windows: a fraction CAUSAL of them with estimated
         starts, if both kinds exist."""
         uniform = torch.rand(
-            2, self.settings.batch, generator=self.generator, device=self.device
+            2,
+            self.settings.batch,
+            generator=self.generator,
+            device=self.device,
         ).to(self.rows[0].device)
         picks = [rows[(uniform[1] * len(rows)).long()] for rows in self.rows]
         return torch.where(uniform[0] < CAUSAL, picks[0], picks[-1])
@@ -176,7 +181,10 @@ class PriorTraining(Supervised):
         return torch.stack([action, trajectory])
 
     def _average(
-        self, average: Sequence[Tensor], current: Sequence[Tensor], _count: Tensor | int
+        self,
+        average: Sequence[Tensor],
+        current: Sequence[Tensor],
+        _count: Tensor | int,
     ) -> None:
         """Exponential moving average whose decay grows to EMA with the steps (`_count`
         may be on the GPU)."""
@@ -243,7 +251,9 @@ def has_bf16(device: torch.device) -> bool:
 
 
 def train_route_choice(
-    prior: Prior, scenes: TensorDictBase, settings: TrainingSettings
+    prior: Prior,
+    scenes: TensorDictBase,
+    settings: TrainingSettings,
 ) -> float:
     """Train by cross-entropy on the driven candidate, over vehicles with several;
     returns the training accuracy."""
@@ -264,7 +274,9 @@ def train_route_choice(
     net = prior.route_choice.net
     generator = torch.Generator().manual_seed(settings.seed)
     optimiser = torch.optim.AdamW(
-        prior.route_choice.parameters(), 3e-3, weight_decay=0.05
+        prior.route_choice.parameters(),
+        3e-3,
+        weight_decay=0.05,
     )
     for _ in Bar(range(settings.route_steps), "route choice"):
         pick = torch.randint(len(label), (512,), generator=generator).to(device)

@@ -146,7 +146,10 @@ def _future(scene: TensorDictBase, offset: int, vehicles: int) -> tuple[Tensor, 
 
 
 def _targets(
-    routed: RoutedScene, state: LaneState, tracks: Tensor, recorded: Tensor
+    routed: RoutedScene,
+    state: LaneState,
+    tracks: Tensor,
+    recorded: Tensor,
 ) -> tuple[Tensor, ...]:
     """x0 [B, V, SIZE] of tracks [B, V, HORIZON, 4], its error [B, V], recorded distance
     and offset [B, V, HORIZON]."""
