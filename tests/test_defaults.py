@@ -10,9 +10,9 @@ import pytest
 from omegaconf import OmegaConf
 
 import e2rl
-from e2rl.run.config import conf_folder, file_values
+from e2rl.run.config import CONF, file_values
 
-FILES = sorted(conf_folder().glob("*/*.yaml"))
+FILES = sorted(CONF.glob("*/*.yaml"))
 OPTIONAL = {
     "commonroad_writer",
     "openscenario",

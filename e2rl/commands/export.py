@@ -135,7 +135,7 @@ def main(arguments: list[str] | None = None) -> None:
         part = "export"
         if options.failure:
             part = f"export/{options.failure}"
-        out = options.out or own_folder(options.run, part, options.to)
+        out = options.out or own_folder(options.run, f"{part}/{options.to}")
         if options.open_ego and options.to not in OPEN_EGO:
             raise InputError(
                 f"--open-ego: {options.to} has no such form; leave it out, or pass "

@@ -144,14 +144,14 @@ def score_all(
 
         return parts.result(name, identity, score, valid=partial(has_files, into))
 
-    for result in in_processes(
+    for rows, samples, errored in in_processes(
         result_of,
         jobs,
         processes=work.processes,
         cost=cost,
         ended=ended,
     ):
-        scored = Scored(*result)
+        scored = Scored(rows, samples, errored=errored)
         scored.rows += map(errored_row, scored.errored)
         scored.samples += [NO_SAMPLES] * len(scored.errored)
         yield scored

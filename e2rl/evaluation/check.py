@@ -8,13 +8,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from e2rl.driving.batches import WHOLE
 from e2rl.metrics.catalogue import table_names
-from e2rl.run.config import (
-    check_choice,
-    choices,
-    machine_of,
-    setting,
-    settings_of,
-)
+from e2rl.run.config import check_choice, choices, setting, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.processes import cores
 from e2rl.search.spending import UNITS
@@ -188,13 +182,14 @@ def check_compared(config: DictConfig, settings: EvaluationSettings) -> None:
 def processes_of(config: DictConfig) -> int:
     """Returns the processes that rollouts are spread over: one a core by default, one
     on a device that they would share."""
-    machine = machine_of(config)
+    processes = config.get("processes")  # train.py has none
+    threads = config.threads
     device = str(config.device)
-    alone = device == "cpu" and machine.threads == 1
-    if not alone and (machine.processes or 1) > 1:
+    alone = device == "cpu" and threads == 1
+    if not alone and (processes or 1) > 1:
         raise InputError(
-            f"processes={machine.processes}, threads={machine.threads}, "
-            f"device={device}: several processes have one thread each and the CPU; set "
-            "threads=1 device=cpu, or processes=1"
+            f"processes={processes}, threads={threads}, device={device}: several "
+            "processes have one thread each and the CPU; set threads=1 device=cpu, or "
+            "processes=1"
         )
-    return machine.processes or (cores() if alone else 1)
+    return processes or (cores() if alone else 1)

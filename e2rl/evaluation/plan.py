@@ -99,9 +99,10 @@ class Evaluation:
         (setup,) = (
             setup for setup in self.setups if setup.ego_name == row["ego_policy"]
         )
-        wanted = (self.scenes.index(row["scene_id"]), row["seed"])
+        scene = self.scenes.index(row["scene_id"])
+        seed = row["seed"]
         batches = [
-            Batch(setup, method, [Task(*wanted)])
+            Batch(setup, method, [Task(scene, seed)])
             for method in self.methods
             if (method.name, method.eta) == (row["method"], row["eta"])
         ]
@@ -110,7 +111,7 @@ class Evaluation:
                 file = run / TRIES_FILE
                 batches += failures_of(file, setup.ego_name, method=search, setup=setup)
         for batch in batches:
-            tasks = [task for task in batch.tasks if task[:2] == wanted]
+            tasks = [task for task in batch.tasks if task[:2] == (scene, seed)]
             if tasks:
                 return batch._replace(tasks=tasks)
         raise InputError(

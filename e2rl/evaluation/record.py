@@ -10,7 +10,8 @@ from omegaconf import DictConfig
 
 from e2rl.driving.batches import Work, drive_all
 from e2rl.driving.setup import Method, Scored, Setup
-from e2rl.evaluation.modes import find_atlas, find_modes, read_modes
+from e2rl.evaluation.atlas import find_atlas
+from e2rl.evaluation.modes import find_modes, read_modes
 from e2rl.evaluation.rollout_files import (
     ERRORED_FILE,
     METRICS_FILE,

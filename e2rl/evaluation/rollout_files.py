@@ -5,7 +5,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from types import NoneType
@@ -84,15 +84,15 @@ def write_tables(
             written.
     """
     counted = [row for row in rows if not lost(row)]
+    columns = table_columns()
     if folder is not None:
-        texts = {TABLE: rows_text(rows)}
+        texts = {TABLE: rows_text(rows, columns)}
         for name, content in tables.items() if counted else ():
             texts[f"{name}.json"] = json_text(content)
         for name, text in texts.items():
             write_atomically(folder / name, text)
         write_errored(folder / ERRORED_FILE, errored)
     require_rows(counted, errored, folder)
-    columns = table_columns()
     return [
         {name: value_of(name, str(cell(row.get(name, math.nan)))) for name in columns}
         for row in rows
@@ -101,12 +101,11 @@ def write_tables(
 
 def write_rows(path: Path, rows: Sequence[dict]) -> None:
     """Write rollouts.csv."""
-    write_atomically(path, rows_text(rows))
+    write_atomically(path, rows_text(rows, table_columns()))
 
 
-def rows_text(rows: Sequence[dict]) -> str:
-    """Returns rollouts.csv: one line per row of `score_rollouts`, NaN as an empty cell."""
-    columns = table_columns()
+def rows_text(rows: Iterable[Mapping], columns: Sequence[str]) -> str:
+    """Returns columns of rows as CSV: NaN, and what a row lacks, is an empty cell."""
     lines = ([cell(row.get(column, math.nan)) for column in columns] for row in rows)
     return csv_text([columns, *lines])
 
@@ -245,9 +244,9 @@ def _texts(value: object) -> Iterator[str]:
         yield value
 
 
-def own_folder(run: Path, *names: str) -> Path:
+def own_folder(run: Path, name: str) -> Path:
     """A folder of a run to write to; InputError where a link leads out of the run."""
-    folder = run.joinpath(*names)
+    folder = run / name
     if not leads_into(folder, run):
         raise InputError(
             f"{folder}: a link out of {run}; remove it, or name another folder with --out"

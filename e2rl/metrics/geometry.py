@@ -53,10 +53,10 @@ def pair_overlap(
         first_size, second_size: [..., 2].
         possible: [...] bool, pairs that count; the area of others is 0.
     """
+    meets = possible & overlap(first, first_size, second, second_size)
     boxes = (first, first_size, second, second_size)
-    meets = possible & overlap(*boxes)
     area = overlap_area(
-        *(box.expand(*meets.shape, box.shape[-1])[meets] for box in boxes)
+        *(box.expand(meets.shape + box.shape[-1:])[meets] for box in boxes)
     )
     result = torch.zeros(
         meets.shape,

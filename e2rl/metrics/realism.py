@@ -124,27 +124,21 @@ def kinematic_samples(
 def traffic_samples(batch: dict[str, Tensor]) -> list[Samples]:
     """`kinematic_samples` per rollout of the traffic, and of the adversaries in it
     under names of their own."""
-    tracks = batch["states"], batch["valid"], batch["logged"], batch["logged_valid"]
-    everybody = kinematic_samples(*tracks, batch["traffic"], batch["stop"])
-    adversaries = kinematic_samples(
-        *tracks,
-        batch["traffic"] & batch["adversaries"],
-        batch["stop"],
+    traffic = batch["traffic"]
+    everybody, adversaries = (
+        kinematic_samples(
+            batch["states"],
+            batch["valid"],
+            logged=batch["logged"],
+            logged_valid=batch["logged_valid"],
+            agents=agents,
+            stop=batch["stop"],
+        )
+        for agents in (traffic, traffic & batch["adversaries"])
     )
     return [
-        samples
-        | dict(
-            zip(
-                OF_ADVERSARIES,
-                theirs.values(),
-                strict=True,
-            )
-        )
-        for samples, theirs in zip(
-            everybody,
-            adversaries,
-            strict=True,
-        )
+        samples | dict(zip(OF_ADVERSARIES, theirs.values(), strict=True))
+        for samples, theirs in zip(everybody, adversaries, strict=True)
     ]
 
 

@@ -12,8 +12,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from tabulate import tabulate
-
 from e2rl.evaluation.modes import OTHER
 from e2rl.evaluation.rollout_files import ERRORED_FILE, TABLE
 from e2rl.evaluation.summary import Headline, headline
@@ -21,7 +19,7 @@ from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import lost, raised
 from e2rl.report.comparison_tables import by_ego
 from e2rl.report.tables import UNKNOWN, grouped, number, plural
-from e2rl.run.terminal import column_groups, terminal_width
+from e2rl.run.terminal import columns, terminal_width
 
 LINES = 25
 WEAKNESSES = 3  # lines of failure modes
@@ -498,35 +496,3 @@ def wrapped(text: str, indent: str = "") -> list[str]:
 def paragraphs(texts: Iterable[str], indent: str = "  ") -> list[str]:
     """The lines of several texts."""
     return [line for text in texts for line in wrapped(text, indent)]
-
-
-def columns(table: Sequence[Sequence[str]]) -> list[str]:
-    """Returns aligned rows of text that fit the terminal; table: the heads, which may
-    be wrapped, then rows.
-
-    Columns that find no room stand beneath, beside the first column again, which is cut
-    where it is too wide.
-    """
-    width = terminal_width()
-    head, *rows = table
-    sizes = [
-        max(map(len, [*title.split(), *(row[column] for row in rows)]), default=0)
-        for column, title in enumerate(head)
-    ]
-    room = width - sum(sizes[1:]) - 2 * (len(sizes) - 1)
-    sizes[0] = min(sizes[0], max(width // 3, room))
-    lines: list[str] = []
-    for group in column_groups(sizes, width):
-        body: list[list[str]] = []
-        heads = [textwrap.wrap(head[column], sizes[column]) for column in group]
-        height = max(map(len, heads))
-        for line in range(-height, 0):
-            body.append([title[line] if -line <= len(title) else "" for title in heads])
-        for row in rows:
-            body.append([row[column] for column in group])
-            if len(row[0]) > sizes[0]:
-                body[-1][0] = f"{row[0][: sizes[0] - 1]}…"
-        align = ["left"] + ["right"] * (len(group) - 1)
-        text = tabulate(body, tablefmt="plain", disable_numparse=True, colalign=align)
-        lines += text.splitlines()
-    return lines

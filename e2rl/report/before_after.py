@@ -15,12 +15,12 @@ from e2rl.report.answer import (
     PER_DISTANCE,
     cell,
     closing,
-    columns,
     tally,
     traffic_name,
     wrapped,
 )
 from e2rl.report.tables import UNKNOWN, plural
+from e2rl.run.terminal import columns
 
 MOST_CELLS = 7  # of an atlas
 CHANGES = {  # rows of the comparison of before and after
@@ -47,7 +47,7 @@ def compared_answer(
         before: rows of metrics.json of the stage `before`.
         after: rows of the stage `after`, which are paired with those before under the
             name `before`.
-        atlases: of both stages (`evaluation.modes.group_atlas`); None: nothing was
+        atlases: of both stages (`evaluation.atlas.group_atlas`); None: nothing was
             searched for.
         folder: of the run, which holds tables.md.
     """

@@ -24,7 +24,7 @@ from omegaconf import DictConfig
 
 from e2rl.evaluation.modes import OTHER
 from e2rl.evaluation.record import Record
-from e2rl.evaluation.rollout_files import TABLE, cell, nulls, own_folder
+from e2rl.evaluation.rollout_files import TABLE, nulls, own_folder, rows_text
 from e2rl.metrics.atlas import CELL, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import raised
@@ -34,12 +34,11 @@ from e2rl.report.failure_tracks import replay_data
 from e2rl.report.tables import (
     Table,
     column_names,
-    grouped,
     metric_tables,
 )
 from e2rl.run.config import assigned
 from e2rl.run.errors import InputError
-from e2rl.run.files import csv_text, write_atomically, write_beside
+from e2rl.run.files import write_atomically, write_beside
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_key, rollout_name
 
 PAGE = "failures.html"
@@ -127,18 +126,21 @@ def failure_list(content: Mapping[str, Any], page_name: str) -> str:
     ENDINGS; then one for each rollout that errored, which has no mode, link or command.
     """
     again = content["commands"].get(AGAIN, "")
-    lines = [["failure", *COLUMNS, "mode", "link", "again", *ENDINGS]]
-    for entry in (*content["failures"], *content["errored"]):
+    rows = []
+    for entry in content["failures"]:
         key = entry["key"]
-        line = [key, *(cell(entry[name]) for name in COLUMNS)]
-        if "mode" in entry:
-            mode = content["modes"].get(entry["mode"], "")
-            link = f"{page_name}#failure={key}"
-            line += [mode, link, again.replace("@NAME@", key), 0, "", ""]
-        else:
-            line += ["", "", "", 1, entry["raised_by"], entry["error"]]
-        lines.append(line)
-    return csv_text(lines)
+        about = {
+            "failure": key,
+            "mode": content["modes"].get(entry["mode"], ""),
+            "link": f"{page_name}#failure={key}",
+            "again": again.replace("@NAME@", key),
+            "errored": 0,
+        }
+        rows.append(entry | about)
+    for entry in content["errored"]:
+        rows.append(entry | {"failure": entry["key"], "errored": 1})
+    columns = ("failure", *COLUMNS, "mode", "link", "again", *ENDINGS)
+    return rows_text(rows, columns)
 
 
 def page(
@@ -201,7 +203,6 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
                 f"--method {name}: not in {run / TABLE}; choose among "
                 f"{', '.join(names)}"
             )
-    rollouts = grouped(every, group_key)
     groups = {}
     for group, label in zip(
         modes["groups"],
@@ -211,7 +212,7 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
         if methods and group["method"] not in methods:
             continue
         key = group_key(group)
-        rows = rollouts.get(key, [])
+        rows = [row for row in every if group_key(row) == key]
         rates, lines = group_lines(group, rows, metrics=metrics, searched=searched)
         groups[key] = {
             "ego": group["ego_policy"],

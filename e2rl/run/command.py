@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.run.config import conf_folder
+from e2rl.run.config import CONF
 from e2rl.run.endings import REFUSED, ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import alone_in
@@ -70,7 +70,7 @@ def run_command(
 
     @hydra.main(
         version_base="1.3",
-        config_path=str(conf_folder().resolve()),
+        config_path=str(CONF),
         config_name=name,
     )
     def command(config: DictConfig) -> None:

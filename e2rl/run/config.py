@@ -29,16 +29,11 @@ from e2rl.run.extras import how_to_install
 
 LISTS = ("methods", "eta", "seeds", "compare", "shard", "plugins")  # keys
 CHOICE = re.compile(r"[\w+-][\w.+-]*(/[\w+-][\w.+-]*)*")  # a file's name in a group
+PACKAGE = Path(__file__).resolve().parents[1]
+INSTALLED = PACKAGE / "scripts" / "conf"
+CONF = INSTALLED if INSTALLED.is_dir() else PACKAGE.parent / "conf"  # of a checkout
 Settings = TypeVar("Settings")
 Kind = TypeVar("Kind", bound=type)
-
-
-def conf_folder() -> Path:
-    """Returns the folder of the configuration: installed with the package, or conf/ of
-    a checkout."""
-    package = Path(__file__).parents[1]
-    installed = package / "scripts" / "conf"
-    return installed if installed.is_dir() else package.parent / "conf"
 
 
 @contextmanager
@@ -47,7 +42,7 @@ def _hydra() -> Iterator[GlobalHydra]:
     if GlobalHydra.instance().is_initialized():
         yield GlobalHydra.instance()
         return
-    with initialize_config_dir(str(conf_folder().resolve()), version_base="1.3"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         yield GlobalHydra.instance()
 
 
@@ -254,15 +249,10 @@ def file_values(file: str, part: str = "") -> dict[str, Any]:
 
 @cache
 def _loaded(file: str) -> Any:
-    root = OmegaConf.load(
-        conf_folder() / "train.yaml"
-    )  # what the file's ${...} may refer to
-    OmegaConf.update(
-        root,
-        "sim",
-        OmegaConf.load(conf_folder() / "sim" / "default.yaml"),
-    )
-    OmegaConf.update(root, "own", OmegaConf.load(conf_folder() / f"{file}.yaml"))
+    # what the file's ${...} may refer to
+    root = OmegaConf.load(CONF / "train.yaml")
+    OmegaConf.update(root, "sim", OmegaConf.load(CONF / "sim" / "default.yaml"))
+    OmegaConf.update(root, "own", OmegaConf.load(CONF / f"{file}.yaml"))
     return root.own
 
 
@@ -360,13 +350,6 @@ class Machine:
     processes: int | None = setting(low=1, optional=True)
 
 
-def machine_of(config: DictConfig) -> Machine:
-    """Returns these settings of a run; InputError for impossible ones."""
-    return settings_of(
-        Machine, {setting.name: config.get(setting.name) for setting in fields(Machine)}
-    )
-
-
 def check_device(key: str, device: str) -> None:
     """Raises InputError for a device that is not there; key: whose value it is."""
     try:
@@ -394,7 +377,7 @@ def set_up(config: DictConfig) -> None:
     """Import the plugins; set the threads, the device and the seeds of torch, numpy and
     python. Raises InputError for a plugin or device that is not there, and a size that
     is impossible."""
-    machine_of(config)
+    settings_of(Machine, {part.name: config.get(part.name) for part in fields(Machine)})
     for key in LISTS:
         check_list(key, config.get(key))
     import_plugins(config.plugins, "plugins: ")

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from e2rl.run.config import as_a_list, choices, conf_folder, load_config
+from e2rl.run.config import CONF, as_a_list, choices, load_config
 from e2rl.run.endings import program
 from e2rl.run.errors import InputError
 from e2rl.run.trust import nodes
@@ -34,13 +34,13 @@ def check_keys(config: DictConfig, name: str) -> None:
 
 def help_text(name: str, arguments: Sequence[str]) -> str:
     """Returns the configuration of a command as its files say it, comments included."""
-    folders = [conf_folder(), *further_folders(arguments)]
+    folders = [CONF, *further_folders(arguments)]
     chosen = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
     parts = [
         f"{' '.join(program())} [GROUP=FILE] [KEY=VALUE] [PART.KEY=VALUE]\n\nOptions by "
         "group, with what they are now; `GROUP=FILE --help` shows those of another "
         "file. hydra.run.dir=FOLDER: where the run is written.",
-        (conf_folder() / f"{name}.yaml").read_text(),
+        (CONF / f"{name}.yaml").read_text(),
     ]
     for group, file in groups_of(name).items():
         if file := chosen.get(group, file):
@@ -149,7 +149,7 @@ def groups_of(name: str) -> dict[str, str | None]:
     """Returns the groups that a command's configuration chooses from, with the file
     that it chooses."""
     groups: dict[str, str | None] = {}
-    for entry in content_of(conf_folder() / f"{name}.yaml")["defaults"]:
+    for entry in content_of(CONF / f"{name}.yaml")["defaults"]:
         if isinstance(entry, dict):
             for group, file in entry.items():
                 groups[group.removeprefix("override ").removeprefix("/")] = file

@@ -324,7 +324,8 @@ def inputs(config: DictConfig) -> Iterator[tuple[str, Any]]:
     for name in dict.fromkeys(methods):
         if name in ("search", config.synthesizer.name, *config.get("variants", ())):
             continue
-        yield f"synthesizer={name}", resolved(load_choice("synthesizer", name))
+        synthesizer = load_choice("synthesizer", name)
+        yield f"synthesizer={name}", OmegaConf.to_container(synthesizer, resolve=True)
     for entry in config.get("egos", {}).values():
         ego = load_choice("ego", entry.ego)
         yield f"ego={entry.ego}", OmegaConf.to_container(ego)  # as written

@@ -3,10 +3,12 @@ file."""
 
 import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from typing import Any
 
+from tabulate import tabulate
 from tqdm import tqdm
 
 NARROWEST, WIDEST = 60, 100  # columns
@@ -31,6 +33,38 @@ def column_groups(sizes: Sequence[int], width: int) -> list[list[int]]:
             groups.append([0])
         groups[-1].append(column)
     return groups
+
+
+def columns(table: Sequence[Sequence[str]]) -> list[str]:
+    """Returns aligned rows of text that fit the terminal; table: the heads, which may
+    be wrapped, then rows.
+
+    Columns that find no room stand beneath, beside the first column again, which is cut
+    where it is too wide.
+    """
+    width = terminal_width()
+    head, *rows = table
+    sizes = [
+        max(map(len, [*title.split(), *(row[column] for row in rows)]), default=0)
+        for column, title in enumerate(head)
+    ]
+    room = width - sum(sizes[1:]) - 2 * (len(sizes) - 1)
+    sizes[0] = min(sizes[0], max(width // 3, room))
+    lines: list[str] = []
+    for group in column_groups(sizes, width):
+        body: list[list[str]] = []
+        heads = [textwrap.wrap(head[column], sizes[column]) for column in group]
+        height = max(map(len, heads))
+        for line in range(-height, 0):
+            body.append([title[line] if -line <= len(title) else "" for title in heads])
+        for row in rows:
+            body.append([row[column] for column in group])
+            if len(row[0]) > sizes[0]:
+                body[-1][0] = f"{row[0][: sizes[0] - 1]}…"
+        align = ["left"] + ["right"] * (len(group) - 1)
+        text = tabulate(body, tablefmt="plain", disable_numparse=True, colalign=align)
+        lines += text.splitlines()
+    return lines
 
 
 def duration(seconds: float) -> str:

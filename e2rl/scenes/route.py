@@ -30,8 +30,8 @@ def _take(route: Tensor, index: Tensor) -> Tensor:
         # of tensors: broadcast_shapes takes ten times as long
         like, _ = torch.broadcast_tensors(route[..., :1, 0], index[..., :1])
         lead = like.shape[:-1]
-        route = route.expand(*lead, *route.shape[-2:])
-        index = index.expand(*lead, index.shape[-1])
+        route = route.expand(lead + route.shape[-2:])
+        index = index.expand(lead + index.shape[-1:])
     return route.gather(-2, index[..., None].expand(*index.shape, 2))
 
 
@@ -103,9 +103,9 @@ def project(
     lead = route.shape[:-2]
     compiled = is_on() and hint is None
     if compiled and torch.broadcast_shapes(points.shape[:-2], lead) == lead:
-        rows = points.expand(*lead, *points.shape[-2:]).flatten(0, -3)
+        rows = points.expand(lead + points.shape[-2:]).flatten(0, -3)
         pose = project_rows(rows, route.flatten(0, -3))
-        return tuple(value.view(*lead, points.shape[-2]) for value in pose)
+        return tuple(value.view(lead + points.shape[-2:-1]) for value in pose)
     return _project(
         points,
         route,

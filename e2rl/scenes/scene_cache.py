@@ -98,7 +98,7 @@ class Index:
         """Returns each key's array [S, ...] in the bytes of a file."""
         places, _ = self.places()
         return {
-            key: content[places[key]].view(kind).reshape(len(self.scene_id), *shape)
+            key: content[places[key]].view(kind).reshape((len(self.scene_id), *shape))
             for key, (kind, shape) in self.layout.items()
         }
 

@@ -148,7 +148,7 @@ def bounded_speed(
     these triples).
     """
     shape = torch.broadcast_shapes(v0.shape[:-1], change.shape[:-1])
-    change = change.expand(*shape, change.shape[-1])
+    change = change.expand(shape + change.shape[-1:])
     lo = torch.as_tensor(low).to(change).expand_as(change)
     hi = torch.full_like(change, high)
     width = 1

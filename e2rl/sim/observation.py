@@ -6,7 +6,7 @@ nearest agents (12 x 16), manoeuvres (15 x 2, see `prospects`).
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import torch
@@ -169,15 +169,13 @@ class Observed(NamedTuple):
 def observation_config(device: torch.device) -> ObservationConfig:
     """The ObservationConfig on a device (cached)."""
 
-    def numbers(*values: float) -> Tensor:
-        return torch.tensor(values, device=device)
-
-    scales = numbers(FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)
+    scales = (FAR, NEAR, 1.0, 1.0, SPEED, SPEED, SPEED, 4.0, 2.5, 1.0, 1.0)
+    tensor = partial(torch.tensor, device=device)
     return ObservationConfig(
-        ahead=numbers(*LOOK_AHEAD, 0.0),
-        probes=torch.cartesian_prod(numbers(*PROBE_X), numbers(*PROBE_Y)),
-        agent=scales[:, None],
-        colours=numbers(1, 2, 3),
+        ahead=tensor((*LOOK_AHEAD, 0.0)),
+        probes=torch.cartesian_prod(tensor(PROBE_X), tensor(PROBE_Y)),
+        agent=tensor(scales)[:, None],
+        colours=tensor((1, 2, 3)),
     )
 
 

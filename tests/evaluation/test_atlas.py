@@ -2,7 +2,7 @@
 
 import json
 
-from e2rl.evaluation.modes import find_atlas
+from e2rl.evaluation.atlas import find_atlas
 from e2rl.evaluation.rollout_files import ATLAS_FILE, write_json
 from e2rl.sim.rollout_file import rollout_name
 from tests.evaluation.test_modes import crashes

@@ -4,7 +4,7 @@ is told."""
 import pytest
 
 from e2rl.planners.ego import Ego
-from e2rl.run.config import built, choices, conf_folder, load_choice, load_config
+from e2rl.run.config import CONF, built, choices, load_choice, load_config
 from e2rl.run.errors import InputError
 from e2rl.run.options import help_text
 from e2rl.traffic.traffic import keep_velocity
@@ -27,7 +27,7 @@ def test_help_has_every_line_of_the_files_that_are_chosen(tmp_path):
         "curriculum/linear",
         "train",
     ):
-        assert (conf_folder() / f"{file}.yaml").read_text().strip() in text
+        assert (CONF / f"{file}.yaml").read_text().strip() in text
     assert "gap: 3  # m" in text
     assert all(choice in text for choice in choices("ego"))
 

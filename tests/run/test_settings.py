@@ -21,7 +21,7 @@ def conf(tmp_path, monkeypatch):
     for other in ("train.yaml", "sim/default.yaml"):  # whose values others may name
         (tmp_path / other).parent.mkdir(exist_ok=True)
         (tmp_path / other).write_text("device: cpu\n")
-    monkeypatch.setattr(config, "conf_folder", lambda: tmp_path)
+    monkeypatch.setattr(config, "CONF", tmp_path)
     config._loaded.cache_clear()
     yield
     config._loaded.cache_clear()

@@ -9,8 +9,8 @@ from typing import Any
 
 from e2rl.driving.batches import Work, drive_all
 from e2rl.driving.setup import Method, Setup
+from e2rl.evaluation.atlas import read_atlas
 from e2rl.evaluation.check import SEARCH
-from e2rl.evaluation.modes import read_atlas
 from e2rl.evaluation.record import record
 from e2rl.evaluation.rollout_files import (
     ATLAS_FILE,
@@ -98,7 +98,7 @@ class BeforeAfter:
         write_tries(folder / TRIES_FILE, spent.tries)
 
     def atlases(self) -> tuple[dict, dict] | None:
-        """The atlas before and after (`evaluation.modes.group_atlas`); None without a
+        """The atlas before and after (`evaluation.atlas.group_atlas`); None without a
         search."""
         if self.search is None:
             return None
