@@ -54,9 +54,9 @@ def device_of(tensor: Tensor) -> torch.device:
 
 def on(found: Any, device: torch.device, given: list[Tensor]) -> Any:
     """Mark the tensors of a result, besides those that were given."""
-    for each in tree_leaves(found):
-        if isinstance(each, Tensor) and not any(each is one for one in given):
-            setattr(each, MARK, device.type == "cuda")
+    for item in tree_leaves(found):
+        if isinstance(item, Tensor) and not any(item is single for single in given):
+            setattr(item, MARK, device.type == "cuda")
     return found
 
 
@@ -68,8 +68,8 @@ class Pretended(TorchFunctionMode):
     ) -> Any:
         kwargs = dict(kwargs or {})
         name = getattr(function, "__name__", "")
-        given = [
-            each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)
+        inputs = [
+            item for item in tree_leaves((args, kwargs)) if isinstance(item, Tensor)
         ]
         if function == Tensor.device.__get__:
             return device_of(args[0])
@@ -77,23 +77,23 @@ class Pretended(TorchFunctionMode):
             return device_of(args[0]) == PRETENDED
         if name in ("to", "cpu", "cuda"):
             return self.moved(function, name, args=args, kwargs=kwargs)
-        asked = kwargs.pop("device", None)
-        if asked is not None:
-            asked = torch.device(asked)
+        requests = kwargs.pop("device", None)
+        if requests is not None:
+            requests = torch.device(requests)
         if function == Tensor.data.__set__:
             function(*args)
             return on(args[0], device_of(args[1]), given=[])
         if name in CREATED or any(part in name for part in LIKE):
-            own = (
-                device_of(given[0])
-                if given and (name in TAKEN or name not in CREATED)
+            ours = (
+                device_of(inputs[0])
+                if inputs and (name in TAKEN or name not in CREATED)
                 else CPU
             )
-            return on(function(*args, **kwargs), asked or own, given=[])
+            return on(function(*args, **kwargs), requests or ours, given=[])
         if name in ("numpy", "__array__"):
             assert device_of(args[0]) == CPU, f"{name} of a tensor on {PRETENDED}"
-        device = self.checked(name, args, given=given)
-        return on(function(*args, **kwargs), device, given=given)
+        device = self.checked(name, args, given=inputs)
+        return on(function(*args, **kwargs), device, given=inputs)
 
     @staticmethod
     def moved(function: Callable, name: str, args: tuple, kwargs: dict) -> Any:
@@ -108,30 +108,30 @@ class Pretended(TorchFunctionMode):
             target = (
                 device_of(place) if isinstance(place, Tensor) else torch.device(place)
             )
-        own = [CPU if isinstance(x, str | torch.device) else x for x in args]
+        ours = [CPU if isinstance(x, str | torch.device) else x for x in args]
         own_kwargs = {
             key: CPU if isinstance(x, str | torch.device) else x
             for key, x in kwargs.items()
         }
-        found = own[0] if name != "to" else function(*own, **own_kwargs)
-        if found is args[0] and target != device_of(args[0]):
-            found = found.clone()
-        return on(found, target, given=[args[0]])
+        outcome = ours[0] if name != "to" else function(*ours, **own_kwargs)
+        if outcome is args[0] and target != device_of(args[0]):
+            outcome = outcome.clone()
+        return on(outcome, target, given=[args[0]])
 
     @staticmethod
     def checked(name: str, args: tuple, given: list[Tensor]) -> torch.device:
         """The device of an operation's result."""
         if name in ("__getitem__", "__setitem__"):
-            own = device_of(args[0])
+            ours = device_of(args[0])
             index = [x for x in tree_leaves(args[1]) if isinstance(x, Tensor)]
-            assert own == PRETENDED or all(device_of(x) == CPU for x in index), (
+            assert ours == PRETENDED or all(device_of(x) == CPU for x in index), (
                 f"{name}: index on {PRETENDED}"
             )
             value = [x for x in args[2:] if isinstance(x, Tensor) and x.ndim]
-            assert all(device_of(x) == own for x in value), (
+            assert all(device_of(x) == ours for x in value), (
                 f"{name}: a value on another device"
             )
-            return own
+            return ours
         places = {device_of(x) for x in given if x.ndim} or {
             device_of(x) for x in given
         }

@@ -30,7 +30,7 @@ BASES = {
 def defaults_of(kind: type) -> set[str]:
     """The names of the arguments that have a default in Python."""
     parameters = inspect.signature(inspect.unwrap(kind.__init__)).parameters.values()
-    return {each.name for each in parameters if each.default is not each.empty}
+    return {item.name for item in parameters if item.default is not item.empty}
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_what_a_file_builds_has_no_default_for_its_keys(file):
 
 def test_settings_dataclasses_have_no_defaults():
     root = Path(e2rl.__file__).parent
-    found = 0
+    result = 0
     for path in root.rglob("*.py"):
         if path.parent.name in ("scripts", "commands") or path.stem.startswith("__"):
             continue
@@ -58,22 +58,22 @@ def test_settings_dataclasses_have_no_defaults():
         except ModuleNotFoundError:
             assert path.stem in OPTIONAL, f"{path}: it needs the library of an extra"
             continue
-        own = [
+        ours = [
             kind
             for kind in vars(module).values()
             if isinstance(kind, type) and kind.__module__ == module.__name__
         ]
         for kind in (
             kind
-            for kind in own
+            for kind in ours
             if "__configured__" in vars(kind) and is_dataclass(kind)
         ):
-            known = file_values(*kind.__configured__).keys() - BASES
+            certain = file_values(*kind.__configured__).keys() - BASES
             twice = {
-                each.name
-                for each in fields(kind)
-                if each.name in known and each.default is not MISSING
+                item.name
+                for item in fields(kind)
+                if item.name in certain and item.default is not MISSING
             }
             assert not twice, f"{kind.__name__}: {', '.join(sorted(twice))}"
-            found += 1
-    assert found > 20
+            result += 1
+    assert result > 20

@@ -67,19 +67,19 @@ def docstrings(path: Path) -> Iterator[str]:
 @cache
 def texts() -> dict[str, str]:
     """Documents, docstrings and configuration files, by path."""
-    found = {path: path.read_text() for path in documents()}
-    found |= {path: path.read_text() for path in (ROOT / "conf").rglob("*.yaml")}
-    found |= {
+    result = {path: path.read_text() for path in documents()}
+    result |= {path: path.read_text() for path in (ROOT / "conf").rglob("*.yaml")}
+    result |= {
         path: "\n".join(docstrings(path)) for path in (ROOT / "e2rl").rglob("*.py")
     }
-    return {str(path.relative_to(ROOT)): text for path, text in found.items()}
+    return {str(path.relative_to(ROOT)): text for path, text in result.items()}
 
 
 def named_paths(text: str) -> set[str]:
     """Paths in a text that stand for one file or folder; the full stop of a sentence is
     not theirs."""
-    found = (match.group().rstrip(".") for match in PATH.finditer(text))
-    return {path for path in found if not PLACEHOLDER.search(path)}
+    result = (match.group().rstrip(".") for match in PATH.finditer(text))
+    return {path for path in result if not PLACEHOLDER.search(path)}
 
 
 @cache
@@ -178,8 +178,8 @@ def test_relative_links_lead_to_a_file_and_a_heading(path):
 def test_what_is_named_exists(name):
     text = texts()[name]
     missing = {path for path in named_paths(text) if not (ROOT / path).exists()}
-    known = {path.name for path in documents()} | WRITTEN
-    missing |= set(DOCUMENT.findall(text)) - known
+    certain = {path.name for path in documents()} | WRITTEN
+    missing |= set(DOCUMENT.findall(text)) - certain
     assert not missing, f"{name} names what is not there: {', '.join(sorted(missing))}"
 
 
@@ -196,7 +196,7 @@ def test_python_of_a_document_imports_what_exists(path):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("e2rl"):
                 module = importlib.import_module(node.module)
                 absent = [
-                    each.name for each in node.names if not hasattr(module, each.name)
+                    item.name for item in node.names if not hasattr(module, item.name)
                 ]
                 assert not absent, f"{node.module} has no {absent}"
 
@@ -220,7 +220,7 @@ def is_choice(override: str) -> bool:
 def commands() -> list[tuple[str, tuple[str, ...]]]:
     """The commands of the documents, each a configuration and its overrides; of those
     that differ in values, one."""
-    found = {}
+    result = {}
     for path in markdown():
         for command, rest in COMMAND.findall(path.read_text()):
             name = command.split()[-1].removesuffix(".py").replace("-", "_")
@@ -231,8 +231,8 @@ def commands() -> list[tuple[str, tuple[str, ...]]]:
             kinds = frozenset(
                 part if is_choice(part) else part.split("=")[0] for part in parts
             )
-            found.setdefault((name, kinds), (name, tuple(parts)))
-    return sorted(found.values())
+            result.setdefault((name, kinds), (name, tuple(parts)))
+    return sorted(result.values())
 
 
 @pytest.mark.parametrize(("name", "overrides"), commands())

@@ -19,23 +19,23 @@ def evaluated(world, tmp_path, monkeypatch, capsys):
     workers would not have them."""
 
     def run(*options):
-        given = [
+        inputs = [
             *SHORT,
             f"data.cache={world / 'bundled'}",
             "seeds=[0]",
             f"hydra.run.dir={tmp_path / 'run'}",
         ]
         named = {option.partition("=")[0] for option in options}
-        kept = [option for option in given if option.partition("=")[0] not in named]
+        rest = [option for option in inputs if option.partition("=")[0] not in named]
         status, said = call(
-            "evaluate.py", [*kept, *options], monkeypatch=monkeypatch, capsys=capsys
+            "evaluate.py", [*rest, *options], monkeypatch=monkeypatch, capsys=capsys
         )
         assert status == 0, said
         return tmp_path / "run"
 
-    known = METRICS.copy(), COMPUTE.copy()
+    certain = METRICS.copy(), COMPUTE.copy()
     yield run
-    for registered, before in zip((METRICS, COMPUTE), known, strict=True):
+    for registered, before in zip((METRICS, COMPUTE), certain, strict=True):
         registered.clear()
         registered.update(before)
     sys.modules.pop("e2rl.metrics.nuplan", None)
@@ -192,18 +192,18 @@ def test_a_folder_of_somebody_else_adds_methods_to_the_table(
 
 
 def test_one_scene_is_driven_as_among_all(evaluated, tmp_path):
-    found = []
+    result = []
     for which in ("scene=null", "scene=1"):
         folder = tmp_path / which
         evaluated(
             "seeds=[1]", "methods=[e2]", which, "batch=1", f"hydra.run.dir='{folder}'"
         )
-        found.append(
+        result.append(
             {
                 path.name: path.read_bytes()
                 for path in (folder / "rollouts").glob("*.npz")
             }
         )
-    assert len(found[0]) == 2
-    assert len(found[1]) == 1
-    assert found[1].items() <= found[0].items()
+    assert len(result[0]) == 2
+    assert len(result[1]) == 1
+    assert result[1].items() <= result[0].items()

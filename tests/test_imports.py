@@ -33,7 +33,7 @@ ORDER = (  # of the rooms
 def imports() -> list[tuple[str, str, str]]:
     """(room, imported room, file:line) of every import between rooms, those inside
     functions included."""
-    found = []
+    result = []
     for path in sorted(PACKAGE.rglob("*.py")):
         room = path.relative_to(PACKAGE).with_suffix("").parts[0]
         for node in ast.walk(ast.parse(path.read_text())):
@@ -50,8 +50,8 @@ def imports() -> list[tuple[str, str, str]]:
                 where = f"{path.relative_to(PACKAGE.parent)}:{node.lineno}"
                 assert first, f"{where}: a relative import; name the module in full"
                 if first == "e2rl" and rest and rest[0] != room:
-                    found.append((room, rest[0], where))
-    return found
+                    result.append((room, rest[0], where))
+    return result
 
 
 def test_every_room_has_its_place_in_the_order():

@@ -17,11 +17,11 @@ ROOT = Path(__file__).parents[1]
 
 def test_every_package_and_the_configuration_are_in_the_wheel():
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    found = {
+    result = {
         ".".join(file.parent.relative_to(ROOT).parts)
         for file in (ROOT / "e2rl").rglob("__init__.py")
     }
-    assert set(setup["packages"]) == found | {"e2rl.scripts", "e2rl.scripts.conf"}
+    assert set(setup["packages"]) == result | {"e2rl.scripts", "e2rl.scripts.conf"}
     assert (ROOT / setup["package-dir"]["e2rl.scripts.conf"] / "evaluate.yaml").exists()
     assert (ROOT / setup["package-dir"]["e2rl.scripts"] / "train.py").exists()
 
@@ -46,13 +46,13 @@ def test_a_notebook_rolls_out_what_the_command_does():
 def test_a_failure_is_found_in_a_few_rollouts(tmp_path):
     """Places first: with the bundled scenes the first four are of four places."""
     scenes = e2rl.load_scenes("bundled", num_scenes=12)
-    found = e2rl.find_failures("lane_graph", "e2", scenes=scenes)
-    assert found
+    result = e2rl.find_failures("lane_graph", "e2", scenes=scenes)
+    assert result
     assert all(
-        failure.row["cfr"] == 1 and failure.contact is not None for failure in found
+        failure.row["cfr"] == 1 and failure.contact is not None for failure in result
     )
-    assert {failure.rollout.scene_id for failure in found} <= set(scenes.scene_id)
-    assert e2rl.save_video(found[0], tmp_path / "failure.gif").stat().st_size > 10_000
+    assert {failure.rollout.scene_id for failure in result} <= set(scenes.scene_id)
+    assert e2rl.save_video(result[0], tmp_path / "failure.gif").stat().st_size > 10_000
 
 
 def test_settings_reach_the_objects_and_wrong_ones_are_named():

@@ -77,10 +77,10 @@ def built(source, folder, execute):
         "NO_MKDOCS_2_WARNING": "1",
         "PYTHONPATH": paths,
     }
-    done = subprocess.run(
+    process = subprocess.run(
         command, cwd=source, env=variables, capture_output=True, text=True, timeout=600
     )
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert process.returncode == 0, process.stdout + process.stderr
     return {
         path.relative_to(folder).as_posix(): Page(path)
         for path in folder.rglob("*.html")
@@ -162,8 +162,8 @@ def test_formulas_are_shown_without_a_script(site):
 )
 def test_the_search_finds_pages_and_the_notebook(site, page, words):
     entries = json.loads((site[1] / "search" / "search_index.json").read_text())["docs"]
-    found = [entry for entry in entries if words in entry["text"].lower()]
-    assert any(entry["location"].startswith(page) for entry in found)
+    result = [entry for entry in entries if words in entry["text"].lower()]
+    assert any(entry["location"].startswith(page) for entry in result)
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,7 @@ def test_two_data_sets_are_apart_where_they_share_no_place(tmp_path, capsys):
     for name, ids in (("one", ("x", "y")), ("two", ("z",)), ("three", ("v", "w"))):
         write_folder(
             tmp_path / name,
-            [description(scenario_id=each) | {"id": each} for each in ids],
+            [description(scenario_id=item) | {"id": item} for item in ids],
         )
     for name, place in (("two", "c"), ("three", "b")):
         for path in sorted((tmp_path / name).glob("*.pkl")):

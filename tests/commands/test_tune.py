@@ -22,10 +22,10 @@ def tune(tmp_path, monkeypatch, capsys):
             "prior.sampler.steps=2",
             "processes=1",
         ]
-        given = [*SHORT, *study, f"hydra.run.dir={folder}", *options]
+        inputs = [*SHORT, *study, f"hydra.run.dir={folder}", *options]
         status, said = call(
             "e2rl/commands/cli.py",
-            ["tune", *given],
+            ["tune", *inputs],
             monkeypatch=monkeypatch,
             capsys=capsys,
         )

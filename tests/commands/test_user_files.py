@@ -80,7 +80,7 @@ def commands(world: Path) -> list[list[str]]:
         for line in block.splitlines()
         if re.search(r"python \w+\.py|^e2rl ", line)
     ]
-    found = []
+    result = []
     for line in lines:
         small = next(
             (options for part, options in SMALL.items() if part in line),
@@ -102,8 +102,8 @@ def commands(world: Path) -> list[list[str]]:
             if words[0] == "python"
             else ["-m", "e2rl.commands.cli", words[1]]
         )
-        found.append([sys.executable, *program, *words[2:], *small])
-    return found
+        result.append([sys.executable, *program, *words[2:], *small])
+    return result
 
 
 def contents(*folders: Path) -> dict[Path, bytes]:
@@ -135,20 +135,20 @@ def test_commands_write_into_their_folder_and_the_cache_alone(world, tmp_path):
         "PYTHONDONTWRITEBYTECODE": "1",
     }
     before = contents(home, here, world)
-    asked = commands(world)
-    assert len(asked) >= 5
-    assert "hydra.run.dir=" in str(asked[0])
-    assert "hydra.run.dir=" not in str(asked[-1])
-    for number, command in enumerate(asked):
-        twice = 1 + (number in (0, len(asked) - 1))
-        begun = [
+    requests = commands(world)
+    assert len(requests) >= 5
+    assert "hydra.run.dir=" in str(requests[0])
+    assert "hydra.run.dir=" not in str(requests[-1])
+    for number, command in enumerate(requests):
+        twice = 1 + (number in (0, len(requests) - 1))
+        start = [
             subprocess.Popen(
                 command, cwd=here, env=environment, stderr=subprocess.PIPE, text=True
             )
             for _ in range(twice)
         ]
-        said = [each.communicate(timeout=600)[1] for each in begun]
-        assert sorted(each.returncode for each in begun) == (
+        said = [each.communicate(timeout=600)[1] for each in start]
+        assert sorted(each.returncode for each in start) == (
             [0, 2] if number == 0 else [0] * twice
         ), (command, said)
     after = contents(home, here, world)
@@ -160,4 +160,4 @@ def test_commands_write_into_their_folder_and_the_cache_alone(world, tmp_path):
         if not any(map(path.is_relative_to, allowed))
     ]
     runs = [path.parent for path in (here / "runs").rglob("provenance.json")]
-    assert len(runs) == sum("inspect" not in command for command in asked) + 1
+    assert len(runs) == sum("inspect" not in command for command in requests) + 1

@@ -29,9 +29,9 @@ def methods_of(*overrides, prior=None):
 def settings_in(traffic):
     """The settings of a method, the prior apart."""
     return {
-        each.name: getattr(traffic, each.name)
-        for each in fields(traffic)
-        if each.name != "prior"
+        item.name: getattr(traffic, item.name)
+        for item in fields(traffic)
+        if item.name != "prior"
     }
 
 
@@ -69,10 +69,10 @@ def test_variants_share_the_prior_but_for_what_they_change_and_differ_in_nothing
     ], "methods orders"
     far, e2, same, blind, cold = (method.traffic for method in methods)
     assert far.prior is e2.prior is same.prior is blind.prior is prior
-    own = settings_in(e2)
-    assert settings_in(same) == settings_in(cold) == own
+    ours = settings_in(e2)
+    assert settings_in(same) == settings_in(cold) == ours
     assert cold.prior.sampler.temperature == 0.5
-    assert settings_in(far) == own | {
+    assert settings_in(far) == ours | {
         "skeleton": replace(e2.skeleton, far=2),
         "reselect": 0,
     }
@@ -105,7 +105,7 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(
     assert len(set(named(methods))) == rows
     variants = [method.traffic for method in methods if method.name in config.variants]
     settings = [(settings_in(on), on.prior.sampler, on.prior.bounds) for on in variants]
-    assert all(settings.count(each) == 1 for each in settings), (
+    assert all(settings.count(item) == 1 for item in settings), (
         "no two variants are the same"
     )
     assert all(name in caption(config, {}) for name in config.variants)
@@ -183,8 +183,12 @@ def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
     ],
 )
 def test_a_search_has_a_few_tries_and_other_methods_one(overrides, rows, budget, unit):
-    asked = evaluation_settings(config_of(*overrides))
-    assert (asked.methods, asked.budget, asked.budget_unit) == (rows, budget, unit)
+    requests = evaluation_settings(config_of(*overrides))
+    assert (requests.methods, requests.budget, requests.budget_unit) == (
+        rows,
+        budget,
+        unit,
+    )
 
 
 def test_a_shared_device_keeps_to_one_process():
@@ -199,10 +203,10 @@ def test_a_shared_device_keeps_to_one_process():
 def test_table_1_has_every_rival_on_both_terms():
     rows = methods_of("experiment=table1")
     rivals = {"ctg", "ctg_adv", "strive", "safe_sim_opt", "diffscene", "ccdiff", "cat"}
-    known = terms_by_method(rows)
-    assert rivals <= set(known)
-    assert all(known[name][0] == "plan" for name in rivals)
-    assert known["e2_pursuit"] == ("plan", "none")  # the rivals' terms
+    certain = terms_by_method(rows)
+    assert rivals <= set(certain)
+    assert all(certain[name][0] == "plan" for name in rivals)
+    assert certain["e2_pursuit"] == ("plan", "none")  # the rivals' terms
     ours = terms_by_method(methods_of("experiment=table1_our_terms"))
     for name in rivals:
         assert ours[f"{name}, our terms"] == (

@@ -16,7 +16,7 @@ from tests.evaluation.constructed_runs import row_of, run_of
 def changes_of(folder, rows, others, searched=False):
     """Groups and pairs of two runs with these rows."""
     sides = [
-        run_of(folder / name, each) for name, each in (("one", rows), ("two", others))
+        run_of(folder / name, item) for name, item in (("one", rows), ("two", others))
     ]
     for side in sides if searched else ():
         (side / TRIES_FILE).write_text("")
@@ -40,8 +40,8 @@ def test_each_failure_is_new_gone_moved_or_the_same(tmp_path):
         row_of(4),
     ]
     (group,), pairs = changes_of(tmp_path, first, others=second)
-    found = {pair["scene_id"]: pair["change"] for pair in pairs}
-    assert found == {
+    result = {pair["scene_id"]: pair["change"] for pair in pairs}
+    assert result == {
         "scene_0": "new",
         "scene_1": "gone",
         "scene_2": "same",
@@ -146,14 +146,14 @@ def test_two_egos_of_one_run_and_none_by_chance(tmp_path):
 def test_runs_that_are_no_pairs_are_refused_by_what_differs(
     tmp_path, settings, inputs, told
 ):
-    one = run_of(tmp_path / "one", [row_of(k) for k in range(3)])
+    single = run_of(tmp_path / "one", [row_of(k) for k in range(3)])
     two = run_of(
         tmp_path / "two", [row_of(k) for k in (2, 9)], settings=settings, inputs=inputs
     )
     with pytest.raises(
         InputError, match=f"two: no pairs with .*one, which has other {told}"
     ):
-        compared(Driven.read(one), Driven.read(two))
+        compared(Driven.read(single), Driven.read(two))
 
 
 def test_contacts_with_people_are_compared_where_there_are_any(tmp_path):
@@ -167,14 +167,14 @@ def test_contacts_with_people_are_compared_where_there_are_any(tmp_path):
 
 
 def test_another_planner_version_or_machine_may_differ(tmp_path):
-    one = run_of(tmp_path / "one", [row_of(0)])
+    single = run_of(tmp_path / "one", [row_of(0)])
     two = run_of(
         tmp_path / "two",
         [row_of(0, ego="b")],
         settings={"ego": {"x": 1}, "processes": 8},
         inputs={"ego.file=b.pt": "9"},
     )
-    assert compared(Driven.read(one), Driven.read(two))[0][0]["of"] == 1
+    assert compared(Driven.read(single), Driven.read(two))[0][0]["of"] == 1
 
 
 def tries(scene, *hits, seed=0):
@@ -240,8 +240,8 @@ def test_a_planner_that_raises_is_a_failure_of_its_own_kind(tmp_path, searched):
     ]
     second = [raised(0), row_of(1), raised(2), raised(3), row_of(4)]
     (group,), pairs = changes_of(tmp_path, first, others=second, searched=searched)
-    found = {pair["scene_id"]: (pair["change"], pair["what"]) for pair in pairs}
-    assert found == {
+    result = {pair["scene_id"]: (pair["change"], pair["what"]) for pair in pairs}
+    assert result == {
         **{
             "scene_0": ("new", []),
             "scene_1": ("gone", []),

@@ -47,13 +47,13 @@ def run(tmp_path_factory):
         seeds=[0],
         work=Work(folder / ROLLOUTS),
     )
-    found = record(
+    result = record(
         scored,
         folder,
         egos=[("same", "one"), ("fast", "one"), ("fast", "same")],
         trainings={"fast": ["fast_0", "fast_1"]},
     )
-    return found.metrics, folder
+    return result.metrics, folder
 
 
 def test_every_ego_has_its_rows_and_files_and_drives_as_if_alone(run, tmp_path):
@@ -74,21 +74,21 @@ def test_every_ego_has_its_rows_and_files_and_drives_as_if_alone(run, tmp_path):
 
 def test_an_ego_does_not_differ_from_itself_at_all(run):
     paired = run[0][1]["paired"]["ego one"]
-    known = {
+    certain = {
         name: value
         for name, value in paired.items()
         if value["n"] and name != "seconds_per_rollout"
     }
-    assert {"cfr", "progress", "macc", "failures_per_km"} <= set(known)
-    for value in known.values():
+    assert {"cfr", "progress", "macc", "failures_per_km"} <= set(certain)
+    for value in certain.values():
         assert value["difference"] == 0
         assert math.isnan(value["low"])
         assert math.isnan(value["high"]), "three places are too few for an interval"
 
 
 def test_trainings_are_pooled_and_compared_with_the_same_rollouts_of_another(run):
-    one, _, first, second, pooled = run[0]
-    assert (pooled["n_rollouts"], pooled["n_trainings"], one.get("n_trainings")) == (
+    single, _, first, second, pooled = run[0]
+    assert (pooled["n_rollouts"], pooled["n_trainings"], single.get("n_trainings")) == (
         6,
         2,
         None,
@@ -96,7 +96,7 @@ def test_trainings_are_pooled_and_compared_with_the_same_rollouts_of_another(run
     means = [row["metrics"]["progress"]["mean"] for row in (first, second, pooled)]
     assert means[2] == pytest.approx((means[0] + means[1]) / 2)
     paired = pooled["paired"]["ego one"]["progress"]
-    base = one["metrics"]["progress"]["mean"]
+    base = single["metrics"]["progress"]["mean"]
     assert paired["n"] == 6
     assert paired["difference"] == pytest.approx(means[2] - base)
 
@@ -118,9 +118,9 @@ def rows_of(values, ego, training=None):
 def test_trainings_that_differ_widen_the_interval_that_places_alone_do_not():
     """Places drive about 10 or 20 m: nearly all that varies is the training."""
     first, features = rows_of([10 + 0.01 * place for place in range(-6, 7)], "a_0")
-    second, more = rows_of([20 + 0.01 * place for place in range(-6, 7)], "a_1")
+    second, further = rows_of([20 + 0.01 * place for place in range(-6, 7)], "a_1")
     rows = first + second
-    samples = features + more
+    samples = features + further
     pooled = {"a": ["a_0", "a_1"]}
     result = {
         row["ego"]: row["metrics"]["progress"]

@@ -99,9 +99,9 @@ FAULTS = {
 
 
 def scene_set(count: int = 4):
-    found = scenes(count, steps=20)
-    found.scenes["start"][:, 0, 3] = 6.0 + torch.arange(count)
-    return found
+    result = scenes(count, steps=20)
+    result.scenes["start"][:, 0, 3] = 6.0 + torch.arange(count)
+    return result
 
 
 def run(ego, folder=None, batch=64, processes=1, count=4):
@@ -178,11 +178,11 @@ def test_a_planner_that_always_raises_is_rated_as_any_other(tmp_path):
         row["headline"] | {"scenes": 1, "raised": 1, "failed": 1, "preventable": 0}
         == row["headline"]
     )
-    found = {
+    result = {
         name: row["metrics"][name]["mean"]
         for name in ("cfr", "cfr_preventable", "errored", "progress")
     }
-    assert found == {
+    assert result == {
         "cfr": 1.0,
         "cfr_preventable": 1.0,
         "errored": 1.0,

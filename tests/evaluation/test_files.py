@@ -82,12 +82,12 @@ def test_metrics_are_strict_json_with_counts_command_and_paired_differences(
 
 def test_several_intensities_of_one_method_are_told_apart(rollouts):
     rows, features = score_rollouts(rollouts)
-    many = [row | {"eta": eta} for eta in (1.0, 2.0) for row in rows]
-    many += labelled(rows, "synthetic", split="test", method="nominal", ego="idm")
-    many += labelled(
+    several = [row | {"eta": eta} for eta in (1.0, 2.0) for row in rows]
+    several += labelled(rows, "synthetic", split="test", method="nominal", ego="idm")
+    several += labelled(
         rows, "synthetic", split="test", method="nominal", ego="lane_graph"
     )
-    result = metric_rows(many, features * 4, draws=10, realism_draws=2)
+    result = metric_rows(several, features * 4, draws=10, realism_draws=2)
     assert [list(row["paired"]) for row in result] == [
         ["e2@2", "nominal"],
         ["e2@1", "nominal"],

@@ -38,11 +38,11 @@ def run_rows():
 
 def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):
     rows = run_rows()
-    found = find_modes(rows)
-    write_json(tmp_path / MODES_FILE, found)
-    assert read_modes(tmp_path / MODES_FILE) == found
-    crossing, rear_end = found["modes"]
-    assert (found["failures"], found["rollouts"], found["unknown"]) == (
+    result = find_modes(rows)
+    write_json(tmp_path / MODES_FILE, result)
+    assert read_modes(tmp_path / MODES_FILE) == result
+    crossing, rear_end = result["modes"]
+    assert (result["failures"], result["rollouts"], result["unknown"]) == (
         12,
         17,
         ["duty"],
@@ -66,13 +66,13 @@ def test_modes_have_counts_fractions_by_method_and_verdicts(tmp_path):
     assert rear_end["at_fault"] == 1
     assert rear_end["avoidable"] is None
     assert rear_end["ego_speed"] == 10
-    assert [(group["failures"], group["modes"]) for group in found["groups"]] == [
+    assert [(group["failures"], group["modes"]) for group in result["groups"]] == [
         (6, 1),
         (6, 2),
         (0, 0),
     ]
     assert [row.get("mode") for row in rows] == [1] * 8 + [2] * 4 + [None] * 5
-    for mode in found["modes"]:
+    for mode in result["modes"]:
         typical = mode["typical"]
         same = [
             row
@@ -91,9 +91,9 @@ def test_small_modes_are_gathered_but_keep_their_numbers():
         + crashes(REAR_END, 1)
         + crashes(REAR_END | {"approach": "oncoming"}, 1)
     )
-    found = find_modes(rows)
-    assert [(mode["mode"], mode["name"], mode["count"]) for mode in found["modes"]][
+    result = find_modes(rows)
+    assert [(mode["mode"], mode["name"], mode["count"]) for mode in result["modes"]][
         1:
     ] == [(0, "other", 2)]
     assert sorted(row["mode"] for row in rows)[-2:] == [2, 3]
-    assert found["groups"][0]["modes"] == 1
+    assert result["groups"][0]["modes"] == 1

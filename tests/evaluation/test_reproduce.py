@@ -58,41 +58,44 @@ def table(eta=1.0):
 
 
 def test_tables_are_equal_but_for_wall_times_and_where_they_were_made():
-    now = table()
-    now[0]["git"], now[0]["metrics"]["seconds_per_rollout"]["mean"] = "other", 9.0
-    found = compare_tables(table(), now)
-    assert (found.equal, found.close, found.different) == (1 + 2 * 4 + 1, 0, [])
-    assert found.text() == "all 10 numbers of its tables are equal"
+    current = table()
+    current[0]["git"], current[0]["metrics"]["seconds_per_rollout"]["mean"] = (
+        "other",
+        9.0,
+    )
+    result = compare_tables(table(), current)
+    assert (result.equal, result.close, result.different) == (1 + 2 * 4 + 1, 0, [])
+    assert result.text() == "all 10 numbers of its tables are equal"
 
 
 def test_each_number_that_differs_is_named_with_both_values():
-    now = table()
+    current = table()
     (
-        now[0]["metrics"]["cfr"]["mean"],
-        now[0]["paired"]["nominal"]["cfr"]["difference"],
+        current[0]["metrics"]["cfr"]["mean"],
+        current[0]["paired"]["nominal"]["cfr"]["difference"],
     ) = 0.5, math.nan
-    found = compare_tables(table(), now)
-    assert [entry[0].split(": ")[1] for entry in found.different] == [
+    result = compare_tables(table(), current)
+    assert [entry[0].split(": ")[1] for entry in result.different] == [
         "cfr.mean",
         "paired.nominal.cfr.difference",
     ]
-    assert "d s e2 idm 1.0: cfr.mean: 0.25 then, 0.5 now" in found.text()
-    assert "8 of 10" in found.text()
-    for one, other, place in (
+    assert "d s e2 idm 1.0: cfr.mean: 0.25 then, 0.5 now" in result.text()
+    assert "8 of 10" in result.text()
+    for single, other, place in (
         (table(), table(2.0) + table(), 1),
         (table(2.0) + table(), table(), 2),
     ):
-        found = compare_tables(one, other)
-        assert found.equal == len(found.different) == 10
-        assert {entry[place] for entry in found.different} == {"missing"}
+        result = compare_tables(single, other)
+        assert result.equal == len(result.different) == 10
+        assert {entry[place] for entry in result.different} == {"missing"}
 
 
 @pytest.mark.parametrize(("factor", "close"), [(1 + 1e-9, 1), (1 + 2e-6, 0)])
 def test_rounding_is_told_apart(factor, close):
-    now = table()
-    now[0]["metrics"]["cfr"]["mean"] *= factor
-    found = compare_tables(table(), now)
-    assert (found.close, len(found.different)) == (close, 1 - close)
+    current = table()
+    current[0]["metrics"]["cfr"]["mean"] *= factor
+    result = compare_tables(table(), current)
+    assert (result.close, len(result.different)) == (close, 1 - close)
 
 
 # --- through evaluate.py
@@ -107,8 +110,8 @@ def then(world, tmp_path_factory):
         readouterr=lambda: SimpleNamespace(out="", err="")
     )  # capsys is none for a module
     with monkeypatch.context():
-        given = [*arguments(world, folder, "good", *QUICK), "data.build.steps=20"]
-        status, _ = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=said)
+        inputs = [*arguments(world, folder, "good", *QUICK), "data.build.steps=20"]
+        status, _ = call("evaluate.py", inputs, monkeypatch=monkeypatch, capsys=said)
     assert status == 0
     return folder / "run"
 
@@ -140,10 +143,10 @@ def test_one_command_makes_the_same_table_in_a_new_folder(
         capsys=capsys,
     )
     assert status == 0, said
-    found = json.loads((tmp_path / "now" / "reproduced.json").read_text())
-    assert found["different"] == []
-    assert found["close"] == 0
-    assert found["equal"] > 50, found
+    result = json.loads((tmp_path / "now" / "reproduced.json").read_text())
+    assert result["different"] == []
+    assert result["close"] == 0
+    assert result["equal"] > 50, result
     same_runs(then, tmp_path / "now")
     assert read_list(tmp_path / "now") == read_list(then)
     assert before == {
@@ -204,10 +207,10 @@ def test_other_scenes_are_refused_by_name(world, then, tmp_path, monkeypatch, ca
     (tmp_path / "good" / "sd_00.pkl").write_bytes(
         (world / "good" / "sd_01.pkl").read_bytes()
     )
-    given = again(
+    inputs = again(
         then, tmp_path / "now", "data=scenarionet", f"data.path={tmp_path / 'good'}"
     )
-    status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
+    status, said = call("evaluate.py", inputs, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 2
     assert "scenes are not" in error_line(said)
     assert "scene-0" in error_line(said)
@@ -229,9 +232,9 @@ def test_what_would_be_another_table_is_refused(then, tmp_path, monkeypatch, cap
 def test_a_failure_that_the_run_does_not_have_is_refused(
     then, tmp_path, monkeypatch, capsys
 ):
-    for given in (again(then, tmp_path / "now", "failure=none"), ["failure=none"]):
+    for inputs in (again(then, tmp_path / "now", "failure=none"), ["failure=none"]):
         status, said = call(
-            "evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys
+            "evaluate.py", inputs, monkeypatch=monkeypatch, capsys=capsys
         )
         assert status == 2
         assert "none of the 0 failures" in said or "reproduce=RUN_DIR" in said
@@ -250,7 +253,7 @@ def test_the_command_of_a_failure_drives_the_same_contact(
 ):
     """In its folder's failures.csv; also that of the run that it makes."""
     (tmp_path / "list.csv").write_text("scene_id,number\nallway_stop_043_0200,7\n")
-    given = [
+    inputs = [
         f"scenes={tmp_path / 'list.csv'}",
         "prior.sampler.steps=4",
         "seeds=[0]",
@@ -260,7 +263,7 @@ def test_the_command_of_a_failure_drives_the_same_contact(
     assert (
         call(
             "evaluate.py",
-            [*given, f"hydra.run.dir={tmp_path / 'then'}"],
+            [*inputs, f"hydra.run.dir={tmp_path / 'then'}"],
             monkeypatch=monkeypatch,
             capsys=capsys,
         )[0]
@@ -283,7 +286,7 @@ def test_the_command_of_a_failure_drives_the_same_contact(
             == 0
         )
         (row,) = read_rows(folder / TABLE)
-        known = rows[line["failure"]]
+        certain = rows[line["failure"]]
         for name in (
             "scene_id",
             "method",
@@ -293,7 +296,7 @@ def test_the_command_of_a_failure_drives_the_same_contact(
             "contact_step",
             "contact_type",
         ):
-            assert row[name] == known[name]
+            assert row[name] == certain[name]
         (twin,) = csv.DictReader((folder / "failures.csv").open(newline=""))
         assert twin["again"] == line["again"]
 
@@ -337,17 +340,17 @@ def test_an_interrupted_evaluation_goes_on_by_the_command_that_it_names(
         "methods=[constant_velocity,replay]",
         "data.build.steps=20",
     ]
-    given = [*arguments(world, tmp_path, "good", *small), "ego=idm"]
+    inputs = [*arguments(world, tmp_path, "good", *small), "ego=idm"]
     status, said = call(
         "evaluate.py",
-        [*given, f"hydra.run.dir={tmp_path / 'whole'}"],
+        [*inputs, f"hydra.run.dir={tmp_path / 'whole'}"],
         monkeypatch=monkeypatch,
         capsys=capsys,
     )
     assert status == 0, said
     monkeypatch.setattr(Setup, "score", stopped)
     run = tmp_path / "run"
-    status, said = call("evaluate.py", given, monkeypatch=monkeypatch, capsys=capsys)
+    status, said = call("evaluate.py", inputs, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 130
     assert f"evaluate.py resume={run}" in said
     assert "interrupted (SIGINT)" in said

@@ -77,11 +77,11 @@ def test_a_planner_s_objective_is_collisions_comfort_and_lost_progress_within_gu
 def test_every_trial_meets_traffic_made_against_it():
     """Real rollouts: the present planner, then others; an ego that stands is refused,
     and no attack is replayed."""
-    made = []
+    built = []
 
     class Watched(type(synthesizer())):
         def replan(self, state, world, ego_plan):
-            made.append(ego_plan[:, -1, :2].clone())
+            built.append(ego_plan[:, -1, :2].clone())
             return super().replan(state, world, ego_plan)
 
     on = Watched(synthesizer().prior)
@@ -110,8 +110,8 @@ def test_every_trial_meets_traffic_made_against_it():
     assert not any(
         trial["admissible"] for trial in others if trial["parameters"]["gain"] < 0.5
     )
-    assert len(made) >= 3 * 2
-    assert not torch.allclose(made[0], made[-1])
+    assert len(built) >= 3 * 2
+    assert not torch.allclose(built[0], built[-1])
 
 
 def test_contacts_with_anybody_and_leaving_the_road_count_as_collisions():
@@ -199,7 +199,7 @@ def attack(parameters):
     """More gain finds more failures, leaves the road more often (1 point a unit, 0.2
     nominal) and is less real."""
     gain = parameters["gain"]
-    found = dict.fromkeys(MEASURED, 0.0) | {
+    result = dict.fromkeys(MEASURED, 0.0) | {
         "cfr": gain / 10,
         "cfr_counted": gain / 20,
         "real_adv": 1 - gain / 10,
@@ -207,7 +207,7 @@ def attack(parameters):
     nominal = {f"{name} nominal": 0.0 for name in MEASURED} | {
         "aor_step nominal": 0.002
     }
-    return found | {"aor_step": 0.01 * gain + 0.002} | nominal
+    return result | {"aor_step": 0.01 * gain + 0.002} | nominal
 
 
 def test_the_limits_of_an_attack_belong_to_it():
@@ -252,16 +252,16 @@ def trials():
 
 
 def test_a_trial_is_measured_as_the_protocol_measures_the_method(trials):
-    found = trials({"gain": 0.5})
+    result = trials({"gain": 0.5})
     (row,) = run_protocol(
         trials.setup,
         [Method("same", trials.make({"gain": 0.5}), eta=2.0)],
         seeds=trials.seeds,
     )
     for name in MEASURED:
-        assert found[name] == pytest.approx(row["metrics"][name]["mean"], nan_ok=True)
+        assert result[name] == pytest.approx(row["metrics"][name]["mean"], nan_ok=True)
     for name in SOUGHT:
-        assert found[f"{name}_high"] == pytest.approx(
+        assert result[f"{name}_high"] == pytest.approx(
             row["metrics"][name]["high"], nan_ok=True
         )
     quiet = trials({"gain": 0.0})

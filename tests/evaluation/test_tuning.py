@@ -92,7 +92,7 @@ def test_a_study_goes_on_as_if_it_had_not_stopped_nor_been_interrupted_in_a_tria
         run("parts", 9, evaluate=dies)
     assert len(part) == 5
     assert run("parts", 9) == whole == run("whole", 9) == tried(trials=9, startup=4)
-    for what, more in (
+    for content, more in (
         ("space", {"space": {"speed": [5.0, 20.0]}}),
         (
             "objective",
@@ -104,7 +104,9 @@ def test_a_study_goes_on_as_if_it_had_not_stopped_nor_been_interrupted_in_a_tria
         ),
         ("scenes", {"about": {"scenes": ["a"]}}),
     ):
-        with pytest.raises(InputError, match=f"differs in {what}; name another file"):
+        with pytest.raises(
+            InputError, match=f"differs in {content}; name another file"
+        ):
             run("parts", 12, **more)
 
 

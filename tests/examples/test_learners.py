@@ -32,11 +32,11 @@ def test_torchrl_trains_the_actor(settings, tmp_path, capsys):
     example("torchrl_ppo").main("320", str(tmp_path / "actor.safetensors"), **settings)
     assert "ego.checkpoint=" in capsys.readouterr().out
     torch.manual_seed(0)
-    begun = e2rl.make_ego("actor").network.weights()
+    beginning = e2rl.make_ego("actor").network.weights()
     trained = read_actor(tmp_path / "actor.safetensors").weights()
     assert all(value.isfinite().all() for value in trained.values())
     last = "network.trunk.last.weight"
-    assert not torch.equal(begun[last], trained[last]), "it is zero at the start"
+    assert not torch.equal(beginning[last], trained[last]), "it is zero at the start"
 
 
 @pytest.mark.parametrize("name", ["sb3_ppo", "torchrl_sac"])

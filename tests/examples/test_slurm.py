@@ -46,14 +46,14 @@ def test_jobs_of_submitit_give_the_run_of_one_machine(tmp_path, monkeypatch, cap
         "--jobs",
         "2",
     ]
-    done = subprocess.run(
+    process = subprocess.run(
         [*command, "--into", str(tmp_path / "jobs"), "--", *options],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=600,
     )
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     shards = [tmp_path / "jobs" / f"shard-{number}" for number in range(2)]
     assert [len(list((shard / "parts").iterdir())) for shard in shards] == [2, 2]
     assert not any((shard / "rollouts.csv").exists() for shard in shards)

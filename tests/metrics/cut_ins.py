@@ -65,7 +65,7 @@ def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
     for lateral, side in zip(lateral_speed, lateral_gap, strict=True):
         overlaps = side <= 0
         crash |= overlaps & (gap <= 0) & (gap >= -2 * LENGTH)
-        seen = Observation(
+        observed = Observation(
             speed,
             acceleration,
             gap=gap,
@@ -75,7 +75,7 @@ def simulate_cut_ins(driver: Driver, cut_in: CutIn) -> Tensor:
             length=length,
             other_length=length,
         )
-        state, wanted = driver.step(state, seen)
+        state, wanted = driver.step(state, observed)
         after = (speed + wanted * DT).clamp(min=0)
         acceleration = (after - speed) / DT
         speed = after

@@ -145,19 +145,21 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_contacts_on_known_courses(case):
     courses, expected = CASES[case]
-    found = row(*courses)
-    assert {name: found[name] for name in expected} == pytest.approx(expected, abs=1e-4)
+    result = row(*courses)
+    assert {name: result[name] for name in expected} == pytest.approx(
+        expected, abs=1e-4
+    )
 
 
 def test_a_contact_is_with_an_adversary_or_not_and_who_has_left_is_not_hit():
     gone = course(30, 0, heading=0, speed=0)
     gone[1][5:] = False
-    found = row(
+    result = row(
         course(0, 0, heading=0, speed=12),
         course(30.5, 0, heading=0, speed=5),
         adversaries=[1],
     )
-    assert found["cfr_adv"] == 1
+    assert result["cfr_adv"] == 1
     assert row(course(0, 0, heading=0, speed=10), gone)["cfr"] == 0
 
 
@@ -215,12 +217,12 @@ def test_a_pedestrian_that_appears_within_the_ego_touches_it_after_they_were_apa
     kind,
 ):
     walker = course(0, -0.5, heading=math.pi / 2, speed=1, appears=10)
-    found = row(course(0, 0, heading=0, speed=0), walker, kinds=[0, kind])
-    assert found["cfr_vru"] == found["cfr_object"] == 0
+    result = row(course(0, 0, heading=0, speed=0), walker, kinds=[0, kind])
+    assert result["cfr_vru"] == result["cfr_object"] == 0
     states, valid = walker
     states = torch.cat([states[:41], states[:40].flip(0)])  # and comes back
-    found = row(course(0, 0, heading=0, speed=0), (states, valid), kinds=[0, kind])
-    assert found["cfr_vru"] + found["cfr_object"] == 1
+    result = row(course(0, 0, heading=0, speed=0), (states, valid), kinds=[0, kind])
+    assert result["cfr_vru"] + result["cfr_object"] == 1
 
 
 @pytest.mark.parametrize(("kind", "vru", "thing"), [(1, 1, 0), (2, 1, 0), (3, 0, 1)])
@@ -269,34 +271,35 @@ def test_touched_is_a_fraction_of_the_traffic_that_moves(
     log = torch.tensor(logged or speeds).double()
     count = len(speeds)
     track = torch.zeros(1, 5, count, 4, dtype=torch.float64)
-    known = torch.tensor(there or [True] * count).expand(1, 5, count)
+    certain = torch.tensor(there or [True] * count).expand(1, 5, count)
     batch = {
         "states": track + 0,
         "logged": track + 0,
-        "valid": known,
-        "logged_valid": known,
+        "valid": certain,
+        "logged_valid": certain,
     }
     batch["states"][..., 3], batch["logged"][..., 3] = speed, log
     batch["traffic"] = torch.arange(count)[None] > 0
-    found = touched_columns(
+    result = touched_columns(
         batch, torch.isin(torch.arange(count), torch.tensor(hit))[None]
     )
-    assert (found["touched"].item(), found["moving_vehicles"].item()) == pytest.approx(
-        expected, nan_ok=True
-    )
+    assert (
+        result["touched"].item(),
+        result["moving_vehicles"].item(),
+    ) == pytest.approx(expected, nan_ok=True)
 
 
 @pytest.mark.parametrize("ahead", [97.5 + 0.8 * index for index in range(10)])
 def test_who_meet_between_two_steps_collide_at_the_step_after(ahead):
     """Two of 1.5 and 1.0 m head-on at 78 m/s, of whom no step shows an overlap in one
     of three cases."""
-    found = score_rollouts(
+    result = score_rollouts(
         scene(
             course(0, 0, heading=0, speed=38),
             course(ahead, 0.2, heading=math.pi, speed=40),
         ).replace(size=torch.tensor([[[1.5, 1.0], [1.0, 0.8]]]))
     )
-    row = found[0][0]
+    row = result[0][0]
     expected = math.ceil((ahead - 1.25) / 7.8 - 1e-6)
     assert (row["cfr"], row["contact_step"], row["contact_type"], row["partner"]) == (
         1,

@@ -52,14 +52,14 @@ def search(vehicles, moment=None, count=1, sim=None, width=2.0, **options):
     )
     scene = scene_set.scenes
     scene["size"][:, 1:, 1] = width
-    found = find_evasions(
+    result = find_evasions(
         scene,
         scene["logged"],
         valid=scene["logged_valid"],
         sim=sim or SimSettings(),
         moment=moment,
     )
-    return found, scene_set
+    return result, scene_set
 
 
 def replay(scene_set, actions):
@@ -149,7 +149,7 @@ def collided():
         2, vehicles=SLOW_AHEAD, num_vrus=0, steps=60, max_vehicles=8, max_agents=10
     )
     scene = scene_set.scenes
-    more = {
+    further = {
         "adversaries": scene["valid"] & False,
         "seed": torch.arange(2),
         "eta": torch.zeros(2).double(),
@@ -159,7 +159,7 @@ def collided():
         torch.arange(2),
         states=scene["logged"],
         valid=scene["logged_valid"],
-        **more,
+        **further,
     )
 
 
@@ -193,10 +193,10 @@ def test_a_collision_has_an_evasion_that_touches_nobody_and_a_clean_rollout_has_
 def test_an_evasion_from_a_moment_on_follows_what_was_driven_until_then():
     driven = torch.zeros(3, 10, 4)
     after = torch.arange(1, 11.0)[None, :, None].expand(3, -1, 4)
-    found = spliced(driven, after, moment=torch.tensor([0, 4, 10]))[..., 0]
-    assert found[0].tolist() == list(range(1, 11))
-    assert found[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6]
-    assert found[2].tolist() == [0] * 10
+    result = spliced(driven, after, moment=torch.tensor([0, 4, 10]))[..., 0]
+    assert result[0].tolist() == list(range(1, 11))
+    assert result[1].tolist() == [0] * 4 + [1, 2, 3, 4, 5, 6]
+    assert result[2].tolist() == [0] * 10
 
 
 def test_the_late_search_begins_a_second_before_the_contact_and_is_enough(monkeypatch):

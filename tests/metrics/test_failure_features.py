@@ -158,11 +158,11 @@ def test_along_a_bend_of_the_lane_nobody_veers():
     ahead = drive(
         150 * math.sin(0.2), 150 * (1 - math.cos(0.2)), 0.2, 4, turn=lambda t: 4 / 150
     )
-    given = scene(on_lane, ahead).replace(
+    inputs = scene(on_lane, ahead).replace(
         lane_points=lane[None], lane_index=torch.zeros(1, 200, dtype=torch.int64)
     )
-    found = score_rollouts(given)[0][0]
-    assert [found[name] for name in WORDS] == ["ahead", "keeps speed", "keeps speed"]
+    result = score_rollouts(inputs)[0][0]
+    assert [result[name] for name in WORDS] == ["ahead", "keeps speed", "keeps speed"]
     straight = score_rollouts(scene(on_lane, ahead))[0][0]
     assert straight["ego_manoeuvre"] == "veers left", (
         "relative to a straight lane it does"
@@ -178,9 +178,9 @@ def test_contacts_soon_after_the_start_use_what_is_known():
     )
     batch |= first_contact(batch)
     collisions = Collisions.of(batch)
-    window, known = collisions.window(collisions.before, WINDOW)
+    window, certain = collisions.window(collisions.before, WINDOW)
     assert window.shape == (1, WINDOW + 1, 2, 4)
-    assert known.tolist() == [int(batch["before"]) - 2]
+    assert certain.tolist() == [int(batch["before"]) - 2]
     assert window[0, 0, 0, 0] == pytest.approx(2.0)
     late = course(5.5, 0, heading=EAST, speed=5, appears=2)  # a step before the contact
     assert words(course(0, 0, heading=EAST, speed=8), late)[1:] == (
@@ -204,8 +204,8 @@ def test_speeds_just_above_and_below_the_thresholds():
     ):
         window = still.clone()
         window[0, :, 0, 3] = 10 + gain * 0.1 * (steps - WINDOW + LATE).clamp(min=0)
-        found = manoeuvre(window, torch.tensor([WINDOW]), lanes=window[..., 2])
-        assert MANOEUVRES[found.item()] == word
+        result = manoeuvre(window, torch.tensor([WINDOW]), lanes=window[..., 2])
+        assert MANOEUVRES[result.item()] == word
 
 
 def word_of(speed):

@@ -101,13 +101,13 @@ def test_one_manoeuvre_or_a_few_metres_per_second_make_no_mode_of_their_own():
 
 def test_the_order_of_the_failures_does_not_matter():
     rows = crowd(60)
-    found = dict(
+    result = dict(
         zip((row["scene_id"] for row in rows), cluster_failures(rows), strict=True)
     )
-    assert 4 < len(set(found.values())) < 30
+    assert 4 < len(set(result.values())) < 30
     for seed in range(3):
         shuffled = random.Random(seed).sample(rows, len(rows))
-        assert [found[row["scene_id"]] for row in shuffled] == cluster_failures(
+        assert [result[row["scene_id"]] for row in shuffled] == cluster_failures(
             shuffled
         )
 
@@ -115,8 +115,8 @@ def test_the_order_of_the_failures_does_not_matter():
 def test_distances_are_the_weights_of_what_differs():
     def apart(**changes):
         pair = [failure(CROSSING), failure(CROSSING, **changes)]
-        one, two = torch.tensor(feature_vectors(pair))
-        return (one - two).abs().sum().item()
+        single, two = torch.tensor(feature_vectors(pair))
+        return (single - two).abs().sum().item()
 
     assert apart() == 0
     assert apart(approach="crossing from the left") == pytest.approx(0.5)
@@ -198,10 +198,10 @@ def expected_labels(labels, places, count):
                         [
                             x
                             for x, place in zip(labels, places, strict=True)
-                            if place == one
+                            if place == single
                         ]
                     )
-                    for one in chosen
+                    for single in chosen
                 }
             )
         )
@@ -218,8 +218,8 @@ def test_coverage_is_the_expected_number_of_modes_at_so_many_places():
         draws=bootstrap_draws(6, 3),
     )
     for count in (1, 2, 4, 6):
-        found = coverage(places=count)
-        assert found[0].item() == pytest.approx(
+        result = coverage(places=count)
+        assert result[0].item() == pytest.approx(
             expected_labels(labels, places, count=count), abs=0.05
         )
     assert coverage(places=7).isnan().all(), "there are only six places"
@@ -255,5 +255,5 @@ def test_coverage_is_of_ten_places(places, known):
         for index in range(places)
     ]
     samples = [NO_SAMPLES] * places
-    found = summarise(rows, samples, draws=2, realism_draws=2)["mode_coverage"]
-    assert (not math.isnan(found["mean"])) is known
+    result = summarise(rows, samples, draws=2, realism_draws=2)["mode_coverage"]
+    assert (not math.isnan(result["mean"])) is known

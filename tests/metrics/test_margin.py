@@ -24,10 +24,10 @@ def test_without_anybody_or_with_whom_the_ego_follows_nobody_is_near():
 def test_who_passes_at_a_distance_has_it_as_its_margin(gap):
     """Oncoming in a lane that is `gap` m beside: at the closest approach 0 s ahead and
     gap minus a width away."""
-    found = row(
+    result = row(
         course(0, 0, heading=0, speed=10), course(60, gap, heading=math.pi, speed=10)
     )
-    assert found["margin"] == pytest.approx(-(gap - 2.0), abs=0.2)
+    assert result["margin"] == pytest.approx(-(gap - 2.0), abs=0.2)
 
 
 def test_the_margin_grows_with_nearness_to_contact_to_verdict():
@@ -55,27 +55,27 @@ def test_a_contact_has_the_share_of_its_speed_that_the_driver_has_lost_before_it
     states[1, :, 0, 3], driver[2] = 0.2, torch.nan
     step = torch.full((4,), 3)
     batch = {"states": states, "driver": driver, "before": step, "stop": step + 1}
-    found = contact_margin(batch | {"preventable": torch.tensor([0, 0, 0, 1])})
-    torch.testing.assert_close(found, torch.tensor([0.4, 0.0, 0.0, PREVENTED]))
+    result = contact_margin(batch | {"preventable": torch.tensor([0, 0, 0, 1])})
+    torch.testing.assert_close(result, torch.tensor([0.4, 0.0, 0.0, PREVENTED]))
 
 
 @pytest.mark.parametrize(("speed", "counts"), [(5.9, False), (6.1, True)])
 def test_a_pair_counts_from_a_relative_speed_of_a_metre_a_second_on(speed, counts):
     """Beside the ego at 5 m/s, 2 m between the sides, and faster."""
-    found = row(course(0, 0, heading=0, speed=5), course(1, 4, heading=0, speed=speed))
-    assert (found["margin"] > -FARTHEST) is counts
+    result = row(course(0, 0, heading=0, speed=5), course(1, 4, heading=0, speed=speed))
+    assert (result["margin"] > -FARTHEST) is counts
 
 
 @pytest.mark.parametrize(("gap", "expected"), [(29.0, -29.0), (31.0, -30.0)])
 def test_nobody_is_farther_than_30_m(gap, expected):
     """A vehicle that passes by so far beside."""
-    found = row(
+    result = row(
         course(0, 0, heading=0, speed=10),
         course(60, gap + 2.0, heading=math.pi, speed=10),
     )
-    assert found["margin"] == pytest.approx(expected, abs=0.2)
+    assert result["margin"] == pytest.approx(expected, abs=0.2)
 
 
 def test_a_preventable_contact_has_twice_the_most_that_others_have():
-    found = row(course(0, 0, heading=0, speed=10), course(60, 0, heading=0, speed=0))
-    assert found["margin"] == 2.0
+    result = row(course(0, 0, heading=0, speed=10), course(60, 0, heading=0, speed=0))
+    assert result["margin"] == 2.0

@@ -54,10 +54,10 @@ def scores(*courses, lanes=None, limit=None, logged=None, length=None, **options
 
 def terms(rollouts):
     batch = as_doubles(rollouts)
-    found = nuplan_columns(batch | first_contact(batch))
+    result = nuplan_columns(batch | first_contact(batch))
     return {
         name: value.tolist()[0] if len(value) == 1 else value
-        for name, value in found.items()
+        for name, value in result.items()
     }
 
 
@@ -74,8 +74,8 @@ def track(x, y, heading, speed):
 
 
 def test_alone_on_the_road_all_terms_are_one():
-    found = scores(course(0, 0, heading=0, speed=10), AWAY, limit=12)
-    assert all(found[name] == pytest.approx(1) for name in (*TERMS, "nuplan_score"))
+    result = scores(course(0, 0, heading=0, speed=10), AWAY, limit=12)
+    assert all(result[name] == pytest.approx(1) for name in (*TERMS, "nuplan_score"))
 
 
 COLLISIONS = {  # the ego, the other, its kind, lanes; the score of collisions
@@ -127,9 +127,9 @@ COLLISIONS = {  # the ego, the other, its kind, lanes; the score of collisions
 @pytest.mark.parametrize("name", COLLISIONS)
 def test_whose_fault_a_collision_is(name):
     ego, other, kind, expected = COLLISIONS[name]
-    found = scores(ego, other, kinds=[VEHICLE, kind], limit=20)
-    assert found["no_ego_at_fault_collisions"] == expected
-    assert found["nuplan_score"] <= expected
+    result = scores(ego, other, kinds=[VEHICLE, kind], limit=20)
+    assert result["no_ego_at_fault_collisions"] == expected
+    assert result["nuplan_score"] <= expected
 
 
 @pytest.mark.parametrize(("creep", "expected"), [(0.02, 0), (0.049, 0), (0.06, 1)])
@@ -137,8 +137,8 @@ def test_a_track_of_at_most_0_05_m_per_s_stands(creep, expected):
     """It touches the side of the ego, which passes in its lane: at fault if it stands,
     else beside within one lane."""
     other = course(18, 3.4 + creep * 1.65, heading=-math.pi / 2, speed=creep)
-    found = scores(course(0, 0, heading=0, speed=10), other, limit=20)
-    assert found["no_ego_at_fault_collisions"] == expected
+    result = scores(course(0, 0, heading=0, speed=10), other, limit=20)
+    assert result["no_ego_at_fault_collisions"] == expected
 
 
 def test_an_object_stands_whatever_its_speed():
@@ -163,13 +163,13 @@ def test_an_object_stands_whatever_its_speed():
 def test_two_objects_leave_nothing():
     """max(0, 1 - 2 / (1 + 1))."""
     objects = [course(30, 0, heading=0, speed=0), course(45, 0, heading=0, speed=0)]
-    found = scores(
+    result = scores(
         course(0, 0, heading=0, speed=12),
         *objects,
         kinds=[VEHICLE, OTHER, OTHER],
         limit=20,
     )
-    assert found["no_ego_at_fault_collisions"] == 0
+    assert result["no_ego_at_fault_collisions"] == 0
 
 
 def test_beside_it_is_the_ego_s_fault_where_it_is_in_two_lanes():
@@ -232,8 +232,8 @@ def test_a_corner_may_be_0_3_m_outside(y, expected):
 )
 def test_metres_against_the_lane_within_a_second(speed, expected):
     """The devkit sums the last 11 steps, so that 1.1 s of driving count."""
-    found = scores(course(100, 0, heading=math.pi, speed=speed), AWAY)
-    assert found["driving_direction_compliance"] == expected
+    result = scores(course(100, 0, heading=math.pi, speed=speed), AWAY)
+    assert result["driving_direction_compliance"] == expected
     assert (
         scores(course(100, 0, heading=0, speed=speed), AWAY)[
             "driving_direction_compliance"
@@ -330,9 +330,9 @@ def test_time_to_collision_looks_beside_in_two_lanes_alone():
         ]
         == 0
     )
-    one = [([[-500, 2], [500, 2]], 8)]
+    single = [([[-500, 2], [500, 2]], 8)]
     assert (
-        scores(course(0, 2, heading=0, speed=10), near, lanes=one)[
+        scores(course(0, 2, heading=0, speed=10), near, lanes=single)[
             "time_to_collision_within_bound"
         ]
         == 1
@@ -344,13 +344,15 @@ def test_time_to_collision_looks_beside_in_two_lanes_alone():
     [(10, 1, 1), (12, 1, 1), (5, 0.5, 1), (1.9, 0.19, 0)],
 )
 def test_progress_is_the_fraction_of_the_recorded_distance(speed, progress, moving):
-    found = scores(
+    result = scores(
         course(0, 0, heading=0, speed=speed),
         AWAY,
         logged=course(0, 0, heading=0, speed=10),
     )
-    assert found["ego_progress_along_expert_route"] == pytest.approx(progress, abs=1e-6)
-    assert found["ego_is_making_progress"] == moving
+    assert result["ego_progress_along_expert_route"] == pytest.approx(
+        progress, abs=1e-6
+    )
+    assert result["ego_is_making_progress"] == moving
 
 
 @pytest.mark.parametrize(
@@ -366,13 +368,15 @@ def test_progress_is_the_fraction_of_the_recorded_distance(speed, progress, movi
 )
 def test_distances_below_2_m_count_as_2_m(recorded, driven, progress, making):
     """min(1, max(driven, 2) / max(recorded, 2)); a fifth of it is progress."""
-    found = scores(
+    result = scores(
         course(0, 0, heading=0, speed=driven / 8),
         AWAY,
         logged=course(0, 0, heading=0, speed=recorded / 8),
     )
-    assert found["ego_progress_along_expert_route"] == pytest.approx(progress, abs=1e-5)
-    assert found["ego_is_making_progress"] == making
+    assert result["ego_progress_along_expert_route"] == pytest.approx(
+        progress, abs=1e-5
+    )
+    assert result["ego_is_making_progress"] == making
 
 
 @pytest.mark.parametrize(("back", "expected"), [(1.9, 2 / 4), (2.1, 0)])
@@ -382,15 +386,17 @@ def test_more_than_2_m_backwards_is_no_progress(back, expected):
     ego = track(
         -back * time / 8, 0 * time, heading=0 * time, speed=-back / 8 + 0 * time
     )
-    found = scores(ego, AWAY, logged=course(0, 0, heading=0, speed=0.5))
-    assert found["ego_progress_along_expert_route"] == pytest.approx(expected, abs=1e-5)
+    result = scores(ego, AWAY, logged=course(0, 0, heading=0, speed=0.5))
+    assert result["ego_progress_along_expert_route"] == pytest.approx(
+        expected, abs=1e-5
+    )
 
 
 def test_where_the_recorded_ego_stands_progress_is_whole():
-    found = scores(
+    result = scores(
         course(0, 0, heading=0, speed=5), AWAY, logged=course(0, 0, heading=0, speed=0)
     )
-    assert found["ego_progress_along_expert_route"] == 1
+    assert result["ego_progress_along_expert_route"] == 1
 
 
 @pytest.mark.parametrize(
@@ -405,9 +411,9 @@ def test_speeding(limit, expected):
 
 
 def test_speeding_is_unknown_without_limits():
-    found = scores(course(0, 0, heading=0, speed=10), AWAY)
-    assert math.isnan(found["speed_limit_compliance"])
-    assert math.isnan(found["nuplan_score"])
+    result = scores(course(0, 0, heading=0, speed=10), AWAY)
+    assert math.isnan(result["speed_limit_compliance"])
+    assert math.isnan(result["nuplan_score"])
 
 
 @pytest.mark.parametrize(
@@ -493,13 +499,13 @@ def test_a_jerk_is_uncomfortable_where_its_acceleration_is_not():
 def test_the_score_is_the_product_of_multipliers_and_the_weighted_mean():
     """Half the recorded way, and 1 m/s too fast throughout: (5 + 5 / 2 + 4 * s + 2) /
     16."""
-    found = scores(
+    result = scores(
         course(0, 0, heading=0, speed=5),
         AWAY,
         limit=4,
         logged=course(0, 0, heading=0, speed=10),
     )
-    assert found["nuplan_score"] == pytest.approx(
+    assert result["nuplan_score"] == pytest.approx(
         (5 + 2.5 + 4 * (1 - 81 / 80 / 2.23) + 2) / 16, abs=1e-6
     )
 
@@ -508,15 +514,15 @@ def test_terms_are_in_0_to_1_and_rows_do_not_depend_on_the_batch():
     rollouts = random_rollouts(12, seed=4).replace(
         speed_limit=torch.full((12, 81), 9.0)
     )
-    found = terms(rollouts)
-    for name, value in found.items():
-        known = value[~value.isnan()]
-        assert len(known)
-        assert bool(((known >= 0) & (known <= 1)).all()), name
+    result = terms(rollouts)
+    for name, value in result.items():
+        certain = value[~value.isnan()]
+        assert len(certain)
+        assert bool(((certain >= 0) & (certain <= 1)).all()), name
     for index in range(12):
         alone = terms(rollouts[index : index + 1])
         assert {name: alone[name] for name in alone} == pytest.approx(
-            {name: value[index].item() for name, value in found.items()}, nan_ok=True
+            {name: value[index].item() for name, value in result.items()}, nan_ok=True
         )
 
 
@@ -538,12 +544,12 @@ def test_who_comes_from_more_than_150_degrees_is_behind(degrees, expected):
     x = axle + 1.5 / math.tan(math.radians(degrees)) + 10 * time
     y = torch.where(time < 0.05, 40.0, 2.0 + 1.5)
     two = [([[-500, 0], [500, 0]], 4), ([[-500, 4], [500, 4]], 4)]
-    found = scores(
+    result = scores(
         course(0, 2, heading=0, speed=10),
         track(x, y, heading=0 * time, speed=10.0 + 0 * time),
         lanes=two,
     )
-    assert found["no_ego_at_fault_collisions"] == expected
+    assert result["no_ego_at_fault_collisions"] == expected
 
 
 @pytest.mark.parametrize(("gap", "expected"), [(0.45, 1), (0.55, 0)])
@@ -552,8 +558,8 @@ def test_a_lane_follows_another_within_half_a_metre(gap, expected):
     ego = course(0, 2, heading=0, speed=10)
     other = course(0.5, 9, heading=-0.35, speed=10.2)
     pieces = [([[x, 2], [x + 7 - gap, 2]], 8) for x in range(-21, 200, 7)]
-    found = scores(ego, other, lanes=pieces)
-    assert found["no_ego_at_fault_collisions"] == expected
+    result = scores(ego, other, lanes=pieces)
+    assert result["no_ego_at_fault_collisions"] == expected
 
 
 @pytest.mark.parametrize(("speed", "expected"), [(0.0045, 1), (0.0055, 0)])
@@ -565,8 +571,8 @@ def test_time_to_collision_has_an_ego_faster_than_5_mm_per_s(speed, expected):
         heading=math.pi + 0 * time,
         speed=torch.where(time < 0.05, 9.0, 0.0),
     )
-    found = scores(course(0, 0, heading=0, speed=speed), near)
-    assert found["time_to_collision_within_bound"] == expected
+    result = scores(course(0, 0, heading=0, speed=speed), near)
+    assert result["time_to_collision_within_bound"] == expected
 
 
 def comfort_of(accel, yaw_rate=None, length=0.0):

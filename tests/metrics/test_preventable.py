@@ -302,8 +302,8 @@ def test_two_centimetres_in_a_step_tell_the_direction_of_motion(way, reverses):
 def test_a_follower_drives_within_60_degrees_of_its_leader(degrees, expected):
     behind = others(track(5.0, math.radians(degrees), start=(-4.0, 0.0)))
     step = torch.tensor([0])
-    found = follows(track(5.0), behind, step=step, index=step)
-    assert found.item() is expected
+    result = follows(track(5.0), behind, step=step, index=step)
+    assert result.item() is expected
 
 
 def test_a_path_goes_on_straight_beyond_its_end():

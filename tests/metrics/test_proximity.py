@@ -97,18 +97,18 @@ def test_a_bent_way_counts_by_its_length_and_a_standing_ego_has_none():
     )
     everywhere = torch.ones(1, 81, 1, dtype=torch.bool)
     for steps in (20, 40, 80):
-        found = route_completion(
+        result = route_completion(
             bent[None],
             torch.tensor([steps + 1]),
             logged=bent[None, :, None],
             logged_valid=everywhere,
         )
-        assert found.item() == pytest.approx(steps / 80, abs=1e-6)
+        assert result.item() == pytest.approx(steps / 80, abs=1e-6)
     gone = everywhere & (torch.arange(81) <= 40)[:, None]
-    found = route_completion(
+    result = route_completion(
         bent[None], torch.tensor([21]), logged=bent[None, :, None], logged_valid=gone
     )
-    assert found.item() == pytest.approx(0.5, abs=1e-6), "of the way that is recorded"
+    assert result.item() == pytest.approx(0.5, abs=1e-6), "of the way that is recorded"
     assert math.isnan(
         completion(course(0, 0, heading=0, speed=5), course(0, 0, heading=0, speed=0.1))
     )
@@ -121,13 +121,13 @@ def test_the_share_of_a_way_that_crosses_itself_is_what_was_driven(steps):
     recorded = track(loop(), 20.0, speed=25.0, steps=90)[None].double()
     ego = recorded + torch.tensor([0.3, -0.3, 0, 0])
     everywhere = torch.ones(1, 91, 1, dtype=torch.bool)
-    found = route_completion(
+    result = route_completion(
         ego,
         torch.tensor([steps + 1]),
         logged=recorded[:, :, None],
         logged_valid=everywhere,
     )
-    assert found.item() == pytest.approx(steps / 90, abs=0.01)
+    assert result.item() == pytest.approx(steps / 90, abs=0.01)
 
 
 PARKED_STAYS, PARKED_MOVES, STANDS, STARTS, STARTS_IN_LOG, DRIVES, LATE = range(1, 8)
@@ -163,8 +163,8 @@ def traffic():
 
 
 def values(batch, who=None):
-    found = standing_columns(batch | {"traffic": traffic() if who is None else who})
-    return {name: value[0].item() for name, value in found.items()}
+    result = standing_columns(batch | {"traffic": traffic() if who is None else who})
+    return {name: value[0].item() for name, value in result.items()}
 
 
 def test_everybody_is_counted_once_and_where_it_belongs():

@@ -96,7 +96,8 @@ def test_real_adv_is_real_of_a_traffic_of_adversaries_alone():
     alone = rollouts.replace(simulated=rollouts.simulated & rollouts.adversaries)
     draws, cluster = once(6)
     ours, theirs = (
-        realism(features_of(given), cluster, draws=draws) for given in (rollouts, alone)
+        realism(features_of(inputs), cluster, draws=draws)
+        for inputs in (rollouts, alone)
     )
     assert ours["real_adv"] == theirs["real"] == theirs["real_adv"]
     assert ours["real_adv"] != ours["real"]

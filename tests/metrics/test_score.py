@@ -53,8 +53,8 @@ def test_rows_and_summary_agree_with_the_independent_scorer(tmp_path):
         "--tolerance",
         *tight,
     ]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    process = subprocess.run(command, capture_output=True, text=True)
+    assert process.returncode == 0, process.stdout + process.stderr
     theirs = json.loads((tmp_path / "theirs.json").read_text())
     agreement = theirs["agreement"]
     assert agreement["joined"] == len(rows)
@@ -159,7 +159,7 @@ def changed(rollouts, matrix, shift, heading):
     headings by a function."""
     result, (matrix, shift) = (
         {},
-        (torch.tensor(given, dtype=torch.float64) for given in (matrix, shift)),
+        (torch.tensor(inputs, dtype=torch.float64) for inputs in (matrix, shift)),
     )
     for name in ("lane_points", "drivable_points"):
         result[name] = rollouts.get(name).double() @ matrix.T + shift

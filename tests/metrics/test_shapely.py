@@ -64,7 +64,7 @@ def boxes(states, size):
 def on_road(points, file):
     """Bool [n]: points [n, 2] in a drivable polygon, or at most 1 m beside a lane."""
     tree = shapely.STRtree(shapely.points(points))
-    found = np.zeros(len(points), bool)
+    result = np.zeros(len(points), bool)
 
     def lines(name):
         parts = zip(
@@ -74,37 +74,37 @@ def on_road(points, file):
 
     for line, width in zip(lines("lane"), file["lane_width"], strict=False):
         if len(line) > 1:
-            found[tree.query(shapely.linestrings(line), "dwithin", width / 2 + 1.0)] = (
-                True
-            )
+            result[
+                tree.query(shapely.linestrings(line), "dwithin", width / 2 + 1.0)
+            ] = True
     for ring in lines("drivable"):
         if len(ring) > 2:
-            found[tree.query(shapely.polygons(ring), "contains")] = True
-    return found
+            result[tree.query(shapely.polygons(ring), "contains")] = True
+    return result
 
 
 def score(file):
     """What a rollout file's contacts, distances, progress and road are."""
-    there = file["valid"]
+    place = file["valid"]
     simulated = np.flatnonzero(file["simulated"])
-    states = np.where(there[..., None], file["states"], 0).astype(float)
-    box = boxes(states, np.broadcast_to(file["size"].astype(float), (*there.shape, 2)))
+    states = np.where(place[..., None], file["states"], 0).astype(float)
+    box = boxes(states, np.broadcast_to(file["size"].astype(float), (*place.shape, 2)))
     vehicle = file["agent_type"] == "vehicle"
-    area = shapely.area(shapely.intersection(box[:, :1], box)) * there * there[:, :1]
+    area = shapely.area(shapely.intersection(box[:, :1], box)) * place * place[:, :1]
     area[:, 0] = 0
     hits = ((area * vehicle) > 0).any(1)
     unknown = hits[0]
     after = np.flatnonzero(hits[1:]) + 1
     hit = bool(len(after)) and not unknown
     stop = after[0] if hit else len(hits) - 1
-    seen = there[1 : stop + 1] & there[1 : stop + 1, :1]
+    observed = place[1 : stop + 1] & place[1 : stop + 1, :1]
     gap = np.where(
-        seen, shapely.distance(box[1 : stop + 1, :1], box[1 : stop + 1]), np.inf
+        observed, shapely.distance(box[1 : stop + 1, :1], box[1 : stop + 1]), np.inf
     )[:, 1:]
-    ego = states[: stop + 1, 0][there[: stop + 1, 0]]
+    ego = states[: stop + 1, 0][place[: stop + 1, 0]]
     turn = np.diff(ego[:, 2])
     heading = ego[:-1, 2] + np.arctan2(np.sin(turn), np.cos(turn)) / 2
-    found = {
+    result = {
         "cfr": np.nan if unknown else float(hit),
         "cfr_vru": float(
             (
@@ -126,26 +126,26 @@ def score(file):
         "bg_pairs": 0.0,
     }
     others = simulated[simulated > 0]
-    for number, one in enumerate(others):
+    for number, single in enumerate(others):
         two = others[number + 1 :]
-        both = there[: stop + 1, [one]] & there[: stop + 1, two]
+        both = place[: stop + 1, [single]] & place[: stop + 1, two]
         meet = (
             shapely.area(
-                shapely.intersection(box[: stop + 1, [one]], box[: stop + 1, two])
+                shapely.intersection(box[: stop + 1, [single]], box[: stop + 1, two])
             )
             > 0
         ) & both
-        found["bg_pairs"] += (meet[1:].any(0) & ~meet[0]).sum()
+        result["bg_pairs"] += (meet[1:].any(0) & ~meet[0]).sum()
     road = on_road(states[: stop + 1, :, :2].reshape(-1, 2), file).reshape(stop + 1, -1)
-    counted = there[: stop + 1, others] & there[0, others] & road[0, others]
+    counted = place[: stop + 1, others] & place[0, others] & road[0, others]
     off = counted[1:] & ~road[1:][:, others]
     mapped = len(file["lane_points"]) + len(file["drivable_points"]) > 0
-    known = mapped and counted[1:].any()
-    found["aor_vehicle_steps"] = float(counted[1:].sum()) * mapped
-    found["aor_step"] = off.sum() / counted[1:].sum() if known else np.nan
-    left = (there[: stop + 1, 0] & ~road[:, 0]).any()
-    found["ego_off_road"] = float(left) if mapped and road[0, 0] else np.nan
-    return found
+    certain = mapped and counted[1:].any()
+    result["aor_vehicle_steps"] = float(counted[1:].sum()) * mapped
+    result["aor_step"] = off.sum() / counted[1:].sum() if certain else np.nan
+    left = (place[: stop + 1, 0] & ~road[:, 0]).any()
+    result["ego_off_road"] = float(left) if mapped and road[0, 0] else np.nan
+    return result
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -73,17 +73,17 @@ def moving_over(
 def test_an_ego_that_changes_lanes_into_a_car_that_keeps_its_lane_is_at_fault(
     side, ahead, across
 ):
-    found = verdict(
+    result = verdict(
         moving_over(0, 0, speed=12, across=side * across),
         course(ahead, side * 3.5, heading=EAST, speed=12),
     )
-    assert (found["cfr"], found["at_fault"], found["counted"], found["duty"]) == (
+    assert (result["cfr"], result["at_fault"], result["counted"], result["duty"]) == (
         1,
         1,
         1,
         "none",
     )
-    assert found["approach"] == (
+    assert result["approach"] == (
         "beside on the left" if side > 0 else "beside on the right"
     )
 
@@ -92,11 +92,11 @@ def test_an_ego_that_changes_lanes_into_a_car_that_keeps_its_lane_is_at_fault(
 @pytest.mark.parametrize("ahead", [-3.0, 0.0, 3.0])
 @pytest.mark.parametrize("across", [0.3, 1.0, 2.0])
 def test_a_car_that_changes_lanes_into_the_ego_is(side, ahead, across):
-    found = verdict(
+    result = verdict(
         course(0, 0, heading=EAST, speed=12),
         moving_over(ahead, side * 3.5, speed=12, across=-side * across),
     )
-    assert (found["cfr"], found["at_fault"], found["duty"]) == (1, 0, "entry")
+    assert (result["cfr"], result["at_fault"], result["duty"]) == (1, 0, "entry")
 
 
 @pytest.mark.parametrize(
@@ -109,9 +109,9 @@ def test_where_both_move_into_a_lane_both_are_but_for_a_drift_beside_a_lane_chan
     """From the outer lanes into the middle one; a drift is less than half as fast."""
     ego = moving_over(0, -3.5, speed=12, across=own, lasts=5.0)
     partner = moving_over(0, 3.5, speed=12, across=-others, lasts=5.0)
-    found = verdict(ego, partner)
-    assert (found["cfr"], found["at_fault"]) == (1, fault)
-    assert (found["duty"] == "entry") == (others > 0.5)
+    result = verdict(ego, partner)
+    assert (result["cfr"], result["at_fault"]) == (1, fault)
+    assert (result["duty"] == "entry") == (others > 0.5)
 
 
 def test_who_drifts_within_its_lane_into_a_car_at_the_lane_s_edge_is_at_fault():
@@ -120,8 +120,8 @@ def test_who_drifts_within_its_lane_into_a_car_at_the_lane_s_edge_is_at_fault():
     drifts = moving_over(0, 0, speed=12, across=0.25, lasts=3.6)
     assert verdict(drifts, course(0, 2.8, heading=EAST, speed=12))["at_fault"] == 1
     keeps = course(0, 0.7, heading=EAST, speed=12)
-    found = verdict(keeps, moving_over(0, 3.5, speed=12, across=-0.25, lasts=3.6))
-    assert (found["cfr"], found["at_fault"]) == (1, 0)
+    result = verdict(keeps, moving_over(0, 3.5, speed=12, across=-0.25, lasts=3.6))
+    assert (result["cfr"], result["at_fault"]) == (1, 0)
 
 
 def bend(radius, steps=80, speed=10.0, drift=0.0, begin=2.0):
@@ -155,8 +155,8 @@ def test_in_a_bend_who_leaves_its_lane_is_at_fault_although_both_turn(
     """The ego is carried outwards; or its neighbour, as fast in angle, comes inwards."""
     ego = bend(40.0, speed=10.0, drift=own)
     partner = bend(43.5, speed=10.9, drift=others)
-    found = verdict(ego, partner, lines=rings(40.0, 43.5))
-    assert (found["cfr"], found["at_fault"]) == (1, fault)
+    result = verdict(ego, partner, lines=rings(40.0, 43.5))
+    assert (result["cfr"], result["at_fault"]) == (1, fault)
 
 
 @pytest.mark.parametrize("reverses", [False, True])
@@ -164,7 +164,7 @@ def test_who_comes_out_of_a_driveway_cuts_in_whichever_way_its_nose_looks(revers
     partner = course(30, -1.6 - 2.0 * 3.6, heading=NORTH, speed=2.0)
     if reverses:
         partner[0][:, 2], partner[0][:, 3] = SOUTH, -2.0
-    found = verdict(
+    result = verdict(
         course(0, 0, heading=EAST, speed=8), partner, lines=straight_lanes(0.0, 3.5)
     )
     expected = {
@@ -174,9 +174,9 @@ def test_who_comes_out_of_a_driveway_cuts_in_whichever_way_its_nose_looks(revers
         "partner_speed": 2.0,
         "relvel": math.hypot(8, 2),
     }
-    assert {name: found[name] for name in expected} == pytest.approx(expected)
-    assert (found["partner_manoeuvre"], found["duty"]) == ("keeps speed", "none")
-    assert found["approach"] == "crossing from the right"
+    assert {name: result[name] for name in expected} == pytest.approx(expected)
+    assert (result["partner_manoeuvre"], result["duty"]) == ("keeps speed", "none")
+    assert result["approach"] == "crossing from the right"
 
 
 def test_a_car_that_reverses_towards_the_ego_in_its_lane_is_judged_as_one_that_comes_towards_it():
@@ -235,15 +235,15 @@ def test_an_ego_that_reverses_leads_with_its_rear():
     backs = course(0, 0, heading=WEST, speed=2.0)
     backs[0][:, 2], backs[0][:, 3] = EAST, -2.0
     westwards = [line.flip(0) for line in straight_lanes(0.0)]
-    found = verdict(backs, course(-12, 0, heading=WEST, speed=0.5), lines=westwards)
-    assert (found["contact_type"], found["at_fault"], found["duty"]) == (
+    result = verdict(backs, course(-12, 0, heading=WEST, speed=0.5), lines=westwards)
+    assert (result["contact_type"], result["at_fault"], result["duty"]) == (
         "rear",
         1,
         "none",
     )
-    assert found["ego_speed"] == pytest.approx(2.0)
-    found = verdict(backs, course(15, 0, heading=WEST, speed=6.0), lines=westwards)
-    assert (found["contact_type"], found["at_fault"], found["duty"]) == (
+    assert result["ego_speed"] == pytest.approx(2.0)
+    result = verdict(backs, course(15, 0, heading=WEST, speed=6.0), lines=westwards)
+    assert (result["contact_type"], result["at_fault"], result["duty"]) == (
         "front",
         0,
         "rear-end",
@@ -254,14 +254,14 @@ def test_an_ego_that_turns_round_into_the_next_lane_is_at_fault_and_a_car_that_d
     """Half a second after it has crossed the line; an ego that could see it turn for
     longer has to stop."""
     turns = drive(20, 0, EAST, 5, turn=lambda t: 0.8 if t > 2.2 else 0.0)
-    found = verdict(
+    result = verdict(
         turns, course(0, 3.5, heading=EAST, speed=9), lines=straight_lanes(0.0, 3.5)
     )
-    assert (found["cfr"], found["at_fault"], found["duty"]) == (1, 1, "none")
-    found = verdict(
+    assert (result["cfr"], result["at_fault"], result["duty"]) == (1, 1, "none")
+    result = verdict(
         course(0, 3.5, heading=EAST, speed=9), turns, lines=straight_lanes(0.0, 3.5)
     )
-    assert (found["cfr"], found["at_fault"]) == (1, 0)
+    assert (result["cfr"], result["at_fault"]) == (1, 0)
 
 
 @pytest.mark.parametrize(("turns", "counted"), [(True, 0), (False, 1)])
@@ -273,17 +273,21 @@ def test_a_standing_car_that_turns_on_the_spot_makes_no_failure_that_counts(
     states, valid = course(40, 2.3, heading=EAST, speed=0)
     slant = torch.linspace(0, 0.8, 81, dtype=torch.float64)
     states[:, 2] = slant if turns else 0.5
-    found = verdict(course(0, 0, heading=EAST, speed=9), (states, valid))
-    assert (found["cfr"], found["at_fault"], found["counted"]) == (1, counted, counted)
+    result = verdict(course(0, 0, heading=EAST, speed=9), (states, valid))
+    assert (result["cfr"], result["at_fault"], result["counted"]) == (
+        1,
+        counted,
+        counted,
+    )
 
 
 def test_a_cyclist_s_or_nobody_s_contact_is_no_movement_into_anybody():
-    found = verdict(
+    result = verdict(
         course(0, 0, heading=EAST, speed=9), course(0, 30, heading=EAST, speed=9)
     )
-    assert found["cfr"] == 0
-    assert math.isnan(found["at_fault"])
-    assert found["duty"] == ""
+    assert result["cfr"] == 0
+    assert math.isnan(result["at_fault"])
+    assert result["duty"] == ""
 
 
 @pytest.mark.parametrize("placing", range(5))
@@ -369,8 +373,8 @@ def test_a_movement_is_of_the_last_second_or_of_two_at_the_ego_s_side(
     ego[stop - first + 1 :, 1] = 0.5
     partner = straight(0, WIDTH + 0.4, heading=EAST, speed=10)
     lines = lane(*((float(x), 0.0) for x in range(-10, 110, 2)))
-    found = moved_into(pair(ego, partner, stop, kind=kind, lanes=lines))
-    assert found.tolist() == [[moved, False]]
+    result = moved_into(pair(ego, partner, stop, kind=kind, lanes=lines))
+    assert result.tolist() == [[moved, False]]
 
 
 @pytest.mark.parametrize(("steps", "moved"), [(39, True), (41, False)])
@@ -383,8 +387,8 @@ def test_a_lane_is_remembered_for_four_seconds(steps, moved):
     partner = straight(1.0, WIDTH + 0.3, heading=EAST, speed=0)
     last = ego[stop - steps, 0].item()
     lines = lane(*((last - 3.8 - d, ego[stop - steps, 1].item()) for d in (4, 2, 0)))
-    found = moved_into(pair(ego, partner, stop, kind=SIDE, lanes=lines))
-    assert found[0, 0].item() is moved
+    result = moved_into(pair(ego, partner, stop, kind=SIDE, lanes=lines))
+    assert result[0, 0].item() is moved
 
 
 def lane_of(angle=0.0, offset=0.0, lanes=None):
@@ -393,8 +397,8 @@ def lane_of(angle=0.0, offset=0.0, lanes=None):
     ego = straight(0, offset, heading=angle, speed=0)
     lines = lanes or lane(*((float(x), 0.0) for x in range(-10, 12, 1)))
     moments = pair(ego, ego, 5, lanes=lines).states[:, :1]
-    heading, known = lanes_along(pair(ego, ego, 5, lanes=lines), moments)
-    return heading[0, 0, 0].item() if known[0, 0, 0] else None
+    heading, certain = lanes_along(pair(ego, ego, 5, lanes=lines), moments)
+    return heading[0, 0, 0].item() if certain[0, 0, 0] else None
 
 
 @pytest.mark.parametrize(("offset", "expected"), [(3.95, 0.0), (4.05, None)])

@@ -130,11 +130,13 @@ def test_fewer_than_ten_places_give_no_interval():
         few = brief(*rows_of(values[:27], clusters=list("abcdefghi") * 3, name=name))[
             name
         ]
-        many = brief(*rows_of(values, clusters=list("abcdefghij") * 3, name=name))[name]
+        several = brief(*rows_of(values, clusters=list("abcdefghij") * 3, name=name))[
+            name
+        ]
         assert math.isnan(few["low"])
         assert math.isnan(few["high"])
         assert few["n"] == 27
-        assert many["low"] < many["mean"] < many["high"]
+        assert several["low"] < several["mean"] < several["high"]
 
 
 @pytest.mark.parametrize("level", [0.95, 0.975])
@@ -147,15 +149,17 @@ def test_few_events_have_the_interval_of_clopper_and_pearson(events, places, lev
         tuple(expected), abs=1e-9
     )
     if level == 0.95:
-        found = brief(*rows_of([1.0] * events + [0.0] * (places - events)))["cfr"]
-        assert (found["low"], found["high"]) == pytest.approx(tuple(expected), abs=1e-9)
+        result = brief(*rows_of([1.0] * events + [0.0] * (places - events)))["cfr"]
+        assert (result["low"], result["high"]) == pytest.approx(
+            tuple(expected), abs=1e-9
+        )
 
 
 def test_the_bootstrap_takes_over_from_ten_places_with_and_ten_without_an_event():
     for events, exact in ((9, True), (10, False), (30, False), (31, True)):
-        found = brief(*rows_of([1.0] * events + [0.0] * (40 - events)))["cfr"]
+        result = brief(*rows_of([1.0] * events + [0.0] * (40 - events)))["cfr"]
         assert (
-            (found["low"], found["high"])
+            (result["low"], result["high"])
             == pytest.approx(exact_interval(events / 40, 40), abs=1e-9)
         ) == exact
 
@@ -164,11 +168,11 @@ def test_rollouts_at_one_place_are_one_trial():
     """24 events in 120 rollouts at 40 places, all of them at eight: as 20% of 40, not
     of 120."""
     values = [1.0] * 24 + [0.0] * 96
-    found = brief(*rows_of(values, clusters=[index // 3 for index in range(120)]))[
+    result = brief(*rows_of(values, clusters=[index // 3 for index in range(120)]))[
         "cfr"
     ]
-    assert (found["low"], found["high"]) == pytest.approx(exact_interval(0.2, 40))
-    assert found["n"] == 120
+    assert (result["low"], result["high"]) == pytest.approx(exact_interval(0.2, 40))
+    assert result["n"] == 120
 
 
 def test_medians_that_agree_and_ratios_of_few_events_have_no_interval():
@@ -178,24 +182,26 @@ def test_medians_that_agree_and_ratios_of_few_events_have_no_interval():
     assert math.isnan(
         brief(*rows_of([3.0] * 40, name="contact_time"))["contact_time"]["low"]
     )
-    few, many = (
+    few, several = (
         brief(*rows_of([1.0] * n + [0.0] * (60 - n), driven_km=[0.1] * 60))
         for n in (9, 10)
     )
     assert math.isnan(few["failures_per_km"]["low"])
     assert few["failures_per_km"]["mean"] == pytest.approx(1.5)
-    assert many["failures_per_km"]["low"] < 10 / 6 < many["failures_per_km"]["high"]
+    assert (
+        several["failures_per_km"]["low"] < 10 / 6 < several["failures_per_km"]["high"]
+    )
 
 
 def test_a_difference_of_rare_events_lies_between_the_differences_of_their_bounds():
     ours = rows_of([1.0] * 8 + [0.0] * 42)
     theirs = rows_of([0.0] * 49 + [1.0])
-    found = paired_differences(*ours, *theirs, draws=50, realism_draws=2)["cfr"]
+    result = paired_differences(*ours, *theirs, draws=50, realism_draws=2)["cfr"]
     (low, high), (other_low, other_high) = (
         exact_interval(k / 50, 50, level=0.975) for k in (8, 1)
     )
-    assert found["difference"] == pytest.approx(0.14)
-    assert (found["low"], found["high"]) == pytest.approx(
+    assert result["difference"] == pytest.approx(0.14)
+    assert (result["low"], result["high"]) == pytest.approx(
         (low - other_high, high - other_low)
     )
     six = paired_differences(
@@ -217,11 +223,11 @@ def test_a_fraction_that_is_the_same_at_each_place_is_bounded_by_that_of_places_
     u)^places = 0.025."""
     halves = [0.0, 1.0] * places
     clusters = [index // 2 for index in range(2 * places)]
-    found = brief(*rows_of(halves, clusters))["cfr"]
+    result = brief(*rows_of(halves, clusters))["cfr"]
     u = 1 - 0.025 ** (1 / places)
     expected = (0.5 * (1 - u), 0.5 * (1 + u)) if places >= 10 else (math.nan, math.nan)
-    assert (found["low"], found["high"]) == pytest.approx(expected, nan_ok=True)
-    assert found["mean"] == 0.5
+    assert (result["low"], result["high"]) == pytest.approx(expected, nan_ok=True)
+    assert result["mean"] == 0.5
     none = brief(*rows_of([0.0] * places))["cfr"]
     assert (none["low"], none["high"]) == pytest.approx(
         (0.0, u) if places >= 10 else expected, nan_ok=True
@@ -229,11 +235,11 @@ def test_a_fraction_that_is_the_same_at_each_place_is_bounded_by_that_of_places_
 
 
 def test_a_mean_that_is_the_same_at_each_place_is_its_own_interval():
-    found = brief(*rows_of([0.1] * 30, name="progress"))["progress"]
-    assert found["low"] == found["high"] == found["mean"] == pytest.approx(0.1)
+    result = brief(*rows_of([0.1] * 30, name="progress"))["progress"]
+    assert result["low"] == result["high"] == result["mean"] == pytest.approx(0.1)
     assert (
         brief(*rows_of([0.1] * 29 + [0.2], name="progress"))["progress"]["low"]
-        < found["high"]
+        < result["high"]
     )
 
 
@@ -244,12 +250,12 @@ def test_what_has_not_changed_is_bounded_by_the_places_that_may_differ(events):
     ours = rows_of(
         [1.0] * events + [0.0] * (40 - events), progress=[30.0 + k for k in range(40)]
     )
-    found = paired_differences(*ours, *ours, draws=100, realism_draws=2)
+    result = paired_differences(*ours, *ours, draws=100, realism_draws=2)
     u = exact_interval(0.0, 40)[1]
     assert [
-        found["cfr"][end] for end in ("low", "difference", "high")
+        result["cfr"][end] for end in ("low", "difference", "high")
     ] == pytest.approx([-u, 0.0, u])
-    assert [found["progress"][end] for end in ("low", "difference", "high")] == [
+    assert [result["progress"][end] for end in ("low", "difference", "high")] == [
         0.0,
         0.0,
         0.0,
@@ -262,9 +268,9 @@ def test_a_change_that_is_the_same_at_each_place_is_within_what_others_may_have(
     clusters = [index // 2 for index in range(40)]
     ours = rows_of([1.0, 1.0] * 20, clusters)
     theirs = rows_of([0.0, 1.0] * 20, clusters)
-    found = paired_differences(*ours, *theirs, draws=100, realism_draws=2)["cfr"]
+    result = paired_differences(*ours, *theirs, draws=100, realism_draws=2)["cfr"]
     u = exact_interval(0.0, 20)[1]
-    assert (found["low"], found["high"]) == pytest.approx(
+    assert (result["low"], result["high"]) == pytest.approx(
         (0.5 - 1.5 * u, 0.5 + 0.5 * u)
     )
     longer = paired_differences(
@@ -332,8 +338,8 @@ def test_a_paired_difference_uses_shared_scenes_and_is_narrower_than_unpaired_on
         < result["progress"]["high"]
         < 1.1
     )
-    own = brief(ours, features)["progress"]
-    assert own["high"] - own["low"] > 10 * (
+    mine = brief(ours, features)["progress"]
+    assert mine["high"] - mine["low"] > 10 * (
         result["progress"]["high"] - result["progress"]["low"]
     )
 

@@ -185,10 +185,10 @@ def test_who_is_struck_as_a_competent_driver_would_be_that_has_stood_is_not_at_f
     speed = torch.zeros(81)
     speed[26:] = 0.3 * torch.arange(1, 56)
     head_on = course(4.5 + 30 * 1.0, 0, heading=math.pi, speed=10.0)
-    found = row_of((track(speed)[0], head_on[1]), head_on)
-    assert found["cfr"] == 1
-    assert found["contact_type"] == "front"
-    assert found["at_fault"] == found["counted"] == 0
+    result = row_of((track(speed)[0], head_on[1]), head_on)
+    assert result["cfr"] == 1
+    assert result["contact_type"] == "front"
+    assert result["at_fault"] == result["counted"] == 0
 
 
 def test_against_every_lane_that_it_is_on_is_the_wrong_way():
@@ -220,8 +220,8 @@ def test_whoever_enters_the_ego_s_path_in_the_last_two_seconds_cuts_in_where_nob
     `off_until`."""
     states, valid = course(34.3, 0, heading=0, speed=0)
     states[:, 3], states[: off_until + 1, 1] = 5.0, 10.0
-    found = row_of(course(0, 0, heading=0, speed=10), (states, valid))
-    assert (found["contact_step"], found["contact_type"], found["at_fault"]) == (
+    result = row_of(course(0, 0, heading=0, speed=10), (states, valid))
+    assert (result["contact_step"], result["contact_type"], result["at_fault"]) == (
         30,
         "front",
         fault,
@@ -248,8 +248,8 @@ def test_a_partner_that_swerves_in_and_stops_is_not_the_ego_s_fault(moves_until,
     `moves_until`: 2 s, or less."""
     states, valid = course(34.3, 0, heading=0, speed=0)
     states[:27, 1], states[: moves_until + 1, 3] = 10.0, 5.0
-    found = row_of(course(0, 0, heading=0, speed=10), (states, valid))
-    assert (found["contact_step"], found["at_fault"], found["counted"]) == (
+    result = row_of(course(0, 0, heading=0, speed=10), (states, valid))
+    assert (result["contact_step"], result["at_fault"], result["counted"]) == (
         30,
         fault,
         fault,
@@ -261,10 +261,10 @@ def test_of_a_leader_that_has_just_stopped_only_what_a_driver_prevents_counts():
     for it or not."""
     for speed, preventable in ((10, 1), (13, 0)):
         stopping = drive(40, 0, 0, 4, accel=lambda t: -3.0 if t > 2.2 else 0.0)
-        found = row_of(
+        result = row_of(
             course(10 * 4.67 - speed * 4.67, 0, heading=0, speed=speed), stopping
         )
-        assert (found["at_fault"], found["preventable"], found["counted"]) == (
+        assert (result["at_fault"], result["preventable"], result["counted"]) == (
             0,
             preventable,
             preventable,
@@ -282,11 +282,11 @@ def test_what_stands_since_the_start_has_stood():
 
 @pytest.mark.parametrize(("speed", "preventable"), [(0.6, 1.0), (0.4, 0.0)])
 def test_an_ego_that_creeps_prevents_nothing_by_braking(speed, preventable):
-    found = row_of(
+    result = row_of(
         course(0, 0, heading=0, speed=speed), course(5.5, 0, heading=0, speed=0)
     )
-    assert found["preventable"] == preventable
-    assert found["counted"] == found["at_fault"] == 1
+    assert result["preventable"] == preventable
+    assert result["counted"] == result["at_fault"] == 1
 
 
 @pytest.mark.parametrize(
@@ -307,9 +307,9 @@ def test_an_ego_that_stands_across_a_lane_is_in_the_way_of_who_comes_along_it(
         "lane_points": line.to(rollouts.lane_points),
         "lane_index": torch.zeros(1, 41).to(rollouts.lane_index),
     }
-    found = score_rollouts(rollouts.replace(**extra))[0][0]
-    assert found["cfr"] == 1
-    assert found["at_fault"] == fault
+    result = score_rollouts(rollouts.replace(**extra))[0][0]
+    assert result["cfr"] == 1
+    assert result["at_fault"] == fault
 
 
 def test_a_failure_is_clean_if_it_is_preventable_and_nobody_else_did_wrong():
@@ -386,11 +386,11 @@ def test_who_runs_a_red_light_and_is_run_into_from_behind_is_not_at_fault():
 def two_way():
     """Lanes of a road: one along +x at y = 0, one along -x at y = 3.5."""
     x = torch.arange(-60.0, 120.0, 2.0, dtype=torch.float64)
-    there = torch.stack([x, torch.zeros_like(x)], -1)
+    place = torch.stack([x, torch.zeros_like(x)], -1)
     back = torch.stack([x.flip(0), torch.full_like(x, 3.5)], -1)
     index = torch.tensor([0, 1]).repeat_interleave(len(x))
     return {
-        "lane_points": torch.cat([there, back])[None],
+        "lane_points": torch.cat([place, back])[None],
         "lane_index": index[None],
         "lane_width": torch.full((1, 2), 3.5),
     }

@@ -161,11 +161,11 @@ class Witness(Straight):
         history = current_input.history
         layers = SemanticMapLayer
         ego, observation = history.current_state
-        seen = {
+        observed = {
             "index": current_input.iteration.index,
             "interval": history.sample_interval,
-            "times": [one.time_point.time_us for one in history.ego_states],
-            "egos": [state_of(one) for one in history.ego_states],
+            "times": [single.time_point.time_us for single in history.ego_states],
+            "egos": [state_of(single) for single in history.ego_states],
             "rear": [
                 *pose_of(ego.rear_axle),
                 ego.dynamic_car_state.rear_axle_velocity_2d.y,
@@ -176,12 +176,12 @@ class Witness(Straight):
                 ego.car_footprint.vehicle_parameters.width,
             ],
             "agents": {
-                one.track_token: agent_of(one)
-                for one in observation.tracked_objects.tracked_objects
+                single.track_token: agent_of(single)
+                for single in observation.tracked_objects.tracked_objects
             },
             "before": [
-                sorted(a.track_token for a in one.tracked_objects.tracked_objects)
-                for one in history.observations
+                sorted(a.track_token for a in single.tracked_objects.tracked_objects)
+                for single in history.observations
             ],
         }
         if current_input.iteration.index == 0:
@@ -193,39 +193,41 @@ class Witness(Straight):
                     block or api.get_map_object(name, layers.ROADBLOCK_CONNECTOR)
                 )
             around = api.get_proximal_map_objects(ego.center, 1.0, LANES)
-            seen["on"] = [
+            observed["on"] = [
                 lane.id
                 for layer in LANES
                 for lane in api.get_all_map_objects(ego.center, layer)
             ]
-            seen["near"] = [lane.id for lanes in around.values() for lane in lanes]
-            seen["route"] = [
+            observed["near"] = [lane.id for lanes in around.values() for lane in lanes]
+            observed["route"] = [
                 [lane_of(lane) for lane in block.interior_edges] for block in blocks
             ]
-            seen["linked"] = [
+            observed["linked"] = [
                 after in block.outgoing_edges
                 for block, after in zip(blocks, blocks[1:])
             ]
-            seen["drivable"] = api.is_in_layer(ego.center, layers.DRIVABLE_AREA)
-            seen["aside"] = [
+            observed["drivable"] = api.is_in_layer(ego.center, layers.DRIVABLE_AREA)
+            observed["aside"] = [
                 aside_of(api, ego.center, 0.25 * k) for k in range(-40, 41)
             ]
-            seen["goal"] = pose_of(self.initialization.mission_goal)
-            seen["lights"] = [
+            observed["goal"] = pose_of(self.initialization.mission_goal)
+            observed["lights"] = [
                 [
-                    one.status.name,
-                    api.get_map_object(one.lane_connector_id, layers.LANE_CONNECTOR).id,
+                    single.status.name,
+                    api.get_map_object(
+                        single.lane_connector_id, layers.LANE_CONNECTOR
+                    ).id,
                 ]
-                for one in current_input.traffic_light_data
+                for single in current_input.traffic_light_data
             ]
         with Path(os.environ["E2RL_WITNESS"]).open("a") as file:
-            file.write(json.dumps(seen) + "\n")
+            file.write(json.dumps(observed) + "\n")
         return self.turning(ego)
 
     def turning(self, ego, rate=0.1):
         """An arc of the centre; the rear axle is where this vehicle's lies."""
         vehicle = ego.car_footprint.vehicle_parameters
-        found = []
+        result = []
         speed = ego.dynamic_car_state.center_velocity_2d.x
         for step in range(51):
             turn = rate * step / 10
@@ -239,12 +241,12 @@ class Witness(Straight):
             velocity = StateVector2D(speed, 0.0)
             zero = StateVector2D(0.0, 0.0)
             pose = StateSE2(x, y, heading)
-            found.append(
+            result.append(
                 EgoState.build_from_center(
                     pose, velocity, zero, 0.0, time, vehicle, angular_vel=rate
                 )
             )
-        return InterpolatedTrajectory(found)
+        return InterpolatedTrajectory(result)
 
 
 def pose_of(pose):
@@ -266,7 +268,7 @@ def aside_of(api, pose, aside):
     layers = ([SemanticMapLayer.DRIVABLE_AREA], LANES, [SemanticMapLayer.CARPARK_AREA])
     return [
         aside,
-        *(any(api.is_in_layer(point, layer) for layer in one) for one in layers),
+        *(any(api.is_in_layer(point, layer) for layer in single) for single in layers),
     ]
 
 

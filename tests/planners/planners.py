@@ -104,9 +104,9 @@ class SameLaw(Ego):
     def plan(self, world):
         mission = mission_of(world.scene)
         scene = world.scene
-        now = world.states
+        current = world.states
         actions = []
-        for row, there in enumerate(world.valid):
+        for row, place in enumerate(world.valid):
             route = torch.cat(
                 [mission.points[row], mission.limit[row, :, None]], 1
             ).tolist()
@@ -117,15 +117,17 @@ class SameLaw(Ego):
                     strict=True,
                 )
             )
-            agents = torch.cat([now[row], scene["size"][row], 0 * now[row]], 1)[
-                there
+            agents = torch.cat([current[row], scene["size"][row], 0 * current[row]], 1)[
+                place
             ].tolist()
             lights = scene["light_state"][row, world.step[row]].tolist()
-            known = (*scene["size"][row, 0].tolist(), route, lines)
-            actions.append(LAW(known, lights, [(0, 0, *agent[:8]) for agent in agents]))
+            certain = (*scene["size"][row, 0].tolist(), route, lines)
+            actions.append(
+                LAW(certain, lights, [(0, 0, *agent[:8]) for agent in agents])
+            )
         steps = self.replan_every
         held = dynamics.rollout(
-            now[:, 0], torch.tensor(actions)[:, None].expand(-1, steps, -1)
+            current[:, 0], torch.tensor(actions)[:, None].expand(-1, steps, -1)
         )
         plan = torch.cat([held, held.new_zeros(len(held), 50 - steps, 4)], 1)
         return continued(plan, torch.full((len(held),), steps))

@@ -130,19 +130,19 @@ def test_nothing_learned_accelerates_into_a_vehicle_that_is_followed_or_a_pedest
         for ego in (bounded, free):
             with torch.no_grad():
                 ego.network.network.trunk.last.bias[0] = push
-        found = [ego.decide(observation)[:, 0] for ego in (bounded, free)]
-        return *found, follow(observation)
+        result = [ego.decide(observation)[:, 0] for ego in (bounded, free)]
+        return *result, follow(observation)
 
     for scenes in (follows, walks):
-        own, unbound, reference = accelerations(scenes, 8.0)
+        ours, unbound, reference = accelerations(scenes, 8.0)
         assert (unbound > 4.9).all()
-        assert torch.allclose(own, reference[:, 2] + 0.5, atol=1e-3)
-        assert (own < -1.0).all()
-        own, unbound, reference = accelerations(scenes, -8.0)
-        assert torch.equal(own, unbound)
-        assert (own < reference[:, 0] - 0.5).all()
-    own, _, _ = accelerations(oncoming, 8.0)
-    assert (own > 4.9).all()
+        assert torch.allclose(ours, reference[:, 2] + 0.5, atol=1e-3)
+        assert (ours < -1.0).all()
+        ours, unbound, reference = accelerations(scenes, -8.0)
+        assert torch.equal(ours, unbound)
+        assert (ours < reference[:, 0] - 0.5).all()
+    ours, _, _ = accelerations(oncoming, 8.0)
+    assert (ours > 4.9).all()
 
 
 def test_with_room_ahead_the_reference_drives_and_without_it_the_network():
@@ -161,12 +161,12 @@ def test_with_room_ahead_the_reference_drives_and_without_it_the_network():
         observation[
             :, [names.index(f"manoeuvre.{accel}.+0.gap") for accel in ("-1", "+1")]
         ] = room / 3.0
-        (own, _), (network, _) = (
+        (ours, _), (network, _) = (
             ego.network.network(observation),
             alone.network.network(observation),
         )
         usual = ego.network.network.offset(observation)[:, :2]
-        torch.testing.assert_close(own, torch.lerp(usual, network, weight))
+        torch.testing.assert_close(ours, torch.lerp(usual, network, weight))
 
 
 def test_normaliser_equals_the_statistics_of_all_it_saw_and_is_frozen_otherwise():
@@ -209,10 +209,10 @@ def test_file_round_trip(tmp_path):
         checkpoint=str(tmp_path),
     )
     assert second.network.architecture == first.network.architecture
-    seen = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()
+    observed = DrivingEnv(make_scenes(2), SimSettings(), 2).reset()
     for ask in (
-        lambda ego: ego.decide(seen["observation"]),
-        lambda ego: ego.network.critic(seen)["state_value"].clone(),
+        lambda ego: ego.decide(observed["observation"]),
+        lambda ego: ego.network.critic(observed)["state_value"].clone(),
     ):
         assert torch.equal(ask(first), ask(second))
 

@@ -62,10 +62,10 @@ def test_a_moved_scene_gets_the_moved_candidates():
     make = {"num_scenes": 2, "num_vehicles": 9, "num_vrus": 3, "red_light_x": 70.0}
     shift = torch.tensor([40.0, -25.0])
     _, here = worlds(make_scenes(**make))
-    _, there = worlds(quarter_turn(make_scenes(**make), shift))
+    _, position = worlds(quarter_turn(make_scenes(**make), shift))
     ego = wild_ego()
     first = ego.candidates(here)
-    second = ego.candidates(there)
+    second = ego.candidates(position)
     x, y, heading, speed = first.states.unbind(-1)
     moved = torch.stack(
         [shift[0] - y, shift[1] + x, dynamics.wrap(heading + torch.pi / 2), speed], -1
@@ -83,7 +83,7 @@ def test_a_moved_scene_gets_the_moved_candidates():
         rtol=0,
     )
     torch.testing.assert_close(
-        ego.costs(there, second),
+        ego.costs(position, second),
         ego.costs(here, first),
         atol=0.5,
         rtol=1e-2,
@@ -92,15 +92,15 @@ def test_a_moved_scene_gets_the_moved_candidates():
 
 def test_a_file_gives_the_network_back_and_another_is_refused(tmp_path):
     network = wild_ego().network
-    seen = torch.randn(4, OBSERVATION_SIZE)
+    observed = torch.randn(4, OBSERVATION_SIZE)
     save_bits(network, tmp_path / "bits.safetensors", origin={"data": "made"})
     again = load_bits(str(tmp_path))
-    for one, other in zip(
-        network.goals(network.encode(seen)),
-        again.goals(again.encode(seen)),
+    for single, other in zip(
+        network.goals(network.encode(observed)),
+        again.goals(again.encode(observed)),
         strict=True,
     ):
-        assert torch.equal(one, other)
+        assert torch.equal(single, other)
         assert not other.requires_grad
     network.architecture["cells"] = 9
     save_bits(network, tmp_path / "bits.safetensors", origin={})

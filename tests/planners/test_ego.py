@@ -92,25 +92,25 @@ def test_what_a_policy_writes_as_its_plan_is_what_it_then_drives(kind, atol):
         2,
     )
     ego = kind(replan_every=5)
-    made = []
+    product = []
     plan = ego.plan
-    ego.plan = lambda world: made.append(plan(world)) or made[-1]
+    ego.plan = lambda world: product.append(plan(world)) or product[-1]
     data = env.rollout(30, EgoPolicy(ego, env))
-    told = data["ego", "plan"]
+    message = data["ego", "plan"]
     driven = data["next", "agents", "states"][:, :, 0]
-    assert len(made) == 6
-    assert told.shape[2] == PLAN_STEPS
+    assert len(product) == 6
+    assert message.shape[2] == PLAN_STEPS
     for step in range(30):
-        fresh = made[step // 5]
+        fresh = product[step // 5]
         age = step % 5
-        assert torch.equal(told[:, step, : PLAN_STEPS - age], fresh[:, age:])
+        assert torch.equal(message[:, step, : PLAN_STEPS - age], fresh[:, age:])
         assert torch.equal(
-            told[:, step, PLAN_STEPS - age :], fresh[:, -1:].expand(-1, age, -1)
+            message[:, step, PLAN_STEPS - age :], fresh[:, -1:].expand(-1, age, -1)
         ), "its end is held"
-    assert torch.allclose(driven, told[:, :, 0], atol=atol)
+    assert torch.allclose(driven, message[:, :, 0], atol=atol)
     for step in range(0, 30, 5):
         assert torch.allclose(
-            driven[:, step : step + 5], told[:, step, :5], atol=atol
+            driven[:, step : step + 5], message[:, step, :5], atol=atol
         ), "the interval that follows"
 
 
@@ -125,9 +125,9 @@ def test_a_reset_in_between_makes_a_new_plan_there():
     data = env.rollout(
         70, EgoPolicy(Cruise(replan_every=5), env), break_when_any_done=False
     )
-    done = data["next", "done"]
-    assert done.any()
-    assert not done.all(0).any()
+    process = data["next", "done"]
+    assert process.any()
+    assert not process.all(0).any()
     assert data["action"].abs().max() < 1e-3
 
 
@@ -290,17 +290,17 @@ class Meddler(Straight):
         self.told = []
 
     def plan(self, world):
-        told = {
+        message = {
             **world.scene,
             **{name: value for name, value in vars(world).items() if name != "scene"},
         }
         self.told.append(
             {
                 key: value if value is None else value.clone()
-                for key, value in told.items()
+                for key, value in message.items()
             }
         )
-        return self.meddle(super().plan(world), *told.values())
+        return self.meddle(super().plan(world), *message.values())
 
     def act(
         self,
@@ -308,8 +308,8 @@ class Meddler(Straight):
         observation,
         plan,
     ):
-        told = observation, plan, world.states, world.valid, *world.scene.values()
-        return self.meddle(super().act(world, observation, plan), *told)
+        message = observation, plan, world.states, world.valid, *world.scene.values()
+        return self.meddle(super().act(world, observation, plan), *message)
 
     def meddle(self, made, *told):
         for value in told:
@@ -348,7 +348,7 @@ def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic
         red_light_x=60.0,
         steps=40,
     )
-    told = []
+    message = []
     first.scenes["valid"][:, 2] = first.scenes["logged_valid"][:, :, 2] = False
     second = replace(first, scenes=first.scenes.clone())
     later = {
@@ -370,16 +370,16 @@ def test_two_recordings_with_one_present_tell_code_from_outside_the_same(traffic
             traffic=traffic,
             sim=SimSettings(),
         )
-        told.append(ego.told[:3])  # at steps 0, 5 and 10
+        message.append(ego.told[:3])  # at steps 0, 5 and 10
         ego.told = []
         world = worlds(scenes)[1]
         planned = world.states[:, :3, None].repeat(1, 1, HORIZON, 1)
         Lookahead(ego, replace(world, plan=planned))(torch.arange(2), planned)
-        told[-1] += ego.told
-    for one, other in zip(*told, strict=True):
-        assert len(told[0]) == 8
-        assert one.pop("plan") is one.pop("route") is None
-        assert not [key for key in one if not torch.equal(one[key], other[key])]
+        message[-1] += ego.told
+    for single, other in zip(*message, strict=True):
+        assert len(message[0]) == 8
+        assert single.pop("plan") is single.pop("route") is None
+        assert not [key for key in single if not torch.equal(single[key], other[key])]
 
 
 def test_an_action_that_no_vehicle_can_take_is_refused_by_its_row():

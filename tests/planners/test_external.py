@@ -44,11 +44,11 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
 def scene_set(count=4, **about):
     """Scenes with a slow leader; the ego of scene BAD is in the other lane, on its
     route."""
-    found = make_scenes(count, vehicles=ROAD, steps=12, **about)
-    found.scenes["start"][BAD : BAD + 1, 0, 1] = 3.5
-    found.scenes["logged"][BAD : BAD + 1, :, 0, 1] = 3.5
-    found.scenes["route_points"][BAD : BAD + 1, 0, :, :, 1] = 3.5
-    return found
+    result = make_scenes(count, vehicles=ROAD, steps=12, **about)
+    result.scenes["start"][BAD : BAD + 1, 0, 1] = 3.5
+    result.scenes["logged"][BAD : BAD + 1, :, 0, 1] = 3.5
+    result.scenes["route_points"][BAD : BAD + 1, 0, :, :, 1] = 3.5
+    return result
 
 
 def run(
@@ -321,9 +321,9 @@ def test_messages_hold_the_world_field_by_field():
     take = partial(_take, content, [32])
     assert take("3f", 1) == [(*scene["size"][0].tolist(), mission.end[1].item())]
     take("3f", points), take("if", 2)  # which the law reads
-    found = take("i2f", dots)
-    assert torch.tensor([dot[1:] for dot in found]).equal(scene["lane_points"])
-    assert [dot[0] for dot in found] == scene["lane_index"].tolist()
+    result = take("i2f", dots)
+    assert torch.tensor([dot[1:] for dot in result]).equal(scene["lane_points"])
+    assert [dot[0] for dot in result] == scene["lane_index"].tolist()
     exits = torch.cat(
         [
             scene["lane_left"][:, None],
@@ -367,20 +367,20 @@ def _take(
 ):
     """The next `count` records of a message; at: [position]."""
     size = count * struct.calcsize("<" + form)
-    found = list(struct.iter_unpack("<" + form, content[at[0] : at[0] + size]))
+    result = list(struct.iter_unpack("<" + form, content[at[0] : at[0] + size]))
     at[0] += size
-    return found
+    return result
 
 
 def test_what_cannot_be_is_named():
     fields = {"command": command_of().replace("external_planner", "cruise")}
-    for given, why in (
+    for inputs, why in (
         ({}, "give one of"),
         (fields, "before it listened"),
         ({"address": "unix:/no"}, "nothing listens"),
     ):
         with pytest.raises(InputError, match=why):
-            ExternalEgo(**given, start_timeout=1.0).plan(
+            ExternalEgo(**inputs, start_timeout=1.0).plan(
                 World.at_start(scene_set().scenes)
             )
 

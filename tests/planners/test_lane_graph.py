@@ -70,7 +70,7 @@ def test_hazard_equals_its_definition():
     scene = torch.tensor([0, 1, 1, 0, 1])
     size = torch.tensor([4.0, 2.0]).double().repeat(5, 1)
     ego_size = torch.tensor([4.5, 1.8]).double().repeat(2, 1)
-    found = collision_hazard(
+    result = collision_hazard(
         ego,
         ego_size,
         others=Prediction(poses, size, scene=scene),
@@ -89,7 +89,7 @@ def test_hazard_equals_its_definition():
             safe[scene[j]] *= torch.tanh(gap.clamp(min=0) * (0.3 + 0.02 * t)).clamp(
                 min=1e-6
             )
-    assert torch.allclose(found, -safe.log(), rtol=1e-3)
+    assert torch.allclose(result, -safe.log(), rtol=1e-3)
 
 
 def test_circles_lie_in_their_box():

@@ -126,37 +126,37 @@ def test_it_sees_the_ego_and_everybody_else_where_they_are(
         nuplan("--planner nuplan_planners:Witness", replan_every),
         traffic=LogReplay(),
     )
-    seen = written(tmp_path)
+    observed = written(tmp_path)
     states = rollouts.states[0]
-    assert [one["index"] for one in seen] == list(range(0, 80, replan_every))
-    for one in seen[:: 20 // replan_every]:
-        step = one["index"]
+    assert [single["index"] for single in observed] == list(range(0, 80, replan_every))
+    for single in observed[:: 20 // replan_every]:
+        step = single["index"]
         x, y, heading, speed = states[step, 0].tolist()
-        assert one["egos"][-1] == pytest.approx([x, y, heading, speed], abs=1e-4)
+        assert single["egos"][-1] == pytest.approx([x, y, heading, speed], abs=1e-4)
         back = (
             x - REAR * math.cos(heading),
             y - REAR * math.sin(heading),
             heading,
-            -REAR * one["yaw_rate"],
+            -REAR * single["yaw_rate"],
         )
-        assert one["rear"] == pytest.approx(back, abs=2e-3)
-        assert one["size"] == [
+        assert single["rear"] == pytest.approx(back, abs=2e-3)
+        assert single["size"] == [
             4.5,
             2.0,
         ]
         present = (rollouts.valid[0, step].nonzero()[:, 0].tolist())[1:]
-        assert set(one["agents"]) == {f"agent-{k}" for k in present}
+        assert set(single["agents"]) == {f"agent-{k}" for k in present}
         for k in present:
             x, y, heading, speed = states[step, k].tolist()
             size = scenes.scenes["size"][0, k].tolist()
             velocity = [speed * math.cos(heading), speed * math.sin(heading)]
-            assert one["agents"][f"agent-{k}"][:7] == pytest.approx(
+            assert single["agents"][f"agent-{k}"][:7] == pytest.approx(
                 [x, y, heading, *velocity, *size], abs=1e-4
             )
-            assert one["agents"][f"agent-{k}"][7] == (
+            assert single["agents"][f"agent-{k}"][7] == (
                 "PEDESTRIAN" if k >= 32 else "VEHICLE"
             )
-    assert seen[-1]["yaw_rate"] == pytest.approx(0.1, abs=0.01)
+    assert observed[-1]["yaw_rate"] == pytest.approx(0.1, abs=0.01)
 
 
 @pytest.mark.parametrize("replan_every", [1, 5])
@@ -174,12 +174,14 @@ def test_its_history_is_what_was_driven_and_before_that_steady(
         traffic=LogReplay(),
     ).states[0, :, 0]
     first, *_, last = written(tmp_path)
-    for one in (first, last):
-        assert len(one["egos"]) == len(one["before"]) == 21
-        assert one["interval"] == DT
+    for single in (first, last):
+        assert len(single["egos"]) == len(single["before"]) == 21
+        assert single["interval"] == DT
         assert {
             later - earlier
-            for earlier, later in zip(one["times"], one["times"][1:], strict=False)
+            for earlier, later in zip(
+                single["times"], single["times"][1:], strict=False
+            )
         } == {100_000}
     came = states[last["index"] - 20 : last["index"] + 1]
     tolerance = (
@@ -202,37 +204,42 @@ def written(folder):
 
 
 def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(bundled):
-    scenes, seen = bundled
+    scenes, observed = bundled
     mission = mission_of(scenes)
-    assert len(seen) == len(scenes) == 48
-    for row, one in enumerate(seen):
-        assert one["on"]
-        assert set(one["on"]) <= set(one["near"])
-        assert one["drivable"]
-        route = [lane["id"] for block in one["route"] for lane in block]
-        assert set(route) & set(one["near"]), row
-        assert all(one["linked"]), row
-        assert (torch.tensor(one["goal"][:2]) - mission.points[row]).norm(
+    assert len(observed) == len(scenes) == 48
+    for row, single in enumerate(observed):
+        assert single["on"]
+        assert set(single["on"]) <= set(single["near"])
+        assert single["drivable"]
+        route = [lane["id"] for block in single["route"] for lane in block]
+        assert set(route) & set(single["near"]), row
+        assert all(single["linked"]), row
+        assert (torch.tensor(single["goal"][:2]) - mission.points[row]).norm(
             dim=-1
         ).min() < 1e-3
-    limits = {lane["limit"] for one in seen for block in one["route"] for lane in block}
-    given = mission.limit[mission.limit > 0].unique().tolist()
+    limits = {
+        lane["limit"]
+        for single in observed
+        for block in single["route"]
+        for lane in block
+    }
+    inputs = mission.limit[mission.limit > 0].unique().tolist()
     assert limits - {None}
-    assert all(min(abs(limit - k) for k in given) < 1e-4 for limit in limits - {None})
+    assert all(min(abs(limit - k) for k in inputs) < 1e-4 for limit in limits - {None})
 
 
 def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(bundled):
-    scenes, seen = bundled
+    scenes, observed = bundled
     mission = mission_of(scenes)
     checked = 0
     for row, column in (mission.light >= 0).nonzero().tolist():
         light = int(mission.light[row, column])
         begin = scenes["light_points"][row, light].tolist()
         state = int(scenes["light_state"][row, 0, light])
-        status = {name: what for what, name in seen[row]["lights"]}
+        status = {name: content for content, name in observed[row]["lights"]}
         lanes = [
             lane
-            for block in seen[row]["route"]
+            for block in observed[row]["route"]
             for lane in block
             if math.dist(lane["begin"][:2], begin) < 0.5
         ]
@@ -244,8 +251,8 @@ def test_lights_of_the_route_are_those_of_the_lanes_that_begin_there(bundled):
 def test_lanes_side_by_side_are_a_roadblock(nuplan, tmp_path):
     scenes = make_scenes(1, limit=12.0)
     nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes.scenes))
-    (one,) = written(tmp_path)
-    (left, right), half = one["route"][0], LANE_WIDTH / 2
+    (single,) = written(tmp_path)
+    (left, right), half = single["route"][0], LANE_WIDTH / 2
     assert (left["id"], left["index"], left["right"], left["left"]) == (
         "1",
         1,
@@ -270,9 +277,9 @@ def test_the_road_reaches_as_far_beside_the_lanes_as_the_metrics_have_it(
 ):
     scenes = make_scenes(1)
     nuplan("--planner nuplan_planners:Witness").plan(World.at_start(scenes.scenes))
-    (one,) = written(tmp_path)
+    (single,) = written(tmp_path)
     border = -LANE_WIDTH / 2, 1.5 * LANE_WIDTH
-    for aside, drivable, lane, beside in one["aside"]:
+    for aside, drivable, lane, beside in single["aside"]:
         beyond = max(border[0] - aside, aside - border[1])  # m outside of the lanes
         if min(abs(beyond), abs(beyond - MARGIN), abs(aside - LANE_WIDTH / 2)) > 0.1:
             assert (drivable, lane, beside) == (

@@ -97,10 +97,10 @@ def test_a_slow_ego_brakes_as_hard_as_it_can_before_a_collision_that_is_near_a_f
         vehicles=[(0, 0, speed), (speed, 0, 0.0)],
         num_vrus=0,
     )
-    lost = EGO.plan(world)[0, :5, 3].diff() / DT
+    loss = EGO.plan(world)[0, :5, 3].diff() / DT
     torch.testing.assert_close(
-        lost,
-        torch.full_like(lost, -braking),
+        loss,
+        torch.full_like(loss, -braking),
         atol=0.05,
         rtol=0,
     )
@@ -186,12 +186,12 @@ def test_whom_it_touched_without_fault_it_may_touch_again():
 def others_at(place):
     """One vehicle of 4.8 x 2 m."""
     states = torch.tensor(place)[None, None, None]
-    there = torch.ones(1, 1, dtype=torch.bool)
+    position = torch.ones(1, 1, dtype=torch.bool)
     return Others(
         states=states,
         size=torch.tensor([[[4.8, 2.0]]]),
-        present=there,
-        objects=~there,
+        present=position,
+        objects=~position,
     )
 
 
@@ -267,8 +267,8 @@ def test_it_brakes_for_a_collision_within_two_seconds(monkeypatch, seconds, brak
         vehicles=[(0, 0, 4.0)],
         num_vrus=0,
     )
-    found = (torch.zeros(1, COUNT), torch.full((1, COUNT), seconds))
-    monkeypatch.setattr(pdm_closed, "score", lambda *_: found)
+    result = (torch.zeros(1, COUNT), torch.full((1, COUNT), seconds))
+    monkeypatch.setattr(pdm_closed, "score", lambda *_: result)
     accel = (EGO.plan(world)[0, 0, 3] - 4.0) / DT
     assert (accel.item() < -7.9) == brakes
 
@@ -361,7 +361,7 @@ def test_the_score_is_the_weighted_mean_of_its_terms():
     )
     states = dynamics.rollout(start[0].expand(3, 4), actions)[None]
     distance = states[0, :, SCORED_STEPS - 1, 0] - start[0, 0, 0]
-    found = score(world, states, others=none)[0][0]
+    result = score(world, states, others=none)[0][0]
     whole = PROGRESS + TIME_TO_COLLISION + COMFORT
     expected = (
         PROGRESS * distance / distance[0]
@@ -369,7 +369,7 @@ def test_the_score_is_the_weighted_mean_of_its_terms():
         + COMFORT * torch.tensor([1.0, 1.0, 0.0])
     )
     torch.testing.assert_close(
-        found,
+        result,
         expected / whole,
         atol=1e-4,
         rtol=0,
@@ -385,7 +385,7 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
     )
     ahead = scored_others(world)
     go = dynamics.rollout(world.states[:, 0], torch.zeros(1, 50, 2))[:, None]
-    found, collides = score(world, go, others=ahead)
+    result, collides = score(world, go, others=ahead)
     size = world.scene["size"][0, 0]
     first = (
         int(
@@ -401,7 +401,7 @@ def test_what_hits_somebody_or_leaves_the_road_scores_nothing():
         )
         + 1
     )
-    assert found.item() == 0
+    assert result.item() == 0
     assert collides.item() == pytest.approx(DT * first)
     turn = dynamics.rollout(
         world.states[:, 0], torch.tensor([0.0, -0.6]).expand(1, 50, 2)
@@ -420,14 +420,14 @@ def test_who_is_ahead_within_a_second_at_constant_velocity_costs_the_time_to_col
     ahead = scored_others(world)
     actions = torch.tensor([[-3.4, 0.0], [-8.0, 0.0]])[:, None].expand(2, 50, 2)
     states = dynamics.rollout(world.states[0, :1].expand(2, 4), actions)[None]
-    found, collides = score(world, states, others=ahead)
+    result, collides = score(world, states, others=ahead)
     late, early = states[0, :, SCORED_STEPS - 1, 0]
     expected = torch.stack(
         [late / late * PROGRESS + COMFORT, early / late * PROGRESS + TIME_TO_COLLISION]
     )
     assert collides.isinf().all()
     torch.testing.assert_close(
-        found[0],
+        result[0],
         expected / (PROGRESS + TIME_TO_COLLISION + COMFORT),
         atol=1e-4,
         rtol=0,

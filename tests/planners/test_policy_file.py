@@ -142,6 +142,6 @@ def test_the_same_rollouts(actor, tmp_path):
     assert torch.allclose(ego.decide(observation), expected, atol=1e-5)
     assert expected.std(0).min() > 0.05
     driven = drive(ego)
-    own = drive(actor)
-    assert torch.allclose(driven, own, atol=1e-3)
-    assert (own[-1, :, 0] - own[0, :, 0]).min() > 5
+    ours = drive(actor)
+    assert torch.allclose(driven, ours, atol=1e-3)
+    assert (ours[-1, :, 0] - ours[0, :, 0]).min() > 5

@@ -101,15 +101,15 @@ def test_the_order_of_the_agents_changes_nothing_and_each_of_them_counts():
         out=2,
         last_gain=1.0,
     )
-    seen = torch.randn(5, OBSERVATION_SIZE)
-    agents = seen[:, AGENTS].unflatten(1, (NEAREST, PER_AGENT))
-    shuffled = seen.clone()
-    out = trunk(seen)
+    observed = torch.randn(5, OBSERVATION_SIZE)
+    agents = observed[:, AGENTS].unflatten(1, (NEAREST, PER_AGENT))
+    shuffled = observed.clone()
+    out = trunk(observed)
     shuffled[:, AGENTS] = agents[:, torch.randperm(NEAREST)].flatten(1)
     assert out.shape == (5, 2)
     assert torch.allclose(trunk(shuffled), out, atol=1e-6)
     for slot in range(NEAREST):
-        moved = seen.clone()
+        moved = observed.clone()
         moved[
             :, AGENTS.start + slot * PER_AGENT : AGENTS.start + (slot + 1) * PER_AGENT
         ] += 3.0
@@ -118,15 +118,15 @@ def test_the_order_of_the_agents_changes_nothing_and_each_of_them_counts():
 
 def test_the_rest_of_the_scene_counts_and_a_last_layer_of_zeros_says_nothing():
     torch.manual_seed(0)
-    seen = torch.randn(OBSERVATION_SIZE, requires_grad=True)
+    observed = torch.randn(OBSERVATION_SIZE, requires_grad=True)
     (gradient,) = torch.autograd.grad(
         Trunk(
             (32,),
             8,
             out=1,
             last_gain=1.0,
-        )(seen).sum(),
-        seen,
+        )(observed).sum(),
+        observed,
     )
     assert (gradient[: AGENTS.start] != 0).all()
     assert (gradient[AGENTS.stop :] != 0).all()
@@ -136,7 +136,7 @@ def test_the_rest_of_the_scene_counts_and_a_last_layer_of_zeros_says_nothing():
             8,
             out=2,
             last_gain=0.0,
-        )(seen),
+        )(observed),
         torch.zeros(2),
     )
 
@@ -144,11 +144,11 @@ def test_the_rest_of_the_scene_counts_and_a_last_layer_of_zeros_says_nothing():
 def test_the_gradient_of_the_largest_is_shared_among_equals():
     values = torch.randint(3, (4, 5, 6), dtype=torch.float32).requires_grad_()
     weight = torch.randn(4, 6)
-    (own,), (other,) = (
+    (ours,), (other,) = (
         torch.autograd.grad((f(values) * weight).sum(), values)
         for f in (Largest.apply, lambda x: x.amax(1))
     )
-    torch.testing.assert_close(own, other)
+    torch.testing.assert_close(ours, other)
 
 
 @pytest.mark.parametrize(("speed", "reach"), [(1.0, 6.0), (10.0, 15.0), (30.0, 30.0)])

@@ -40,7 +40,7 @@ def run(
 def test_vehicles_may_be_listed_in_any_order():
     net, (x, level, nodes, pairs, present) = small_prior().denoiser, inputs()
     order = torch.tensor([3, 0, 5, 1, 4, 2])
-    there = run(
+    place = run(
         net,
         x[:, order],
         level=level[:, order],
@@ -49,7 +49,7 @@ def test_vehicles_may_be_listed_in_any_order():
         present=present[:, order],
     )
     torch.testing.assert_close(
-        there,
+        place,
         run(
             net,
             x,
@@ -79,7 +79,7 @@ def test_absent_vehicles_do_not_influence_the_others():
     pairs = pairs.clone()
     x[hidden], nodes[hidden] = 50.0, -9.0
     pairs[hidden[:, None, :].expand(pairs.shape[:3])] = 7.0
-    there = run(
+    place = run(
         net,
         x,
         level=level,
@@ -88,7 +88,7 @@ def test_absent_vehicles_do_not_influence_the_others():
         present=present,
     )
     torch.testing.assert_close(
-        there[present],
+        place[present],
         here[present],
         rtol=0,
         atol=0,

@@ -51,17 +51,17 @@ def features(scene, step=None):
 def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
     scene = curved_scenes()
     here = features(scene)[kind]
-    there = features(mirrored(scene))[kind]
+    place = features(mirrored(scene))[kind]
     sign = torch.ones(here.shape[-1])
     sign[list(sided)] = -1
     torch.testing.assert_close(
-        there,
+        place,
         here * sign,
         rtol=0,
         atol=2e-3,
     )
     flipping = (
-        ((here - there).abs() > 5e-3).flatten(0, -2).any(0).nonzero()[:, 0].tolist()
+        ((here - place).abs() > 5e-3).flatten(0, -2).any(0).nonzero()[:, 0].tolist()
     )
     assert set(flipping) == set(sided), (
         "every listed feature is looked at by this scene"
@@ -70,7 +70,7 @@ def test_a_mirror_flips_exactly_the_sided_features(kind, sided):
 
 def test_features_do_not_know_where_the_scene_lies():
     scene = curved_scenes()
-    for here, there in zip(
+    for here, place in zip(
         features(scene),
         features(
             moved(
@@ -83,7 +83,7 @@ def test_features_do_not_know_where_the_scene_lies():
         strict=True,
     ):
         torch.testing.assert_close(
-            there,
+            place,
             here,
             rtol=0,
             atol=5e-3,
@@ -95,9 +95,9 @@ def test_only_estimates_look_at_the_past():
     changed = scene.clone()
     changed["past"] = changed["past"] + 0.3 * torch.arange(1, 11)[:, None]
     first = torch.zeros(1, dtype=torch.long)
-    now = torch.full((1,), 5)
+    current = torch.full((1,), 5)
     assert not torch.equal(features(scene)[0], features(changed)[0])
-    assert torch.equal(features(scene, now)[0], features(changed, now)[0])
+    assert torch.equal(features(scene, current)[0], features(changed, current)[0])
     alone = features(scene, first)[0][
         0, 0, 51:61
     ]  # 8 m/s now, 0.4 m/s^2 less and less before

@@ -72,17 +72,17 @@ def test_fitting_a_decoded_plan_gives_it_back():
     )
     plan = decode(x, state)
     wrapped = torch.remainder(plan.heading + torch.pi, 2 * torch.pi) - torch.pi
-    found = fit(
+    result = fit(
         wrapped,
         torch.ones_like(plan.heading),
         state=state,
         knots=x[:, :KNOTS],
     )
-    again = decode(torch.cat([x[:, :KNOTS], found], 1), state)
+    again = decode(torch.cat([x[:, :KNOTS], result], 1), state)
     gap = torch.hypot(again.x - plan.x, again.y - plan.y)
     assert gap.max() < 0.1
     torch.testing.assert_close(
-        found,
+        result,
         x[:, KNOTS:],
         rtol=0,
         atol=0.15,
@@ -132,7 +132,7 @@ def test_fitted_knots_are_those_of_the_ridge():
     """Weighted by 0.001, of a turn that the first steps know, in which knots matter
     little."""
     state = start(torch.full((1,), 8.0), torch.zeros(1), heading=torch.zeros(1))
-    known = (torch.arange(HORIZON) < 6).float()[None]
+    certain = (torch.arange(HORIZON) < 6).float()[None]
     units = []
     for number in (KNOTS, KNOTS + 1):
         x = torch.zeros(1, SIZE)
@@ -144,7 +144,7 @@ def test_fitted_knots_are_those_of_the_ridge():
     heading = torch.full((1, HORIZON), 0.02)
     lateral = fit(
         heading,
-        known,
+        certain,
         state=state,
         knots=torch.zeros(1, KNOTS),
     )

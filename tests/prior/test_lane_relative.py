@@ -217,10 +217,10 @@ def test_fitting_a_decoded_plan_gives_it_back(generator):
     ).cumsum(1)
     x = torch.cat([knots.clamp(-1.5, 3), torch.randn(COUNT, 2, generator=generator)], 1)
     plan = decode(x, state, points=points)
-    found, error = fit(plan, torch.ones_like(plan.s), state=state)
+    result, error = fit(plan, torch.ones_like(plan.s), state=state)
     assert error.max() < 0.1
     torch.testing.assert_close(
-        found[:, :KNOTS],
+        result[:, :KNOTS],
         x[:, :KNOTS],
         rtol=0,
         atol=0.15,
@@ -228,7 +228,7 @@ def test_fitting_a_decoded_plan_gives_it_back(generator):
     # The ridge pulls lateral knots towards 0; the offsets they stand for are met within
     # centimetres.
     torch.testing.assert_close(
-        decode(found, state, points=points).d,
+        decode(result, state, points=points).d,
         plan.d,
         rtol=0,
         atol=0.08,
@@ -239,13 +239,13 @@ def test_unknown_steps_do_not_influence_a_fit(generator):
     points = routes()
     state = random_state(points, generator)
     plan = decode(torch.randn(COUNT, SIZE, generator=generator), state, points=points)
-    known = torch.ones_like(plan.s)
-    known[:, 20:] = 0
-    other = plan.map(lambda value: torch.where(known > 0, value, -77.0))
-    for one, two in zip(
-        fit(plan, known, state=state), fit(other, known, state=state), strict=True
+    certain = torch.ones_like(plan.s)
+    certain[:, 20:] = 0
+    other = plan.map(lambda value: torch.where(certain > 0, value, -77.0))
+    for single, two in zip(
+        fit(plan, certain, state=state), fit(other, certain, state=state), strict=True
     ):
-        torch.testing.assert_close(one, two)
+        torch.testing.assert_close(single, two)
 
 
 def test_travelled_distance_is_the_integral_of_speed(generator):
@@ -392,9 +392,9 @@ def test_fitted_accelerations_are_those_of_the_ridge(steps):
             curvature=0,
         )[None],
     )
-    known = (torch.arange(HORIZON) < steps).float()[None]
-    knots = fit(track, known, state)[0][0, :KNOTS]
-    expected = ridge_fit(track, known, state)
+    certain = (torch.arange(HORIZON) < steps).float()[None]
+    knots = fit(track, certain, state)[0][0, :KNOTS]
+    expected = ridge_fit(track, certain, state)
     torch.testing.assert_close(
         knots.double(),
         expected,
@@ -414,8 +414,8 @@ def test_fitted_lateral_knots_are_those_of_the_ridge():
     )[None]
     track = decode(torch.zeros(1, SIZE), state, route)
     track.d = torch.full_like(track.d, 2.0)
-    known = torch.zeros(1, HORIZON)
-    known[:, 20:25] = 1.0
+    certain = torch.zeros(1, HORIZON)
+    certain[:, 20:25] = 1.0
     units = []
     for number in (KNOTS, KNOTS + 1):
         x = torch.zeros(1, SIZE)
@@ -424,7 +424,7 @@ def test_fitted_lateral_knots_are_those_of_the_ridge():
     rows = torch.stack(units, -1).double()
     gram = rows.T @ rows + torch.diag(torch.tensor([0.05, 0.02])).double()
     expected = torch.linalg.solve(gram, (2.0 * rows).sum(0))
-    lateral = fit(track, known, state)[0][0, KNOTS:]
+    lateral = fit(track, certain, state)[0][0, KNOTS:]
     torch.testing.assert_close(
         lateral.double(),
         expected,

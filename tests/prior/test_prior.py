@@ -75,7 +75,7 @@ def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
         noise[k, k + 1] = 1.0  # scene 0 has no noise: the mean
 
     def paths(shift):
-        seen = []
+        observed = []
 
         def control(
             x,
@@ -84,12 +84,12 @@ def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
             context,
             denoise,
         ):
-            seen.append(x[:, 0, 0])
+            observed.append(x[:, 0, 0])
             x0 = denoise(x)
             return x, x0, x0 + shift
 
         kl = prior.sample(None, noise, control).kl
-        return torch.stack(seen, -1).double(), kl
+        return torch.stack(observed, -1).double(), kl
 
     (free, none), (pushed, kl) = paths(0.0), paths(push)
     mix = (free[1:] - free[:1]).T
@@ -155,7 +155,7 @@ def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
 def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
     prior = gaussian_prior(steps=6)
     noise = torch.randn(6, 2, 1, SIZE, generator=torch.Generator().manual_seed(0))
-    seen = []
+    observed = []
 
     def control(
         x,
@@ -164,13 +164,13 @@ def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
         context,
         denoise,
     ):
-        seen.append(x)
+        observed.append(x)
         x0 = denoise(x)
         return x, x0, x0 + 0.5
 
     free = prior.sample(None, noise, control).kl[:, 0]
     budget = torch.stack([0.4 * free[0], 2 * free[1]])
-    seen.clear()
+    observed.clear()
     sample = prior.sample(None, noise, control, budget)
     torch.testing.assert_close(
         sample.kl[:, 0],
@@ -179,9 +179,11 @@ def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
         atol=0,
     )
     last = prior.sampler.levels(prior.schedule)[5]
-    x = seen[-1][:1]  # the last step is the prior's own where the budget is spent
+    x = observed[-1][:1]  # the last step is the prior's own where the budget is spent
     torch.testing.assert_close(sample.x0[:1], prior.denoise(x, last, None))
-    assert (sample.x0[1] - prior.denoise(seen[-1][1:], last, None)[0]).abs().min() > 0.4
+    assert (
+        sample.x0[1] - prior.denoise(observed[-1][1:], last, None)[0]
+    ).abs().min() > 0.4
 
 
 def test_the_ego_s_row_is_its_plan_in_every_estimate():
@@ -367,38 +369,42 @@ def test_what_is_known_of_the_moment_changes_no_context(moved):
     before = context_of(prior, scene)
     state = replace(before.state, s=before.state.s + 7.0 * moved)
     world = World.at_start(scene)
-    known = prior.encode(before.routed, state, world, known=before)
+    certain = prior.encode(before.routed, state, world, known=before)
     anew = prior.encode(before.routed, state, world)
-    assert torch.equal(known.encoding.nodes, anew.encoding.nodes)
+    assert torch.equal(certain.encoding.nodes, anew.encoding.nodes)
     assert all(
-        torch.equal(one, other)
-        for one, other in zip(known.followed, anew.followed, strict=True)
+        torch.equal(single, other)
+        for single, other in zip(certain.followed, anew.followed, strict=True)
     )
-    assert (known.followed is before.followed) == (not moved)
+    assert (certain.followed is before.followed) == (not moved)
 
 
 def test_without_a_plan_the_ego_is_sampled_like_everybody_else():
     prior = small_prior()
     scene = curved_scenes(2)
-    known = context_of(prior, scene)
-    unknown = prior.encode(known.routed, known.state, World.at_start(scene))
-    one, two = (
+    certain = context_of(prior, scene)
+    unknown = prior.encode(certain.routed, certain.state, World.at_start(scene))
+    single, two = (
         prior.sample(unknown, noise_for(prior, scene, seed=seed)).x0[:, 0]
         for seed in (0, 1)
     )
-    assert (one - two).abs().amin() > 0
+    assert (single - two).abs().amin() > 0
 
 
 def test_the_network_sees_the_ego_s_plan_nearly_noise_free(monkeypatch):
     scene = curved_scenes()
     prior = small_prior()
     context = context_of(prior, scene)
-    seen = []
+    observed = []
     monkeypatch.setattr(
-        prior.denoiser, "forward", lambda x, level, encoding: seen.append(level) or x
+        prior.denoiser,
+        "forward",
+        lambda x, level, encoding: observed.append(level) or x,
     )
     prior.denoise(noise_for(prior, scene)[0], torch.tensor(0.7), context)
-    assert seen[0][0].tolist() == pytest.approx([0.01] + [0.7] * (seen[0].shape[1] - 1))
+    assert observed[0][0].tolist() == pytest.approx(
+        [0.01] + [0.7] * (observed[0].shape[1] - 1)
+    )
 
 
 @pytest.mark.parametrize(

@@ -287,8 +287,8 @@ def test_the_first_step_and_a_constant_estimate_are_ddim_s():
     before = torch.tensor(0.8)
     expected = SAMPLERS["ddim"](SCHEDULE).step(x, x0, high, low, noise)
     for past in (None, (x0, before)):
-        found = SAMPLERS["dpm_solver_pp"](SCHEDULE).step(x, x0, high, low, noise, past)
-        torch.testing.assert_close(found, expected)
+        result = SAMPLERS["dpm_solver_pp"](SCHEDULE).step(x, x0, high, low, noise, past)
+        torch.testing.assert_close(result, expected)
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)

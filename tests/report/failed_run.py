@@ -20,10 +20,10 @@ def planned(rollouts: Rollouts) -> Rollouts:
     """The rollouts with straight plans of everybody, adversaries that aim at the ego,
     and an evasion of the ego."""
     replans = torch.arange(0, rollouts.states.shape[1] - 1, 5)
-    now = rollouts.states[:, replans].nan_to_num()
-    ahead = torch.stack([now[..., 2:3].cos(), now[..., 2:3].sin()], -1)
-    distance = now[..., 3:] * 0.5 * torch.arange(1, 11)
-    rollouts.plans = now[..., None, :2] + distance[..., None] * ahead
+    current = rollouts.states[:, replans].nan_to_num()
+    ahead = torch.stack([current[..., 2:3].cos(), current[..., 2:3].sin()], -1)
+    distance = current[..., 3:] * 0.5 * torch.arange(1, 11)
+    rollouts.plans = current[..., None, :2] + distance[..., None] * ahead
     rollouts.targets = torch.where(rollouts.adversaries, 0, -1)[:, None].expand(
         -1, len(replans), -1
     )

@@ -207,8 +207,8 @@ def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
     for lines in (
         *answers,
         *(
-            compared_answer(pairs, pairs, atlases=each, folder=tmp_path)
-            for each in (None, (ways, ways))
+            compared_answer(pairs, pairs, atlases=item, folder=tmp_path)
+            for item in (None, (ways, ways))
         ),
     ):
         assert len(lines) <= LINES
@@ -219,8 +219,8 @@ def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
 def test_preventable_failures_decide_then_clean_ones_then_those_that_count():
     rates = {"hits": 0.75, "clean": 0.5, "same": 0.5, "few": 0.25}
     rows = [row(name, 1.0, cfr=cfr) for name, cfr in rates.items()]
-    for each, preventable, clean in zip(rows, (1, 4, 4, 3), (1, 2, 1, 3), strict=True):
-        each["metrics"] |= {
+    for item, preventable, clean in zip(rows, (1, 4, 4, 3), (1, 2, 1, 3), strict=True):
+        item["metrics"] |= {
             "cfr_preventable": value(preventable / 12),
             "cfr_clean": value(clean / 12),
         }
@@ -271,11 +271,11 @@ def test_a_search_is_told_by_its_scenes_and_none_of_its_tries_rates():
 
 
 def test_nominal_failures_are_not_among_those_of_an_attack():
-    found = modes_of(
+    result = modes_of(
         mode(1, "rear", count=4, counted=1, nominal=3),
         mode(2, "oncoming", count=0, counted=0, nominal=5),
     )
-    text = " ".join(answer_lines([row(cfr=8 / 12), row("e2", 2.0, cfr=4 / 12)], found))
+    text = " ".join(answer_lines([row(cfr=8 / 12), row("e2", 2.0, cfr=4 / 12)], result))
     assert "rear (4 of 4 failures, 1 count)" in text
     assert "oncoming" not in text
 
@@ -288,10 +288,10 @@ def test_nominal_failures_are_not_among_those_of_an_attack():
     ],
 )
 def test_what_counts_is_not_denied(other, said):
-    found = modes_of(
+    result = modes_of(
         mode(1, "rear", count=4, counted=0), mode(0, "other", count=5, counted=other)
     )
-    assert said in " ".join(answer_lines([row("e2", 2.0, cfr=9 / 12)], found))
+    assert said in " ".join(answer_lines([row("e2", 2.0, cfr=9 / 12)], result))
 
 
 def test_rollouts_in_which_the_planner_raised_are_failures_and_named():
@@ -355,8 +355,8 @@ def test_people_touched_are_told_and_named_where_there_is_no_page(report):
 def test_people_touched_before_or_after_training_have_a_row():
     old = row("e2", 2.0)
     new = row("e2", 2.0)
-    for each, rate in ((old, 0.25), (new, 0.0)):
-        each["metrics"] |= {"cfr_vru": value(rate), "cfr_object": value(0.0)}
+    for item, rate in ((old, 0.25), (new, 0.0)):
+        item["metrics"] |= {"cfr_vru": value(rate), "cfr_object": value(0.0)}
     lines = compared_answer([old], [new])
     (line,) = [line for line in lines if line.startswith("people touched")]
     assert "25% (3 of 12)" in line

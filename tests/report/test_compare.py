@@ -34,16 +34,16 @@ def runs(tmp_path_factory):
         rollouts.states[index] = other[index].where(
             rollouts.valid[index][..., None], rollouts.states[index]
         )
-    found = []
+    result = []
     for name, rollouts in (("one", first), ("two", second)):
         rollouts.seed[:] = 0
         rollouts.ego_policy = [name] * len(rollouts)
         write_run(folder / name, {"e2": rollouts})
-        kept = (folder / name / "rollouts.csv").read_text()
+        rest = (folder / name / "rollouts.csv").read_text()
         run_of(folder / name, [])
-        (folder / name / "rollouts.csv").write_text(kept)
-        found.append(folder / name)
-    return found
+        (folder / name / "rollouts.csv").write_text(rest)
+        result.append(folder / name)
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -128,13 +128,13 @@ def test_without_rollout_files_the_pairs_are_still_told(runs, tmp_path):
 
 
 def test_the_command_needs_two_and_a_page(runs, capsys):
-    one, two = map(str, runs)
-    for given, said in (
-        ([one], "give two runs, or one with"),
-        ([one, two, "--out", "x.json"], "ends in .html"),
+    single, two = map(str, runs)
+    for inputs, said in (
+        ([single], "give two runs, or one with"),
+        ([single, two, "--out", "x.json"], "ends in .html"),
     ):
         with pytest.raises(SystemExit) as end:
-            main(given)
+            main(inputs)
         assert end.value.code == 2
         assert said in capsys.readouterr().err
 
@@ -166,8 +166,8 @@ def test_one_clock_moves_both_replays(made, chromium, width, height):  # noqa: F
     chromium.find_element("id", "play").click()
     time = chromium.execute_script(STEP)
     assert all(
-        one != other
-        for one, other in zip(begin, chromium.execute_script(pictures), strict=True)
+        single != other
+        for single, other in zip(begin, chromium.execute_script(pictures), strict=True)
     )
     clocks = [
         node.text.split()[0]

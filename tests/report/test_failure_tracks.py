@@ -30,13 +30,13 @@ def decoded(text: str) -> np.ndarray:
 def replays_of(rollouts):
     """[(rollout, its row, its replay)] of the failures among rollouts."""
     rows = score_rollouts(rollouts)[0]
-    found = [
+    result = [
         Failure(rollouts.rollout(index), row)
         for index, row in enumerate(rows)
         if row["cfr"] == 1
     ]
     return [
-        (failure.rollout, failure.row, failure_replay(failure)) for failure in found
+        (failure.rollout, failure.row, failure_replay(failure)) for failure in result
     ]
 
 
@@ -59,9 +59,9 @@ def track_of(replay, role) -> int:
 
 
 def test_everybody_is_where_the_rollout_has_them():
-    found = replays_of(random_rollouts(8, seed=21))
-    assert len(found) > 2
-    for rollout, row, replay in found:
+    result = replays_of(random_rollouts(8, seed=21))
+    assert len(result) > 2
+    for rollout, row, replay in result:
         motion = motion_of(replay)
         steps = motion["x"].shape[1]
         assert steps == min(int(row["contact_step"]) + AFTER + 1, len(rollout.states))
@@ -69,9 +69,9 @@ def test_everybody_is_where_the_rollout_has_them():
         present = rollout.valid[:steps, agents].T
         np.testing.assert_array_equal(motion["present"][: len(agents)], present)
         for index, name in enumerate(("x", "y")):
-            there = rollout.states[:steps, agents, index].T
+            place = rollout.states[:steps, agents, index].T
             np.testing.assert_allclose(
-                motion[name][: len(agents)][present], there[present], atol=0.0051
+                motion[name][: len(agents)][present], place[present], atol=0.0051
             )
         turn = motion["heading"][: len(agents)] - rollout.states[:steps, agents, 2].T
         assert np.abs(np.sin(turn / 2)[present]).max() < 0.001
@@ -109,17 +109,17 @@ def test_plans_and_the_evasion_are_those_of_the_file():
         atol=0.0051,
     )
     agents = np.flatnonzero(rollout.valid[:steps].any(0))
-    known = np.isin(rollout.planners, agents)
-    assert agents[plans["agents"]].tolist() == rollout.planners[known].tolist()
+    certain = np.isin(rollout.planners, agents)
+    assert agents[plans["agents"]].tolist() == rollout.planners[certain].tolist()
     points = (
-        decoded(plans["points"]).reshape(known.sum(), -1, 2, 10).cumsum(-1).cumsum(-1)
+        decoded(plans["points"]).reshape(certain.sum(), -1, 2, 10).cumsum(-1).cumsum(-1)
         * CHANNELS["x"]
     )
     np.testing.assert_allclose(
-        points.transpose(1, 0, 3, 2), rollout.plans[:, known], atol=0.0051
+        points.transpose(1, 0, 3, 2), rollout.plans[:, certain], atol=0.0051
     )
     assert (
-        decoded(plans["targets"]).reshape(known.sum(), -1)[1:]
+        decoded(plans["targets"]).reshape(certain.sum(), -1)[1:]
         == track_of(replay, "ego")
     ).all()
 

@@ -19,7 +19,7 @@ from tests.evaluation.constructed_runs import row_of, run_of
 def gate(capsys, *arguments):
     """Status and what is said."""
     with pytest.raises(SystemExit) as end:
-        main([str(each) for each in arguments])
+        main([str(item) for item in arguments])
     said = capsys.readouterr()
     return end.value.code, said.out + said.err
 
@@ -113,8 +113,8 @@ def test_the_interval_decides_and_a_failure_outweighs_doubt(
     tmp_path, capsys, rules, status
 ):
     """40 of 100 places: the interval is about 0.31 to 0.50."""
-    found, said = gate(capsys, run_with(tmp_path, 100, hits=40), *rules)
-    assert found == status
+    result, said = gate(capsys, run_with(tmp_path, 100, hits=40), *rules)
+    assert result == status
     assert len(said.splitlines()) == len(rules)
     assert all(rule in said for rule in rules)
 
@@ -180,8 +180,8 @@ def test_a_planner_that_has_not_changed_is_within_what_its_places_exclude(
 ):
     """No place of 80 differs: at most 4.5% do."""
     run = run_with(tmp_path, 80, hits=24)
-    found, said = gate(capsys, run, rule, "--against", run)
-    assert found == status
+    result, said = gate(capsys, run, rule, "--against", run)
+    assert result == status
     assert ("[-4.5, +4.5] points" in said) == ("progress" not in rule)
 
 
@@ -263,7 +263,7 @@ def test_the_files_for_continuous_integration_hold_what_was_decided(tmp_path, ca
         "error",
     ]
     results = json.loads(files[1].read_text())
-    assert [each["outcome"] for each in results] == [
+    assert [item["outcome"] for item in results] == [
         "passed",
         "failed",
         "not enough rollouts",
@@ -271,10 +271,10 @@ def test_the_files_for_continuous_integration_hold_what_was_decided(tmp_path, ca
     assert (
         [case.get("name") for case in suite]
         == rules
-        == [each["rule"] for each in results]
+        == [item["rule"] for item in results]
     )
     assert all(
-        each["value"] == 0.4 and each["low"] < 0.4 < each["high"] for each in results
+        item["value"] == 0.4 and item["low"] < 0.4 < item["high"] for item in results
     )
 
 
@@ -304,7 +304,7 @@ def test_a_planner_that_raises_fails_whatever_is_gated(tmp_path, capsys, rule, s
     driven = [row_of(k, progress=30.0 + k % 7) for k in range(40)]
     assert gate(capsys, run_of(tmp_path / "driven", driven), rule)[0] == 0
     run = run_of(tmp_path / "raised", driven + [errored(40 + k) for k in range(40)])
-    found, said = gate(
+    outcome, said = gate(
         capsys,
         run,
         rule,
@@ -313,7 +313,7 @@ def test_a_planner_that_raises_fails_whatever_is_gated(tmp_path, capsys, rule, s
         "--junit",
         tmp_path / "gate.xml",
     )
-    assert found == status
+    assert outcome == status
     assert "in 40 of them the planner raised" in said
     texts = (
         said,
@@ -353,10 +353,10 @@ def test_at_few_places_a_planner_that_raises_in_every_scene_fails(
         for k in range(3)
         for seed in (0, 1)
     ]
-    found, said = gate(capsys, run_of(tmp_path, rows), rule)
+    result, said = gate(capsys, run_of(tmp_path, rows), rule)
     alone = f"in {2 * crashed} of them the planner raised: these alone break the "
     alone += f"limit, in {crashed} of 3 scenes"
-    assert found == status
+    assert result == status
     assert (alone in said) == (status == 1 or rule == "contacts<=0.05")
     assert said.startswith("failed" if status == 1 else "not enough rollouts")
 
@@ -368,8 +368,8 @@ def test_where_all_places_are_alike_the_exact_interval_decides(
     """One of two rollouts at each of 12 places: of 12, none, so at most 26%, is
     otherwise, and then 0 or 1."""
     rows = [errored(k) if seed else row_of(k) for k in range(12) for seed in (0, 1)]
-    found, said = gate(capsys, run_of(tmp_path, rows), f"contacts<={limit}")
-    assert found == status
+    result, said = gate(capsys, run_of(tmp_path, rows), f"contacts<={limit}")
+    assert result == status
     assert "found 50.0 [36.8, 63.2] %" in said
 
 

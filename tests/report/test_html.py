@@ -131,21 +131,21 @@ def test_the_first_lines_say_what_the_tables_say(tmp_path):
     data = data_of(write_report(run).read_text())
     head = data["tables"][0]["head"]
     lines = {line[0]: line for line in data["tables"][0]["rows"]}
-    found = 0
+    result = 0
     for group in data["groups"]:
         for name, text in group["rates"].items():
             hits, of, rate, *interval = map(
                 float, re.findall(r"[\d.]+", text.replace("95% interval", ""))
             )
-            cell, _, known = lines[f"{name} [%]"][head.index(group["label"])].partition(
-                " ("
-            )
+            cell, _, certain = lines[f"{name} [%]"][
+                head.index(group["label"])
+            ].partition(" (")
             mean, *bounds = map(float, re.findall(r"[\d.]+", cell))
-            found += len(bounds) == 2
-            assert of == float(known.strip(")") or group["rollouts"])
+            result += len(bounds) == 2
+            assert of == float(certain.strip(")") or group["rollouts"])
             assert hits / of == pytest.approx(mean / 100, abs=5.1e-4)
             assert [rate, *interval] == pytest.approx([mean, *bounds], abs=0.51)
-    assert found >= 3
+    assert result >= 3
     assert len(data["groups"]) == 2
 
 
@@ -167,17 +167,17 @@ def test_a_training_has_a_page_for_what_it_measured(tmp_path, capsys):
 
 
 def test_a_limit_and_a_method_keep_their_own(run, tmp_path):
-    one = data_of(
+    single = data_of(
         write_report(
             run, replays=1, methods=["e2"], path=tmp_path / "one.html"
         ).read_text()
     )
     assert (
-        {entry["method"] for entry in one["failures"]}
-        == {group["method"] for group in one["groups"]}
+        {entry["method"] for entry in single["failures"]}
+        == {group["method"] for group in single["groups"]}
         == {"e2"}
     )
-    assert len(one["replays"]) == 1
+    assert len(single["replays"]) == 1
 
 
 def test_the_page_knows_the_atlas_and_replays_its_likeliest_failures_first(tmp_path):
@@ -188,20 +188,20 @@ def test_the_page_knows_the_atlas_and_replays_its_likeliest_failures_first(tmp_p
     typical = sum(entry["typical"] for entry in entries)
     for method in (None, "e2", "planned"):
         ours = [k for k, row in enumerate(rows) if method in (None, row["method"])]
-        found = {}
+        result = {}
         for k in sorted(ours, key=lambda k: entries[k]["rank"]):
-            found.setdefault(
+            result.setdefault(
                 tuple(data["cells"][entries[k]["cell"]][name] for name in CELL), k
             )
         atlas = atlas_of([rows[k] for k in ours])
         assert len(atlas) == 3
-        assert list(found) == list(atlas)
-        assert [rows[k] for k in found.values()] == [
+        assert list(result) == list(atlas)
+        assert [rows[k] for k in result.values()] == [
             failures[0] for failures in atlas.values()
         ]
         first = replay_order(entries)[: typical + 6]
         assert all(entries[k]["typical"] for k in first[:typical])
-        assert set(found.values()) <= set(first)
+        assert set(result.values()) <= set(first)
 
 
 def test_the_page_loads_nothing_and_files_cannot_add_markup(page):

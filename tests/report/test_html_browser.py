@@ -114,13 +114,13 @@ def choose(browser, label: str, starts: str) -> None:
     """Choose, in the select of this label, what begins so."""
     labels = browser.find_elements("css selector", "#scope label, #filters label")
     node = next(
-        each
-        for each in labels
-        if each.text.splitlines() and each.text.splitlines()[0].strip() == label
+        item
+        for item in labels
+        if item.text.splitlines() and item.text.splitlines()[0].strip() == label
     )
     select = support.Select(node.find_element("tag name", "select"))
     select.select_by_visible_text(
-        next(each.text for each in select.options if each.text.startswith(starts))
+        next(item.text for item in select.options if item.text.startswith(starts))
     )
 
 
@@ -149,9 +149,9 @@ def test_the_browser_decodes_what_the_files_hold(run, page):
                 ("y", 1, 0.01),
                 ("speed", 3, 0.01),
             ):
-                found = np.array(track[name])[present]
+                result = np.array(track[name])[present]
                 assert (
-                    np.abs(found - rollout.states[:steps, agent, index][present]).max()
+                    np.abs(result - rollout.states[:steps, agent, index][present]).max()
                     < 0.51 * quantum + 1e-5
                 )
 
@@ -216,8 +216,8 @@ def test_the_atlas_shows_the_likeliest_failure_of_a_cell_in_its_scope(
                 failures[0]["scene_id"],
                 failures[0]["seed"],
             )
-            pressed = [each.get_attribute("aria-pressed") for each in buttons]
-            assert pressed == [str(each == button).lower() for each in buttons]
+            pressed = [item.get_attribute("aria-pressed") for item in buttons]
+            assert pressed == [str(item == button).lower() for item in buttons]
     assert chromium.get_log("browser") == []
 
 
@@ -259,9 +259,9 @@ def test_the_first_lines_are_of_one_traffic_and_others_can_be_chosen(run, page):
         rows = [
             row for row in read_rows(run / TABLE) if row["method"] == (method or "e2")
         ]
-        known = [row["cfr"] for row in rows if row["cfr"] == row["cfr"]]
+        certain = [row["cfr"] for row in rows if row["cfr"] == row["cfr"]]
         assert (
-            f"hit in {sum(known):.0f} of {len(known)} rollouts"
+            f"hit in {sum(certain):.0f} of {len(certain)} rollouts"
             in page.find_element("id", "summary").text
         )
         assert len(rows_of(page)) == len(
@@ -285,12 +285,12 @@ def test_failures_of_a_scene_stand_together_whatever_the_traffic(run, page):
     assert len(scenes) == len(names) == len(under)
     assert sum(map(len, under.values())) == len(failures_of(run))
     for name in names:
-        own = [row for row in failures_of(run) if row["scene_id"] == name]
+        ours = [row for row in failures_of(run) if row["scene_id"] == name]
         (head,) = [
-            text for text in scenes if text.startswith(f"{name}: {len(own)} failure")
+            text for text in scenes if text.startswith(f"{name}: {len(ours)} failure")
         ]
-        assert len(under[head]) == len(own)
-        assert all(row["method"] in head for row in own)
+        assert len(under[head]) == len(ours)
+        assert all(row["method"] in head for row in ours)
     assert any("e2 η=2, planned η=2" in text for text in scenes)
 
 

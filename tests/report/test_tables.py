@@ -21,9 +21,9 @@ def rows_of(*drawn, rollouts=6, draws=50, **options):
     rows = []
     samples = []
     for number_, (method, ego, eta) in enumerate(drawn):
-        found, features = score_rollouts(random_rollouts(rollouts, seed=3 + number_))
+        result, features = score_rollouts(random_rollouts(rollouts, seed=3 + number_))
         rows += [
-            row | {"method": method, "ego_policy": ego, "eta": eta} for row in found
+            row | {"method": method, "ego_policy": ego, "eta": eta} for row in result
         ]
         samples += features
     return metric_rows(rows, samples, draws=draws, realism_draws=5, **options)
@@ -53,8 +53,8 @@ def test_what_rests_on_fewer_rollouts_says_so(rows):
     means, _ = metric_tables(rows)
     (cells,) = (row[1:] for row in means.rows if row[0].startswith("relvel ["))
     for cell, row in zip(cells, rows, strict=True):
-        known = row["metrics"]["relvel"]["n"]
-        assert cell.endswith(f"({known})") if known else cell == "–"
+        certain = row["metrics"]["relvel"]["n"]
+        assert cell.endswith(f"({certain})") if certain else cell == "–"
 
 
 def test_numbers_keep_three_digits():
@@ -98,8 +98,8 @@ def test_differences_are_paired_to_each_reference(methods):
         ["replay η=2", "–", "–"],
     ]
     cfr = differences.head.index("cfr [points]")
-    there, back = (differences.rows[place][cfr].split(" ")[0] for place in (1, 2))
-    assert float(there) == -float(back) != 0
+    position, back = (differences.rows[place][cfr].split(" ")[0] for place in (1, 2))
+    assert float(position) == -float(back) != 0
     pairs = [(row[0], row[3]) for row in differences.rows]
     assert pairs == [
         ("ctg_adv η=2", "e2"),

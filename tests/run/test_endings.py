@@ -122,7 +122,7 @@ def test_a_disk_or_memory_that_is_full_ends_in_one_line_with_how_to_go_on(
 
 
 def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):
-    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    before = [signal.getsignal(item) for item in (signal.SIGINT, signal.SIGTERM)]
     with pytest.raises(SystemExit) as stopped, ending(lambda: "run x again"):
         raise InputError("x=3: no")
     assert stopped.value.code == 2
@@ -131,7 +131,7 @@ def test_bad_input_ends_with_its_message_and_other_errors_pass(capsys):
         with pytest.raises(type(error)), ending(lambda: "run x again"):
             raise error
     assert [
-        signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)
+        signal.getsignal(item) for item in (signal.SIGINT, signal.SIGTERM)
     ] == before
 
 
@@ -177,13 +177,13 @@ def test_an_output_that_nobody_reads_is_told_from_others(
 ):
     script = f"import time\nfrom e2rl.run.endings import ending\nwith ending(lambda: 'again'): {code}"
     command = f'set -o pipefail; "$0" -c "$1" {redirection}'
-    done = subprocess.run(
+    process = subprocess.run(
         ["bash", "-c", command, sys.executable, script],
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert done.returncode == status
-    assert done.stderr.strip().splitlines()[-1:] == ([reason] if reason else [])
+    assert process.returncode == status
+    assert process.stderr.strip().splitlines()[-1:] == ([reason] if reason else [])
 
 
 @pytest.mark.parametrize(
@@ -206,8 +206,10 @@ def test_an_interrupt_that_a_library_turns_into_an_error_of_its_own_is_one(
             ) from error
     signal.signal(number, before)
     assert stopped.value.code == status
-    told = f"interrupted ({number.name}); go on with: python evaluate.py 'a=$(touch x)'"
-    assert capsys.readouterr().err.strip() == told
+    message = (
+        f"interrupted ({number.name}); go on with: python evaluate.py 'a=$(touch x)'"
+    )
+    assert capsys.readouterr().err.strip() == message
 
 
 @pytest.mark.parametrize(
@@ -231,9 +233,9 @@ def test_what_ends_a_command_before_it_begins_is_one_line(code, status, told):
             resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
     command = [sys.executable, "-c", f"import e2rl.commands.cli; {code}"]
-    done = subprocess.run(
+    process = subprocess.run(
         command, stderr=subprocess.PIPE, text=True, preexec_fn=heed, timeout=60
     )
-    assert done.returncode == status
-    assert done.stderr.strip().count("\n") == 0
-    assert told in done.stderr
+    assert process.returncode == status
+    assert process.stderr.strip().count("\n") == 0
+    assert told in process.stderr

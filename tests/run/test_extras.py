@@ -44,10 +44,10 @@ def test_a_library_that_is_missing_is_told_with_its_extra(monkeypatch):
 
 
 def test_every_extra_that_the_code_names_is_one():
-    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+    certain = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]
-    assert all(how_to_install(extra) for extra in known)
+    assert all(how_to_install(extra) for extra in certain)
     for path in (ROOT / "e2rl").rglob("*.py"):
         assert "e2rl[" not in path.read_text(), (
             f"{path}: names an installation that only some have"

@@ -167,9 +167,9 @@ def test_standard_output_is_written_in_turn_whatever_it_is(tmp_path, into):
             subprocess.run(command, stdout=file, check=True, timeout=60)
         said = (tmp_path / "out").read_bytes()
     else:
-        here, there = socket.socketpair()
-        with here, there:
-            subprocess.run(command, stdout=there, check=True, timeout=60)
+        here, place = socket.socketpair()
+        with here, place:
+            subprocess.run(command, stdout=place, check=True, timeout=60)
             said = here.recv(1000)
     assert said == b"before\ncontent\nafter\n"
 
@@ -195,7 +195,7 @@ def test_what_is_no_file_is_refused_by_its_name_and_stays(tmp_path, kind):
         write_atomically(path, "new")
     assert refused.value.filename == str(path)
     assert path.lstat() == before
-    assert [each.name for each in tmp_path.iterdir()] == ["target"]
+    assert [item.name for item in tmp_path.iterdir()] == ["target"]
 
 
 def test_what_comes_beside_a_file_follows_no_link_out_of_its_folder(tmp_path):

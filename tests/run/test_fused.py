@@ -54,14 +54,14 @@ def test_compiled_it_gives_what_it_gives_eagerly_for_every_size(on, batch, count
     arguments = given(batch, count)
     across(*arguments)  # compiles it, which calls the function
     calls.clear()
-    found = across(*arguments)
+    result = across(*arguments)
     assert not calls, "the function itself was called"
-    for one, other in zip(found, across.function(*arguments), strict=True):
-        assert torch.allclose(one, other, atol=1e-6)
-    assert isinstance(found, Line)
+    for single, other in zip(result, across.function(*arguments), strict=True):
+        assert torch.allclose(single, other, atol=1e-6)
+    assert isinstance(result, Line)
     assert across.file.exists()
     views = arguments[0].transpose(0, 1).contiguous().transpose(0, 1), *arguments[1:]
-    assert torch.equal(across(*views).offset, found.offset), (
+    assert torch.equal(across(*views).offset, result.offset), (
         "it depends on how a tensor lies in memory"
     )
 
@@ -84,11 +84,11 @@ def test_compiled_it_gives_what_it_gives_eagerly_for_every_size(on, batch, count
 def test_what_is_not_as_declared_runs_as_it_is(on, change):
     arguments = change(*given(4, 3))
     calls.clear()
-    found = across(*arguments)
+    result = across(*arguments)
     assert calls == [len(arguments[0])]
     assert all(
-        torch.equal(one, other)
-        for one, other in zip(found, across.function(*arguments), strict=True)
+        torch.equal(single, other)
+        for single, other in zip(result, across.function(*arguments), strict=True)
     )
 
 

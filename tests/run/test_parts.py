@@ -31,8 +31,8 @@ def computes(parts, name="a", identity=(1,), **options):
 def file(tmp_path):
     """The file of a part."""
     assert computes(Parts(tmp_path))
-    (found,) = tmp_path.rglob("*.pt")
-    return found
+    (result,) = tmp_path.rglob("*.pt")
+    return result
 
 
 def test_a_part_is_computed_once_and_read_as_it_was(tmp_path, file, monkeypatch):

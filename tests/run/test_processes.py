@@ -15,11 +15,11 @@ def square(job):
 
 
 def test_results_keep_the_order_of_the_jobs_whoever_does_them():
-    found = list(in_processes(square, range(7), processes=3, cost=float))
-    assert [result["value"][0].item() for result in found] == [
+    outcome = list(in_processes(square, range(7), processes=3, cost=float))
+    assert [result["value"][0].item() for result in outcome] == [
         float(k**2) for k in range(7)
     ]
-    assert os.getpid() not in {result["process"] for result in found}
+    assert os.getpid() not in {result["process"] for result in outcome}
 
 
 @pytest.mark.parametrize(("jobs", "processes"), [(range(3), 1), ([5], 4)])

@@ -25,9 +25,9 @@ SCENES = {"scenes": ("scene_id\na\n", "abc")}
 
 
 def begin(folder, resume=False, scenes=SCENES, free=("processes",), **changes):
-    given = {"resume": str(folder) if resume else None}
+    arguments = {"resume": str(folder) if resume else None}
     run = Run(
-        OmegaConf.merge(load_config("evaluate"), given, changes),
+        OmegaConf.merge(load_config("evaluate"), arguments, changes),
         folder,
         choices={"ego": "lane_graph"},
         free=free,
@@ -45,7 +45,7 @@ def weights(tmp_path):
 def test_the_same_run_goes_on(tmp_path, weights):
     run = begin(tmp_path, prior={"checkpoint": str(weights)})
     Parts(run.folder).save("a", [], 1)
-    begun = (tmp_path / PROVENANCE).read_bytes()
+    start = (tmp_path / PROVENANCE).read_bytes()
     again = begin(
         tmp_path,
         resume=True,
@@ -53,7 +53,7 @@ def test_the_same_run_goes_on(tmp_path, weights):
         processes=3,
         plugins=["json"],
     )
-    assert (tmp_path / PROVENANCE).read_bytes() == begun
+    assert (tmp_path / PROVENANCE).read_bytes() == start
     assert Parts(again.folder).load("a", []) == 1
     assert OmegaConf.load(tmp_path / CONFIG) == run.config
     assert (tmp_path / "scenes.csv").read_text() == SCENES["scenes"][0]
@@ -117,8 +117,8 @@ def test_of_a_run_s_folder_the_newest_whole_checkpoint_is_hashed(tmp_path):
 
 def test_other_code_is_told_and_named_in_the_rows(tmp_path, monkeypatch, capsys):
     command = origin_of(begin(tmp_path).folder)["command"]
-    now = runs.versions(load_config("evaluate")) | {"git": "abc", "e2rl": "123"}
-    monkeypatch.setattr(runs, "versions", lambda config: now)
+    current = runs.versions(load_config("evaluate")) | {"git": "abc", "e2rl": "123"}
+    monkeypatch.setattr(runs, "versions", lambda config: current)
     for _ in range(2):
         begin(tmp_path, resume=True)
     assert "other versions than before (e2rl, git)" in capsys.readouterr().err
@@ -140,9 +140,9 @@ def test_a_damaged_file_is_named(tmp_path, content):
 def test_a_new_run_begins_in_an_empty_folder(tmp_path, name):
     """Logs may be there, and what was left where a run was killed as it began."""
     config = load_config("evaluate")
-    for own in ("job.log", "job.err", str(CONFIG), "scenes.csv"):
-        (tmp_path / own).parent.mkdir(exist_ok=True)
-        (tmp_path / own).write_text("")
+    for ours in ("job.log", "job.err", str(CONFIG), "scenes.csv"):
+        (tmp_path / ours).parent.mkdir(exist_ok=True)
+        (tmp_path / ours).write_text("")
         Run(config, tmp_path, choices={}).enter()
     (tmp_path / CONFIG).unlink()
     (tmp_path / CONFIG).parent.rmdir()
@@ -184,9 +184,9 @@ def test_a_run_that_is_refused_leaves_everything_as_it_was(
 def test_runs_that_begin_in_one_second_have_a_folder_each(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with ThreadPoolExecutor(8) as pool:
-        made = list(pool.map(new_folder, ["runs/x"] * 40))
-    assert len(set(made)) == 40
-    assert all(not list((tmp_path / name).iterdir()) for name in made)
+        built = list(pool.map(new_folder, ["runs/x"] * 40))
+    assert len(set(built)) == 40
+    assert all(not list((tmp_path / name).iterdir()) for name in built)
     (tmp_path / "file").touch()
     assert new_folder("file/x").startswith("file/x/"), (
         "Hydra says that it cannot be made"
@@ -221,7 +221,7 @@ def test_shards_are_joined_and_those_of_another_run_are_refused(tmp_path):
 
 def test_the_files_of_a_search_s_families_are_inputs_of_a_run_that_searches():
     searched, plain = (
-        {name for name, _ in inputs(load_config("evaluate", [given]))}
-        for given in ("tries=4", "tries=1")
+        {name for name, _ in inputs(load_config("evaluate", [arguments]))}
+        for arguments in ("tries=4", "tries=1")
     )
     assert {"synthesizer=ccdiff", "synthesizer=e2_pursuit"} <= searched - plain

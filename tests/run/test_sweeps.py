@@ -66,16 +66,18 @@ def test_a_sweep_goes_on_after_a_job_that_is_refused(tmp_path, values, status):
         f"batch={values}",
         f"hydra.sweep.dir={tmp_path / 'sweep'}",
     ]
-    done = subprocess.run(
+    process = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     names = values.split(",")
-    assert done.returncode == status, done.stderr
-    did = [line for line in done.stdout.splitlines() if line.startswith("did")]
+    assert process.returncode == status, process.stderr
+    did = [line for line in process.stdout.splitlines() if line.startswith("did")]
     assert did == [f"did {name}" for name in names if name != "2"]
     summary = f"error: 1 of {len(names)} jobs of the sweep were refused: batch=2"
-    assert (done.stderr.strip().splitlines() or [""])[-1] == (summary if status else "")
-    assert done.stderr.count("batch=2: refused") == (status > 0)
+    assert (process.stderr.strip().splitlines() or [""])[-1] == (
+        summary if status else ""
+    )
+    assert process.stderr.count("batch=2: refused") == (status > 0)
 
 
 def test_a_job_alone_that_is_refused_says_so_once(tmp_path):
@@ -86,8 +88,8 @@ def test_a_job_alone_that_is_refused_says_so_once(tmp_path):
         "batch=2",
         f"hydra.run.dir={tmp_path / 'run'}",
     ]
-    done = subprocess.run(
+    process = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=120
     )
-    assert done.returncode == 2
-    assert done.stderr == "error: batch=2: refused\n"
+    assert process.returncode == 2
+    assert process.stderr == "error: batch=2: refused\n"

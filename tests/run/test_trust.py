@@ -64,8 +64,8 @@ def test_a_run_of_a_version_without_an_option_that_is_off_goes_on(tmp_path):
 @pytest.mark.parametrize("group", ["learner", "ego", "curriculum", "synthesizer"])
 def test_every_file_of_ones_own_goes_on(tmp_path, group):
     for name in set(choices(group)) - {"class", "external", "nuplan", "policy_file"}:
-        own = changed(TRAIN, with_choice(group, name))
-        assert reading(tmp_path, own, config=TRAIN) == own, name
+        ours = changed(TRAIN, with_choice(group, name))
+        assert reading(tmp_path, ours, config=TRAIN) == ours, name
 
 
 @pytest.mark.parametrize(

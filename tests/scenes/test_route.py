@@ -171,16 +171,16 @@ def test_a_track_is_followed_across_the_crossing_of_a_loop(begin):
 
 def test_a_gap_in_a_track_is_no_jump_and_what_does_not_jump_is_projected():
     states = track(loop(), 20.0, speed=25.0)
-    known = torch.ones(1, 81, dtype=torch.bool)
-    known[0, 30:40] = False
-    points = torch.where(known[0, :, None], states[:, :2], 0.0)[None]
+    certain = torch.ones(1, 81, dtype=torch.bool)
+    certain[0, 30:40] = False
+    points = torch.where(certain[0, :, None], states[:, :2], 0.0)[None]
     s = project_track(
         points,
         loop()[None],
-        known=known,
+        known=certain,
         start=20.0,
     )[0][0]
-    assert (s - 20 - 2.5 * torch.arange(81))[known[0]].abs().max() < 0.6
+    assert (s - 20 - 2.5 * torch.arange(81))[certain[0]].abs().max() < 0.6
     short = states[None, :8, :2]
     assert torch.equal(
         project_track(short, loop()[None])[0], project(short, loop()[None])[0]

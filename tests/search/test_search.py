@@ -27,18 +27,20 @@ def told(search, rounds, hopeless=()):
     for _ in range(rounds):
         tries = search.ask()
         outcomes = []
-        for one in tries:
+        for single in tries:
             luck = torch.rand(
                 (),
                 generator=torch.Generator().manual_seed(
-                    hash((one.scene, one.seed)) % 2**31
+                    hash((single.scene, single.seed)) % 2**31
                 ),
             ).item()
-            fails = luck < CHANCE[one.family] and one.scene not in hopeless
-            margin = PREVENTED if fails else -25.0 if one.scene in hopeless else -2.0
+            fails = luck < CHANCE[single.family] and single.scene not in hopeless
+            margin = PREVENTED if fails else -25.0 if single.scene in hopeless else -2.0
             outcomes.append(
                 Outcome(
-                    margin, f"cell {one.scene} {one.number}" if fails else "", nfe=100.0
+                    margin,
+                    f"cell {single.scene} {single.number}" if fails else "",
+                    nfe=100.0,
                 )
             )
         search.tell(tries, outcomes)
@@ -46,7 +48,7 @@ def told(search, rounds, hopeless=()):
 
 
 def tries_of(search):
-    return [one for scene in search.tries for one in scene]
+    return [single for scene in search.tries for single in scene]
 
 
 def test_the_same_answers_lead_to_the_same_questions():
@@ -60,12 +62,14 @@ def test_every_scene_is_tried_before_any_is_tried_more():
 
 
 def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_them_all():
-    many = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
-    CHANCE.update({family.name: 0.0 for family in many})
-    search = search_of(scenes=5, settings=replace(PLAIN, cover=7), families=many)
+    several = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
+    CHANCE.update({family.name: 0.0 for family in several})
+    search = search_of(scenes=5, settings=replace(PLAIN, cover=7), families=several)
     first = search.ask()
     assert (
-        len({(one.scene, one.family) for one in first}) == len(first) == ROUND + 1
+        len({(single.scene, single.family) for single in first})
+        == len(first)
+        == ROUND + 1
     )  # five of each of five scenes
     search.tell(first, [Outcome(-2.0, "", nfe=100.0)] * len(first))
     assert {len(tries) for tries in told(search, 1).tries} == {7}
@@ -73,16 +77,19 @@ def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_
 
 
 def test_rounds_grow_with_the_tries_so_far():
-    many = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
-    CHANCE.update({family.name: 0.0 for family in many})
+    several = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
+    CHANCE.update({family.name: 0.0 for family in several})
     search = told(
-        search_of(settings=replace(PLAIN, growth=0.5), families=many), PLAIN.cover + 1
+        search_of(settings=replace(PLAIN, growth=0.5), families=several),
+        PLAIN.cover + 1,
     )
     for _ in range(4):
-        asked = search.ask()
-        assert len(asked) == min(max(40, len(tries_of(search)) // 2), 40 * 12 // 4)
-        assert len({(one.scene, one.family) for one in asked}) == len(asked)
-        search.tell(asked, [Outcome(-2.0, "", nfe=100.0)] * len(asked))
+        requests = search.ask()
+        assert len(requests) == min(max(40, len(tries_of(search)) // 2), 40 * 12 // 4)
+        assert len({(single.scene, single.family) for single in requests}) == len(
+            requests
+        )
+        search.tell(requests, [Outcome(-2.0, "", nfe=100.0)] * len(requests))
     assert len(search.ask()) == 120
 
 
@@ -94,12 +101,12 @@ def test_a_family_that_nearly_finds_is_tried_more():
         for _ in range(15):
             tries = search.ask()
             outcomes = [
-                Outcome(margin if one.family == "near" else -2.0, "", nfe=100.0)
-                for one in tries
+                Outcome(margin if single.family == "near" else -2.0, "", nfe=100.0)
+                for single in tries
             ]
             search.tell(tries, outcomes)
         tries = tries_of(search)
-        return sum(one.family == "near" for one in tries) / len(tries)
+        return sum(single.family == "near" for single in tries) / len(tries)
 
     assert share(margin=0.9) > 1.4 * share(margin=-2.0)
 
@@ -107,7 +114,8 @@ def test_a_family_that_nearly_finds_is_tried_more():
 def test_tries_go_to_the_family_that_finds_and_not_to_hopeless_scenes():
     search = told(search_of(), 20, hopeless=range(20))
     counts = {
-        name: sum(one.family == name for one in tries_of(search)) for name in CHANCE
+        name: sum(single.family == name for single in tries_of(search))
+        for name in CHANCE
     }
     assert counts["good"] > 2 * counts["poor"]
     assert counts["good"] > 2 * counts["idle"]
@@ -142,7 +150,10 @@ def crashing(scenes, rounds=30):
         tries = search.ask()
         search.tell(
             tries,
-            [Outcome(-2.0, "", nfe=100.0, raised=one.scene in scenes) for one in tries],
+            [
+                Outcome(-2.0, "", nfe=100.0, raised=single.scene in scenes)
+                for single in tries
+            ],
         )
     return search
 

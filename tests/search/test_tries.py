@@ -19,20 +19,20 @@ def drawn(count, family=TIMED, seed=7):
 def test_a_try_is_reproducible_from_its_seed_and_number():
     assert drawn(5) == drawn(5)
     assert drawn(5) != drawn(5, seed=8)
-    assert len({one.seed for one in drawn(50)}) == 50
+    assert len({single.seed for single in drawn(50)}) == 50
 
 
 def test_decisions_lie_in_their_range_and_others_follow_the_rule():
-    for one in drawn(50):
-        found = Decisions(*one.decisions)
-        assert 1 <= found.moment <= 5
-        assert 0.5 <= found.strength <= 1.5
-        assert found._replace(moment=RULE.moment, strength=RULE.strength) == RULE
+    for single in drawn(50):
+        result = Decisions(*single.decisions)
+        assert 1 <= result.moment <= 5
+        assert 0.5 <= result.strength <= 1.5
+        assert result._replace(moment=RULE.moment, strength=RULE.strength) == RULE
 
 
 def test_a_family_without_ranges_is_the_rule():
     assert [
-        one.decisions for one in drawn(3, family=Family("rule", "e2", ranges={}))
+        single.decisions for single in drawn(3, family=Family("rule", "e2", ranges={}))
     ] == [RULE] * 3
 
 
@@ -50,7 +50,7 @@ def test_tries_look_elsewhere_than_those_before_of_whatever_family():
             drawn(10, family=family, seed=seed)[position::2]
             for position, family in enumerate((TIMED, other))
         ]
-        return [Decisions(*one.decisions).moment for one in sum(tries, [])]
+        return [Decisions(*single.decisions).moment for single in sum(tries, [])]
 
     draw = Random(0)
     independent = [[draw.uniform(1.0, 5.0) for _ in range(10)] for _ in range(40)]
@@ -61,14 +61,14 @@ def test_tries_look_elsewhere_than_those_before_of_whatever_family():
 
 
 def test_a_family_is_read_from_its_configuration():
-    given = {
+    inputs = {
         "whom": "crossing",
         "patience": [1, 3],
         "chance": 0.3,
         "method": "e2_pursuit",
         "changes": {"reselect": 1},
     }
-    family = family_of("crossing", given, where="search.families")
+    family = family_of("crossing", inputs, where="search.families")
     assert (family.method, family.chance, family.changes) == (
         "e2_pursuit",
         0.3,

@@ -135,10 +135,10 @@ def test_turns_respect_curvature_and_lateral_acceleration():
     states = torch.cat([start[:, None], dynamics.rollout(start, 10 * actions)], 1)
     rate = dynamics.wrap(states[:, 1:, 2] - states[:, :-1, 2]).abs() / DT
     speed = (states[:, 1:, 3] + states[:, :-1, 3]) / 2
-    asked = (10 * actions[..., 1]).abs()
+    requests = (10 * actions[..., 1]).abs()
     allowed = torch.minimum(MAX_CURVATURE * speed, MAX_LATERAL / speed.clamp(min=1e-3))
-    torch.testing.assert_close(rate, torch.minimum(asked, allowed))
-    assert (asked < allowed).any()
+    torch.testing.assert_close(rate, torch.minimum(requests, allowed))
+    assert (requests < allowed).any()
     assert (speed > 6).any()
     assert (speed < 4).any(), "by steering lock, grip, or neither"
 
@@ -165,18 +165,18 @@ def test_gradients_flow(horizon):
 def test_the_curvature_that_is_expected_of_a_turn():
     rate = torch.tensor([0.5, -0.3, 0.05, 2.0])
     speed = torch.tensor([10.0, 6.0, 0.2, 5.0])
-    found = dynamics.curvature_of(rate, speed)
-    torch.testing.assert_close(found, torch.tensor([0.05, -0.05, 0.05, 0.12]))
+    result = dynamics.curvature_of(rate, speed)
+    torch.testing.assert_close(result, torch.tensor([0.05, -0.05, 0.05, 0.12]))
 
 
 def test_constant_velocity_is_a_rollout_without_actions():
     start, _ = random_case()
     actions = torch.zeros(len(start), 20, 2, dtype=torch.float64)
     times = DT * torch.arange(1, 21, dtype=torch.float64)
-    found = dynamics.constant_velocity(start, times)
+    result = dynamics.constant_velocity(start, times)
     expected = dynamics.rollout(start, actions)
-    torch.testing.assert_close(found[..., :2], expected[..., :2])
-    assert torch.equal(found[..., 2:], start[:, None, 2:].expand(-1, 20, -1))
+    torch.testing.assert_close(result[..., :2], expected[..., :2])
+    assert torch.equal(result[..., 2:], start[:, None, 2:].expand(-1, 20, -1))
 
 
 @pytest.mark.parametrize(
@@ -192,10 +192,10 @@ def test_constant_velocity_is_a_rollout_without_actions():
 def test_the_cost_of_the_closest_approach_has_its_published_values(
     offset, closing, cost
 ):
-    found = dynamics.closest_approach_cost(
+    result = dynamics.closest_approach_cost(
         torch.tensor(offset).double(), torch.tensor(closing).double()
     )
-    assert found.item() == pytest.approx(cost, abs=1e-4)
+    assert result.item() == pytest.approx(cost, abs=1e-4)
 
 
 def test_nobody_is_faster_than_40_metres_a_second():

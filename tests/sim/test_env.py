@@ -72,19 +72,19 @@ def test_what_is_not_observed_drives_alike():
     """The observation takes no part in what happens; an environment without it has
     none."""
     scenes = make_scenes(3)
-    seen, blind = (
+    records, blind = (
         DrivingEnv(scenes, SimSettings(), 2, observed=observed)
         for observed in (True, False)
     )
     check_env_specs(DrivingEnv(scenes, SimSettings(), 2, observed=False), seed=0)
     begin = TensorDict({"scene_index": torch.tensor([[0], [2]])}, batch_size=[2])
-    one = seen.reset(begin.clone())
+    single = records.reset(begin.clone())
     other = blind.reset(begin.clone())
     for _ in range(15):
         action = torch.tensor([[1.0, 0.1], [-1.0, 0.2]])
-        one, other = (
+        single, other = (
             env.step(td.set("action", action))["next"]
-            for env, td in ((seen, one), (blind, other))
+            for env, td in ((records, single), (blind, other))
         )
         assert other["observation"].shape == (2, 0)
         for key in (
@@ -94,7 +94,7 @@ def test_what_is_not_observed_drives_alike():
             ("metrics", "contact"),
             ("metrics", "progress"),
         ):
-            assert torch.equal(one[key], other[key]), key
+            assert torch.equal(single[key], other[key]), key
 
 
 def test_the_reported_agents_are_the_environments_world():
@@ -102,7 +102,7 @@ def test_the_reported_agents_are_the_environments_world():
     environment."""
     env = DrivingEnv(make_scenes(3), SimSettings(), 2, agents=True)
     env.reset()
-    told = World.of(
+    message = World.of(
         act(
             env,
             acceleration=1.0,
@@ -110,10 +110,10 @@ def test_the_reported_agents_are_the_environments_world():
         ),
         env.scene,
     )
-    now = env.world()
+    current = env.world()
     for name in ("step", "states", "valid", "accel", "turn_rate"):
-        assert torch.equal(getattr(told, name), getattr(now, name)), name
-    assert torch.allclose(told.turn_rate[:, 0], torch.tensor(0.2), atol=1e-4)
+        assert torch.equal(getattr(message, name), getattr(current, name)), name
+    assert torch.allclose(message.turn_rate[:, 0], torch.tensor(0.2), atol=1e-4)
 
 
 def test_partial_resets_keep_the_others_running():
@@ -129,17 +129,17 @@ def test_partial_resets_keep_the_others_running():
     data = env.rollout(200, break_when_any_done=False)
     assert (data["next", "timestep"] == data["timestep"] + 1).all()
     assert (data["next", "scene_index"] == data["scene_index"]).all()
-    done = data["next", "done"][:, :-1]
-    assert done.any(1).all()
-    assert (data["timestep"][:, 1:][done] == 0).all()
+    process = data["next", "done"][:, :-1]
+    assert process.any(1).all()
+    assert (data["timestep"][:, 1:][process] == 0).all()
     same = data["scene_index"][:, 1:] == data["scene_index"][:, :-1]
-    assert same[~done].all()
-    assert not same[done].all()
+    assert same[~process].all()
+    assert not same[process].all()
     carried = (data["next", "observation"][:, :-1] == data["observation"][:, 1:]).all(
         -1, keepdim=True
     )
-    assert carried[~done].all()
-    assert not carried[done].any()
+    assert carried[~process].all()
+    assert not carried[process].any()
 
 
 def test_seed_makes_batches_identical():
@@ -383,13 +383,15 @@ def test_a_held_action_is_that_action_at_every_step_until_the_episode_ends(way, 
         expected = None
         reward = torch.zeros(4, 1)
         for _ in range(hold):
-            now = once.step(TensorDict({"action": action}, [4]))["next"]
-            reward = reward + now["reward"] * alive[:, None]
+            current = once.step(TensorDict({"action": action}, [4]))["next"]
+            reward = reward + current["reward"] * alive[:, None]
             expected = (
-                now.clone() if expected is None else torch.where(alive, now, expected)
+                current.clone()
+                if expected is None
+                else torch.where(alive, current, expected)
             )
-            alive = alive & ~now["done"][:, 0]
-        found = held.step(TensorDict({"action": action}, [4]))["next"]
+            alive = alive & ~current["done"][:, 0]
+        result = held.step(TensorDict({"action": action}, [4]))["next"]
         running = torch.ones(4, dtype=torch.bool) if last is None else ~last
         for key in (
             "observation",
@@ -399,9 +401,9 @@ def test_a_held_action_is_that_action_at_every_step_until_the_episode_ends(way, 
             "truncated",
             *METRIC_KEYS,
         ):
-            assert torch.equal(found[key][running], expected[key][running]), key
-        torch.testing.assert_close(found["reward"][running], reward[running])
-        last = found["done"][:, 0] if last is None else last | found["done"][:, 0]
+            assert torch.equal(result[key][running], expected[key][running]), key
+        torch.testing.assert_close(result["reward"][running], reward[running])
+        last = result["done"][:, 0] if last is None else last | result["done"][:, 0]
         rewards.append(reward)
     assert last.all()
 
@@ -416,13 +418,13 @@ def test_what_a_reset_of_some_writes_is_what_a_reset_of_all_writes():
         for _ in range(2)
     )
     index = torch.tensor([[4], [1], [3], [0]])
-    seen = whole.reset(TensorDict({"scene_index": index}, [4]))["observation"]
+    observed = whole.reset(TensorDict({"scene_index": index}, [4]))["observation"]
     some.reset(TensorDict({"scene_index": torch.tensor([[0], [1], [2], [0]])}, [4]))
-    begun = torch.tensor([[True], [False], [True], [False]])
-    seen_anew = some.reset(TensorDict({"scene_index": index, "_reset": begun}, [4]))[
+    start = torch.tensor([[True], [False], [True], [False]])
+    seen_anew = some.reset(TensorDict({"scene_index": index, "_reset": start}, [4]))[
         "observation"
     ]
-    torch.testing.assert_close(seen_anew[begun[:, 0]], seen[begun[:, 0]])
+    torch.testing.assert_close(seen_anew[start[:, 0]], observed[start[:, 0]])
     assert torch.equal(
         act(whole, 1.0, yaw_rate=0.1)["observation"],
         act(some, 1.0, yaw_rate=0.1)["observation"],

@@ -82,12 +82,12 @@ def test_own_fault_by_place_and_speed(
     for heading in (0.0, 2.0):  # whichever way the ego looks
         cos = math.cos(heading)
         sin = math.sin(heading)
-        there = torch.tensor([[cos, -sin], [sin, cos]]) @ torch.tensor(
+        position = torch.tensor([[cos, -sin], [sin, cos]]) @ torch.tensor(
             place
         ) + torch.tensor([10.0, -5.0])
         ego = torch.tensor([[10.0, -5.0, heading, speed]])
         others = torch.tensor(
-            [[[*there.tolist(), heading, other_speed], [60.0, 60.0, 0.0, 5.0]]]
+            [[[*position.tolist(), heading, other_speed], [60.0, 60.0, 0.0, 5.0]]]
         )
         assert judged(ego, others) == [expected]
 

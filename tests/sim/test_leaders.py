@@ -31,7 +31,7 @@ def lead(agents):
     agents = torch.tensor(agents, dtype=torch.float32)[None]
     size = torch.tensor([LENGTH, WIDTH]).expand(1, agents.shape[1], 2)
     present = torch.ones(agents.shape[:2]).bool()
-    found = leaders(
+    result = leaders(
         agents[:, :1, 0] + 20.0,
         arc(
             0.0,
@@ -43,7 +43,7 @@ def lead(agents):
         size=size,
         present=present,
     )
-    return tuple(value[0, :, 0] for value in found)
+    return tuple(value[0, :, 0] for value in result)
 
 
 def test_the_gap_is_between_bumpers_of_the_nearest():
@@ -80,15 +80,15 @@ def test_who_stands_at_the_crossing_of_a_loop_leads_at_the_first_passage_to_come
         ).view(1, 2, 4)
         size = torch.tensor([LENGTH, WIDTH]).expand(1, 2, 2)
         present = torch.ones(1, 2, dtype=torch.bool)
-        found = leaders(
+        result = leaders(
             torch.tensor([[s]]),
             loop()[None, None],
             agents=ego[:, :, None],
             size=size,
             present=present,
         )
-        assert found.index.item() == 1
-        assert abs(found.gap.item() - gap + LENGTH / 2 + 1.5) < 1.0
+        assert result.index.item() == 1
+        assert abs(result.gap.item() - gap + LENGTH / 2 + 1.5) < 1.0
 
 
 def all_pairs(
@@ -156,7 +156,7 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
     d = 6 * (draw(batch, vehicles) - 0.5) * offsets
     s = 60 * draw(batch, vehicles)
     expected = all_pairs(s, points, agents, size, present, d, free_gap)
-    found = leaders(
+    result = leaders(
         s,
         points,
         agents=agents[:, :, None],
@@ -165,23 +165,23 @@ def test_pruned_pairs_are_those_that_could_not_lead(vehicles, offsets, free_gap)
         d=d if offsets else None,
         free_gap=free_gap,
     )
-    found = Leaders(*(value[..., 0] for value in found))
+    result = Leaders(*(value[..., 0] for value in result))
     led = expected[0] < free_gap
     assert led.sum() > 40
-    assert torch.equal(found.index[led], expected[2][led])
+    assert torch.equal(result.index[led], expected[2][led])
     torch.testing.assert_close(
-        found.gap,
+        result.gap,
         expected[0],
         rtol=0,
         atol=1e-4,
     )
     torch.testing.assert_close(
-        found.speed[led],
+        result.speed[led],
         expected[1][led],
         rtol=0,
         atol=1e-4,
     )
-    assert torch.equal(found.speed[~led], agents[:, :vehicles, 3][~led]), (
+    assert torch.equal(result.speed[~led], agents[:, :vehicles, 3][~led]), (
         "nobody ahead moves as the vehicle does"
     )
 

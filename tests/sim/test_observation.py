@@ -98,7 +98,7 @@ def test_absent_agents_leave_no_trace():
 def test_a_map_without_limits_looks_like_one_with_the_usual_one_or_that_of_the_ego_s_speed(
     speed, limit
 ):
-    unknown, known = (
+    unknown, certain = (
         observe(
             make_scenes(
                 2,
@@ -108,9 +108,9 @@ def test_a_map_without_limits_looks_like_one_with_the_usual_one_or_that_of_the_e
         )
         for value in (0.0, limit)
     )
-    assert torch.allclose(unknown, known, atol=1e-6)
+    assert torch.allclose(unknown, certain, atol=1e-6)
     assert not torch.allclose(
-        known,
+        certain,
         observe(
             make_scenes(
                 2,
@@ -145,14 +145,14 @@ def test_beyond_the_recording_a_light_keeps_its_last_state_in_its_own_scene():
 def observations(scenes, actions):
     """[B, T, D] of a drive by actions [T, 2] in every scene."""
     env = DrivingEnv(scenes, SimSettings(), len(scenes))
-    seen = []
+    observed = []
     td = env.reset()
     for action in actions:
-        seen.append(td["observation"])
+        observed.append(td["observation"])
         td = env.step(td.set("action", action.expand(len(scenes), 2)))["next"].exclude(
             "reward"
         )
-    return torch.stack(seen, 1)
+    return torch.stack(observed, 1)
 
 
 def test_driving_in_the_mirror_looks_like_the_mirror_of_driving():
@@ -171,10 +171,10 @@ def test_driving_in_the_mirror_looks_like_the_mirror_of_driving():
     ][:8]
     other = [scenes.scene_id.index(f"{scenes.scene_id[k]}~mirrored") for k in first]
     actions = torch.randn(20, 2) * torch.tensor([1.5, 0.15])
-    seen = observations(scenes.chosen(first), actions)
+    observed = observations(scenes.chosen(first), actions)
     reflected = observations(scenes.chosen(other), actions * torch.tensor([1.0, -1.0]))
-    assert torch.allclose(mirrored(seen), reflected, atol=2e-3)
-    assert not torch.allclose(seen, reflected, atol=0.1), (
+    assert torch.allclose(mirrored(observed), reflected, atol=2e-3)
+    assert not torch.allclose(observed, reflected, atol=0.1), (
         "and these scenes are not symmetric themselves"
     )
-    assert torch.equal(mirrored(mirrored(seen)), seen)
+    assert torch.equal(mirrored(mirrored(observed)), observed)

@@ -38,12 +38,12 @@ def random_steps(count, generator):
 def test_the_interval_is_that_of_a_fine_look():
     generator = torch.Generator().manual_seed(0)
     offset, change, turn, other = random_steps(3000, generator)
-    own = torch.tensor([[2.3], [0.95]], dtype=torch.float64).expand(2, 3000)
+    ours = torch.tensor([[2.3], [0.95]], dtype=torch.float64).expand(2, 3000)
     begin, end = time_inside(
         offset,
         change,
         direction=torch.stack([turn.cos(), turn.sin()]),
-        own=own,
+        own=ours,
         other=other,
     )
     time = torch.linspace(0, 1, FINE + 1, dtype=torch.float64)
@@ -54,7 +54,7 @@ def test_the_interval_is_that_of_a_fine_look():
     still = torch.zeros(4, dtype=torch.float64)
     gap = separation(
         still,
-        2 * own.T[:, None],
+        2 * ours.T[:, None],
         second=box,
         second_size=2 * other.T[:, None],
     )
@@ -66,10 +66,10 @@ def test_the_interval_is_that_of_a_fine_look():
 
 
 def test_what_moves_no_farther_than_half_of_the_smallest_extent_is_not_looked_at():
-    own = torch.tensor([[2.0], [1.0]])
+    ours = torch.tensor([[2.0], [1.0]])
     other = torch.tensor([[2.0], [0.4]])
-    assert not is_fast(torch.tensor([[0.3], [0.2]]), own, other=other).any()
-    assert is_fast(torch.tensor([[0.3], [0.3]]), own, other=other).all()
+    assert not is_fast(torch.tensor([[0.3], [0.2]]), ours, other=other).any()
+    assert is_fast(torch.tensor([[0.3], [0.3]]), ours, other=other).all()
 
 
 @pytest.mark.parametrize(
@@ -82,12 +82,12 @@ def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
     ego_before = torch.tensor([[0.0, 0.0, 0.0, 38.0]])
     ego = torch.tensor([[3.8, 0.0, 0.0, 38.0]])
     before = torch.tensor([[[4.2, lateral, math.pi, 40.0]]])
-    now = before - torch.tensor([4.0, 0.0, 0.0, 0.0])
+    current = before - torch.tensor([4.0, 0.0, 0.0, 0.0])
     size = torch.tensor([[4.0, 1.9]])
     still = torch.zeros(1, 1)
     half = torch.tensor([[[1.1], [0.4]]])
     agents = Agents(
-        now,
+        current,
         still == 0,
         accel=still,
         turn_rate=still,
@@ -104,23 +104,25 @@ def test_a_neighbour_that_has_passed_is_where_it_touched(lateral, known, hits):
         static=static,
         agents=agents,
     )
-    tracks = torch.stack([torch.cat([ego[:, None], at], 1) for at in (before, now)], 1)
-    there = torch.tensor([[[True, known], [True, True]]])
-    found = passed(
+    tracks = torch.stack(
+        [torch.cat([ego[:, None], at], 1) for at in (before, current)], 1
+    )
+    place = torch.tensor([[[True, known], [True, True]]])
+    result = passed(
         near,
         ego=ego,
         ego_before=ego_before,
-        tracks=Tracks(tracks, there),
+        tracks=Tracks(tracks, place),
         static=static,
         before=first[0],
     )
     assert (near.gap > 0).all()
-    assert bool((found.gap < 0).all()) == hits
+    assert bool((result.gap < 0).all()) == hits
     if hits:
-        assert found.position[0, :, 0].tolist() == pytest.approx([3.1, 0.0], abs=1e-4)
+        assert result.position[0, :, 0].tolist() == pytest.approx([3.1, 0.0], abs=1e-4)
     else:
-        assert torch.equal(found.gap, near.gap)
-        assert torch.equal(found.position, near.position)
+        assert torch.equal(result.gap, near.gap)
+        assert torch.equal(result.position, near.position)
 
 
 def tiny_pass(displacement, speed, past):
@@ -158,7 +160,7 @@ def tiny_passes(displacement, speeds, past):
         [torch.cat([ego[:, None], at], 1) for at in (before, agent)], 1
     )
     tracks = Tracks(states, torch.ones_like(states[..., 0], dtype=torch.bool))
-    found = passed(
+    result = passed(
         near,
         ego=ego,
         ego_before=ego,
@@ -166,7 +168,7 @@ def tiny_passes(displacement, speeds, past):
         static=static,
         before=torch.zeros(count, dtype=torch.int64),
     )
-    return (found.gap[:, 0] < 0).tolist()
+    return (result.gap[:, 0] < 0).tolist()
 
 
 def test_each_ego_is_passed_by_its_own_neighbours():

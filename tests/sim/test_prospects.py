@@ -32,14 +32,14 @@ def others(*cars):
     ]
     half = (torch.tensor(CAR) / 2)[None, :, None].expand(1, 2, len(cars))
     direction = torch.stack([heading.cos(), heading.sin()], 1)
-    there = torch.ones(1, len(cars), dtype=torch.bool)
+    place = torch.ones(1, len(cars), dtype=torch.bool)
     return Others(
         torch.stack([x, y], 1),
         direction,
         half_size=half,
         speed=speed,
         arc=Arc(accel, curvature),
-        present=there,
+        present=place,
     )
 
 
@@ -80,7 +80,7 @@ def test_gaps_are_those_of_the_boxes_but_for_rounded_corners(seed):
     ego = straight_on(9.0)
     rounded = 2 * (2**0.5 - 1) * CAR[1] / 2
     for pose in poses.tolist():
-        found = gaps(ego, torch.tensor([CAR]), others=others((*pose, 0.0, 0.0)))[
+        result = gaps(ego, torch.tensor([CAR]), others=others((*pose, 0.0, 0.0)))[
             0, :, 0
         ]
         boxes = [polygon(x, 0.0, heading=0.0) for x in ego[0, 0, :, 0].tolist()]
@@ -88,16 +88,16 @@ def test_gaps_are_those_of_the_boxes_but_for_rounded_corners(seed):
             [box.distance(polygon(*pose)) for box in boxes], dtype=torch.float32
         )
         apart = exact > 0
-        assert (found[apart] >= exact[apart] - 1e-3).all()
-        assert (found[apart] <= exact[apart] + rounded + 0.1).all()
+        assert (result[apart] >= exact[apart] - 1e-3).all()
+        assert (result[apart] <= exact[apart] + rounded + 0.1).all()
 
 
 def test_others_keep_their_acceleration_for_a_second_then_their_speed():
     ego = straight_on(0.0)
     size = torch.tensor([CAR])
-    found = gaps(ego, size, others=others((20.0, 0.0, torch.pi, 5.0, -2.0)))[0, :, 0]
+    result = gaps(ego, size, others=others((20.0, 0.0, torch.pi, 5.0, -2.0)))[0, :, 0]
     way = [5 * t - t**2 if t <= 1 else 4 + 3 * (t - 1) for t in TIMES]
-    assert found.tolist() == pytest.approx(
+    assert result.tolist() == pytest.approx(
         [20 - driven - CAR[0] for driven in way], abs=0.05
     )
 
@@ -110,18 +110,18 @@ def test_who_turns_goes_on_turning():
     pose = (12.0, -14.0, 1.4)
     speed = 6.0
     curvature = 0.06
-    found = gaps(ego, size, others=others((*pose, speed, 0.0, curvature)))[0, :, 0]
+    result = gaps(ego, size, others=others((*pose, speed, 0.0, curvature)))[0, :, 0]
     x, y, heading = pose
     standing = []
     for time in TIMES[:4]:
         turn = curvature * speed * time
         middle = heading + turn / 2
         chord = 2 / curvature * math.sin(turn / 2)
-        there = (x + chord * math.cos(middle), y + chord * math.sin(middle))
-        car = others((*there, heading + turn, 0.0, 0.0))
+        place = (x + chord * math.cos(middle), y + chord * math.sin(middle))
+        car = others((*place, heading + turn, 0.0, 0.0))
         standing.append(gaps(ego, size, others=car)[0, 0, 0])
     torch.testing.assert_close(
-        found[:4],
+        result[:4],
         torch.stack(standing),
         rtol=0,
         atol=1e-4,

@@ -151,13 +151,13 @@ def test_plans_are_those_of_the_ego_and_of_adversaries_and_unknown_tracks_are_le
     evasion = rollouts.states[:, :, 0].clone()
     driver = rollouts.states[:, :, 0] + 1
     evasion[1] = driver[2] = torch.nan
-    more = rollouts.replace(
+    further = rollouts.replace(
         plans=plans,
         targets=targets,
         evasion=evasion,
         driver=driver,
     )
-    for index, path in enumerate(more.to_npz(tmp_path)):
+    for index, path in enumerate(further.to_npz(tmp_path)):
         data = Rollout.read(path)
         planners = [0, *rollouts.adversaries[index].nonzero()[:, 0].tolist()]
         assert data.planners.tolist() == planners
@@ -175,33 +175,33 @@ def test_scenes_tell_who_is_simulated_and_what_was_recorded():
         steps=10,
     )
     scene = scenes.scenes
-    more = {
+    further = {
         "adversaries": scene["valid"] & False,
         "seed": torch.arange(2),
         "eta": torch.zeros(2).double(),
     }
-    made = Rollouts.in_scenes(
+    built = Rollouts.in_scenes(
         scenes,
         torch.arange(2),
         states=scene["logged"],
         valid=scene["logged_valid"],
-        **more,
+        **further,
     )
     assert torch.equal(
-        made.simulated, scene["valid"] & (scene["agent_type"] == VEHICLE)
+        built.simulated, scene["valid"] & (scene["agent_type"] == VEHICLE)
     )
-    assert not made.logged_valid[:, :, ~scene["valid"][0]].any()
-    assert list(made.scene_id) == scenes.scene_id
+    assert not built.logged_valid[:, :, ~scene["valid"][0]].any()
+    assert list(built.scene_id) == scenes.scene_id
     replayed = Rollouts.in_scenes(
         scenes,
         torch.arange(2),
-        states=made.states,
-        valid=made.valid,
+        states=built.states,
+        valid=built.valid,
         replays_ego=True,
-        **more,
+        **further,
     )
     assert not replayed.simulated[:, 0].any()
-    assert torch.equal(replayed.simulated[:, 1:], made.simulated[:, 1:])
+    assert torch.equal(replayed.simulated[:, 1:], built.simulated[:, 1:])
 
 
 def test_a_failure_has_its_contact_and_a_rollout_without_one_has_none(
@@ -229,12 +229,12 @@ def test_a_failure_has_its_contact_and_a_rollout_without_one_has_none(
 
 def test_lines_too_short_to_be_lines_are_left_out():
     points = torch.arange(12.0).reshape(6, 2)
-    kept, offsets, numbers = polylines(
+    rest, offsets, numbers = polylines(
         points, torch.tensor([0, 0, 3, 4, 4, -1]), minimum=2
     )
     assert numbers.tolist() == [0, 4]
     assert offsets.tolist() == [0, 2, 4]
-    assert kept.tolist() == points[[0, 1, 3, 4]].tolist()
+    assert rest.tolist() == points[[0, 1, 3, 4]].tolist()
     empty, offsets, _ = polylines(
         points[:0], torch.zeros(0, dtype=torch.int64), minimum=3
     )
@@ -277,11 +277,11 @@ def test_a_damaged_rollout_is_refused_by_name(
         damaged[int(where * len(damaged))] = value
     path.write_bytes(damaged)
     try:
-        found = Rollout.read(path)
+        result = Rollout.read(path)
     except InputError as error:
         assert str(error).startswith(str(path))
     else:
-        np.testing.assert_equal(vars(found), vars(whole))  # NaN equals NaN
+        np.testing.assert_equal(vars(result), vars(whole))  # NaN equals NaN
 
 
 @pytest.mark.parametrize(
@@ -311,10 +311,10 @@ def test_an_archive_that_claims_more_than_it_may_is_not_unpacked(tmp_path):
         zipfile.ZipFile(
             tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1
         ) as archive,
-        archive.open("states.npy", "w") as one,
+        archive.open("states.npy", "w") as single,
     ):
         for _ in range(1025):
-            one.write(bytes(1 << 20))
+            single.write(bytes(1 << 20))
     with pytest.raises(
         InputError, match=r"bomb\.npz: no readable rollout .unpacks to 1075 MB"
     ):

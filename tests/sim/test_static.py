@@ -41,8 +41,8 @@ def test_the_pose_is_the_projection_on_the_mission():
     ]
     xy = near + 3 * torch.randn(BATCH, 2, generator=draw)
     expected = project(xy[:, None], mission.points, hint=hint[:, None])
-    for found, value in zip(follow(static, xy, hint=hint), expected, strict=True):
-        assert torch.equal(found, value[:, 0])
+    for result, value in zip(follow(static, xy, hint=hint), expected, strict=True):
+        assert torch.equal(result, value[:, 0])
 
 
 def test_the_way_ahead_is_interpolated_with_its_limit():
@@ -84,7 +84,7 @@ def test_others_are_seen_in_the_ego_frame_with_their_gap():
     ego = states[:, 0]
     others = states[:, 1:]
     present = scene["valid"][:, 1:]
-    seen = neighbours_of(
+    observed = neighbours_of(
         ego,
         rotation_into(ego),
         static=static,
@@ -96,17 +96,17 @@ def test_others_are_seen_in_the_ego_frame_with_their_gap():
         ),
     )
     assert torch.allclose(
-        seen.position.transpose(1, 2),
+        observed.position.transpose(1, 2),
         to_frame(others[..., :2], ego[:, None]),
         atol=1e-5,
     )
     turned = others[..., 2] - ego[:, None, 2]
     assert torch.allclose(
-        seen.direction, torch.stack([turned.cos(), turned.sin()], 1), atol=1e-5
+        observed.direction, torch.stack([turned.cos(), turned.sin()], 1), atol=1e-5
     )
     size = scene["size"]
     assert torch.allclose(
-        seen.gap,
+        observed.gap,
         separation(
             ego[:, None],
             size[:, :1],

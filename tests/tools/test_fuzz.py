@@ -81,18 +81,18 @@ def test_whole_inputs_are_read_and_hostile_ones_run_nothing(tmp_path, watch):
     for name in ("pickles", "descriptions"):
         _, read = getattr(readers, name)()
         read(pickle.dumps(description()))
-    found = Counter()
+    result = Counter()
 
     @settings(max_examples=40, database=None, deadline=None)
     @given(hostile(str(readers.mark)))
     def each(content):
-        found[
+        result[
             outcome(readers.pickles()[1], content, watch=watch, mark=readers.mark)[0]
         ] += 1
 
     each()
-    assert found["refused"] > 20
-    assert not set(found) - set(fuzz.GOOD)
+    assert result["refused"] > 20
+    assert not set(result) - set(fuzz.GOOD)
 
 
 def test_what_no_reader_may_return_is_known():

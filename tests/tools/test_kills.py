@@ -33,7 +33,7 @@ def run_of(folder, **changes):
 
 
 def test_wall_times_and_what_a_run_keeps_for_itself_are_no_difference(tmp_path):
-    one = run_of(
+    single = run_of(
         tmp_path / "one",
         **{"parts/a.pt": "1", "logs/scalars/time/improve.csv": "0,1", "tables.md": "1"},
     )
@@ -41,17 +41,17 @@ def test_wall_times_and_what_a_run_keeps_for_itself_are_no_difference(tmp_path):
         "metrics.json": FILES["metrics.json"].replace("1.0", "2.0"),
         "rollouts.csv": "scene_id,cfr,seconds\na,1,7\n",
     }
-    assert kills.differences(one, run_of(tmp_path / "other", **times)) == []
+    assert kills.differences(single, run_of(tmp_path / "other", **times)) == []
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_everything_else_is_one(tmp_path, name):
-    one = run_of(tmp_path / "one")
+    single = run_of(tmp_path / "one")
     other = run_of(tmp_path / "other")
     (other / name).write_text(FILES[name].replace(*CHANGED[name]))
-    assert kills.differences(one, other) == [name]
+    assert kills.differences(single, other) == [name]
     (other / name).unlink()
-    assert kills.differences(one, other) == [name]
+    assert kills.differences(single, other) == [name]
 
 
 def test_states_and_weights_are_compared_by_their_tensors(tmp_path):

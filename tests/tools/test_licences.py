@@ -19,7 +19,7 @@ def test_the_document_names_every_dependency():
     groups = {"": project["dependencies"], **project["optional-dependencies"]}
     text = (ROOT / "docs" / "reference" / "licences.md").read_text()
     for group, requirements in groups.items():
-        names = {canonicalize_name(Requirement(each).name) for each in requirements} - {
+        names = {canonicalize_name(Requirement(item).name) for item in requirements} - {
             "e2rl"
         }
         missing = {

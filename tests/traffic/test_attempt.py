@@ -26,8 +26,8 @@ def test_states_that_are_not_finite_count_as_ended():
             [len(tasks)],
         )
 
-    ((kept, rollouts),), ended = attempt(roll_out, [4, 5, 6])
-    assert kept == [4, 6] == rollouts["task"].tolist()
+    ((rest, rollouts),), ended = attempt(roll_out, [4, 5, 6])
+    assert rest == [4, 6] == rollouts["task"].tolist()
     assert [(task, why["reason"]) for task, why in ended] == [(5, NOT_FINITE)]
 
 
@@ -47,20 +47,20 @@ def test_errors_of_the_whole_run_end_it(error):
     [KeyError(5), ConnectionRefusedError(111, "refused"), FileNotFoundError(2, "x")],
 )
 def test_a_batch_is_halved_until_the_one_that_raises_is_alone(error):
-    asked = []
+    requests = []
 
     def roll_out(tasks):
-        asked.append(list(tasks))
+        requests.append(list(tasks))
         if 5 in tasks:
             raise error
         return whole(tasks)
 
-    done, ended = attempt(roll_out, list(range(8)))
-    assert [task for tasks, _ in done for task in tasks] == [0, 1, 2, 3, 4, 6, 7]
+    process, ended = attempt(roll_out, list(range(8)))
+    assert [task for tasks, _ in process for task in tasks] == [0, 1, 2, 3, 4, 6, 7]
     assert [(task, why["reason"]) for task, why in ended] == [
         (5, f"raised {type(error).__name__}")
     ]
-    assert len(asked) == 7
+    assert len(requests) == 7
 
 
 @pytest.mark.parametrize(
@@ -74,6 +74,6 @@ def test_rows_that_a_planner_names_are_believed_where_the_batch_has_them(wrong, 
             )
         return whole(tasks)
 
-    done, ended = attempt(roll_out, [4, 5, 6])
-    assert [task for tasks, _ in done for task in tasks] == [4, 6]
+    process, ended = attempt(roll_out, [4, 5, 6])
+    assert [task for tasks, _ in process for task in tasks] == [4, 6]
     assert [(task, why["detail"]) for task, why in ended] == [(5, detail)]

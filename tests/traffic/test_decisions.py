@@ -15,7 +15,7 @@ EGO_STATE = (0.0, 0.0, 0.0, 10.0)
 
 def driven(scene_set, on, decisions):
     index = torch.arange(len(scene_set))
-    given = torch.tensor([decisions] * len(index))
+    inputs = torch.tensor([decisions] * len(index))
     return roll_out(
         scene_set,
         index,
@@ -24,7 +24,7 @@ def driven(scene_set, on, decisions):
         ego=EGO,
         traffic=on,
         sim=SimSettings(),
-        decisions=given,
+        decisions=inputs,
     )
 
 
@@ -73,10 +73,10 @@ def test_nobody_else_acts_by_proposal_or_by_kernel(kind):
     ]
     world = make_world([EGO_STATE, *others], 4)
     on = synthesizer()
-    given = torch.tensor([RULE._replace(whom=WHOM.index(kind))] * 4)
+    inputs = torch.tensor([RULE._replace(whom=WHOM.index(kind))] * 4)
     state = on.reset(
-        world.scene, torch.arange(4), torch.full((4,), 2.0), decisions=given
+        world.scene, torch.arange(4), torch.full((4,), 2.0), decisions=inputs
     )
     plan = on.replan(state, world, EGO.plan(world))[1]
     assert plan.adversary.any()
-    assert not (plan.adversary & ~eligible(world, given[:, 1], lawful=False)).any()
+    assert not (plan.adversary & ~eligible(world, inputs[:, 1], lawful=False)).any()

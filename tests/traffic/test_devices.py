@@ -17,15 +17,15 @@ from tests.traffic.e2.traffic_scenes import scenes, synthesizer
 def test_tensors_of_two_devices_do_not_meet():
     with pretended_device():
         here = torch.ones(3)
-        there = torch.ones(3, device="cuda")
-        assert device_of(there + 1).type == "cuda"
-        assert torch.equal((there * 2).cpu(), here * 2)
+        place = torch.ones(3, device="cuda")
+        assert device_of(place + 1).type == "cuda"
+        assert torch.equal((place * 2).cpu(), here * 2)
         for wrong in (
-            lambda: here + there,
+            lambda: here + place,
             lambda: here[torch.zeros(1, dtype=torch.int64, device="cuda")],
-            lambda: torch.stack([here, there]),
-            lambda: there.numpy(),
-            lambda: torch.nn.Linear(3, 3)(there),
+            lambda: torch.stack([here, place]),
+            lambda: place.numpy(),
+            lambda: torch.nn.Linear(3, 3)(place),
         ):
             with pytest.raises(AssertionError):
                 wrong()
@@ -57,7 +57,7 @@ def test_a_rollout_keeps_to_its_device_and_is_that_of_the_cpu(method, ego):
         )
 
     with pretended_device():
-        there = driven("cuda")
+        place = driven("cuda")
     here = driven("cpu")
-    assert torch.equal(there.states, here.states)
-    assert torch.equal(there.adversaries, here.adversaries)
+    assert torch.equal(place.states, here.states)
+    assert torch.equal(place.adversaries, here.adversaries)

@@ -43,7 +43,7 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
     world = World.at_start(scene)
     state = begin(on, scene)
     plan = EGO.plan(world)
-    after, found = on.replan(state, world, plan)
+    after, result = on.replan(state, world, plan)
     plan = plan if knowledge == "plan" else on.predicted_ego(state, world)[0]
     routed, lane = on.prior.start(scene, state.routed.route)
     lane = on.lane_now(replace(state, routed=routed, lane=lane), world, plan)
@@ -54,11 +54,11 @@ def test_a_plan_is_the_prior_s_sample(knowledge):
     expected = on.prior.plan(on.prior.sample(context, noise).x0, context)
     here = scene["valid"][:, :ROWS]
     torch.testing.assert_close(
-        found.states[here], expected.states()[here], rtol=1e-4, atol=1e-4
+        result.states[here], expected.states()[here], rtol=1e-4, atol=1e-4
     )
-    assert torch.equal(found.present[here], expected.on_map[here])
-    assert not found.present[~here].any()
-    assert found.adversary is None
+    assert torch.equal(result.present[here], expected.on_map[here])
+    assert not result.present[~here].any()
+    assert result.adversary is None
     assert after.replans.tolist() == [1, 1]
 
 
@@ -87,19 +87,22 @@ def test_everybody_is_seen_where_it_drives_and_goes_on_as_planned(free_space):
     state = begin(on, scene)
     state.routed.has_lane[:] = not free_space
     state = replace(state, lane=state.lane.map(lambda value: value + 0.25))
-    seen = on.lane_now(state, world, turning)
-    assert seen.kappa[0, 0].item() == pytest.approx(0.2 / 8.0, rel=1e-3)
+    observed = on.lane_now(state, world, turning)
+    assert observed.kappa[0, 0].item() == pytest.approx(0.2 / 8.0, rel=1e-3)
     start = on.prior.start(scene, state.routed.route)[1]
-    torch.testing.assert_close(seen.d[:, 0], start.d[:, 0], rtol=0, atol=1e-3)
+    torch.testing.assert_close(observed.d[:, 0], start.d[:, 0], rtol=0, atol=1e-3)
     for name in ("s", "d", "d1"):
         torch.testing.assert_close(
-            getattr(seen, name)[:, 1:6], getattr(start, name)[:, 1:6], rtol=0, atol=1e-3
+            getattr(observed, name)[:, 1:6],
+            getattr(start, name)[:, 1:6],
+            rtol=0,
+            atol=1e-3,
         )
-    kept = seen.d2[:, 1:6] - start.d2[:, 1:6]
+    rest = observed.d2[:, 1:6] - start.d2[:, 1:6]
     if not free_space:
-        torch.testing.assert_close(kept, torch.full_like(kept, 0.25), rtol=0, atol=1e-3)
-    torch.testing.assert_close(seen.a[:, 1:], state.lane.a[:, 1:])
-    torch.testing.assert_close(seen.x[:, 1:], state.lane.x[:, 1:])
+        torch.testing.assert_close(rest, torch.full_like(rest, 0.25), rtol=0, atol=1e-3)
+    torch.testing.assert_close(observed.a[:, 1:], state.lane.a[:, 1:])
+    torch.testing.assert_close(observed.x[:, 1:], state.lane.x[:, 1:])
 
 
 def test_who_reverses_at_the_start_halts_and_every_step_is_as_long_as_its_speed():
@@ -157,11 +160,11 @@ def test_the_prediction_begins_at_the_ego():
     scene = scenes(3).scenes
     world = World.at_start(scene)
     state = begin(synthesizer(), scene)
-    found = on.predicted_ego(state, world)[0]
-    assert found.shape == (3, 50, 4)
-    assert found.isfinite().all()
+    result = on.predicted_ego(state, world)[0]
+    assert result.shape == (3, 50, 4)
+    assert result.isfinite().all()
     first = world.states[:, 0, 3] * DT
-    way = (found[:, 0, :2] - world.states[:, 0, :2]).norm(dim=-1)
+    way = (result[:, 0, :2] - world.states[:, 0, :2]).norm(dim=-1)
     torch.testing.assert_close(way, first, rtol=0.1, atol=0.05)
 
 
@@ -195,13 +198,13 @@ def plans_beside(method, scene, times=2):
     """Plans of all but the ego, which keeps its velocity."""
     state = begin(method, scene, eta=2.0 * method.adversarial)
     world = World.at_start(scene)
-    found = []
+    result = []
     for _ in range(times):
-        known = keep_velocity(world.states[:, 0])
-        state, plan = method.replan(state, world, known)
-        found.append(plan.states[:, 1:])
-        world = executed(world, plan, ego_plan=known)
-    return torch.stack(found)
+        certain = keep_velocity(world.states[:, 0])
+        state, plan = method.replan(state, world, certain)
+        result.append(plan.states[:, 1:])
+        world = executed(world, plan, ego_plan=certain)
+    return torch.stack(result)
 
 
 @pytest.mark.parametrize("name", METHODS)

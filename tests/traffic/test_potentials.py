@@ -47,9 +47,11 @@ def situation(*vehicles, targets=()):
     target = torch.full((1, 8), -1)
     for vehicle, aim in targets:
         target[:, vehicle] = aim
-    now = scene["start"][:, :8], scene["start_accel"][:, :8], world.valid[:, :8]
+    current = scene["start"][:, :8], scene["start_accel"][:, :8], world.valid[:, :8]
     path = scene["route_points"][:, :, 0], scene["route_valid"].any(-1)
-    return states, PotentialContext(scene, *now, *path, states[:, 0].clone(), target)
+    return states, PotentialContext(
+        scene, *current, *path, states[:, 0].clone(), target
+    )
 
 
 def busy():
@@ -209,9 +211,9 @@ def test_the_pair_term_is_the_squared_shortfall_of_the_gap_that_is_wanted():
         states, context = situation((30.0, 0.0, 0.0, 10.0), (30.0, began, 0.0, 10.0))
         context.scene["size"][:, 1:3] = torch.tensor([4.5, size])
         states[0, 2, :, 1] = size + 0.1
-        found = feasibility_potential(states, context, settings=only(pair=3.0))[0]
-        assert found[1].item() == pytest.approx(3.0 * (wanted - 0.1) ** 2, rel=2e-2)
-        assert found[1] == found[2]
+        result = feasibility_potential(states, context, settings=only(pair=3.0))[0]
+        assert result[1].item() == pytest.approx(3.0 * (wanted - 0.1) ** 2, rel=2e-2)
+        assert result[1] == result[2]
 
 
 def test_v_adv_has_its_closed_form_at_a_constant_distance():

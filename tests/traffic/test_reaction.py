@@ -19,8 +19,8 @@ def onward(world):
 def test_one_period_as_long_as_the_horizon_is_the_ego_s_plan():
     world = World.at_start(scenes(3).scenes)
     for rows in (torch.tensor([2, 0]), torch.arange(3)):
-        found = Lookahead(EGO, world, period=HORIZON)(rows, onward(world)[rows])
-        torch.testing.assert_close(found, EGO.plan(world)[rows])
+        result = Lookahead(EGO, world, period=HORIZON)(rows, onward(world)[rows])
+        torch.testing.assert_close(result, EGO.plan(world)[rows])
 
 
 def test_the_ego_reacts_to_what_the_others_plan():

@@ -68,13 +68,13 @@ def test_who_crosses_from_the_left_gives_way_at_once():
 def test_patience_grows_with_intensity_up_to_its_bound():
     world, coalition = world_of((40.0, 0.0, math.pi, 8.0))
     settings = YieldingSettings(patience=1.5, max_patience=2.5)
-    found = [
+    result = [
         duty_of(
             "full", settings, world=world, coalition=coalition, eta=torch.tensor([eta])
         ).patience[0, 1]
         for eta in (0.5, 1, 2, 3)
     ]
-    assert found == [0.75, 1.5, 2.5, 2.5]
+    assert result == [0.75, 1.5, 2.5, 2.5]
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_less_responsibility_binds_only_those_behind_or_nobody(responsibility, e
 
 def test_by_default_patience_is_1_m_s2_per_intensity_up_to_2():
     world, coalition = world_of((40.0, 0.0, math.pi, 8.0))
-    found = [
+    result = [
         duty_of(
             "full",
             YieldingSettings(),
@@ -106,4 +106,4 @@ def test_by_default_patience_is_1_m_s2_per_intensity_up_to_2():
         ).patience[0, 1]
         for eta in (0.5, 1.5, 3.0)
     ]
-    assert found == [0.5, 1.5, 2.0]
+    assert result == [0.5, 1.5, 2.0]

@@ -38,10 +38,10 @@ def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_s
     exec(textwrap.dedent("".join(source)), names)
     scene_set = scenes(2, steps=80)
     out = drive(scene_set, names["Halt"](), 1.0, seeds=[3, 4])
-    there = slice(1, len(VEHICLES))
-    start = scene_set.scenes["start"][:, None, there]
+    place = slice(1, len(VEHICLES))
+    start = scene_set.scenes["start"][:, None, place]
     time = torch.minimum(DT * torch.arange(81)[:, None], start[..., 3] / 2.0)
-    track = out.states[:, :, there]
+    track = out.states[:, :, place]
     torch.testing.assert_close(
         track[..., 3], start[..., 3] - 2.0 * time, rtol=0, atol=1e-3
     )
@@ -49,7 +49,7 @@ def test_the_method_of_a_few_lines_in_the_documentation_drives_everybody_as_it_s
         track[..., 0], start[..., 0] + start[..., 3] * time - time**2, rtol=0, atol=1e-2
     )
     assert torch.equal(track[..., 1:3], start[..., 1:3].expand_as(track[..., 1:3]))
-    assert out.valid[:, :, there].all()
+    assert out.valid[:, :, place].all()
     assert not out.adversaries.any()
     assert (out.transport_others == 0).all()
 
@@ -100,10 +100,10 @@ def test_traffic_drives_on_as_planned_after_the_ego_has_left(replay_ego):
     out = drive(scene_set, synthesizer(), 0.0, ego=ReplayEgo(), replay_ego=replay_ego)
     assert not out.valid[:, 5:, 0].any()
     assert not out.simulated[:, 0].any()
-    there = out.valid[:, 1:, 1:5] & out.valid[:, :-1, 1:5]
+    place = out.valid[:, 1:, 1:5] & out.valid[:, :-1, 1:5]
     jump = (out.states[:, 1:, 1:5, :2] - out.states[:, :-1, 1:5, :2]).norm(dim=-1)
-    assert there.any()
-    assert jump[there].max() < 4.0
+    assert place.any()
+    assert jump[place].max() < 4.0
 
 
 class Turns(Traffic):
@@ -142,16 +142,16 @@ def test_the_traffic_of_a_round_is_the_rollouts_and_its_seeds_are_the_scenes_own
     synthesize = synthesize_traffic(
         scene_set, synthesizer(), sim=SimSettings(), batch=2
     )
-    found = synthesize(EGO, rows, 2.0, 5)
-    assert torch.equal(found["scene_index"], rows)
-    assert found["states"].shape[:2] == (
+    result = synthesize(EGO, rows, 2.0, 5)
+    assert torch.equal(result["scene_index"], rows)
+    assert result["states"].shape[:2] == (
         3,
         21,
     )
-    assert found["adversaries"].any(1).all()
-    assert found["contact"].shape == (3,)
+    assert result["adversaries"].any(1).all()
+    assert result["contact"].shape == (3,)
     alone = synthesize(EGO, rows[1:2], 2.0, 5)
     torch.testing.assert_close(
-        alone["states"][0], found["states"][1], rtol=0, atol=2e-2
+        alone["states"][0], result["states"][1], rtol=0, atol=2e-2
     )
-    assert not torch.equal(synthesize(EGO, rows, 2.0, 6)["states"], found["states"])
+    assert not torch.equal(synthesize(EGO, rows, 2.0, 6)["states"], result["states"])

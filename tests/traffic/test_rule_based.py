@@ -208,13 +208,13 @@ def test_it_stops_at_the_line_of_a_red_or_yellow_light_and_waits(colour):
 
 
 def test_a_green_light_is_no_obstacle():
-    found = {}
+    result = {}
     for red in (True, False):
         scene = scenes_of([AWAY, (0, 0, 10)], red_light_x=25.0, limit=LIMIT).scenes
         scene["light_state"][:] = LIGHT_RED if red else LIGHT_RED + 2
-        found[red] = acceleration_in(plan_of(World.at_start(scene)))
-    assert found[True] < -1
-    assert found[False] == pytest.approx(1 - (10 / LIMIT) ** 4, abs=1e-4)
+        result[red] = acceleration_in(plan_of(World.at_start(scene)))
+    assert result[True] < -1
+    assert result[False] == pytest.approx(1 - (10 / LIMIT) ** 4, abs=1e-4)
 
 
 def test_who_stands_at_the_start_stands_for_good():
@@ -233,11 +233,11 @@ def test_a_vehicle_is_gone_once_its_route_leaves_the_map():
     )
     rollouts = drive(scene_set, idm(BoundSettings()), 0.0)
     x = rollouts.states[0, :, 1:3, 0]
-    there = rollouts.valid[0, :, 1:3]
-    assert there[:, 1].all()
-    assert not there[-1, 0]
-    assert (x[:, 0][there[:, 0]] <= 80.5).all()
-    assert (there[1:, 0] <= there[:-1, 0]).all(), "nobody comes back"
+    place = rollouts.valid[0, :, 1:3]
+    assert place[:, 1].all()
+    assert not place[-1, 0]
+    assert (x[:, 0][place[:, 0]] <= 80.5).all()
+    assert (place[1:, 0] <= place[:-1, 0]).all(), "nobody comes back"
 
 
 @pytest.mark.parametrize("floor", [-7.0, -4.0])

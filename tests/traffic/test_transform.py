@@ -202,13 +202,13 @@ def test_a_partial_reset_begins_those_rows_anew_and_leaves_the_others():
 
 
 def test_a_method_that_asks_the_ego_can_where_there_is_one():
-    asked = []
+    requests = []
 
     class Asking(March):
         queries_ego = True
 
         def replan(self, state, world, ego_plan, react=None):
-            asked.append(
+            requests.append(
                 react
                 and react(
                     torch.tensor([1]), keep_velocity(world.states[1:2, :ROWS])
@@ -219,7 +219,7 @@ def test_a_method_that_asks_the_ego_can_where_there_is_one():
     for ego in (EGO, None):
         env = environment(live(), Asking(), ego=ego)
         advance(env, still, tensordict=env.reset(), steps=1)
-    assert asked == [(1, 50, 4), None]
+    assert requests == [(1, 50, 4), None]
 
 
 class Picky(Ego):
@@ -347,12 +347,12 @@ def test_vehicles_of_replayed_rows_are_expected_to_keep_their_velocity():
 
 
 def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
-    seen = []
+    observed = []
     env = environment(live(), March())
 
     class Watching(EgoPolicy):
         def forward(self, tensordict):
-            seen.append(tensordict.get(("traffic", "plan"), None))
+            observed.append(tensordict.get(("traffic", "plan"), None))
             return super().forward(tensordict)
 
     options = {
@@ -371,7 +371,7 @@ def test_plans_are_for_the_policy_alone_and_are_not_stacked_over_time():
         "plan",
     ) not in data.keys(True)
     torch.testing.assert_close(
-        seen[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS]
+        observed[-1][:, 1:, 0], data["next", "agents", "states"][:, -1, 1:ROWS]
     )
     collector.shutdown()
 

@@ -60,33 +60,33 @@ def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
     env = e2rl.make_env(4, **given)
     batch = e2rl.make_gym_env(4, **given)
     env.set_seed(5)
-    td, (seen, info) = env.reset(), batch.reset(seed=5)
+    td, (observed, info) = env.reset(), batch.reset(seed=5)
     ended = 0
     for step in range(90):
-        assert (seen == td["observation"].numpy()).all()
-        assert seen.dtype == np.float32
+        assert (observed == td["observation"].numpy()).all()
+        assert observed.dtype == np.float32
         assert [given["scenes"].index(scene) for scene in info["scene"]] == td[
             "scene_index"
         ][:, 0].tolist()
         action = actions(4, step)
         td["action"] = in_units(torch.tensor(action), *batch.bounds)
-        done, td = env.step_and_maybe_reset(td)
-        seen, *flags, info = batch.step(action)
+        process, td = env.step_and_maybe_reset(td)
+        observed, *flags, info = batch.step(action)
         for key, value in zip(
             ("reward", "terminated", "truncated"), flags, strict=True
         ):
-            assert (value == done["next", key][:, 0].numpy()).all()
-        over = done["next", "done"][:, 0].numpy()
+            assert (value == process["next", key][:, 0].numpy()).all()
+        over = process["next", "done"][:, 0].numpy()
         assert (over == info.get("_final_obs", False)).all()
         for row in over.nonzero()[0]:
             assert (
-                info["final_obs"][row] == done["next", "observation"][row].numpy()
+                info["final_obs"][row] == process["next", "observation"][row].numpy()
             ).all()
             assert (
                 info["final_info"]["off_road"][row]
-                == done["next", "metrics", "off_road"][row, 0]
+                == process["next", "metrics", "off_road"][row, 0]
             )
-            assert seen[row, ELAPSED] == 0, "the next episode's first"
+            assert observed[row, ELAPSED] == 0, "the next episode's first"
             ended += 1
     assert ended > 4
 
@@ -94,18 +94,18 @@ def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
 def test_a_scene_drives_alone_as_in_a_batch(given):
     """In a chosen scene, to the end of the episode, whose observation and info are
     those of the step."""
-    one = e2rl.make_gym_env(**given)
+    single = e2rl.make_gym_env(**given)
     batch = e2rl.make_gym_env(2, **given)
     name = given["scenes"].scene_id[1]
     (alone, info), (both, _) = (
-        one.reset(options={"scene": name}),
+        single.reset(options={"scene": name}),
         batch.reset(options={"scene": 1}),
     )
     assert info["scene"] == name
     for step in range(200):
         assert np.allclose(alone, both, atol=1e-5)
         action = actions(1, step)[0]
-        alone, reward, terminated, truncated, info = one.step(action)
+        alone, reward, terminated, truncated, info = single.step(action)
         both, rewards, *_, infos = batch.step(np.stack([action, action]))
         assert reward == pytest.approx(rewards[0], abs=1e-5)
         assert info["scene"] == name

@@ -71,23 +71,23 @@ def test_it_is_the_batch_of_gymnasium(given):
     env = e2rl.make_sb3_env(3, **given)
     batch = e2rl.make_gym_env(3, **given)
     env.seed(2)
-    seen, (other, _) = env.reset(), batch.reset(seed=2)
+    observed, (other, _) = env.reset(), batch.reset(seed=2)
     ends = {"truncated": 0, "terminated": 0}
     for step in range(100):
-        assert (seen == other).all()
+        assert (observed == other).all()
         action = np.zeros((3, 2), dtype=np.float32)
         action[0] = 1.0, float(step % 2)  # speeds, and leaves the road
         action[1] = -1.0, 0.0  # stands
-        seen, reward, done, infos = env.step(action)
+        observed, reward, process, infos = env.step(action)
         other, rewards, terminated, truncated, info = batch.step(action)
         assert (reward == rewards).all()
-        assert (done == (terminated | truncated)).all()
+        assert (process == (terminated | truncated)).all()
         for row in range(3):
-            told = info["final_info"] if done[row] else info
-            assert infos[row]["scene"] == told["scene"][row]
-            assert infos[row]["contact"] == told["contact"][row]
-            assert ("terminal_observation" in infos[row]) == done[row]
-            if done[row]:
+            message = info["final_info"] if process[row] else info
+            assert infos[row]["scene"] == message["scene"][row]
+            assert infos[row]["contact"] == message["contact"][row]
+            assert ("terminal_observation" in infos[row]) == process[row]
+            if process[row]:
                 assert (
                     infos[row]["terminal_observation"] == info["final_obs"][row]
                 ).all()
@@ -115,8 +115,8 @@ def test_a_saved_policy_does_what_the_model_predicts(given, tmp_path, kind):
     ).astype(np.float32)
     assert model.policy.training == training, "the model goes on as it was"
     normaliser = model.get_vec_normalize_env()
-    seen = normaliser.normalize_obs(observation) if normaliser else observation
-    predicted = torch.tensor(model.predict(seen, deterministic=True)[0])
+    observed = normaliser.normalize_obs(observation) if normaliser else observation
+    predicted = torch.tensor(model.predict(observed, deterministic=True)[0])
     wanted = in_units(
         predicted, torch.tensor([-8.0, -1.6]), high=torch.tensor([5.0, 1.6])
     )
@@ -198,8 +198,8 @@ def test_statistics_of_several_normalisers_are_applied_in_turn(given, tmp_path):
     observation = (
         np.random.default_rng(0).normal(size=(50, OBSERVATION_SIZE)).astype(np.float32)
     )
-    seen = env.normalize_obs(env.venv.normalize_obs(observation))
-    predicted = torch.tensor(model.predict(seen, deterministic=True)[0])
+    observed = env.normalize_obs(env.venv.normalize_obs(observation))
+    predicted = torch.tensor(model.predict(observed, deterministic=True)[0])
     wanted = in_units(
         predicted, torch.tensor([-8.0, -1.6]), high=torch.tensor([5.0, 1.6])
     )

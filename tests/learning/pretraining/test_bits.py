@@ -58,24 +58,24 @@ def test_a_window_sees_what_the_environment_shows_a_replayed_ego():
         env.reset().select("scene_index").set("scene_index", torch.arange(2)[:, None])
     )
     frames = env.rollout(11, break_when_any_done=False)
-    own = as_ego(
+    ours = as_ego(
         scenes.scenes, torch.arange(2), vehicle=torch.zeros(2, dtype=torch.long)
     )
     for step in (0, 10):
         expected = frames["observation"][:, step].clone()
         expected[:, ELAPSED] = 0
         torch.testing.assert_close(
-            observed(world_at(own, step)), expected, atol=2e-3, rtol=0
+            observed(world_at(ours, step)), expected, atol=2e-3, rtol=0
         )
 
 
 def test_a_vehicle_that_plays_the_ego_sees_the_ego():
     scenes = small_scenes(2, steps=60)
-    own = as_ego(scenes.scenes, torch.tensor([1]), vehicle=torch.tensor([1]))
-    world = world_at(own, 3)
+    ours = as_ego(scenes.scenes, torch.tensor([1]), vehicle=torch.tensor([1]))
+    world = world_at(ours, 3)
     assert torch.equal(world.states[0, [1, 0, 2]], scenes.scenes["logged"][1, 3, :3])
     assert torch.equal(
-        own["route_points"][0, 0, 0], scenes.scenes["route_points"][1, 1, 0]
+        ours["route_points"][0, 0, 0], scenes.scenes["route_points"][1, 1, 0]
     )
 
 
@@ -132,9 +132,9 @@ def test_a_loss_of_zero_is_the_recording():
     """A vehicle at constant speed on its goal: the untrained policy keeps its speed, so
     its plan is the recording."""
     data = windows(small_scenes(2, steps=60), 0, disturbed=(0.0, 0.0, 0.0))
-    found = losses(BitsNetwork(16).eval(), data)
-    assert found["trajectory"] < 1e-3
-    assert found["goal"] > 5
+    result = losses(BitsNetwork(16).eval(), data)
+    assert result["trajectory"] < 1e-3
+    assert result["goal"] > 5
 
 
 def small_stage(monkeypatch, folder, scenes=None):
@@ -173,7 +173,7 @@ def test_the_stage_writes_the_weights_of_the_lowest_held_out_loss_and_goes_on_ex
     with pytest.raises(KeyboardInterrupt):
         small_stage(monkeypatch, tmp_path / "parts")
     assert small_stage(monkeypatch, tmp_path / "parts") == row
-    one, two = (
+    single, two = (
         load_bits(str(tmp_path / name)).state_dict() for name in ("whole", "parts")
     )
-    assert all(torch.equal(value, two[name]) for name, value in one.items())
+    assert all(torch.equal(value, two[name]) for name, value in single.items())

@@ -41,17 +41,17 @@ def test_the_teaching_loss_is_that_of_a_mixture_round_the_labels():
     """Each counts by its weight and by its distance in units of the labels' width."""
     policy = network().network
     weights = [0.7, 0.3]
-    given = shown([[-3.0, 0.2], [1.0, -0.4]], weights)
-    away = given["action"] - policy.deterministic(given["observation"])[:, None]
+    inputs = shown([[-3.0, 0.2], [1.0, -0.4]], weights)
+    away = inputs["action"] - policy.deterministic(inputs["observation"])[:, None]
     away = away / (policy.reach * torch.tensor([0.25, 0.12]))
     likelihood = (torch.tensor(weights) * torch.exp(-away.square().sum(-1) / 2)).sum(1)
-    torch.testing.assert_close(teaching_loss(policy, given), -likelihood.log().mean())
+    torch.testing.assert_close(teaching_loss(policy, inputs), -likelihood.log().mean())
 
 
 def test_teaching_leaves_the_explorations_width_alone():
     policy = network().network
-    given = shown([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0])  # a weight of 0 fills up
-    loss = teaching_loss(policy, given)
+    inputs = shown([[-3.0, 0.2], [1.0, -0.4]], [1.0, 0.0])  # a weight of 0 fills up
+    loss = teaching_loss(policy, inputs)
     assert torch.autograd.grad(
         loss, policy.spread, allow_unused=True, retain_graph=True
     ) == (None,)

@@ -73,7 +73,7 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
         seed=7,
         ego=IDMEgo(),
     )
-    made, errored = make_traffic(
+    built, errored = make_traffic(
         order,
         synthesize_traffic(
             scenes,
@@ -91,7 +91,7 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
             batch=3,
         ),
     )
-    assert made["entered"].tolist() == [True, True, False, True]
+    assert built["entered"].tolist() == [True, True, False, True]
     assert whole["entered"].all()
     assert not none
     (entry,) = errored
@@ -103,16 +103,16 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
     )
     assert entry["reason"] == "raised ZeroDivisionError"
     assert "no way out" in entry["traceback"]
-    assert made["scene_index"].tolist() == [0, 1, 3, 0, 1, 2, 3]
-    assert made["eta"].tolist() == [2.0] * 3 + [0.0] * 4
+    assert built["scene_index"].tolist() == [0, 1, 3, 0, 1, 2, 3]
+    assert built["eta"].tolist() == [2.0] * 3 + [0.0] * 4
     rest = torch.tensor([0, 1, 3, 4, 5, 6, 7])
     torch.testing.assert_close(
-        made["states"],
+        built["states"],
         whole["states"][rest],
         rtol=0,
         atol=1e-4,
     )
-    assert made["contact"] == 1.0, "the share of those that were made"
+    assert built["contact"] == 1.0, "the share of those that were made"
 
 
 # --- what some driver avoids
@@ -139,8 +139,8 @@ def test_the_doomed_are_left_out_and_reported():
     run.solvable = partial(solvable, scenes=scenes, sim=SimSettings())
     run.settings = type(run.settings)(scenes=4, nominal="log")
     metrics = train_round(run)
-    kept = run.memory.rounds[-1].traffic["scene_index"]
-    assert sorted(kept.tolist()) == [0, 2]
+    rest = run.memory.rounds[-1].traffic["scene_index"]
+    assert sorted(rest.tolist()) == [0, 2]
     assert metrics["synthesizer/left_out"] == 2.0
     assert metrics["synthesizer/contact"] == 1.0, "the intensity follows all of them"
     assert set(run.episodes.scene_index[run.episodes.adversarial].tolist()) <= {0, 2}

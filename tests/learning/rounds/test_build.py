@@ -114,9 +114,9 @@ def test_settings_that_do_not_fit_are_refused_at_the_start():
 
 
 def test_the_time_left_is_told_once_each_kind_of_phase_was_measured(monkeypatch):
-    now = [0.0]
+    current = [0.0]
     left = []
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr("time.monotonic", lambda: current[0])
     progress = build_progress(load_config("train", ["rounds=2"]))
     for kind, seconds in (
         ("measurement", 600),
@@ -126,7 +126,7 @@ def test_the_time_left_is_told_once_each_kind_of_phase_was_measured(monkeypatch)
     ):
         left.append(progress.left())
         with progress.phase(kind):
-            now[0] += seconds
+            current[0] += seconds
     assert left == ["", "", "about 11 min left", "about 10 min left"]
     assert progress.left() == ""
 

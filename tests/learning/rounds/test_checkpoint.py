@@ -38,19 +38,20 @@ def test_resumed_rounds_are_those_of_one_run(tmp_path, kind):
         rounds=shorter,
         **settings,
     )
-    begun = rounds(first, 2)
+    start = rounds(first, 2)
     save_checkpoint(folder, first)
     second = small_run(seed=99, folder=folder, **settings)
     second.seed = 3
     assert load_checkpoint(folder, second) == 2
-    assert begun + rounds(second, 2) == expected
+    assert start + rounds(second, 2) == expected
     for key, value in whole.ego.network.weights().items():
         assert torch.equal(value, second.ego.network.weights()[key]), key
     assert whole.memory.index() == second.memory.index()
     assert len(whole.memory.rounds) == 2
-    for one, other in zip(whole.memory.rounds, second.memory.rounds, strict=True):
+    for single, other in zip(whole.memory.rounds, second.memory.rounds, strict=True):
         assert all(
-            torch.equal(value, other.traffic[key]) for key, value in one.traffic.items()
+            torch.equal(value, other.traffic[key])
+            for key, value in single.traffic.items()
         )
 
 
@@ -132,8 +133,8 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(
     assert load_checkpoint(tmp_path, other) == 1
     assert "passed over: " in capsys.readouterr().err
     saved = ActorEgo(hidden=(16,), checkpoint=str(older)).network.weights()
-    found = ActorEgo(hidden=(16,), checkpoint=str(tmp_path)).network.weights()
-    assert all(torch.equal(value, saved[key]) for key, value in found.items())
+    result = ActorEgo(hidden=(16,), checkpoint=str(tmp_path)).network.weights()
+    assert all(torch.equal(value, saved[key]) for key, value in result.items())
     assert all(
         torch.equal(value, saved[key])
         for key, value in other.ego.network.weights().items()

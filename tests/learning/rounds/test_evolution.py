@@ -16,18 +16,18 @@ from tests.learning.small import rounds, small_run, small_scenes
 def test_a_round_improves_moves_on_and_reports():
     run = small_run(nominal="prior")
     attack = run.synthesize
-    asked = []
+    requests = []
     run.synthesize = lambda ego, index, eta, seed: (
-        asked.append((ego, eta, seed)) or attack(ego, index, eta, seed)
+        requests.append((ego, eta, seed)) or attack(ego, index, eta, seed)
     )
     before = {key: value.clone() for key, value in run.ego.network.weights().items()}
     metrics = train_round(run)
-    etas = [eta.tolist() for _, eta, _ in asked]
+    etas = [eta.tolist() for _, eta, _ in requests]
     assert etas == [[1.0] * 3, [0.0] * 3], (
         "the attack, then the same scenes by the prior alone"
     )
-    assert asked[0][0] is run.ego
-    assert asked[0][2] == asked[1][2]
+    assert requests[0][0] is run.ego
+    assert requests[0][2] == requests[1][2]
     assert any(
         not torch.equal(value, before[key])
         for key, value in run.ego.network.weights().items()
@@ -38,7 +38,7 @@ def test_a_round_improves_moves_on_and_reports():
     assert run.curriculum.eta == 1.25, "no contact at eta 1: it rises"
     assert all(isinstance(value, float) for value in metrics.values())
     train_round(run)
-    assert asked[2][2] != asked[0][2], "another round, another seed"
+    assert requests[2][2] != requests[0][2], "another round, another seed"
 
 
 def test_a_round_s_choices_and_their_outcomes_are_counted():

@@ -10,9 +10,9 @@ from tests.learning.small import brake_check, small_scenes
 
 def traffic(number, rows=4, eta=2.0):
     index = torch.arange(rows)
-    made = brake_check(small_scenes(rows))(None, index, eta, 0)
-    made["states"] = made["states"] + number
-    return {**made, "eta": torch.full((rows,), eta)}
+    built = brake_check(small_scenes(rows))(None, index, eta, 0)
+    built["states"] = built["states"] + number
+    return {**built, "eta": torch.full((rows,), eta)}
 
 
 def filled(folder, bound, rounds=5):
@@ -29,7 +29,7 @@ def filled(folder, bound, rounds=5):
 )
 def test_the_oldest_rounds_leave_and_the_newest_stays(tmp_path, bound, left):
     memory = filled(tmp_path, bound)
-    assert [one.number for one in memory.rounds] == left
+    assert [single.number for single in memory.rounds] == left
     assert memory.rows == 4 * len(left)
     assert len(list(memory.folder.iterdir())) == 5, "a checkpoint may still name them"
     memory.prune(left[0])

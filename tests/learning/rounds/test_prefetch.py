@@ -37,23 +37,23 @@ def test_the_traffic_is_that_of_the_same_order_here():
     )
     train_round(run)
     order = run._next
-    kept = {name: value.clone() for name, value in order.ego.network.weights().items()}
-    now = run.ego.network.weights()
-    assert any(not torch.equal(value, now[name]) for name, value in kept.items())
+    rest = {name: value.clone() for name, value in order.ego.network.weights().items()}
+    current = run.ego.network.weights()
+    assert any(not torch.equal(value, current[name]) for name, value in rest.items())
     expected, _ = make_traffic(order, run.synthesize)
     metrics = train_round(run)
-    found = run.memory.rounds[-1].traffic
-    assert set(found) == set(expected)
+    result = run.memory.rounds[-1].traffic
+    assert set(result) == set(expected)
     assert order.number == run.memory.rounds[-1].number == 1
-    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    assert all(torch.equal(result[name], expected[name]) for name in expected)
     assert metrics["time/waiting"] >= 0
     assert metrics["synthesizer/eta"] == pytest.approx(order.eta.mean().item())
     assert all(
         torch.equal(value, order.ego.network.weights()[name])
-        for name, value in kept.items()
+        for name, value in rest.items()
     )
     against_now = run.synthesize(run.ego, order.scenes, order.eta, order.seed)["states"]
-    assert not torch.equal(against_now, found["states"][: len(order.scenes)])
+    assert not torch.equal(against_now, result["states"][: len(order.scenes)])
 
 
 def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tmp_path):

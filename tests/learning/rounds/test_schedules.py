@@ -40,11 +40,11 @@ def test_adaptive_intensity_seeks_the_band_within_its_bounds():
         eta=1.0,
         **band,
     )
-    seen = []
+    observed = []
     for rate in (0.0, 0.2, 0.4, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9, 0.9):
         curriculum.advance(rate)
-        seen.append(curriculum.eta)
-    assert seen == [1.5, 1.5, 1.5, 2.0, 2.0, 1.5, 1.0, 0.5, 0.5, 0.5], (
+        observed.append(curriculum.eta)
+    assert observed == [1.5, 1.5, 1.5, 2.0, 2.0, 1.5, 1.0, 0.5, 0.5, 0.5], (
         "the band's ends belong to it"
     )
     curriculum.advance()
@@ -92,11 +92,15 @@ def test_constant_intensities_take_turns():
         eta=[1.0, 2.0, 3.0],
         fraction=0.3,
     )
-    seen = []
+    observed = []
     for _ in range(3):
-        seen.append(curriculum.etas(torch.arange(4)).tolist())
+        observed.append(curriculum.etas(torch.arange(4)).tolist())
         curriculum.advance(0.0)
-    assert seen == [[1.0, 2.0, 3.0, 1.0], [2.0, 3.0, 1.0, 2.0], [3.0, 1.0, 2.0, 3.0]]
+    assert observed == [
+        [1.0, 2.0, 3.0, 1.0],
+        [2.0, 3.0, 1.0, 2.0],
+        [3.0, 1.0, 2.0, 3.0],
+    ]
     assert curriculum.eta == 2.0
     assert curriculum.fraction == 0.3
 

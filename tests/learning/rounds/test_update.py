@@ -104,14 +104,16 @@ def test_a_teacher_of_the_left_teaches_the_right_too():
 
     def turns():
         return [
-            ego.decide(seen)[:, 1].mean()
-            for seen in (labels["observation"], mirrored(labels["observation"]))
+            ego.decide(observed)[:, 1].mean()
+            for observed in (labels["observation"], mirrored(labels["observation"]))
         ]
 
     before = turns()
     for _ in range(8):
         learner.update(batch_of(ego), labels=labels)
-    left, right = (now - then for now, then in zip(turns(), before, strict=True))
+    left, right = (
+        current - later for current, later in zip(turns(), before, strict=True)
+    )
     assert left > 0.05
     assert right < -0.05
 
@@ -144,8 +146,8 @@ def test_the_action_penalty_counts_calm_frames_alone():
         torch.rand(data.shape) < 0.5,
         torch.ones(data.shape, dtype=torch.bool),
     ):
-        found = action_penalty(ego.network.network, inputs.set("calm", calm)).item()
-        assert found == pytest.approx(meant[calm].mean().item() / 4, rel=1e-4)
+        result = action_penalty(ego.network.network, inputs.set("calm", calm)).item()
+        assert result == pytest.approx(meant[calm].mean().item() / 4, rel=1e-4)
     assert (
         action_penalty(
             ego.network.network, inputs.set("calm", torch.zeros_like(calm))
@@ -208,8 +210,8 @@ def test_advantages_are_those_of_torchrl():
         value_network=values,
         deactivate_vmap=True,
     )(data.clone())
-    found = learner.advantages(data, ego.network.prepared(data["observation"])["seen"])
-    for name, value in zip(("advantage", "value_target"), found, strict=True):
+    result = learner.advantages(data, ego.network.prepared(data["observation"])["seen"])
+    for name, value in zip(("advantage", "value_target"), result, strict=True):
         torch.testing.assert_close(
             value,
             expected[name],
@@ -249,8 +251,8 @@ def test_frames_with_little_to_learn_are_left_out():
     critic warms up."""
     ego, learner, data = begun(advantage_filter=0.3, critic_warmup=1, epochs=1)
     assert learner.update(data)["frames_used"] == 1.0
-    seen = ego.network.prepared(data["observation"])["seen"]
-    advantage = learner.advantages(data, seen)[0].abs()
+    observed = ego.network.prepared(data["observation"])["seen"]
+    advantage = learner.advantages(data, observed)[0].abs()
     before = learner.peak.clone()
     expected = (
         (advantage >= 0.3 * (0.75 * before + 0.25 * advantage.max()))
@@ -303,10 +305,10 @@ def test_what_is_taught_counts_by_its_weight():
                 .mean()
             )
         return torch.cat(
-            [each.detach().flatten() for each in ego.network.parameters()]
+            [item.detach().flatten() for item in ego.network.parameters()]
         ), missed
 
-    (none, far), (little, _), (much, near) = after(0.0), after(1e-9), after(1.0)
+    (none, far), (little, _), (amount, near) = after(0.0), after(1e-9), after(1.0)
     assert torch.allclose(none, little, atol=2e-5)
-    assert not torch.allclose(none, much, atol=2e-5)
+    assert not torch.allclose(none, amount, atol=2e-5)
     assert near < far

@@ -72,8 +72,8 @@ def write_run(folder: Path) -> Path:
     data = data_config(write_folder(folder / "data", scenes()), folder / "cache")
     build = {"steps": 80, "vehicles": 8, "others": 4, "field_cells": 64}
     data |= {"build": build, "path": "data"}  # relative to where the command ran
-    found = load_scenes(data | {"path": str(folder / "data")})
-    batch = {key: found.scenes[key] for key in found.scenes.keys()}  # noqa: SIM118 - not a dict
+    result = load_scenes(data | {"path": str(folder / "data")})
+    batch = {key: result.scenes[key] for key in result.scenes.keys()}  # noqa: SIM118 - not a dict
     states = batch["logged"].clone()
     valid = batch["logged_valid"].clone()
     states[:, 0] = batch["start"]
@@ -85,7 +85,7 @@ def write_run(folder: Path) -> Path:
         late[first:end] = True
     valid[:, :, LATE] = late[:, None].T
     rollouts = Rollouts.in_scenes(
-        found,
+        result,
         torch.arange(2),
         states=states,
         valid=valid,
@@ -112,7 +112,7 @@ def save_run(folder: Path, data: dict, rollouts: Rollouts) -> Path:
     rollouts.to_npz(run / ROLLOUTS)
     (run / ".hydra").mkdir()
     OmegaConf.save({"data": data}, run / ".hydra" / "config.yaml")
-    begun = {
+    start = {
         "command": "",
         "cwd": str(folder),
         "choices": {},
@@ -121,7 +121,7 @@ def save_run(folder: Path, data: dict, rollouts: Rollouts) -> Path:
         "files": {},
     }
     (run / "provenance.json").write_text(
-        json.dumps(begun | {"versions": [{"git": ""}]})
+        json.dumps(start | {"versions": [{"git": ""}]})
     )
     return run
 

@@ -45,7 +45,7 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
     for index, (scenario, _) in enumerate(scenarios):
         rollout = rollout_of(run, index)
         count = len(rollout.size)
-        seen = np.zeros(rollout.valid.shape, bool)
+        observed = np.zeros(rollout.valid.shape, bool)
         for obstacle in scenario.dynamic_obstacles:
             row = (
                 obstacle.obstacle_id - 1 if obstacle.obstacle_id <= count else LATE
@@ -56,7 +56,7 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
                 assert np.hypot(*(state.position - [x, y])) < 0.01
                 assert abs(turned) < 1e-3
                 assert abs(speed - state.velocity) < 0.01
-                seen[state.time_step, row] = True
+                observed[state.time_step, row] = True
             assert np.allclose(
                 [obstacle.obstacle_shape.length, obstacle.obstacle_shape.width],
                 rollout.size[row],
@@ -64,7 +64,8 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
         single = rollout.valid.copy()
         single[:, [row for row in range(count) if row != LATE]] = False
         assert (
-            seen == rollout.valid & ~(single & (np.arange(81) == GAPS[2][0])[:, None])
+            observed
+            == rollout.valid & ~(single & (np.arange(81) == GAPS[2][0])[:, None])
         ).all()
 
 

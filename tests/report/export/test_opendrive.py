@@ -146,13 +146,13 @@ def test_a_turn_in_two_pieces_changes_width_and_limit_where_the_second_begins():
     assert beside.max() < 0.1
     lane = element.find("lanes/laneSection/right/lane")
     widths = [
-        (float(each.get("sOffset")), float(each.get("a")))
-        for each in lane.iterfind("width")
+        (float(item.get("sOffset")), float(item.get("a")))
+        for item in lane.iterfind("width")
     ]
     (_, first), (start, other) = widths
     assert (first, other) == (3.0, 3.2)
     assert start == pytest.approx(15 * arc[9], abs=0.1)
-    offsets = [float(each.get("a")) for each in element.iterfind("lanes/laneOffset")]
+    offsets = [float(item.get("a")) for item in element.iterfind("lanes/laneOffset")]
     assert offsets == [1.5, 1.6]
     limits = [kind.find("speed") for kind in element.iterfind("type")]
     assert limits[0].get("max") == lane.find("speed").get("max") == "5.0"
@@ -169,8 +169,8 @@ def test_the_file_follows_the_standard_s_schema(roads):
         / "opendrive_17_core.xsd"
     )
     etree.XMLSchema(etree.parse(str(schema))).assertValid(etree.parse(str(roads[1])))
-    known = {
+    certain = {
         item.get("code"): item.get("value")
         for item in roads[0].iterfind("header/userData")
     }
-    assert known == {"origin": "28 0"}
+    assert certain == {"origin": "28 0"}

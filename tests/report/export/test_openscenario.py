@@ -45,8 +45,8 @@ def entities_of(scenario):
         item.name: item.entityobject for item in scenario.entities.scenario_objects
     }
     return {
-        0 if name == EGO else int(name.removeprefix("agent_")): found
-        for name, found in named.items()
+        0 if name == EGO else int(name.removeprefix("agent_")): result
+        for name, result in named.items()
     }
 
 
@@ -66,7 +66,7 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
     for index, scenario in enumerate(scenarios):
         rollout = rollout_of(run, index)
         boxes = entities_of(scenario)
-        seen = np.zeros(rollout.valid.shape, bool)
+        observed = np.zeros(rollout.valid.shape, bool)
         for row, start, actions in events_of(scenario):
             ahead = boxes[row].boundingbox.center.x
             for action in actions:
@@ -86,16 +86,16 @@ def test_every_state_comes_back_and_no_other(run, scenarios):
                     assert abs(step * 0.1 - time) < 1e-6
                     assert np.hypot(*(np.array(middle) - [x, y])) < 0.01
                     assert abs(turned) < 1e-3
-                    seen[step, row] = True
+                    observed[step, row] = True
                 assert (
                     np.abs(np.diff([place.h for place in shape.positions])).max() < 0.5
                 )  # headings do not jump
-        seen[GAPS[2][0], LATE] = True  # a single step has no polyline
-        assert (seen == rollout.valid).all()
+        observed[GAPS[2][0], LATE] = True  # a single step has no polyline
+        assert (observed == rollout.valid).all()
 
 
 def test_who_appears_late_is_added_then_and_deleted_when_gone(scenarios):
-    found = [
+    result = [
         (type(a), row, start)
         for row, start, actions in events_of(scenarios[0])
         for a in actions
@@ -105,25 +105,25 @@ def test_who_appears_late_is_added_then_and_deleted_when_gone(scenarios):
         zip(*GAPS, strict=True),
         strict=True,
     ):
-        assert sorted(each[1:] for each in found if each[0] == kind) == [
+        assert sorted(item[1:] for item in result if item[0] == kind) == [
             (LATE, step / 10) for step in steps
         ]
 
 
 def test_boxes_types_and_reference_points(run, scenarios):
     rollout = rollout_of(run, 0)
-    found = entities_of(scenarios[0])
-    for row, entity in found.items():
+    result = entities_of(scenarios[0])
+    for row, entity in result.items():
         sides = entity.boundingbox.boundingbox
         assert [sides.length, sides.width] == pytest.approx(
             rollout.size[row].tolist(), abs=1e-5
         )
     kinds = [
-        found[row].vehicle_type.get_name()
+        result[row].vehicle_type.get_name()
         for row in (0, TRUCK, row_of(rollout, CYCLIST))
     ]
     assert kinds == ["car", "truck", "bicycle"]
-    assert isinstance(found[row_of(rollout, PEDESTRIAN)], xosc.Pedestrian)
-    axles = found[0].axles
+    assert isinstance(result[row_of(rollout, PEDESTRIAN)], xosc.Pedestrian)
+    axles = result[0].axles
     assert axles.rearaxle.xpos == 0
-    assert axles.frontaxle.xpos == pytest.approx(2 * found[0].boundingbox.center.x)
+    assert axles.frontaxle.xpos == pytest.approx(2 * result[0].boundingbox.center.x)

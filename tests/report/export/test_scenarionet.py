@@ -79,19 +79,19 @@ def test_descriptions_are_plain_and_zero_where_nobody_is(folder):
         ):
             check(part)
 
-    for made in (
+    for built in (
         pickle.loads(path.read_bytes()) for path in sorted(folder.glob("sd_*.pkl"))
     ):
-        check(made)
-        assert made["metadata"]["ts"].shape == (made["length"],)
-        for name, track in made["tracks"].items():
+        check(built)
+        assert built["metadata"]["ts"].shape == (built["length"],)
+        for name, track in built["tracks"].items():
             assert track["metadata"]["object_id"] == name
             assert track["state"]["valid"].any()
             for values in track["state"].values():
-                assert len(values) == made["length"]
+                assert len(values) == built["length"]
                 assert not np.any(values[~track["state"]["valid"]])
-        facts = made["metadata"]["e2rl"]
-        assert facts["scene_id"] in made["id"]
+        facts = built["metadata"]["e2rl"]
+        assert facts["scene_id"] in built["id"]
         assert facts["adversaries"] == [CUT_IN]
 
 
@@ -99,11 +99,11 @@ def test_the_summary_counts_what_filters_ask_for(run, folder):
     summary = pickle.loads((folder / SUMMARY).read_bytes())
     assert list(summary) == list(pickle.loads((folder / MAPPING).read_bytes()))
     for index, (name, facts) in enumerate(summary.items()):
-        made = pickle.loads((folder / name).read_bytes())
+        built = pickle.loads((folder / name).read_bytes())
         rollout = rollout_of(run, index)
         numbers = facts["number_summary"]
         types = rollout.agent_type[rollout.valid.any(0)].tolist()
-        assert facts["id"] == made["id"]
+        assert facts["id"] == built["id"]
         assert (
             numbers["num_objects"]
             == len(types)
@@ -115,7 +115,7 @@ def test_the_summary_counts_what_filters_ask_for(run, folder):
         assert numbers["num_traffic_lights"] == 2
         states = {"LANE_STATE_STOP": 40, "LANE_STATE_GO": 91 + 51}
         assert numbers["num_traffic_light_each_step"] == states
-        assert numbers["num_map_features"] == len(made["map_features"])
+        assert numbers["num_map_features"] == len(built["map_features"])
         assert facts["map_height_diff"] == numbers["map_height_diff"] == 0
 
 

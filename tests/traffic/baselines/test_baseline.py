@@ -113,8 +113,8 @@ def test_the_yielding_rule_binds_the_adversaries():
     duties = []
     for responsibility in ("none", "full"):
         bound = baseline("ctg_adv", responsibility=responsibility)
-        (now, _), _ = first_replan(bound, scene)
-        state, _, context = bound.replan_group(now)
+        (current, _), _ = first_replan(bound, scene)
+        state, _, context = bound.replan_group(current)
         duties.append(context.obstacles.duty)
         assert torch.equal(duties[-1].exempt | duties[-1].yields, state.adversary)
     assert not duties[0].yields.any()

@@ -45,7 +45,7 @@ def test_the_vehicle_and_the_future_of_greatest_value_are_driven(monkeypatch):
         tracks=1,
         gain=2.0,
     )  # four candidates at eta = 2
-    (now, context), _ = first_replan(on, scenes(2).scenes)
+    (current, context), _ = first_replan(on, scenes(2).scenes)
     values = torch.zeros(8, 2, 8)
     values[2, 0, 3], values[1, 0, 1], values[6, 0, 2] = (
         0.5,
@@ -54,10 +54,10 @@ def test_the_vehicle_and_the_future_of_greatest_value_are_driven(monkeypatch):
     )  # the seventh is not tried
     values[1, 1, 5] = 0.9  # a parked vehicle
     monkeypatch.setattr(cat, "overlap_value", lambda *_, size: values)
-    state, x0 = on.attack(now, context)
+    state, x0 = on.attack(current, context)
     assert state.adversary.nonzero().tolist() == [[0, 3]]
     assert torch.equal(state.held, state.adversary)
-    nominal = on.prior.sample(context, now.noise[..., 0, :].contiguous()).x0
+    nominal = on.prior.sample(context, current.noise[..., 0, :].contiguous()).x0
     same = (x0 == nominal).all(-1)
     assert not same[0, 3]
     assert same[1].all()

@@ -102,23 +102,23 @@ def test_clean_guidance_is_clipped_and_leaves_masked_rows_alone():
 
 def test_samples_go_along_the_batch_and_back():
     on = baseline("ctg_adv", samples=3)
-    (now, context), _ = first_replan(on, scenes(2).scenes)
-    flat = on.prior.sample(tiled(context, 3), folded(now.noise)).x0
-    many = flat.unflatten(0, (3, 2))
+    (current, context), _ = first_replan(on, scenes(2).scenes)
+    flat = on.prior.sample(tiled(context, 3), folded(current.noise)).x0
+    several = flat.unflatten(0, (3, 2))
     for number in range(3):
-        one = on.prior.sample(context, now.noise[..., number, :].contiguous()).x0
+        single = on.prior.sample(context, current.noise[..., number, :].contiguous()).x0
         torch.testing.assert_close(
-            many[number],
-            one,
+            several[number],
+            single,
             rtol=1e-4,
             atol=1e-4,
         )
     by_scene = torch.tensor([2, 0])
     by_vehicle = torch.arange(8).expand(2, -1) % 3
-    assert torch.equal(pick(flat, by_scene)[0], many[2, 0])
-    assert torch.equal(pick(flat, by_scene)[1], many[0, 1])
-    assert torch.equal(pick(flat, by_vehicle)[1, 4], many[1, 1, 4])
-    assert torch.equal(now.state.lane.v, context.state.v)
+    assert torch.equal(pick(flat, by_scene)[0], several[2, 0])
+    assert torch.equal(pick(flat, by_scene)[1], several[0, 1])
+    assert torch.equal(pick(flat, by_vehicle)[1, 4], several[1, 1, 4])
+    assert torch.equal(current.state.lane.v, context.state.v)
 
 
 @pytest.fixture(scope="module")
@@ -132,9 +132,9 @@ def bundled():
 def test_guidance_lowers_the_loss_of_bundled_scenes(name, bundled):
     scene, prior = bundled
     on = e2rl.make_traffic(name, prior, samples=1)
-    (now, context), view = first_replan(on, scene)
-    state, x0 = on.attack(now, context)
-    nominal = prior.sample(context, now.noise[..., 0, :].contiguous()).x0
+    (current, context), view = first_replan(on, scene)
+    state, x0 = on.attack(current, context)
+    nominal = prior.sample(context, current.noise[..., 0, :].contiguous()).x0
     view = replace(view, adversary=state.adversary)
     guided = state.adversary if on.adversarial else context.active
 

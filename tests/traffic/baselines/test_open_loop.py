@@ -26,18 +26,18 @@ def test_a_plan_goes_on_where_it_was_left():
             for i in range(5)
         ]
     )
-    begun = random_state(points, generator, speed=(5.0, 12.0)).map(
+    start = random_state(points, generator, speed=(5.0, 12.0)).map(
         lambda value: value[None]
     )
     x = 0.5 * torch.randn(1, 5, SIZE, generator=generator)
-    whole = decode(x, begun, points=points[None])
+    whole = decode(x, start, points=points[None])
     on_lane = torch.ones(1, 5, dtype=torch.bool)
     for age in (1, 4, 7):
         lane = whole.map(lambda value, at=5 * age - 1: value[..., at])
         rest = decode(
             later(
                 x,
-                begun,
+                start,
                 lane=lane,
                 age=torch.tensor([age]),
                 has_lane=on_lane,
@@ -45,16 +45,16 @@ def test_a_plan_goes_on_where_it_was_left():
             lane,
             points=points[None],
         )
-        known = HORIZON - 5 * age
+        certain = HORIZON - 5 * age
         torch.testing.assert_close(
-            rest.v[..., :known],
+            rest.v[..., :certain],
             whole.v[..., 5 * age :],
             rtol=0,
             atol=0.1,
         )
         gap = torch.hypot(
-            rest.x[..., :known] - whole.x[..., 5 * age :],
-            rest.y[..., :known] - whole.y[..., 5 * age :],
+            rest.x[..., :certain] - whole.x[..., 5 * age :],
+            rest.y[..., :certain] - whole.y[..., 5 * age :],
         )
         assert gap.max() < 0.3
         assert gap.mean() < 0.1
@@ -91,10 +91,10 @@ def test_after_the_plan_speed_is_kept():
 def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
     on = baseline("diffscene")
     scene = scenes(2).scenes
-    made = []
+    built = []
     scenario = on.scenario
     on.scenario = lambda replan, *rest: (
-        made.append(replan.state.replans.tolist()) or scenario(replan, *rest)
+        built.append(replan.state.replans.tolist()) or scenario(replan, *rest)
     )
     state = begin(on, scene, eta=2.0)
     world = World.at_start(scene)
@@ -102,7 +102,7 @@ def test_a_scenario_is_made_once_and_again_when_its_plan_is_over():
         plan = EGO.plan(world)
         state, traffic = on.replan(state, world, plan)
         world = executed(world, traffic, ego_plan=plan)
-    assert made == [[0, 0], [EVERY, EVERY]]
+    assert built == [[0, 0], [EVERY, EVERY]]
 
 
 def test_who_is_held_does_not_react_to_the_ego():

@@ -17,7 +17,7 @@ from tests.traffic.e2.traffic_scenes import EGO, begin, scenes
 def test_latents_are_decoded_as_by_ddim_without_noise():
     on = baseline("strive")
     on.steps = 4
-    (now, context), _ = first_replan(on, scenes(2).scenes)
+    (current, context), _ = first_replan(on, scenes(2).scenes)
     prior = small_prior(
         0,
         sampler=SamplerSettings(
@@ -27,8 +27,10 @@ def test_latents_are_decoded_as_by_ddim_without_noise():
             churn=0.0,
         ),
     )
-    expected = prior.sample(context, now.noise[..., 0, :]).x0
-    torch.testing.assert_close(on.decode(now.noise[0, ..., 0, :], context), expected)
+    expected = prior.sample(context, current.noise[..., 0, :]).x0
+    torch.testing.assert_close(
+        on.decode(current.noise[0, ..., 0, :], context), expected
+    )
 
 
 def test_the_objective_falls_over_the_iterations():
@@ -37,8 +39,8 @@ def test_the_objective_falls_over_the_iterations():
         iterations=12,
         knowledge="predicted",
     )
-    (now, context), view = first_replan(on, scenes(3).scenes)
-    first = now.noise[0, :, :, 0]
+    (current, context), view = first_replan(on, scenes(3).scenes)
+    first = current.noise[0, :, :, 0]
     values = []
 
     def loss(latent):
@@ -60,16 +62,16 @@ def test_the_objective_falls_over_the_iterations():
 
 def test_the_planner_is_driven_anew_at_every_iteration_and_not_without_its_plan():
     scene = scenes(2).scenes
-    asked = []
+    requests = []
     world = World.at_start(scene)
     look = Lookahead(EGO, world)
-    react = lambda rows, planned: asked.append(planned) or look(rows, planned)  # noqa: E731
+    react = lambda rows, planned: requests.append(planned) or look(rows, planned)  # noqa: E731
     on = baseline("strive", iterations=3)
     assert on.queries_ego
     assert not baseline("strive", knowledge="predicted").queries_ego
     on.replan(begin(on, scene, eta=2.0), world, EGO.plan(world), react)
-    assert len(asked) == 4
-    assert not torch.equal(asked[0], asked[3])
+    assert len(requests) == 4
+    assert not torch.equal(requests[0], requests[3])
 
 
 def test_nobody_behind_the_ego_is_the_attacker():
@@ -89,15 +91,15 @@ def test_nobody_behind_the_ego_is_the_attacker():
 
 def test_an_ego_that_is_boxed_in_has_no_solution():
     on = baseline("strive", iterations=10)
-    (now, context), view = first_replan(on, scenes(1).scenes)
-    first = now.noise[0, ..., 0, :]
+    (current, context), view = first_replan(on, scenes(1).scenes)
+    first = current.noise[0, ..., 0, :]
     far = view.states[None, :, :, None].repeat(1, 1, 1, 10, 1)
     far[..., 1] += 100.0 * (torch.arange(far.shape[2]) > 0)[:, None]
     walled = far.clone()
     walled[:, :, 1, :, :2] = torch.tensor(
         [8.0, 0.0]
     )  # stands a box's length ahead, at 10 m/s
-    found = []
+    result = []
     for states in (far, walled):
         motion = on.motion(torch.zeros_like(first), context)
         motion.x, motion.y, motion.heading, motion.v = states.unbind(-1)
@@ -107,8 +109,8 @@ def test_an_ego_that_is_boxed_in_has_no_solution():
             view=view,
             context=context,
         )
-        found.append(solved.tolist())
-    assert found == [[True], [False]]
+        result.append(solved.tolist())
+    assert result == [[True], [False]]
 
 
 def test_nobody_is_attacked_before_2_seconds():

@@ -126,9 +126,9 @@ def test_a_kept_route_is_the_only_one_looked_at():
     plan = constant_speed_states(world.scene, world, times=TIMES)[:, 0]
     assert not proposed(world, skeleton, plan=plan, keep_route=True).feasible.any()
     world.route[:, 1] = 2
-    kept = proposed(world, skeleton, plan=plan, keep_route=True)
-    assert kept.feasible[0, 1]
-    assert torch.equal(kept.route, world.route)
+    rest = proposed(world, skeleton, plan=plan, keep_route=True)
+    assert rest.feasible[0, 1]
+    assert torch.equal(rest.route, world.route)
 
 
 def test_who_cannot_meet_the_target_has_no_anchor_and_keeps_its_route():
@@ -179,14 +179,14 @@ def test_accelerations_are_bounded_and_bends_slow_down(monkeypatch):
 
 def free_candidate(speed):
     """One vehicle at the start of a long straight candidate without bends."""
-    one = torch.ones(1, 1, 1)
+    single = torch.ones(1, 1, 1)
     return anchoring._Candidates(
-        one.long(),
-        one,
-        usable=one.bool(),
-        end=200 * one,
-        s=0 * one,
-        d=0 * one,
+        single.long(),
+        single,
+        usable=single.bool(),
+        end=200 * single,
+        s=0 * single,
+        d=0 * single,
         bend_bound=torch.full((1, 1, 1, anchoring.BEND_VERTICES), 1e4),
         speed=torch.full((1, 1), speed),
         accel=torch.zeros(1, 1),
@@ -204,7 +204,7 @@ def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_sti
     """At 10 m/s to a target that stays 30.5 m ahead: the nearest steps are half a metre
     off it. Acceleration and offset from the route have prices of their own."""
     candidates = free_candidate(speed=10.0)
-    one = torch.ones(1, 1, 1)
+    single = torch.ones(1, 1, 1)
     steps = torch.ones(1, 1, 1, 50)
     limits = torch.tensor((-3.0, 2.0))
     target = anchoring._Target(
@@ -218,7 +218,7 @@ def test_the_time_gap_is_the_missing_distance_over_speed_and_what_the_target_sti
     expected = max(0.5 - slack, 0.0) / 10 + abs(beside) * crossing
     assert gap.item() == pytest.approx(expected, abs=1e-4)
     assert cost.item() == pytest.approx(expected, abs=1e-4)
-    shifted = candidates._replace(d=-0.4 * one)
+    shifted = candidates._replace(d=-0.4 * single)
     cost, gap, _ = anchoring.scored(
         shifted, torch.full((1, 1, 1, 1), -1.5), target, limits
     )

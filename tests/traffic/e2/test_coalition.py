@@ -132,7 +132,7 @@ def test_a_new_route_costs_its_log_probability_up_to_50_nats(gap, nats):
         sampler=SimpleNamespace(route_temperature=0.0),
         route_choice=lambda _: torch.tensor([[[0.0, gap]]]),
     )
-    found = coalition.Selector._route_nats(
+    result = coalition.Selector._route_nats(
         SimpleNamespace(prior=prior), None, torch.tensor([[0]])
     )
-    assert found.item() == pytest.approx(nats, abs=1e-3)
+    assert result.item() == pytest.approx(nats, abs=1e-3)

@@ -145,5 +145,5 @@ def test_arrival_windows_solve_the_equations_of_motion():
 @pytest.mark.parametrize(("x", "conflicting"), [(79.0, True), (83.0, False)])
 def test_by_default_routes_meet_within_five_seconds(x, conflicting):
     """The ego, flat out at 2 m/s^2 from 10 m/s, drives 75 m; both have a length."""
-    found = judge((x, -30.0, UP, 10.0))[0]
-    assert found.conflicting[0, 1].item() is conflicting
+    result = judge((x, -30.0, UP, 10.0))[0]
+    assert result.conflicting[0, 1].item() is conflicting

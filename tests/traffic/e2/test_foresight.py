@@ -75,14 +75,14 @@ def test_who_reverses_is_foreseen_as_the_same_motion_forwards():
     tracks[..., 0] = 24.0
     ways = [
         foresee(
-            each,
+            item,
             SIZE,
             tracks=tracks,
             sizes=SIZE,
             since=torch.tensor([-1.0]),
             settled=torch.tensor([False]),
         )
-        for each in (path, mirrored(path))
+        for item in (path, mirrored(path))
     ]
     assert float(ways[0].worth) > 0.2
     assert float(ways[0].time) < 3

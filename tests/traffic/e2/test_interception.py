@@ -35,7 +35,7 @@ def met(
     scene = world.scene
     expected = constant_speed_states(world.scene, world, times=TIMES)
     index, target = (torch.full((len(scene), 1), vehicle) for vehicle in (1, 0))
-    found = intercept(
+    result = intercept(
         world,
         index,
         target=target,
@@ -44,7 +44,7 @@ def met(
         settings=settings,
         halt_at_red=halt_at_red,
     )
-    return found, expected, scene["size"][:, :8]
+    return result, expected, scene["size"][:, :8]
 
 
 def driven(found, speed):
@@ -64,9 +64,9 @@ def driven(found, speed):
     ],
 )
 def test_the_boxes_touch_if_everybody_drives_as_expected(vehicle):
-    found, expected, size = met([EGO, vehicle])
-    assert found.cost.isfinite().all()
-    track = driven(found, vehicle[3])
+    result, expected, size = met([EGO, vehicle])
+    assert result.cost.isfinite().all()
+    track = driven(result, vehicle[3])
     assert overlap(
         track,
         size[0, 1].expand(50, 2),
@@ -76,8 +76,8 @@ def test_the_boxes_touch_if_everybody_drives_as_expected(vehicle):
 
 
 def test_a_way_begins_at_the_vehicle_in_its_direction_with_a_vertex_every_two_metres():
-    found, _, _ = met([EGO, BESIDE])
-    points = found.path[0, 0]
+    result, _, _ = met([EGO, BESIDE])
+    points = result.path[0, 0]
     assert torch.allclose(points[0], torch.tensor(BESIDE[:2]), atol=1e-4)
     step = points.diff(dim=0)
     assert (step.norm(dim=-1) - SPACING).abs().max() < 0.02
@@ -105,7 +105,7 @@ def test_the_cubic_between_two_poses_of_a_circle_is_its_arc(angle):
 def test_straight_on_it_costs_what_its_acceleration_and_time_weigh(x, heading, ego):
     """Behind the ego, or head-on: one constant acceleration until the boxes touch; the
     cheapest of ten moments."""
-    found, _, size = met([EGO, (x, 0.0, heading, 10.0)])
+    result, _, size = met([EGO, (x, 0.0, heading, 10.0)])
     touch = 0.4 * (size[0, 0, 0] + size[0, 1, 0]).item() * (heading == 0.0)
     costs = []
     for step in range(1, 11):
@@ -121,9 +121,9 @@ def test_straight_on_it_costs_what_its_acceleration_and_time_weigh(x, heading, e
             )
         )
     cost, accel, step = min(costs)
-    assert found.cost.item() == pytest.approx(cost, abs=1e-3)
-    assert found.knots[0, 0, :step].tolist() == pytest.approx([accel] * step, abs=1e-3)
-    assert not found.knots[0, 0, step:].any()
+    assert result.cost.item() == pytest.approx(cost, abs=1e-3)
+    assert result.knots[0, 0, :step].tolist() == pytest.approx([accel] * step, abs=1e-3)
+    assert not result.knots[0, 0, step:].any()
 
 
 @pytest.mark.parametrize("eta", [0.5, 1.0, 3.0])
@@ -133,15 +133,15 @@ def test_what_is_proposed_keeps_the_limits(eta):
     generator = torch.Generator().manual_seed(0)
     world.states[:, 1, 0] += 30 * torch.rand(30, generator=generator) - 10
     world.states[:, 1, 3] += 6 * torch.rand(30, generator=generator) - 3
-    found, _, _ = met([EGO, BESIDE], eta, settings=settings, world=world)
-    some = found.cost[:, 0].isfinite()
+    result, _, _ = met([EGO, BESIDE], eta, settings=settings, world=world)
+    some = result.cost[:, 0].isfinite()
     assert some.any()
-    knots = found.knots[some, 0]
+    knots = result.knots[some, 0]
     assert (knots <= settings.push * eta + 1e-5).all()
     assert (knots >= -settings.brake * eta - 1e-5).all()
     v = world.states[some, 1, 3]
     _, _, curvature = interpolate(
-        found.path[some, 0], torch.arange(2.0, 20.0, 2.0).expand(int(some.sum()), -1)
+        result.path[some, 0], torch.arange(2.0, 20.0, 2.0).expand(int(some.sum()), -1)
     )
     slow = v[:, None] ** 2 - 2 * settings.brake * eta * torch.arange(2.0, 20.0, 2.0)
     assert (
@@ -163,7 +163,7 @@ def test_no_way_leads_off_the_road_or_through_another_vehicle():
 
 
 def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
-    one = met([EGO, BESIDE])[0]
+    single = met([EGO, BESIDE])[0]
     turn = 0.7
     shift = torch.tensor([30.0, -12.0])
     spin = torch.tensor(
@@ -175,9 +175,9 @@ def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
     ]
     other = met(moved)[0]
     torch.testing.assert_close(
-        other.path[0, 0], one.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4
+        other.path[0, 0], single.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4
     )
-    torch.testing.assert_close(other.cost, one.cost, atol=1e-3, rtol=1e-4)
+    torch.testing.assert_close(other.cost, single.cost, atol=1e-3, rtol=1e-4)
 
 
 def oncoming_world():
@@ -328,5 +328,5 @@ def test_a_path_may_leave_the_road_by_half_a_metre(off, possible):
     cells = world.scene["field"].shape[-1]
     y = world.scene["field_origin"][0, 1] + CELL * torch.arange(cells)
     world.scene["field"][:, :, (y > 0.8) & (y < 2.6)] = off
-    found = met([EGO, BESIDE], world=world)[0]
-    assert found.cost.isfinite().item() is possible
+    result = met([EGO, BESIDE], world=world)[0]
+    assert result.cost.isfinite().item() is possible

@@ -84,10 +84,10 @@ def test_a_drawn_vehicle_is_an_adversary_that_pays_for_its_shift_and_the_choice(
     assert (plan.target[state.drawn] == 0).all()
     assert (plan.path_kl[state.drawn] > 0).all()
     assert (plan.path_kl[state.drawn.any(1), 0] >= math.log(3 / DRAWN)).all()
-    _, one = replanned(
+    _, single = replanned(
         synthesizer(kernels={"samples": 1}, interception={"reach": 0}), scene, eta=3.0
     )
-    assert not torch.equal(one.states, plan.states)
+    assert not torch.equal(single.states, plan.states)
 
 
 def test_a_budget_below_the_price_of_a_choice_draws_nobody_and_none_is_the_prior():
@@ -154,7 +154,7 @@ def test_two_kernels_of_a_vehicle_are_6_nats_apart(apart, drawn, monkeypatch):
     value[0, 1] = 1.0
     monkeypatch.setattr(kernels, "displacements", lambda _: table)
     monkeypatch.setattr(kernels, "_values", lambda *_, **__: value)
-    found = propose_kernels(
+    result = propose_kernels(
         SimpleNamespace(row=torch.tensor([0])),
         None,
         points=None,
@@ -162,7 +162,7 @@ def test_two_kernels_of_a_vehicle_are_6_nats_apart(apart, drawn, monkeypatch):
         gain=torch.tensor([1.0]),
         count=2,
     )
-    assert found.vehicle[0].tolist() == drawn
+    assert result.vehicle[0].tolist() == drawn
 
 
 def test_a_kernel_accelerates_by_up_to_2_and_brakes_by_up_to_3_m_s2():

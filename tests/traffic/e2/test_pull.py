@@ -54,14 +54,14 @@ def test_the_pull_is_the_posterior_mean_of_a_gaussian_prior(level, strength):
         (1 + strength) * precision + noise,
         precision @ (m + strength * goal) + alpha / sigma**2 * x,
     )
-    found = pulled(
+    result = pulled(
         clean.float(),
         goal.float(),
         strength=torch.tensor(strength),
         level=t.float(),
         schedule=schedule,
     )
-    torch.testing.assert_close(found.double(), tilted, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(result.double(), tilted, rtol=1e-3, atol=1e-3)
 
 
 def test_what_a_pull_costs_goes_to_the_divergence_of_the_tilted_gaussian(monkeypatch):
@@ -96,8 +96,8 @@ def test_what_a_pull_costs_goes_to_the_divergence_of_the_tilted_gaussian(monkeyp
     finally:
         for cached in caches:
             cached.cache_clear()
-    known = SIZE / 2 * ((1 - w) + (w * d / STD) ** 2 - 1 - math.log(1 - w))
-    assert sample.kl.mean().item() == pytest.approx(known, rel=0.06)
+    certain = SIZE / 2 * ((1 - w) + (w * d / STD) ** 2 - 1 - math.log(1 - w))
+    assert sample.kl.mean().item() == pytest.approx(certain, rel=0.06)
     assert sample.x0.mean().item() == pytest.approx(MEAN + w * d, abs=0.03)
     assert sample.x0.var().item() == pytest.approx((1 - w) * STD**2, rel=0.1)
 

@@ -58,8 +58,8 @@ def chat_server(answer):
         def do_POST(self):  # noqa: N802 (the name is http.server's)
             request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
             requests.append(request | {"path": self.path})
-            given = answer(request)
-            status, text = given if isinstance(given, tuple) else (200, given)
+            inputs = answer(request)
+            status, text = inputs if isinstance(inputs, tuple) else (200, inputs)
             choice = {
                 "index": 0,
                 "finish_reason": "stop",
@@ -102,12 +102,12 @@ def key(monkeypatch):
 
 def world(copies=1):
     """The ego and two vehicles: the first crosses its way, the second never meets it."""
-    made = make_world(
+    built = make_world(
         [(0.0, 0.0, 0.0, 10.0), (50.0, -40.0, UP, 10.0), (0.0, 12.0, 0.0, 10.0)],
         copies=copies,
     )
-    made.states[:, 1, 3] += torch.arange(copies)  # scenes that differ
-    return made
+    built.states[:, 1, 3] += torch.arange(copies)  # scenes that differ
+    return built
 
 
 def ask(url, tmp_path, made, **settings):
@@ -156,15 +156,15 @@ def test_the_model_decides_and_is_asked_by_schema_at_temperature_zero(tmp_path):
 
 
 def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_path):
-    made = world()
-    made.scene["parked"][:, 2] = True
+    built = world()
+    built.scene["parked"][:, 2] = True
     with chat_server(verdicts) as (url, requests):
-        result, _ = ask(url, tmp_path, made=made)
+        result, _ = ask(url, tmp_path, made=built)
     assert result.mask[0].tolist() == [False, True] + [False] * 6
     assert "Vehicle 2" not in requests[0]["messages"][-1]["content"]
     torch.testing.assert_close(
         result.conflicts.s,
-        feasible_vehicles(made.scene, made, settings=RULES).conflicts.s,
+        feasible_vehicles(built.scene, built, settings=RULES).conflicts.s,
     )
 
 
@@ -196,14 +196,14 @@ def test_the_conflict_table_stays_and_parked_vehicles_are_not_asked_about(tmp_pa
     ],
 )
 def test_the_rules_decide_where_the_model_fails(tmp_path, answer):
-    made = world(2)
+    built = world(2)
     with (
         chat_server(lambda request: answer) as (url, _),
         pytest.warns(UserWarning, match="rules decided for 1 of"),
     ):
-        result, counts = ask(url, tmp_path, made=made)
+        result, counts = ask(url, tmp_path, made=built)
     assert torch.equal(
-        result.mask, feasible_vehicles(made.scene, made, settings=RULES).mask
+        result.mask, feasible_vehicles(built.scene, built, settings=RULES).mask
     )
     assert counts["lm_fallbacks"] == counts["lm_requests"] == 2
     assert not list(tmp_path.iterdir()), "failures are not kept"

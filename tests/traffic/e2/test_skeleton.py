@@ -115,9 +115,9 @@ def test_the_ego_s_own_neighbour_and_following_lanes_hold_no_initiator():
         if lane is not None:
             world.scene[lane][:, 0] = 1
         states = world.states[:, [0, 2]]
-        asked = torch.tensor([[True]])
+        requests = torch.tensor([[True]])
         assert (
-            skeleton._on_ego_lanes(states, asked, scene=world.scene).item() != counts
+            skeleton._on_ego_lanes(states, requests, scene=world.scene).item() != counts
         ), lane
 
 
@@ -170,8 +170,8 @@ def random_world(seed, count=7):
 def acts(own, other, time, tau_long):
     """Whether vehicle `own` can act on `other` in `time` s, both states [4], on
     straight routes (Sec. IV-A3)."""
-    there = other[:2] + other[3] * time * torch.stack([other[2].cos(), other[2].sin()])
-    gap = there - own[:2]
+    place = other[:2] + other[3] * time * torch.stack([other[2].cos(), other[2].sin()])
+    gap = place - own[:2]
     v = own[3].item()
     along = (own[2].cos() * gap[0] + own[2].sin() * gap[1]).item()
     across = (own[2].cos() * gap[1] - own[2].sin() * gap[0]).item()
@@ -189,7 +189,7 @@ def test_influence_is_that_of_the_equations_of_motion(seed):
     settings = SkeletonSettings(tau_long=12.0)
     times = STEP * torch.arange(1, 11)
     expected = constant_speed_states(world.scene, world, times=times)
-    found = influence(
+    result = influence(
         world,
         index=torch.arange(1, 8)[None],
         present=torch.ones(1, 7, dtype=torch.bool),
@@ -197,7 +197,7 @@ def test_influence_is_that_of_the_equations_of_motion(seed):
         settings=settings,
     )[0]
     states = world.states[0]
-    wanted = torch.zeros_like(found)
+    wanted = torch.zeros_like(result)
     for i in range(7):
         for j in range(8):
             if i != j:
@@ -209,15 +209,15 @@ def test_influence_is_that_of_the_equations_of_motion(seed):
                     ]
                 )
     assert wanted.any()
-    assert torch.equal(found, wanted)
+    assert torch.equal(result, wanted)
 
 
 def earliest(link, path):
     """The step at which the last link of a path of slots is over, each no earlier than
     the one before; None: never."""
     step = 0
-    for one, next_one in zip(path, path[1:], strict=False):
-        later = link[one, next_one, step:].nonzero()
+    for single, next_one in zip(path, path[1:], strict=False):
+        later = link[single, next_one, step:].nonzero()
         if not len(later):
             return None
         step += int(later[0, 0])
@@ -293,8 +293,8 @@ def test_a_chain_begins_no_farther_than_80_m_from_the_ego(last, far):
 def test_by_default_three_act_on_the_ego():
     row = [(30.0, -20.0 - 18 * k, UP, 8.0) for k in range(5)]
     world = make_world([EGO, *row])
-    found = skeleton_of(world, mask(world, *range(1, 6)), far=0)
-    assert found.near.nonzero()[:, 1].tolist() == [1, 2, 3]
+    result = skeleton_of(world, mask(world, *range(1, 6)), far=0)
+    assert result.near.nonzero()[:, 1].tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize(("distance", "far"), [(14.5, False), (15.5, True)])
@@ -303,8 +303,8 @@ def test_by_default_a_vehicle_is_distant_from_15_m_on(distance, far):
     behind = -math.sqrt(distance**2 - 8.0**2)
     vehicles = [(0.0, 0.0, 0.0, 4.0), (8.0, -4.0, UP, 8.0), (8.0, behind, UP, 8.0)]
     world = make_world(vehicles)
-    found = skeleton_of(world, mask(world, 1, 2), near=1)
-    assert bool(found.far.any()) is far
+    result = skeleton_of(world, mask(world, 1, 2), near=1)
+    assert bool(result.far.any()) is far
 
 
 def column(gap, count):
@@ -315,13 +315,13 @@ def column(gap, count):
 @pytest.mark.parametrize(("gap", "linked"), [(19.5, True), (20.5, False)])
 def test_by_default_a_vehicle_acts_on_another_up_to_20_m_ahead(gap, linked):
     world = make_world([EGO, *column(gap, 2)])
-    found = skeleton_of(world, mask(world, 1, 2), near=1)
-    assert bool(found.far.any()) is linked
+    result = skeleton_of(world, mask(world, 1, 2), near=1)
+    assert bool(result.far.any()) is linked
 
 
 @pytest.mark.parametrize(("count", "linked"), [(4, True), (5, False)])
 def test_by_default_a_chain_has_four_vehicles(count, linked):
     """12 m apart, so that each acts on the one ahead of it alone."""
     world = make_world([EGO, *column(12.0, count)])
-    found = skeleton_of(world, mask(world, *range(1, 1 + count)), near=1)
-    assert bool(found.far.any()) is linked
+    result = skeleton_of(world, mask(world, *range(1, 1 + count)), near=1)
+    assert bool(result.far.any()) is linked

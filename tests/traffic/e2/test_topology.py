@@ -72,11 +72,11 @@ def test_first_contact_is_that_of_stepped_polygons():
 @pytest.mark.parametrize(("gap", "ttc"), [(79.9, 7.99), (80.1, math.inf)])
 def test_ttc_of_a_follower_of_equal_speeds_and_at_the_horizon(gap, ttc):
     states = torch.tensor([[0.0, 0, 0, 10], [4 + gap, 0, 0, 0], [-30, 0, 0, 10]])
-    found = time_to_collision(states, torch.tensor([4.0, 2.0]).expand(3, 2))
+    result = time_to_collision(states, torch.tensor([4.0, 2.0]).expand(3, 2))
     assert RISK_SECONDS == 8.0
-    assert found[0, 1].item() == pytest.approx(ttc)
-    assert found[0, 2] == torch.inf
-    assert found[0, 0] == 0
+    assert result[0, 1].item() == pytest.approx(ttc)
+    assert result[0, 2] == torch.inf
+    assert result[0, 0] == 0
 
 
 def test_weights_are_the_sigmoid_of_the_ttc_and_nothing_for_the_absent():
@@ -121,7 +121,7 @@ def cliques_by_definition(weight, distance, valid, settings):
         for some in combinations(nodes, size)
         if all((i, j) in graph for i, j in combinations(some, 2))
     ]
-    found = set()
+    result = set()
     for clique in (
         some for some in complete if not any(some < other for other in complete)
     ):
@@ -130,8 +130,8 @@ def cliques_by_definition(weight, distance, valid, settings):
             for i in clique
         }
         order = sorted(clique, key=lambda i: (i != 0, -total[i], distance[i], i))
-        found.add(tuple(sorted(order[: settings.max_clique])))
-    found = [clique for clique in found if min(hops[i] for i in clique) <= HOPS]
+        result.add(tuple(sorted(order[: settings.max_clique])))
+    result = [clique for clique in result if min(hops[i] for i in clique) <= HOPS]
 
     def rank(clique):
         pairs = [weight[i, j] for i, j in combinations(clique, 2)]
@@ -141,7 +141,7 @@ def cliques_by_definition(weight, distance, valid, settings):
             clique,
         )
 
-    return sorted(found, key=rank)[: settings.top_cliques]
+    return sorted(result, key=rank)[: settings.top_cliques]
 
 
 @pytest.mark.parametrize(("seed", "nodes"), [(3, 24), (5, 24), (8, 24), (9, 7)])
@@ -203,14 +203,14 @@ def candidates_of(pairs, vehicles, monkeypatch, **settings):
 def test_a_queue_counts_up_to_three_vehicles_from_the_ego(monkeypatch):
     """Cliques need a member within two edges: 2 and 3 are one, 3 and 4 are none."""
     queue = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
-    found = candidates_of(queue, 6, monkeypatch, top_cliques=100)
-    assert found == [1, 2, 3]
+    result = candidates_of(queue, 6, monkeypatch, top_cliques=100)
+    assert result == [1, 2, 3]
 
 
 def test_graphs_have_the_ego_and_the_23_vehicles_nearest_to_it(monkeypatch):
     star = [(0, vehicle) for vehicle in range(1, 30)]
-    found = candidates_of(star, 30, monkeypatch, top_cliques=100, candidates=100)
-    assert found == list(range(1, 24))
+    result = candidates_of(star, 30, monkeypatch, top_cliques=100, candidates=100)
+    assert result == list(range(1, 24))
 
 
 def star(vehicles):
@@ -230,8 +230,8 @@ def test_by_default_a_clique_has_four_members(monkeypatch):
 
 
 def test_by_default_there_are_ten_candidates(monkeypatch):
-    found = candidates_of(star(15), 16, monkeypatch, top_cliques=100)
-    assert found == list(range(1, 11))
+    result = candidates_of(star(15), 16, monkeypatch, top_cliques=100)
+    assert result == list(range(1, 11))
 
 
 def risk(time):

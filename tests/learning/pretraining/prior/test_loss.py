@@ -103,8 +103,8 @@ def test_the_action_term_is_the_weighted_mean_square_over_known_knots(windows):
     )
     drawn = draw(windows, seeded())
     weight = loss_weight(windows, drawn)
-    known = torch.cat([windows["knot_weight"]] * loss.LEVELS).mean(-1)
-    expected = (0.25 * known * weight).sum() / weight.sum()
+    certain = torch.cat([windows["knot_weight"]] * loss.LEVELS).mean(-1)
+    expected = (0.25 * certain * weight).sum() / weight.sum()
     torch.testing.assert_close(terms(prior, windows, generator=seeded())[1], expected)
 
 
@@ -115,8 +115,8 @@ def test_offsets_count_on_lanes_only(windows):
     free["on_lane"] = torch.zeros_like(free["on_lane"])
     wrong[..., -1] += 2.0  # 1 m to the left in the end
     prior.denoiser.forward = lambda x, level, encoding: torch.cat([wrong] * loss.LEVELS)
-    seen, unseen = (
+    observed, unseen = (
         terms(prior, batch, generator=seeded())[2] for batch in (windows, free)
     )
-    assert seen > 0.2
+    assert observed > 0.2
     assert unseen < 0.05

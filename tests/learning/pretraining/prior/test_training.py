@@ -77,8 +77,8 @@ def test_the_average_is_exponential_with_a_decay_that_grows_to_ema(
         run.train(run.done + 1)
         for key, value in run.prior.denoiser.state_dict().items():
             expected[key].lerp_(value, 1 - decay)
-    found = run.average.module.state_dict()
-    assert all(torch.equal(found[key], value) for key, value in expected.items())
+    result = run.average.module.state_dict()
+    assert all(torch.equal(result[key], value) for key, value in expected.items())
 
 
 def test_the_rate_warms_up_and_ends_at_zero(windows):
@@ -160,7 +160,7 @@ def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_w
             **how,
         )
 
-    one, origin = load_prior(str(trained("whole")))
+    single, origin = load_prior(str(trained("whole")))
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(training, "held_out_loss", stopping)
         trained("part")
@@ -168,7 +168,7 @@ def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_w
     assert all(
         torch.equal(a, b)
         for a, b in zip(
-            one.state_dict().values(), two.state_dict().values(), strict=True
+            single.state_dict().values(), two.state_dict().values(), strict=True
         )
     )
     assert origin["held_out_loss"] == again["held_out_loss"]

@@ -38,8 +38,8 @@ def test_mirrored_scenes_give_mirrored_windows(free):
     scene = curved_scenes()
     scene["route_valid"][:, :FIRST] &= not free
     here = make_windows(scene)
-    there = make_windows(mirrored(scene))
-    assert len(here) == len(there)
+    place = make_windows(mirrored(scene))
+    assert len(here) == len(place)
     for key, sided in (
         ("nodes", SIDED_NODE),
         ("pairs", SIDED_EDGE),
@@ -49,15 +49,15 @@ def test_mirrored_scenes_give_mirrored_windows(free):
         sign[list(sided)] = -1
         real = [slice(None), slice(0, FIRST), slice(0, FIRST)][: here[key].ndim - 1]
         torch.testing.assert_close(
-            there[key][real], (here[key] * sign)[real], rtol=0, atol=2e-2, msg=key
+            place[key][real], (here[key] * sign)[real], rtol=0, atol=2e-2, msg=key
         )
     for key in ("d", "d1", "d2", "aside"):
         torch.testing.assert_close(
-            there[key][:, :FIRST], -here[key][:, :FIRST], rtol=0, atol=2e-3, msg=key
+            place[key][:, :FIRST], -here[key][:, :FIRST], rtol=0, atol=2e-3, msg=key
         )
     for key in ("v", "a", "ahead", "weight"):
         torch.testing.assert_close(
-            there[key],
+            place[key],
             here[key],
             rtol=0,
             atol=2e-2,
@@ -103,9 +103,9 @@ def test_the_derivative_of_a_parabola_is_exact_inside_and_one_sided_at_gaps():
     time = 0.1 * torch.arange(12.0)
     values = (time**2)[None, :, None]
     valid = torch.ones(1, 12, 1, dtype=torch.bool)
-    found = derivative(values, valid)[0, :, 0]
+    result = derivative(values, valid)[0, :, 0]
     torch.testing.assert_close(
-        found[1:-1],
+        result[1:-1],
         2 * time[1:-1],
         rtol=0,
         atol=1e-5,

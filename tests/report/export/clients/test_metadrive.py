@@ -27,12 +27,12 @@ def test_contacts_are_at_the_same_step_and_summaries_the_same(run, metadrive, tm
             for row in csv.DictReader(file)
         ]
     assert len(read) == len(steps)
-    for found, step in zip(read, steps, strict=True):
-        assert (found["contact"] is None) == (step is None)
+    for result, step in zip(read, steps, strict=True):
+        assert (result["contact"] is None) == (step is None)
         if step is not None:
-            assert found["contact"] == pytest.approx(
+            assert result["contact"] == pytest.approx(
                 step + HISTORY, abs=1
             )  # boxes have a margin there
-        assert found["differing"] == [
+        assert result["differing"] == [
             "map_height_diff"
         ]  # which is -inf there, of maps without lines

@@ -78,10 +78,10 @@ def test_every_link_is_a_connection_at_its_lane_s_limit(places, sumo, tmp_path):
                 limit, abs=0.01
             )
         connections = [
-            each for each in root.iterfind("connection") if each.get("from") in lane_of
+            item for item in root.iterfind("connection") if item.get("from") in lane_of
         ]
         ways = {
-            (lane_of[each.get("from")], lane_of[each.get("to")]) for each in connections
+            (lane_of[item.get("from")], lane_of[item.get("to")]) for item in connections
         }
         assert ways == lane_pairs(episode.lanes, set(lane_of.values()))
         count += 1
@@ -118,9 +118,11 @@ def test_commonroad_sumo_takes_every_place_with_its_lights(
         tools, "lights_to_sumo", *commonroad_files(places, "places"), path=sumo
     )
     assert len(read) == len(episodes) == 16
-    for episode, found in zip(episodes, read, strict=True):
-        assert found["connections"] > 0
-        assert (found["lights"] > 0) == (found["signalled"] > 0) == bool(episode.lights)
+    for episode, result in zip(episodes, read, strict=True):
+        assert result["connections"] > 0
+        assert (
+            (result["lights"] > 0) == (result["signalled"] > 0) == bool(episode.lights)
+        )
 
 
 def test_the_drivability_checker_sees_contacts_at_the_same_step(
