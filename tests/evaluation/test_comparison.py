@@ -146,14 +146,14 @@ def test_two_egos_of_one_run_and_none_by_chance(tmp_path):
 def test_runs_that_are_no_pairs_are_refused_by_what_differs(
     tmp_path, settings, inputs, told
 ):
-    single = run_of(tmp_path / "one", [row_of(k) for k in range(3)])
+    first = run_of(tmp_path / "one", [row_of(k) for k in range(3)])
     two = run_of(
         tmp_path / "two", [row_of(k) for k in (2, 9)], settings=settings, inputs=inputs
     )
     with pytest.raises(
         InputError, match=f"two: no pairs with .*one, which has other {told}"
     ):
-        compared(Driven.read(single), Driven.read(two))
+        compared(Driven.read(first), Driven.read(two))
 
 
 def test_contacts_with_people_are_compared_where_there_are_any(tmp_path):
@@ -167,14 +167,14 @@ def test_contacts_with_people_are_compared_where_there_are_any(tmp_path):
 
 
 def test_another_planner_version_or_machine_may_differ(tmp_path):
-    single = run_of(tmp_path / "one", [row_of(0)])
+    first = run_of(tmp_path / "one", [row_of(0)])
     two = run_of(
         tmp_path / "two",
         [row_of(0, ego="b")],
         settings={"ego": {"x": 1}, "processes": 8},
         inputs={"ego.file=b.pt": "9"},
     )
-    assert compared(Driven.read(single), Driven.read(two))[0][0]["of"] == 1
+    assert compared(Driven.read(first), Driven.read(two))[0][0]["of"] == 1
 
 
 def tries(scene, *hits, seed=0):

@@ -85,10 +85,10 @@ def test_methods_share_the_noise_of_a_scene_and_seed():
     assert len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
     methods = [Method("one", synthesizer()), Method("two", synthesizer())]
     twice = run_protocol(setup_of(scenes(SCENES)), methods, seeds=[4])
-    single, two = (row["metrics"] for row in twice)
-    for name in single:
+    first, two = (row["metrics"] for row in twice)
+    for name in first:
         if not name.startswith("seconds"):
-            means = torch.tensor([single[name]["mean"], two[name]["mean"]])
+            means = torch.tensor([first[name]["mean"], two[name]["mean"]])
             torch.testing.assert_close(means[0], means[1], equal_nan=True, msg=name)
 
 
@@ -130,11 +130,11 @@ class Stopped(Setup):
 def stopping_run(folder, stops, scene_set):
     """A run that is interrupted after so many batches each time, and then ends; returns
     what was rolled out."""
-    process = []
+    finished = []
     for left in (*stops, 100):
         setup = Stopped(scene_set, IDMEgo(), ego_name="idm", sim=SimSettings(), batch=2)
         setup.left = left
-        setup.done = process
+        setup.done = finished
         methods = [
             Method("nominal", ConstantVelocity()),
             Method("ambush", Ambush(), eta=2.0),
@@ -146,7 +146,7 @@ def stopping_run(folder, stops, scene_set):
         except KeyboardInterrupt:
             assert left < 100
             assert not (folder / TABLE).exists(), "no table of half a run"
-    return process
+    return finished
 
 
 def same_runs(one, other):
@@ -177,6 +177,6 @@ def test_a_run_that_was_interrupted_equals_one_that_was_not(tmp_path):
     """However often it stops; no rollout is done twice, and none has two rows."""
     scene_set = small_scenes(3)
     whole = stopping_run(tmp_path / "whole", (), scene_set=scene_set)
-    process = stopping_run(tmp_path / "parts", (3, 0, 1), scene_set=scene_set)
-    assert sorted(process) == sorted(set(process)) == sorted(whole)
+    finished = stopping_run(tmp_path / "parts", (3, 0, 1), scene_set=scene_set)
+    assert sorted(finished) == sorted(set(finished)) == sorted(whole)
     same_runs(tmp_path / "whole", tmp_path / "parts")

@@ -81,11 +81,11 @@ def test_each_number_that_differs_is_named_with_both_values():
     ]
     assert "d s e2 idm 1.0: cfr.mean: 0.25 then, 0.5 now" in result.text()
     assert "8 of 10" in result.text()
-    for single, other, place in (
+    for first, other, place in (
         (table(), table(2.0) + table(), 1),
         (table(2.0) + table(), table(), 2),
     ):
-        result = compare_tables(single, other)
+        result = compare_tables(first, other)
         assert result.equal == len(result.different) == 10
         assert {entry[place] for entry in result.different} == {"missing"}
 

@@ -115,8 +115,8 @@ def test_the_order_of_the_failures_does_not_matter():
 def test_distances_are_the_weights_of_what_differs():
     def apart(**changes):
         pair = [failure(CROSSING), failure(CROSSING, **changes)]
-        single, two = torch.tensor(feature_vectors(pair))
-        return (single - two).abs().sum().item()
+        first, two = torch.tensor(feature_vectors(pair))
+        return (first - two).abs().sum().item()
 
     assert apart() == 0
     assert apart(approach="crossing from the left") == pytest.approx(0.5)

@@ -330,9 +330,9 @@ def test_time_to_collision_looks_beside_in_two_lanes_alone():
         ]
         == 0
     )
-    single = [([[-500, 2], [500, 2]], 8)]
+    first = [([[-500, 2], [500, 2]], 8)]
     assert (
-        scores(course(0, 2, heading=0, speed=10), near, lanes=single)[
+        scores(course(0, 2, heading=0, speed=10), near, lanes=first)[
             "time_to_collision_within_bound"
         ]
         == 1

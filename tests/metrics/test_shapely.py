@@ -126,12 +126,12 @@ def score(file):
         "bg_pairs": 0.0,
     }
     others = simulated[simulated > 0]
-    for number, single in enumerate(others):
+    for number, first in enumerate(others):
         two = others[number + 1 :]
-        both = place[: stop + 1, [single]] & place[: stop + 1, two]
+        both = place[: stop + 1, [first]] & place[: stop + 1, two]
         meet = (
             shapely.area(
-                shapely.intersection(box[: stop + 1, [single]], box[: stop + 1, two])
+                shapely.intersection(box[: stop + 1, [first]], box[: stop + 1, two])
             )
             > 0
         ) & both

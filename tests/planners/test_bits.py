@@ -95,12 +95,12 @@ def test_a_file_gives_the_network_back_and_another_is_refused(tmp_path):
     observed = torch.randn(4, OBSERVATION_SIZE)
     save_bits(network, tmp_path / "bits.safetensors", origin={"data": "made"})
     again = load_bits(str(tmp_path))
-    for single, other in zip(
+    for first, other in zip(
         network.goals(network.encode(observed)),
         again.goals(again.encode(observed)),
         strict=True,
     ):
-        assert torch.equal(single, other)
+        assert torch.equal(first, other)
         assert not other.requires_grad
     network.architecture["cells"] = 9
     save_bits(network, tmp_path / "bits.safetensors", origin={})

@@ -125,9 +125,9 @@ def test_a_reset_in_between_makes_a_new_plan_there():
     data = env.rollout(
         70, EgoPolicy(Cruise(replan_every=5), env), break_when_any_done=False
     )
-    process = data["next", "done"]
-    assert process.any()
-    assert not process.all(0).any()
+    finished = data["next", "done"]
+    assert finished.any()
+    assert not finished.all(0).any()
     assert data["action"].abs().max() < 1e-3
 
 

@@ -242,10 +242,10 @@ def test_unknown_steps_do_not_influence_a_fit(generator):
     certain = torch.ones_like(plan.s)
     certain[:, 20:] = 0
     other = plan.map(lambda value: torch.where(certain > 0, value, -77.0))
-    for single, two in zip(
+    for first, two in zip(
         fit(plan, certain, state=state), fit(other, certain, state=state), strict=True
     ):
-        torch.testing.assert_close(single, two)
+        torch.testing.assert_close(first, two)
 
 
 def test_travelled_distance_is_the_integral_of_speed(generator):

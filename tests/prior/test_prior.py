@@ -373,8 +373,8 @@ def test_what_is_known_of_the_moment_changes_no_context(moved):
     anew = prior.encode(before.routed, state, world)
     assert torch.equal(certain.encoding.nodes, anew.encoding.nodes)
     assert all(
-        torch.equal(single, other)
-        for single, other in zip(certain.followed, anew.followed, strict=True)
+        torch.equal(first, other)
+        for first, other in zip(certain.followed, anew.followed, strict=True)
     )
     assert (certain.followed is before.followed) == (not moved)
 
@@ -384,11 +384,11 @@ def test_without_a_plan_the_ego_is_sampled_like_everybody_else():
     scene = curved_scenes(2)
     certain = context_of(prior, scene)
     unknown = prior.encode(certain.routed, certain.state, World.at_start(scene))
-    single, two = (
+    first, two = (
         prior.sample(unknown, noise_for(prior, scene, seed=seed)).x0[:, 0]
         for seed in (0, 1)
     )
-    assert (single - two).abs().amin() > 0
+    assert (first - two).abs().amin() > 0
 
 
 def test_the_network_sees_the_ego_s_plan_nearly_noise_free(monkeypatch):

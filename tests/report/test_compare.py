@@ -128,10 +128,10 @@ def test_without_rollout_files_the_pairs_are_still_told(runs, tmp_path):
 
 
 def test_the_command_needs_two_and_a_page(runs, capsys):
-    single, two = map(str, runs)
+    first, two = map(str, runs)
     for inputs, said in (
-        ([single], "give two runs, or one with"),
-        ([single, two, "--out", "x.json"], "ends in .html"),
+        ([first], "give two runs, or one with"),
+        ([first, two, "--out", "x.json"], "ends in .html"),
     ):
         with pytest.raises(SystemExit) as end:
             main(inputs)
@@ -166,8 +166,8 @@ def test_one_clock_moves_both_replays(made, chromium, width, height):  # noqa: F
     chromium.find_element("id", "play").click()
     time = chromium.execute_script(STEP)
     assert all(
-        single != other
-        for single, other in zip(begin, chromium.execute_script(pictures), strict=True)
+        first != other
+        for first, other in zip(begin, chromium.execute_script(pictures), strict=True)
     )
     clocks = [
         node.text.split()[0]

@@ -56,8 +56,8 @@ def test_compiled_it_gives_what_it_gives_eagerly_for_every_size(on, batch, count
     calls.clear()
     result = across(*arguments)
     assert not calls, "the function itself was called"
-    for single, other in zip(result, across.function(*arguments), strict=True):
-        assert torch.allclose(single, other, atol=1e-6)
+    for first, other in zip(result, across.function(*arguments), strict=True):
+        assert torch.allclose(first, other, atol=1e-6)
     assert isinstance(result, Line)
     assert across.file.exists()
     views = arguments[0].transpose(0, 1).contiguous().transpose(0, 1), *arguments[1:]
@@ -87,8 +87,8 @@ def test_what_is_not_as_declared_runs_as_it_is(on, change):
     result = across(*arguments)
     assert calls == [len(arguments[0])]
     assert all(
-        torch.equal(single, other)
-        for single, other in zip(result, across.function(*arguments), strict=True)
+        torch.equal(first, other)
+        for first, other in zip(result, across.function(*arguments), strict=True)
     )
 
 

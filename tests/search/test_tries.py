@@ -50,7 +50,7 @@ def test_tries_look_elsewhere_than_those_before_of_whatever_family():
             drawn(10, family=family, seed=seed)[position::2]
             for position, family in enumerate((TIMED, other))
         ]
-        return [Decisions(*single.decisions).moment for single in sum(tries, [])]
+        return [Decisions(*first.decisions).moment for first in sum(tries, [])]
 
     draw = Random(0)
     independent = [[draw.uniform(1.0, 5.0) for _ in range(10)] for _ in range(40)]

@@ -78,13 +78,13 @@ def test_what_is_not_observed_drives_alike():
     )
     check_env_specs(DrivingEnv(scenes, SimSettings(), 2, observed=False), seed=0)
     begin = TensorDict({"scene_index": torch.tensor([[0], [2]])}, batch_size=[2])
-    single = records.reset(begin.clone())
+    first = records.reset(begin.clone())
     other = blind.reset(begin.clone())
     for _ in range(15):
         action = torch.tensor([[1.0, 0.1], [-1.0, 0.2]])
-        single, other = (
+        first, other = (
             env.step(td.set("action", action))["next"]
-            for env, td in ((records, single), (blind, other))
+            for env, td in ((records, first), (blind, other))
         )
         assert other["observation"].shape == (2, 0)
         for key in (
@@ -94,7 +94,7 @@ def test_what_is_not_observed_drives_alike():
             ("metrics", "contact"),
             ("metrics", "progress"),
         ):
-            assert torch.equal(single[key], other[key]), key
+            assert torch.equal(first[key], other[key]), key
 
 
 def test_the_reported_agents_are_the_environments_world():
@@ -129,17 +129,17 @@ def test_partial_resets_keep_the_others_running():
     data = env.rollout(200, break_when_any_done=False)
     assert (data["next", "timestep"] == data["timestep"] + 1).all()
     assert (data["next", "scene_index"] == data["scene_index"]).all()
-    process = data["next", "done"][:, :-1]
-    assert process.any(1).all()
-    assert (data["timestep"][:, 1:][process] == 0).all()
+    finished = data["next", "done"][:, :-1]
+    assert finished.any(1).all()
+    assert (data["timestep"][:, 1:][finished] == 0).all()
     same = data["scene_index"][:, 1:] == data["scene_index"][:, :-1]
-    assert same[~process].all()
-    assert not same[process].all()
+    assert same[~finished].all()
+    assert not same[finished].all()
     carried = (data["next", "observation"][:, :-1] == data["observation"][:, 1:]).all(
         -1, keepdim=True
     )
-    assert carried[~process].all()
-    assert not carried[process].any()
+    assert carried[~finished].all()
+    assert not carried[finished].any()
 
 
 def test_seed_makes_batches_identical():

@@ -46,12 +46,12 @@ def test_wall_times_and_what_a_run_keeps_for_itself_are_no_difference(tmp_path):
 
 @pytest.mark.parametrize("name", FILES)
 def test_everything_else_is_one(tmp_path, name):
-    single = run_of(tmp_path / "one")
+    first = run_of(tmp_path / "one")
     other = run_of(tmp_path / "other")
     (other / name).write_text(FILES[name].replace(*CHANGED[name]))
-    assert kills.differences(single, other) == [name]
+    assert kills.differences(first, other) == [name]
     (other / name).unlink()
-    assert kills.differences(single, other) == [name]
+    assert kills.differences(first, other) == [name]
 
 
 def test_states_and_weights_are_compared_by_their_tensors(tmp_path):

@@ -55,8 +55,8 @@ def test_a_batch_is_halved_until_the_one_that_raises_is_alone(error):
             raise error
         return whole(tasks)
 
-    process, ended = attempt(roll_out, list(range(8)))
-    assert [task for tasks, _ in process for task in tasks] == [0, 1, 2, 3, 4, 6, 7]
+    finished, ended = attempt(roll_out, list(range(8)))
+    assert [task for tasks, _ in finished for task in tasks] == [0, 1, 2, 3, 4, 6, 7]
     assert [(task, why["reason"]) for task, why in ended] == [
         (5, f"raised {type(error).__name__}")
     ]
@@ -74,6 +74,6 @@ def test_rows_that_a_planner_names_are_believed_where_the_batch_has_them(wrong, 
             )
         return whole(tasks)
 
-    process, ended = attempt(roll_out, [4, 5, 6])
-    assert [task for tasks, _ in process for task in tasks] == [4, 6]
+    finished, ended = attempt(roll_out, [4, 5, 6])
+    assert [task for tasks, _ in finished for task in tasks] == [4, 6]
     assert [(task, why["detail"]) for task, why in ended] == [(5, detail)]

@@ -70,21 +70,21 @@ def test_a_batch_has_the_episodes_of_the_torchrl_environment(given):
         ][:, 0].tolist()
         action = actions(4, step)
         td["action"] = in_units(torch.tensor(action), *batch.bounds)
-        process, td = env.step_and_maybe_reset(td)
+        finished, td = env.step_and_maybe_reset(td)
         observed, *flags, info = batch.step(action)
         for key, value in zip(
             ("reward", "terminated", "truncated"), flags, strict=True
         ):
-            assert (value == process["next", key][:, 0].numpy()).all()
-        over = process["next", "done"][:, 0].numpy()
+            assert (value == finished["next", key][:, 0].numpy()).all()
+        over = finished["next", "done"][:, 0].numpy()
         assert (over == info.get("_final_obs", False)).all()
         for row in over.nonzero()[0]:
             assert (
-                info["final_obs"][row] == process["next", "observation"][row].numpy()
+                info["final_obs"][row] == finished["next", "observation"][row].numpy()
             ).all()
             assert (
                 info["final_info"]["off_road"][row]
-                == process["next", "metrics", "off_road"][row, 0]
+                == finished["next", "metrics", "off_road"][row, 0]
             )
             assert observed[row, ELAPSED] == 0, "the next episode's first"
             ended += 1

@@ -78,16 +78,16 @@ def test_it_is_the_batch_of_gymnasium(given):
         action = np.zeros((3, 2), dtype=np.float32)
         action[0] = 1.0, float(step % 2)  # speeds, and leaves the road
         action[1] = -1.0, 0.0  # stands
-        observed, reward, process, infos = env.step(action)
+        observed, reward, finished, infos = env.step(action)
         other, rewards, terminated, truncated, info = batch.step(action)
         assert (reward == rewards).all()
-        assert (process == (terminated | truncated)).all()
+        assert (finished == (terminated | truncated)).all()
         for row in range(3):
-            message = info["final_info"] if process[row] else info
+            message = info["final_info"] if finished[row] else info
             assert infos[row]["scene"] == message["scene"][row]
             assert infos[row]["contact"] == message["contact"][row]
-            assert ("terminal_observation" in infos[row]) == process[row]
-            if process[row]:
+            assert ("terminal_observation" in infos[row]) == finished[row]
+            if finished[row]:
                 assert (
                     infos[row]["terminal_observation"] == info["final_obs"][row]
                 ).all()

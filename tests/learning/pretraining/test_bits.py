@@ -173,7 +173,7 @@ def test_the_stage_writes_the_weights_of_the_lowest_held_out_loss_and_goes_on_ex
     with pytest.raises(KeyboardInterrupt):
         small_stage(monkeypatch, tmp_path / "parts")
     assert small_stage(monkeypatch, tmp_path / "parts") == row
-    single, two = (
+    first, two = (
         load_bits(str(tmp_path / name)).state_dict() for name in ("whole", "parts")
     )
-    assert all(torch.equal(value, two[name]) for name, value in single.items())
+    assert all(torch.equal(value, two[name]) for name, value in first.items())

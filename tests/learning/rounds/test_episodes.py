@@ -11,13 +11,13 @@ def frames(lengths, total, fail=()):
     `fail` end by contact."""
     timestep = torch.cat([torch.arange(1, n + 1) for n in lengths])[:total]
     number = torch.cat([torch.full((n,), k) for k, n in enumerate(lengths)])[:total]
-    process = torch.tensor(
+    finished = torch.tensor(
         [
             t == lengths[k]
             for t, k in zip(timestep.tolist(), number.tolist(), strict=True)
         ]
     )
-    contact = process & torch.tensor([k in fail for k in number.tolist()])
+    contact = finished & torch.tensor([k in fail for k in number.tolist()])
     row = number[None, :, None]
     returns = timestep.float()
     return TensorDict(
@@ -26,7 +26,7 @@ def frames(lengths, total, fail=()):
             "scene_index": row + 10,
             "next": {
                 "timestep": timestep[None, :, None],
-                "done": process[None, :, None],
+                "done": finished[None, :, None],
                 "episode_reward": returns[None, :, None],
                 "metrics": {
                     "contact": contact[None, :, None],

@@ -163,7 +163,7 @@ def test_no_way_leads_off_the_road_or_through_another_vehicle():
 
 
 def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
-    single = met([EGO, BESIDE])[0]
+    first = met([EGO, BESIDE])[0]
     turn = 0.7
     shift = torch.tensor([30.0, -12.0])
     spin = torch.tensor(
@@ -175,9 +175,9 @@ def test_a_turned_and_moved_scene_has_the_turned_and_moved_way():
     ]
     other = met(moved)[0]
     torch.testing.assert_close(
-        other.path[0, 0], single.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4
+        other.path[0, 0], first.path[0, 0] @ spin.T + shift, atol=2e-3, rtol=1e-4
     )
-    torch.testing.assert_close(other.cost, single.cost, atol=1e-3, rtol=1e-4)
+    torch.testing.assert_close(other.cost, first.cost, atol=1e-3, rtol=1e-4)
 
 
 def oncoming_world():

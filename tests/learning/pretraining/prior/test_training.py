@@ -160,7 +160,7 @@ def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_w
             **how,
         )
 
-    single, origin = load_prior(str(trained("whole")))
+    first, origin = load_prior(str(trained("whole")))
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(training, "held_out_loss", stopping)
         trained("part")
@@ -168,7 +168,7 @@ def test_an_interrupted_training_ends_as_the_whole_one_and_its_checkpoint_says_w
     assert all(
         torch.equal(a, b)
         for a, b in zip(
-            single.state_dict().values(), two.state_dict().values(), strict=True
+            first.state_dict().values(), two.state_dict().values(), strict=True
         )
     )
     assert origin["held_out_loss"] == again["held_out_loss"]
