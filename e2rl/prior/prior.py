@@ -3,7 +3,6 @@ scene's vehicles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -92,12 +91,24 @@ class Plan:
         return self.motion.map(lambda value: value[..., steps - 1])
 
 
-# (x, level, step k, context, denoise) -> (x, x0 before and x0 after control); see
-# e2rl/traffic/e2/control.py.
-Control = Callable[
-    [Tensor, Tensor, int, Context, Callable[[Tensor], Tensor]],
-    tuple[Tensor, Tensor, Tensor],
-]
+@dataclass(frozen=True)
+class Denoising:
+    """A step of the reverse process, as a control sees it: x [B, V, SIZE] at a noise
+    level [], with k steps left, this one included."""
+
+    prior: "Prior"
+    x: Tensor
+    level: Tensor
+    k: int
+    context: Context
+
+    def clean(self, x: Tensor) -> Tensor:
+        """The prior's clean estimate [B, V, SIZE] of x at this level."""
+        return self.prior.denoise(x, self.level, self.context)
+
+
+Controlled = tuple[Tensor, Tensor, Tensor]  # x, x0 before and x0 after control
+Control = Callable[[Denoising], Controlled]  # e2rl/traffic/e2/control.py has one
 
 
 class Prior(nn.Module):
@@ -277,13 +288,8 @@ class Prior(nn.Module):
         past = None
         for index in range(settings.steps - 1):
             high = levels[index]
-            denoise = partial(
-                self.denoise,
-                level=high,
-                context=context,
-            )
             k = settings.steps - index
-            x, nominal, x0 = control(x, high, k, context, denoise)
+            x, nominal, x0 = control(Denoising(self, x, high, k=k, context=context))
             clean = Estimates(x0, nominal)
             interval = Interval(before, high, levels[index + 1], noise[index + 1])
             account = Account(kl, log_ratio, allowed)
@@ -291,12 +297,8 @@ class Prior(nn.Module):
             past = Estimates(x0, nominal)
             before = high
         # The last step takes x0 itself: without noise there is no KL to count.
-        denoise = partial(
-            self.denoise,
-            level=levels[-2],
-            context=context,
-        )
-        _, nominal, x0 = control(x, levels[-2], 1, context, denoise)
+        last = Denoising(self, x, levels[-2], k=1, context=context)
+        _, nominal, x0 = control(last)
         if budget is not None:
             within = kl.sum(-1) < BUDGET_SPENT * budget
             x0 = torch.where(within[:, None, None], x0, nominal)
@@ -369,22 +371,10 @@ class Prior(nn.Module):
 
 
 @torch.no_grad()
-def uncontrolled(
-    x: Tensor,
-    level: Tensor,
-    k: int,
-    context: Context,
-    denoise: Callable[[Tensor], Tensor],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The Control of the nominal prior: none.
-
-    Args:
-        x: [B, V, SIZE] at the noise level.
-        level, k, context: unused.
-        denoise: from x to x0.
-    """
-    x0 = denoise(x)
-    return x, x0, x0
+def uncontrolled(step: Denoising) -> Controlled:
+    """The Control of the nominal prior: none."""
+    x0 = step.clean(step.x)
+    return step.x, x0, x0
 
 
 def _leaders_anew(

@@ -77,16 +77,10 @@ def test_path_kl_is_that_of_the_two_laws_of_the_path(sampler, temperature):
     def paths(shift):
         observed = []
 
-        def control(
-            x,
-            level,
-            k,
-            context,
-            denoise,
-        ):
-            observed.append(x[:, 0, 0])
-            x0 = denoise(x)
-            return x, x0, x0 + shift
+        def control(step):
+            observed.append(step.x[:, 0, 0])
+            x0 = step.clean(step.x)
+            return step.x, x0, x0 + shift
 
         kl = prior.sample(None, noise, control).kl
         return torch.stack(observed, -1).double(), kl
@@ -119,13 +113,8 @@ def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
     total = torch.zeros(6, 1).double()
     before = []
 
-    def control(
-        x,
-        level,
-        k,
-        context,
-        denoise,
-    ):
+    def control(denoising):
+        x = denoising.x
         if before:
             means = [
                 step(*before[-1][:1], x0, *before[-1][2:], x * 0)[0]
@@ -139,8 +128,9 @@ def test_the_log_ratio_is_that_of_the_two_densities_of_the_path():
                 for mean in means
             )
             total.add_(of_control - of_prior)
-        x0 = denoise(x)
-        before.append((x, (x0, x0 + 0.2 * x), level, levels[len(before) + 1]))
+        x0 = denoising.clean(x)
+        low = levels[len(before) + 1]
+        before.append((x, (x0, x0 + 0.2 * x), denoising.level, low))
         return x, x0, x0 + 0.2 * x
 
     sample = prior.sample(None, noise, control)
@@ -157,16 +147,10 @@ def test_a_budget_is_spent_by_the_first_steps_and_later_ones_are_the_prior_s():
     noise = torch.randn(6, 2, 1, SIZE, generator=torch.Generator().manual_seed(0))
     observed = []
 
-    def control(
-        x,
-        level,
-        k,
-        context,
-        denoise,
-    ):
-        observed.append(x)
-        x0 = denoise(x)
-        return x, x0, x0 + 0.5
+    def control(step):
+        observed.append(step.x)
+        x0 = step.clean(step.x)
+        return step.x, x0, x0 + 0.5
 
     free = prior.sample(None, noise, control).kl[:, 0]
     budget = torch.stack([0.4 * free[0], 2 * free[1]])
@@ -433,15 +417,9 @@ def test_a_budget_counts_as_spent_a_thousandth_before_its_end(spent, controlled)
     prior = gaussian_prior(steps=3)
     noise = torch.randn(3, 1, 1, SIZE, generator=torch.Generator().manual_seed(3))
 
-    def control(
-        x,
-        level,
-        k,
-        context,
-        denoise,
-    ):
-        x0 = denoise(x)
-        return x, x0, x0 + 0.5
+    def control(step):
+        x0 = step.clean(step.x)
+        return step.x, x0, x0 + 0.5
 
     used = prior.sample(None, noise, control).kl[:, 0]
     sample = prior.sample(None, noise, control, budget=used / spent)

@@ -15,7 +15,14 @@ import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
-from e2rl.prior.prior import Context, Control, Prior
+from e2rl.prior.prior import (
+    Context,
+    Control,
+    Controlled,
+    Denoising,
+    Prior,
+    uncontrolled,
+)
 from e2rl.prior.sde import Past
 from e2rl.run.config import setting
 from e2rl.run.errors import InputError
@@ -27,7 +34,6 @@ from e2rl.traffic.traffic import State
 # Motion, fields [S, B, V, T] -> [S, B, V]; each row's own, others detached.
 Loss = Callable[[LaneState], Tensor]
 Objective = Callable[[Tensor], Tensor]  # x [S * B, V, SIZE] -> [], the sum of a loss
-Denoise = Callable[[Tensor], Tensor]
 # Of Adam: its steps are as long for any gradient, so rounding would decide where there
 # is none.
 ROUNDING = 1e-3
@@ -51,36 +57,28 @@ class MeanGuidance:
     iterations: int
     past: Past = None  # of the step, where the sampler is of second order
 
-    def __call__(
-        self,
-        x: Tensor,
-        level: Tensor,
-        k: int,
-        context: Context,
-        denoise: Denoise,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(self, step: Denoising) -> Controlled:
         """See `prior.Control`."""
-        with torch.no_grad():
-            x0 = denoise(x)
-        if k == 1:
+        x, x0, _ = uncontrolled(step)
+        if step.k == 1:
             return x, x0, x0
         sampler = self.prior.sampler
         schedule = self.prior.schedule
-        past = None if k == sampler.steps else self.past
-        low = sampler.levels(schedule, x.device)[sampler.steps - k + 1]
-        zero = torch.zeros_like(level)
-        step = partial(
+        past = None if step.k == sampler.steps else self.past
+        low = sampler.levels(schedule, x.device)[sampler.steps - step.k + 1]
+        zero = torch.zeros_like(step.level)
+        move = partial(
             sampler.on(schedule).step,
-            high=level,
+            high=step.level,
             low=low,
             noise=zero,
         )
-        mean, variance = step(x=x, x0=x0, past=past)
+        mean, variance = move(x=x, x0=x0, past=past)
         none = None if past is None else (zero, past[1])
-        per_x0, _ = step(x=zero, x0=zero + 1, past=none)  # a step is affine in x0
+        per_x0, _ = move(x=zero, x0=zero + 1, past=none)  # a step is affine in x0
         limit = self.limit[:, None, None] * variance.sqrt()
         moved = x0 + self._shift(mean, limit) / per_x0
-        self.past = moved, level
+        self.past = moved, step.level
         return x, x0, moved
 
     def _shift(self, mean: Tensor, limit: Tensor) -> Tensor:
@@ -108,22 +106,15 @@ class CleanGuidance:
     step_size: float
     clip: float
 
-    def __call__(
-        self,
-        x: Tensor,
-        level: Tensor,
-        k: int,
-        context: Context,
-        denoise: Denoise,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(self, step: Denoising) -> Controlled:
         """See `prior.Control`."""
         with torch.enable_grad():
-            variable = x.detach().requires_grad_(True)
-            x0 = denoise(variable)
+            variable = step.x.detach().requires_grad_(True)
+            x0 = step.clean(variable)
             (gradient,) = torch.autograd.grad(self.objective(x0), variable)
         shift = (self.step_size * gradient).clamp(-self.clip, self.clip)
         x0 = x0.detach()
-        return x, x0, x0 - torch.where(self.guided[..., None], shift, 0.0)
+        return step.x, x0, x0 - torch.where(self.guided[..., None], shift, 0.0)
 
 
 @dataclass

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, HORIZON, KNOTS, SIZE
-from e2rl.prior.prior import Context, Plan, Sample
+from e2rl.prior.prior import Context, Control, Plan, Sample, uncontrolled
 from e2rl.run.config import configured, setting, settings_of
 from e2rl.run.errors import InputError
 from e2rl.sim.world import World
@@ -394,7 +394,7 @@ class E2(NominalTraffic):
         if self.control.anchoring == "raw":
             driven = anchored & state.attacked[:, None]
             raw = torch.where(driven[..., None], anchor.knots, torch.nan)
-        guidance = None
+        guidance: Control = uncontrolled
         if self.guidance is not None:
             guidance = self._guidance(state, world, ego_plan, anchor, context)
         return SparseControl(state.attacked, pulls, guidance=guidance, raw=raw)

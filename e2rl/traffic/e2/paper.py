@@ -7,16 +7,15 @@ clean estimate: x0 <- x0 - (sigma^2 / alpha) grad V. V_feas acts on all vehicles
 V_adv on the coalition alone, through the mask M_S.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from e2rl.prior.lane_relative import ACCEL_SCALE, KNOTS
-from e2rl.prior.prior import Context, Prior
+from e2rl.prior.prior import Controlled, Denoising, Prior
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.config import configured, setting
-from e2rl.traffic.e2.control import Denoise
 from e2rl.traffic.potentials import (
     SAMPLED_STEPS,
     PotentialContext,
@@ -78,27 +77,24 @@ class LiteralAnchor:
     def __post_init__(self) -> None:
         self.jump = self.noise.new_zeros(self.vehicles.shape)
 
-    def __call__(
-        self,
-        x: Tensor,
-        x0: Tensor,
-        level: Tensor,
-        schedule: NoiseSchedule,
-    ) -> Tensor:
-        """Returns x [B, V, SIZE] of a noise level after the blend; x0: its clean
-        estimate, of which the proposals keep the lateral part."""
+    def __call__(self, step: Denoising) -> Tensor:
+        """Returns x [B, V, SIZE] after the blend; of its clean estimate the proposals
+        keep the lateral part."""
+        schedule = step.prior.schedule
+        with torch.no_grad():
+            x0 = step.clean(step.x)
         proposal = torch.cat([self.knots / ACCEL_SCALE, x0[..., KNOTS:]], -1)
-        noised = schedule.noised(proposal, level, self.noise)
-        blend = (1 - self.weight) * x + self.weight * noised
-        after = torch.where(self.vehicles[..., None], blend, x)
-        energy = ((after - x) ** 2).sum(-1)
-        self.jump = energy / (2 * schedule.sigma(level) ** 2)
+        noised = schedule.noised(proposal, step.level, self.noise)
+        blend = (1 - self.weight) * step.x + self.weight * noised
+        after = torch.where(self.vehicles[..., None], blend, step.x)
+        energy = ((after - step.x) ** 2).sum(-1)
+        self.jump = energy / (2 * schedule.sigma(step.level) ** 2)
         return after
 
 
 @dataclass
 class MaskedGuidance:
-    """Eq. 16 for one replan of B scenes: the `Guidance` of a SparseControl.
+    """Eq. 16 for one replan of B scenes: the guidance of a SparseControl.
 
     conditions: what the potentials see; coalition [B, V] bool: C*, the mask M_S; eta
     [B]: intensity; anchor: None, eq. 14 does not act.
@@ -131,58 +127,16 @@ class MaskedGuidance:
             return torch.zeros(self.coalition.shape, device=self.eta.device)
         return self.anchor.jump
 
-    def blend(
-        self,
-        x: Tensor,
-        level: Tensor,
-        k: int,
-        context: Context,
-        denoise: Denoise,
-    ) -> Tensor:
-        """Returns x after eq. 14, where that is due.
-
-        Args:
-            x: [B, V, SIZE], of step k.
-            level: noise level of the step.
-            k: steps left, this one included.
-            context: of the replan.
-            denoise: the prior's clean estimate of x at this level.
-        """
-        if self.anchor is None or k != self.anchor_step:
-            return x
-        with torch.no_grad():
-            x0 = denoise(x)
-        return self.anchor(x, x0, level=level, schedule=self.prior.schedule)
-
-    def estimate(
-        self,
-        x: Tensor,
-        level: Tensor,
-        k: int,
-        context: Context,
-        denoise: Denoise,
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the clean estimate x0 and the one guided by eq. 16, [B, V, SIZE]
-        each.
-
-        Args:
-            x: [B, V, SIZE], of step k.
-            level: noise level of the step.
-            k: steps left, this one included.
-            context: of the replan.
-            denoise: the prior's clean estimate of x at this level.
-        """
+    def __call__(self, step: Denoising) -> Controlled:
+        """Returns x after eq. 14, where that is due, the clean estimate x0 and the one
+        guided by eq. 16, [B, V, SIZE] each."""
+        if self.anchor is not None and step.k == self.anchor_step:
+            step = replace(step, x=self.anchor(step))
         settings = self.settings
-        with_feasibility = 1 < k <= self.feasibility_step
-        x0, adversarial, feasibility = self._gradients(
-            x,
-            level,
-            with_feasibility,
-            context=context,
-            denoise=denoise,
-        )
+        with_feasibility = 1 < step.k <= self.feasibility_step
+        x0, adversarial, feasibility = self._gradients(step, with_feasibility)
         guided = x0
-        weight = gradient_weight(self.prior.schedule, level, settings.scaling)
+        weight = gradient_weight(self.prior.schedule, step.level, settings.scaling)
         if self.has_coalition:
             shift = clip_rows(weight * adversarial, settings.adversarial_clip)
             eta = self.eta[:, None, None]
@@ -190,30 +144,23 @@ class MaskedGuidance:
         if with_feasibility:
             shift = settings.feasibility * weight * feasibility
             shift = clip_rows(shift, settings.feasibility_clip)
-            guided = guided - shift * context.active[..., None]
-        return x0, guided
+            guided = guided - shift * step.context.active[..., None]
+        return step.x, x0, guided
 
-    def _gradients(
-        self,
-        x: Tensor,
-        level: Tensor,
-        with_feasibility: bool,
-        context: Context,
-        denoise: Denoise,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _gradients(self, step: Denoising, with_feasibility: bool) -> Controlled:
         """x0, grad V_adv by x or by x0 as set, and grad V_feas by x0, [B, V, SIZE]
         each."""
-        adversarial = feasibility = torch.zeros_like(x)
+        adversarial = feasibility = torch.zeros_like(step.x)
         through_network = self.has_coalition and self.settings.gradient == "denoiser"
         with torch.enable_grad():
-            variable = x.detach().requires_grad_(through_network)
-            denoised = denoise(variable)
+            variable = step.x.detach().requires_grad_(through_network)
+            denoised = step.clean(variable)
             x0 = denoised.detach().requires_grad_(True)
             if not self.has_coalition and not with_feasibility:
                 return x0.detach(), adversarial, feasibility
-            states = self.prior.decode(x0, context, steps=SAMPLED_STEPS).states()
+            states = self.prior.decode(x0, step.context, steps=SAMPLED_STEPS).states()
             if self.has_coalition:
-                temperature = annealed_temperature(level, self.potentials)
+                temperature = annealed_temperature(step.level, self.potentials)
                 value = self.potentials.adversarial(
                     states,
                     self.conditions,

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import e2rl
+from e2rl.prior.prior import Denoising
 from e2rl.traffic.baselines.guidance import CleanGuidance, MeanGuidance
 from e2rl.traffic.baselines.view import folded, motion_of, pick, tiled
 from tests.traffic.baselines.attacks import baseline, first_replan
@@ -45,9 +46,7 @@ def test_the_mean_of_a_step_moves_by_adam_s_step_within_the_limit():
         step_size=0.3,
         iterations=1,
     )
-    _, nominal, x0 = control(
-        x, level, 3, context, lambda value: on.prior.denoise(value, level, context)
-    )
+    _, nominal, x0 = control(Denoising(on.prior, x, level, k=3, context=context))
 
     def mean(clean):
         return on.prior.sampler.on(on.prior.schedule).step(
@@ -76,9 +75,7 @@ def test_the_last_step_of_mean_guidance_is_free():
         step_size=0.3,
         iterations=1,
     )
-    _, nominal, x0 = control(
-        x, level, 1, context, lambda value: on.prior.denoise(value, level, context)
-    )
+    _, nominal, x0 = control(Denoising(on.prior, x, level, k=1, context=context))
     assert torch.equal(nominal, x0)
 
 
@@ -92,9 +89,7 @@ def test_clean_guidance_is_clipped_and_leaves_masked_rows_alone():
         step_size=1e6,
         clip=0.25,
     )
-    _, nominal, x0 = control(
-        x, level, 3, context, lambda value: on.prior.denoise(value, level, context)
-    )
+    _, nominal, x0 = control(Denoising(on.prior, x, level, k=3, context=context))
     shift = (x0 - nominal).abs()
     assert (shift[~guided] == 0).all()
     assert shift.max().item() == pytest.approx(0.25, rel=1e-4)

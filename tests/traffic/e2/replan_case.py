@@ -3,6 +3,7 @@
 import torch
 
 from e2rl.prior.lane_relative import HORIZON, KNOTS, SIZE
+from e2rl.prior.prior import Denoising
 from e2rl.sim.world import World
 from e2rl.traffic.potentials import PotentialContext
 from tests.prior.small import small_prior
@@ -46,9 +47,9 @@ class Case:
         generator = torch.Generator().manual_seed(seed)
         return torch.randn(len(self.scene), ROWS, SIZE, generator=generator)
 
-    def denoiser(self, level: torch.Tensor):
-        """The prior's clean estimate at a noise level, as a function of x."""
-        return lambda x: self.prior.denoise(x, level, self.context)
+    def denoising(self, x: torch.Tensor, level: torch.Tensor, k: int) -> Denoising:
+        """A step of x at a noise level, with k steps left."""
+        return Denoising(self.prior, x, level, k=k, context=self.context)
 
     def eta(self, value) -> torch.Tensor:
         """Intensities [count], of one number or of each."""

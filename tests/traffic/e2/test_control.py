@@ -18,9 +18,7 @@ def pulled(case, eta=1.0, strength=8.0, k=2, vehicles=None):
     goal = torch.cat([case.knots / ACCEL_SCALE, lateral], -1)
     vehicles = case.coalition if vehicles is None else vehicles
     control = SparseControl(eta > 0, [Pull(goal, vehicles, strength * eta)])
-    _, before, after = control(
-        case.noise(), level, k, case.context, case.denoiser(level)
-    )
+    _, before, after = control(case.denoising(case.noise(), level, k))
     return after - before
 
 
@@ -65,9 +63,7 @@ def test_raw_proposals_take_the_sample_s_place_in_the_last_step():
     raw = torch.where(case.coalition[..., None], case.knots, torch.nan)
     control = SparseControl(case.eta(1.0) > 0, [], raw=raw)
     for k in (2, 1):
-        _, x0, driven = control(
-            case.noise(), level, k, case.context, case.denoiser(level)
-        )
+        _, x0, driven = control(case.denoising(case.noise(), level, k))
         assert torch.equal(driven[:, OTHERS], x0[:, OTHERS])
         if k == 2:
             assert torch.equal(driven, x0)

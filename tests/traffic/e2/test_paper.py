@@ -52,7 +52,7 @@ def shifts(case, level=0.5, k=2, eta=1.0, **options):
     level = torch.tensor(level)
     x = case.noise()
     control = SparseControl(case.eta(eta) > 0, [], guidance(case, eta, **options))
-    blended, before, after = control(x, level, k, case.context, case.denoiser(level))
+    blended, before, after = control(case.denoising(x, level, k))
     return blended - x, after - before
 
 
@@ -96,7 +96,7 @@ def test_eq_16_shifts_by_the_scaled_clipped_and_masked_gradients(
     level = torch.tensor(0.4)
     eta = torch.tensor([0.0, 0.5, 1.0, 2.0])
     x = case.noise(seed=3).requires_grad_(True)
-    x0 = case.denoiser(level)(x)
+    x0 = case.denoising(x, level, 2).clean(x)
     states = case.prior.decode(x0, case.context, steps=SAMPLED_STEPS).states()
     settings = PotentialSettings()
     temperature = settings.narrow * (settings.wide / settings.narrow) ** 0.4
@@ -128,7 +128,7 @@ def test_eq_16_shifts_by_the_scaled_clipped_and_masked_gradients(
             feasibility_clip=clips[1],
         ),
     )
-    _, before, after = control(x, level, 2, case.context, case.denoiser(level))
+    _, before, after = control(case.denoising(x, level, 2))
     torch.testing.assert_close(before, x0.detach())
     torch.testing.assert_close(before - after, expected, rtol=2e-3, atol=1e-5)
     assert (expected[1:, [MEMBER, 2]] != 0).any(-1).any(0).all()
@@ -156,7 +156,7 @@ def test_a_clip_of_0_is_no_shift_also_where_there_is_no_gradient():
     assert (clip_rows(rows, 0.0) == 0).all()
 
 
-def test_eq_14_halves_the_noise_and_its_energy_is_booked():
+def test_eq_14_halves_the_noise_and_its_energy_is_booked(monkeypatch):
     """x = alpha x0 + sigma e with a clean estimate of 0.3, blended with weight 0.5."""
     case = Case(count=600)
     control = guidance(case, weight=0.5, **OFF)
@@ -166,13 +166,8 @@ def test_eq_14_halves_the_noise_and_its_energy_is_booked():
     alpha = schedule.alpha(level)
     sigma = schedule.sigma(level)
     x = alpha * 0.3 + sigma * case.noise(seed=1)
-    after = control.blend(
-        x,
-        level,
-        k=control.anchor_step,
-        context=case.context,
-        denoise=lambda y: torch.full_like(y, 0.3),
-    )
+    monkeypatch.setattr(case.prior, "denoise", lambda y, *_: torch.full_like(y, 0.3))
+    after, _, _ = control(case.denoising(x, level, control.anchor_step))
     assert torch.equal(after[:, OTHERS], x[:, OTHERS])
     knots = after[:, MEMBER, :KNOTS]
     mean = alpha * (0.5 * 0.3 + 0.5 * ACCEL / ACCEL_SCALE)

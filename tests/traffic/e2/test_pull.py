@@ -75,16 +75,16 @@ def test_what_a_pull_costs_goes_to_the_divergence_of_the_tilted_gaussian(monkeyp
     d = 1.5
     noise = torch.randn(200, 400, 1, SIZE, generator=torch.Generator().manual_seed(1))
 
-    def control(x, level, k, context, denoise):
-        x0 = denoise(x)
+    def control(step):
+        x0 = step.clean(step.x)
         return (
-            x,
+            step.x,
             x0,
             pulled(
                 x0,
                 torch.full((SIZE,), MEAN + d),
                 strength=torch.tensor(w / (1 - w)),
-                level=level,
+                level=step.level,
                 schedule=prior.schedule,
             ),
         )
