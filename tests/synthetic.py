@@ -117,7 +117,7 @@ def _routes(start, valid, num_routes, num_points, limit, red_light_x, road):
     first[..., 0] = valid
     length = (road[1] - begin).clamp(0, arc[-1].item())
     light = torch.full((*shape, 2), -1)
-    light_s = torch.zeros(*shape, 2)
+    light_s = torch.zeros((*shape, 2))
     if red_light_x is not None:
         light_s[..., 0] = (red_light_x - begin)[..., None]
         light[..., 0] = torch.where(

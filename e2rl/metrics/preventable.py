@@ -118,14 +118,7 @@ def prevention(driver: Driver, collision: Collision, along: Along) -> Prevention
     )
     steps = torch.arange(driven.shape[1], device=stop.device)
     counts = ((steps >= 1) & (steps <= stop[:, None] + AFTER))[..., None]
-    touched = (
-        contacts(
-            driven,
-            size,
-            others=others,
-        )
-        & counts
-    )
+    touched = contacts(driven, size, others) & counts
     misses_partner = ~touched[:, :, 0].any(1)
     row = torch.arange(len(stop), device=stop.device)
     first_touch = touched[:, :, 0].int().argmax(1)
@@ -213,35 +206,12 @@ def followers_brake(
                 others=leader.track,
             ),
         )
-        still_hits = (
-            contacts(
-                braked,
-                size,
-                others=leader.track,
-            )
-            & counts
-        ).any(1)
+        still_hits = (contacts(braked, size, leader.track) & counts).any(1)
         avoided = avoided & (~hits | ~still_hits[:, 0])
         followers = followers + (hits & avoided).long()
-        recorded = (
-            contacts(
-                states,
-                size,
-                others=others,
-            )
-            & counts
-        ).any(1, keepdim=True)
+        recorded = (contacts(states, size, others) & counts).any(1, keepdim=True)
         itself = one_hot(follower, blamed.shape[1]).bool()[:, None]
-        touched = (
-            contacts(
-                braked,
-                size,
-                others=others,
-            )
-            & counts
-            & ~recorded
-            & ~itself
-        )
+        touched = contacts(braked, size, others) & counts & ~recorded & ~itself
         blamed = touched.any(1) & (hits & avoided)[:, None]
         leader = Leader(braked, size)
     return avoided, followers

@@ -69,27 +69,11 @@ def bootstrap_draws(clusters: int, draws: int = DRAWS, seed: int = 0) -> Tensor:
     """Multiplicities [1 + draws, clusters] float64 of clusters drawn with replacement;
     row 0 counts each once."""
     generator = torch.Generator().manual_seed(seed)
-    chosen = torch.randint(
-        max(clusters, 1),
-        (draws, clusters),
-        generator=generator,
-    )
-    counts = torch.zeros(
-        draws,
-        clusters,
-        dtype=torch.float64,
-    )
-    counts.scatter_add_(1, chosen, torch.ones_like(chosen, dtype=torch.float64))
-    return torch.cat(
-        [
-            torch.ones(
-                1,
-                clusters,
-                dtype=torch.float64,
-            ),
-            counts,
-        ]
-    )
+    chosen = torch.randint(max(clusters, 1), (draws, clusters), generator=generator)
+    counts = torch.ones(1 + draws, clusters, dtype=torch.float64)
+    counts[1:] = 0.0
+    counts[1:].scatter_add_(1, chosen, torch.ones_like(counts[1:]))
+    return counts
 
 
 def resampled_means(
@@ -259,11 +243,7 @@ class Bootstrap:
         def crossed(draws: int) -> Tensor:
             """[D, C * K]: places and trainings are drawn independently."""
             of_places = bootstrap_draws(places, draws)[:, :, None]
-            of_trainings = bootstrap_draws(
-                trainings,
-                draws,
-                seed=1,
-            )[:, None]
+            of_trainings = bootstrap_draws(trainings, draws, seed=1)[:, None]
             return (of_places * of_trainings).flatten(1)
 
         self.place_draws = bootstrap_draws(places, draws)
@@ -332,11 +312,7 @@ class Bootstrap:
         places = self.places(counted)
         if places < LEAST or metric.per:
             return UNKNOWN
-        return exact_interval(
-            mean,
-            places,
-            level=level,
-        )
+        return exact_interval(mean, places, level)
 
     def agreed(
         self,
@@ -364,13 +340,7 @@ class Bootstrap:
             return None
         if ((drawn - mean).abs() > SAME * max(1, abs(mean))).any():
             return None
-        if metric.fraction:
-            return bounds_of_alike(
-                mean,
-                places,
-                least=least,
-            )
-        return mean, mean
+        return bounds_of_alike(mean, places, least) if metric.fraction else (mean, mean)
 
     def intervals(
         self,
@@ -426,11 +396,7 @@ def summarise(
         raise ValueError(
             f"{len(rows)} rows but {len(samples)} samples; score_rollouts makes both"
         )
-    bootstrap = Bootstrap(
-        rows,
-        draws,
-        realism_draws=realism_draws,
-    )
+    bootstrap = Bootstrap(rows, draws, realism_draws)
     table = MetricTable.of(rows, row_metrics())
     counted = known_rollouts(~table.totals.isnan() & (table.weights > 0), samples)
     values = bootstrap.resampled(table, samples)
@@ -449,20 +415,9 @@ def summarise(
             table.weights[:, column],
         ):
             mean = values[name][0].item()
-            bounds = bootstrap.exact(
-                metric,
-                table,
-                mean=mean,
-                level=LEVEL,
-            )
+            bounds = bootstrap.exact(metric, table, mean=mean, level=LEVEL)
         if bounds is not None:
-            result[name] |= dict(
-                zip(
-                    ("low", "high"),
-                    bounds,
-                    strict=True,
-                )
-            )
+            result[name]["low"], result[name]["high"] = bounds
     return result
 
 
@@ -500,19 +455,9 @@ def paired_differences(
     unmatched = unmatched & ~per_collision
     table.totals = table.totals.masked_fill(unmatched, torch.nan)
     other_table.totals = other_table.totals.masked_fill(unmatched, torch.nan)
-    shared = [  # either may tell the training
-        {**other, **row}
-        for row, other in zip(
-            rows,
-            other_rows,
-            strict=True,
-        )
-    ]
-    bootstrap = Bootstrap(
-        shared,
-        draws,
-        realism_draws=realism_draws,
-    )
+    # either may tell the training
+    shared = [{**other, **row} for row, other in zip(rows, other_rows, strict=True)]
+    bootstrap = Bootstrap(shared, draws, realism_draws)
     values = bootstrap.resampled(table, samples)
     others = bootstrap.resampled(other_table, other_samples)
     known_rows = ~table.totals.isnan() | ~other_table.totals.isnan()
@@ -533,27 +478,18 @@ def paired_differences(
             bootstrap.is_rare(metric, each.totals[:, column], each.weights[:, column])
             for each in (table, other_table)
         ):
-            low, high = bootstrap.exact(
-                metric,
-                table,
-                mean=values[name][0].item(),
-                level=(1 + LEVEL) / 2,
-            )
-            other_low, other_high = bootstrap.exact(
-                metric,
-                other_table,
-                mean=others[name][0].item(),
-                level=(1 + LEVEL) / 2,
+            (low, high), (other_low, other_high) = (
+                bootstrap.exact(
+                    metric,
+                    group,
+                    mean=drawn[name][0].item(),
+                    level=(1 + LEVEL) / 2,
+                )
+                for group, drawn in ((table, values), (other_table, others))
             )
             bounds = low - other_high, high - other_low
         if bounds is not None:
-            result[name] |= dict(
-                zip(
-                    ("low", "high"),
-                    bounds,
-                    strict=True,
-                )
-            )
+            result[name]["low"], result[name]["high"] = bounds
     return {
         name: {"difference": value.pop("mean"), **value}
         for name, value in result.items()

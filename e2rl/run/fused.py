@@ -20,7 +20,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -372,21 +372,13 @@ class _Module(nn.Module):
 
 def holds_tensors(kind: Any) -> bool:
     """Returns whether a type is a dataclass or a named tuple."""
-    return is_dataclass(kind) or hasattr(kind, "_fields")
-
-
-@cache
-def names_of(kind: Any) -> tuple[str, ...]:
-    """Returns the names of what a dataclass or a named tuple holds."""
-    if is_dataclass(kind):
-        return tuple(part.name for part in fields(kind))
-    return kind._fields
+    return hasattr(kind, "__match_args__")
 
 
 def kinds_of(kind: Any) -> list[Any]:
     """Returns the types of what a dataclass or a named tuple holds."""
     hints = get_type_hints(kind)
-    return [hints[name] for name in names_of(kind)]
+    return [hints[name] for name in kind.__match_args__]
 
 
 def count_of(kind: Any) -> int:
@@ -398,8 +390,7 @@ def packed(kind: Any, tensors: Iterator[Tensor]) -> Any:
     """Returns the next of some tensors as a type."""
     if not holds_tensors(kind):
         return next(tensors)
-    parts = [packed(part, tensors) for part in kinds_of(kind)]
-    return kind(*parts)
+    return kind(*[packed(part, tensors) for part in kinds_of(kind)])
 
 
 def tensors_of(value: Any) -> list[Tensor]:
@@ -409,14 +400,8 @@ def tensors_of(value: Any) -> list[Tensor]:
     parts = value
     if is_dataclass(value):
         kind: Any = type(value)
-        parts = [getattr(value, name) for name in names_of(kind)]
-    tensors = []
-    for part in parts:
-        if isinstance(part, Tensor):
-            tensors.append(part)
-        else:
-            tensors += tensors_of(part)
-    return tensors
+        parts = [getattr(value, name) for name in kind.__match_args__]
+    return [tensor for part in parts for tensor in tensors_of(part)]
 
 
 # --- what machine code depends on

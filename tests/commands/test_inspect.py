@@ -157,8 +157,10 @@ def test_two_data_sets_are_apart_where_they_share_no_place(tmp_path, capsys):
             path = path.rename(path.with_stem(f"{name}-{path.stem}"))
             index += f"{name}/{path.name},{place}\n"
     (tmp_path / "index.csv").write_text(index)
-    out = ("--out", tmp_path / "x.png")
-    text = run(tmp_path / "one", "--apart", tmp_path / "two", *out, capsys=capsys)
+    out = tmp_path / "x.png"
+    text = run(
+        tmp_path / "one", "--apart", tmp_path / "two", "--out", out, capsys=capsys
+    )
     assert number(text, "apart") == f"from the 1 places of {tmp_path / 'two'}"
     assert number(text, "scenes") == "2, of 2 places"
     for other, message in (
@@ -168,5 +170,12 @@ def test_two_data_sets_are_apart_where_they_share_no_place(tmp_path, capsys):
         if other == "alone/four":
             write_folder(tmp_path / other, [description()])
         with pytest.raises(SystemExit):
-            run(tmp_path / "one", "--apart", tmp_path / other, *out, capsys=capsys)
+            run(
+                tmp_path / "one",
+                "--apart",
+                tmp_path / other,
+                "--out",
+                out,
+                capsys=capsys,
+            )
         assert message in capsys.readouterr().err

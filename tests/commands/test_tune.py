@@ -14,7 +14,7 @@ def tune(tmp_path, monkeypatch, capsys):
     """Runs the command in a folder of its own; returns it, or if `wrong` the error."""
     runs = []
 
-    def run(*options, wrong=False):
+    def run(options, wrong=False):
         folder = tmp_path / f"run-{len(runs)}"
         runs.append(folder)
         study = [
@@ -39,8 +39,8 @@ def test_an_adversary_is_tuned_and_the_study_goes_on(tune):
     """Rollouts are those of the method's own YAML; another budget or method is another
     study."""
     e2 = ["synthesizer=e2", "tuning.sweep=2"]
-    tune(*e2, "tuning.trials=1")
-    run = tune(*e2, "tuning.trials=3")
+    tune([*e2, "tuning.trials=1"])
+    run = tune([*e2, "tuning.trials=3"])
     result = json.loads((run / "tuning.json").read_text())
     tried = [trial["parameters"]["interception.lateral"] for trial in result["trials"]]
     assert tried == pytest.approx(
@@ -51,7 +51,7 @@ def test_an_adversary_is_tuned_and_the_study_goes_on(tune):
     )
     assert "interception:\n  lateral: " in (run / "tuned.yaml").read_text()
     assert "differs in objective; name another file" in tune(
-        *e2, "tuning.attack.off_road=0.1", wrong=True
+        [*e2, "tuning.attack.off_road=0.1"], wrong=True
     )
 
 
@@ -64,11 +64,13 @@ def test_an_adversary_is_tuned_and_the_study_goes_on(tune):
     ],
 )
 def test_what_cannot_be_tuned_is_told(tune, options, what):
-    assert what in tune(*options, wrong=True)
+    assert what in tune(options, wrong=True)
 
 
 def test_a_planner_is_tuned_in_the_traffic_of_all_methods(tune):
-    run = tune("tuning.group=ego", "ego=sampling", "tuning.trials=2", "tuning.sweep=0")
+    run = tune(
+        ["tuning.group=ego", "ego=sampling", "tuning.trials=2", "tuning.sweep=0"]
+    )
     result = json.loads((run / "tuning.json").read_text())
     assert len(result["trials"]) == 2
     assert set(result["best"]) <= set(load_choice("ego", "sampling"))

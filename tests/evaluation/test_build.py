@@ -16,12 +16,12 @@ from e2rl.traffic.rule_based import IDM
 from tests.prior.small import small_prior
 
 
-def config_of(*overrides):
-    return load_config("evaluate", overrides)
+def config_of(overrides=()):
+    return load_config("evaluate", list(overrides))
 
 
-def methods_of(*overrides, prior=None):
-    config = config_of(*overrides)
+def methods_of(overrides=(), prior=None):
+    config = config_of(overrides)
     evaluation_settings(config)
     return build_methods(config, prior or small_prior())
 
@@ -41,7 +41,7 @@ def named(methods):
 
 def test_a_name_twice_is_one_row_and_rows_keep_their_order_on_the_same_weights():
     prior = small_prior()
-    methods = methods_of("methods=[idm,nominal,e2,idm]", "eta=1.5", prior=prior)
+    methods = methods_of(["methods=[idm,nominal,e2,idm]", "eta=1.5"], prior=prior)
     assert named(methods) == [("idm", 0), ("nominal", 0), ("e2", 1.5)], (
         "eta does not touch what knows none"
     )
@@ -55,13 +55,15 @@ def test_a_name_twice_is_one_row_and_rows_keep_their_order_on_the_same_weights()
 def test_variants_share_the_prior_but_for_what_they_change_and_differ_in_nothing_else():
     prior = small_prior()
     methods = methods_of(
-        "methods=[far,e2]",
-        "eta=1",
-        "+variants.far={synthesizer: {skeleton: {far: 2}, reselect: 0}}",
-        "+variants.same={}",
-        "+variants.blind={synthesizer: ctg_adv, synthesizer.knowledge: predicted, "
-        "synthesizer.responsibility: full}",
-        "+variants.cold={prior.sampler.temperature: 0.5}",
+        [
+            "methods=[far,e2]",
+            "eta=1",
+            "+variants.far={synthesizer: {skeleton: {far: 2}, reselect: 0}}",
+            "+variants.same={}",
+            "+variants.blind={synthesizer: ctg_adv, synthesizer.knowledge: predicted, "
+            "synthesizer.responsibility: full}",
+            "+variants.cold={prior.sampler.temperature: 0.5}",
+        ],
         prior=prior,
     )
     assert named(methods) == [
@@ -85,9 +87,11 @@ def test_variants_share_the_prior_but_for_what_they_change_and_differ_in_nothing
 
 def test_several_intensities_are_a_row_each_but_of_what_knows_none():
     methods = methods_of(
-        "methods=[nominal,idm,e2]",
-        "eta=[1,0,1,2.5]",
-        "+variants.near={synthesizer.skeleton.far: 0}",
+        [
+            "methods=[nominal,idm,e2]",
+            "eta=[1,0,1,2.5]",
+            "+variants.near={synthesizer.skeleton.far: 0}",
+        ],
     )
     adversaries = [(name, eta) for name in ("e2", "near") for eta in (1, 0, 2.5)]
     assert named(methods) == [("nominal", 0), ("idm", 0), *adversaries]
@@ -99,8 +103,8 @@ def test_several_intensities_are_a_row_each_but_of_what_knows_none():
 def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(
     experiment, rows
 ):
-    config = config_of(f"experiment={experiment}")
-    methods = methods_of(f"experiment={experiment}")
+    config = config_of([f"experiment={experiment}"])
+    methods = methods_of([f"experiment={experiment}"])
     assert len(methods) == rows
     assert len(set(named(methods))) == rows
     variants = [method.traffic for method in methods if method.name in config.variants]
@@ -168,7 +172,7 @@ def test_every_row_of_an_experiment_can_be_built_and_tells_its_changes(
 )
 def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
     with pytest.raises(InputError, match=message):
-        methods_of(*overrides)
+        methods_of(overrides)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +187,7 @@ def test_what_cannot_run_is_named_with_its_remedy(overrides, message):
     ],
 )
 def test_a_search_has_a_few_tries_and_other_methods_one(overrides, rows, budget, unit):
-    requests = evaluation_settings(config_of(*overrides))
+    requests = evaluation_settings(config_of(overrides))
     assert (requests.methods, requests.budget, requests.budget_unit) == (
         rows,
         budget,
@@ -193,21 +197,21 @@ def test_a_search_has_a_few_tries_and_other_methods_one(overrides, rows, budget,
 
 def test_a_shared_device_keeps_to_one_process():
     assert (
-        processes_of(config_of("device=cuda"))
-        == processes_of(config_of("threads=2"))
+        processes_of(config_of(["device=cuda"]))
+        == processes_of(config_of(["threads=2"]))
         == 1
     )
-    assert processes_of(config_of("processes=3")) == 3
+    assert processes_of(config_of(["processes=3"])) == 3
 
 
 def test_table_1_has_every_rival_on_both_terms():
-    rows = methods_of("experiment=table1")
+    rows = methods_of(["experiment=table1"])
     rivals = {"ctg", "ctg_adv", "strive", "safe_sim_opt", "diffscene", "ccdiff", "cat"}
     certain = terms_by_method(rows)
     assert rivals <= set(certain)
     assert all(certain[name][0] == "plan" for name in rivals)
     assert certain["e2_pursuit"] == ("plan", "none")  # the rivals' terms
-    ours = terms_by_method(methods_of("experiment=table1_our_terms"))
+    ours = terms_by_method(methods_of(["experiment=table1_our_terms"]))
     for name in rivals:
         assert ours[f"{name}, our terms"] == (
             "predicted",

@@ -145,19 +145,19 @@ LEARNING = ["experiment=policy_learning"]
 TRAINED = [*LEARNING, "egos.after.checkpoint=bundled"]
 
 
-def config_of(*overrides):
-    return load_config("evaluate", overrides)
+def config_of(overrides=()):
+    return load_config("evaluate", list(overrides))
 
 
 def test_an_entry_is_a_file_with_changes_whose_first_weights_do_not_depend_on_the_other_egos():
     chosen = build_egos(
-        config_of("+egos.a={ego: lane_graph, max_risk: 0.3}", "+egos.x={ego: actor}"),
+        config_of(["+egos.a={ego: lane_graph, max_risk: 0.3}", "+egos.x={ego: actor}"]),
         "",
     )
     assert isinstance(chosen.egos["a"], LaneGraphEgo)
     assert chosen.egos["a"].max_risk == 0.3
     alone = (
-        build_egos(config_of("+egos.x={ego: actor}"), "").egos["x"].network.weights()
+        build_egos(config_of(["+egos.x={ego: actor}"]), "").egos["x"].network.weights()
     )
     assert all(
         (alone[name] == value).all()
@@ -166,7 +166,7 @@ def test_an_entry_is_a_file_with_changes_whose_first_weights_do_not_depend_on_th
 
 
 def test_table_4_compares_every_ego_with_one_of_them():
-    chosen = build_egos(config_of("experiment=table4"), "ego")
+    chosen = build_egos(config_of(["experiment=table4"]), "ego")
     names = [
         "replay",
         "idm",
@@ -189,7 +189,7 @@ def test_table_4_compares_every_ego_with_one_of_them():
 
 
 def test_the_experiment_compares_each_ego_with_the_untrained_one():
-    chosen = build_egos(config_of(*TRAINED), "")
+    chosen = build_egos(config_of(TRAINED), "")
     assert list(chosen.egos) == ["before", "after", "lane_graph", "sampling"]
     assert not chosen.trainings
     assert chosen.pairs == [
@@ -201,7 +201,7 @@ def test_the_experiment_compares_each_ego_with_the_untrained_one():
 
 def test_several_checkpoints_are_trainings_of_one_name():
     chosen = build_egos(
-        config_of(*LEARNING, "egos.after.checkpoints=[bundled,bundled]"), ""
+        config_of([*LEARNING, "egos.after.checkpoints=[bundled,bundled]"]), ""
     )
     assert list(chosen.egos) == [
         "before",
@@ -237,4 +237,4 @@ def test_several_checkpoints_are_trainings_of_one_name():
 )
 def test_what_cannot_be_is_named_with_its_remedy(overrides, message):
     with pytest.raises(InputError, match=message):
-        build_egos(config_of(*overrides), "")
+        build_egos(config_of(overrides), "")

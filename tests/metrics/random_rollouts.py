@@ -102,7 +102,7 @@ def labelled(
 
 def random_tracks(rollouts, count, steps, extent, generator):
     def draw(*shape):
-        return torch.rand(rollouts, count, *shape, generator=generator)
+        return torch.rand((rollouts, count, *shape), generator=generator)
 
     speed = 14 * draw() * (draw() > 0.3)
     waver = 1 + 0.4 * torch.sin(
@@ -147,7 +147,7 @@ def random_map(
     as in a scene batch."""
 
     def draw(*shape):
-        return torch.rand(rollouts, *shape, generator=generator)
+        return torch.rand((rollouts, *shape), generator=generator)
 
     heading = (draw(lanes, 1) * 2 * math.pi) + (
         draw(lanes, 1) - 0.5

@@ -27,23 +27,26 @@ def random_boxes(count, seed, spread=4.0):
     return state, 0.3 + draw[:, 4:] * torch.tensor([6.0, 3.0], dtype=torch.float64)
 
 
-def polygons(state, size):
+def polygons(boxes):
+    state, size = boxes
     return shapely.polygons(corners(state, size).numpy())
 
 
 def test_overlap_area_is_shapely_s():
     first = random_boxes(4000, 1)
     second = random_boxes(4000, 2)
-    expected = shapely.area(shapely.intersection(polygons(*first), polygons(*second)))
-    area = overlap_area(*first, *second)
+    expected = shapely.area(shapely.intersection(polygons(first), polygons(second)))
+    state, size = first
+    other, other_size = second
+    area = overlap_area(state, size, second=other, second_size=other_size)
     assert (expected > 0).mean() > 0.4
     np.testing.assert_allclose(area, expected, atol=1e-9)
     apart = torch.zeros(4000, dtype=torch.bool)
-    assert not pair_overlap(*first, *second, apart).any(), (
+    assert not pair_overlap(state, size, other, other_size, apart).any(), (
         "pairs that are not possible have no overlap"
     )
     np.testing.assert_allclose(
-        pair_overlap(*first, *second, ~apart),
+        pair_overlap(state, size, other, other_size, ~apart),
         np.where(expected > 1e-6, expected, 0),
         atol=1e-9,
     )
@@ -67,11 +70,13 @@ def test_shared_and_collinear_edges_need_no_special_case(turn):
 def test_edge_parts_are_shapely_s():
     first = random_boxes(600, 3)
     second = random_boxes(600, 4)
-    parts = edge_parts_inside(*first, *second)
-    corner = corners(*first).numpy()
-    other = polygons(*second)
-    point = shapely.points(second[0][:, :2].numpy())
-    away = edge_distances(*first, second[0][:, :2])
+    state, size = first
+    centre, other_size = second
+    parts = edge_parts_inside(state, size, other=centre, other_size=other_size)
+    corner = corners(state, size).numpy()
+    other = polygons(second)
+    point = shapely.points(centre[:, :2].numpy())
+    away = edge_distances(state, size, centre[:, :2])
     for edge in range(4):
         line = shapely.linestrings(corner[:, [edge, (edge + 1) % 4]])
         np.testing.assert_allclose(

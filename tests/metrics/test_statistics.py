@@ -42,6 +42,10 @@ def brief(rows, features):
     return summarise(rows, features, draws=300, realism_draws=2)
 
 
+def differences(ours, theirs, draws=300):
+    return paired_differences(*ours, *theirs, draws=draws, realism_draws=2)
+
+
 def test_intervals_cover_the_truth_in_about_95_of_100_cases_when_rollouts_come_in_clusters():
     """Rates that vary between locations; treating the rollouts as independent would
     cover in about 70 of 100."""
@@ -196,7 +200,7 @@ def test_medians_that_agree_and_ratios_of_few_events_have_no_interval():
 def test_a_difference_of_rare_events_lies_between_the_differences_of_their_bounds():
     ours = rows_of([1.0] * 8 + [0.0] * 42)
     theirs = rows_of([0.0] * 49 + [1.0])
-    result = paired_differences(*ours, *theirs, draws=50, realism_draws=2)["cfr"]
+    result = differences(ours, theirs, draws=50)["cfr"]
     (low, high), (other_low, other_high) = (
         exact_interval(k / 50, 50, level=0.975) for k in (8, 1)
     )
@@ -210,7 +214,7 @@ def test_a_difference_of_rare_events_lies_between_the_differences_of_their_bound
     assert six["difference"] == pytest.approx(-1 / 3)
     assert math.isnan(six["low"])
     assert math.isnan(six["high"])
-    same = paired_differences(*ours, *ours, draws=50, realism_draws=2)["cfr"]
+    same = differences(ours, ours, draws=50)["cfr"]
     assert same["difference"] == 0
     assert same["low"] == -same["high"] < 0
 
@@ -250,7 +254,7 @@ def test_what_has_not_changed_is_bounded_by_the_places_that_may_differ(events):
     ours = rows_of(
         [1.0] * events + [0.0] * (40 - events), progress=[30.0 + k for k in range(40)]
     )
-    result = paired_differences(*ours, *ours, draws=100, realism_draws=2)
+    result = differences(ours, ours, draws=100)
     u = exact_interval(0.0, 40)[1]
     assert [
         result["cfr"][end] for end in ("low", "difference", "high")
@@ -268,7 +272,7 @@ def test_a_change_that_is_the_same_at_each_place_is_within_what_others_may_have(
     clusters = [index // 2 for index in range(40)]
     ours = rows_of([1.0, 1.0] * 20, clusters)
     theirs = rows_of([0.0, 1.0] * 20, clusters)
-    result = paired_differences(*ours, *theirs, draws=100, realism_draws=2)["cfr"]
+    result = differences(ours, theirs, draws=100)["cfr"]
     u = exact_interval(0.0, 20)[1]
     assert (result["low"], result["high"]) == pytest.approx(
         (0.5 - 1.5 * u, 0.5 + 0.5 * u)
@@ -288,9 +292,7 @@ def test_failures_per_kilometre_are_all_failures_over_all_kilometres():
     table = brief(*ours)["failures_per_km"]
     assert table["mean"] == pytest.approx(2 / 0.5)
     assert table["n"] == 3
-    paired = paired_differences(*ours, *theirs, draws=300, realism_draws=2)[
-        "failures_per_km"
-    ]
+    paired = differences(ours, theirs, draws=300)["failures_per_km"]
     assert paired["difference"] == pytest.approx(4 - 1)
     assert paired["n"] == 3
 
@@ -348,6 +350,6 @@ def test_paired_ratios_compare_the_two_groups_own_collisions():
     nan = math.nan
     ours = rows_of([1.0, 1.0, nan, nan], name="rir")
     theirs = rows_of([nan, 0.0, 1.0, nan], name="rir")
-    result = paired_differences(*ours, *theirs, draws=300, realism_draws=2)["rir"]
+    result = differences(ours, theirs, draws=300)["rir"]
     assert result["difference"] == pytest.approx(0.5)
     assert result["n"] == 3

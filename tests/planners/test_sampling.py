@@ -112,7 +112,8 @@ def test_a_mirrored_scene_gets_the_mirrored_plan(beside):
             SamplingEgo().plan(worlds(scenes)[1]) * torch.tensor([1.0, sign, sign, 1.0])
         )
     torch.testing.assert_close(
-        *plans,
+        plans[0],
+        plans[1],
         atol=1e-3,
         rtol=0,
     )

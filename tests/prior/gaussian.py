@@ -42,7 +42,6 @@ def flow(
 def run(
     estimate,
     sampler,
-    churn,
     levels,
     noise,
 ):
@@ -50,7 +49,8 @@ def run(
     - 1, ...]."""
     x = noise[0]
     past = None
-    step = SAMPLERS[sampler](SCHEDULE, churn).step
+    name, churn = sampler
+    step = SAMPLERS[name](SCHEDULE, churn).step
     for k, (high, low) in enumerate(zip(levels[:-1], levels[1:], strict=True)):
         x0 = estimate(x, high)
         if low == 0:
@@ -63,7 +63,6 @@ def run(
 def moments(
     estimate,
     sampler,
-    churn,
     steps,
     spacing="level",
 ):
@@ -74,8 +73,7 @@ def moments(
     x = run(
         estimate,
         sampler,
-        churn=churn,
-        levels=SCHEDULE.levels(steps, spacing=spacing).double(),
+        SCHEDULE.levels(steps, spacing=spacing).double(),
         noise=noise,
     )
     return x[0].item(), (x[1:] - x[0]).norm().item()

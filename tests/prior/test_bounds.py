@@ -32,7 +32,7 @@ STRIDE = 3
 
 
 def traffic(
-    *cars,
+    cars,
     turn=0.0,
     exempt=(),
     yields=(),
@@ -108,7 +108,7 @@ def contact_time(seconds):
 
 def test_plans_that_meet_nobody_are_free():
     decode, state, obstacles = traffic(
-        (0, 0, 0, 10), (30, 0, 0, 10), (0, 3.5, 0, 12), (40, -3.5, math.pi, 9)
+        [(0, 0, 0, 10), (30, 0, 0, 10), (0, 3.5, 0, 12), (40, -3.5, math.pi, 9)]
     )
     assert (caps(decode, state, obstacles=obstacles) == NO_CAP).all()
     motion = bounded(
@@ -123,7 +123,7 @@ def test_plans_that_meet_nobody_are_free():
 
 @pytest.mark.parametrize("speed", [0.0, 4.0])
 def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
-    decode, state, obstacles = traffic((0, 0, 0, 10), (15, 0, 0, speed))
+    decode, state, obstacles = traffic([(0, 0, 0, 10), (15, 0, 0, speed)])
     cap = caps(decode, state, obstacles=obstacles)
     time = contact_time((15 - CAR[0]) / (10 - speed))
     room = 10 * time - GAP - speed * time
@@ -133,14 +133,14 @@ def test_a_follower_brakes_to_its_leader_s_speed_in_the_room_there_is(speed):
 
 
 def test_braking_is_never_harder_than_the_floor_nor_softer_than_gentle():
-    hard = traffic((0, 0, 0, 15), (8, 0, 0, 0))
-    soft = traffic((0, 0, 0, 1.0), (6.5, 0, 0, 0))
-    assert caps(*hard, floor=-5.0)[0] == -5.0
-    assert caps(*soft)[0] == -MIN_BRAKING
+    hard = [(0, 0, 0, 15), (8, 0, 0, 0)]
+    soft = [(0, 0, 0, 1.0), (6.5, 0, 0, 0)]
+    assert caps(*traffic(hard), floor=-5.0)[0] == -5.0
+    assert caps(*traffic(soft))[0] == -MIN_BRAKING
 
 
 def test_of_two_that_cross_the_later_one_brakes():
-    decode, state, obstacles = traffic((-20, 0, 0, 10), (0, -23, math.pi / 2, 10))
+    decode, state, obstacles = traffic([(-20, 0, 0, 10), (0, -23, math.pi / 2, 10)])
     cap = caps(decode, state, obstacles=obstacles)
     assert cap[0] == NO_CAP
     assert cap[1] < -1
@@ -148,8 +148,8 @@ def test_of_two_that_cross_the_later_one_brakes():
 
 def test_only_an_exempt_vehicle_may_meet_the_ego():
     cars = (12, 0, 0, 0), (0, 0, 0, 10), (-12, 0, 0, 13)
-    shy = caps(*traffic(*cars))
-    bold = caps(*traffic(*cars, exempt=[1]))
+    shy = caps(*traffic(cars))
+    bold = caps(*traffic(cars, exempt=[1]))
     assert shy[1] < 0
     assert bold[1] == NO_CAP
     assert bold[2] == shy[2] < 0
@@ -160,18 +160,18 @@ def test_who_yields_brakes_for_the_ego_even_where_the_ego_would_have_to():
         (0, -23, math.pi / 2, 10),
         (-20, 0, 0, 10),
     )  # the ego is later, so it would brake
-    assert caps(*traffic(*crossing))[1] == NO_CAP
-    assert caps(*traffic(*crossing, yields=[1]))[1] < -1
+    assert caps(*traffic(crossing))[1] == NO_CAP
+    assert caps(*traffic(crossing, yields=[1]))[1] < -1
 
 
 def test_a_patient_vehicle_brakes_later_and_harder_and_still_in_time():
     ego = (20.0, 0, 0, 0)
     eager, patient = (
-        caps(*traffic(ego, (0.0, 0, 0, 8), patience=value))[1] for value in (0.0, 6.0)
+        caps(*traffic([ego, (0.0, 0, 0, 8)], patience=value))[1] for value in (0.0, 6.0)
     )
     assert -6 < eager < 0
     assert patient == NO_CAP
-    closer = caps(*traffic(ego, (5.0, 0, 0, 8), patience=4.0))[1]
+    closer = caps(*traffic([ego, (5.0, 0, 0, 8)], patience=4.0))[1]
     room = 20 - 5 - CAR[0] - GAP
     assert -(8**2) / (2 * (room - 2)) < closer < eager
 
@@ -189,24 +189,24 @@ def test_who_drifts_into_the_ego_s_side_falls_behind_it_in_time():
         (3.0 - CAR[1] - LATERAL_MARGIN - CAR[0] / 2 * math.sin(angle))
         / (10 * math.tan(angle))
     )
-    cap = caps(*traffic(ego, drifting, yields=[1]), floor=-50.0)[1]
+    cap = caps(*traffic([ego, drifting], yields=[1]), floor=-50.0)[1]
     assert cap == pytest.approx(-2 * (CAR[0] + GAP + 2.0) / time**2, rel=0.05)
-    assert caps(*traffic(ego, drifting, exempt=[1]))[1] == NO_CAP
+    assert caps(*traffic([ego, drifting], exempt=[1]))[1] == NO_CAP
 
 
 def test_patience_is_for_the_ego_alone():
     cars = (100, 50, 0, 0), (20.0, 0, 0, 0), (0.0, 0, 0, 8)
-    assert caps(*traffic(*cars, patience=6.0))[2] == caps(*traffic(*cars))[2] < 0
+    assert caps(*traffic(cars, patience=6.0))[2] == caps(*traffic(cars))[2] < 0
 
 
 def test_absent_vehicles_are_in_nobody_s_way():
-    decode, state, obstacles = traffic((0, 0, 0, 10), (15, 0, 0, 0))
+    decode, state, obstacles = traffic([(0, 0, 0, 10), (15, 0, 0, 0)])
     obstacles.present[0, 1] = False
     assert (caps(decode, state, obstacles=obstacles) == NO_CAP).all()
 
 
 def test_a_pedestrian_without_a_plan_keeps_its_velocity():
-    decode, state, obstacles = traffic((0, 0, 0, 10))
+    decode, state, obstacles = traffic([(0, 0, 0, 10)])
     walker = torch.tensor([[[20.0, -3.0, math.pi / 2, 1.5]]])
     obstacles = Obstacles(
         torch.cat([obstacles.agents, walker], 1),
@@ -219,7 +219,7 @@ def test_a_pedestrian_without_a_plan_keeps_its_velocity():
 
 
 def test_a_curve_is_met_at_the_lateral_acceleration_allowed():
-    decode, state, obstacles = traffic((0, 0, 0, 12), turn=1 / 20.0)
+    decode, state, obstacles = traffic([(0, 0, 0, 12)], turn=1 / 20.0)
     cap = caps(
         decode,
         state,
@@ -252,7 +252,7 @@ def test_a_curve_is_met_at_the_lateral_acceleration_allowed():
 
 
 def test_whoever_follows_a_braking_vehicle_brakes_too():
-    decode, state, obstacles = traffic((20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12))
+    decode, state, obstacles = traffic([(20, 0, 0, 0), (0, 0, 0, 12), (-5.0, 0, 0, 12)])
     assert (
         caps(
             decode,
@@ -274,7 +274,7 @@ def test_whoever_follows_a_braking_vehicle_brakes_too():
 
 
 def test_a_cap_lowers_the_next_knot_and_at_most_by_its_onset_the_present_acceleration():
-    _, state, _ = traffic((0, 0, 0, 10), (0, 8, 0, 10), (0, 16, 0, 10))
+    _, state, _ = traffic([(0, 0, 0, 10), (0, 8, 0, 10), (0, 16, 0, 10)])
     state.a = torch.tensor([[1.0, -1.5, -6.0]])
     x0 = torch.tensor([[[0.5] * SIZE, [-3.0] * SIZE, [0.0] * SIZE]])
     capped, after = apply_cap(torch.tensor([[-4.0, -2.0, -5.0]]), x0, state=state)
@@ -346,12 +346,12 @@ def test_who_comes_alongside_falls_behind_and_who_crosses_does_not(cosine, behin
 
 
 def test_whoever_is_free_has_a_cap_beyond_what_a_car_can_do():
-    decode, state, obstacles = traffic((0, 0, 0, 10))
+    decode, state, obstacles = traffic([(0, 0, 0, 10)])
     assert caps(decode, state, obstacles=obstacles).tolist() == [20.0]
 
 
 @pytest.mark.parametrize(("aside", "free"), [(2.09, False), (2.11, True)])
 def test_a_tenth_of_a_metre_is_kept_to_either_side(aside, free):
     """Of two cars of 2 m, one beside the other's way."""
-    cap = caps(*traffic((0, 0, 0, 10), (20, aside, 0, 0)))[0]
+    cap = caps(*traffic([(0, 0, 0, 10), (20, aside, 0, 0)]))[0]
     assert (cap == NO_CAP) == free

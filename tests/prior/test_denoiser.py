@@ -15,7 +15,7 @@ VEHICLES = 6
 
 def inputs(seed=0):
     generator = torch.Generator().manual_seed(seed)
-    draw = lambda *shape: torch.randn(BATCH, VEHICLES, *shape, generator=generator)  # noqa: E731
+    draw = lambda *shape: torch.randn((BATCH, VEHICLES, *shape), generator=generator)  # noqa: E731
     present = torch.tensor([[True] * 6, [True, True, False, True, False, False]])
     return (
         draw(SIZE),

@@ -106,7 +106,7 @@ def test_an_ancestral_step_is_the_posterior_given_both_ends():
 @pytest.mark.parametrize("sampler", [DDPM, DDIM_0, SDE_2M, ODE_2M, EULER])
 def test_many_steps_draw_the_data(sampler, data):
     """Deterministic samplers keep 1% of the mean that the first level's x still holds."""
-    mean, std = moments(denoiser(*data), *sampler, 1000)
+    mean, std = moments(denoiser(data[0], data[1]), sampler, 1000)
     assert mean == pytest.approx(data[0], abs=0.018)
     assert std == pytest.approx(data[1], abs=0.003)
 
@@ -125,7 +125,7 @@ def test_bias_of_the_samplers_at_eight_steps(sampler, mean, std):
     """The score is exactly the tilt's, so what is left is the sampler's: first-order
     ones lose a quarter to a third of the spread, Euler-Maruyama adds an eighth, the
     second-order ones lose a fifth."""
-    assert moments(denoiser(*TILTED), *sampler, 8) == pytest.approx(
+    assert moments(denoiser(TILTED[0], TILTED[1]), sampler, 8) == pytest.approx(
         (mean, std), abs=1e-4
     )
 
@@ -158,10 +158,10 @@ def test_levels_begin_at_nearly_pure_noise_and_end_at_little():
 def test_eight_steps_even_in_the_log_ratio_keep_the_spread(std):
     """Within 5% of the data's, over all spreads that knots have; ancestral steps, even
     in t, lose a fifth and more."""
-    assert moments(denoiser(0.3, std), *SDE_2M, 8, "log_ratio")[1] == pytest.approx(
+    assert moments(denoiser(0.3, std), SDE_2M, 8, "log_ratio")[1] == pytest.approx(
         std, rel=0.05
     )
-    assert moments(denoiser(0.3, std), *DDPM, 8)[1] < 0.81 * std
+    assert moments(denoiser(0.3, std), DDPM, 8)[1] < 0.81 * std
 
 
 def test_eight_steps_draw_a_mixture():
@@ -181,7 +181,7 @@ def test_eight_steps_draw_a_mixture():
         return (share * clean).sum(-1)
 
     noise = torch.randn(8, 20_000, generator=torch.Generator().manual_seed(0))
-    x = run(estimate, *SDE_2M, SCHEDULE.levels(8, spacing="log_ratio"), noise)
+    x = run(estimate, SDE_2M, SCHEDULE.levels(8, spacing="log_ratio"), noise)
     assert (x > 0).float().mean().item() == pytest.approx(0.7, abs=0.03)
     expected = (weights * (means**2 + std**2)).sum() - (weights * means).sum() ** 2
     assert x.std().item() == pytest.approx(expected.sqrt().item(), rel=0.07)
@@ -227,7 +227,7 @@ def test_bias_of_the_guidance_modes(
     0.72); deterministic samplers add to it; the straight-through gradient and the tamed
     weight all but replace the data by the minimum of V, which is why the control clips
     them."""
-    assert moments(guided(gradient, scaling), *sampler, 1000) == pytest.approx(
+    assert moments(guided(gradient, scaling), sampler, 1000) == pytest.approx(
         (mean, std), abs=1e-4
     )
 
@@ -240,7 +240,7 @@ def errors(sampler, counts):
         levels = torch.linspace(0.9, 0.1, count + 1, dtype=torch.float64)
         end = run(
             denoiser(MEAN, STD),
-            *sampler,
+            sampler,
             levels,
             torch.cat([x[None], torch.zeros(count - 1, 5)]),
         )

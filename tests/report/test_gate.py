@@ -16,10 +16,11 @@ from e2rl.search.tries_file import TRIES_FILE
 from tests.evaluation.constructed_runs import row_of, run_of
 
 
-def gate(capsys, *arguments):
-    """Status and what is said."""
+def gate(capsys, run, rules, *options):
+    """Status and what is said; rules: one or several."""
+    rules = [rules] if isinstance(rules, str) else rules
     with pytest.raises(SystemExit) as end:
-        main([str(item) for item in arguments])
+        main([str(item) for item in (run, *rules, *options)])
     said = capsys.readouterr()
     return end.value.code, said.out + said.err
 
@@ -113,7 +114,7 @@ def test_the_interval_decides_and_a_failure_outweighs_doubt(
     tmp_path, capsys, rules, status
 ):
     """40 of 100 places: the interval is about 0.31 to 0.50."""
-    result, said = gate(capsys, run_with(tmp_path, 100, hits=40), *rules)
+    result, said = gate(capsys, run_with(tmp_path, 100, hits=40), rules)
     assert result == status
     assert len(said.splitlines()) == len(rules)
     assert all(rule in said for rule in rules)
@@ -130,7 +131,7 @@ def test_the_interval_decides_and_a_failure_outweighs_doubt(
     ],
 )
 def test_bad_rules_have_the_status_of_bad_input(tmp_path, capsys, rules, said):
-    status, text = gate(capsys, run_with(tmp_path, 12, hits=1), *rules)
+    status, text = gate(capsys, run_with(tmp_path, 12, hits=1), rules)
     assert status == 2
     assert said in text
     assert len(text.splitlines()) == 1
@@ -149,14 +150,16 @@ def test_an_attack_must_be_named_where_there_are_several(tmp_path, capsys):
 def test_changes_are_measured_against_a_former_run(tmp_path, capsys):
     before = run_with(tmp_path / "before", 200, hits=60)
     after = run_with(tmp_path / "after", 200, hits=20)
-    against = ("--against", before)
-    assert gate(capsys, after, "contacts<=+0.02", *against)[0] == 0
-    assert gate(capsys, after, "contacts<=-0.1", *against)[0] == 0
+    assert gate(capsys, after, "contacts<=+0.02", "--against", before)[0] == 0
+    assert gate(capsys, after, "contacts<=-0.1", "--against", before)[0] == 0
     assert gate(capsys, before, "contacts<=+0.02", "--against", after)[0] == 1
-    assert gate(capsys, after, "contacts<=-0.2", *against)[0] == 3
-    assert "no rule is on a change" in gate(capsys, after, "contacts<=0.2", *against)[1]
+    assert gate(capsys, after, "contacts<=-0.2", "--against", before)[0] == 3
+    assert (
+        "no rule is on a change"
+        in gate(capsys, after, "contacts<=0.2", "--against", before)[1]
+    )
     other = run_with(tmp_path / "other", 200, hits=20, seeds=[7])
-    status, said = gate(capsys, other, "contacts<=+0.02", *against)
+    status, said = gate(capsys, other, "contacts<=+0.02", "--against", before)
     assert status == 2
     assert "which has other seeds" in said
 
@@ -248,7 +251,7 @@ def test_the_files_for_continuous_integration_hold_what_was_decided(tmp_path, ca
     rules = ["preventable<=0.6", "preventable<=0.2", "preventable<=0.45"]
     files = [tmp_path / "out" / "gate.xml", tmp_path / "out" / "gate.json"]
     run = run_with(tmp_path / "run", 100, hits=40)
-    gate(capsys, run, *rules, "--junit", files[0], "--json", files[1])
+    gate(capsys, run, rules, "--junit", files[0], "--json", files[1])
     root = ET.fromstring(files[0].read_text())
     check(root)
     (suite,) = root

@@ -35,7 +35,7 @@ def across(points: Tensor, line: Line, weight: Tensor, counts: Tensor) -> Line:
 def given(batch: int, count: int) -> tuple:
     draw = torch.Generator().manual_seed(batch)
     points, angle = (
-        torch.randn(batch, *shape, generator=draw) for shape in ((count, 2), ())
+        torch.randn((batch, *shape), generator=draw) for shape in ((count, 2), ())
     )
     return points, Line(angle / 3, angle), torch.arange(3.0), angle > 0
 
@@ -51,17 +51,18 @@ def on():
 @pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
 @pytest.mark.parametrize(("batch", "count"), [(1, 1), (1, 40), (5, 1), (19, 33)])
 def test_compiled_it_gives_what_it_gives_eagerly_for_every_size(on, batch, count):
-    arguments = given(batch, count)
-    across(*arguments)  # compiles it, which calls the function
+    points, line, weight, counts = given(batch, count)
+    across(points, line, weight, counts)  # compiles it, which calls the function
     calls.clear()
-    result = across(*arguments)
+    result = across(points, line, weight, counts)
     assert not calls, "the function itself was called"
-    for first, other in zip(result, across.function(*arguments), strict=True):
+    eager = across.function(points, line, weight, counts)
+    for first, other in zip(result, eager, strict=True):
         assert torch.allclose(first, other, atol=1e-6)
     assert isinstance(result, Line)
     assert across.file.exists()
-    views = arguments[0].transpose(0, 1).contiguous().transpose(0, 1), *arguments[1:]
-    assert torch.equal(across(*views).offset, result.offset), (
+    view = points.transpose(0, 1).contiguous().transpose(0, 1)
+    assert torch.equal(across(view, line, weight, counts).offset, result.offset), (
         "it depends on how a tensor lies in memory"
     )
 
@@ -82,13 +83,13 @@ def test_compiled_it_gives_what_it_gives_eagerly_for_every_size(on, batch, count
     ids=["doubles", "no rows", "gradients", "another size"],
 )
 def test_what_is_not_as_declared_runs_as_it_is(on, change):
-    arguments = change(*given(4, 3))
+    points, line, weight, counts = change(*given(4, 3))
     calls.clear()
-    result = across(*arguments)
-    assert calls == [len(arguments[0])]
+    result = across(points, line, weight, counts)
+    assert calls == [len(points)]
+    eager = across.function(points, line, weight, counts)
     assert all(
-        torch.equal(first, other)
-        for first, other in zip(result, across.function(*arguments), strict=True)
+        torch.equal(first, other) for first, other in zip(result, eager, strict=True)
     )
 
 

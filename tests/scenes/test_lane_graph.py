@@ -62,7 +62,7 @@ def test_a_route_follows_its_lanes_and_ends_where_the_map_does():
     assert np.allclose(np.diff(on.points[:, 0]), SPACING, atol=1e-6)
     true = LineString([(40, 0), (100, 0), *LEFT])
     inside = left.points[: int(left.length / SPACING) + 1]
-    assert max(true.distance(Point(*point)) for point in inside) < 0.25
+    assert max(true.distance(Point(point)) for point in inside) < 0.25
     assert [name for name, _ in left.lanes] == ["in", "left"]
     assert abs(left.lanes[1][1] - 60.0) < 0.5
     assert on.limit[10] == 14.0
@@ -157,7 +157,7 @@ def test_a_recorded_way_goes_on_along_the_lane_at_its_end():
     route = route_from_log(graph, lane_change(), vertices=150)
     line = LineString(route.points)
     assert route.vehicle_s == 20.0
-    assert max(line.distance(Point(*point)) for point in lane_change()[:, :2]) < 0.1
+    assert max(line.distance(Point(point)) for point in lane_change()[:, :2]) < 0.1
     assert route.open
     assert abs(route.length - 200.0) < 3.0
     assert np.allclose(route.points[60:, 1], 3.5, atol=1e-3)

@@ -37,7 +37,7 @@ def genuine():
 def scaled(
     recording,
     factor,
-    *parts,
+    parts,
 ):
     """Parts of a recording in units that are `factor` times smaller."""
     if "positions" in parts:
@@ -120,13 +120,12 @@ MUTATIONS = {
         lambda r: moved(r, lambda points: points * [1, -1] + [0, 17]),
         "m is the ego from|drive along a lane",
     ),
-    "feet": (lambda r: scaled(r, 3.28, *ALL), "median length of vehicles"),
+    "feet": (lambda r: scaled(r, 3.28, ALL), "median length of vehicles"),
     "positions and map in feet": (
         lambda r: scaled(
             r,
             3.28,
-            "positions",
-            "map",
+            ["positions", "map"],
         ),
         "is what the recorded speeds make",
     ),
@@ -139,8 +138,8 @@ MUTATIONS = {
         "displacement of a vehicle",
     ),
     "one vehicle twice": (twice, "at the same place"),
-    "millimetres": (lambda r: scaled(r, 1000.0, *ALL), "m is"),
-    "km/h": (lambda r: scaled(r, 3.6, "speeds"), "is what the recorded speeds make"),
+    "millimetres": (lambda r: scaled(r, 1000.0, ALL), "m is"),
+    "km/h": (lambda r: scaled(r, 3.6, ["speeds"]), "is what the recorded speeds make"),
     "coordinates of 1e9": (far_away, "m is the largest coordinate"),
 }
 

@@ -59,7 +59,7 @@ def test_projection_is_shapelys(seed):
     points = base + aside[:, None] * torch.stack([-heading.sin(), heading.cos()], -1)
     line = LineString(route.tolist())
     along, offset, _ = project(points, route)
-    oracle = [Point(*point.tolist()) for point in points]
+    oracle = [Point(point.tolist()) for point in points]
     distance = torch.tensor(
         [line.distance(point) for point in oracle], dtype=torch.float64
     )
@@ -83,7 +83,7 @@ def test_interpolation_lies_on_the_line_and_projects_back():
     points, heading, _ = interpolate(route, s)
     line = LineString(route.tolist())
     apart = [
-        line.interpolate(a).distance(Point(*p))
+        line.interpolate(a).distance(Point(p))
         for a, p in zip(s.tolist(), points.tolist(), strict=True)
     ]
     assert max(apart) < 1e-9

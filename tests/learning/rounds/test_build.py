@@ -48,7 +48,8 @@ class Doubling(CurriculumScheduler):
 
 def config_of(*overrides):
     """train.yaml with two rounds of two scenes."""
-    return load_config("train", ["rounds=2", "learner.round.scenes=2", *overrides])
+    small = ["rounds=2", "learner.round.scenes=2", *POLICY]
+    return load_config("train", [*small, *overrides])
 
 
 def built(config, folder=None):
@@ -65,22 +66,20 @@ def built(config, folder=None):
 
 @pytest.mark.parametrize("curriculum", CURRICULA)
 def test_policy_learner(curriculum):
-    run = built(config_of(f"curriculum={curriculum}", *POLICY))
+    run = built(config_of(f"curriculum={curriculum}"))
     assert isinstance(run.improve, PolicyImprovement)
     assert type(run.curriculum) is CURRICULA[curriculum]
     assert train_round(run)["synthesizer/memory_rows"] > 0
 
 
 def test_the_experiment_of_training_is_of_options_that_exist():
-    run = built(config_of("experiment=harden", *POLICY))
+    run = built(config_of("experiment=harden"))
     assert isinstance(run.improve, PolicyImprovement)
     assert run.improve.teacher is not None
 
 
 def test_without_a_synthesizer_given_the_traffic_method_attacks():
-    config = config_of(
-        "learner.round.nominal=log", "curriculum.solvable_only=false", *POLICY
-    )
+    config = config_of("learner.round.nominal=log", "curriculum.solvable_only=false")
     run = build_evolution(
         config, small_scenes(3), ego=build_ego(config), traffic=Ambush()
     )
@@ -90,7 +89,7 @@ def test_without_a_synthesizer_given_the_traffic_method_attacks():
 
 
 def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
-    config = config_of(*POLICY)
+    config = config_of()
     with open_dict(config):
         config.curriculum = {
             "_target_": f"{__name__}.Doubling",
@@ -110,7 +109,7 @@ def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
 
 def test_settings_that_do_not_fit_are_refused_at_the_start():
     with pytest.raises(InputError, match="curriculum"):
-        built(config_of("+curriculum.cosine=1", *POLICY))
+        built(config_of("+curriculum.cosine=1"))
 
 
 def test_the_time_left_is_told_once_each_kind_of_phase_was_measured(monkeypatch):
@@ -139,6 +138,6 @@ def test_a_run_that_goes_on_has_measured_nothing_yet():
 
 
 def test_a_device_for_learning_that_cannot_be_used_is_refused():
-    config = config_of("learner.device=banana", *POLICY)
+    config = config_of("learner.device=banana")
     with pytest.raises(InputError, match="banana: .*use learner.device=cpu or cuda"):
         check_training(config)

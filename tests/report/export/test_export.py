@@ -24,7 +24,7 @@ def copy(run, tmp_path):
     return shutil.copytree(run, tmp_path / "run")
 
 
-def refused(capsys, *arguments) -> str:
+def refused(capsys, arguments) -> str:
     with pytest.raises(SystemExit) as end:
         main([str(argument) for argument in arguments])
     assert end.value.code == 2
@@ -55,7 +55,7 @@ def test_of_a_run_with_a_damaged_rollout_nothing_is_left(copy, tmp_path, capsys)
     ]  # the second of two, when the first is written
     path.write_bytes(path.read_bytes()[:100])
     assert path.name in refused(
-        capsys, copy, "--to", "scenarionet", "--all", "--out", tmp_path / "out"
+        capsys, [copy, "--to", "scenarionet", "--all", "--out", tmp_path / "out"]
     )
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -70,11 +70,11 @@ def edit(copy, **changes):
 def test_scenes_that_are_not_those_of_the_run_are_refused(copy, tmp_path, capsys):
     arguments = (copy, "--to", "npz", "--out", tmp_path / "out")
     edit(copy, starts=[15])
-    assert "hold no scene 'scene-0'" in refused(capsys, *arguments)
+    assert "hold no scene 'scene-0'" in refused(capsys, arguments)
     edit(copy, starts=None, build={"steps": 60})
-    assert "not driven in the scene 'scene-0'" in refused(capsys, *arguments)
+    assert "not driven in the scene 'scene-0'" in refused(capsys, arguments)
     shutil.rmtree(copy / ".hydra")
-    assert "pass --no-scene" in refused(capsys, *arguments)
+    assert "pass --no-scene" in refused(capsys, arguments)
     main([str(argument) for argument in (*arguments, "--no-scene")])
     (line,) = lines(tmp_path / "out")
     assert line["scene_id"] == "scene-0"
@@ -96,7 +96,7 @@ def test_a_stranger_s_folder_runs_no_code_but_that_which_the_command_names(
     monkeypatch.syspath_prepend(tmp_path)
     edit(copy, _target_="theirs.Theirs")
     assert "runs code that is no extension" in refused(
-        capsys, copy, "--to", "npz", "--out", tmp_path / "out"
+        capsys, [copy, "--to", "npz", "--out", tmp_path / "out"]
     )
     assert not (tmp_path / "ran").exists()
     main(

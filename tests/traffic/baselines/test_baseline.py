@@ -104,7 +104,7 @@ def test_who_predicts_the_ego_does_not_look_at_its_plan(name):
         on.replan(begin(on, scene, eta=2.0), world, EGO.plan(world) + shift)[1].states
         for shift in (0.0, 50.0)
     ]
-    assert torch.equal(*plans)
+    assert torch.equal(plans[0], plans[1])
 
 
 def test_the_yielding_rule_binds_the_adversaries():
