@@ -8,24 +8,19 @@ import torch
 from e2rl.tail.moves import Moves
 from e2rl.tail.sampler import EXTINCT, LEAST, REACHED, SPENT, Driven, SamplerSettings
 from e2rl.tail.subset import Subset
-from tests.tail.closed_forms import corner, linear, quantile, tally, union
+from tests.tail.closed_forms import FORMS, linear, quantile, tally
 
 SETTINGS = SamplerSettings(
     particles=64, killed=0.5, moves=2, rollouts=100_000, least=1e-12
 )
 P = 1e-3
-FORMS = {
-    "linear": (linear, quantile(P)),
-    "union": (union, quantile(P / 2)),
-    "corner": (corner, quantile(math.sqrt(P))),
-}
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_estimates_are_unbiased(form):
     level, threshold = FORMS[form]
     tallies = [
-        tally(level, threshold, numbers=400, seed=seed, settings=SETTINGS)
+        tally(level, threshold(P), numbers=400, seed=seed, settings=SETTINGS)
         for seed in range(16)
     ]
     estimates = torch.tensor([each.probability for each in tallies]) / P
