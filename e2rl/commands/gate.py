@@ -17,7 +17,7 @@ from e2rl.evaluation.comparison import Driven, check_shared
 from e2rl.evaluation.rollout_files import write_json
 from e2rl.report.answer import errored_lines, touched_lines
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED, judged, junit
-from e2rl.report.rate_gate import RateRun, judged_rate
+from e2rl.report.rate_gate import judged_rate, rates_of_run
 from e2rl.report.rates import RATES_FILE
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
@@ -85,10 +85,10 @@ def rollout_results(options: argparse.Namespace) -> tuple[list[dict], list[str]]
 
 def rate_results(options: argparse.Namespace) -> list[dict]:
     """Returns what becomes of rules on a run of `e2rl rate`."""
-    run = RateRun.read(options.run, options.ego)
+    run = rates_of_run(options.run, options.ego)
     former = None
     if options.against is not None:
-        former = RateRun.read(options.against, options.ego)
+        former = rates_of_run(options.against, options.ego)
         if not any("=x" in rule for rule in options.rules):
             raise InputError(
                 "--against: no rule is on a ratio; write one as "

@@ -1,14 +1,19 @@
 """`e2rl rate [ego=NAME] [data=...]`: how often an ego fails in traffic as the prior has
 it, with an interval, and which failures are the likeliest (docs/guide/rate.md).
 
-Writes rates.json, rates.md, tail.csv and, of failures, rollouts.csv and rollouts/.
+Writes rates.json, rates.md and tail.csv, and of the failures that it draws what an
+evaluation writes: rollouts.csv, rollouts/, metrics.json, modes.json, failures.html.
 """
 
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
+from e2rl.driving.setup import Scored
 from e2rl.evaluation.plan import Evaluation, begin
-from e2rl.report.rates import EgoRates, rate_lines, write_rates
+from e2rl.evaluation.record import record
+from e2rl.report.html import write_report
+from e2rl.report.rates import EgoRates, rate_tables, summary_lines, write_rates
+from e2rl.report.tables import save_tables
 from e2rl.run.command import run_command
 from e2rl.run.config import resolved, settings_of
 from e2rl.run.errors import InputError
@@ -17,6 +22,7 @@ from e2rl.tail.rate import RateSettings, Rating
 from e2rl.tail.summary import scene_rates
 from e2rl.traffic.nominal import NominalTraffic
 
+TABLES_FILE = "rates.md"
 MAY_CHANGE = ("processes",)  # when a run is resumed
 
 
@@ -31,21 +37,34 @@ def rate(run: Run) -> None:
     traffic = nominal_traffic(plan)
     (seed,) = plan.settings.seeds
     egos = []
+    failures = Scored()
     for setup in plan.setups:
         rating = Rating(setup, traffic, settings, seed=seed)
         scenes = scene_rates(
             rating.estimates(plan.work), plan.scenes, target=settings.target
         )
+        for scene in scenes:
+            failures.add(scene.failures)
         egos.append(
-            EgoRates(
+            EgoRates.of(
                 setup.ego_name,
                 scenes,
                 target=settings.target,
                 steps=plan.scenes.steps,
             )
         )
-    write_rates(run.folder, egos)
-    print("", *rate_lines(egos), f"written to {run.folder}", sep="\n")
+    write_rates(run.folder, egos, failures)
+    tables = rate_tables(egos)
+    save_tables(run.folder / TABLES_FILE, tables)
+    lines = [line for ego in egos for line in summary_lines(ego)]
+    lines += ["", *(table.text() for table in tables)]
+    if failures.rows:
+        drawn = record(
+            failures, run.folder, config=run.config, searched=True, **plan.origin
+        )
+        page = write_report(run.folder, drawn, tables=tables)
+        lines.append(f"its failures: {page}")
+    print("", *lines, f"written to {run.folder}", sep="\n")
 
 
 def nominal_traffic(plan: Evaluation) -> NominalTraffic:

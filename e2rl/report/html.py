@@ -15,7 +15,7 @@ import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import repeat
+from itertools import product, repeat
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from e2rl.metrics.errored import raised
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.answer import group_lines
 from e2rl.report.failure_tracks import replay_data
+from e2rl.report.rates import RATES_FILE, EgoRates, rate_tables, summary_lines
 from e2rl.report.tables import (
     Table,
     column_names,
@@ -99,9 +100,15 @@ def write_report(
         InputError: where files of the run are missing, or no method has the name.
     """
     record = record or Record.read(run)
+    rates = EgoRates.read(run) if (run / RATES_FILE).is_file() else []
     if tables is None:
-        tables = metric_tables(record.metrics)
+        tables = rate_tables(rates) if rates else metric_tables(record.metrics)
     content = page_content(run, record, methods)
+    for ego, group in product(rates, content["groups"]):
+        if ego.ego == group["ego"]:
+            group |= {"summary": summary_lines(ego), "rates": {}}
+    if rates:  # their noise is not kept
+        content["commands"].pop(AGAIN, None)
     rows = content.pop("rows")
     entries = content["failures"]
     order = replay_order(entries)[:replays]

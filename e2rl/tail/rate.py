@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from e2rl.driving.batches import Work, split_tasks
-from e2rl.driving.setup import Method, Setup, Task
+from e2rl.driving.setup import Method, Scored, Setup, Task
 from e2rl.metrics.errored import errored_row, lost, raised
+from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.score import score_rollouts
 from e2rl.run.config import configured, setting
 from e2rl.run.processes import in_processes
@@ -76,7 +77,7 @@ class Estimate(NamedTuple):
         km: that the ego drives in a rollout, on average.
         raised: rollouts in which the planner raised, which count as failures.
         lost: rollouts in which the traffic raised, which are none.
-        failures: rows of the rollouts that reached the target, each with its weight.
+        failures: the rollouts that reached the target; rows have a `weight`.
     """
 
     scene: int
@@ -85,7 +86,7 @@ class Estimate(NamedTuple):
     km: float
     raised: int
     lost: int
-    failures: list[dict]
+    failures: Scored
 
 
 class Job(NamedTuple):
@@ -159,8 +160,16 @@ class Rating:
             cost=lambda job: len(job.scenes),
             ended=lambda job: bar.update(len(job.scenes)),
         ):
-            for scene, repetition, tally, *rest in results:
-                yield Estimate(scene, repetition, Tally(**tally), *rest)
+            for scene, repetition, tally, km, raises, losses, failures in results:
+                yield Estimate(
+                    scene,
+                    repetition,
+                    Tally(**tally),
+                    km=km,
+                    raised=raises,
+                    lost=losses,
+                    failures=Scored(*failures),
+                )
 
     def _drive(self, job: Job, folder: Path | None) -> list[tuple]:
         """The estimates of a job, of plain values."""
@@ -208,15 +217,14 @@ class Rating:
                     results[task.noise] = rollout
             for task, reason in errored:
                 assert task.noise is not None
-                row = errored_row(
+                entry = (
                     self.setup.source(method)
                     | {"eta": 0.0, "scene_id": self.setup.scenes.scene_id[task.scene]}
                     | {"location": self.setup.scenes.location[task.scene]}
                     | {"seed": task.seed}
                     | reason
                 )
-                level_of = max(TARGETS.values()) if raised(row) else UNKNOWN
-                results[task.noise] = OneRollout(level_of, math.nan, row, None)
+                results[task.noise] = OneRollout.errored(entry)
         return [results[row] for row in range(len(tasks))]
 
 
@@ -227,31 +235,62 @@ class OneRollout(NamedTuple):
         level: how near it comes to a failure.
         km: that the ego drives; NaN where the planner or the traffic raised.
         row: its metrics where there is a contact, and what was raised.
+        sample: of realism, where there is a contact.
+        entry: of errored.json, where the planner or the traffic raised.
         rollouts: itself where there is a contact.
     """
 
     level: float
     km: float
-    row: dict | None
-    rollouts: Rollouts | None
+    row: dict | None = None
+    sample: dict[str, Tensor] = NO_SAMPLES
+    entry: dict | None = None
+    rollouts: Rollouts | None = None
+
+    @classmethod
+    def errored(cls, entry: dict) -> "OneRollout":
+        """Returns the rollout of an entry of errored.json."""
+        row = errored_row(entry)
+        level = max(TARGETS.values()) if raised(row) else UNKNOWN
+        return cls(level, math.nan, row, entry=entry)
+
+    def scored(self, seed: int, weight: float, folder: Path | None) -> Scored:
+        """Returns what it scored, under a seed of its own, and writes its file.
+
+        Args:
+            seed: in tables and file names.
+            weight: part of the probability that it stands for.
+            folder: of the files; None: none is written.
+        """
+        assert self.row is not None
+        if self.rollouts is not None and folder is not None:
+            self.rollouts.seed = torch.tensor([seed])
+            self.rollouts.to_npz(folder)
+        entries = [] if self.entry is None else [self.entry | {"seed": seed}]
+        row = self.row | {"seed": seed, "weight": weight}
+        return Scored([row], [self.sample], entries)
 
 
 def one_by_one(rollouts: Rollouts) -> list[OneRollout]:
     """Returns each of some rollouts; only those with a contact are scored whole."""
     hit, km = contacts(rollouts)
     index = hit.nonzero()[:, 0].tolist()
-    scored = score_rollouts(rollouts[index])[0] if index else []
-    rows = dict(zip(index, scored, strict=True))
-    level = levels(rollouts, rows).tolist()
-    return [
-        OneRollout(
-            level[number],
-            km[number],
-            rows.get(number),
-            rollouts[[number]] if number in rows else None,
-        )
-        for number in range(len(rollouts))
-    ]
+    scored: dict[int, tuple] = {}
+    if index:
+        touching = rollouts[index]
+        rows, samples = score_rollouts(touching)  # which sets `driver`
+        scored = {
+            number: (rows[place], samples[place], touching[[place]])
+            for place, number in enumerate(index)
+        }
+    by_number = {number: row for number, (row, *_) in scored.items()}
+    level = levels(rollouts, by_number).tolist()
+    results = []
+    for number in range(len(rollouts)):
+        row, sample, whole = scored.get(number, (None, NO_SAMPLES, None))
+        rollout = OneRollout(level[number], km[number], row, sample, rollouts=whole)
+        results.append(rollout)
+    return results
 
 
 @dataclass
@@ -310,15 +349,11 @@ class Population:
         """Returns the fields of Estimate, and writes the failures' files."""
         tally = self.sampler.tally
         failures = self.sampler.failures() if tally.end == REACHED else []
-        rows = []
+        begin = self.repetition * self.sampler.settings.rollouts
+        scored = Scored()
         for index, failure in enumerate(failures):
-            seed = self.repetition * self.sampler.settings.particles + index
-            row = failure.row | {"seed": seed}
-            row["weight"] = tally.probability / len(failures)
-            if failure.rollouts is not None and folder is not None:
-                failure.rollouts.seed = torch.tensor([seed])
-                failure.rollouts.to_npz(folder)
-            rows.append(row)
+            weight = tally.probability / len(failures)
+            scored.add(failure.scored(begin + index, weight=weight, folder=folder))
         return (
             self.scene,
             self.repetition,
@@ -326,7 +361,7 @@ class Population:
             self.km,
             self.raised,
             self.lost,
-            rows,
+            (scored.rows, scored.samples, scored.errored),
         )
 
 

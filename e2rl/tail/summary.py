@@ -4,14 +4,15 @@ and the likeliest failures (docs/guide/rate.md)."""
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from e2rl.driving.setup import Scored
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
-from e2rl.tail.interval import Bounds, of_counts, of_logs, of_ratio, ratio_of_ratios
+from e2rl.tail.interval import Bounds, of_counts, of_logs, of_ratio
 from e2rl.tail.rate import Estimate
 from e2rl.tail.sampler import REACHED
 
@@ -37,7 +38,8 @@ class SceneRate:
         end: of the first population.
         raised: rollouts in which the planner raised.
         lost: rollouts in which the traffic raised.
-        failures: rows of failures drawn, each with its weight.
+        failures: that were drawn; rows have a `weight`, their part of the probability,
+            and the scene's nats as `transport`.
     """
 
     scene_id: str
@@ -49,27 +51,12 @@ class SceneRate:
     end: str
     raised: int
     lost: int
-    failures: list[dict]
+    failures: Scored
 
     @property
     def nats(self) -> float:
         """-log P(failure | scene): the least that any control of the traffic costs."""
         return -math.log(self.bounds.value) if self.bounds.value > 0 else math.inf
-
-
-class Rate(NamedTuple):
-    """A rate of an event over scenes.
-
-    Args:
-        event: of EVENTS.
-        bounds: of each of UNITS.
-        unresolved: of each of UNITS, estimate of what scenes may add in which the
-            populations ended before the target.
-    """
-
-    event: str
-    bounds: dict[str, Bounds]
-    unresolved: dict[str, float]
 
 
 def scene_rates(
@@ -110,9 +97,12 @@ def scene_rate(scene_id: str, parts: Sequence[Estimate], target: str) -> SceneRa
         bounds = of_counts(sum(hits), sum(tally.rollouts for tally in tallies))
     else:
         bounds = target_bounds(probability[target], unresolved)
-    failures = [row for part in parts for row in part.failures]
-    for row in failures:
+    failures = Scored()
+    for part in parts:
+        failures.add(part.failures)
+    for row in failures.rows:
         row["weight"] /= len(parts)
+        row["transport"] = -math.log(bounds.value)
     return SceneRate(
         scene_id,
         probability,
@@ -142,45 +132,28 @@ def target_bounds(probability: Tensor, unresolved: Tensor) -> Bounds:
     return Bounds(value, low, high=interval.high)
 
 
-def rates_of(scenes: Sequence[SceneRate], steps: int) -> list[Rate]:
-    """Returns the rate of each event that all scenes know, over scenes of so many
-    steps."""
+def rates_of(scenes: Sequence[SceneRate], steps: int) -> dict[str, dict[str, Bounds]]:
+    """Returns the rates {event: {unit: bounds}} of the events that all scenes know, over
+    scenes of so many steps.
+
+    The interval's end holds what scenes may add in which populations ended before the
+    target.
+    """
     km = torch.tensor([scene.km for scene in scenes], dtype=torch.float64)
     at_most = torch.tensor([scene.at_most for scene in scenes], dtype=torch.float64)
     ones = torch.ones_like(km)
     exposures = (ones, ones * steps * DT / HOUR, km / DISTANCE)
-    by_unit = dict(zip(UNITS, exposures, strict=True))
-    unresolved = {
-        unit: float(at_most.sum() / exposure.sum())
-        for unit, exposure in by_unit.items()
-    }
-    rates = []
+    rates: dict[str, dict[str, Bounds]] = {}
     for event in EVENTS:
-        if event in scenes[0].probability:
-            estimates = [scene.probability[event] for scene in scenes]
-            bounds = {
-                unit: of_ratio(estimates, exposure)
-                for unit, exposure in by_unit.items()
-            }
-            rates.append(Rate(event, bounds, unresolved))
+        if event not in scenes[0].probability:
+            continue
+        estimates = [scene.probability[event] for scene in scenes]
+        rates[event] = {}
+        for unit, exposure in zip(UNITS, exposures, strict=True):
+            bounds = of_ratio(estimates, exposure)
+            unresolved = float(at_most.sum() / exposure.sum())
+            rates[event][unit] = bounds._replace(high=bounds.high + unresolved)
     return rates
-
-
-def ratio(
-    first: Sequence[SceneRate], second: Sequence[SceneRate], event: str
-) -> Bounds:
-    """Returns the rate of an event per km of the first ego over that of the second,
-    paired by scene."""
-    other = {scene.scene_id: scene for scene in second}
-    pairs = [(scene, other[scene.scene_id]) for scene in first]
-    sides = [
-        (
-            [pair[side].probability[event] for pair in pairs],
-            torch.tensor([pair[side].km for pair in pairs], dtype=torch.float64),
-        )
-        for side in (0, 1)
-    ]
-    return ratio_of_ratios(sides[0], sides[1])
 
 
 def as_json(scene: SceneRate) -> dict[str, Any]:
@@ -200,5 +173,5 @@ def as_json(scene: SceneRate) -> dict[str, Any]:
         "end": scene.end,
         "raised": scene.raised,
         "lost": scene.lost,
-        "failures": len(scene.failures),
+        "failures": len(scene.failures.rows),
     }

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from e2rl.tail.interval import of_counts, of_logs
+from e2rl.driving.setup import Scored
+from e2rl.tail.interval import of_counts, of_logs, of_ratio
 from e2rl.tail.rate import Estimate
 from e2rl.tail.sampler import REACHED, SPENT, Tally
-from e2rl.tail.summary import rates_of, ratio, scene_rates
+from e2rl.tail.summary import rates_of, scene_rates
 
 SCENES = SimpleNamespace(scene_id=["a", "b", "c"])
 STEPS = 80
@@ -21,11 +22,13 @@ def reached(scene, repetition, probability, failures=0):
     )
     tally.end = REACHED
     rows = [{"weight": probability / failures} for _ in range(failures)]
-    return Estimate(scene, repetition, tally, 0.1, 0, 0, rows)
+    return Estimate(scene, repetition, tally, 0.1, 0, 0, Scored(rows))
 
 
 def spent(scene, bound):
-    return Estimate(scene, 0, Tally(bound=bound, rollouts=10, end=SPENT), 0.1, 0, 0, [])
+    return Estimate(
+        scene, 0, Tally(bound=bound, rollouts=10, end=SPENT), 0.1, 0, 0, Scored()
+    )
 
 
 @pytest.fixture
@@ -54,7 +57,9 @@ def test_a_failure_not_drawn_is_bounded_by_the_last_level(rates):
 
 
 def test_what_a_repetition_did_not_reach_is_part_of_the_interval():
-    ended = Estimate(0, 1, Tally(bound=0.02, rollouts=10, end=SPENT), 0.1, 0, 0, [])
+    ended = Estimate(
+        0, 1, Tally(bound=0.02, rollouts=10, end=SPENT), 0.1, 0, 0, Scored()
+    )
     (scene,) = scene_rates([reached(0, 0, 0.01), ended], SCENES, "preventable")
     assert scene.bounds.value == pytest.approx(0.005)
     assert scene.bounds.low == 0
@@ -62,41 +67,38 @@ def test_what_a_repetition_did_not_reach_is_part_of_the_interval():
     assert scene.at_most == pytest.approx(0.01)
 
 
-def test_scenes_that_were_not_reached_may_add_their_bounds_in_every_unit(rates):
-    (contact, preventable, _) = rates_of(rates, STEPS)
-    assert preventable.unresolved["scene"] == pytest.approx(1.1e-3 / 3)
-    assert preventable.unresolved["hour"] == pytest.approx(1.1e-3 / 3 * 3600 / 8)
-    assert preventable.unresolved["1000km"] == pytest.approx(1.1e-3 / 0.3 * 1000)
-    assert contact.unresolved == preventable.unresolved
+@pytest.mark.parametrize(
+    ("unit", "exposure"), [("scene", 3), ("hour", 3 * 8 / 3600), ("1000km", 3e-4)]
+)
+def test_scenes_that_were_not_reached_may_add_their_bounds(rates, unit, exposure):
+    estimates = [scene.probability["preventable"] for scene in rates]
+    interval = of_ratio(estimates, torch.full((3,), exposure / 3).double())
+    bounds = rates_of(rates, STEPS)["preventable"][unit]
+    assert bounds.value == pytest.approx(interval.value)
+    assert bounds.high == pytest.approx(interval.high + 1.1e-3 / exposure)
 
 
 def test_independent_rollouts_have_the_interval_of_their_counts():
     tally = Tally(0.02, hits=2, rollouts=100, end=REACHED)
-    (scene,) = scene_rates([Estimate(0, 0, tally, 0.1, 0, 0, [])], SCENES, "contact")
+    (scene,) = scene_rates(
+        [Estimate(0, 0, tally, 0.1, 0, 0, Scored())], SCENES, "contact"
+    )
     assert scene.bounds == of_counts(2, 100)
 
 
 def test_weights_of_failures_sum_to_the_probability(rates):
-    assert sum(row["weight"] for row in rates[0].failures) == pytest.approx(0.02)
+    assert sum(row["weight"] for row in rates[0].failures.rows) == pytest.approx(0.02)
+
+
+def test_failures_have_the_nats_of_their_scene(rates):
+    nats = [row["transport"] for row in rates[0].failures.rows]
+    assert nats == [rates[0].nats] * 4
 
 
 def test_rates_are_per_scene_hour_and_1000_km(rates):
-    by_event = {rate.event: rate for rate in rates_of(rates, STEPS)}
+    by_event = rates_of(rates, STEPS)
     preventable = by_event["preventable"]
-    assert preventable.bounds["scene"].value == pytest.approx(0.02 / 3)
-    assert preventable.bounds["hour"].value == pytest.approx(0.02 / 3 * 3600 / 8)
-    assert preventable.bounds["1000km"].value == pytest.approx(0.02 / 0.3 * 1000)
-    assert by_event["contact"].bounds["scene"].value == pytest.approx(0.04 / 3)
-
-
-def test_the_ratio_of_two_egos_is_that_of_their_rates(rates):
-    twice = scene_rates(
-        [
-            *(reached(1, k, p) for k, p in enumerate((0.02, 0.06))),
-            spent(0, 1e-3),
-            spent(2, 1e-4),
-        ],
-        SCENES,
-        "preventable",
-    )
-    assert ratio(twice, rates, "preventable").value == pytest.approx(2)
+    assert preventable["scene"].value == pytest.approx(0.02 / 3)
+    assert preventable["hour"].value == pytest.approx(0.02 / 3 * 3600 / 8)
+    assert preventable["1000km"].value == pytest.approx(0.02 / 0.3 * 1000)
+    assert by_event["contact"]["scene"].value == pytest.approx(0.04 / 3)
