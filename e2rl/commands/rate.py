@@ -50,6 +50,7 @@ def rate(run: Run) -> None:
                 setup.ego_name,
                 scenes,
                 target=settings.target,
+                least=settings.least,
                 steps=plan.scenes.steps,
             )
         )
@@ -57,14 +58,14 @@ def rate(run: Run) -> None:
     tables = rate_tables(egos)
     save_tables(run.folder / TABLES_FILE, tables)
     lines = [line for ego in egos for line in summary_lines(ego)]
-    lines += ["", *(table.text() for table in tables)]
+    lines += [f"\n{table.text()}" for table in tables]
     if failures.rows:
         drawn = record(
             failures, run.folder, config=run.config, searched=True, **plan.origin
         )
         page = write_report(run.folder, drawn, tables=tables)
-        lines.append(f"its failures: {page}")
-    print("", *lines, f"written to {run.folder}", sep="\n")
+        lines.append(f"\nIts failures: {page}")
+    print("", *lines, f"Written to {run.folder}", sep="\n")
 
 
 def nominal_traffic(plan: Evaluation) -> NominalTraffic:

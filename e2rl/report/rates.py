@@ -51,7 +51,13 @@ SCENE = {
     "end": str,
     "failures": int,
 }
-ENTRY = {"ego": str, "target": str, "rates": {...: {...: BOUNDS}}, "scenes": [SCENE]}
+ENTRY = {
+    "ego": str,
+    "target": str,
+    "least": NUMBER,
+    "rates": {...: {...: BOUNDS}},
+    "scenes": [SCENE],
+}
 
 
 @dataclass(frozen=True)
@@ -61,18 +67,26 @@ class EgoRates:
     Args:
         ego: its name.
         target: of the populations.
+        least: probability below which it was not looked for.
         rates: bounds of each unit of each event.
         scenes: as `summary.as_json` has them, the likeliest failure first.
     """
 
     ego: str
     target: str
+    least: float
     rates: Mapping[str, Mapping[str, Bounds]]
     scenes: Sequence[Mapping[str, Any]]
 
     @classmethod
     def of(
-        cls, ego: str, scenes: Sequence[SceneRate], *, target: str, steps: int
+        cls,
+        ego: str,
+        scenes: Sequence[SceneRate],
+        *,
+        target: str,
+        least: float,
+        steps: int,
     ) -> "EgoRates":
         """Returns those of an ego.
 
@@ -80,10 +94,12 @@ class EgoRates:
             ego: its name.
             scenes: the likeliest failure first.
             target: of the populations.
+            least: probability below which it was not looked for.
             steps: of a scene.
         """
         rows = [nans(as_json(scene)) for scene in scenes]
-        return cls(ego, target, rates_of(scenes, steps), scenes=rows)
+        rates = rates_of(scenes, steps)
+        return cls(ego, target, least=least, rates=rates, scenes=rows)
 
     @classmethod
     def read(cls, run: Path) -> "list[EgoRates]":
@@ -94,6 +110,7 @@ class EgoRates:
             cls(
                 entry["ego"],
                 entry["target"],
+                least=entry["least"],
                 rates={
                     event: {
                         unit: Bounds(**nans(bounds)) for unit, bounds in units.items()
@@ -136,6 +153,7 @@ def write_rates(folder: Path, egos: Sequence[EgoRates], failures: Scored) -> Non
         {
             "ego": ego.ego,
             "target": ego.target,
+            "least": ego.least,
             "rates": {
                 event: {unit: bounds._asdict() for unit, bounds in units.items()}
                 for event, units in ego.rates.items()
@@ -186,7 +204,7 @@ def rate_tables(egos: Sequence[EgoRates]) -> list[Table]:
         head = ["ego", "over", "event", "ratio per km"]
         tables.append(Table("Ratios of rates, paired by scene.", head, rows=pairs))
     tables.append(nats_table(egos))
-    tables += [likeliest_table(ego) for ego in egos]
+    tables += [table for table in map(likeliest_table, egos) if table.rows]
     ends = [
         [ego.ego, ENDS.get(end, end), str(count)]
         for ego in egos
@@ -204,14 +222,15 @@ def nats_table(egos: Sequence[EgoRates]) -> Table:
     for ego in egos:
         count = len(ego.scenes)
         for budget in BUDGETS:
+            if math.exp(-budget) < ego.least:
+                break
             hits = sum(scene["nats"] <= budget for scene in ego.scenes)
             interval = stats.binomtest(hits, count).proportion_ci(LEVEL, "wilson")
             share = f"{hits / count:.0%} [{interval.low:.0%}, {interval.high:.0%}]"
             rows.append([ego.ego, str(budget), f"{hits} of {count}", share])
     return Table(
         "Scenes in which a failure costs at most so many nats, -log p: the least that any "
-        "control of the traffic spends on it. Rarer ones than rate.least were not looked "
-        "for.",
+        "control of the traffic spends on it.",
         ["ego", "nats", "scenes", "share"],
         rows=rows,
     )

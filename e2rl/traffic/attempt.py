@@ -58,33 +58,34 @@ def attempt(
     code.
     """
     try:
-        rollouts = roll_out(tasks)
+        return _finite(roll_out(tasks), tasks)
     except (Exception, SystemExit) as error:  # outside code raises anything
         if _ends_the_run(error, begins):
             raise
-        named = error.rows if isinstance(error, RowsError) else {}
-        details = {row: why for row, why in named.items() if 0 <= row < len(tasks)}
-        if len(tasks) > 1 and not details:
-            half = len(tasks) // 2
-            first = attempt(roll_out, tasks[:half])
-            second = attempt(roll_out, tasks[half:])
-            return first[0] + second[0], first[1] + second[1]
-        why = {
-            "reason": f"raised {type(error).__name__}",
-            "detail": str(error),
-            "traceback": traceback.format_exc(),
-            "raised_by": raiser(error),
-        }
-        if isinstance(error, TrafficNotFinite):
-            why["reason"] = NOT_FINITE
-        details = details or {0: str(error)}
-        errored = [
-            (tasks[row], why | {"detail": detail}) for row, detail in details.items()
-        ]
-        others = [task for row, task in enumerate(tasks) if row not in details]
-        parts, further = attempt(roll_out, others) if others else ([], [])
-        return parts, errored + further
-    return _finite(rollouts, tasks)
+        failure = error
+    # Outside of the block, so that no half has the whole batch's error as its context.
+    named = failure.rows if isinstance(failure, RowsError) else {}
+    details = {row: why for row, why in named.items() if 0 <= row < len(tasks)}
+    if len(tasks) > 1 and not details:
+        half = len(tasks) // 2
+        first = attempt(roll_out, tasks[:half])
+        second = attempt(roll_out, tasks[half:])
+        return first[0] + second[0], first[1] + second[1]
+    why = {
+        "reason": f"raised {type(failure).__name__}",
+        "detail": str(failure),
+        "traceback": "".join(traceback.format_exception(failure)),
+        "raised_by": raiser(failure),
+    }
+    if isinstance(failure, TrafficNotFinite):
+        why["reason"] = NOT_FINITE
+    details = details or {0: str(failure)}
+    errored = [
+        (tasks[row], why | {"detail": detail}) for row, detail in details.items()
+    ]
+    others = [task for row, task in enumerate(tasks) if row not in details]
+    parts, further = attempt(roll_out, others) if others else ([], [])
+    return parts, errored + further
 
 
 def _ends_the_run(error: BaseException, begins: bool) -> bool:

@@ -35,8 +35,16 @@ def rate(tmp_path, monkeypatch, capsys):
     return run
 
 
-def test_two_egos_are_rated_and_gated(rate, monkeypatch, capsys):
-    run = rate("+egos.a.ego=idm", "+egos.b.ego=lane_graph")
+def test_two_egos_are_rated_gated_and_reported(rate, tmp_path, monkeypatch, capsys):
+    scenes = tmp_path / "scenes.csv"
+    scenes.write_text("scene_id\ncurved_road_023_0280\npriority_cross_040_0720\n")
+    run = rate(
+        "+egos.a={ego: class, _target_: tests.planners.planners.Faster}",
+        "+egos.b={ego: lane_graph}",
+        f"scenes={scenes}",
+        "num_scenes=null",
+        "data.build.steps=25",
+    )
     entries = json.loads((run / "rates.json").read_text())
     assert [entry["ego"] for entry in entries] == ["a", "b"]
     assert all(len(entry["scenes"]) == 2 for entry in entries)
@@ -50,13 +58,19 @@ def test_two_egos_are_rated_and_gated(rate, monkeypatch, capsys):
         for scene in entry["scenes"]:
             weight = weights.get((entry["ego"], scene["scene_id"]), 0)
             assert weight == pytest.approx(scene["probability"])
-    status, output = call(
-        "e2rl/commands/cli.py",
+    page = (run / "failures.html").read_text()
+    assert "contact failures per 1,000 km" in page
+    for command in (
         ["gate", str(run), "--ego", "a", "contact_per_scene<=1"],
-        monkeypatch=monkeypatch,
-        capsys=capsys,
-    )
-    assert status == 0, output
+        ["report", str(run), "--out", str(run / "again.html")],
+        ["replay", str(run), "--failures", "1"],
+        ["export", str(run), "--to", "scenarionet"],
+    ):
+        status, output = call(
+            "e2rl/commands/cli.py", command, monkeypatch=monkeypatch, capsys=capsys
+        )
+        assert status == 0, output
+    assert (run / "again.html").read_text() == page
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,11 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from e2rl.planners.ego import Ego
+from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.external import continued
+from e2rl.planners.path import MissionPath
+from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.mission import mission_of
@@ -131,3 +133,13 @@ class SameLaw(Ego):
         )
         plan = torch.cat([held, held.new_zeros(len(held), 50 - steps, 4)], 1)
         return continued(plan, torch.full((len(held),), steps))
+
+
+class Faster(Ego):
+    """Speeds up along its mission, whoever is there."""
+
+    def plan(self, world):
+        """States [B, 51, 4]."""
+        time = DT * torch.arange(PLAN_STEPS + 1)
+        speed = world.states[:, 0, 3:] + 4.0 * time
+        return MissionPath(world).drive(speed)

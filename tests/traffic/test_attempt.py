@@ -77,3 +77,16 @@ def test_rows_that_a_planner_names_are_believed_where_the_batch_has_them(wrong, 
     finished, ended = attempt(roll_out, [4, 5, 6])
     assert [task for tasks, _ in finished for task in tasks] == [4, 6]
     assert [(task, why["detail"]) for task, why in ended] == [(5, detail)]
+
+
+def test_a_traceback_is_of_the_rollout_alone():
+    """The errors of the batches that it was halved from are no part of it."""
+
+    def roll_out(tasks):
+        if 5 in tasks:
+            raise KeyError(len(tasks))
+        return whole(tasks)
+
+    _, ((_, why),) = attempt(roll_out, list(range(8)))
+    assert why["traceback"].count("Traceback (most recent call last)") == 1
+    assert why["traceback"].endswith("KeyError: 1\n")

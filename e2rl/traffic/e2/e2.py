@@ -84,6 +84,14 @@ class E2(NominalTraffic):
                 "guidance.anchor_level: take synthesizer=e2_paper, or set "
                 "synthesizer.guidance"
             )
+        sampler = self.prior.sampler
+        without_noise = sampler.churn == 0 and sampler.sampler != "euler_maruyama"
+        if without_noise and self.control.transport_budget is not None:
+            raise InputError(
+                "prior.sampler.churn=0: control of steps without noise has no price in "
+                "nats, so that a transport_budget binds nothing; set it above 0, or "
+                "synthesizer.control.transport_budget=null"
+            )
         by_rules = self.reasoner.kind == "rules"
         self.selector = Selector(
             prior=self.prior,

@@ -3,8 +3,11 @@
 import pytest
 import torch
 
+from e2rl.prior.sde import SamplerSettings
+from e2rl.run.errors import InputError
 from e2rl.traffic.e2 import e2
 from e2rl.traffic.e2.pull import Pull
+from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import replanned, scenes, synthesizer
 
 
@@ -73,3 +76,9 @@ def test_by_default_anchors_pull_by_8_and_kernels_by_6_per_intensity(pulls_and_k
 
 def test_by_default_five_kernels_gain_100_nats_per_intensity(pulls_and_kernels):
     assert pulls_and_kernels[1] == [([100 * 1.5], 5)]
+
+
+def test_a_budget_of_steps_without_noise_is_refused():
+    prior = small_prior(sampler=SamplerSettings(churn=0.0))
+    with pytest.raises(InputError, match=r"prior\.sampler\.churn=0"):
+        e2.E2(prior, control={"transport_budget": 20.0})
