@@ -20,13 +20,13 @@ class Pulled:
         self.goal = goal
         self.strength = strength
 
-    def __call__(self, x, level, k, context, denoise):
-        variance = self.schedule.sigma(level) ** 2
-        x0 = self.schedule.alpha(level) * x
-        if k == 1:
-            return x, x0, x0
+    def __call__(self, step):
+        variance = self.schedule.sigma(step.level) ** 2
+        x0 = self.schedule.alpha(step.level) * step.x
+        if step.k == 1:
+            return step.x, x0, x0
         weight = self.strength * variance / (self.strength * variance + 1)
-        return x, x0, x0 + weight * (self.goal - x0)
+        return step.x, x0, x0 + weight * (self.goal - x0)
 
 
 def drawn(strength, sampler="dpm_solver_pp", churn=1.0, steps=8):
