@@ -1,7 +1,10 @@
 """Scenes and checkpoints, good and bad, that the tests of the scripts share."""
+# ruff: noqa: E402
 
+import gc
 import os
 
+gc.disable()  # until all is imported: see pytest_collection_finish
 os.environ.setdefault(
     "OMP_NUM_THREADS", "1"
 )  # before torch is imported: each of xdist's processes has one core
@@ -41,6 +44,14 @@ os.environ.setdefault(
     "MPLCONFIGDIR", matplotlib.get_cachedir()
 )  # its list of fonts takes long to make
 os.environ["XDG_CACHE_HOME"] = os.environ["E2RL_TESTS"]
+
+
+def pytest_collection_finish():
+    """Modules stay to the end: searching them for garbage, during their import and
+    again and again after it, takes a fifth of all time."""
+    gc.freeze()
+    gc.set_threshold(20_000)
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

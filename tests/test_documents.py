@@ -64,15 +64,19 @@ def docstrings(path: Path) -> Iterator[str]:
             yield ast.get_docstring(node) or ""
 
 
-@cache
-def texts() -> dict[str, str]:
-    """Documents, docstrings and configuration files, by path."""
-    result = {path: path.read_text() for path in documents()}
-    result |= {path: path.read_text() for path in (ROOT / "conf").rglob("*.yaml")}
-    result |= {
-        path: "\n".join(docstrings(path)) for path in (ROOT / "e2rl").rglob("*.py")
-    }
-    return {str(path.relative_to(ROOT)): text for path, text in result.items()}
+def text_files() -> list[str]:
+    """Documents, modules and configuration files."""
+    files = [
+        *documents(),
+        *(ROOT / "conf").rglob("*.yaml"),
+        *(ROOT / "e2rl").rglob("*.py"),
+    ]
+    return sorted(str(path.relative_to(ROOT)) for path in files)
+
+
+def text_of(path: Path) -> str:
+    """What a file says: of a module its docstrings."""
+    return "\n".join(docstrings(path)) if path.suffix == ".py" else path.read_text()
 
 
 def named_paths(text: str) -> set[str]:
@@ -174,9 +178,9 @@ def test_relative_links_lead_to_a_file_and_a_heading(path):
     assert not broken, f"{path.relative_to(ROOT)}: {', '.join(broken)}"
 
 
-@pytest.mark.parametrize("name", sorted(texts()))
+@pytest.mark.parametrize("name", text_files())
 def test_what_is_named_exists(name):
-    text = texts()[name]
+    text = text_of(ROOT / name)
     missing = {path for path in named_paths(text) if not (ROOT / path).exists()}
     certain = {path.name for path in documents()} | WRITTEN
     missing |= set(DOCUMENT.findall(text)) - certain

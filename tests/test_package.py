@@ -28,7 +28,7 @@ def test_every_package_and_the_configuration_are_in_the_wheel():
 
 def test_a_notebook_rolls_out_what_the_command_does():
     """The ten lines of e2rl.api: the rollouts do not depend on how they are asked for."""
-    scenes = e2rl.load_scenes("bundled", num_scenes=2)
+    scenes = e2rl.load_scenes("bundled", num_scenes=2, build={"steps": 20})
     ego = e2rl.make_ego("lane_graph")
     prior = e2rl.load_prior()
     ours = e2rl.roll_out(scenes, ego, traffic=e2rl.make_traffic("e2", prior), eta=2.0)

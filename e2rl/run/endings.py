@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 
 from e2rl.run.errors import InputError
-from e2rl.run.processes import kill_workers
+from e2rl.run.guard import kill_workers
 
 WRITING = {
     errno.ENOSPC,

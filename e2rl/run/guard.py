@@ -10,14 +10,23 @@ import subprocess
 import sys
 import threading
 from contextlib import suppress
+from multiprocessing.queues import SimpleQueue
 
 GRACE = 1.0  # s between SIGTERM and SIGKILL
+STARTED: list[SimpleQueue] = []  # of each pool, the numbers of its workers
 
 
 def kill_group(leader: int, number: int = signal.SIGKILL) -> None:
     """Send a signal to a process and to all that it has started in its group."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(leader, number)
+
+
+def kill_workers() -> None:
+    """Kill the workers of all pools, each with its process group."""
+    for started in STARTED:
+        while not started.empty():
+            kill_group(started.get())
 
 
 def main(command: list[str]) -> None:

@@ -20,14 +20,13 @@ from typing import Any, TypeVar
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.run.guard import kill_group
+from e2rl.run.guard import STARTED, kill_workers
 
 PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 _work: Callable[[int], bytes]  # of a forked worker, which has it without its being sent
-_started: list[SimpleQueue] = []  # of each pool, the numbers of its workers
 
 
 def cores() -> int:
@@ -134,7 +133,7 @@ def worker_pool(
         initializer=_begin,
         initargs=(started, os.getpid(), begin, arguments),
     )
-    _started.append(started)
+    STARTED.append(started)
     try:
         yield pool
     except BaseException:
@@ -144,14 +143,7 @@ def worker_pool(
     else:
         pool.shutdown(cancel_futures=True)
     finally:
-        _started.remove(started)
-
-
-def kill_workers() -> None:
-    """Kill the workers of all pools, each with its process group."""
-    for started in _started:
-        while not started.empty():
-            kill_group(started.get())
+        STARTED.remove(started)
 
 
 def _begin(

@@ -19,7 +19,7 @@ def tune(tmp_path, monkeypatch, capsys):
         runs.append(folder)
         study = [
             f"tuning.study={tmp_path / 's'}",
-            "prior.sampler.steps=2",
+            "data.build.steps=10",
             "processes=1",
         ]
         inputs = [*SHORT, *study, f"hydra.run.dir={folder}", *options]

@@ -38,7 +38,7 @@ def run(tmp_path_factory):
     on = synthesizer()
     methods = [Method("nominal", on), Method("e2", on, eta=3.0)]
     rows = run_protocol(
-        setup_of(scenes(SCENES, steps=40), 3),
+        setup_of(scenes(SCENES, steps=10), 3),
         methods,
         seeds=SEEDS,
         folder=folder,
@@ -75,7 +75,7 @@ def test_a_row_for_each_method_and_a_line_and_a_file_for_each_rollout(run):
     for file in files:
         assert file.seed in SEEDS
         assert file.ego_policy == "idm"
-        assert file.states.shape[0] == 41
+        assert file.states.shape[0] == 11
         assert file.adversaries.any() == (file.method == "e2")
         assert not file.adversaries[0]
 
@@ -84,7 +84,7 @@ def test_methods_share_the_noise_of_a_scene_and_seed():
     assert scene_seed(3, 1) == scene_seed(3, 1)
     assert len({scene_seed(i, j) for i in range(50) for j in range(5)}) == 250
     methods = [Method("one", synthesizer()), Method("two", synthesizer())]
-    twice = run_protocol(setup_of(scenes(SCENES)), methods, seeds=[4])
+    twice = run_protocol(setup_of(scenes(SCENES, steps=10)), methods, seeds=[4])
     first, two = (row["metrics"] for row in twice)
     for name in first:
         if not name.startswith("seconds"):
@@ -94,7 +94,7 @@ def test_methods_share_the_noise_of_a_scene_and_seed():
 
 def test_processes_change_nothing_but_the_time(tmp_path):
     """Two forked processes give the rows, tables and rollouts of one, bit for bit."""
-    scene_set = scenes(2, steps=20)
+    scene_set = scenes(2, steps=10)
     folders = (tmp_path / "one", tmp_path / "two")
     for processes, folder in enumerate(folders, 1):
         methods = [
@@ -132,7 +132,14 @@ def stopping_run(folder, stops, scene_set):
     what was rolled out."""
     finished = []
     for left in (*stops, 100):
-        setup = Stopped(scene_set, IDMEgo(), ego_name="idm", sim=SimSettings(), batch=2)
+        setup = Stopped(
+            scene_set,
+            IDMEgo(),
+            ego_name="idm",
+            sim=SimSettings(),
+            batch=2,
+            evasions=False,
+        )
         setup.left = left
         setup.done = finished
         methods = [
@@ -175,7 +182,7 @@ def same_runs(one, other):
 
 def test_a_run_that_was_interrupted_equals_one_that_was_not(tmp_path):
     """However often it stops; no rollout is done twice, and none has two rows."""
-    scene_set = small_scenes(3)
+    scene_set = small_scenes(3, steps=10)
     whole = stopping_run(tmp_path / "whole", (), scene_set=scene_set)
     finished = stopping_run(tmp_path / "parts", (3, 0, 1), scene_set=scene_set)
     assert sorted(finished) == sorted(set(finished)) == sorted(whole)

@@ -94,9 +94,20 @@ def world_of(**scene):
 
 def driven(ego, steps=80, **scene):
     """What an ego does in a scene, and its last state [4]."""
-    env, _ = world_of(**scene)
-    data = env.rollout(steps, EgoPolicy(ego, env))
-    return data, env.world().states[0, 0]
+    data, states = all_driven(ego, make_scenes(**{"num_scenes": 1} | scene), steps)
+    return data, states[0]
+
+
+def all_driven(ego, scenes, steps=80, **sim):
+    """What an ego does in each of the scenes until it is over in one, and its last
+    states [B, 4]; sim: settings of the simulator."""
+    env = DrivingEnv(scenes, SimSettings(**sim), len(scenes), agents=True)
+    policy = EgoPolicy(ego, env)
+    begin = env.reset(
+        TensorDict({"scene_index": torch.arange(len(scenes))[:, None]}, [len(scenes)])
+    )
+    data = env.rollout(steps, policy, auto_reset=False, tensordict=begin)
+    return data, env.world().states[:, 0]
 
 
 class SameLaw(Ego):

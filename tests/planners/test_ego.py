@@ -24,7 +24,7 @@ from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.traffic.lookahead import Lookahead
 from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.rule_based import ConstantVelocity, LogReplay
-from tests.planners.planners import driven, world_of, worlds
+from tests.planners.planners import all_driven, driven, world_of, worlds
 from tests.synthetic import make_scenes
 
 
@@ -432,40 +432,42 @@ def test_scenes_of_a_batch_do_not_mix(kind):
 
 
 @pytest.mark.parametrize("kind", [IDMEgo, LaneGraphEgo, SamplingEgo, BitsEgo])
-def test_a_red_light_is_halted_at_and_without_one_it_drives_on(kind):
+def test_a_red_light_is_halted_at_and_at_a_green_one_it_drives_on(kind):
     halts_by = (
         48.3 if kind is IDMEgo else 47.8
     )  # the line is at 50 m, the front 2.25 m ahead of the centre
-    for light, low, high in ((50.0, 35.0, halts_by), (None, 55.0, 1e3)):
-        _, state = driven(
-            kind(),
-            num_vehicles=1,
-            num_vrus=0,
-            red_light_x=light,
-        )
-        assert low < state[0] < high
-        assert (state[3] < 2.5) == (light is not None)
+    scenes = make_scenes(
+        2,
+        num_vehicles=1,
+        num_vrus=0,
+        red_light_x=50.0,
+    )
+    scenes.scenes["light_state"][1] = LIGHT_GREEN
+    _, (red, green) = all_driven(kind(), scenes)
+    assert 35.0 < red[0] < halts_by
+    assert red[3] < 2.5
+    assert green[0] > 55.0
+    assert green[3] > 2.5
 
 
 @pytest.mark.parametrize("kind", [LaneGraphEgo, SamplingEgo])
 def test_a_free_road_is_driven_at_the_limit_and_behind_a_wall_it_halts(kind):
-    for limit, speed in ((0.0, 20.0), (12.0, 12.0)):
-        data, state = driven(
-            kind(),
-            num_vehicles=1,
-            num_vrus=0,
-            limit=limit,
-        )
-        assert abs(state[3] - speed) < 0.3
-        assert data["next", "agents", "states"][0, :, 0, 1].abs().max() < 0.05
-    data, state = driven(
-        kind(),
+    scenes = make_scenes(
+        3,
         vehicles=[(0.0, 0, 10.0), (50.0, 0, 0.0), (50.0, 1, 0.0)],
         num_vrus=0,
     )
+    scenes.scenes["route_limit"][0] = 0.0  # unknown
+    scenes.scenes["route_limit"][1] = 12.0
+    for name in ("valid", "logged_valid"):
+        scenes.scenes[name][:2, ..., 1:] = False  # alone
+    data, (unknown, limited, behind_wall) = all_driven(kind(), scenes)
     assert not data["next", "terminated"].any()
-    assert state[3] < 2.0
-    assert 20 < state[0] < 46
+    assert abs(unknown[3] - 20.0) < 0.3
+    assert abs(limited[3] - 12.0) < 0.3
+    assert data["next", "agents", "states"][:2, :, 0, 1].abs().max() < 0.05
+    assert behind_wall[3] < 2.0
+    assert 20 < behind_wall[0] < 46
 
 
 def test_idm_settles_behind_a_slower_leader_and_returns_to_its_lane():

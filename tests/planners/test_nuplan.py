@@ -18,6 +18,7 @@ from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.record import run_protocol
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.planners.external import ExternalEgo
+from e2rl.scenes.bundled import BundledSource
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
 from e2rl.sim.env import SimSettings
@@ -32,7 +33,27 @@ ADAPTER = HERE.parents[1] / "examples" / "nuplan_planner.py"
 REAR = (
     0.2823 * 4.5
 )  # m from the rear axle to the centre of the scenes' egos, in proportion to nuPlan's vehicle
+LIT = (  # bundled scenes with lights on the ego's route
+    "arterial_015_0720",
+    "signalled_cross_018_0480",
+    "signalled_cross_018_0680",
+    "signalled_cross_041_0520",
+    "signalled_cross_041_0760",
+    "signalled_cross_041_0880",
+    "signalled_cross_066_0520",
+    "signalled_small_037_0600",
+    "signalled_small_037_0240",
+)
+UNLIT = ("lane_drop_017_0440", "ramp_022_0200", "roundabout_014_0280")
+
 LIGHTS = ("UNKNOWN", "RED", "YELLOW", "GREEN")  # by state
+
+
+class Chosen(BundledSource):
+    """Some of the bundled scenes."""
+
+    def logs(self):
+        return list(LIT + UNLIT)
 
 
 @pytest.fixture
@@ -43,9 +64,9 @@ def nuplan(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def bundled(tmp_path_factory):
-    """The bundled scenes, and what a Witness sees at their start."""
+    """Bundled scenes, and what a Witness sees at their start."""
     folder = tmp_path_factory.mktemp("bundled")
-    scenes = e2rl.load_scenes().scenes
+    scenes = Chosen(cache=str(folder / "cache"), workers=1).load().scenes
     with pytest.MonkeyPatch.context() as patch:
         ego = maker(patch, folder)("--planner nuplan_planners:Witness")
         ego.plan(World.at_start(scenes))
@@ -74,7 +95,7 @@ def test_a_planner_that_keeps_its_velocity_moves_as_at_constant_velocity(
 ):
     """Whatever vehicle it plans for: the rear axle of its plan is that of the scene's
     ego."""
-    scenes = make_scenes(2)
+    scenes = make_scenes(2, steps=40)
     heading = torch.tensor([0.0, 0.4])
     scenes.scenes["start"][:, 0, 2] = scenes.scenes["logged"][:, 0, 0, 2] = heading
     start = scenes.scenes["start"][:, 0].clone()
@@ -94,7 +115,7 @@ def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_softly_to_its_path(
 ):
     """From e beside the path a cubic of length S begins with curvature 6 e / S^2, which
     is its largest."""
-    scenes = make_scenes(2)
+    scenes = make_scenes(2, steps=51)
     beside = torch.tensor([1.0, -0.6])
     seconds = DT * torch.arange(51)
     scenes.scenes["start"][:, 0, 1] = scenes.scenes["logged"][:, 0, 0, 1] = beside
@@ -118,7 +139,7 @@ def test_a_planner_of_poses_alone_moves_as_they_do_and_comes_softly_to_its_path(
 def test_it_sees_the_ego_and_everybody_else_where_they_are(
     nuplan, tmp_path, replan_every
 ):
-    scenes = make_scenes(1, num_vrus=1)
+    scenes = make_scenes(1, num_vrus=1, steps=40)
     scenes.scenes["start"][:, 1, 2] = 1.0  # one looks along no axis
     scenes.scenes["logged"][:, :, 1, 2] = 1.0
     rollouts = e2rl.roll_out(
@@ -128,7 +149,7 @@ def test_it_sees_the_ego_and_everybody_else_where_they_are(
     )
     observed = written(tmp_path)
     states = rollouts.states[0]
-    assert [single["index"] for single in observed] == list(range(0, 80, replan_every))
+    assert [single["index"] for single in observed] == list(range(0, 40, replan_every))
     for single in observed[:: 20 // replan_every]:
         step = single["index"]
         x, y, heading, speed = states[step, 0].tolist()
@@ -163,7 +184,7 @@ def test_it_sees_the_ego_and_everybody_else_where_they_are(
 def test_its_history_is_what_was_driven_and_before_that_steady(
     nuplan, tmp_path, replan_every
 ):
-    scenes = make_scenes(1)
+    scenes = make_scenes(1, steps=40)
     scenes.scenes["start_yaw_rate"][0, 0], scenes.scenes["start_accel"][0, 0] = (
         0.2,
         -1.0,
@@ -206,7 +227,7 @@ def written(folder):
 def test_lanes_of_the_map_hold_the_ego_and_lead_along_its_route(bundled):
     scenes, observed = bundled
     mission = mission_of(scenes)
-    assert len(observed) == len(scenes) == 48
+    assert len(observed) == len(scenes) == len(LIT + UNLIT)
     for row, single in enumerate(observed):
         assert single["on"]
         assert set(single["on"]) <= set(single["near"])

@@ -8,7 +8,6 @@ import torch
 
 from e2rl.planners import pdm_closed
 from e2rl.planners.chunks import take
-from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.pdm_closed import FRACTIONS, OFFSETS, PDMClosedEgo, others_of
 from e2rl.planners.pdm_score import (
     SCORED_STEPS,
@@ -21,9 +20,9 @@ from e2rl.planners.pdm_score import (
     score,
 )
 from e2rl.scenes.boxes import separation
-from e2rl.scenes.recording import DT
+from e2rl.scenes.recording import DT, LIGHT_GREEN
 from e2rl.sim import dynamics
-from tests.planners.planners import driven, world_of, worlds
+from tests.planners.planners import all_driven, world_of, worlds
 from tests.synthetic import make_scenes
 
 EGO = PDMClosedEgo()
@@ -43,47 +42,43 @@ def touched(data):
     return bool(data["next", "metrics", "contact"].any())
 
 
-def test_it_follows_a_slower_leader_without_contact():
-    data, last = driven(
-        EGO,
+def test_it_follows_a_slower_leader_without_contact_and_keeps_the_speed_limit():
+    """A leader at 6 m/s in a scene, nobody and limits of 8 and 15 m/s in others."""
+    scenes = make_scenes(
+        3,
         vehicles=[(0, 0, 14.0), (30, 0, 6.0)],
         num_vrus=0,
     )
+    for name in ("valid", "logged_valid"):
+        scenes.scenes[name][1:, ..., 1] = False
+    scenes.scenes["start"][1:, 0, 3] = scenes.scenes["logged"][1:, :, 0, 3] = 5.0
+    scenes.scenes["route_limit"][1] = 8.0
+    data, (follower, slow, fast) = all_driven(EGO, scenes)
     assert not touched(data)
-    assert 5.0 < float(last[3]) < 8.0
+    assert 5.0 < float(follower[3]) < 8.0
+    fastest = data["next", "agents", "states"][:, :, 0, 3].amax(1)
+    assert fastest[1] < 8.1
+    assert fastest[2] < 15.1
+    assert slow[3] > 0.9 * 8.0
+    assert fast[3] > 0.9 * 14.0
 
 
 def test_it_stops_behind_whom_stands_and_at_a_red_light():
-    data, last = driven(
-        EGO,
-        steps=100,
+    scenes = make_scenes(
+        2,
         vehicles=[(0, 0, 10.0), (60, 0, 0.0)],
-        num_vrus=0,
-    )
-    assert not touched(data)
-    assert float(last[3]) < 1.5
-    assert float(last[0]) > 45
-    _, last = driven(
-        EGO,
-        steps=100,
-        vehicles=[(0, 0, 10.0)],
         num_vrus=0,
         red_light_x=50.0,
     )
-    assert float(last[3]) < 1.5
-    assert 35 < float(last[0]) < 50
-
-
-@pytest.mark.parametrize("limit", [8.0, 15.0])
-def test_it_keeps_the_speed_limit(limit):
-    data, last = driven(
-        EGO,
-        vehicles=[(0, 0, 5.0)],
-        num_vrus=0,
-        limit=limit,
-    )
-    assert data["next", "agents", "states"][0, :, 0, 3].max() < limit + 0.1
-    assert float(last[3]) > 0.9 * min(limit, 14.0)
+    scenes.scenes["light_state"][0] = LIGHT_GREEN
+    for name in ("valid", "logged_valid"):
+        scenes.scenes[name][1, ..., 1] = False
+    data, (behind, at_line) = all_driven(EGO, scenes)
+    assert not touched(data)
+    assert float(behind[3]) < 1.5
+    assert float(behind[0]) > 45
+    assert float(at_line[3]) < 1.5
+    assert 35 < float(at_line[0]) < 50
 
 
 @pytest.mark.parametrize(
@@ -106,21 +101,24 @@ def test_a_slow_ego_brakes_as_hard_as_it_can_before_a_collision_that_is_near_a_f
     )
 
 
-@pytest.mark.parametrize("beside", [1.0, -1.0])
-def test_it_comes_over_where_somebody_who_stands_beside_blocks_the_mission(beside):
-    """A parked car reaches 0.2 m into the ego's way; a metre to the other side the ego
-    passes it."""
+def test_it_comes_over_where_somebody_who_stands_beside_blocks_the_mission():
+    """A parked car reaches 0.2 m into the ego's way, from the left or the right; a
+    metre to the other side the ego passes it."""
     scenes = make_scenes(
-        1,
+        2,
         vehicles=[(0.0, 0, 10.0), (40.0, 0, 0.0)],
         num_vrus=0,
     )
-    scenes.scenes["start"][0, 1, 1] = scenes.scenes["logged"][0, :, 1, 1] = 1.8 * beside
-    env, world = worlds(scenes)
-    assert EGO.plan(world)[0, -1, 1] * beside < -0.7
-    data = env.rollout(80, EgoPolicy(EGO, env))
+    beside = torch.tensor([1.0, -1.0])
+    for name in ("start", "logged"):
+        scenes.scenes[name][:, ..., 1, 1] = (
+            1.8 * beside if name == "start" else 1.8 * beside[:, None]
+        )
+    _, world = worlds(scenes)
+    assert (EGO.plan(world)[:, -1, 1] * beside < -0.7).all()
+    data, states = all_driven(EGO, scenes)
     assert not touched(data)
-    assert env.world().states[0, 0, 0] > 60
+    assert (states[:, 0] > 60).all()
 
 
 def test_proposals_lead_to_their_offsets_and_are_slower_by_their_fraction():

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from e2rl.planners.actor import ActorEgo
-from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.reference import (
     AGENTS,
     LIGHTS,
@@ -17,65 +16,69 @@ from e2rl.planners.reference import (
     stop_lines,
 )
 from e2rl.planners.trunk import Largest, Trunk
+from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.sim.env import DrivingEnv, SimSettings
 from e2rl.sim.observation import LOOK_AHEAD, NEAREST, OBSERVATION_SIZE, PER_AGENT
+from tests.planners.planners import all_driven
 from tests.synthetic import make_scenes
 
-
-def drive(scenes, batch=2):
-    """The untrained actor drives as its reference does."""
-    env = DrivingEnv(scenes, SimSettings(end_on_contact=False), batch, agents=True)
-    return env.rollout(80, EgoPolicy(ActorEgo(hidden=(8,)), env)), env.world()
+EMPTY, CAR_AHEAD, RED_LIGHT, CAR_BESIDE, ALONE, OFFSET = range(6)
 
 
-def test_an_empty_road_is_driven_at_the_limit():
-    data, world = drive(
-        make_scenes(
-            2,
-            num_vehicles=1,
-            num_vrus=0,
-            speed=10.0,
-            limit=12.0,
-            road=(-60.0, 600.0),
-        )
-    )
-    assert ((world.states[:, 0, 3] > 11.0) & (world.states[:, 0, 3] < 12.0)).all()
-    assert data["action"][..., 1].abs().max() < 1e-3
-
-
-def test_a_standing_car_and_a_red_light_are_halted_at():
-    data, world = drive(make_scenes(2, vehicles=[(0.0, 0, 10.0), (45.0, 0, 0.0)]))
-    assert not data["next", "metrics", "contact"].any()
-    assert (world.states[:, 0, 3] < 1.0).all()
-    assert (world.states[:, 0, 0] > 30.0).all()
-    _, world = drive(
-        make_scenes(
-            2,
-            num_vehicles=1,
-            num_vrus=0,
-            red_light_x=50.0,
-        )
-    )
-    front = world.states[:, 0, 0] + 2.25
-    assert (front < 50.0).all()
-    assert (front > 40.0).all()
-
-
-def test_a_car_in_the_other_lane_is_no_leader():
-    free, _ = drive(make_scenes(2, vehicles=[(0.0, 0, 10.0)]))
-    beside, _ = drive(make_scenes(2, vehicles=[(0.0, 0, 10.0), (45.0, 1, 0.0)]))
-    assert torch.allclose(free["action"], beside["action"])
-
-
-def test_an_offset_is_steered_back():
+@pytest.fixture(scope="module")
+def reference():
+    """The untrained actor drives as its reference does: 80 steps on a road of one
+    lane's limit, a standing car 45 m ahead, a red light at 50 m, a car in the other
+    lane, nobody, and an offset at the start."""
     scenes = make_scenes(
-        2,
-        num_vehicles=1,
+        6,
+        vehicles=[(0.0, 0, 10.0), (45.0, 0, 0.0), (45.0, 1, 0.0)],
         num_vrus=0,
+        red_light_x=50.0,
+        road=(-60.0, 600.0),
     )
-    scenes.scenes["start"][:, 0, 1], scenes.scenes["start"][:, 0, 2] = 1.0, 0.1
-    _, world = drive(scenes)
-    assert world.states[:, 0, 1].abs().max() < 0.1
+    light = scenes.scenes["light_state"]
+    light[:] = LIGHT_GREEN
+    light[RED_LIGHT] = LIGHT_RED
+    scenes.scenes["route_limit"][EMPTY] = 12.0
+    for name in ("valid", "logged_valid"):
+        present = scenes.scenes[name]
+        present[..., 1:3] = False
+        present[CAR_AHEAD, ..., 1] = True
+        present[CAR_BESIDE, ..., 2] = True
+    start = scenes.scenes["start"]
+    start[..., 0] -= torch.arange(6.0)[:, None]  # all begin at one place
+    start[OFFSET, 0, 1] = 1.0
+    start[OFFSET, 0, 2] = 0.1
+    return all_driven(ActorEgo(hidden=(8,)), scenes, end_on_contact=False)
+
+
+def test_an_empty_road_is_driven_at_the_limit(reference):
+    data, states = reference
+    assert 11.0 < states[EMPTY, 3] < 12.0
+    assert data["action"][EMPTY, :, 1].abs().max() < 1e-3
+
+
+def test_a_standing_car_is_halted_at(reference):
+    data, states = reference
+    assert not data["next", "metrics", "contact"].any()
+    assert states[CAR_AHEAD, 3] < 1.0
+    assert states[CAR_AHEAD, 0] > 30.0
+
+
+def test_a_red_light_is_halted_at(reference):
+    _, states = reference
+    front = states[RED_LIGHT, 0] + 2.25
+    assert 40.0 < front < 50.0
+
+
+def test_a_car_in_the_other_lane_is_no_leader(reference):
+    actions = reference[0]["action"]
+    assert torch.allclose(actions[ALONE], actions[CAR_BESIDE])
+
+
+def test_an_offset_is_steered_back(reference):
+    assert reference[1][OFFSET, 1].abs() < 0.1
 
 
 def test_leading_dims_do_not_matter():

@@ -43,8 +43,16 @@ def alive(process: int) -> bool:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
-@pytest.mark.parametrize("method", ["fork", "spawn"])
-@pytest.mark.parametrize("how", ["Ctrl-C", "SIGTERM", "SIGKILL"])
+@pytest.mark.parametrize(
+    ("how", "method"),
+    [
+        ("Ctrl-C", "fork"),
+        ("SIGTERM", "fork"),
+        ("SIGKILL", "fork"),
+        ("Ctrl-C", "spawn"),
+        ("SIGKILL", "spawn"),
+    ],
+)
 def test_an_interrupted_command_leaves_no_process(tmp_path, method, how):
     marks = [tmp_path / name for name in "ab"]
     (tmp_path / "script.py").write_text(SCRIPT)

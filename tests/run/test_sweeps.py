@@ -1,16 +1,14 @@
 """What a command line is told: lists, and jobs of a sweep that are refused."""
 
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
 
+from e2rl.run.command import run_command
 from e2rl.run.config import check_list, load_config, set_up
 from e2rl.run.errors import InputError
 from e2rl.run.options import wrong_option
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
@@ -41,55 +39,44 @@ def test_a_text_with_commas_is_refused_for_every_list(key):
         set_up(load_config("evaluate", [f"{key}='1,2'"]))
 
 
-SWEEP = """
-import sys
-from e2rl.run.command import run_command
-from e2rl.run.errors import InputError
+@pytest.fixture
+def sweep(tmp_path, monkeypatch, capfd):
+    """Runs a command that refuses batch=2; returns its status and what it said."""
 
-def work(run):
-    if run.config.batch == 2:
-        raise InputError("batch=2: refused")
-    print("did", run.config.batch)
+    def work(run):
+        if run.config.batch == 2:
+            raise InputError("batch=2: refused")
+        print("did", run.config.batch)
 
-sys.argv = ["evaluate.py", *sys.argv[1:]]
-run_command("evaluate", work)
-"""
+    def command(*options):
+        monkeypatch.setattr(sys, "argv", ["evaluate.py", *options])
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+        monkeypatch.chdir(tmp_path)
+        status = 0
+        try:
+            run_command("evaluate", work)
+        except SystemExit as stop:
+            status = stop.code
+        finally:
+            GlobalHydra.instance().clear()
+        return status, *capfd.readouterr()
+
+    return command
 
 
-@pytest.mark.parametrize(("values", "status"), [("2,3", 2), ("1,2,3", 2), ("1,3", 0)])
-def test_a_sweep_goes_on_after_a_job_that_is_refused(tmp_path, values, status):
-    command = [
-        sys.executable,
-        "-c",
-        SWEEP,
-        "-m",
-        f"batch={values}",
-        f"hydra.sweep.dir={tmp_path / 'sweep'}",
-    ]
-    process = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+@pytest.mark.parametrize(("values", "status"), [("1,2,3", 2), ("1,3", 0)])
+def test_a_sweep_goes_on_after_a_job_that_is_refused(sweep, values, status):
+    ended, out, err = sweep("-m", f"batch={values}", "hydra.sweep.dir=sweep")
     names = values.split(",")
-    assert process.returncode == status, process.stderr
-    did = [line for line in process.stdout.splitlines() if line.startswith("did")]
+    assert ended == status, err
+    did = [line for line in out.splitlines() if line.startswith("did")]
     assert did == [f"did {name}" for name in names if name != "2"]
     summary = f"error: 1 of {len(names)} jobs of the sweep were refused: batch=2"
-    assert (process.stderr.strip().splitlines() or [""])[-1] == (
-        summary if status else ""
-    )
-    assert process.stderr.count("batch=2: refused") == (status > 0)
+    assert (err.strip().splitlines() or [""])[-1] == (summary if status else "")
+    assert err.count("batch=2: refused") == (status > 0)
 
 
-def test_a_job_alone_that_is_refused_says_so_once(tmp_path):
-    command = [
-        sys.executable,
-        "-c",
-        SWEEP,
-        "batch=2",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    ]
-    process = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
-    assert process.returncode == 2
-    assert process.stderr == "error: batch=2: refused\n"
+def test_a_job_alone_that_is_refused_says_so_once(sweep):
+    status, _, err = sweep("batch=2", "hydra.run.dir=run")
+    assert status == 2
+    assert err == "error: batch=2: refused\n"

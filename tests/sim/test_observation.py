@@ -161,14 +161,14 @@ def test_driving_in_the_mirror_looks_like_the_mirror_of_driving():
     torch.manual_seed(0)
     scenes = e2rl.load_scenes(
         "bundled",
-        num_scenes=16,
+        num_scenes=6,
         versions=["recorded", "mirrored"],
     )
     first = [
         k
         for k, name in enumerate(scenes.scene_id)
         if f"{name}~mirrored" in scenes.scene_id
-    ][:8]
+    ]
     other = [scenes.scene_id.index(f"{scenes.scene_id[k]}~mirrored") for k in first]
     actions = torch.randn(20, 2) * torch.tensor([1.5, 0.15])
     observed = observations(scenes.chosen(first), actions)

@@ -29,7 +29,7 @@ def driven(scene_set, on, decisions):
 
 
 def test_decisions_of_the_rule_are_none():
-    scene_set = scenes(3)
+    scene_set = scenes(2, steps=10)
     on = synthesizer()
     assert torch.equal(
         driven(scene_set, on, decisions=RULE).states, drive(scene_set, on, 2.0).states
@@ -37,7 +37,7 @@ def test_decisions_of_the_rule_are_none():
 
 
 def test_without_strength_nobody_is_controlled_bit_for_bit():
-    scene_set = scenes(3)
+    scene_set = scenes(2, steps=10)
     on = synthesizer()
     idle = driven(scene_set, on, decisions=RULE._replace(strength=0.0))
     assert torch.equal(

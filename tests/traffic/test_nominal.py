@@ -143,7 +143,7 @@ def driven(ego, eta=2.0, **settings):
         if eta == 0
         else synthesizer(**settings)
     )
-    return drive(scenes(3), method, eta, ego=ego).states
+    return drive(scenes(2, steps=10), method, eta, ego=ego).states
 
 
 @pytest.mark.parametrize("eta", [0.0, 2.0])
@@ -212,7 +212,7 @@ def test_who_is_not_told_the_plan_does_not_know_the_mission(name):
     """Of two egos that drive alike and mean to go elsewhere traffic makes the same,
     where one's way is a candidate, and where it is the recorded path, which nobody
     knows."""
-    scene = fork()
+    scene = fork(1)
     turns = scene.clone()
     recorded = scene.clone()
     turns["route_log"][:, 0] = 1
@@ -223,6 +223,8 @@ def test_who_is_not_told_the_plan_does_not_know_the_mission(name):
     recorded["route_valid"][:, 0, 2] = recorded["route_recorded"][:, 0, 2] = True
     group = method_config(load_config("evaluate", []), name)
     group.knowledge = "predicted"
+    if name == "strive":
+        group.iterations = 5
     method = build_traffic(group, small_prior(0, sampler=SamplerSettings(steps=2)))
     assert torch.equal(plans_beside(method, scene), plans_beside(method, turns))
     assert torch.equal(plans_beside(method, scene), plans_beside(method, recorded))

@@ -186,8 +186,7 @@ def test_vehicles_drive_on_the_middle_of_their_lane_and_never_backwards():
     assert aside[..., 0].min() > -0.01
 
 
-@pytest.mark.parametrize("colour", [LIGHT_RED, LIGHT_YELLOW])
-def test_it_stops_at_the_line_of_a_red_or_yellow_light_and_waits(colour):
+def test_it_stops_at_the_line_of_a_red_or_yellow_light_and_waits():
     line = 60.0
     vehicles = [
         AWAY,
@@ -195,9 +194,18 @@ def test_it_stops_at_the_line_of_a_red_or_yellow_light_and_waits(colour):
         (5, 0, 9),
         (line - 0.5, 1, 9),
     ]  # two in line, one that can no longer stop
-    scene_set = scenes_of(vehicles, steps=200, red_light_x=line, limit=LIMIT)
-    scene_set.scenes["light_state"][:] = colour
-    track = drive(scene_set, idm(BoundSettings()), 0.0).states[0]
+    scene_set = scenes_of(
+        vehicles, num_scenes=2, steps=120, red_light_x=line, limit=LIMIT
+    )
+    scene_set.scenes["light_state"][0] = LIGHT_RED
+    scene_set.scenes["light_state"][1] = LIGHT_YELLOW
+    red, yellow = drive(scene_set, idm(BoundSettings()), 0.0).states
+    waits_at(line, red)
+    waits_at(line, yellow)
+
+
+def waits_at(line, track):
+    """Two of the three vehicles of a track [T+1, A, 4] halt before the line."""
     front = track[:, 1:4, 0] + LENGTH / 2
     assert (front[:, 0] < line).all()
     assert front[-1, 0] > line - 3

@@ -36,7 +36,7 @@ def given():
 def bundled():
     """So many bundled scenes that two draws of several are hardly ever alike."""
     return {
-        "scenes": e2rl.load_scenes("bundled", 16),
+        "scenes": e2rl.load_scenes("bundled", 12),
         "method": "replay",
         "eta": 0.0,
         "compile": False,
