@@ -14,7 +14,7 @@ from scipy import stats
 
 from e2rl.driving.setup import Scored
 from e2rl.evaluation.rollout_files import NUMBER, nans, read_json, write_json
-from e2rl.report.tables import Table
+from e2rl.report.tables import UNKNOWN, Table
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, misfit, write_atomically
 from e2rl.tail.interval import LEVEL, Bounds, Side, ratio_of_ratios
@@ -261,6 +261,8 @@ def likeliest_table(ego: EgoRates) -> Table:
 
 def text(bounds: Bounds) -> str:
     """Returns an estimate with its interval."""
+    if math.isnan(bounds.value):
+        return UNKNOWN
     if math.isnan(bounds.low):
         return f"{bounds.value:.3g}"
     return f"{bounds.value:.3g} [{bounds.low:.2g}, {bounds.high:.2g}]"

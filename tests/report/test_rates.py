@@ -68,6 +68,12 @@ def test_two_egos_have_their_ratio():
     assert row["ratio per km"] == "3 [3, 3]"
 
 
+def test_the_ratio_of_two_that_never_fail_is_unknown():
+    tables = rate_tables([rates("one", 0.0), rates("other", 0.0)])
+    (row,) = [row for row in cells(tables[1]) if row["event"] == "contact"]
+    assert row["ratio per km"] == "–"
+
+
 def test_failures_are_counted_by_what_they_cost():
     """-log 0.01 is 4.6 nats, in half of the scenes; beyond 11.5 nobody looked."""
     table = rate_tables([rates("mine")])[1]
