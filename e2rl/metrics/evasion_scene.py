@@ -9,6 +9,7 @@ from e2rl.scenes.boxes import separation
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import BEHIND, project, project_track
+from e2rl.sim.dynamics import midpoints
 from e2rl.sim.mission import mission_of
 
 PAIRS = 8_000_000  # boxes compared at once: bounds the memory
@@ -181,7 +182,7 @@ def past_end(states: Tensor, wrong: Tensor, scene: EvasionScene) -> Tensor:
     position = states[..., :2].gather(2, last[..., None].expand(-1, -1, -1, 2))
     start_speed = scene.start[:, None, None, 3].expand_as(states[:, :, :1, 3])
     speed = torch.cat([start_speed, states[..., 3]], -1)
-    driven = ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1)
+    driven = (midpoints(speed) * DT).cumsum(-1)
     hint = scene.s[:, None] + driven.gather(2, last)[..., 0]
     s, _, _ = project(
         position[:, :, 0],

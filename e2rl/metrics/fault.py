@@ -8,7 +8,7 @@ from torch import Tensor
 from e2rl.metrics.collisions import EGO, PARTNER, Collisions
 from e2rl.metrics.contact import FRONT, REAR
 from e2rl.metrics.geometry import from_segment, travel_heading
-from e2rl.scenes.boxes import separation
+from e2rl.scenes.boxes import angle_of, separation, unit_vectors
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.neighbours import STANDING, STOOD
@@ -116,7 +116,7 @@ def path_boxes(states: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
     [C, 2], and of the strip of AHEAD m ahead of the last one."""
     last = states[:, -1:]
     heading = travel_heading(last)
-    direction = torch.stack([heading.cos(), heading.sin()], -1)
+    direction = unit_vectors(heading)
     shift = (size[:, :1] + AHEAD)[..., None] / 2
     strip = torch.cat([last[..., :2] + shift * direction, last[..., 2:]], -1)
     sizes = size[:, None].repeat(1, states.shape[1] + 1, 1)
@@ -163,7 +163,7 @@ def blocks_lane(collisions: Collisions) -> Tensor:
         start,
         along=along,
     ).norm(dim=-1)
-    turn = wrap(torch.atan2(along[..., 1], along[..., 0]) - direction[:, None])
+    turn = wrap(angle_of(along) - direction[:, None])
     is_lane = (line[:, 1:] == line[:, :-1]) & (line[:, 1:] >= 0)
     runs_there = is_lane & (gap <= LANE_HALF) & (turn.abs() < LANE_ANGLE)
     return across & runs_there.any(1)

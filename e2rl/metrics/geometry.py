@@ -9,8 +9,8 @@ broadcast. Use float64 where an overlap of 1e-6 m2 decides.
 import torch
 from torch import Tensor
 
-from e2rl.scenes.boxes import corners, overlap, to_frame
-from e2rl.sim.dynamics import wrap
+from e2rl.scenes.boxes import corners, overlap, to_frame, unit_vectors
+from e2rl.sim.dynamics import midpoints, wrap
 from e2rl.sim.neighbours import STANDING
 
 EDGES = (
@@ -24,9 +24,7 @@ MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
 
 def velocity(states: Tensor) -> Tensor:
     """Velocity vectors [..., 2] [m/s] of states [..., 4]: the speed along the heading."""
-    return states[..., 3:4] * torch.stack(
-        [states[..., 2].cos(), states[..., 2].sin()], -1
-    )
+    return states[..., 3:4] * unit_vectors(states[..., 2])
 
 
 def travel_heading(states: Tensor) -> Tensor:
@@ -94,9 +92,7 @@ def overlap_area(
     knots = torch.stack([begin, *(bounds[..., 0].maximum(begin).minimum(end)), end], -1)
     x = start[..., 0, None] + knots * change[..., 0, None]
     x = x.maximum(-half[..., 0, None]).minimum(half[..., 0, None])
-    integral = (
-        (knots[..., 1:] - knots[..., :-1]) * (x[..., 1:] + x[..., :-1]) / 2
-    ).sum(-1)
+    integral = ((knots[..., 1:] - knots[..., :-1]) * midpoints(x)).sum(-1)
     return (integral * change[..., 1]).sum(-1).clamp(min=0)
 
 

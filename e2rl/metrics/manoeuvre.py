@@ -9,6 +9,7 @@ from e2rl.planners.path import RoutePath
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate
 from e2rl.sim import dynamics
+from e2rl.sim.dynamics import midpoints
 from e2rl.sim.env import SimSettings
 
 # Steps between knots (0.5 s): a shift of 2 m within one of them takes all the grip of
@@ -93,7 +94,7 @@ def execute(
     speed = torch.cat(
         [start_speed, dynamics.bounded_speed(start_speed, bounded * DT)], -1
     )
-    mean_speed = (speed[..., 1:] + speed[..., :-1]) / 2
+    mean_speed = midpoints(speed)
     driven = pad((mean_speed * DT).cumsum(-1), (1, 0))
     path = RoutePath(start, route)
     offset, slope = path.offset(driven)

@@ -28,7 +28,7 @@ from e2rl.metrics.off_road import (
     near_segments,
 )
 from e2rl.metrics.proximity import ego_path, route_completion
-from e2rl.scenes.boxes import corners, overlap, to_frame
+from e2rl.scenes.boxes import angle_of, corners, overlap, to_frame, unit_vectors
 from e2rl.scenes.recording import CYCLIST, DT, OTHER, PEDESTRIAN, VEHICLE
 from e2rl.sim.dynamics import wrap
 
@@ -188,7 +188,7 @@ def connected(corners_inside: Tensor, follows: Tensor) -> Tensor:
 def rear_axle(states: Tensor, size: Tensor) -> Tensor:
     """Position [..., 2] of the rear axle of vehicles at states [..., 4] of size [...,
     2]."""
-    heading = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)
+    heading = unit_vectors(states[..., 2])
     return states[..., :2] - REAR_AXLE * size[..., :1] * heading
 
 
@@ -243,7 +243,7 @@ def angle_at(axle: Tensor, heading: Tensor, centre: Tensor) -> Tensor:
     """Angle [...] in [0, pi] at axle [..., 2] between the heading [...] and another's
     centre [..., 2]."""
     gap = centre - axle
-    return wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading).abs()
+    return wrap(angle_of(gap) - heading).abs()
 
 
 class Contacts(NamedTuple):

@@ -21,7 +21,7 @@ from e2rl.metrics.drivers import DRIVERS, Driver, Observation, no_conflict
 from e2rl.metrics.geometry import travel_heading
 from e2rl.metrics.passing import with_passing
 from e2rl.run.fused import fused
-from e2rl.scenes.boxes import separation, to_frame
+from e2rl.scenes.boxes import separation, to_frame, unit_vectors
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, project
 from e2rl.sim.dynamics import constant_velocity, wrap
@@ -347,7 +347,7 @@ def poses(states: Tensor, s: Tensor) -> Tensor:
     heading = first[..., 2] + fraction[..., 0] * turn
     end = torch.full_like(after[:, 0], states.shape[1] - 1)
     onwards = last_direction(states, end)[:, None]
-    direction = torch.stack([onwards.cos(), onwards.sin()], -1)
+    direction = unit_vectors(onwards)
     beyond = (s - length[:, -1:]).clamp(min=0)[..., None]
     position = torch.lerp(first[..., :2], second[..., :2], fraction)
     return torch.cat([position + beyond * direction, heading[..., None]], -1)

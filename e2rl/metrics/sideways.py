@@ -13,7 +13,7 @@ from torch import Tensor
 from e2rl.metrics.collisions import Collisions
 from e2rl.metrics.contact import SIDE
 from e2rl.metrics.geometry import travel_heading
-from e2rl.scenes.boxes import separation
+from e2rl.scenes.boxes import angle_of, separation
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import wrap
 
@@ -180,4 +180,4 @@ def lane_directions(points: Tensor, index: Tensor) -> Tensor:
     same_lane = (index[:, 1:] == index[:, :-1])[..., None]
     change = torch.nn.functional.pad(points.diff(dim=1) * same_lane, (0, 0, 1, 1))
     both = change[:, 1:] + change[:, :-1]
-    return torch.atan2(both[..., 1], both[..., 0])
+    return angle_of(both)

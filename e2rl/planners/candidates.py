@@ -13,7 +13,7 @@ from e2rl.planners.profiles import NODES, PLAN_DT, capped, upsample
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate
 from e2rl.sim import dynamics
-from e2rl.sim.dynamics import wrap
+from e2rl.sim.dynamics import midpoints, wrap
 
 FIRST = round(1.0 / PLAN_DT)  # nodes of the first acceleration of a profile: 1 s
 MAX_YAW_RATE = 1.6  # rad/s, the simulator's bound
@@ -85,7 +85,7 @@ def drive(
     shift = shift.expand((*profiles, shift.shape[-1]))
     time = time.expand((*profiles, time.shape[-1]))
     speed = speed[:, :, None]
-    mean = (speed[..., 1:] + speed[..., :-1]) / 2
+    mean = midpoints(speed)
     accel = speed.diff(dim=-1) / DT
     driven = pad((mean * DT).cumsum(-1), (1, 0))
     target = shift[..., None]

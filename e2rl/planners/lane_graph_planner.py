@@ -26,6 +26,8 @@ from e2rl.planners.profiles import (
     upsample,
 )
 from e2rl.run.config import configured, setting
+from e2rl.scenes.boxes import unit_vectors
+from e2rl.sim.dynamics import midpoints
 from e2rl.sim.world import World
 
 FIRST_HALF = 12  # nodes towards the first speed target
@@ -71,7 +73,7 @@ class LaneGraphEgo(Ego):
         """The chosen profile as states [B, PLAN_STEPS, 4]."""
         path = MissionPath(world)
         speed = self.profiles(world, path)
-        steps = (speed[..., 1:] + speed[..., :-1]) / 2 * PLAN_DT
+        steps = midpoints(speed) * PLAN_DT
         driven = pad(steps.cumsum(-1), (1, 0))
         poses = path.at(path.ahead(driven.transpose(0, 1))).transpose(0, 1)
         others = predict(
@@ -231,6 +233,6 @@ def ahead(
 def straight_on(state: Tensor, distance: Tensor) -> Tensor:
     """Poses [J, K, 3] at distance [J, K] m along the heading of state [J, 4]."""
     heading = state[:, 2:3]
-    direction = torch.stack([heading.cos(), heading.sin()], -1)
+    direction = unit_vectors(heading)
     xy = state[:, None, :2] + direction * distance[..., None]
     return torch.cat([xy, heading[..., None].expand(*distance.shape, 1)], -1)

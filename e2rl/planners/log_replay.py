@@ -8,6 +8,7 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.run.config import configured, setting
+from e2rl.scenes.boxes import unit_vectors
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 
@@ -35,6 +36,6 @@ class ReplayEgo(Ego):
         index = step.minimum(last)
         state = track[torch.arange(len(track), device=device)[:, None], index]
         distance = (step - index)[..., None] * DT * state[..., 3:]
-        direction = torch.stack([state[..., 2].cos(), state[..., 2].sin()], -1)
+        direction = unit_vectors(state[..., 2])
         xy = state[..., :2] + distance * direction
         return torch.cat([xy, state[..., 2:]], -1)

@@ -9,7 +9,7 @@ from torch.nn.functional import avg_pool1d
 from e2rl.planners.ego import return_length
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, interpolate, project
-from e2rl.sim.dynamics import wrap
+from e2rl.sim.dynamics import midpoints, wrap
 from e2rl.sim.mission import light_state_at, limit_at, mission_of, stop_line_distance
 from e2rl.sim.world import World
 
@@ -87,7 +87,7 @@ class RoutePath:
     def drive(self, speed: Tensor) -> Tensor:
         """States [..., H, 4] at steps 1..H of DT for speeds [..., H + 1] at steps 0..H
         (0: now)."""
-        distance = ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1)
+        distance = (midpoints(speed) * DT).cumsum(-1)
         return torch.cat([self.at(self.ahead(distance)), speed[..., 1:, None]], -1)
 
 

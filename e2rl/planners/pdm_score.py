@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from e2rl.planners.path import MissionPath
-from e2rl.scenes.boxes import corners, overlap, to_frame
+from e2rl.scenes.boxes import corners, overlap, to_frame, unit_vectors
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import project
@@ -166,7 +166,7 @@ def at_fault(
     state = ego.states[scene, proposal, step]
     size = ego.size[scene]
     other = others.states[scene, agent, step]
-    direction = torch.stack([state[:, 2].cos(), state[:, 2].sin()], -1)
+    direction = unit_vectors(state[:, 2])
     xy = state[:, :2] + size[:, :1] / 2 * direction
     front = overlap(
         torch.cat([xy, state[:, 2:]], -1),

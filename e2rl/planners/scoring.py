@@ -11,7 +11,7 @@ from e2rl.planners.candidates import Candidates
 from e2rl.run.config import setting
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
-from e2rl.sim.dynamics import MAX_CURVATURE, constant_velocity, wrap
+from e2rl.sim.dynamics import MAX_CURVATURE, constant_velocity, midpoints, wrap
 from e2rl.sim.world import World
 
 LOOK = (0.0, 1.0, 2.0, 3.0)  # s at which the nearest are looked for
@@ -104,13 +104,13 @@ def forecast(
     accel = world.accel[row, index][..., None]
     start = state[..., 3:]
     speed = (start + accel * pad(times, (1, 0)).clamp(max=hold)).clamp(min=0)
-    steps = (speed[..., 1:] + speed[..., :-1]) / 2 * times[0]
+    steps = midpoints(speed) * times[0]
     driven = pad(steps.cumsum(-1), (1, 0))
     curvature = world.turn_rate[row, index] / state[..., 3].clamp(min=SLOW_TURN)
     curvature = curvature.clamp(-MAX_CURVATURE, MAX_CURVATURE)[..., None]
     turning = torch.minimum(driven, torch.maximum(start, speed) * turn)
     heading = state[..., 2:3] + curvature * turning
-    middle = (heading[..., 1:] + heading[..., :-1]) / 2
+    middle = midpoints(heading)
     x = state[..., 0:1] + (steps * middle.cos()).cumsum(-1)
     y = state[..., 1:2] + (steps * middle.sin()).cumsum(-1)
     return Forecast(

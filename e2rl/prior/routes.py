@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from e2rl.prior.lane_relative import LaneState, locate
 from e2rl.run.fused import fused
+from e2rl.scenes.boxes import angle_of
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.route import BEHIND, SPACING, interpolate, project
 from e2rl.sim.dynamics import wrap
@@ -216,7 +217,7 @@ def _conflicts(
     meets, first, other = first_conflicts(apart.view(len(rows), count, vehicles, count))
     conflict = meets & (rows[:, None] != torch.arange(vehicles, device=rows.device))
     tangent = torch.gradient(line, dim=1)[0]
-    angle = torch.atan2(tangent[..., 1], tangent[..., 0])
+    angle = angle_of(tangent)
     crossing = wrap(angle.gather(1, other.T).T - angle[rows].gather(1, first))
     spacing = SPACING * CONFLICT_STRIDE
     return (conflict, first * spacing, crossing), (

@@ -9,6 +9,16 @@ import torch
 from torch import Tensor
 
 
+def unit_vectors(heading: Tensor) -> Tensor:
+    """Unit vectors [..., 2] of headings [...] in rad."""
+    return torch.stack([heading.cos(), heading.sin()], -1)
+
+
+def angle_of(vector: Tensor) -> Tensor:
+    """Angles [...] rad of vectors [..., 2]."""
+    return torch.atan2(vector[..., 1], vector[..., 0])
+
+
 def corners(pose: Tensor, size: Tensor) -> Tensor:
     """Corners [..., 4, 2], counter-clockwise from the front left one."""
     cos = pose[..., 2].cos()

@@ -217,26 +217,22 @@ class SceneBuilder:
         }
 
 
+@dataclass
 class _Agents:
     """Who takes part in a scene.
 
-    states, valid: the smoothed tracks; tracks [N]: of each agent, -1 for padding;
-    left_out: how many vehicles come near that no traffic drives.
+    recording: with the start frame and the ego; states, valid: the smoothed tracks;
+    tracks [N]: of each agent, -1 for padding; left_out: how many vehicles come near
+    that no traffic drives.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        settings: BuildSettings,
-        *,
-        states: ndarray,
-        valid: ndarray,
-    ) -> None:
-        """recording: with the start frame and the ego."""
-        self.recording = recording
-        self.settings = settings
-        self.states = states
-        self.valid = valid
+    recording: Recording
+    settings: BuildSettings
+    states: ndarray
+    valid: ndarray
+
+    def __post_init__(self) -> None:
+        settings = self.settings
         self.tracks = np.full(settings.vehicles + settings.others, -1)
         self.left_out = self._choose()
         self.rows = np.flatnonzero(self.tracks >= 0)
@@ -371,22 +367,18 @@ def _approach(
     return path_distance, moves
 
 
+@dataclass
 class _Routes:
     """Route candidates of the vehicles of a scene, as arrays; lights: lane id ->
     index."""
 
-    def __init__(
-        self,
-        graph: LaneGraph,
-        settings: BuildSettings,
-        *,
-        origin: ndarray,
-        lights: dict[str, int],
-    ) -> None:
-        self.graph = graph
-        self.settings = settings
-        self.origin = origin
-        self.lights = lights
+    graph: LaneGraph
+    settings: BuildSettings
+    origin: ndarray
+    lights: dict[str, int]
+
+    def __post_init__(self) -> None:
+        settings = self.settings
         shape = (settings.vehicles, settings.routes)
         reach = (settings.vertices - 1) * SPACING
         self.arrays: Arrays = {

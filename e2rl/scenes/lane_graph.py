@@ -19,6 +19,7 @@ from scipy.ndimage import convolve1d
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from e2rl.scenes.boxes import unit_vectors
 from e2rl.scenes.links import (
     adjacent,
     drivable_exits,
@@ -373,7 +374,7 @@ def against_lanes(
     near = (torch.cdist(xy, start) < LANE_REACH) & filled[:, None]
     b, k, segment = near.nonzero(as_tuple=True)  # few of them are near
     unit = ahead[b, segment]
-    towards = torch.stack([heading[b, k].cos(), heading[b, k].sin()], -1)
+    towards = unit_vectors(heading[b, k])
     cosine = (towards * unit[:, None]).sum(-1)
     offset = xy[b, k] - start[b, segment]
     along = (offset * unit).sum(-1).clamp(min=0).minimum(length[b, segment])

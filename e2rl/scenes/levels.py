@@ -7,6 +7,7 @@ alone are found here, and left out of its scenes.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray
@@ -34,24 +35,23 @@ SAMPLES = 200  # places of vehicles that are held against lanes
 AGREE = 0.8  # fraction of them that has to agree
 
 
+@dataclass
 class Levels:
     """Heights of the tracks and lanes of a log.
 
-    heights [F, A] m of tracks, None where they tell nothing; lane_height [P] m: at the
-    points of a LaneGraph, in the tracks' heights; NaN where it is unknown.
+    valid [F, A]: frames of the tracks that count; heights [F, A] m of tracks, None
+    where they tell nothing; lane_height [P] m: at the points of a LaneGraph, in the
+    tracks' heights; NaN where it is unknown.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        graph: LaneGraph,
-        valid: ndarray,
-    ) -> None:
-        """valid [F, A]: frames of the tracks that count."""
-        self.recording = recording
-        self.graph = graph
-        self.valid = valid
-        self.heights = recording.heights if ego_climbs(recording, valid) else None
+    recording: Recording
+    graph: LaneGraph
+    valid: ndarray
+
+    def __post_init__(self) -> None:
+        graph = self.graph
+        climbs = ego_climbs(self.recording, self.valid)
+        self.heights = self.recording.heights if climbs else None
         self.lane_height = np.full(len(graph.points), np.nan)
         if self.heights is not None:
             height = np.concatenate([_at_points(graph, name) for name in graph.ids])

@@ -17,6 +17,7 @@ from e2rl.run.fused import (
     fused,
     is_on,
 )
+from e2rl.scenes.boxes import angle_of
 
 SPACING = 2.0  # m of arc length between vertices
 WINDOW = 20.0  # m on either side of an expected arc length
@@ -311,4 +312,4 @@ def _tangent(vertices: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     second = after - a
     cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
     turn = torch.atan2(cross, (first * second).sum(-1))
-    return torch.atan2(first[..., 1], first[..., 0]), turn
+    return angle_of(first), turn

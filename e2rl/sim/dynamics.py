@@ -22,6 +22,11 @@ SLOW = 1.0  # m/s below which a turn rate says little of the path's curvature
 SHARPEST = 0.12  # 1/m, of a path that is expected of a vehicle
 
 
+def midpoints(values: Tensor) -> Tensor:
+    """Means [..., T] of values [..., T + 1] and the ones after them."""
+    return (values[..., 1:] + values[..., :-1]) / 2
+
+
 def constant_velocity(states: Tensor, times: Tensor) -> Tensor:
     """States [..., K, 4] at times [K] or [..., K] s ahead of states [..., 4] that keep
     their heading and speed."""

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import lateral_horizon
 from e2rl.prior.routes import take_route
+from e2rl.scenes.boxes import unit_vectors
 from e2rl.scenes.route import interpolate, project
 from e2rl.sim.dynamics import wrap
 from e2rl.sim.mission import light_state_at, stop_line_distance
@@ -64,11 +65,6 @@ def smallest(mask: Tensor, key: Tensor, count: Tensor | int) -> Tensor:
     )
 
 
-def direction(heading: Tensor) -> Tensor:
-    """Unit vectors [..., 2] of headings [...] in rad."""
-    return torch.stack([heading.cos(), heading.sin()], -1)
-
-
 def frenet_pose(states: Tensor, routes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """s, offset [m] and heading error [rad], each [B, M, R], of states [B, M, 4] on
     routes [B, M, R, P, 2]."""
@@ -117,7 +113,7 @@ def constant_speed_states(scene: TensorDictBase, world: World, times: Tensor) ->
     )
     xy = (
         states[:, :, None, :2]
-        + travelled[..., None] * direction(states[..., 2])[:, :, None]
+        + travelled[..., None] * unit_vectors(states[..., 2])[:, :, None]
     )
     straight = torch.cat([xy, states[:, :, None, 2:].expand(*travelled.shape, 2)], -1)
     return torch.where(has_route[..., None, None], along, straight)

@@ -18,12 +18,11 @@ from torch import Tensor
 
 from e2rl.metrics.geometry import velocity
 from e2rl.run.config import configured, setting
-from e2rl.scenes.boxes import to_frame
+from e2rl.scenes.boxes import to_frame, unit_vectors
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate, project
 from e2rl.sim.dynamics import closest_approach_cost, wrap
-from e2rl.traffic.motion import direction
 
 STRIDE = 5  # steps between the states of a plan that the potentials look at
 SAMPLED_STEPS = slice(STRIDE - 1, None, STRIDE)
@@ -158,7 +157,7 @@ def box_gap(
     shift = (size[..., :1] - size[..., 1:]).clamp(min=0) * along
     centres = (
         states[..., None, :2]
-        + shift[..., None] * direction(states[..., 2])[..., None, :]
+        + shift[..., None] * unit_vectors(states[..., 2])[..., None, :]
     )
     local = to_frame(centres, other[..., None, :]).abs() - other_size[..., None, :] / 2
     outside = _length(local.clamp(min=0))

@@ -35,6 +35,7 @@ from torch import Tensor
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.prior.prior import Prior
 from e2rl.run.config import Extension
+from e2rl.scenes.boxes import unit_vectors
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 
@@ -124,9 +125,7 @@ def keep_velocity(states: Tensor, steps: Tensor | None = None) -> Tensor:
         torch.arange(1, HORIZON + 1, device=states.device) if steps is None else steps
     )
     distance = states[..., 3, None] * DT * steps
-    direction = torch.stack([states[..., 2].cos(), states[..., 2].sin()], -1)[
-        ..., None, :
-    ]
+    direction = unit_vectors(states[..., 2])[..., None, :]
     xy = states[..., None, :2] + distance[..., None] * direction
     return torch.cat([xy, states[..., None, 2:].expand(*xy.shape[:-1], 2)], -1)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from e2rl.learning.logging import RunLogger
-from e2rl.learning.pretraining.supervised import Epochs, stage_settings
+from e2rl.learning.pretraining.supervised import Epochs, EpochSettings, stage_settings
 from e2rl.planners.bits import observed
 from e2rl.planners.bits_network import (
     WEIGHTS,
@@ -64,16 +64,11 @@ LAST_ACTION_NOISE = 1.0
 
 
 @configured("stage/bits")
-@dataclass(frozen=True)
-class BitsSettings:
-    """Settings of stage=bits; seed: the run's."""
+@dataclass(frozen=True, kw_only=True)
+class BitsSettings(EpochSettings):
+    """Settings of stage=bits."""
 
     hidden: int = setting(low=1)
-    epochs: int = setting(low=1)
-    minibatch: int = setting(low=1)
-    learning_rate: float = setting(low=0)
-    held_out: float = setting(low=0, high=0.9)
-    seed: int = 0
 
 
 # --- windows

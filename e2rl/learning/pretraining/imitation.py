@@ -27,12 +27,12 @@ from e2rl.learning.pretraining.cloning import (
     clip_expert,
     cloning_loss,
 )
-from e2rl.learning.pretraining.supervised import Epochs, stage_settings
+from e2rl.learning.pretraining.supervised import Epochs, EpochSettings, stage_settings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.planners.network import WEIGHTS, ActorCritic
-from e2rl.run.config import configured, setting
+from e2rl.run.config import configured
 from e2rl.run.errors import InputError
 from e2rl.run.parts import Parts
 from e2rl.run.run import Run
@@ -57,15 +57,9 @@ Disturbance = Callable[[Tensor, Tensor], Tensor]
 
 
 @configured("stage/imitation")
-@dataclass(frozen=True)
-class ImitationSettings:
-    """Settings of stage=imitation; seed: the run's."""
-
-    epochs: int = setting(low=1)
-    minibatch: int = setting(low=1)
-    learning_rate: float = setting(low=0)
-    held_out: float = setting(low=0, high=0.9)
-    seed: int = 0
+@dataclass(frozen=True, kw_only=True)
+class ImitationSettings(EpochSettings):
+    """Settings of stage=imitation."""
 
 
 def recorded_demonstrations(

@@ -5,6 +5,7 @@ chosen; an interrupted training goes on exactly."""
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 
 from e2rl.learning.generators import generator_states, restore_generators
 from e2rl.learning.logging import RunLogger
-from e2rl.run.config import Settings, resolved, settings_of
+from e2rl.run.config import Settings, resolved, setting, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.terminal import Bar
@@ -30,6 +31,17 @@ def stage_settings(config: DictConfig, kind: type[Settings]) -> Settings:
     options = resolved(config.stage) | {"seed": config.seed}
     del options["name"]
     return settings_of(kind, options, where="stage")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpochSettings:
+    """Settings of a stage in passes over its data; seed: the run's."""
+
+    epochs: int = setting(low=1)
+    minibatch: int = setting(low=1)
+    learning_rate: float = setting(low=0)
+    held_out: float = setting(low=0, high=0.9)
+    seed: int = 0
 
 
 class Supervised(ABC):
@@ -123,13 +135,12 @@ class Epochs(Supervised):
         self,
         network: Any,
         data: TensorDictBase,
-        settings: Any,
+        settings: EpochSettings,
         parameters: nn.Module,
         weight_decay: float,
     ) -> None:
-        """network: with `device` and `normaliser`; settings: minibatch, learning_rate,
-        held_out and seed; parameters: the module whose parameters are trained. Raises
-        InputError where no scene is left to train on."""
+        """network: with `device` and `normaliser`; parameters: the module whose
+        parameters are trained. Raises InputError where no scene is left to train on."""
         super().__init__(settings)
         self.network = network
         self._generator = torch.Generator().manual_seed(settings.seed)

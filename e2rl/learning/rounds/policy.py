@@ -118,7 +118,7 @@ class PolicyImprovement(Improvement):
         placed = scenes.to(device)
         self.teacher: Teacher | None = None
         if update.teaching > 0:
-            planner = (
+            planner: Any = (
                 teacher
                 if isinstance(teacher, Ego)
                 else built(OmegaConf.create(dict(teacher)), "learner.teacher", kind=Ego)

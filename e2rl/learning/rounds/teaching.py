@@ -62,6 +62,7 @@ def critical(data: TensorDictBase, window: float, near: float) -> Tensor:
     return (event < length) & (event <= end) & (wait * DT <= window)
 
 
+@dataclass
 class Teacher:
     """Labels states of collected batches; `labelled` [M]
     (e2rl/learning/pretraining/cloning.py) are the newest ones of all rounds.
@@ -69,42 +70,33 @@ class Teacher:
     It knows of the others what it sees, so that a critical decision from which it would
     get away, where the policy would not, is one that the policy has to learn:
     `survivable`.
+
+    Args:
+        planner: that labels.
+        scenes: of the states.
+        low: lowest action [2].
+        high: highest action [2].
+        hold: steps of a decision.
+        settings: which states are labelled.
+
+    Raises:
+        InputError: the planner does not rank candidates.
     """
 
-    def __init__(
-        self,
-        planner: Ego,
-        scenes: SceneSet,
-        *,
-        low: Tensor,
-        high: Tensor,
-        hold: int,
-        settings: TeachingSettings,
-    ) -> None:
-        """
-        Args:
-            planner: that labels.
-            scenes: of the states.
-            low: lowest action [2].
-            high: highest action [2].
-            hold: steps of a decision.
-            settings: which states are labelled.
+    planner: ScoringEgo
+    scenes: SceneSet
+    low: Tensor
+    high: Tensor
+    hold: int
+    settings: TeachingSettings
 
-        Raises:
-            InputError: the planner does not rank candidates.
-        """
-        if not isinstance(planner, ScoringEgo):
+    def __post_init__(self) -> None:
+        if not isinstance(self.planner, ScoringEgo):
             raise InputError(
-                f"learner.teacher={type(planner).__name__}: it cannot tell what its "
+                f"learner.teacher={type(self.planner).__name__}: it cannot tell what its "
                 "candidates cost; take an ScoringEgo such as "
                 "e2rl.planners.sampling.SamplingEgo, or set learner.ppo.teaching=0"
             )
-        self.settings = settings
-        self.planner = planner
-        self.scenes = scenes
-        self.low = low
-        self.high = high
-        self.hold = hold
         self.labelled: TensorDict | None = None
         self._judged = NO_ROWS  # rows of the pool of decisions that were judged
         self._survived = NO_FLAGS  # which of them the planner alone survives

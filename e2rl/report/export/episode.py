@@ -14,6 +14,7 @@ from tensordict import TensorDict
 
 from e2rl.evaluation.rollout_files import cell
 from e2rl.run.errors import InputError
+from e2rl.scenes.boxes import unit_vectors
 from e2rl.scenes.builder import BuildSettings, SceneBuilder
 from e2rl.scenes.lane_graph import LaneGraph
 from e2rl.scenes.recording import Lane, Recording
@@ -222,9 +223,7 @@ def past_of(episode: Episode) -> Iterator[tuple[int, np.ndarray]]:
             -1,
         )
         moved = torch.cat([pose[1:], start[row, None, :3]])[:, :2] - pose[:, :2]
-        forwards = (moved * torch.stack([pose[:, 2].cos(), pose[:, 2].sin()], -1)).sum(
-            -1, keepdim=True
-        ) >= 0
+        forwards = (moved * unit_vectors(pose[:, 2])).sum(-1, keepdim=True) >= 0
         speed = (
             moved.norm(dim=-1, keepdim=True)
             / episode.rollout.dt

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.run.config import configured, setting
+from e2rl.scenes.boxes import unit_vectors
 from e2rl.scenes.recording import DT
 from e2rl.sim.world import World
 from e2rl.traffic.baselines.baseline import BaselineState, replay_others
@@ -27,7 +28,7 @@ from e2rl.traffic.baselines.losses import (
 from e2rl.traffic.baselines.view import View
 from e2rl.traffic.cliques import cliques_in, weight_of
 from e2rl.traffic.grouping import noise_of
-from e2rl.traffic.motion import direction, smallest
+from e2rl.traffic.motion import smallest
 from e2rl.traffic.nominal import React
 from e2rl.traffic.traffic import TrafficPlan
 
@@ -129,7 +130,7 @@ def recent_states(scene: TensorDictBase) -> Tensor:
     differences of position."""
     past = scene["past"].flip(2)  # [B, V, 10, 3] in the start's frame
     start = scene["start"][:, : past.shape[1], None]
-    ahead = direction(start[..., 2])
+    ahead = unit_vectors(start[..., 2])
     left = torch.stack([-ahead[..., 1], ahead[..., 0]], -1)
     xy = start[..., :2] + past[..., :1] * ahead + past[..., 1:2] * left
     xy = torch.cat([xy, start[..., :2]], 2)
@@ -146,7 +147,7 @@ def risk(states: Tensor, size: Tensor) -> Tensor:
     t is the larger of the times after which the gaps along x and along y are closed: 0
     where they overlap on the axis, FAR where they open.
     """
-    along = direction(states[..., 2])
+    along = unit_vectors(states[..., 2])
     extent = (along.abs() * size[..., :1] + along.flip(-1).abs() * size[..., 1:]) / 2
     velocity = states[..., 3:] * along
     offset = states[..., None, :, :2] - states[..., :, None, :2]

@@ -14,12 +14,11 @@ from torch import Tensor
 
 from e2rl.metrics.geometry import velocity
 from e2rl.prior.lane_relative import LaneState
-from e2rl.scenes.boxes import corners, to_frame
+from e2rl.scenes.boxes import corners, to_frame, unit_vectors
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import closest_approach_cost
 from e2rl.traffic.baselines.view import View
-from e2rl.traffic.motion import direction
 from e2rl.traffic.potentials import STRIDE
 
 DISCOUNT = 0.9  # CTG's, a step of DT
@@ -132,7 +131,7 @@ def disk_gap(pairs: Pairs) -> tuple[Tensor, Tensor]:
     def centres(pose: Tensor, box: Tensor) -> Tensor:
         along = torch.linspace(-0.5, 0.5, DISKS, device=pose.device)[:, None]
         length = (box[:, 0] - box[:, 1]).clamp(min=0)[:, None, None, None]
-        ahead = direction(pose[..., 2])[..., None, :]
+        ahead = unit_vectors(pose[..., 2])[..., None, :]
         return pose[..., None, :2] + length * along * ahead
 
     first = centres(pairs.states, pairs.size)[..., :, None, :]

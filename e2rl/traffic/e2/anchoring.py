@@ -25,7 +25,7 @@ from e2rl.run.config import check_range, configured, setting
 from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, interpolate, project
-from e2rl.sim.dynamics import wrap
+from e2rl.sim.dynamics import midpoints, wrap
 from e2rl.sim.world import World
 from e2rl.traffic.e2.interception import InterceptionSettings, Wish, intercept
 from e2rl.traffic.e2.skeleton import Skeleton
@@ -213,7 +213,7 @@ def _knots(candidates: _Candidates, accel: Tensor, limits: Tensor) -> Tensor:
     braking = (v0 + limits[0] * time).clamp(min=0)  # nobody loses speed faster
     speed = free
     for _ in range(3):
-        distance = ((speed[..., 1:] + speed[..., :-1]) / 2 * DT).cumsum(-1)
+        distance = (midpoints(speed) * DT).cumsum(-1)
         travelled = torch.nn.functional.pad(distance, (1, 0))
         vertex = (travelled / SPACING).clamp(max=BEND_VERTICES - 1.001)
         low = vertex.long()

@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.run.config import configured, setting
+from e2rl.scenes.boxes import unit_vectors
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.route import interpolate, project
 from e2rl.sim.mission import mission_of
@@ -16,7 +17,6 @@ from e2rl.sim.world import World
 from e2rl.traffic.motion import (
     MAX_ACCELERATION,
     arrival_window,
-    direction,
     frenet_pose,
 )
 
@@ -172,8 +172,8 @@ def _to_intersection(
     """Shift [Q] in m along a route from points [Q, 2] to where its tangent crosses that
     of the ego's route at near points `ego` [Q, 2]; 0 where they are near parallel.
     """
-    u = direction(heading)
-    w = direction(ego_heading)
+    u = unit_vectors(heading)
+    w = unit_vectors(ego_heading)
     gap = ego - points
     cross = u[..., 0] * w[..., 1] - u[..., 1] * w[..., 0]
     crossing = cross.abs() > 0.3

@@ -20,16 +20,16 @@ from e2rl.prior.lane_relative import HORIZON, KNOT_STEPS, KNOTS, LaneState
 from e2rl.prior.routes import take_route
 from e2rl.run.config import configured, setting
 from e2rl.run.fused import fused
-from e2rl.scenes.boxes import overlap
+from e2rl.scenes.boxes import angle_of, overlap, unit_vectors
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.lane_graph import against_lanes
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import SPACING, interpolate, project
-from e2rl.sim.dynamics import SHARPEST, wrap
+from e2rl.sim.dynamics import SHARPEST, midpoints, wrap
 from e2rl.sim.world import World
 from e2rl.traffic.e2.foresight import foresee
 from e2rl.traffic.e2.pull import SPREAD
-from e2rl.traffic.motion import direction, distance_to_stop_line, take
+from e2rl.traffic.motion import distance_to_stop_line, take
 
 ENDS = 3  # directions tried at the end of a path
 SAMPLES = 17  # points of a path that are checked
@@ -124,13 +124,13 @@ def cubic(
         u: [U], parameters in [0, 1].
     """
     chord = end - start
-    bearing = wrap(torch.atan2(chord[..., 1], chord[..., 0]) - heading)
+    bearing = wrap(angle_of(chord) - heading)
     arc = (bearing / 2).cos().square().clamp(min=0.5)[..., None]
     chord = chord.norm(dim=-1)[..., None] / arc
     a = start[..., None, :]
     b = end[..., None, :]
-    m = (chord * direction(heading))[..., None, :]
-    n = (chord * direction(end_heading))[..., None, :]
+    m = (chord * unit_vectors(heading))[..., None, :]
+    n = (chord * unit_vectors(end_heading))[..., None, :]
     u = u[:, None]
     points = (
         (2 * u**3 - 3 * u**2 + 1) * a
@@ -151,7 +151,7 @@ def _paths(states: Tensor, meeting: Tensor) -> _Paths:
     target, or into its heading."""
     heading = states[:, :, None, 2].expand(meeting.shape[:3])
     gap = meeting[..., :2] - states[:, :, None, :2]
-    bearing = wrap(torch.atan2(gap[..., 1], gap[..., 0]) - heading)
+    bearing = wrap(angle_of(gap) - heading)
     ends = (heading + 2 * bearing, heading + bearing, meeting[..., 2])
     end_heading = torch.stack(ends, -1).flatten(2)
     heading, bearing, xy = (
@@ -174,7 +174,7 @@ def _paths(states: Tensor, meeting: Tensor) -> _Paths:
 
 def _lateral(paths: _Paths, drive: _Drive) -> tuple[Tensor, Tensor]:
     """Largest lateral acceleration [m/s^2] and curvature [1/m] on paths."""
-    heading = torch.atan2(paths.tangents[..., 1], paths.tangents[..., 0])
+    heading = angle_of(paths.tangents)
     turn = wrap(heading.diff(dim=-1))
     curvature = (turn / paths.length.diff(dim=-1).clamp(min=0.1)).abs()
     gained = 2 * drive.accel[..., None] * paths.length[..., 1:]
@@ -396,11 +396,11 @@ def _tracks(paths: _Paths, speed: Tensor, accel: Tensor) -> Tensor:
     at accel [G, O], then straight on."""
     time = DT * torch.arange(HORIZON + 1, device=speed.device)
     v = (speed[..., None] + accel[..., None] * time).clamp(min=0)
-    driven = ((v[..., 1:] + v[..., :-1]) / 2 * DT).cumsum(-1)
+    driven = (midpoints(v) * DT).cumsum(-1)
     tangent = _at(paths.tangents, paths.length, s=driven)
-    heading = torch.atan2(tangent[..., 1], tangent[..., 0])
+    heading = angle_of(tangent)
     beyond = (driven - paths.length[..., -1:]).clamp(min=0)[..., None]
-    xy = _at(paths.points, paths.length, s=driven) + beyond * direction(heading)
+    xy = _at(paths.points, paths.length, s=driven) + beyond * unit_vectors(heading)
     return torch.cat([xy, heading[..., None], v[..., 1:, None]], -1)
 
 
@@ -459,7 +459,7 @@ def _resampled(points: Tensor, length: Tensor, heading: Tensor, count: int) -> T
     s = SPACING * torch.arange(count, device=points.device, dtype=points.dtype)
     s = s.expand(*length.shape[:2], count)
     beyond = (s - length[..., -1:]).clamp(min=0)[..., None]
-    return _at(points, length, s=s) + beyond * direction(heading)[:, :, None]
+    return _at(points, length, s=s) + beyond * unit_vectors(heading)[:, :, None]
 
 
 def _at(values: Tensor, length: Tensor, s: Tensor) -> Tensor:

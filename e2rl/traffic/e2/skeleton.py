@@ -15,11 +15,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from e2rl.run.config import configured, setting
+from e2rl.scenes.boxes import unit_vectors
 from e2rl.scenes.route import project
 from e2rl.sim.world import World
 from e2rl.traffic.motion import (
     compact,
-    direction,
     frenet_pose,
     put,
     reachable_distance,
@@ -96,7 +96,7 @@ def lane_of(states: Tensor, scene: TensorDictBase) -> Tensor:
     # A lane's last point looks back.
     last = torch.nn.functional.pad(lane[:, 1:] != lane[:, :-1], (0, 1), value=True)
     ahead = torch.where(last[..., None], ahead.roll(1, 1), ahead)
-    along = direction(states[..., 2]) @ ahead.transpose(1, 2)
+    along = unit_vectors(states[..., 2]) @ ahead.transpose(1, 2)
     other = (along < SAME_WAY_COSINE) | (lane < 0)[:, None]
     gap = torch.cdist(states[..., :2], points).masked_fill(other, torch.inf)
     nearest, index = gap.min(-1)
