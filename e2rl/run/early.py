@@ -1,10 +1,12 @@
 """Import this first in a command: Ctrl-C ends it in one line from then on, also while
 heavy libraries load; so does a disk on which no temporary file can be written, which
-these libraries need.
+these libraries need. Garbage is not collected while they load: that would look through
+all of their objects time and again, for a sixth of the start.
 
 `e2rl.run.endings.ending` takes over once the command knows how it can go on.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -17,6 +19,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(128 + number)
 
 
+gc.disable()
 if (
     signal.getsignal(signal.SIGINT) is signal.default_int_handler
 ):  # not in the background, which is deaf to it

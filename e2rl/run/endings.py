@@ -2,6 +2,7 @@
 no process is left behind."""
 
 import errno
+import gc
 import os
 import select
 import shlex
@@ -61,6 +62,9 @@ def ending(go_on: Callable[[], str] = command_line) -> Iterator[None]:
     the way; what counts is that the signal arrived. go_on: returns the command that
     goes on where this one ends.
     """
+    if not gc.isenabled():  # while libraries loaded (early.py)
+        gc.freeze()
+        gc.enable()
     arrived: list[int] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:
