@@ -18,7 +18,8 @@ from e2rl.run.command import run_command
 from e2rl.run.config import resolved, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
-from e2rl.tail.rate import RateSettings, Rating
+from e2rl.tail.rate import Rating
+from e2rl.tail.settings import RateSettings
 from e2rl.tail.summary import scene_rates
 from e2rl.traffic.nominal import NominalTraffic
 

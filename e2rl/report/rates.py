@@ -18,7 +18,7 @@ from e2rl.report.tables import UNKNOWN, Table
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, misfit, write_atomically
 from e2rl.tail.interval import LEVEL, Bounds, Side, ratio_of_ratios
-from e2rl.tail.rate import ALONE
+from e2rl.tail.population import ALONE
 from e2rl.tail.sampler import EXTINCT, LEAST, REACHED, SPENT
 from e2rl.tail.summary import UNITS, SceneRate, as_json, rates_of
 
