@@ -30,13 +30,19 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--probability", type=float, nargs="+", default=[1e-3, 1e-6])
     parser.add_argument("--numbers", type=int, default=10_000, help="standard normals")
     parser.add_argument("--repetitions", type=int, default=100, help="of an interval")
+    parser.add_argument("--moves", type=int, help="of each copy (conf/rate.yaml's)")
     parser.add_argument("--form", choices=FORMS, action="append")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     rate = yaml.safe_load((ROOT / "conf/rate.yaml").read_text())["rate"]
     names = [field.name for field in fields(SamplerSettings)]
     settings = SamplerSettings(**{name: rate[name] for name in names})
-    settings = replace(settings, rollouts=100_000, least=1e-12)
+    settings = replace(
+        settings,
+        rollouts=100_000,
+        least=1e-12,
+        moves=options.moves or settings.moves,
+    )
     rows = []
     for probability in options.probability:
         for form in options.form or FORMS:
