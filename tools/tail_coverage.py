@@ -14,8 +14,8 @@ import torch
 import yaml
 from tabulate import tabulate
 
-from e2rl.tail.interval import of_logs
 from e2rl.tail.sampler import REACHED, SamplerSettings
+from e2rl.tail.summary import target_bounds
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -78,9 +78,9 @@ def coverage(
             )
             for population in range(populations)
         ]
-        assert all(part.end == REACHED for part in tallies)
         values = torch.tensor([part.probability for part in tallies]).double()
-        bounds = of_logs(values.log())
+        open_ends = [0.0 if part.end == REACHED else part.bound for part in tallies]
+        bounds = target_bounds(values, torch.tensor(open_ends).double())
         held += bounds.low <= probability <= bounds.high
         estimates.append(values / probability)
         rollouts += sum(part.rollouts for part in tallies)
