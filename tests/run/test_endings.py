@@ -49,7 +49,6 @@ def alive(process: int) -> bool:
         ("Ctrl-C", "fork"),
         ("SIGTERM", "fork"),
         ("SIGKILL", "fork"),
-        ("Ctrl-C", "spawn"),
         ("SIGKILL", "spawn"),
     ],
 )

@@ -16,7 +16,7 @@ SETTINGS = SamplerSettings(
 P = 1e-3
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", ["linear", "union of two", "rotated corner"])
 def test_estimates_are_unbiased(form):
     level, threshold = FORMS[form]
     tallies = [
