@@ -47,27 +47,25 @@ class Subset(Sampler):
         self._moving = torch.empty(0, dtype=torch.int64)  # particles
         self._left = 0  # moves of this stage
         self._retries = RETRIES
-        self._asked = Proposal(self.normals, self._moving)
+        self._asked: Proposal | None = None  # moves; None: the first rollouts
 
     def ask(self) -> Tensor:
         """Returns the normals [M, V, D] of the next rollouts, none once it has ended."""
         if self.ended:
             return self.normals[:0]
-        if len(self.normals):
-            self._asked = self.moves.propose(self.normals[self._moving])
-        else:
-            first = self.fresh(self.settings.particles)
-            self._asked = Proposal(first, torch.empty(0))
+        if not len(self.normals):
+            self.normals = self.fresh(self.settings.particles)
+            return self.normals
+        self._asked = self.moves.propose(self.normals[self._moving])
         return self._asked.normals
 
     def tell(self, driven: Driven) -> None:
         """Take what became of the rollouts that were asked for last."""
         self.tally.rollouts += len(driven.level)
-        if len(self.normals):
-            self._accept(driven)
-        else:
-            self.normals = self._asked.normals
+        if self._asked is None:
             self.particles = driven
+        else:
+            self._accept(self._asked, driven)
         if self._left == 0:
             self._select()
 
@@ -78,11 +76,12 @@ class Subset(Sampler):
         distinct = {id(self.particles.result[row]): row for row in reached}
         return [self.particles.result[row] for row in distinct.values()]
 
-    def _accept(self, driven: Driven) -> None:
+    def _accept(self, proposal: Proposal, driven: Driven) -> None:
         accepted = driven.level > self.tally.level
-        self.moves.learn(self._asked.kind, accepted)
+        changed = driven.level != self.particles.level[self._moving]
+        self.moves.learn(proposal, accepted, changed)
         rows = self._moving[accepted]
-        self.normals[rows] = self._asked.normals[accepted]
+        self.normals[rows] = proposal.normals[accepted]
         self.particles.level[rows] = driven.level[accepted]
         self.particles.counted[rows] = driven.counted[accepted]
         for row, index in zip(rows, accepted.nonzero()[:, 0], strict=True):

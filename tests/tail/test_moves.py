@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.tail.moves import ACCEPTED, KINDS, LEAST, Moves
+from e2rl.tail.moves import ACCEPTED, KINDS, LEAST, Moves, Proposal
 
 VEHICLES = 3
 NUMBERS = 9  # of a vehicle: the route's, and two of each of four replans
@@ -47,23 +47,65 @@ def test_vehicles_alone_are_drawn_by_their_weights():
     )
 
 
-def test_step_sizes_follow_the_accepted_fraction():
+def made(count, kind=0, vehicle=-1, begin=0):
+    """Moves of one kind of block."""
+    same = torch.ones(count, dtype=torch.int64)
+    return Proposal(
+        torch.zeros(count, VEHICLES, NUMBERS), kind * same, vehicle * same, begin * same
+    )
+
+
+def learned(learner, accepted, changed=True, **block):
+    count = len(accepted)
+    learner.learn(made(count, **block), accepted, torch.full((count,), changed))
+
+
+@pytest.mark.parametrize("kind", range(KINDS))
+def test_step_sizes_follow_the_accepted_fraction(kind):
     learner = moves()
-    kind = torch.arange(KINDS).repeat(100)
     before = learner.size.clone()
-    learner.learn(kind, torch.zeros(len(kind), dtype=torch.bool))
-    assert (learner.size < before).all()
+    learned(learner, torch.zeros(100, dtype=torch.bool), kind=kind)
+    assert learner.size[kind] < before[kind]
     for _ in range(50):
-        learner.learn(kind, torch.zeros(len(kind), dtype=torch.bool))
-    assert (learner.size == LEAST).all()
+        learned(learner, torch.zeros(100, dtype=torch.bool), kind=kind)
+    assert learner.size[kind] == LEAST
     for _ in range(50):
-        learner.learn(kind, torch.ones(len(kind), dtype=torch.bool))
-    assert (learner.size == 1).all()
+        learned(learner, torch.ones(100, dtype=torch.bool), kind=kind)
+    assert learner.size[kind] == 1
+    others = torch.arange(KINDS) != kind
+    torch.testing.assert_close(learner.size[others], before[others])
 
 
 def test_the_accepted_fraction_aimed_at_leaves_them_as_they_are():
     learner = moves()
     before = learner.size.clone()
-    accepted = torch.arange(1000) < 1000 * ACCEPTED
-    learner.learn(torch.zeros(1000, dtype=torch.int64), accepted)
+    learned(learner, torch.arange(1000) < 1000 * ACCEPTED)
     torch.testing.assert_close(learner.size, before)
+
+
+def test_moves_without_an_effect_say_nothing_of_the_step_size():
+    learner = moves()
+    before = learner.size.clone()
+    learned(learner, torch.ones(100, dtype=torch.bool), changed=False)
+    torch.testing.assert_close(learner.size, before)
+
+
+def test_vehicles_without_an_effect_are_moved_less_often():
+    """98 moves of the vehicle of weight 3 do nothing: 3 * 2 / 100 beside 1."""
+    learner = moves()
+    block = {"kind": 1, "vehicle": 2}
+    learned(learner, torch.ones(98, dtype=torch.bool), changed=False, **block)
+    proposal = learner.propose(torch.zeros(20_000, VEHICLES, NUMBERS))
+    alone = proposal.vehicle[proposal.kind % 2 == 1]
+    share = (alone == 2).double().mean()
+    torch.testing.assert_close(float(share), 0.06 / 1.06, atol=0.01, rtol=0)
+
+
+def test_replans_without_an_effect_begin_fewer_blocks():
+    learner = moves()
+    block = {"kind": 2, "begin": 3}
+    learned(learner, torch.ones(98, dtype=torch.bool), changed=False, **block)
+    proposal = learner.propose(torch.zeros(20_000, VEHICLES, NUMBERS))
+    begins = proposal.begin[proposal.kind >= 2]
+    share = (begins == 3).double().mean()
+    torch.testing.assert_close(float(share), 0.02 / 3.02, atol=0.005, rtol=0)

@@ -11,7 +11,7 @@ from e2rl.tail.subset import Subset
 from tests.tail.closed_forms import FORMS, linear, quantile, tally
 
 SETTINGS = SamplerSettings(
-    particles=64, killed=0.5, moves=2, rollouts=100_000, least=1e-12
+    particles=64, killed=0.5, moves=4, rollouts=100_000, least=1e-12
 )
 P = 1e-3
 
