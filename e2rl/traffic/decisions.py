@@ -45,7 +45,6 @@ class Decisions(NamedTuple):
 
 
 RULE = Decisions()
-OWES = Decisions._fields.index("owes")
 
 
 def eligible(world: World, whom: Tensor, lawful: bool) -> Tensor:
