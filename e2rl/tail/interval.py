@@ -27,13 +27,16 @@ def of_logs(logs: Tensor) -> Bounds:
     their mean, with the interval of log-normal ones (Cox's method: Zhou and Gao 1997).
 
     It is around mean + s^2 / 2 of the logarithms, whose variance s^2 / R + s^4 / (2 (R
-    - 1)) is that of a t law.
+    - 1)) is that of a t law. It has R - 2 degrees of freedom, as populations' estimates
+    have longer tails: with R - 1 the intervals hold 88% of closed forms at 1e-6, with R
+    - 2 93% (tools/tail_coverage.py).
     """
     count = len(logs)
     variance = float(logs.var().clamp(min=LEAST_VARIANCE))
     centre = float(logs.mean()) + variance / 2
     spread = math.sqrt(variance / count + variance**2 / (2 * (count - 1)))
-    half = spread * float(stats.t.ppf((1 + LEVEL) / 2, count - 1))
+    freedom = max(count - 2, 1)
+    half = spread * float(stats.t.ppf((1 + LEVEL) / 2, freedom))
     value = float(logs.exp().mean())
     low = min(math.exp(centre - half), value)
     return Bounds(value, low, high=min(max(math.exp(centre + half), value), 1.0))
