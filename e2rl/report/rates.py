@@ -33,6 +33,7 @@ ENDS = {
     EXTINCT: "all rollouts come equally near, so no further draws",
     ALONE: "nothing is left to chance",
 }
+WORDS = {"contact": "contacts", "preventable": "preventable failures"}  # of targets
 NOTE = (
     "p is that of the prior, which is no road: what it makes of speeds, gaps and routes "
     "beside recordings stands in docs/results/prior.md."
@@ -174,8 +175,8 @@ def summary_lines(ego: EgoRates) -> list[str]:
     reached = sum(scene["end"] == REACHED for scene in ego.scenes)
     rate = ego.rates[ego.target]["1000km"]
     return [
-        f"{ego.ego} in traffic as the prior has it: {text(rate)} {ego.target} failures "
-        f"per 1,000 km.",
+        f"{ego.ego} in traffic as the prior has it: {text(rate)} {WORDS[ego.target]} "
+        "per 1,000 km.",
         f"They were drawn in {reached} of {len(ego.scenes)} scenes, by {rollouts:,} "
         "rollouts.",
     ]
@@ -243,7 +244,7 @@ def likeliest_table(ego: EgoRates) -> Table:
         [
             scene["scene_id"],
             text(Bounds(scene["probability"], scene["low"], scene["high"])),
-            f"{scene['nats']:.1f}",
+            f"{abs(scene['nats']):.1f}",
             f"{scene['probability'] / total:.0%}",
             str(scene["failures"]),
             str(scene["rollouts"]),
@@ -252,7 +253,7 @@ def likeliest_table(ego: EgoRates) -> Table:
         if scene["probability"] > 0
     ]
     return Table(
-        f"{ego.ego}: where {ego.target} failures are likeliest; share of all scenes' "
+        f"{ego.ego}: where {WORDS[ego.target]} are likeliest; share of all scenes' "
         "probability.",
         ["scene", "p", "nats", "share", "failures drawn", "rollouts"],
         rows=rows,
@@ -263,6 +264,12 @@ def text(bounds: Bounds) -> str:
     """Returns an estimate with its interval."""
     if math.isnan(bounds.value):
         return UNKNOWN
+    value = number(bounds.value, digits=3)
     if math.isnan(bounds.low):
-        return f"{bounds.value:.3g}"
-    return f"{bounds.value:.3g} [{bounds.low:.2g}, {bounds.high:.2g}]"
+        return value
+    return f"{value} [{number(bounds.low)}, {number(bounds.high)}]"
+
+
+def number(value: float, digits: int = 2) -> str:
+    """Returns a number with some digits, from 100 on with all before the point."""
+    return f"{value:,.0f}" if 100 <= value < math.inf else f"{value:.{digits}g}"

@@ -59,7 +59,7 @@ def test_two_egos_are_rated_gated_and_reported(rate, tmp_path, monkeypatch, caps
             weight = weights.get((entry["ego"], scene["scene_id"]), 0)
             assert weight == pytest.approx(scene["probability"])
     page = (run / "failures.html").read_text()
-    assert "contact failures per 1,000 km" in page
+    assert "contacts per 1,000 km" in page
     for command in (
         ["gate", str(run), "--ego", "a", "contact_per_scene<=1"],
         ["report", str(run), "--out", str(run / "again.html")],

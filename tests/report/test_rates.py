@@ -9,7 +9,13 @@ import torch
 from e2rl.driving.setup import Scored
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED
 from e2rl.report.rate_gate import judged_rate, rates_of_run
-from e2rl.report.rates import EgoRates, rate_tables, summary_lines, write_rates
+from e2rl.report.rates import (
+    EgoRates,
+    number,
+    rate_tables,
+    summary_lines,
+    write_rates,
+)
 from e2rl.run.errors import InputError
 from e2rl.tail.interval import of_ratio
 from e2rl.tail.rate import Estimate
@@ -132,3 +138,11 @@ def test_a_damaged_file_is_refused(run):
     (run / "rates.json").write_text(json.dumps(entries))
     with pytest.raises(InputError, match="km is missing"):
         rates_of_run(run, None)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "words"),
+    [(0.00312, 3, "0.00312"), (24.4, 2, "24"), (1234.5, 2, "1,234"), (0.0, 2, "0")],
+)
+def test_numbers_have_all_digits_before_the_point(value, digits, words):
+    assert number(value, digits) == words
