@@ -45,17 +45,17 @@ class Effects:
 
     def __init__(self, count: int) -> None:
         self.changed = torch.full((count,), PRIOR, dtype=torch.float64)
-        self.made = torch.full((count,), PRIOR, dtype=torch.float64)
+        self.tried = torch.full((count,), PRIOR, dtype=torch.float64)
 
     @property
     def share(self) -> Tensor:
         """Of each [N], the share of its moves with an effect."""
-        return self.changed / self.made
+        return self.changed / self.tried
 
     def count(self, index: Tensor, changed: Tensor) -> None:
         """Count moves index [M] int64, of which some `changed` [M] bool the level."""
         ones = torch.ones(len(index), dtype=torch.float64)
-        self.made.index_add_(0, index, ones)
+        self.tried.index_add_(0, index, ones)
         self.changed.index_add_(0, index, changed.double())
 
 

@@ -1,30 +1,24 @@
 """Plain Monte Carlo: independent rollouts of the prior. What other samplers are compared
 with."""
 
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
 from e2rl.tail.level import CONTACT
-from e2rl.tail.moves import Moves
-from e2rl.tail.sampler import REACHED, SPENT, Driven, Sampler, SamplerSettings
+from e2rl.tail.sampler import REACHED, SPENT, Driven, Sampler
 
 NO_HIT = 0.05  # chance of no hit in all rollouts at the bound
 
 
+@dataclass(eq=False)
 class Plain(Sampler):
     """Independent rollouts of one scene, `particles` at a time."""
 
-    def __init__(
-        self,
-        *,
-        target: float,
-        settings: SamplerSettings,
-        moves: Moves,
-        shape: tuple[int, int],
-    ) -> None:
-        """Begin; arguments of `Sampler`."""
-        super().__init__(target=target, settings=settings, moves=moves, shape=shape)
+    repeated = False  # its counts tell their own interval
+
+    def __post_init__(self) -> None:
         self.tally.hits = 0
         self._contacts = 0
         self._counted = 0

@@ -155,7 +155,9 @@ class Population:
                 list(driven),
             )
         )
-        if first and self.alone and self.sampler.tally.end in ("", EXTINCT):
+        fails = any(part.level >= self.sampler.target for part in driven)
+        ended = self.sampler.tally.end not in ("", EXTINCT)
+        if first and self.alone and not fails and not ended:
             self.sampler.tally.end = ALONE
             self.sampler.tally.bound = 0.0
 

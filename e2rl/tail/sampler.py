@@ -3,8 +3,8 @@ drive, `tell` what became of it, until it has ended; `tally` is the estimate."""
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -70,30 +70,24 @@ class Driven(NamedTuple):
     result: list[Any]
 
 
+@dataclass(eq=False)
 class Sampler(ABC):
-    """Draws rollouts of one scene."""
+    """Draws rollouts of one scene.
 
-    def __init__(
-        self,
-        *,
-        target: float,
-        settings: SamplerSettings,
-        moves: Moves,
-        shape: tuple[int, int],
-    ) -> None:
-        """Begin a population.
+    Args:
+        target: level of the failure.
+        settings: how rollouts are spent.
+        moves: in this scene; its generator draws everything.
+        shape: (V, D) of a rollout's normals.
+    """
 
-        Args:
-            target: level of the failure.
-            settings: how rollouts are spent.
-            moves: in this scene; its generator draws everything.
-            shape: (V, D) of a rollout's normals.
-        """
-        self.target = target
-        self.settings = settings
-        self.moves = moves
-        self.shape = shape
-        self.tally = Tally()
+    target: float
+    settings: SamplerSettings
+    moves: Moves
+    shape: tuple[int, int]
+    tally: Tally = field(default_factory=Tally, init=False)
+
+    repeated: ClassVar[bool] = True  # intervals are of several populations
 
     @property
     def ended(self) -> bool:

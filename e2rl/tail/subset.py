@@ -9,13 +9,14 @@ again, and the population is extinct where that does not help.
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from e2rl.tail.level import CONTACT
-from e2rl.tail.moves import Moves, Proposal
+from e2rl.tail.moves import Proposal
 from e2rl.tail.sampler import (
     EXTINCT,
     LEAST,
@@ -23,26 +24,17 @@ from e2rl.tail.sampler import (
     SPENT,
     Driven,
     Sampler,
-    SamplerSettings,
 )
 
 RETRIES = 5  # moves of all particles at one level, with ever smaller steps
 
 
+@dataclass(eq=False)
 class Subset(Sampler):
     """A population of particles of one scene."""
 
-    def __init__(
-        self,
-        *,
-        target: float,
-        settings: SamplerSettings,
-        moves: Moves,
-        shape: tuple[int, int],
-    ) -> None:
-        """Begin a population; arguments of `Sampler`."""
-        super().__init__(target=target, settings=settings, moves=moves, shape=shape)
-        self.normals = torch.empty(0, *shape)  # [N, V, D]
+    def __post_init__(self) -> None:
+        self.normals = torch.empty(0, *self.shape)  # [N, V, D]
         self.particles = Driven(torch.empty(0), torch.empty(0), [])
         self._moving = torch.empty(0, dtype=torch.int64)  # particles
         self._left = 0  # moves of this stage

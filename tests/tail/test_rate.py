@@ -1,5 +1,7 @@
 """Rates of an ego in synthetic scenes: the same over processes, and after a kill."""
 
+from dataclasses import replace
+
 import pytest
 
 from e2rl.api import load_prior, make_ego, make_traffic
@@ -11,7 +13,7 @@ from e2rl.sim.env import SimSettings
 from e2rl.tail.population import ALONE, vehicle_weight
 from e2rl.tail.rate import Rating
 from e2rl.tail.sampler import REACHED
-from e2rl.tail.settings import RateSettings
+from e2rl.tail.settings import METHODS, RateSettings
 from e2rl.tail.summary import rates_of, scene_rates
 from tests.synthetic import make_scenes
 
@@ -89,6 +91,24 @@ def test_a_planner_that_raises_fails_surely():
     assert [scene.bounds.value for scene in rates] == [1]
     assert all(scene.end == REACHED for scene in rates)
     assert all(scene.raised == scene.rollouts for scene in rates)
+
+
+def test_plain_rollouts_are_one_population_of_each_scene(scenes):
+    settings = replace(SETTINGS, method="plain", rollouts=8)
+    parts = rating(scenes, Crash(), settings).estimates(Work())
+    assert [(part.scene, part.repetition) for part in parts] == [(0, 0), (1, 0)]
+    assert [part.tally.hits for part in parts] == [8, 8]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_planner_that_raises_where_nobody_drives_fails_surely(method):
+    alone = make_scenes(1, steps=STEPS)
+    alone.scenes["valid"][:, 1:] = False
+    alone.scenes["logged_valid"][:, :, 1:] = False
+    settings = replace(SETTINGS, method=method, repetitions=1)
+    (part,) = rating(alone, Crash(), settings).estimates(Work())
+    assert part.tally.end == REACHED
+    assert part.tally.probability == 1
 
 
 def test_scenes_without_driven_vehicles_leave_nothing_to_chance(scenes):
