@@ -147,7 +147,9 @@ class MaskedGuidance:
             guided = guided - shift * step.context.active[..., None]
         return step.x, x0, guided
 
-    def _gradients(self, step: Denoising, with_feasibility: bool) -> Controlled:
+    def _gradients(
+        self, step: Denoising, with_feasibility: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """x0, grad V_adv by x or by x0 as set, and grad V_feas by x0, [B, V, SIZE]
         each."""
         adversarial = feasibility = torch.zeros_like(step.x)
