@@ -129,14 +129,14 @@ class Population:
         number = setup.scenes.number[scene]
         draw = (seed * SEED_STEP + repetition) * SEED_STEP + number
         generator = torch.Generator().manual_seed(draw % 2**63)
-        weight = vehicle_weight(setup, scene)
+        effect = vehicle_effect(setup, scene)
         sampler = METHODS[settings.method](
             target=TARGETS[settings.target],
             settings=settings.sampler,
-            moves=Moves(weight, layout.replan_of(), generator),
+            moves=Moves(effect, layout.replan_of(), generator),
             shape=(layout.vehicles, layout.numbers),
         )
-        return cls(scene, repetition, sampler, alone=not bool(weight.any()))
+        return cls(scene, repetition, sampler, alone=not bool(effect.any()))
 
     def tell(self, driven: Sequence[OneRollout]) -> None:
         """Take what became of the rollouts that were asked for last."""
@@ -181,9 +181,9 @@ class Population:
         )
 
 
-def vehicle_weight(setup: Setup, scene: int) -> Tensor:
-    """Returns how often each vehicle [V] of a scene is moved alone: more the nearer it
-    begins to the ego; 0 for the ego and whom the prior does not drive."""
+def vehicle_effect(setup: Setup, scene: int) -> Tensor:
+    """Returns a guess of how much each vehicle [V] of a scene changes the level: more the
+    nearer it begins to the ego; 0 for the ego and whom the prior does not drive."""
     batch = setup.scenes.batch([scene])
     vehicles = batch["route_valid"].shape[1]
     start = batch["start"][0, :vehicles]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from e2rl.run.config import configured, setting
+from e2rl.run.errors import InputError
 from e2rl.tail.moves import Moves
 
 # why a population ended
@@ -24,11 +25,18 @@ SPENT = "spent"  # the budget of rollouts
 class SamplerSettings:
     """How the rollouts of a population are spent; conf/rate.yaml explains each."""
 
+    first: int = setting(low=4)
     particles: int = setting(low=4)
     killed: float = setting(low=0.05, high=0.95)
     moves: int = setting(low=1)
     rollouts: int = setting(low=4)
     least: float = setting(low=0, high=1)
+
+    def __post_init__(self) -> None:
+        if self.first < self.particles:
+            raise InputError(
+                f"rate.first={self.first}: fewer than rate.particles={self.particles}"
+            )
 
 
 @dataclass

@@ -19,6 +19,7 @@ class RateSettings:
     method: str = setting(choices=METHODS)
     target: str = setting(choices=TARGETS)
     repetitions: int = setting(low=1)
+    first: int = setting(low=4)
     particles: int = setting(low=4)
     killed: float = setting(low=0.05, high=0.95)
     moves: int = setting(low=1)

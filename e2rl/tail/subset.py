@@ -38,6 +38,7 @@ class Subset(Sampler):
         self.particles = Driven(torch.empty(0), torch.empty(0), [])
         self._moving = torch.empty(0, dtype=torch.int64)  # particles
         self._left = 0  # moves of this stage
+        self._spread = 1.0  # of the survivors' levels above the stage's
         self._retries = RETRIES
         self._asked: Proposal | None = None  # moves; None: the first rollouts
 
@@ -46,7 +47,7 @@ class Subset(Sampler):
         if self.ended:
             return self.normals[:0]
         if not len(self.normals):
-            self.normals = self.fresh(self.settings.particles)
+            self.normals = self.fresh(self.settings.first)
             return self.normals
         self._asked = self.moves.propose(self.normals[self._moving])
         return self._asked.normals
@@ -70,8 +71,8 @@ class Subset(Sampler):
 
     def _accept(self, proposal: Proposal, driven: Driven) -> None:
         accepted = driven.level > self.tally.level
-        changed = driven.level != self.particles.level[self._moving]
-        self.moves.learn(proposal, accepted, changed)
+        change = (driven.level - self.particles.level[self._moving]).abs()
+        self.moves.learn(proposal, accepted, change / (change + self._spread))
         rows = self._moving[accepted]
         self.normals[rows] = proposal.normals[accepted]
         self.particles.level[rows] = driven.level[accepted]
@@ -88,7 +89,8 @@ class Subset(Sampler):
         if tally.level < CONTACT:
             tally.contact = tally.bound * float((level >= CONTACT).double().mean())
             tally.counted = tally.bound * float(self.particles.counted.double().mean())
-        killed = math.ceil(self.settings.killed * count)
+        kept = math.floor((1 - self.settings.killed) * self.settings.particles)
+        killed = count - kept
         threshold = float(level.sort().values[killed - 1])
         if threshold >= self.target:
             fraction = float((level >= self.target).double().mean())
@@ -100,14 +102,17 @@ class Subset(Sampler):
             self._retry()
             return
         self._retries = RETRIES
-        fraction = len(survivors) / count
-        tally.bound *= fraction
+        self._spread = float((level[survivors] - threshold).mean())
+        tally.bound *= len(survivors) / count
         tally.level = threshold
-        self._moving = (level <= threshold).nonzero()[:, 0]
         if tally.bound < self.settings.least:
             tally.end = LEAST
-        elif self._affords(len(self._moving)):
-            self._copy(survivors)
+            return
+        dead = (level <= threshold).nonzero()[:, 0]
+        self._keep(torch.cat([survivors, dead]))
+        self._moving = torch.arange(len(survivors), len(self.normals))
+        if self._affords(len(self._moving)):
+            self._copy(len(survivors))
 
     def _retry(self) -> None:
         """Move all particles, which are at one level, once more; they may be copies
@@ -116,6 +121,7 @@ class Subset(Sampler):
             self.tally.end = EXTINCT
             return
         self._retries -= 1
+        self._keep(torch.arange(len(self.normals)))  # which are alike
         self._moving = torch.arange(len(self.normals))
         self._affords(len(self._moving))
 
@@ -128,14 +134,20 @@ class Subset(Sampler):
         self.tally.end = SPENT
         return False
 
-    def _copy(self, survivors: Tensor) -> None:
-        """Replace the particles to be moved by copies of survivors."""
-        drawn = torch.randint(
-            len(survivors), (len(self._moving),), generator=self.moves.generator
+    def _keep(self, order: Tensor) -> None:
+        """Go on with the first particles of an order."""
+        rows = order[: self.settings.particles]
+        self.normals = self.normals[rows]
+        self.particles = Driven(
+            self.particles.level[rows],
+            self.particles.counted[rows],
+            [self.particles.result[row] for row in rows.tolist()],
         )
-        parents = survivors[drawn]
-        self.normals[self._moving] = self.normals[parents]
-        self.particles.level[self._moving] = self.particles.level[parents]
-        self.particles.counted[self._moving] = self.particles.counted[parents]
-        for row, parent in zip(self._moving, parents, strict=True):
-            self.particles.result[row] = self.particles.result[parent]
+
+    def _copy(self, survivors: int) -> None:
+        """Replace the particles to be moved by copies of survivors, which come first."""
+        parents = torch.randint(
+            survivors, (len(self._moving),), generator=self.moves.generator
+        )
+        order = torch.cat([torch.arange(survivors), parents])
+        self._keep(order)

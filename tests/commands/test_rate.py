@@ -8,6 +8,7 @@ import pytest
 from tests.scripts import SHORT, call, error_line
 
 SMALL = [
+    "rate.first=8",
     "rate.particles=8",
     "rate.rollouts=16",
     "rate.repetitions=2",
@@ -80,6 +81,7 @@ def test_two_egos_are_rated_gated_and_reported(rate, tmp_path, monkeypatch, caps
         ("seeds=[0,1]", "one seed gives all draws"),
         ("rate.target=scratch", "rate.target=scratch"),
         ("rate.killed=1.5", "rate.killed=1.5"),
+        ("rate.first=7", "rate.first=7: fewer than rate.particles=8"),
     ],
 )
 def test_what_cannot_be_rated_is_refused(rate, option, message):

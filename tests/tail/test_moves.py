@@ -10,8 +10,8 @@ NUMBERS = 9  # of a vehicle: the route's, and two of each of four replans
 REPLAN = torch.tensor([0, 0, 0, 1, 1, 2, 2, 3, 3])
 
 
-def moves(weight=(0.0, 1.0, 3.0), seed=0):
-    return Moves(torch.tensor(weight), REPLAN, torch.Generator().manual_seed(seed))
+def moves(effect=(0.0, 0.25, 0.75), seed=0):
+    return Moves(torch.tensor(effect), REPLAN, torch.Generator().manual_seed(seed))
 
 
 def test_normals_stay_standard_normal_and_uncorrelated():
@@ -37,7 +37,7 @@ def test_a_kind_changes_its_block_alone(alone, later):
     assert begins == (expected if later else {(1,) * NUMBERS})
 
 
-def test_vehicles_alone_are_drawn_by_their_weights():
+def test_vehicles_alone_are_drawn_by_their_effects():
     x = torch.zeros(20_000, VEHICLES, NUMBERS)
     proposal = moves().propose(x)
     alone = proposal.normals[proposal.kind == 1] != 0
@@ -55,9 +55,10 @@ def made(count, kind=0, vehicle=-1, begin=0):
     )
 
 
-def learned(learner, accepted, changed=True, **block):
+def learned(learner, accepted, effect=1.0, **block):
     count = len(accepted)
-    learner.learn(made(count, **block), accepted, torch.full((count,), changed))
+    effects = torch.full((count,), effect, dtype=torch.float64)
+    learner.learn(made(count, **block), accepted, effects)
 
 
 @pytest.mark.parametrize("kind", range(KINDS))
@@ -86,25 +87,49 @@ def test_the_accepted_fraction_aimed_at_leaves_them_as_they_are():
 def test_moves_without_an_effect_say_nothing_of_the_step_size():
     learner = moves()
     before = learner.size.clone()
-    learned(learner, torch.ones(100, dtype=torch.bool), changed=False)
+    learned(learner, torch.ones(100, dtype=torch.bool), effect=0.0)
     torch.testing.assert_close(learner.size, before)
 
 
+def test_the_step_size_follows_moves_by_their_effects():
+    """Of 100 moves 35 with an effect are refused, the others count as little as it."""
+    learner = moves()
+    before = learner.size.clone()
+    accepted = torch.arange(100) >= 35
+    effect = torch.where(accepted, 0.01, 1.0).double()
+    learner.learn(made(100), accepted, effect)
+    assert learner.size[0] < before[0]
+
+
 def test_vehicles_without_an_effect_are_moved_less_often():
-    """98 moves of the vehicle of weight 3 do nothing: 3 * 2 / 100 beside 1."""
+    """98 moves of the third vehicle do nothing: 0.75 * 2 / 100 beside 0.25."""
     learner = moves()
     block = {"kind": 1, "vehicle": 2}
-    learned(learner, torch.ones(98, dtype=torch.bool), changed=False, **block)
+    learned(learner, torch.ones(98, dtype=torch.bool), effect=0.0, **block)
     proposal = learner.propose(torch.zeros(20_000, VEHICLES, NUMBERS))
     alone = proposal.vehicle[proposal.kind % 2 == 1]
     share = (alone == 2).double().mean()
-    torch.testing.assert_close(float(share), 0.06 / 1.06, atol=0.01, rtol=0)
+    torch.testing.assert_close(float(share), 0.015 / 0.265, atol=0.01, rtol=0)
+
+
+def test_vehicles_without_an_effect_are_drawn_anew_in_moves_of_all():
+    """The second one's step is that of all, the third's almost 1, and the first's, whose
+    effect is not learned, that of all."""
+    learner = moves()
+    block = {"kind": 1, "vehicle": 2}
+    learned(learner, torch.ones(998, dtype=torch.bool), effect=0.0, **block)
+    proposal = learner.propose(torch.zeros(20_000, VEHICLES, NUMBERS))
+    size = proposal.normals[proposal.kind == 0].std((0, 2))
+    everyone = float(learner.size[0])
+    torch.testing.assert_close(
+        size, torch.tensor([everyone, everyone, 1.0]), atol=0.01, rtol=0
+    )
 
 
 def test_replans_without_an_effect_begin_fewer_blocks():
     learner = moves()
     block = {"kind": 2, "begin": 3}
-    learned(learner, torch.ones(98, dtype=torch.bool), changed=False, **block)
+    learned(learner, torch.ones(98, dtype=torch.bool), effect=0.0, **block)
     proposal = learner.propose(torch.zeros(20_000, VEHICLES, NUMBERS))
     begins = proposal.begin[proposal.kind >= 2]
     share = (begins == 3).double().mean()

@@ -14,7 +14,7 @@ openturns = pytest.importorskip("openturns")
 SHIFT = 4.3  # of the branches: P(failure) some 1e-5
 POPULATIONS = 16
 SETTINGS = SamplerSettings(
-    particles=64, killed=0.5, moves=16, rollouts=100_000, least=1e-12
+    first=64, particles=64, killed=0.5, moves=16, rollouts=100_000, least=1e-12
 )
 
 

@@ -10,7 +10,9 @@ from e2rl.tail.sampler import REACHED, SPENT, Driven, SamplerSettings
 from tests.tail.closed_forms import linear, quantile
 
 P = 0.1
-SETTINGS = SamplerSettings(particles=64, killed=0.5, moves=1, rollouts=1000, least=0)
+SETTINGS = SamplerSettings(
+    first=64, particles=64, killed=0.5, moves=1, rollouts=1000, least=0
+)
 
 
 def drawn(target):

@@ -10,7 +10,7 @@ from e2rl.driving.setup import Setup
 from e2rl.planners.ego import Ego
 from e2rl.run.parts import Parts
 from e2rl.sim.env import SimSettings
-from e2rl.tail.population import ALONE, vehicle_weight
+from e2rl.tail.population import ALONE, vehicle_effect
 from e2rl.tail.rate import Rating
 from e2rl.tail.sampler import REACHED
 from e2rl.tail.settings import METHODS, RateSettings
@@ -22,6 +22,7 @@ SETTINGS = RateSettings(
     method="subset",
     target="contact",
     repetitions=2,
+    first=8,
     particles=8,
     moves=1,
     rollouts=24,
@@ -115,21 +116,22 @@ def test_scenes_without_driven_vehicles_leave_nothing_to_chance(scenes):
     alone = make_scenes(1, steps=STEPS)
     alone.scenes["valid"][:, 1:] = False
     alone.scenes["logged_valid"][:, :, 1:] = False
-    assert not vehicle_weight(rating(alone).setup, 0).any()
+    assert not vehicle_effect(rating(alone).setup, 0).any()
     (part,) = rating(alone).estimates(Work())
     assert part.tally.end == ALONE
     assert part.tally.bound == 0
 
 
-def test_vehicles_nearer_to_the_ego_are_moved_more_often(scenes):
-    weight = vehicle_weight(rating(scenes).setup, 0)
-    start = scenes.batch([0])["start"][0, : len(weight)]
+def test_vehicles_nearer_to_the_ego_are_expected_to_matter_more(scenes):
+    effect = vehicle_effect(rating(scenes).setup, 0)
+    start = scenes.batch([0])["start"][0, : len(effect)]
     distance = (start[:, :2] - start[:1, :2]).norm(dim=-1)
-    moved = weight > 0
-    assert moved.any()
-    assert not moved[0]
-    order = distance[moved].argsort()
-    assert (weight[moved][order].diff() <= 0).all()
+    driven = effect > 0
+    assert driven.any()
+    assert not driven[0]
+    assert (effect <= 1).all()
+    order = distance[driven].argsort()
+    assert (effect[driven][order].diff() <= 0).all()
 
 
 def test_rates_are_sums_over_scenes_per_exposure(scenes, estimates):

@@ -1,6 +1,7 @@
 """Subset simulation, on failures of known probability."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,9 +12,10 @@ from e2rl.tail.subset import Subset
 from tests.tail.closed_forms import FORMS, linear, quantile, tally
 
 SETTINGS = SamplerSettings(
-    particles=64, killed=0.5, moves=4, rollouts=100_000, least=1e-12
+    first=64, particles=64, killed=0.5, moves=4, rollouts=100_000, least=1e-12
 )
 P = 1e-3
+GENERATOR = torch.Generator().manual_seed(0)
 
 
 @pytest.mark.parametrize("form", ["linear", "union of two", "rotated corner"])
@@ -51,7 +53,7 @@ def test_equal_levels_are_an_extinction_and_no_estimate():
 
 def test_it_spends_no_more_rollouts_than_asked_for():
     settings = SamplerSettings(
-        particles=64, killed=0.5, moves=2, rollouts=300, least=1e-12
+        first=64, particles=64, killed=0.5, moves=2, rollouts=300, least=1e-12
     )
     result = tally(linear, 8.0, numbers=40, seed=0, settings=settings)
     assert result.end == SPENT
@@ -60,7 +62,7 @@ def test_it_spends_no_more_rollouts_than_asked_for():
 
 def test_it_stops_below_the_least_probability():
     settings = SamplerSettings(
-        particles=64, killed=0.5, moves=1, rollouts=100_000, least=0.1
+        first=64, particles=64, killed=0.5, moves=1, rollouts=100_000, least=0.1
     )
     result = tally(linear, 8.0, numbers=40, seed=0, settings=settings)
     assert result.end == LEAST
@@ -99,3 +101,35 @@ def test_copies_whose_moves_were_refused_are_moved_again():
         subset.tell(Driven(nearer, nearer > 1, [None] * count))
     assert not subset.ended
     assert subset.tally.bound == 0.5
+
+
+def test_many_first_rollouts_are_one_stage_of_a_smaller_fraction():
+    """The best of 512 go on: 32 of them in the second stage, without a loss."""
+    settings = replace(SETTINGS, first=512)
+    subset = Subset(
+        target=quantile(P),
+        settings=settings,
+        moves=Moves(torch.ones(4), torch.zeros(10, dtype=torch.int64), GENERATOR),
+        shape=(4, 10),
+    )
+    level = linear(subset.ask())
+    subset.tell(Driven(level, level > 9, list(range(512))))
+    assert subset.tally.bound == 32 / 512
+    best = set(level.argsort()[-32:].tolist())
+    assert set(subset.particles.result[:32]) == best
+    assert set(subset.particles.result[32:]) <= best
+    assert len(subset.ask()) == 32
+
+
+def test_a_second_stage_of_equal_first_rollouts_is_of_as_many_as_asked_for():
+    settings = replace(SETTINGS, first=512)
+    subset = Subset(
+        target=quantile(P),
+        settings=settings,
+        moves=Moves(torch.ones(4), torch.zeros(10, dtype=torch.int64), GENERATOR),
+        shape=(4, 10),
+    )
+    level = torch.zeros(len(subset.ask()), dtype=torch.float64)
+    subset.tell(Driven(level, level > 9, list(range(512))))
+    assert subset.tally.bound == 1
+    assert len(subset.ask()) == 64
