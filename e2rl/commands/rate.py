@@ -33,7 +33,7 @@ def rate(run: Run) -> None:
     settings = settings_of(RateSettings, resolved(config.rate), where="rate")
     plan = begin(
         run,
-        f"up to {settings.repetitions} populations of {settings.rollouts} rollouts a scene",
+        f"up to {settings.populations} x {settings.rollouts} rollouts a scene",
     )
     traffic = nominal_traffic(plan)
     (seed,) = plan.settings.seeds

@@ -16,7 +16,7 @@ from e2rl.run.terminal import Bar
 from e2rl.tail.noise import ChosenNoise, NoiseLayout
 from e2rl.tail.population import OneRollout, Population, one_by_one
 from e2rl.tail.sampler import REACHED, Tally
-from e2rl.tail.settings import METHODS, RateSettings
+from e2rl.tail.settings import RateSettings
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.nominal import NominalTraffic
 
@@ -78,8 +78,7 @@ class Rating:
         """
         scenes = list(work.scenes(self.setup))
         settings = self.settings
-        repeated = METHODS[settings.method].repeated
-        repetitions = settings.repetitions if repeated else 1
+        repetitions = settings.populations
         total = len(scenes) * repetitions
         with Bar(total=total, desc="populations", unit="population") as bar:
             first = list(self._all(self._jobs(scenes, [0]), work, bar))

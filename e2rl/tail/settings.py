@@ -28,6 +28,11 @@ class RateSettings:
     together: int = setting(low=1)
 
     @property
+    def populations(self) -> int:
+        """Of each scene, at most."""
+        return self.repetitions if METHODS[self.method].repeated else 1
+
+    @property
     def sampler(self) -> SamplerSettings:
         """Those of one population."""
         names = [field.name for field in fields(SamplerSettings)]
