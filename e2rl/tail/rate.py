@@ -93,7 +93,7 @@ class Rating:
             for begin in range(0, len(scenes), together)
         ]
         return [
-            Job(f"rate-{repetition}-{part[0]:06}", part, repetition)
+            Job(f"{self.setup.ego_name}-{repetition}-{part[0]:06}", part, repetition)
             for repetition in repetitions
             for part in parts
         ]

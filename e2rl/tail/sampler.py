@@ -44,7 +44,7 @@ class Tally:
     """The estimate of one population.
 
     Args:
-        probability: of the target; 0 unless `end` is REACHED.
+        probability: of the target; 0 until rollouts reached it.
         bound: what the probability may be where `end` is another.
         hits: number of failures among independent rollouts; None where they are not.
         contact: probability of a contact.

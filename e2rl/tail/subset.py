@@ -92,9 +92,9 @@ class Subset(Sampler):
         kept = math.floor((1 - self.settings.killed) * self.settings.particles)
         killed = count - kept
         threshold = float(level.sort().values[killed - 1])
+        fraction = float((level >= self.target).double().mean())
+        tally.probability = tally.bound * fraction
         if threshold >= self.target:
-            fraction = float((level >= self.target).double().mean())
-            tally.probability = tally.bound * fraction
             tally.end = REACHED
             return
         survivors = (level > threshold).nonzero()[:, 0]
@@ -106,7 +106,7 @@ class Subset(Sampler):
         tally.bound *= len(survivors) / count
         tally.level = threshold
         if tally.bound < self.settings.least:
-            tally.end = LEAST
+            self._end(LEAST)
             return
         dead = (level <= threshold).nonzero()[:, 0]
         self._keep(torch.cat([survivors, dead]))
@@ -131,8 +131,12 @@ class Subset(Sampler):
         needed = self._left * moving
         if self.tally.rollouts + needed <= self.settings.rollouts:
             return True
-        self.tally.end = SPENT
+        self._end(SPENT)
         return False
+
+    def _end(self, reason: str) -> None:
+        """End before most particles reach the target: some may have."""
+        self.tally.end = REACHED if self.tally.probability > 0 else reason
 
     def _keep(self, order: Tensor) -> None:
         """Go on with the first particles of an order."""

@@ -33,6 +33,7 @@ class SceneRate:
             population.
         at_most: estimate of what populations that ended before the target may add to
             its probability.
+        independent: its rollouts are, and not of populations.
         km: that the ego drives in a rollout.
         rollouts: that were driven.
         end: of the first population.
@@ -46,6 +47,7 @@ class SceneRate:
     probability: dict[str, Tensor]
     bounds: Bounds
     at_most: float
+    independent: bool
     km: float
     rollouts: int
     end: str
@@ -108,6 +110,7 @@ def scene_rate(scene_id: str, parts: Sequence[Estimate], target: str) -> SceneRa
         probability,
         bounds=bounds,
         at_most=float(unresolved.mean()),
+        independent=bool(hits),
         km=sum(part.km for part in parts) / len(parts),
         rollouts=sum(tally.rollouts for tally in tallies),
         end=tallies[0].end,
@@ -137,10 +140,12 @@ def rates_of(scenes: Sequence[SceneRate], steps: int) -> dict[str, dict[str, Bou
     scenes of so many steps.
 
     The interval's end holds what scenes may add in which populations ended before the
-    target.
+    target. Of independent rollouts, n in each, without a failure in some scenes, one
+    scene's bound is that of the sum of their p: (1 - p) (1 - q) <= exp(-(p + q)).
     """
     km = torch.tensor([scene.km for scene in scenes], dtype=torch.float64)
     at_most = torch.tensor([scene.at_most for scene in scenes], dtype=torch.float64)
+    unresolved = at_most.max() if scenes[0].independent else at_most.sum()
     ones = torch.ones_like(km)
     exposures = (ones, ones * steps * DT / HOUR, km / DISTANCE)
     rates: dict[str, dict[str, Bounds]] = {}
@@ -151,8 +156,9 @@ def rates_of(scenes: Sequence[SceneRate], steps: int) -> dict[str, dict[str, Bou
         rates[event] = {}
         for unit, exposure in zip(UNITS, exposures, strict=True):
             bounds = of_ratio(estimates, exposure)
-            unresolved = float(at_most.sum() / exposure.sum())
-            rates[event][unit] = bounds._replace(high=bounds.high + unresolved)
+            high = bounds.high + float(unresolved / exposure.sum())
+            high = min(high, 1.0) if unit == "scene" else high
+            rates[event][unit] = bounds._replace(high=high)
     return rates
 
 

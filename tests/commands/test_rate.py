@@ -59,6 +59,8 @@ def test_two_egos_are_rated_gated_and_reported(rate, tmp_path, monkeypatch, caps
         for scene in entry["scenes"]:
             weight = weights.get((entry["ego"], scene["scene_id"]), 0)
             assert weight == pytest.approx(scene["probability"])
+    parts = {part.name.split("-")[0] for part in (run / "parts").iterdir()}
+    assert parts == {"a", "b"}  # none in another's place, so that the run can go on
     page = (run / "failures.html").read_text()
     assert "contacts per 1,000 km" in page
     for command in (

@@ -60,6 +60,16 @@ def test_it_spends_no_more_rollouts_than_asked_for():
     assert result.rollouts <= 300
 
 
+def test_failures_among_the_first_rollouts_are_an_estimate_where_the_budget_ends():
+    settings = replace(SETTINGS, first=512, rollouts=512)
+    threshold = quantile(0.01)
+    result = tally(linear, threshold, numbers=40, seed=0, settings=settings)
+    assert result.end == REACHED
+    assert result.rollouts == 512
+    assert 0 < result.probability < 0.03
+    assert (result.probability * 512) % 1 == 0
+
+
 def test_it_stops_below_the_least_probability():
     settings = SamplerSettings(
         first=64, particles=64, killed=0.5, moves=1, rollouts=100_000, least=0.1

@@ -86,6 +86,14 @@ def test_independent_rollouts_have_the_interval_of_their_counts():
     assert scene.bounds == of_counts(2, 100)
 
 
+def test_scenes_without_a_hit_share_the_bound_of_independent_rollouts():
+    """None of 100 rollouts hits in two scenes: p + q <= 3%, of both together."""
+    tally = Tally(0.0, bound=0.03, hits=0, rollouts=100, end=SPENT)
+    parts = [Estimate(scene, 0, tally, 0.1, 0, 0, Scored()) for scene in range(2)]
+    scenes = scene_rates(parts, SCENES, "contact")
+    assert rates_of(scenes, STEPS)["contact"]["scene"].high == pytest.approx(0.015)
+
+
 def test_weights_of_failures_sum_to_the_probability(rates):
     assert sum(row["weight"] for row in rates[0].failures.rows) == pytest.approx(0.02)
 
