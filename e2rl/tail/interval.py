@@ -28,8 +28,7 @@ def of_logs(logs: Tensor) -> Bounds:
 
     It is around mean + s^2 / 2 of the logarithms, whose variance s^2 / R + s^4 / (2 (R
     - 1)) is that of a t law. It has R - 2 degrees of freedom, as populations' estimates
-    have longer tails: with R - 1 the intervals hold 88% of closed forms at 1e-6, with R
-    - 2 93% (tools/tail_coverage.py).
+    have longer tails (tools/tail_coverage.py).
     """
     count = len(logs)
     variance = float(logs.var().clamp(min=LEAST_VARIANCE))
