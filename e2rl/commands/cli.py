@@ -51,6 +51,10 @@ COMMANDS = {  # module, and what the command does
         "e2rl.commands.gate",
         "whether a run keeps within limits, for continuous integration",
     ),
+    "power": (
+        "e2rl.commands.power",
+        "how many scenes it takes to see that failures became rarer",
+    ),
     "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
 }
 EXAMPLES = """examples:
