@@ -90,8 +90,7 @@ class Subset(Sampler):
             tally.contact = tally.bound * float((level >= CONTACT).double().mean())
             tally.counted = tally.bound * float(self.particles.counted.double().mean())
         kept = math.floor((1 - self.settings.killed) * self.settings.particles)
-        killed = count - kept
-        threshold = float(level.sort().values[killed - 1])
+        threshold = float(level.sort().values[count - max(kept, 1) - 1])
         fraction = float((level >= self.target).double().mean())
         tally.probability = tally.bound * fraction
         if threshold >= self.target:

@@ -51,6 +51,12 @@ def test_equal_levels_are_an_extinction_and_no_estimate():
     assert result.bound == 1
 
 
+def test_one_particle_survives_a_stage_that_kills_most():
+    settings = replace(SETTINGS, first=8, particles=8, killed=0.95)
+    result = tally(linear, quantile(0.01), numbers=40, seed=0, settings=settings)
+    assert result.end == REACHED
+
+
 def test_it_spends_no_more_rollouts_than_asked_for():
     settings = SamplerSettings(
         first=64, particles=64, killed=0.5, moves=2, rollouts=300, least=1e-12
