@@ -125,7 +125,7 @@ class Moves:
         """Of the step size of each vehicle [V] in moves of all: 1 for those that change
         the level most, or whose effect is not learned, near 0 for those that do not."""
         mean = self.of_vehicles.mean
-        power = mean / mean.amax().clamp(min=LEAST)
+        power = mean / mean.amax()
         return power.masked_fill(self.vehicle_effect == 0, 1.0)
 
     def _drawn(self, weight: Tensor, count: int) -> Tensor:

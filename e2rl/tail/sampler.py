@@ -35,7 +35,8 @@ class SamplerSettings:
     def __post_init__(self) -> None:
         if self.first < self.particles:
             raise InputError(
-                f"rate.first={self.first}: fewer than rate.particles={self.particles}"
+                f"rate.first={self.first}: fewer than rate.particles={self.particles}; "
+                "raise the first or lower the other"
             )
 
 

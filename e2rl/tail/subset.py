@@ -107,11 +107,12 @@ class Subset(Sampler):
         if tally.bound < self.settings.least:
             self._end(LEAST)
             return
-        dead = (level <= threshold).nonzero()[:, 0]
-        self._keep(torch.cat([survivors, dead]))
-        self._moving = torch.arange(len(survivors), len(self.normals))
+        self._moving = torch.arange(len(survivors), self.settings.particles)
         if self._affords(len(self._moving)):
-            self._copy(len(survivors))
+            copies = torch.randint(
+                len(survivors), self._moving.shape, generator=self.moves.generator
+            )
+            self._keep(torch.cat([survivors, survivors[copies]]))
 
     def _retry(self) -> None:
         """Move all particles, which are at one level, once more; they may be copies
@@ -120,8 +121,8 @@ class Subset(Sampler):
             self.tally.end = EXTINCT
             return
         self._retries -= 1
-        self._keep(torch.arange(len(self.normals)))  # which are alike
-        self._moving = torch.arange(len(self.normals))
+        self._moving = torch.arange(self.settings.particles)
+        self._keep(self._moving)  # all are at one level
         self._affords(len(self._moving))
 
     def _affords(self, moving: int) -> bool:
@@ -137,20 +138,11 @@ class Subset(Sampler):
         """End before most particles reach the target: some may have."""
         self.tally.end = REACHED if self.tally.probability > 0 else reason
 
-    def _keep(self, order: Tensor) -> None:
-        """Go on with the first particles of an order."""
-        rows = order[: self.settings.particles]
+    def _keep(self, rows: Tensor) -> None:
+        """Go on with particles `rows` [N], of which some may be copies."""
         self.normals = self.normals[rows]
         self.particles = Driven(
             self.particles.level[rows],
             self.particles.counted[rows],
             [self.particles.result[row] for row in rows.tolist()],
         )
-
-    def _copy(self, survivors: int) -> None:
-        """Replace the particles to be moved by copies of survivors, which come first."""
-        parents = torch.randint(
-            survivors, (len(self._moving),), generator=self.moves.generator
-        )
-        order = torch.cat([torch.arange(survivors), parents])
-        self._keep(order)

@@ -140,12 +140,15 @@ def rates_of(scenes: Sequence[SceneRate], steps: int) -> dict[str, dict[str, Bou
     scenes of so many steps.
 
     The interval's end holds what scenes may add in which populations ended before the
-    target. Of independent rollouts, n in each, without a failure in some scenes, one
-    scene's bound is that of the sum of their p: (1 - p) (1 - q) <= exp(-(p + q)).
+    target. Of independent rollouts, n in each, scenes without a failure share one bound b:
+    that n fail in none has a chance of (1 - p)^n (1 - q)^n <= exp(-n (p + q)), which is
+    (1 - b)^n where p + q is -log(1 - b).
     """
     km = torch.tensor([scene.km for scene in scenes], dtype=torch.float64)
     at_most = torch.tensor([scene.at_most for scene in scenes], dtype=torch.float64)
-    unresolved = at_most.max() if scenes[0].independent else at_most.sum()
+    unresolved = at_most.sum()
+    if scenes[0].independent:
+        unresolved = -(-at_most.max()).log1p()
     ones = torch.ones_like(km)
     exposures = (ones, ones * steps * DT / HOUR, km / DISTANCE)
     rates: dict[str, dict[str, Bounds]] = {}

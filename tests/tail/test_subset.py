@@ -15,7 +15,6 @@ SETTINGS = SamplerSettings(
     first=64, particles=64, killed=0.5, moves=4, rollouts=100_000, least=1e-12
 )
 P = 1e-3
-GENERATOR = torch.Generator().manual_seed(0)
 
 
 @pytest.mark.parametrize("form", ["linear", "union of two", "rotated corner"])
@@ -119,15 +118,20 @@ def test_copies_whose_moves_were_refused_are_moved_again():
     assert subset.tally.bound == 0.5
 
 
-def test_many_first_rollouts_are_one_stage_of_a_smaller_fraction():
-    """The best of 512 go on: 32 of them in the second stage, without a loss."""
-    settings = replace(SETTINGS, first=512)
-    subset = Subset(
+def population_of_512():
+    """A population of 64 particles that begins with 512 rollouts."""
+    generator = torch.Generator().manual_seed(0)
+    return Subset(
         target=quantile(P),
-        settings=settings,
-        moves=Moves(torch.ones(4), torch.zeros(10, dtype=torch.int64), GENERATOR),
+        settings=replace(SETTINGS, first=512),
+        moves=Moves(torch.ones(4), torch.zeros(10, dtype=torch.int64), generator),
         shape=(4, 10),
     )
+
+
+def test_many_first_rollouts_are_one_stage_of_a_smaller_fraction():
+    """The best of 512 go on: 32 of them in the second stage, without a loss."""
+    subset = population_of_512()
     level = linear(subset.ask())
     subset.tell(Driven(level, level > 9, list(range(512))))
     assert subset.tally.bound == 32 / 512
@@ -138,13 +142,7 @@ def test_many_first_rollouts_are_one_stage_of_a_smaller_fraction():
 
 
 def test_a_second_stage_of_equal_first_rollouts_is_of_as_many_as_asked_for():
-    settings = replace(SETTINGS, first=512)
-    subset = Subset(
-        target=quantile(P),
-        settings=settings,
-        moves=Moves(torch.ones(4), torch.zeros(10, dtype=torch.int64), GENERATOR),
-        shape=(4, 10),
-    )
+    subset = population_of_512()
     level = torch.zeros(len(subset.ask()), dtype=torch.float64)
     subset.tell(Driven(level, level > 9, list(range(512))))
     assert subset.tally.bound == 1

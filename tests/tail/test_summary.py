@@ -87,11 +87,13 @@ def test_independent_rollouts_have_the_interval_of_their_counts():
 
 
 def test_scenes_without_a_hit_share_the_bound_of_independent_rollouts():
-    """None of 100 rollouts hits in two scenes: p + q <= 3%, of both together."""
-    tally = Tally(0.0, bound=0.03, hits=0, rollouts=100, end=SPENT)
+    """None of 100 rollouts hits in two scenes: exp(-100 (p + q)) >= 5%."""
+    bound = 1 - 0.05 ** (1 / 100)
+    tally = Tally(0.0, bound=bound, hits=0, rollouts=100, end=SPENT)
     parts = [Estimate(scene, 0, tally, 0.1, 0, 0, Scored()) for scene in range(2)]
     scenes = scene_rates(parts, SCENES, "contact")
-    assert rates_of(scenes, STEPS)["contact"]["scene"].high == pytest.approx(0.015)
+    high = rates_of(scenes, STEPS)["contact"]["scene"].high
+    assert high == pytest.approx(-math.log(0.05) / 100 / 2)
 
 
 def test_weights_of_failures_sum_to_the_probability(rates):
