@@ -122,7 +122,7 @@ class Subset(Sampler):
             return
         self._retries -= 1
         self._moving = torch.arange(self.settings.particles)
-        self._keep(self._moving)  # all are at one level
+        self._keep(self._moving)  # of the first rollouts, any of them
         self._affords(len(self._moving))
 
     def _affords(self, moving: int) -> bool:
