@@ -8,12 +8,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from e2rl.planners.ego import PLAN_STEPS, RETURN_LENGTH
-from e2rl.planners.path import LEAST_STRETCH, RoutePath, between_entries, fading
+from e2rl.planners.path import LEAST_STRETCH, RoutePath, fading
 from e2rl.planners.profiles import NODES, PLAN_DT, capped, upsample
+from e2rl.run.fused import fused, running_sum
 from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate
 from e2rl.sim import dynamics
-from e2rl.sim.dynamics import midpoints, wrap
+from e2rl.sim.dynamics import wrap
 
 FIRST = round(1.0 / PLAN_DT)  # nodes of the first acceleration of a profile: 1 s
 MAX_YAW_RATE = 1.6  # rad/s, the simulator's bound
@@ -77,51 +78,84 @@ def drive(
     Args:
         start: states [B, 4].
         path: of these states.
-        speed: [B, L, PLAN_STEPS + 1] m/s, the profiles.
+        speed: [B, L, PLAN_STEPS + 1] m/s, the profiles, of speeds that vehicles have.
         shift: [B, L, S] m, or what broadcasts to it.
         time: [B, L, S] s, or what broadcasts to it.
     """
-    profiles = speed.shape[:2]
-    shift = shift.expand((*profiles, shift.shape[-1]))
-    time = time.expand((*profiles, time.shape[-1]))
-    speed = speed[:, :, None]
-    mean = midpoints(speed)
-    accel = speed.diff(dim=-1) / DT
-    driven = pad((mean * DT).cumsum(-1), (1, 0))
-    target = shift[..., None]
-    turned = path.turned[:, None, None]
-    offset, slope = fading(
-        path.d[:, None, None, None] - target,
-        turned[..., None],
-        length=(time * start[:, 3, None, None]).clamp(min=RETURN_LENGTH)[..., None],
-        ahead=driven,
+    batch, profiles, ticks = speed.shape
+    moves = shift.shape[-1]
+    shape = (batch, profiles, moves)
+    count = profiles * moves
+    scene = torch.arange(batch, device=start.device).repeat_interleave(count)
+    states, distance = driven(
+        speed.permute(2, 0, 1)[..., None].expand(ticks, *shape).reshape(ticks, -1),
+        shift.expand(shape).reshape(-1),
+        time.expand(shape).reshape(-1),
+        scene,
+        start,
+        path.d,
+        path.turned,
+        heading_table(path),
     )
-    headings = heading_table(path)
-    low, high, _ = between_entries(headings, driven / CELL)
-    inner = (1 - (high - low) / CELL * (target + offset)).clamp(min=LEAST_STRETCH)
+    return Candidates(
+        states.unflatten(-1, (batch, count)).permute(2, 3, 1, 0),
+        distance.view(batch, count),
+        shift=shift.expand(shape).flatten(1),
+    )
+
+
+@fused(f"{PLAN_STEPS + 1} N", "N", "N", "N:int64", "B 4", "B", "B", f"B {REACH}")
+def driven(
+    speed: Tensor,
+    shift: Tensor,
+    time: Tensor,
+    scene: Tensor,
+    start: Tensor,
+    d: Tensor,
+    turned: Tensor,
+    headings: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Returns the states [4, PLAN_STEPS, N] of `drive`, and the distance [N] m along
+    the mission to their end.
+
+    Args:
+        speed: [PLAN_STEPS + 1, N] m/s.
+        shift: [N] m.
+        time: [N] s.
+        scene: [N], of B.
+        start: states [B, 4].
+        d: m beside the mission at the start.
+        turned: rad off it.
+        headings: [B, REACH] rad, of `heading_table`.
+    """
+    mean = (speed[1:] + speed[:-1]) / 2
+    steps = mean * DT
+    ahead = torch.cat([torch.zeros_like(steps[:1]), running_sum(steps)])
+    start = start[scene]
+    offset, slope = fading(
+        d[scene] - shift,
+        turned[scene],
+        length=(time * start[:, 3]).clamp(min=RETURN_LENGTH),
+        ahead=ahead,
+    )
+    low, high, _ = between(headings, ahead / CELL, scene)
+    inner = (1 - (high - low) / CELL * (shift + offset)).clamp(min=LEAST_STRETCH)
     stretch = torch.hypot(inner, slope)
-    doubled = driven.diff(dim=-1) * 2
-    along = (doubled / (stretch[..., 1:] + stretch[..., :-1])).cumsum(-1)
-    heading = torch.lerp(*between_entries(headings, along / CELL))
-    aim = heading + torch.atan(slope[..., 1:] / inner[..., 1:])
+    along = running_sum(2 * steps / (stretch[1:] + stretch[:-1]))
+    heading = torch.lerp(*between(headings, along / CELL, scene))
+    accel = (speed[1:] - speed[:-1]) / DT
     grip = (dynamics.MAX_LATERAL**2 - accel.square()).clamp(min=0).sqrt()
     bound = torch.minimum(grip / mean.clamp(min=1e-3), dynamics.yaw_rate_bound(mean))
-    bound = bound.clamp(max=MAX_YAW_RATE)
-    yaw_rate = (
-        steer(
-            turned.expand_as(shift),
-            aim,
-            bound=bound * DT,
-        )
-        / DT
+    turn = steer(
+        turned[scene],
+        heading + torch.atan(slope[1:] / inner[1:]),
+        bound=bound.clamp(max=MAX_YAW_RATE) * DT,
     )
-    actions = torch.stack([accel.expand_as(yaw_rate), yaw_rate], -1).flatten(1, 2)
-    states = dynamics.rollout(start[:, None].expand(-1, actions.shape[1], 4), actions)
-    return Candidates(
-        states,
-        along[..., -1].flatten(1),
-        shift=shift.flatten(1),
-    )
+    heading = start[:, 2] + running_sum(turn)
+    middle = heading - turn / 2
+    x = start[:, 0] + running_sum(steps * middle.cos())
+    y = start[:, 1] + running_sum(steps * middle.sin())
+    return torch.stack([x, y, wrap(heading), speed[1:]]), along[-1]
 
 
 def steer(
@@ -129,18 +163,28 @@ def steer(
     aim: Tensor,
     bound: Tensor,
 ) -> Tensor:
-    """Turns [..., T] rad of each step from heading [...] to aim [..., T] rad, within
-    bound [..., T], which broadcasts. What a bound withholds is made up later."""
+    """Turns [T, ...] rad of each step from heading [...] to aim [T, ...] rad, within
+    bound [T, ...], which broadcasts. What a bound withholds is made up later."""
     turns = []
-    for target, most in zip(
-        aim.unbind(-1),
-        bound.unbind(-1),
-        strict=True,
-    ):
+    for target, most in zip(aim, bound, strict=True):
         turn = torch.clamp(target - heading, -most, most)
         heading = heading + turn
         turns.append(turn)
-    return torch.stack(turns, -1)
+    return torch.stack(turns)
+
+
+def between(
+    table: Tensor,
+    place: Tensor,
+    scene: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`between_entries` of rows scene [N] of a table [B, K] at places [..., N]."""
+    entries = table.shape[-1]
+    place = place.clamp(0, entries - 1.001)
+    index = place.long()
+    flat = table.flatten()
+    first = scene * entries + index
+    return flat[first], flat[first + 1], place - index
 
 
 def heading_table(path: RoutePath) -> Tensor:

@@ -2,14 +2,17 @@
 border, progress, comfort."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from e2rl.planners.candidates import Candidates
+from e2rl.planners.ego import PLAN_STEPS
 from e2rl.run.config import setting
-from e2rl.scenes.drivable_area import off_road
+from e2rl.run.fused import fused
+from e2rl.scenes.drivable_area import off_road_at
 from e2rl.scenes.recording import DT
 from e2rl.sim.dynamics import MAX_CURVATURE, constant_velocity, midpoints, wrap
 from e2rl.sim.world import World
@@ -43,9 +46,14 @@ class Weights:
     comfort: float = setting(low=0)
     lateral_offset: float = setting(low=0)
 
+    def prices(self, like: Tensor) -> "Prices":
+        """The Prices, of a tensor's type, where it lies."""
+        return Prices(
+            *[like.new_tensor(getattr(self, name)) for name in Prices._fields]
+        )
 
-@dataclass
-class Forecast:
+
+class Forecast(NamedTuple):
     """M agents of each of B scenes: states [B, M, T, 4], size [B, M, 2], present [B,
     M]: the row holds an agent."""
 
@@ -54,16 +62,27 @@ class Forecast:
     present: Tensor
 
 
-@dataclass
-class Pairs:
-    """Q pairs of a candidate and an agent at a moment: states [Q, 4] and sizes [Q, 2],
-    and the margin [Q] m below which their gap costs."""
+class Pairs(NamedTuple):
+    """Pairs of a candidate and an agent at a moment: states [..., 4] and sizes [...,
+    2], and the margin [...] m below which their gap costs; they broadcast."""
 
     ego: Tensor
     ego_size: Tensor
     other: Tensor
     other_size: Tensor
     margin: Tensor
+
+
+class Prices(NamedTuple):
+    """Those of `Weights` that pairs depend on, scalars."""
+
+    margin: Tensor
+    margin_growth: Tensor
+    headway: Tensor
+    rear: Tensor
+    fade: Tensor
+    contact: Tensor
+    near: Tensor
 
 
 def nearest(world: World, count: int) -> tuple[Tensor, Tensor]:
@@ -145,32 +164,32 @@ def score(
         steps: [T], of the candidates, that are scored; 1 is the next.
         weights: what costs how much.
     """
-    states = candidates.states[:, :, steps - 1]
-    cost = contact_cost(
-        states,
-        world,
-        others,
-        times=steps * DT,
-        weights=weights,
-    )
+    driven = candidates.states.permute(3, 2, 0, 1)
+    scored = driven[:, steps - 1]
+    size = world.scene["size"][:, 0]
+    times = steps * DT
+    prices = weights.prices(size)
+    cost = contact_cost(scored, size, others, times, prices)
     beyond = beyond_border(
-        states[:, :, ::ROAD_STRIDE],
-        world,
-        border=weights.border,
+        scored[:2, ::ROAD_STRIDE],
+        world.states[:, 0, :2],
+        world.scene["field"],
+        world.scene["field_origin"],
+        size.new_tensor(weights.border),
     )
     cost = cost + weights.off_road * beyond
-    cost = cost + weights.comfort * discomfort(candidates.states, world)
+    now = torch.stack([world.states[:, 0, 3], world.accel[:, 0]])
+    cost = cost + weights.comfort * discomfort(driven, now)
     cost = cost + weights.lateral_offset * candidates.shift.abs()
     return cost - weights.progress * candidates.distance
 
 
 def contact_cost(
     ego: Tensor,
-    world: World,
+    ego_size: Tensor,
     others: Forecast,
-    *,
     times: Tensor,
-    weights: Weights,
+    prices: Prices,
 ) -> Tensor:
     """Returns costs [B, C] of candidates near others: the worst moment with each agent,
     summed over agents.
@@ -180,61 +199,78 @@ def contact_cost(
     are near enough to cost something are compared as boxes.
 
     Args:
-        ego: states [B, C, T, 4] of the candidates.
-        world: B scenes.
-        others: M agents of each.
+        ego: states [4, T, B, C] of the candidates.
+        ego_size: [B, 2] m.
+        others: M agents of each scene.
         times: [T] s.
-        weights: what costs how much.
+        prices: what costs how much.
     """
-    batch, count, steps, _ = ego.shape
+    _, steps, batch, count = ego.shape
     agents = others.present.shape[1]
-    ego_size = world.scene["size"][:, 0]
     moving = (others.states[..., 3] / MOVING).clamp(max=1)
-    margin = weights.margin + weights.margin_growth * times * moving  # [B, M, T]
+    margin = prices.margin + prices.margin_growth * times * moving  # [B, M, T]
     radii = (ego_size.norm(dim=-1)[:, None] + others.size.norm(dim=-1)) / 2
-    room = (radii[..., None] + margin + BESIDE)[:, None]
-    room = room + weights.headway * ego[:, :, None, :, 3]
-    dx = ego[:, :, None, :, 0] - others.states[:, None, :, :, 0]
-    dy = ego[:, :, None, :, 1] - others.states[:, None, :, :, 1]
-    near = (dx * dx + dy * dy < room * room) & others.present[:, None, :, None]
-    flat = near.view(-1).nonzero()[:, 0]
-    scene, candidate, agent, time = torch.unravel_index(flat, near.shape)
-    candidate = scene * count + candidate
-    agent_row = scene * agents + agent
-    moment = agent_row * steps + time
+    room = (radii[..., None] + margin + BESIDE).where(others.present[..., None], -1e6)
+    near = near_pairs(ego, others.states, room, prices.headway)
+    flat = near.flatten().nonzero()[:, 0]
+    moment = flat // count  # of B M T
+    agent = moment // steps
+    time = moment - agent * steps
+    scene = agent // agents
+    candidate = scene * count + flat - moment * count
     pairs = Pairs(
-        ego=ego.reshape(-1, 4)[candidate * steps + time],
+        ego=ego.flatten(1)[:, time * (batch * count) + candidate].mT,
         ego_size=ego_size[scene],
-        other=others.states.view(-1, 4)[moment],
-        other_size=others.size.view(-1, 2)[agent_row],
-        margin=margin.view(-1)[moment],
+        other=others.states.flatten(0, 2)[moment],
+        other_size=others.size.flatten(0, 1)[agent],
+        margin=margin.flatten()[moment],
     )
-    cost, ends = pair_cost(pairs, weights)
+    cost, ends = pair_cost(pairs, prices)
     end = torch.full((batch * count,), steps, device=ego.device)
     end.scatter_reduce_(0, candidate[ends], time[ends], "amin")
-    faded = cost * torch.exp(-weights.fade * times)[time]
+    faded = cost * torch.exp(-prices.fade * times)[time]
     cost = faded * (time <= end[candidate])
     worst = ego.new_zeros(batch * count * agents)
-    worst.scatter_reduce_(0, candidate * agents + agent, cost, "amax")
+    number = agent - scene * agents
+    worst.scatter_reduce_(0, candidate * agents + number, cost, "amax")
     return worst.view(batch, count, agents).sum(-1)
 
 
-def pair_cost(pairs: Pairs, weights: Weights) -> tuple[Tensor, Tensor]:
-    """Costs [Q] of pairs; and bool [Q]: they touch, and not from behind.
+@fused("4 T B C", "B M T 4", "B M T", "")
+def near_pairs(ego: Tensor, other: Tensor, room: Tensor, headway: Tensor) -> Tensor:
+    """Returns where [B, M, T, C] a candidate and an agent are near enough to cost
+    something.
+
+    Args:
+        ego: states [4, T, B, C] of the candidates.
+        other: states [B, M, T, 4] of the agents.
+        room: [B, M, T] m between the centres, of a standing ego.
+        headway: s by which its speed adds to it.
+    """
+    x, y, _, speed = ego.transpose(1, 2)[:, :, None]  # [B, 1, T, C] each
+    dx = x - other[..., 0, None]
+    dy = y - other[..., 1, None]
+    reach = room[..., None] + headway * speed
+    return (dx * dx + dy * dy < reach * reach) & (reach > 0)
+
+
+@fused(("Q 4", "Q 2", "Q 4", "Q 2", "Q"), "")
+def pair_cost(pairs: Pairs, prices: Prices) -> tuple[Tensor, Tensor]:
+    """Costs [...] of pairs; and bool [...]: they touch, and not from behind.
 
     Contact costs more at a higher relative velocity, and half where the ego stands.
     Without contact, what counts is the fraction of the margin or of `headway` s that is
     missing, the latter before the ego's own speed closes the gap to whom it has ahead.
     An agent behind the ego counts `rear`: its driver is to keep the distance.
     """
-    ego = pairs.ego
-    other = pairs.other
-    dx = other[:, 0] - ego[:, 0]
-    dy = other[:, 1] - ego[:, 1]
-    cos_a = ego[:, 2].cos()
-    sin_a = ego[:, 2].sin()
-    cos_b = other[:, 2].cos()
-    sin_b = other[:, 2].sin()
+    x, y, heading, speed = pairs.ego.unbind(-1)
+    other_x, other_y, other_heading, other_speed = pairs.other.unbind(-1)
+    dx = other_x - x
+    dy = other_y - y
+    cos_a = heading.cos()
+    sin_a = heading.sin()
+    cos_b = other_heading.cos()
+    sin_b = other_heading.sin()
     cos = cos_a * cos_b + sin_a * sin_b
     sin = sin_a * cos_b - cos_a * sin_b
     length_a, width_a = (pairs.ego_size / 2).unbind(-1)
@@ -250,49 +286,56 @@ def pair_cost(pairs: Pairs, weights: Weights) -> tuple[Tensor, Tensor]:
         side_of_other - (width_b + sin.abs() * length_a + cos.abs() * width_a),
     )
     gap = torch.maximum(torch.maximum(along, beside), from_other)
-    closing = ego[:, 3] - other[:, 3] * cos
-    severity = 1 + (closing.square() + (other[:, 3] * sin).square()) / IMPACT**2
-    severity = severity * (1 + (ego[:, 3] / SLOW).clamp(max=1)) / 2
+    closing = speed - other_speed * cos
+    severity = 1 + (closing.square() + (other_speed * sin).square()) / IMPACT**2
+    severity = severity * (1 + (speed / SLOW).clamp(max=1)) / 2
     hit = gap < TOUCH
     tight = (1 - gap / pairs.margin).clamp(0, 1).square()
-    approach = torch.minimum(closing, ego[:, 3]).clamp(min=0)
-    soon = (1 - along / (weights.headway * approach).clamp(min=1e-3)).clamp(0, 1)
+    approach = torch.minimum(closing, speed).clamp(min=0)
+    soon = (1 - along / (prices.headway * approach).clamp(min=1e-3)).clamp(0, 1)
     in_line = beside < BESIDE
     behind = in_line & (ahead < 0)
     nearness = torch.maximum(tight, soon * (in_line & (ahead > 0)))
-    cost = weights.contact * hit * severity + weights.near * nearness
-    return cost * torch.where(behind, weights.rear, 1.0), hit & ~behind
+    cost = prices.contact * hit * severity + prices.near * nearness
+    return cost * torch.where(behind, prices.rear, 1.0), hit & ~behind
 
 
+@fused("2 T B C", "B 2", "B G G:float16", "B 2", "")
 def beyond_border(
-    states: Tensor,
-    world: World,
-    border: float,
+    places: Tensor,
+    present: Tensor,
+    field: Tensor,
+    origin: Tensor,
+    border: Tensor,
 ) -> Tensor:
-    """Metres [B, C], summed over T, by which centres [B, C, T, 4] come nearer to the
-    drivable border than `border`, or leave it; only what exceeds the ego's present
-    place counts."""
-    field = world.scene["field"]
-    origin = world.scene["field_origin"]
-    present = off_road(
-        world.states[:, :1, :2],
-        field,
-        origin=origin,
-    ).clamp(min=-border)
-    distance = off_road(
-        states[..., :2],
-        field,
-        origin=origin,
-    )
-    return (distance - present[..., None]).clamp(0, FARTHEST).sum(-1)
+    """Metres [B, C], summed over T, by which centres come nearer to the drivable border
+    than `border`, or leave it; only what exceeds the ego's present place counts.
+
+    Args:
+        places: [2, T, B, C] m, of the candidates.
+        present: [B, 2] m, of the ego.
+        field, origin: see `off_road`.
+        border: m.
+    """
+    x, y = places.transpose(1, 2).flatten(2)
+    beyond = off_road_at(x, y, field, origin).unflatten(1, (-1, places.shape[-1]))
+    here = off_road_at(present[:, :1], present[:, 1:], field, origin)
+    allowed = torch.maximum(here, -border)[..., None]
+    return (beyond - allowed).clamp(0, FARTHEST).sum(1)
 
 
-def discomfort(states: Tensor, world: World) -> Tensor:
-    """Mean |acceleration| [B, C] m/s^2 of candidates [B, C, T, 4], along and across,
-    and JERK_TIME s of jerk now."""
-    speed = states[..., 3]
-    turn = wrap(states[..., 2].diff(dim=-1)) / DT
-    first = (speed[..., 0] - world.states[:, :1, 3]) / DT - world.accel[:, :1]
-    along = speed.diff(dim=-1).abs().mean(-1) / DT
-    across = (turn * speed[..., 1:]).abs().mean(-1)
+@fused(f"4 {PLAN_STEPS} B C", "2 B")
+def discomfort(states: Tensor, now: Tensor) -> Tensor:
+    """Mean |acceleration| [B, C] m/s^2 of candidates, along and across, and JERK_TIME s
+    of jerk now.
+
+    Args:
+        states: [4, PLAN_STEPS, B, C].
+        now: [2, B], the ego's speed and acceleration.
+    """
+    heading, speed = states[2:]
+    turn = wrap(heading[1:] - heading[:-1]) / DT
+    first = (speed[0] - now[0, :, None]) / DT - now[1, :, None]
+    along = (speed[1:] - speed[:-1]).abs().mean(0) / DT
+    across = (turn * speed[1:]).abs().mean(0)
     return along + across + JERK_TIME * first.abs()

@@ -334,6 +334,19 @@ def some(truths: Tensor) -> Tensor:
     return truths.any(1)
 
 
+def running_sum(values: Tensor) -> Tensor:
+    """Returns `values.cumsum(0)`, in what is compiled by one addition after the other:
+    its compiler would call a function for it."""
+    if not torch.compiler.is_compiling():
+        return values.cumsum(0)
+    total = values[0]
+    sums = [total]
+    for value in values[1:]:
+        total = total + value
+        sums.append(total)
+    return torch.stack(sums)
+
+
 def has_compiler() -> bool:
     """Returns whether there is a C++ compiler."""
     names = filter(None, (os.environ.get("CXX"), *COMPILERS))

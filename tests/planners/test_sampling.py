@@ -219,8 +219,8 @@ def test_forecasts_of_constant_acceleration_and_turn():
 def test_pair_costs_order_situations():
     """Contact costs more than nearness, faster contact more than slower, behind less
     than ahead, far nothing."""
-    weights = SamplingEgo()
     size = torch.tensor([[4.5, 2.0]])
+    prices = SamplingEgo().prices(size)
 
     def cost(
         x,
@@ -237,7 +237,7 @@ def test_pair_costs_order_situations():
             other_size=size,
             margin=torch.tensor([1.0]),
         )
-        return pair_cost(pairs, weights)[0].item()
+        return pair_cost(pairs, prices)[0].item()
 
     assert cost(4.0, 0.0, 0.0) > cost(4.0, 0.0, 8.0) > cost(5.0, 0.0, 8.0) > 0
     assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0
@@ -261,7 +261,7 @@ def cost_of(
         other_size=size,
         margin=torch.tensor([1.0]),
     )
-    return pair_cost(pairs, SamplingEgo())[0].item()
+    return pair_cost(pairs, SamplingEgo().prices(size))[0].item()
 
 
 @pytest.mark.parametrize(
@@ -286,11 +286,9 @@ def test_who_has_30_centimetres_beside_the_ego_is_not_ahead(gap, expected):
 
 
 def test_a_first_change_of_acceleration_costs_a_tenth_of_a_second_of_it():
-    _, world = world_of(num_vehicles=1)
-    world.accel[:, 0] = -2.0
-    x = torch.arange(1, PLAN_STEPS + 1.0)
-    states = torch.stack([x, 0 * x, 0 * x, 0 * x + 10.0], -1)[None, None]
-    assert discomfort(states, world).item() == pytest.approx(0.2)
+    x = torch.arange(1, PLAN_STEPS + 1.0)[:, None, None]
+    states = torch.stack([x, 0 * x, 0 * x, 0 * x + 10.0])
+    assert discomfort(states, torch.tensor([[10.0], [-2.0]])).item() == pytest.approx(0.2)
 
 
 def test_the_ranked_begin_with_the_plan_and_are_driven_differently():
