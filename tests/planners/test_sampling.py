@@ -288,7 +288,9 @@ def test_who_has_30_centimetres_beside_the_ego_is_not_ahead(gap, expected):
 def test_a_first_change_of_acceleration_costs_a_tenth_of_a_second_of_it():
     x = torch.arange(1, PLAN_STEPS + 1.0)[:, None, None]
     states = torch.stack([x, 0 * x, 0 * x, 0 * x + 10.0])
-    assert discomfort(states, torch.tensor([[10.0], [-2.0]])).item() == pytest.approx(0.2)
+    assert discomfort(states, torch.tensor([[10.0], [-2.0]])).item() == pytest.approx(
+        0.2
+    )
 
 
 def test_the_ranked_begin_with_the_plan_and_are_driven_differently():
