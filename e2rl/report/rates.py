@@ -20,7 +20,7 @@ from e2rl.run.files import csv_text, misfit, write_atomically
 from e2rl.tail.interval import LEVEL, Bounds, Side, ratio_of_ratios
 from e2rl.tail.population import ALONE
 from e2rl.tail.sampler import EXTINCT, LEAST, REACHED, SPENT
-from e2rl.tail.summary import UNITS, SceneRate, as_json, rates_of
+from e2rl.tail.summary import UNITS, SceneRate, as_json, rates_of, unresolved_in
 
 RATES_FILE = "rates.json"
 TAIL_FILE = "tail.csv"
@@ -56,6 +56,7 @@ ENTRY = {
     "ego": str,
     "target": str,
     "least": NUMBER,
+    "unresolved": NUMBER,
     "rates": {...: {...: BOUNDS}},
     "scenes": [SCENE],
 }
@@ -69,6 +70,7 @@ class EgoRates:
         ego: its name.
         target: of the populations.
         least: probability below which it was not looked for.
+        unresolved: `summary.unresolved_in` its scenes.
         rates: bounds of each unit of each event.
         scenes: as `summary.as_json` has them, the likeliest failure first.
     """
@@ -76,6 +78,7 @@ class EgoRates:
     ego: str
     target: str
     least: float
+    unresolved: float
     rates: Mapping[str, Mapping[str, Bounds]]
     scenes: Sequence[Mapping[str, Any]]
 
@@ -99,8 +102,14 @@ class EgoRates:
             steps: of a scene.
         """
         rows = [nans(as_json(scene)) for scene in scenes]
-        rates = rates_of(scenes, steps)
-        return cls(ego, target, least=least, rates=rates, scenes=rows)
+        return cls(
+            ego,
+            target,
+            least=least,
+            unresolved=unresolved_in(scenes),
+            rates=rates_of(scenes, steps),
+            scenes=rows,
+        )
 
     @classmethod
     def read(cls, run: Path) -> "list[EgoRates]":
@@ -112,6 +121,7 @@ class EgoRates:
                 entry["ego"],
                 entry["target"],
                 least=entry["least"],
+                unresolved=entry["unresolved"],
                 rates={
                     event: {
                         unit: Bounds(**nans(bounds)) for unit, bounds in units.items()
@@ -135,9 +145,10 @@ class EgoRates:
         rows = [by_id[name] for name in scenes]
         if any(event not in row["repetitions"] for row in rows):
             raise InputError(f"{self.ego}: knows no rate of {event}")
-        return (
+        return Side(
             [torch.tensor(row["repetitions"][event]).double() for row in rows],
             torch.tensor([row["km"] for row in rows], dtype=torch.float64),
+            self.unresolved,
         )
 
     def ratio_to(self, other: "EgoRates", event: str) -> Bounds:
@@ -155,6 +166,7 @@ def write_rates(folder: Path, egos: Sequence[EgoRates], failures: Scored) -> Non
             "ego": ego.ego,
             "target": ego.target,
             "least": ego.least,
+            "unresolved": ego.unresolved,
             "rates": {
                 event: {unit: bounds._asdict() for unit, bounds in units.items()}
                 for event, units in ego.rates.items()

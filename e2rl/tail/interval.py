@@ -47,7 +47,14 @@ def of_counts(hits: int, count: int) -> Bounds:
     return Bounds(hits / count, float(interval.low), float(interval.high))
 
 
-Side = tuple[Sequence[Tensor], Tensor]  # estimates [R] of S scenes, and exposure [S]
+class Side(NamedTuple):
+    """What is known of S scenes: estimates of each, of R repetitions, [R]; exposure
+    [S], such as km driven; unresolved: the sum over scenes of what their probabilities
+    may be beyond these, where nothing was drawn."""
+
+    estimates: Sequence[Tensor]
+    exposure: Tensor
+    unresolved: float = 0.0
 
 
 def of_ratio(estimates: Sequence[Tensor], exposure: Tensor) -> Bounds:
@@ -59,16 +66,22 @@ def of_ratio(estimates: Sequence[Tensor], exposure: Tensor) -> Bounds:
         estimates: of each of S scenes, of R repetitions, [R].
         exposure: [S], such as km driven.
     """
-    value, draws = drawn_ratios((estimates, exposure))
+    value, draws = drawn_ratios(Side(estimates, exposure))
     return bounded(value, draws)
 
 
 def ratio_of_ratios(first: Side, second: Side) -> Bounds:
     """Returns the quotient of two `of_ratio` in the same scenes, which are drawn
-    together."""
+    together. Its lower end holds what the second may have unresolved, its upper end what
+    the first may."""
     value, draws = drawn_ratios(first)
     other, other_draws = drawn_ratios(second)
-    return bounded(value / other, draws / other_draws)
+    more = first.unresolved / first.exposure.sum()
+    other_more = second.unresolved / second.exposure.sum()
+    ratio = value / other
+    low = bounded(ratio, draws / (other_draws + other_more)).low
+    high = bounded(ratio, (draws + more) / other_draws).high
+    return Bounds(float(ratio), low, high)
 
 
 def bounded(value: Tensor, draws: Tensor) -> Bounds:
@@ -84,7 +97,7 @@ def bounded(value: Tensor, draws: Tensor) -> Bounds:
 def drawn_ratios(side: Side) -> tuple[Tensor, Tensor]:
     """Returns `of_ratio`'s value, and DRAWS of it; the scenes drawn depend on their
     number alone."""
-    estimates, exposure = side
+    estimates, exposure, _ = side
     count = len(estimates)
     generator = torch.Generator().manual_seed(0)
     scenes = torch.randint(count, (DRAWS, count), generator=generator)

@@ -139,16 +139,10 @@ def rates_of(scenes: Sequence[SceneRate], steps: int) -> dict[str, dict[str, Bou
     """Returns the rates {event: {unit: bounds}} of the events that all scenes know, over
     scenes of so many steps.
 
-    The interval's end holds what scenes may add in which populations ended before the
-    target. Of independent rollouts, n in each, scenes without a failure share one bound b:
-    that n fail in none has a chance of (1 - p)^n (1 - q)^n <= exp(-n (p + q)), which is
-    (1 - b)^n where p + q is -log(1 - b).
+    The interval's end holds what is `unresolved_in` the scenes.
     """
     km = torch.tensor([scene.km for scene in scenes], dtype=torch.float64)
-    at_most = torch.tensor([scene.at_most for scene in scenes], dtype=torch.float64)
-    unresolved = at_most.sum()
-    if scenes[0].independent:
-        unresolved = -(-at_most.max()).log1p()
+    unresolved = unresolved_in(scenes)
     ones = torch.ones_like(km)
     exposures = (ones, ones * steps * DT / HOUR, km / DISTANCE)
     rates: dict[str, dict[str, Bounds]] = {}
@@ -159,10 +153,24 @@ def rates_of(scenes: Sequence[SceneRate], steps: int) -> dict[str, dict[str, Bou
         rates[event] = {}
         for unit, exposure in zip(UNITS, exposures, strict=True):
             bounds = of_ratio(estimates, exposure)
-            high = bounds.high + float(unresolved / exposure.sum())
+            high = bounds.high + unresolved / float(exposure.sum())
             high = min(high, 1.0) if unit == "scene" else high
             rates[event][unit] = bounds._replace(high=high)
     return rates
+
+
+def unresolved_in(scenes: Sequence[SceneRate]) -> float:
+    """Returns the sum of what scenes may add in which populations ended before the
+    target.
+
+    Of independent rollouts, n in each, scenes without a failure share one bound b: that n
+    fail in none has a chance of (1 - p)^n (1 - q)^n <= exp(-n (p + q)), which is (1 -
+    b)^n where p + q is -log(1 - b).
+    """
+    at_most = [scene.at_most for scene in scenes]
+    if scenes[0].independent:
+        return -math.log1p(-max(at_most))
+    return sum(at_most)
 
 
 def as_json(scene: SceneRate) -> dict[str, Any]:

@@ -5,7 +5,13 @@ import math
 import pytest
 import torch
 
-from e2rl.tail.interval import of_counts, of_logs, of_ratio, ratio_of_ratios
+from e2rl.tail.interval import (
+    Side,
+    of_counts,
+    of_logs,
+    of_ratio,
+    ratio_of_ratios,
+)
 
 COVERED = 0.93  # of 400 experiments, at least, for an interval of 95%
 
@@ -52,7 +58,8 @@ def test_ratios_over_scenes_cover_the_population_s():
 def test_the_quotient_of_equal_egos_is_one_without_an_interval():
     estimates = [torch.tensor([0.1]), torch.tensor([0.2]), torch.tensor([0.0])]
     exposure = torch.tensor([1.0, 2.0, 1.0])
-    bounds = ratio_of_ratios((estimates, exposure), (estimates, exposure))
+    side = Side(estimates, exposure)
+    bounds = ratio_of_ratios(side, side)
     assert bounds == (1, 1, 1)
 
 
@@ -61,6 +68,16 @@ def test_scenes_are_paired():
     first = [torch.rand(1, generator=generator) for _ in range(30)]
     second = [2 * value for value in first]
     exposure = torch.ones(30)
-    bounds = ratio_of_ratios((second, exposure), (first, exposure))
+    bounds = ratio_of_ratios(Side(second, exposure), Side(first, exposure))
     assert bounds.low == pytest.approx(2)
     assert bounds.high == pytest.approx(2)
+
+
+def test_one_without_a_failure_bounds_the_quotient_on_one_side():
+    """Scenes fail with 0.1, and in none of as many others with up to 0.5 in all: at
+    least 2 times, and nobody knows how much more; the other way round at most half."""
+    exposure = torch.ones(10)
+    failing = Side([torch.tensor([0.1])] * 10, exposure)
+    none = Side([torch.tensor([0.0])] * 10, exposure, unresolved=0.5)
+    assert ratio_of_ratios(failing, none) == (math.inf, pytest.approx(2), math.inf)
+    assert ratio_of_ratios(none, failing) == (0, 0, pytest.approx(0.5))
