@@ -18,6 +18,7 @@ from e2rl.run.terminal import Bar
 USERS = (
     "e2rl.traffic.e2.e2",
     "e2rl.planners.lane_graph_planner",
+    "e2rl.planners.sampling",
     "e2rl.planners.actor",
     "e2rl.sim.env",
 )

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 import e2rl
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
+from e2rl.planners.sampling import SamplingEgo
 from e2rl.prior.free_space import decode_plans
 from e2rl.prior.lane_relative import SIZE, LaneState
 from e2rl.run import fused
@@ -21,6 +22,7 @@ from e2rl.run.fused import FUSED, Fused, has_compiler, is_on, switch, switched_o
 from e2rl.scenes.route import SPACING
 from e2rl.sim.observation import OBSERVATION_SIZE
 from e2rl.traffic.fusing import fused_functions, prepare_fused
+from tests.planners.planners import worlds
 from tests.traffic.e2.traffic_scenes import drive, scenes, synthesizer
 
 
@@ -82,6 +84,7 @@ def compared():
         graphs = drive(scene_set, method, 2.0, ego=LaneGraphEgo())
         actor = ActorEgo()
         drive(scenes(1, steps=5), method, 2.0, ego=actor)
+        drive(scenes(1, steps=5), method, 2.0, ego=SamplingEgo())
         trunk = actor.network.network.trunk
         trunk(torch.zeros(2, OBSERVATION_SIZE)).sum().backward()
         yield eager, graphs, names, trunk
@@ -114,6 +117,19 @@ def test_the_graph_of_a_plan_is_the_plan(compared):
     expected = vars(decode_plans.function(*arguments))
     for name, value in values.items():
         torch.testing.assert_close(value, expected[name], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_candidates_cost_in_graphs_what_they_cost(compared):
+    """Costs are of contact, 200, down to metres beside the mission, 2 each."""
+    _, world = worlds(scenes(2))
+    ego = SamplingEgo()
+    expected = ego.candidates(world)
+    costs = ego.costs(world, expected)
+    switch(True)
+    candidates = ego.candidates(world)
+    torch.testing.assert_close(candidates.states, expected.states, rtol=0, atol=1e-3)
+    torch.testing.assert_close(ego.costs(world, expected), costs, rtol=0, atol=1e-2)
 
 
 @pytest.mark.slow
