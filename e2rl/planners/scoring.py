@@ -227,7 +227,8 @@ def contact_cost(
     )
     cost, ends = pair_cost(pairs, prices)
     end = torch.full((batch * count,), steps, device=ego.device)
-    end.scatter_reduce_(0, candidate[ends], time[ends], "amin")
+    ending = ends.nonzero()[:, 0]
+    end.scatter_reduce_(0, candidate[ending], time[ending], "amin")
     faded = cost * torch.exp(-prices.fade * times)[time]
     cost = faded * (time <= end[candidate])
     worst = ego.new_zeros(batch * count * agents)
@@ -238,8 +239,8 @@ def contact_cost(
 
 @fused("4 T B C", "B M T 4", "B M T", "")
 def near_pairs(ego: Tensor, other: Tensor, room: Tensor, headway: Tensor) -> Tensor:
-    """Returns where [B, M, T, C] a candidate and an agent are near enough to cost
-    something.
+    """Returns 1 where [B, M, T, C] a candidate and an agent are near enough to cost
+    something, else 0.
 
     Args:
         ego: states [4, T, B, C] of the candidates.
@@ -251,12 +252,13 @@ def near_pairs(ego: Tensor, other: Tensor, room: Tensor, headway: Tensor) -> Ten
     dx = x - other[..., 0, None]
     dy = y - other[..., 1, None]
     reach = room[..., None] + headway * speed
-    return (dx * dx + dy * dy < reach * reach) & (reach > 0)
+    near = (dx * dx + dy * dy < reach * reach) & (reach > 0)
+    return torch.where(near, 1.0, 0.0)
 
 
 @fused(("Q 4", "Q 2", "Q 4", "Q 2", "Q"), "")
 def pair_cost(pairs: Pairs, prices: Prices) -> tuple[Tensor, Tensor]:
-    """Costs [...] of pairs; and bool [...]: they touch, and not from behind.
+    """Costs [...] of pairs; and 1 where they touch, and not from behind, else 0 [...].
 
     Contact costs more at a higher relative velocity, and half where the ego stands.
     Without contact, what counts is the fraction of the margin or of `headway` s that is
@@ -297,7 +299,8 @@ def pair_cost(pairs: Pairs, prices: Prices) -> tuple[Tensor, Tensor]:
     behind = in_line & (ahead < 0)
     nearness = torch.maximum(tight, soon * (in_line & (ahead > 0)))
     cost = prices.contact * hit * severity + prices.near * nearness
-    return cost * torch.where(behind, prices.rear, 1.0), hit & ~behind
+    ends = torch.where(hit & ~behind, 1.0, 0.0)
+    return cost * torch.where(behind, prices.rear, 1.0), ends
 
 
 @fused("2 T B C", "B 2", "B G G:float16", "B 2", "")
