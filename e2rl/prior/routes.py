@@ -37,9 +37,10 @@ class RoutedScene:
     assigned route candidates: route [B, V], their index; points [B, V, P, 2]; length
     [B, V]; open [B, V]: the route ends at the map's border; limit [B, V, P]; light,
     light_s [B, V, 2]. conflict [B, V, V] bool: the routes of i and j meet; conflict_s
-    [B, V, V]: arc length on i's route where it first does; crossing [B, V, V]: angle
-    between them there [rad]. modelled [B, V]: the prior moves the vehicle or conditions
-    on it; parked [B, V]; has_lane [B, V]: else it is represented in free space.
+    [B, V, V]: arc length on i's route where it first does, or 0; crossing [B, V, V]:
+    angle between them there [rad], or 0. modelled [B, V]: the prior moves the vehicle or
+    conditions on it; parked [B, V]; has_lane [B, V]: else it is represented in free
+    space.
     """
 
     size: Tensor = field(metadata={"vehicle_axes": None})
@@ -87,20 +88,27 @@ def route_scene(scene: TensorDictBase, route: Tensor) -> RoutedScene:
     valid = scene["valid"][:, :vehicles]
     parked = scene["parked"][:, :vehicles]
     has_lane = take_route(scene["route_valid"], route)
-    everybody = torch.arange(vehicles, device=route.device)
-    of_scenes = [_conflicts(points, everybody)[0] for points in assigned["points"]]
-    meets, conflict_s, crossing = (
-        torch.stack(values) for values in zip(*of_scenes, strict=True)
-    )
     modelled = valid & ~parked
-    both = modelled & has_lane
+    conflict = torch.zeros_like(modelled[..., None].expand(-1, -1, vehicles))
+    conflict_s = torch.zeros_like(conflict, dtype=assigned["points"].dtype)
+    crossing = torch.zeros_like(conflict_s)
+    pairs = (conflict, conflict_s, crossing)
+    for b, follows in enumerate(modelled & has_lane):
+        rows = follows.nonzero()[:, 0]
+        if len(rows) > 1:
+            points = assigned["points"][b, rows]
+            meetings, _ = _conflicts(
+                points, torch.arange(len(rows), device=rows.device)
+            )
+            for value, of_rows in zip(pairs, meetings, strict=True):
+                value[b, rows[:, None], rows] = of_rows
     return RoutedScene(
         size=scene["size"],
         light_state=scene["light_state"],
         past=scene["past"][:, :vehicles],
         route=route,
         **assigned,
-        conflict=meets & both[:, :, None] & both[:, None, :],
+        conflict=conflict,
         conflict_s=conflict_s,
         crossing=crossing,
         modelled=modelled,
@@ -189,13 +197,14 @@ def reroute(
             value[b][:, rows] = back.T
             value[b][rows] = forth
     both = routed.modelled & lane["valid"]
+    conflict = meets & both[:, :, None] & both[:, None]
     return replace(
         routed,
         route=torch.where(moved, route, routed.route),
         has_lane=changed(routed.has_lane, lane["valid"], True),
-        conflict=meets & both[:, :, None] & both[:, None],
-        conflict_s=conflict_s,
-        crossing=crossing,
+        conflict=conflict,
+        conflict_s=torch.where(conflict, conflict_s, 0.0),
+        crossing=torch.where(conflict, crossing, 0.0),
         **lines,
     )
 
@@ -219,7 +228,8 @@ def _conflicts(
     tangent = torch.gradient(line, dim=1)[0]
     angle = angle_of(tangent)
     crossing = wrap(angle.gather(1, other.T).T - angle[rows].gather(1, first))
-    spacing = SPACING * CONFLICT_STRIDE
+    crossing = torch.where(conflict, crossing, 0.0)
+    spacing = torch.where(conflict, SPACING * CONFLICT_STRIDE, 0.0)
     return (conflict, first * spacing, crossing), (
         conflict,
         other * spacing,
