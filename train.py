@@ -103,8 +103,9 @@ def evolve(task: Run) -> None:
     answer = compared_answer(
         [row for row in rows if row["stage"] == "before"],
         [row for row in rows if row["stage"] == "after"],
-        measure.atlases(),
-        folder,
+        atlases=measure.atlases(),
+        rates=measure.ego_rates(),
+        folder=folder,
     )
     print("", *answer, run.improve.outcome(folder), sep="\n")
 

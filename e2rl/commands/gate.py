@@ -14,11 +14,11 @@ import sys
 from pathlib import Path
 
 from e2rl.evaluation.comparison import Driven, check_shared
+from e2rl.evaluation.rates import RATES_FILE
 from e2rl.evaluation.rollout_files import write_json
 from e2rl.report.answer import errored_lines, touched_lines
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED, judged, junit
 from e2rl.report.rate_gate import judged_rate, rates_of_run
-from e2rl.report.rates import RATES_FILE
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically

@@ -10,9 +10,10 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 from e2rl.driving.setup import Scored
 from e2rl.evaluation.plan import Evaluation, begin
+from e2rl.evaluation.rates import EgoRates, write_rates
 from e2rl.evaluation.record import record
 from e2rl.report.html import write_report
-from e2rl.report.rates import EgoRates, rate_tables, summary_lines, write_rates
+from e2rl.report.rates import rate_tables, summary_lines
 from e2rl.report.tables import save_tables
 from e2rl.run.command import run_command
 from e2rl.run.config import resolved, settings_of

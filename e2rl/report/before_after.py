@@ -3,9 +3,11 @@ side."""
 
 import math
 from collections.abc import Mapping, Sequence
+from math import inf
 from pathlib import Path
 
 from e2rl.evaluation.check import SEARCH
+from e2rl.evaluation.rates import EgoRates
 from e2rl.evaluation.rollout_files import ATLAS_FILE
 from e2rl.metrics.atlas import CELL
 from e2rl.metrics.catalogue import METRICS
@@ -19,6 +21,7 @@ from e2rl.report.answer import (
     traffic_name,
     wrapped,
 )
+from e2rl.report.rates import WORDS, number, text
 from e2rl.report.tables import UNKNOWN, plural
 from e2rl.run.terminal import columns
 
@@ -38,6 +41,7 @@ def compared_answer(
     before: Sequence[dict],
     after: Sequence[dict],
     atlases: tuple[Mapping, Mapping] | None = None,
+    rates: tuple[EgoRates, EgoRates] | None = None,
     folder: Path | None = None,
 ) -> list[str]:
     """Returns the lines that say what training changed: the ego before and after it,
@@ -49,6 +53,7 @@ def compared_answer(
             name `before`.
         atlases: of both stages (`evaluation.atlas.group_atlas`); None: nothing was
             searched for.
+        rates: in the prior's traffic, of both stages; None: they were not estimated.
         folder: of the run, which holds tables.md.
     """
     earlier = {(row["method"], row["eta"]): row for row in before}
@@ -59,6 +64,7 @@ def compared_answer(
     ]
     last = closing(after, folder)
     lines = atlas_lines(before=atlases[0], after=atlases[1]) if atlases else []
+    lines += rate_lines(*rates) if rates else []
     if pairs:
         last = wrapped(COUNTS) + last
         metrics = CHANGES | {
@@ -110,6 +116,22 @@ def atlas_lines(before: Mapping, after: Mapping) -> list[str]:
     if len(cells) > MOST_CELLS:
         rest = len(cells) - MOST_CELLS
         lines.append(f"... and {rest} more in {{before,after}}/{SEARCH}/{ATLAS_FILE}")
+    return lines
+
+
+def rate_lines(before: EgoRates, after: EgoRates) -> list[str]:
+    """What training made of the rates in the prior's traffic: a sentence for each
+    event."""
+    words = {"contact": WORDS["contact"], before.target: WORDS[before.target]}
+    lines = []
+    for event, name in words.items():
+        old, new = (text(side.rates[event]["1000km"]) for side in (before, after))
+        ratio = before.ratio_to(after, event)
+        times = f"at least {number(ratio.low)}" if ratio.value == inf else text(ratio)
+        lines += wrapped(
+            f"In the prior's traffic {old} {name} per 1,000 km before training, {new} "
+            f"after it; before over after {times}."
+        )
     return lines
 
 

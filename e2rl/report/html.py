@@ -23,6 +23,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from e2rl.evaluation.modes import OTHER
+from e2rl.evaluation.rates import RATES_FILE, EgoRates
 from e2rl.evaluation.record import Record
 from e2rl.evaluation.rollout_files import TABLE, nulls, own_folder, rows_text
 from e2rl.metrics.atlas import CELL, by_likelihood, cell_of
@@ -31,7 +32,7 @@ from e2rl.metrics.errored import raised
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.answer import group_lines
 from e2rl.report.failure_tracks import replay_data
-from e2rl.report.rates import RATES_FILE, EgoRates, rate_tables, summary_lines
+from e2rl.report.rates import rate_tables, summary_lines
 from e2rl.report.tables import (
     Table,
     column_names,

@@ -6,8 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+from e2rl.evaluation.rates import EgoRates
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED
-from e2rl.report.rates import EgoRates, text
+from e2rl.report.rates import text
 from e2rl.run.errors import InputError
 from e2rl.tail.summary import EVENTS, UNITS
 

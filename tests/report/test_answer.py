@@ -9,6 +9,7 @@ import pytest
 from e2rl.metrics.atlas import CELL
 from e2rl.report.answer import LINES, answer_lines
 from e2rl.report.before_after import compared_answer
+from tests.report.known_rates import ego_rates
 
 NAN = math.nan
 
@@ -181,6 +182,20 @@ def test_the_ways_before_and_after_training_stand_side_by_side(tmp_path):
     assert "in 0 of 12 scenes before training" in " ".join(" ".join(none).split())
 
 
+def test_rates_before_and_after_stand_with_their_ratio(tmp_path):
+    old, new = ego_rates("actor", 3.0), ego_rates("actor")
+    lines = compared_answer([], [], rates=(old, new), folder=tmp_path)
+    said = " ".join(" ".join(lines).split())
+    assert "preventable failures per 1,000 km before training, 50 [" in said
+    assert "before over after 3 [3, 3]." in said
+
+
+def test_a_ratio_to_no_failure_is_told_by_its_lower_end(tmp_path):
+    old, new = ego_rates("actor", 3.0), ego_rates("actor", 0.0)
+    lines = compared_answer([], [], rates=(old, new), folder=tmp_path)
+    assert "before over after at least" in " ".join(" ".join(lines).split())
+
+
 @pytest.mark.parametrize("width", [80, 100])
 def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
     monkeypatch.setenv("COLUMNS", str(width))
@@ -204,10 +219,11 @@ def test_it_fits_whatever_it_is_told(tmp_path, monkeypatch, width):
         answer_lines(rows, long, folder=tmp_path, report=None, notes=notes)
         for rows in (pairs[:1], egos, egos[:1])
     ]
+    rates = (ego_rates("one"), ego_rates("one"))
     for lines in (
         *answers,
         *(
-            compared_answer(pairs, pairs, atlases=item, folder=tmp_path)
+            compared_answer(pairs, pairs, atlases=item, rates=rates, folder=tmp_path)
             for item in (None, (ways, ways))
         ),
     ):

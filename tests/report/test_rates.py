@@ -1,48 +1,23 @@
 """Tables, files and rules of rates."""
 
 import json
-from types import SimpleNamespace
 
 import pytest
 import torch
 
 from e2rl.driving.setup import Scored
+from e2rl.evaluation.rates import EgoRates, write_rates
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED
 from e2rl.report.rate_gate import judged_rate, rates_of_run
-from e2rl.report.rates import (
-    EgoRates,
-    number,
-    rate_tables,
-    summary_lines,
-    write_rates,
-)
+from e2rl.report.rates import number, rate_tables, summary_lines
 from e2rl.run.errors import InputError
 from e2rl.tail.interval import of_ratio
-from e2rl.tail.rate import Estimate
-from e2rl.tail.sampler import REACHED, SPENT, Tally
-from e2rl.tail.summary import scene_rates
-
-COUNT = 40
-KM = 0.1
-LEAST = 1e-5  # 11.5 nats
-
-
-def rates(ego, factor=1.0):
-    """An ego that fails in every other of COUNT scenes with 0.01 times a factor."""
-    estimates = []
-    for scene in range(COUNT):
-        likely = Tally(0.01 * factor, 0.01, contact=0.02 * factor, rollouts=50)
-        likely.end = REACHED
-        tally = likely if scene % 2 else Tally(bound=1e-4, rollouts=70, end=SPENT)
-        estimates.append(Estimate(scene, 0, tally, KM, 0, 0, Scored()))
-    names = SimpleNamespace(scene_id=[f"scene {k}" for k in range(COUNT)])
-    scenes = scene_rates(estimates, names, "preventable")
-    return EgoRates.of(ego, scenes, target="preventable", least=LEAST, steps=80)
+from tests.report.known_rates import COUNT, KM, ego_rates
 
 
 @pytest.fixture
 def run(tmp_path):
-    write_rates(tmp_path, [rates("mine")], Scored())
+    write_rates(tmp_path, [ego_rates("mine")], Scored())
     return tmp_path
 
 
@@ -52,14 +27,14 @@ def cells(table):
 
 
 def test_the_lines_have_the_rate_and_what_was_spent():
-    lines = summary_lines(rates("mine"))
+    lines = summary_lines(ego_rates("mine"))
     assert "mine in traffic as the prior has it: 50 [" in lines[0]
     assert lines[1] == "They were drawn in 20 of 40 scenes, by 2,400 rollouts."
 
 
 def test_the_interval_s_end_holds_what_was_not_drawn():
     """20 of 40 scenes of 0.1 km may have 1e-4 each: 0.5 per 1,000 km."""
-    mine = rates("mine")
+    mine = ego_rates("mine")
     without = of_ratio(
         [torch.tensor([scene["probability"]]) for scene in mine.scenes],
         torch.full((COUNT,), KM / 1000).double(),
@@ -69,20 +44,20 @@ def test_the_interval_s_end_holds_what_was_not_drawn():
 
 
 def test_two_egos_have_their_ratio():
-    tables = rate_tables([rates("worse", 3.0), rates("mine")])
+    tables = rate_tables([ego_rates("worse", 3.0), ego_rates("mine")])
     (row,) = [row for row in cells(tables[1]) if row["event"] == "preventable"]
     assert row["ratio per km"] == "3 [3, 3]"
 
 
 def test_the_ratio_of_two_that_never_fail_is_unknown():
-    tables = rate_tables([rates("one", 0.0), rates("other", 0.0)])
+    tables = rate_tables([ego_rates("one", 0.0), ego_rates("other", 0.0)])
     (row,) = [row for row in cells(tables[1]) if row["event"] == "contact"]
     assert row["ratio per km"] == "–"
 
 
 def test_failures_are_counted_by_what_they_cost():
     """-log 0.01 is 4.6 nats, in half of the scenes; beyond 11.5 nobody looked."""
-    table = rate_tables([rates("mine")])[1]
+    table = rate_tables([ego_rates("mine")])[1]
     assert {row["nats"]: row["scenes"] for row in cells(table)} == {
         "5": "20 of 40",
         "10": "20 of 40",
@@ -91,7 +66,7 @@ def test_failures_are_counted_by_what_they_cost():
 
 def test_rates_are_read_as_they_were_written(run):
     (read,) = EgoRates.read(run)
-    written = rates("mine")
+    written = ego_rates("mine")
     assert read.rates == written.rates
     names = [scene["scene_id"] for scene in written.scenes]
     assert [scene["scene_id"] for scene in read.scenes] == names
@@ -115,7 +90,7 @@ def test_undecided_rules_say_how_many_scenes_are_needed(run):
 
 def test_ratios_are_judged_against_a_former_run(run, tmp_path_factory):
     worse = tmp_path_factory.mktemp("worse")
-    write_rates(worse, [rates("mine", 3.0)], Scored())
+    write_rates(worse, [ego_rates("mine", 3.0)], Scored())
     rule = "preventable_per_1000km<=x1.2"
     now = rates_of_run(worse, None)
     former = rates_of_run(run, None)

@@ -1,5 +1,6 @@
 """What an evolution run changes: the same scenes and seeds, nominal and adversarial,
-for the policies before and after it; and the atlas of what a search finds against each.
+for the policies before and after it; the atlas of what a search finds against each; and
+how often each fails in traffic as the prior has it.
 """
 
 from collections.abc import Sequence
@@ -8,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.driving.batches import Work, drive_all
-from e2rl.driving.setup import Method, Setup
+from e2rl.driving.setup import Method, Scored, Setup
 from e2rl.evaluation.atlas import read_atlas
 from e2rl.evaluation.check import SEARCH
+from e2rl.evaluation.rates import EgoRates, write_rates
 from e2rl.evaluation.record import record
 from e2rl.evaluation.rollout_files import (
     ATLAS_FILE,
@@ -26,6 +28,12 @@ from e2rl.run.run import origin_of
 from e2rl.search.spending import SearchMethod, search_all
 from e2rl.search.tries_file import TRIES_FILE, write_tries
 from e2rl.sim.rollout_file import ROLLOUTS
+from e2rl.tail.rate import Rating
+from e2rl.tail.settings import RateSettings
+from e2rl.tail.summary import scene_rates
+from e2rl.traffic.nominal import NominalTraffic
+
+RATES = "rates"  # folder of a stage
 
 
 @dataclass
@@ -33,7 +41,8 @@ class BeforeAfter:
     """Evaluates an ego and keeps the rows of both stages in folder/metrics.json.
 
     search: what is tried with `budget` NFE a scene, from the first of the seeds; None:
-    there is no search.
+    there is no search. rates: what is estimated of `prior_traffic`, from the first of
+    the seeds; None: nothing.
     """
 
     setup: Setup
@@ -43,6 +52,8 @@ class BeforeAfter:
     processes: int = 1
     search: SearchMethod | None = None
     budget: float = 0.0
+    rates: RateSettings | None = None
+    prior_traffic: NominalTraffic | None = None
 
     def __call__(self, stage: str, ego: Ego, rounds: int) -> list[dict]:
         """Evaluate an ego as `stage` (before or after) that was trained for some
@@ -60,6 +71,8 @@ class BeforeAfter:
         scored = drive_all([setup], self.methods, seeds=self.seeds, work=work)
         if self.search is not None:
             self._search(self.search, setup, work=work, folder=folder / SEARCH)
+        if self.rates is not None:
+            self._rate(self.rates, setup, work=work, folder=folder / RATES)
         fields: dict[str, Any] = {"stage": stage, **origin_of(self.folder)}
         rows = record(scored, folder, **fields).metrics
         if stage == "before":
@@ -96,6 +109,37 @@ class BeforeAfter:
         )
         record(spent.scored, folder, searched=True)
         write_tries(folder / TRIES_FILE, spent.tries)
+
+    def _rate(
+        self,
+        settings: RateSettings,
+        setup: Setup,
+        work: Work,
+        folder: Path,
+    ) -> None:
+        """Write how often an ego fails in the prior's traffic into a folder."""
+        assert self.prior_traffic is not None
+        rating = Rating(setup, self.prior_traffic, settings, seed=self.seeds[0])
+        estimates = rating.estimates(replace(work, into=None))
+        rates = EgoRates.of(
+            setup.ego_name,
+            scene_rates(estimates, setup.scenes, target=settings.target),
+            target=settings.target,
+            least=settings.least,
+            steps=setup.scenes.steps,
+        )
+        folder.mkdir(parents=True, exist_ok=True)
+        write_rates(folder, [rates], Scored())
+
+    def ego_rates(self) -> tuple[EgoRates, EgoRates] | None:
+        """The rates before and after; None where none were estimated."""
+        if self.rates is None:
+            return None
+        before, after = (
+            EgoRates.read(self.folder / stage / RATES)[0]
+            for stage in ("before", "after")
+        )
+        return before, after
 
     def atlases(self) -> tuple[dict, dict] | None:
         """The atlas before and after (`evaluation.atlas.group_atlas`); None without a

@@ -32,6 +32,7 @@ from e2rl.run.errors import InputError
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes, source_of
 from e2rl.scenes.versions import RECORDED
+from e2rl.tail.settings import RateSettings
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic
 
@@ -140,6 +141,7 @@ class MeasureSettings:
     seeds: tuple[int, ...] = setting(low=0)
     eta: tuple[float, ...] = setting(low=0)
     budget: float = setting(low=0)
+    rollouts: int = setting(low=0)
 
 
 def measure_settings(config: DictConfig) -> MeasureSettings:
@@ -211,6 +213,14 @@ def build_measure(
         prior=prior,
     )
     attacks = [Method(config.synthesizer.name, traffic, eta=eta) for eta in options.eta]
+    rates = None
+    if options.rollouts:
+        rates = RateSettings(
+            method="plain",
+            first=options.rollouts,
+            particles=options.rollouts,
+            rollouts=options.rollouts,
+        )
     search = None
     if options.budget:
         search = build_search(SEARCH, config, prior, eta=max(options.eta))
@@ -234,6 +244,8 @@ def build_measure(
         processes=processes_of(config),
         search=search,
         budget=options.budget,
+        rates=rates,
+        prior_traffic=nominal,
     )
 
 
