@@ -10,12 +10,13 @@ import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one lin
 # isort: split
 import math
 
-from e2rl.evaluation.build import build_ego, build_prior, build_traffic
+from e2rl.evaluation.build import build_ego, build_prior
 from e2rl.evaluation.rollout_files import ERRORED_FILE, add_errored
 from e2rl.learning.pretraining.bits import run_bits_stage
 from e2rl.learning.pretraining.imitation import run_imitation_stage
 from e2rl.learning.pretraining.prior.stage import run_prior_stage
 from e2rl.learning.rounds.build import (
+    build_attackers,
     build_evolution,
     build_logger,
     build_measure,
@@ -58,18 +59,24 @@ def evolve(task: Run) -> None:
     done = rounds_done(config.resume)
     progress = build_progress(config, done)
     prior, origin = build_prior(config, config.device)  # a wrong path fails early
-    traffic = build_traffic(config.synthesizer, prior)
+    attackers = build_attackers(config, prior)
     ego = build_ego(config)
     scenes = load_scenes(
         config.data, config.num_scenes, split="train", scenes=config.scenes
     )
-    run = build_evolution(config, scenes, ego=ego, traffic=traffic, folder=folder)
+    run = build_evolution(
+        config,
+        scenes,
+        ego=ego,
+        attackers=attackers,
+        folder=folder,
+    )
     logger = build_logger(config, folder)
     measure = build_measure(
         config,
         ego,
         ego_name=task.choices["ego"],
-        traffic=traffic,
+        traffic=attackers[0],
         prior=prior,
         folder=folder,
     )

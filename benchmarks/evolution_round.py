@@ -23,7 +23,7 @@ def evolution_round(bench: Bench) -> Iterator[Row]:
         config.learner.round.prefetch = prefetch
         torch.manual_seed(0)
         run = build_evolution(
-            config, bench.scenes, ego=build_ego(config), traffic=bench.traffic
+            config, bench.scenes, ego=build_ego(config), attackers=[bench.traffic]
         )
         if prefetch:
             train_round(run)

@@ -102,7 +102,7 @@ def small_run(
     return Evolution(
         AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread),
         improve,
-        synthesize=brake_check(scenes),
+        attacks=[brake_check(scenes)],
         settings=RoundSettings(
             scenes=3,
             nominal=nominal,

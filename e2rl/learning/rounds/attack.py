@@ -59,17 +59,19 @@ Synthesize = Callable[[Ego, Tensor, Tensor, int], Mapping[str, Any]]
 Solvable = Callable[[Mapping[str, Tensor]], Tensor]
 ATTACK = "attack"  # what of a round was being made
 NOMINAL = "nominal traffic"
-FLAGS = ("attacked", "contact", "entered")
+FLAGS = ("attacked", "contact", "entered")  # of the attack alone
 TRACKS = ("scene_index", "states", "valid", "adversaries")
 
 
 @dataclass(frozen=True)
 class Order:
-    """What is to be synthesized: for round `number`, in scenes [S], at intensities eta
-    [S], from a seed, against an ego that does not change meanwhile."""
+    """What is to be synthesized: for round `number`, in scenes [S], by attacks [S]
+    int64 (0 the synthesizer's, 1 a harder one) in their order, at intensities eta [S],
+    from a seed, against an ego that does not change meanwhile."""
 
     number: int
     scenes: Tensor
+    attack: Tensor
     eta: Tensor
     seed: int
     ego: Ego
@@ -77,7 +79,7 @@ class Order:
 
 def make_traffic(
     order: Order,
-    synthesize: Synthesize,
+    attacks: Sequence[Synthesize],
     *,
     solvable: Solvable | None = None,
     nominal: bool = True,
@@ -90,43 +92,46 @@ def make_traffic(
 
     Args:
         order: what is to be made.
-        synthesize: see `Evolution`.
+        attacks: see `Evolution`.
         solvable: which attacked rows enter D'; None: all.
         nominal: make the scenes at intensity 0, too.
         batch: scenes that are made at once.
 
     Returns:
         Tensors scene_index [R], eta [R], states [R, T+1, N, 4], valid [R, T+1, N] and
-        adversaries [R, N]; of the attack entered [S] bool (rows in D') and the
-        fractions of the made rows that were attacked [] (have an adversary) and in
-        contact [] (the ego was hit). Errored rows as dicts of round, scene, eta,
+        adversaries [R, N]; of the attack entered [S] bool (rows in D'), and
+        attacked (it has an adversary) and contact (the ego was hit), [S], NaN where the
+        row errored. Errored rows as dicts of round, scene, eta,
         reason, detail, traceback.
 
     Raises:
         InputError: no attack could be made.
     """
-    rows = torch.arange(len(order.scenes)).split(batch)
-    parts = [
-        _make_part(order, synthesize, part, solvable=solvable, attack=attack)
-        for attack in ((True, False) if nominal else (True,))
-        for part in rows
+    rows = torch.arange(len(order.scenes))
+    attacked = [
+        _make_part(order, synthesize, part, solvable=solvable, attack=True)
+        for number, synthesize in enumerate(attacks)
+        for part in rows[order.attack == number].split(batch)
+        if len(part)
     ]
+    calm = [
+        _make_part(order, attacks[0], part, solvable=solvable, attack=False)
+        for part in (rows.split(batch) if nominal else ())
+    ]
+    parts = attacked + calm
     errored = [entry for part in parts for entry in part.pop("errored")]
     traffic = {
         name: torch.cat([part[name] for part in parts])
         for name in parts[0]
         if name not in FLAGS
     }
-    attack, contact, entered = (
-        torch.cat([part[name] for part in parts[: len(rows)]]) for name in FLAGS
-    )
-    if not len(attack):
+    flags = {name: torch.cat([part[name] for part in attacked]) for name in FLAGS}
+    if flags["contact"].isnan().all():
         raise InputError(
             f"no traffic could be made: {summary_of(errored)}; "
             "mend the planner or the traffic"
         )
-    fractions = {"attacked": attack.float().mean(), "contact": contact.float().mean()}
-    return traffic | fractions | {"entered": entered}, errored
+    return traffic | flags, errored
 
 
 def _make_part(
@@ -138,7 +143,7 @@ def _make_part(
     attack: bool,
 ) -> dict[str, Any]:
     """The traffic of an order's scenes rows [s], attacked or at intensity 0; FLAGS of
-    them (entered [s], the others of the rows that were made); and the errored rest."""
+    them [s]; and the errored rest."""
     scenes = order.scenes[rows]
     eta = order.eta[rows] if attack else torch.zeros_like(order.eta[rows])
     traffic = synthesize(order.ego, scenes, eta, order.seed)
@@ -150,6 +155,7 @@ def _make_part(
     if attack and len(places) and solvable is not None:
         enters = solvable(traffic)
     tracks = {name: traffic[name] for name in TRACKS} | {"eta": eta[places]}
+    unknown = torch.full((len(rows),), torch.nan)
     about = {"round": order.number, "during": ATTACK if attack else NOMINAL}
     errored = [
         about | {"scene": int(scenes[row]), "eta": round(float(eta[row]), 4)} | cause
@@ -157,8 +163,10 @@ def _make_part(
     ]
     return {
         **{name: value[enters] for name, value in tracks.items()},
-        "attacked": traffic["adversaries"].any(-1),
-        "contact": traffic["contact"],
+        "attacked": unknown.index_copy(
+            0, places, traffic["adversaries"].any(-1).float()
+        ),
+        "contact": unknown.index_copy(0, places, traffic["contact"].float()),
         "entered": torch.zeros(len(rows), dtype=torch.bool).index_fill(
             0,
             places[enters],

@@ -1,5 +1,6 @@
 """Builds the parts of an evolution from a run's configuration."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from e2rl.driving.setup import Method, Setup
-from e2rl.evaluation.build import build_search, build_sim
+from e2rl.evaluation.build import build_search, build_sim, build_traffic
 from e2rl.evaluation.check import SEARCH, as_list, processes_of
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.rounds.attack import Synthesize, solvable
@@ -37,13 +38,21 @@ from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic
 
 
+def build_attackers(config: DictConfig, prior: Prior) -> list[Traffic]:
+    """Returns the traffic of the synthesizer, and of the harder one that joins in where
+    `learner.round.harder` names one for it."""
+    harder = config.learner.round.harder.get(config.synthesizer.name)
+    further = [load_choice("synthesizer", harder)] if harder else []
+    return [build_traffic(group, prior) for group in (config.synthesizer, *further)]
+
+
 def build_evolution(
     config: DictConfig,
     scenes: SceneSet,
     *,
     ego: Ego,
-    traffic: Traffic,
-    synthesize: Synthesize | None = None,
+    attackers: Sequence[Traffic] = (),
+    attacks: Sequence[Synthesize] = (),
     folder: Path | None = None,
 ) -> Evolution:
     """Returns an evolution by config.learner and config.curriculum over config.rounds
@@ -53,8 +62,8 @@ def build_evolution(
         config: of train.py.
         scenes: to train on.
         ego: that is hardened.
-        traffic: that attacks it.
-        synthesize: makes D'; None: closed-loop rollouts with `traffic`.
+        attackers: of `build_attackers`.
+        attacks: make D'; none: closed-loop rollouts with the attackers do.
         folder: of the run, where D' is remembered; None: a temporary one.
 
     Returns:
@@ -86,18 +95,21 @@ def build_evolution(
         seed=config.seed,
         device=learner.pop("device", config.device),
     )
-    synthesize = synthesize or synthesize_traffic(
-        scenes,
-        traffic,
-        sim=sim,
-        batch=config.batch,
-        device=config.device,
-    )
+    attacks = attacks or [
+        synthesize_traffic(
+            scenes,
+            attacker,
+            sim=sim,
+            batch=config.batch,
+            device=config.device,
+        )
+        for attacker in attackers
+    ]
     enters = partial(solvable, scenes=scenes, sim=sim)
     return Evolution(
         curriculum,
         improve,
-        synthesize=synthesize,
+        attacks=attacks,
         settings=settings,
         memory=Memory(folder, settings.memory),
         seed=config.seed,

@@ -24,7 +24,7 @@ from e2rl.run.files import altered, misfit, read_regular, seal, written_whole
 from e2rl.run.parts import load_plain
 
 STATE = "state.pt"
-FORMAT = "e2rl-checkpoint/10"
+FORMAT = "e2rl-checkpoint/11"
 
 
 def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:

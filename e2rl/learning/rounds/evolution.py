@@ -3,8 +3,10 @@ a run between them."""
 
 import copy
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
 from e2rl.learning.rounds.attack import (
@@ -17,6 +19,7 @@ from e2rl.learning.rounds.attack import (
 )
 from e2rl.learning.rounds.episodes import Episodes
 from e2rl.learning.rounds.improvement import Improvement
+from e2rl.learning.rounds.ladder import Ladder
 from e2rl.learning.rounds.memory import Memory
 from e2rl.learning.rounds.prefetch import Prefetch
 from e2rl.learning.rounds.scheduler import (
@@ -39,9 +42,11 @@ class RoundSettings:
     """Settings `learner.round`."""
 
     scenes: int = setting(low=1)
+    hits: float = setting(low=0, high=1)
     nominal: str = setting(choices=("prior", "log", "none"))
     memory: int = setting(low=0)
     prefetch: bool | None = setting(optional=True)
+    harder: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -65,7 +70,8 @@ class Evolution:
     of D'.
 
     Args:
-        synthesize: (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states
+        attacks: the synthesizer's, and a harder one where the settings name one; each
+            (ego, scene_index [S], eta [S], seed) -> {scene_index [S], states
             [S, T+1, N, 4], valid [S, T+1, N], adversaries [S, N] bool, contact [S]
             bool}: closed-loop traffic against that ego; contact: it was hit. Rows that
             cannot be made are left out, and `errored` {position in S: why} names them.
@@ -79,7 +85,7 @@ class Evolution:
 
     curriculum: CurriculumScheduler
     improve: Improvement
-    synthesize: Synthesize
+    attacks: Sequence[Synthesize]
     settings: RoundSettings
     memory: Memory
     seed: int = 0
@@ -88,8 +94,12 @@ class Evolution:
     episodes: Episodes = field(init=False)
     choices: list[Choice] = field(init=False, default_factory=list)
     errored: list[dict] = field(init=False, default_factory=list)
+    _ladder: Ladder = field(init=False)
     _next: Order | None = field(init=False, default=None)  # of the coming round
     _prefetch: Prefetch | None = field(init=False, default=None)  # what makes it
+
+    def __post_init__(self) -> None:
+        self._ladder = Ladder(self.settings.hits, self.seed)
 
     @property
     def ego(self) -> Ego:
@@ -126,11 +136,14 @@ class Evolution:
         pool = self.memory.pool()
         if self.settings.nominal == "log" or not len(pool):  # it is never empty
             pool = pool + TrafficPool.recorded(order.scenes)
+        contact = newest.traffic["contact"]
+        known = ~contact.isnan()
+        self._ladder.observe(order.attack[known], contact[known] > 0)
         return RoundTraffic(
             pool,
             newest.traffic["entered"].nonzero()[:, 0],
-            attacked=newest.traffic["attacked"].item(),
-            contact=newest.traffic["contact"].item(),
+            attacked=newest.traffic["attacked"].nanmean().item(),
+            contact=contact.nanmean().item(),
             errored=newest.errored,
             seconds=seconds,
         )
@@ -178,11 +191,12 @@ class Evolution:
         curriculum.update(self.episodes)
         curriculum.leave_out(order.scenes[outcomes.left_out])
         curriculum.advance(attack.contact)
-        self.choices = tally(order.number, outcomes)
+        self.choices = tally(order.number, outcomes, order.attack)
         self.errored = attack.errored
         not_made = sum(entry["during"] == ATTACK for entry in attack.errored)
         attacks = {
             "scenes": float(len(order.scenes)),
+            "harder": float(order.attack.sum()),
             "eta": order.eta.mean().item(),
             "left_out": float(outcomes.left_out.sum() - not_made),
             "memory_rows": float(self.memory.rows),
@@ -202,12 +216,17 @@ class Evolution:
     def _order(self, number: int) -> Order:
         """What is to be synthesized for a round, as the curriculum and the ego are now."""
         scenes = self.curriculum.draw(self.settings.scenes)
+        attack = torch.zeros(len(scenes), dtype=torch.int64)
+        if len(self.attacks) > 1:
+            attack, place = self._ladder.draw(len(scenes)).sort(stable=True)
+            scenes = scenes[place]
         ego = self.ego
         if self.settings.prefetch:  # learning changes weights in place
             ego = copy.deepcopy(ego)
         return Order(
             number,
             scenes,
+            attack,
             eta=self.curriculum.etas(scenes),
             seed=self.seed * 1_000_003 + number,
             ego=ego,
@@ -224,7 +243,7 @@ class Evolution:
         """Write the traffic of an order into the memory's folder."""
         traffic, errored = make_traffic(
             order,
-            self.synthesize,
+            self.attacks,
             solvable=self.solvable,
             nominal=self.settings.nominal == "prior",
             batch=self.batch,
@@ -232,7 +251,7 @@ class Evolution:
         self.memory.write(order.number, traffic, errored)
 
     def state_dict(self) -> dict:
-        """Curriculum, improvement and the order of the coming round; the checkpoint
+        """Curriculum, ladder, improvement and the order of the coming round; the checkpoint
         adds weights, the memory's index and generators."""
         coming = None
         if self._next is not None:
@@ -245,6 +264,7 @@ class Evolution:
             }
         return {
             "curriculum": self.curriculum.state_dict(),
+            "ladder": self._ladder.state_dict(),
             "improvement": self.improve.state_dict(),
             "next": coming,
         }
@@ -252,6 +272,7 @@ class Evolution:
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`."""
         self.curriculum.load_state_dict(state["curriculum"])
+        self._ladder.load_state_dict(state["ladder"])
         self.improve.load_state_dict(state["improvement"])
         self._next = None
         self._prefetch = None

@@ -56,10 +56,13 @@ def round_line(metrics: Mapping[str, float], number: int, rounds: int) -> str:
         for name, count in metrics.items()
         if "/errored_" in name
     )
+    harder = metrics.get("synthesizer/harder", 0.0)
+    mix = f", {harder:.0f} harder" if harder else ""
     errored = f", without a score: {reasons}" if reasons else ""
     left = f", {left_out:.0f} left out" if left_out else ""
     return (
         f"round {number}/{rounds}: the attacks hit in {hit:.0%} of "
         f"{metrics['synthesizer/scenes']:.0f} scenes{left} "
-        f"(eta {metrics['synthesizer/eta']:.2f}); {metrics['time/improve']:.0f} s learning{errored}"
+        f"(eta {metrics['synthesizer/eta']:.2f}{mix}); {metrics['time/improve']:.0f} s learning"
+        f"{errored}"
     )

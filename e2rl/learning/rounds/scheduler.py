@@ -64,9 +64,9 @@ def outcomes_of(eta: Tensor, *, drawn: Tensor, row: Tensor, failed: Tensor) -> O
     )
 
 
-def tally(number: int, outcomes: Outcomes) -> list[Choice]:
-    """The table of round `number`: a row for each multiple of BIN to which intensities
-    of its attacks are rounded. Unknown numbers are NaN."""
+def tally(number: int, outcomes: Outcomes, attack: Tensor) -> list[Choice]:
+    """The table of round `number` and its attacks [S]: a row for each multiple of BIN
+    to which their intensities are rounded. Unknown numbers are NaN."""
     level = (outcomes.eta / BIN).round() * BIN
     rows: list[Choice] = []
     for eta in level.unique().tolist():
@@ -78,6 +78,7 @@ def tally(number: int, outcomes: Outcomes) -> list[Choice]:
                 "round": number,
                 "eta": round(eta, 4),
                 "draws": int(attacks.sum()),
+                "harder": int(attack[attacks].sum()),
                 "left_out": int(outcomes.left_out[attacks].sum()),
                 "episodes": episodes,
                 "failures": failures,

@@ -30,23 +30,24 @@ def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
     order = Order(
         0,
         SCENES,
+        torch.tensor([0, 0, 0, 1, 1]),
         eta=ETA,
         seed=7,
         ego=None,
     )
     traffic, _ = make_traffic(
-        order, attack, solvable=even_scenes, nominal=nominal, batch=batch
+        order, [attack] * 2, solvable=even_scenes, nominal=nominal, batch=batch
     )
     entered = [0, 4, 2]
     scenes = entered + SCENES.tolist() * nominal
     assert traffic["scene_index"].tolist() == scenes
     assert traffic["entered"].tolist() == (SCENES % 2 == 0).tolist()
     assert traffic["eta"].tolist() == [2.0, 0.0, 1.5] + [0.0] * (len(scenes) - 3)
-    assert traffic["attacked"] == 4 / 5, "of all that were attacked"
-    assert traffic["contact"] == 3 / 5
+    assert traffic["attacked"].tolist() == [1, 1, 0, 1, 1], "also of what is left out"
+    assert traffic["contact"].sum() == 3
     whole, _ = make_traffic(
         order,
-        attack,
+        [attack] * 2,
         solvable=even_scenes,
         nominal=nominal,
     )
@@ -69,27 +70,32 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
     order = Order(
         2,
         index,
+        torch.zeros_like(index),
         eta=torch.full((4,), 2.0),
         seed=7,
         ego=IDMEgo(),
     )
     built, errored = make_traffic(
         order,
-        synthesize_traffic(
-            scenes,
-            Stumbles(),
-            sim=SimSettings(),
-            batch=3,
-        ),
+        [
+            synthesize_traffic(
+                scenes,
+                Stumbles(),
+                sim=SimSettings(),
+                batch=3,
+            )
+        ],
     )
     whole, none = make_traffic(
         order,
-        synthesize_traffic(
-            scenes,
-            Ambush(),
-            sim=SimSettings(),
-            batch=3,
-        ),
+        [
+            synthesize_traffic(
+                scenes,
+                Ambush(),
+                sim=SimSettings(),
+                batch=3,
+            )
+        ],
     )
     assert built["entered"].tolist() == [True, True, False, True]
     assert whole["entered"].all()
@@ -112,7 +118,9 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
         rtol=0,
         atol=1e-4,
     )
-    assert built["contact"] == 1.0, "the share of those that were made"
+    torch.testing.assert_close(
+        built["contact"], torch.tensor([1.0, 1.0, torch.nan, 1.0]), equal_nan=True
+    )
 
 
 # --- what some driver avoids
@@ -132,10 +140,32 @@ def ambush(scenes):
     return synthesize
 
 
+def test_each_scene_is_attacked_as_ordered():
+    """By the first attack or the second, whose adversaries differ."""
+    calm = brake_check(small_scenes(5))
+
+    def other(ego, index, eta, seed):
+        return (traffic := calm(ego, index, eta, seed)) | {
+            "adversaries": ~traffic["adversaries"]
+        }
+
+    order = Order(
+        0,
+        SCENES,
+        torch.tensor([0, 0, 0, 1, 1]),
+        eta=torch.ones(5),
+        seed=7,
+        ego=None,
+    )
+    traffic, _ = make_traffic(order, [calm, other], batch=2)
+    assert traffic["adversaries"][:5, 1].tolist() == [True] * 3 + [False] * 2
+    assert traffic["adversaries"][5:, 1].tolist() == [False] * 5, "nominal by the first"
+
+
 def test_the_doomed_are_left_out_and_reported():
     scenes = small_scenes(4)
     run = small_run(scenes=scenes)
-    run.synthesize = ambush(scenes)
+    run.attacks = [ambush(scenes)]
     run.solvable = partial(solvable, scenes=scenes, sim=SimSettings())
     run.settings = type(run.settings)(scenes=4, nominal="log")
     metrics = train_round(run)

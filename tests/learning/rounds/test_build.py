@@ -58,8 +58,7 @@ def built(config, folder=None):
         config,
         scenes,
         ego=build_ego(config),
-        traffic=Ambush(),
-        synthesize=brake_check(scenes),
+        attacks=[brake_check(scenes)],
         folder=folder,
     )
 
@@ -81,7 +80,7 @@ def test_the_experiment_of_training_is_of_options_that_exist():
 def test_without_a_synthesizer_given_the_traffic_method_attacks():
     config = config_of("learner.round.nominal=log", "curriculum.solvable_only=false")
     run = build_evolution(
-        config, small_scenes(3), ego=build_ego(config), traffic=Ambush()
+        config, small_scenes(3), ego=build_ego(config), attackers=[Ambush()]
     )
     metrics = train_round(run)
     assert metrics["synthesizer/attacked"] == metrics["synthesizer/contact"] == 1.0

@@ -15,11 +15,13 @@ from tests.learning.small import rounds, small_run, small_scenes
 
 def test_a_round_improves_moves_on_and_reports():
     run = small_run(nominal="prior")
-    attack = run.synthesize
+    (attack,) = run.attacks
     requests = []
-    run.synthesize = lambda ego, index, eta, seed: (
-        requests.append((ego, eta, seed)) or attack(ego, index, eta, seed)
-    )
+    run.attacks = [
+        lambda ego, index, eta, seed: (
+            requests.append((ego, eta, seed)) or attack(ego, index, eta, seed)
+        )
+    ]
     before = {key: value.clone() for key, value in run.ego.network.weights().items()}
     metrics = train_round(run)
     etas = [eta.tolist() for _, eta, _ in requests]

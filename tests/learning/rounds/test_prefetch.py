@@ -18,7 +18,7 @@ from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 
 def real(run, scenes):
     """Closed-loop synthesis, in which the ego's weights matter."""
-    run.synthesize = synthesize_traffic(scenes, Ambush(), sim=SimSettings())
+    run.attacks = [synthesize_traffic(scenes, Ambush(), sim=SimSettings())]
     return run
 
 
@@ -40,7 +40,7 @@ def test_the_traffic_is_that_of_the_same_order_here():
     rest = {name: value.clone() for name, value in order.ego.network.weights().items()}
     current = run.ego.network.weights()
     assert any(not torch.equal(value, current[name]) for name, value in rest.items())
-    expected, _ = make_traffic(order, run.synthesize)
+    expected, _ = make_traffic(order, run.attacks)
     metrics = train_round(run)
     result = run.memory.rounds[-1].traffic
     assert set(result) == set(expected)
@@ -52,7 +52,7 @@ def test_the_traffic_is_that_of_the_same_order_here():
         torch.equal(value, order.ego.network.weights()[name])
         for name, value in rest.items()
     )
-    against_now = run.synthesize(run.ego, order.scenes, order.eta, order.seed)["states"]
+    against_now = run.attacks[0](run.ego, order.scenes, order.eta, order.seed)["states"]
     assert not torch.equal(against_now, result["states"][: len(order.scenes)])
 
 
@@ -62,11 +62,13 @@ def test_a_process_that_dies_is_named_and_the_run_goes_on_from_its_checkpoint(tm
 
     run = begun()
     attack = brake_check(small_scenes())
-    run.synthesize = lambda ego, index, eta, seed: (
-        os.kill(os.getpid(), signal.SIGKILL)
-        if seed == 1
-        else attack(ego, index, eta, seed)
-    )
+    run.attacks = [
+        lambda ego, index, eta, seed: (
+            os.kill(os.getpid(), signal.SIGKILL)
+            if seed == 1
+            else attack(ego, index, eta, seed)
+        )
+    ]
     train_round(run)
     save_checkpoint(tmp_path, run)
     with pytest.raises(InputError, match=r"round 2: .*killed"):

@@ -179,7 +179,10 @@ def test_the_table_counts_draws_episodes_and_failures_by_multiples_of_a_half():
         episodes=torch.tensor([2, 0, 2, 0]),
         failures=torch.tensor([1, 0, 2, 0]),
     )
-    rows = [tuple(row.values()) for row in tally(4, outcomes)]
-    assert rows[:2] == [(4, 1.0, 1, 0, 2, 1, 0.5), (4, 2.0, 2, 1, 2, 2, 1.0)]
-    assert rows[2][:-1] == (4, 3.0, 1, 0, 0, 0)
+    rows = [
+        tuple(row.values())
+        for row in tally(4, outcomes, attack=torch.tensor([0, 0, 1, 1]))
+    ]
+    assert rows[:2] == [(4, 1.0, 1, 0, 0, 2, 1, 0.5), (4, 2.0, 2, 1, 1, 2, 2, 1.0)]
+    assert rows[2][:-1] == (4, 3.0, 1, 1, 0, 0, 0)
     assert math.isnan(rows[2][-1]), "no episode, no rate"
