@@ -226,7 +226,7 @@ class Evolution:
         return Order(
             number,
             scenes,
-            attack,
+            attack=attack,
             eta=self.curriculum.etas(scenes),
             seed=self.seed * 1_000_003 + number,
             ego=ego,

@@ -30,7 +30,7 @@ def test_batches_are_joined_in_the_order_of_the_scenes(nominal, batch):
     order = Order(
         0,
         SCENES,
-        torch.tensor([0, 0, 0, 1, 1]),
+        attack=torch.tensor([0, 0, 0, 1, 1]),
         eta=ETA,
         seed=7,
         ego=None,
@@ -70,7 +70,7 @@ def test_rows_that_raise_are_left_out_and_named_and_the_others_are_as_without_th
     order = Order(
         2,
         index,
-        torch.zeros_like(index),
+        attack=torch.zeros_like(index),
         eta=torch.full((4,), 2.0),
         seed=7,
         ego=IDMEgo(),
@@ -152,7 +152,7 @@ def test_each_scene_is_attacked_as_ordered():
     order = Order(
         0,
         SCENES,
-        torch.tensor([0, 0, 0, 1, 1]),
+        attack=torch.tensor([0, 0, 0, 1, 1]),
         eta=torch.ones(5),
         seed=7,
         ego=None,
