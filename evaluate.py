@@ -4,12 +4,11 @@ often, and how, an ego fails."""
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
+from collections.abc import Sequence
 from pathlib import Path
 
-from e2rl.driving.batches import WHOLE
-from e2rl.evaluation.plan import begin
-from e2rl.evaluation.reproduce import compared_with_run, failure_row, outcome, run_of
-from e2rl.report.results import write_results
+from omegaconf import DictConfig
+
 from e2rl.run.command import run_command
 from e2rl.run.run import Run
 
@@ -18,6 +17,11 @@ MAY_CHANGE = ("processes", "shard")  # when a run is resumed
 
 def evaluate(run: Run) -> None:
     """Roll out and score what is not on disk yet; then summarise, draw and print."""
+    from e2rl.driving.batches import WHOLE
+    from e2rl.evaluation.plan import begin
+    from e2rl.evaluation.reproduce import compared_with_run, failure_row, outcome
+    from e2rl.report.results import write_results
+
     config = run.config
     plan = begin(run)
     failure = None
@@ -42,9 +46,17 @@ def evaluate(run: Run) -> None:
         print(f"{config.reproduce}: {comparison.text()}")
 
 
+def begun(config: DictConfig, free: Sequence[str]) -> Run:
+    """Returns the run that the command line asks for."""
+    from e2rl.evaluation.reproduce import run_of
+
+    return run_of(config, free)
+
+
 def main() -> None:
-    """The command."""
-    run_command("evaluate", evaluate, MAY_CHANGE, run_of)
+    """The command. Its libraries load once the options are read: `--help` and a wrong
+    option do without."""
+    run_command("evaluate", evaluate, MAY_CHANGE, begun)
 
 
 if __name__ == "__main__":

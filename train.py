@@ -34,7 +34,7 @@ from e2rl.report.before_after import compared_answer
 from e2rl.report.caption import caption
 from e2rl.report.tables import metric_tables, print_tables, save_tables
 from e2rl.run.command import run_command
-from e2rl.run.config import set_up
+from e2rl.run.machine import set_up
 from e2rl.run.run import Run
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes

@@ -57,6 +57,7 @@ COMMANDS = {  # module, and what the command does
     ),
     "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
 }
+CONFIGURED = ("evaluate", "train", "tune", "rate")  # by conf/<name>.yaml
 EXAMPLES = """examples:
   e2rl try LOGS --planner my_planner.py:MyPlanner --scenes 12
   e2rl evaluate num_scenes=12                    the lane-graph planner on twelve bundled scenes
@@ -86,6 +87,10 @@ def main() -> None:
         print(f"e2rl {version('e2rl')}")
     elif name in COMMANDS:
         sys.argv = [f"e2rl {name}", *arguments]
+        if name in CONFIGURED and {"-h", "--help"} & set(arguments):
+            options = import_module("e2rl.run.options")  # without the command's libraries
+            print(options.help_text(name, arguments))
+            return
         import_module(COMMANDS[name][0]).main()
     else:
         near = get_close_matches(name, COMMANDS, 1, 0.4)

@@ -17,8 +17,7 @@ from typing import IO
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import open_regular, write_atomically, written_whole
-from e2rl.run.parts import PARTS
-from e2rl.run.run import PROVENANCE, assigned, changed, read_provenance
+from e2rl.run.run import PARTS, PROVENANCE, assigned, changed, read_provenance
 from e2rl.run.trust import CONFIG
 from e2rl.sim.rollout_file import ROLLOUTS
 

@@ -18,8 +18,8 @@ from e2rl.evaluation.check import EvaluationSettings, evaluation_settings
 from e2rl.evaluation.record import Record, record
 from e2rl.evaluation.reproduce import files_of_run
 from e2rl.prior.prior import Prior
-from e2rl.run.config import set_up
 from e2rl.run.errors import InputError
+from e2rl.run.machine import set_up
 from e2rl.run.parts import Parts
 from e2rl.run.run import Run
 from e2rl.scenes.scene import SceneSet

@@ -23,7 +23,7 @@ from e2rl.run.files import (
     read_regular,
     write_atomically,
 )
-from e2rl.run.parts import PARTS
+from e2rl.run.run import PARTS
 from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.traffic.attempt import summary_of
 

@@ -3,18 +3,15 @@ values stand once, in these files."""
 
 import copy
 import inspect
-import random
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from functools import cache, wraps
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
@@ -24,6 +21,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from e2rl.run.endings import out_of_memory
 from e2rl.run.errors import InputError
 from e2rl.run.extras import how_to_install
 
@@ -138,13 +136,15 @@ def built(config: DictConfig, where: str, kind: type, **given: Any) -> Any:
     target = settings.get("_target_")
     try:
         instance = instantiate(settings, _partial_=True, _convert_="all")(**given)
-    except (InputError, MemoryError, torch.OutOfMemoryError):
+    except (InputError, MemoryError):
         raise
     except SystemExit as error:  # of outside code, perhaps as it is imported
         raise InputError(
             f"{where}={target}: it called sys.exit({error.code!r}) instead of being built"
         ) from error
     except Exception as error:  # outside code raises anything
+        if out_of_memory(error):
+            raise
         cause = (
             error.__cause__
             if isinstance(error, InstantiationException) and error.__cause__
@@ -338,28 +338,6 @@ def check_range(
         )
 
 
-# --- settings of the machine
-
-
-@dataclass(frozen=True)
-class Machine:
-    """What a run takes of its machine; train.py has no `processes`."""
-
-    batch: int = setting(low=1)
-    threads: int = setting(low=1)
-    processes: int | None = setting(low=1, optional=True)
-
-
-def check_device(key: str, device: str) -> None:
-    """Raises InputError for a device that is not there; key: whose value it is."""
-    try:
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(
-            f"{key}={device}: {str(error).splitlines()[0]}; use {key}=cpu or cuda"
-        ) from error
-
-
 def check_list(key: str, value: Any) -> None:
     """Raises InputError for a text of several values, where the values of `key` are a
     list."""
@@ -371,24 +349,6 @@ def as_a_list(key: str, value: str) -> str:
     """Returns how to write several values that commas part; a name with spaces is one."""
     values = ",".join(part.strip() for part in value.split(","))
     return f"several values are a list, '{key}=[{values}]'"
-
-
-def set_up(config: DictConfig) -> None:
-    """Import the plugins; set the threads, the device and the seeds of torch, numpy and
-    python. Raises InputError for a plugin or device that is not there, and a size that
-    is impossible."""
-    settings_of(Machine, {part.name: config.get(part.name) for part in fields(Machine)})
-    for key in LISTS:
-        check_list(key, config.get(key))
-    import_plugins(config.plugins, "plugins: ")
-    torch.set_num_threads(config.threads)
-    check_device("device", config.device)
-    seed = config.get(
-        "seed", 0
-    )  # first weights and exploration; evaluation's noise has seeds of its own
-    torch.manual_seed(seed)
-    np.random.seed(seed % 2**32)
-    random.seed(seed)
 
 
 def library(name: str, where: str, extra: str) -> Any:

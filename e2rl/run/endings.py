@@ -118,18 +118,22 @@ def _told(
             f"before is whole. Mend that, then go on with: {go_on()}"
         )
         return message, 1
-    memory = isinstance(error, MemoryError)
-    if isinstance(error, OSError):
-        memory = error.errno == errno.ENOMEM
-    if isinstance(error, RuntimeError):
-        memory = any(words in str(error) for words in MEMORY)
-    if memory:
+    if out_of_memory(error):
         message = (
             "\nerror: out of memory; what was written before is whole. Free memory, or "
             f"use fewer processes, then go on with: {go_on()}"
         )
         return message, 1
     return None, 1
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Returns whether an error says that memory is full, a GPU's included."""
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    if isinstance(error, RuntimeError):
+        return any(words in str(error) for words in MEMORY)
+    return isinstance(error, MemoryError)
 
 
 def _is_unread() -> bool:

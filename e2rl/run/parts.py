@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 from e2rl.run.files import MAX_FILE, read_regular, write_atomically
+from e2rl.run.run import PARTS
 
-PARTS = "parts"
 FORMAT = "e2rl-part/1"
 HASHED = b"e2rl-sha256:"
 

@@ -18,11 +18,11 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -38,7 +38,6 @@ from e2rl.run.files import (
     sha256_of,
     write_atomically,
 )
-from e2rl.run.parts import PARTS
 from e2rl.run.trust import (
     ALWAYS,
     CONFIG,
@@ -50,6 +49,7 @@ from e2rl.run.trust import (
 )
 
 PROVENANCE = "provenance.json"
+PARTS = "parts"  # the folder of `e2rl.run.parts`
 PROVENANCE_SHAPE = {
     "command": str,
     "cwd": str,
@@ -285,7 +285,7 @@ def versions(config: DictConfig) -> dict[str, str]:
     result = {
         "git": git_commit(),
         "python": platform.python_version(),
-        "torch": torch.__version__,
+        "torch": metadata.version("torch"),
         "e2rl": hash_files(sorted(PACKAGE.rglob("*.py"))).hex(),
         "bundled weights": hash_files(sorted(PACKAGE.rglob("*.safetensors"))).hex(),
     }

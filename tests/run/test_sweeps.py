@@ -6,8 +6,9 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from e2rl.run.command import run_command
-from e2rl.run.config import check_list, load_config, set_up
+from e2rl.run.config import check_list, load_config
 from e2rl.run.errors import InputError
+from e2rl.run.machine import set_up
 from e2rl.run.options import wrong_option
 
 

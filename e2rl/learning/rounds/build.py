@@ -23,13 +23,13 @@ from e2rl.planners.ego import Ego
 from e2rl.prior.prior import Prior
 from e2rl.run.config import (
     built,
-    check_device,
     load_choice,
     resolved,
     setting,
     settings_of,
 )
 from e2rl.run.errors import InputError
+from e2rl.run.machine import check_device
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes, source_of
 from e2rl.scenes.versions import RECORDED
