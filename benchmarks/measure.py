@@ -20,8 +20,9 @@ from e2rl.planners.ego import Ego
 from e2rl.run.config import load_config
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.rollouts import Rollouts
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.traffic import Traffic
 

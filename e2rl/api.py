@@ -42,9 +42,10 @@ from e2rl.run.config import (
 )
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.rollout_file import Failure
 from e2rl.sim.rollouts import Rollouts
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.fusing import prepare_fused
 from e2rl.traffic.pool import RowDraw, TrafficPool
 from e2rl.traffic.traffic import Traffic

@@ -8,7 +8,8 @@ from pathlib import Path
 import e2rl
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
+from e2rl.sim.settings import SimSettings
 from tests.synthetic import make_scenes
 
 PACKAGE = Path(e2rl.__file__).parent

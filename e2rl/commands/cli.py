@@ -88,7 +88,9 @@ def main() -> None:
     elif name in COMMANDS:
         sys.argv = [f"e2rl {name}", *arguments]
         if name in CONFIGURED and {"-h", "--help"} & set(arguments):
-            options = import_module("e2rl.run.options")  # without the command's libraries
+            options = import_module(
+                "e2rl.run.options"
+            )  # without the command's libraries
             print(options.help_text(name, arguments))
             return
         import_module(COMMANDS[name][0]).main()

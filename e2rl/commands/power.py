@@ -4,7 +4,7 @@ failures became rarer, or what so many scenes can show (docs/guide/compare.md)."
 import argparse
 import math
 
-from e2rl.metrics.power import ratio_seen, scenes_needed
+from e2rl.evaluation.power import ratio_seen, scenes_needed
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 

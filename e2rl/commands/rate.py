@@ -8,7 +8,7 @@ evaluation writes: rollouts.csv, rollouts/, metrics.json, modes.json, failures.h
 import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
 
 # isort: split
-from e2rl.driving.setup import Scored
+from e2rl.driving.scored import Scored
 from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.evaluation.rates import EgoRates, write_rates
 from e2rl.evaluation.record import record

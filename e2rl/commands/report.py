@@ -5,11 +5,11 @@ and a list of its failures.
 import argparse
 from pathlib import Path
 
-from e2rl.evaluation.check import SEARCH
 from e2rl.evaluation.rollout_files import TABLE
 from e2rl.report.html import PAGE, REPLAYS, write_report
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
+from e2rl.search.tries import SEARCH
 
 MEASURED = ("before", f"before/{SEARCH}", "after", f"after/{SEARCH}")  # of a training
 

@@ -23,7 +23,6 @@ from e2rl.evaluation.build import (
     build_traffic,
     method_config,
 )
-from e2rl.evaluation.check import SEARCH
 from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.evaluation.trials import (
     NOMINAL,
@@ -46,7 +45,8 @@ from e2rl.run.command import run_command
 from e2rl.run.config import check_choice, resolved, settings_of, with_changes
 from e2rl.run.errors import InputError
 from e2rl.run.run import Run
-from e2rl.search.tries_file import TRIES_FILE, failures_of
+from e2rl.search.tries import SEARCH, TRIES_FILE
+from e2rl.search.tries_file import failures_of
 
 MAY_CHANGE = ("processes",)  # when a run is resumed
 GROUPS = ("synthesizer", "ego")

@@ -6,7 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from e2rl.driving.setup import Method, Scored, Setup, Task
+from e2rl.driving.scored import Scored
+from e2rl.driving.setup import Method, Setup, Task
 from e2rl.metrics.errored import errored_row
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.run.parts import NO_PARTS, Parts

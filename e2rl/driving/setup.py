@@ -2,23 +2,23 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
+from e2rl.driving.scored import Scored
 from e2rl.metrics.catalogue import SOURCE
 from e2rl.metrics.evasion import add_avoidable
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.sim.rollouts import Rollouts
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.traffic import Traffic
@@ -40,33 +40,6 @@ class Task(NamedTuple):
     seed: int
     noise: int | None = None
     decisions: tuple[float, ...] | None = None
-
-
-@dataclass
-class Scored:
-    """What rollouts scored.
-
-    Args:
-        rows: of rollouts.csv.
-        samples: of realism, one for each row.
-        errored: entries of errored.json.
-    """
-
-    rows: list[dict] = field(default_factory=list)
-    samples: list[dict[str, Tensor]] = field(default_factory=list)
-    errored: list[dict] = field(default_factory=list)
-
-    def add(self, other: "Scored") -> None:
-        """Add what others scored."""
-        self.rows += other.rows
-        self.samples += other.samples
-        self.errored += other.errored
-
-    def where(self, chosen: Sequence[int]) -> tuple[list[dict], list[dict]]:
-        """Returns the rows and samples at some positions."""
-        rows = [self.rows[index] for index in chosen]
-        samples = [self.samples[index] for index in chosen]
-        return rows, samples
 
 
 @dataclass

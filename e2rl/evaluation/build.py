@@ -31,7 +31,7 @@ from e2rl.run.errors import InputError
 from e2rl.search.search import Search, SearchSettings
 from e2rl.search.spending import SearchMethod
 from e2rl.search.tries import TRIES, Family, family_of
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.traffic import Traffic
 
 NAME = re.compile(r"[A-Za-z0-9._+-]+")  # what a file name may hold

@@ -12,8 +12,8 @@ from e2rl.run.config import check_choice, choices, setting, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.processes import cores
 from e2rl.search.spending import UNITS
+from e2rl.search.tries import SEARCH
 
-SEARCH = "search"  # the method whose tries are drawn from families
 DEFAULT_BUDGET = 640.0  # NFE a scene: a rollout of CCDiff
 ALL = "all"  # metrics
 

@@ -24,8 +24,7 @@ from e2rl.metrics.statistics import paired_differences
 from e2rl.run.errors import InputError
 from e2rl.run.run import changed, read_provenance
 from e2rl.scenes.scene_list import SCENES, read_list
-from e2rl.search.tries import TRIES
-from e2rl.search.tries_file import TRIES_FILE
+from e2rl.search.tries import TRIES, TRIES_FILE
 
 PAIR = ("method", "eta", "scene_id", "seed")
 CHANGES = ("new", "gone", "moved", "same")

@@ -26,7 +26,8 @@ from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 from e2rl.search.spending import SearchMethod, Spent, search_all
-from e2rl.search.tries_file import TRIES_FILE, failures_of, write_tries
+from e2rl.search.tries import TRIES_FILE
+from e2rl.search.tries_file import failures_of, write_tries
 from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.traffic.fusing import prepare_fused
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from e2rl.driving.setup import Scored
+from e2rl.driving.scored import Scored
 from e2rl.evaluation.rollout_files import NUMBER, nans, read_json, write_json
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, misfit, write_atomically

@@ -1,15 +1,13 @@
 """What a run leaves: the rows of its tables, written as they come, and read again by
 other commands (docs/reference/metrics.md)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
-from e2rl.driving.batches import Work, drive_all
-from e2rl.driving.setup import Method, Scored, Setup
+from e2rl.driving.scored import Scored
 from e2rl.evaluation.atlas import find_atlas
 from e2rl.evaluation.modes import find_modes, read_modes
 from e2rl.evaluation.rollout_files import (
@@ -23,10 +21,8 @@ from e2rl.evaluation.rollout_files import (
 )
 from e2rl.evaluation.summary import metric_rows
 from e2rl.run.errors import InputError
-from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.trust import CONFIG, read_yaml
-from e2rl.search.tries_file import TRIES_FILE
-from e2rl.sim.rollout_file import ROLLOUTS
+from e2rl.search.tries import TRIES_FILE
 
 
 @dataclass(frozen=True)
@@ -64,37 +60,6 @@ class Record:
             searched=(run / TRIES_FILE).is_file(),
             config=read_yaml(run / CONFIG) if (run / CONFIG).is_file() else None,
         )
-
-
-def run_protocol(
-    setup: Setup,
-    methods: Sequence[Method],
-    *,
-    seeds: Sequence[int],
-    folder: Path | None = None,
-    processes: int = 1,
-    parts: Parts = NO_PARTS,
-    **fields: Any,
-) -> list[dict]:
-    """Returns the rows of metrics.json of every method on every (scene, seed):
-    `drive_all`, then `record`.
-
-    Args:
-        setup: scenes, ego and simulator.
-        methods: of the traffic.
-        seeds: of the noise.
-        folder: of the run's files (None: nothing is written).
-        processes: over which the batches are spread.
-        parts: the batches that are on disk.
-        fields: added to each row, or further arguments of `metric_rows`.
-
-    Raises:
-        InputError: where the traffic lost all rollouts.
-    """
-    into = folder and folder / ROLLOUTS
-    work = Work(into=into, processes=processes, parts=parts)
-    scored = drive_all([setup], methods, seeds=seeds, work=work)
-    return record(scored, folder, **fields).metrics
 
 
 def record(

@@ -21,8 +21,8 @@ from e2rl.metrics.manoeuvre import (
 )
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.env import SimSettings
 from e2rl.sim.rollouts import Rollouts
+from e2rl.sim.settings import SimSettings
 
 BRAKES = (2.0, 4.0, 6.0, 8.0)  # m/s^2, held from a moment on
 PULSES = (  # m/s^2 of braking, s it lasts

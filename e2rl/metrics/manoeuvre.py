@@ -10,7 +10,7 @@ from e2rl.scenes.recording import DT
 from e2rl.scenes.route import interpolate
 from e2rl.sim import dynamics
 from e2rl.sim.dynamics import midpoints
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 
 # Steps between knots (0.5 s): a shift of 2 m within one of them takes all the grip of
 # the tyres.

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.signal import savgol_filter
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
@@ -506,6 +505,8 @@ def smoothed(
         order: of its polynomials.
         deriv: which derivative.
     """
+    from scipy.signal import savgol_filter  # loads all of scipy, for half a second
+
     values = np.asarray(values)
     length = min(window, values.shape[-1])
     return savgol_filter(

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.signal import savgol_filter
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -304,6 +303,8 @@ def savitzky_golay(
 ) -> Tensor:
     """The filter of SCORED_STEPS + 1 values at steps of DT as a matrix [SCORED_STEPS +
     1, SCORED_STEPS + 1]."""
+    from scipy.signal import savgol_filter  # loads all of scipy, for half a second
+
     unit = np.eye(SCORED_STEPS + 1)
     matrix = savgol_filter(
         unit,

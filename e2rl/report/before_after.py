@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
 
-from e2rl.evaluation.check import SEARCH
 from e2rl.evaluation.rates import EgoRates
 from e2rl.evaluation.rollout_files import ATLAS_FILE
 from e2rl.metrics.atlas import CELL
@@ -24,6 +23,7 @@ from e2rl.report.answer import (
 from e2rl.report.rates import WORDS, number, text
 from e2rl.report.tables import UNKNOWN, plural
 from e2rl.run.terminal import columns
+from e2rl.search.tries import SEARCH
 
 MOST_CELLS = 7  # of an atlas
 CHANGES = {  # rows of the comparison of before and after

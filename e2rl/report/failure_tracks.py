@@ -19,8 +19,7 @@ import torch
 from tqdm import tqdm
 
 from e2rl.metrics.preventable import AFTER
-from e2rl.report.picture import contact_point
-from e2rl.scenes.boxes import separation
+from e2rl.scenes.boxes import corners, separation, to_frame
 from e2rl.sim.rollout_file import Failure, Rollout
 from e2rl.traffic.traffic import POINT_STEPS, REPLAN_STEPS
 
@@ -137,6 +136,18 @@ def replay_data(
         "channels": CHANNELS,
         "map_quantum": MAP_QUANTUM,
     }
+
+
+def contact_point(rollout: Rollout, step: int, partner: int) -> np.ndarray:
+    """Where the ego and its partner touch [2] m: the mean of the corners that lie
+    inside the other box, or, where there are none, the middle between the two centres.
+    """
+    pair = [rollout.ego, partner]
+    pose = torch.tensor(rollout.states[step, pair]).double()
+    size = torch.tensor(rollout.size[pair]).double()
+    others = corners(pose, size).flip(0)
+    inside = (to_frame(others, pose[:, None]).abs() <= size[:, None] / 2 + 1e-6).all(-1)
+    return (others[inside] if inside.any() else pose[:, :2]).mean(0).numpy()
 
 
 def role_of(rollout: Rollout, row: int) -> str:

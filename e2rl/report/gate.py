@@ -11,8 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from scipy.optimize import brentq
-
 from e2rl.evaluation.comparison import RATES, Driven, difference
 from e2rl.evaluation.summary import headline
 from e2rl.metrics.catalogue import METRICS, Metric
@@ -241,6 +239,8 @@ def growth(
 
     def sample(end: float) -> float:
         """The places of which the exact interval of the value ends there."""
+        from scipy.optimize import brentq
+
         log = brentq(
             lambda log: exact_interval(value, math.exp(log))[upper] - end,
             0,

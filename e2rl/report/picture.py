@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
-from scipy.signal import savgol_filter
 from tqdm import tqdm
 
 from e2rl.report import drawing
@@ -22,7 +20,7 @@ from e2rl.report.drawing import (
     image_of,
     new_figure,
 )
-from e2rl.scenes.boxes import corners, to_frame
+from e2rl.report.failure_tracks import contact_point
 from e2rl.sim.rollout_file import Rollout
 
 TRAIL = 2.0  # s
@@ -76,6 +74,8 @@ class Replay:
     caption: tuple[str, str] | None = None
 
     def __post_init__(self) -> None:
+        from scipy.signal import savgol_filter  # loads all of scipy, for half a second
+
         step = self.row["contact_step"]
         self.contact = None if math.isnan(step) else int(step)
         self.last = len(self.rollout.states) - 1
@@ -243,18 +243,6 @@ def interpolated(rollout: Rollout, time: float) -> np.ndarray:
     change[:, 2] = (change[:, 2] + np.pi) % (2 * np.pi) - np.pi
     stays = ~rollout.valid[high, :, None]
     return states[low] + np.where(stays, 0, (time - low) * change)
-
-
-def contact_point(rollout: Rollout, step: int, partner: int) -> np.ndarray:
-    """Where the ego and its partner touch [2] m: the mean of the corners that lie
-    inside the other box, or, where there are none, the middle between the two centres.
-    """
-    pair = [rollout.ego, partner]
-    pose = torch.tensor(rollout.states[step, pair]).double()
-    size = torch.tensor(rollout.size[pair]).double()
-    others = corners(pose, size).flip(0)
-    inside = (to_frame(others, pose[:, None]).abs() <= size[:, None] / 2 + 1e-6).all(-1)
-    return (others[inside] if inside.any() else pose[:, :2]).mean(0).numpy()
 
 
 def contact_text(row: Mapping[str, Any]) -> str:

@@ -5,13 +5,10 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import combinations
 
-from scipy import stats
-
 from e2rl.evaluation.rates import EgoRates
 from e2rl.report.tables import UNKNOWN, Table
 from e2rl.tail.interval import LEVEL, Bounds
-from e2rl.tail.population import ALONE
-from e2rl.tail.sampler import EXTINCT, LEAST, REACHED, SPENT
+from e2rl.tail.sampler import ALONE, EXTINCT, LEAST, REACHED, SPENT
 from e2rl.tail.summary import UNITS
 
 LIKELIEST = 10  # scenes whose failures are named
@@ -80,6 +77,8 @@ def rate_tables(egos: Sequence[EgoRates]) -> list[Table]:
 
 def nats_table(egos: Sequence[EgoRates]) -> Table:
     """Returns in how many scenes a failure costs at most some nats."""
+    from scipy import stats  # takes half a second to load
+
     rows = []
     for ego in egos:
         count = len(ego.scenes)

@@ -3,7 +3,6 @@
 
 import numpy as np
 import torch
-from matplotlib.path import Path
 from numpy import ndarray
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -121,6 +120,8 @@ def _lower(
         ring,
         0.0,
     )
+    from matplotlib.path import Path  # only where scenes are built
+
     within = Path(ring).contains_points(cell[box].reshape(-1, 2))
     inside[box] = within.reshape(inside[box].shape)
     change = inside | (least < beyond)

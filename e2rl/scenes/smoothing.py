@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 from numpy import ndarray
 from scipy.ndimage import convolve1d
-from scipy.signal import savgol_coeffs
 
 from e2rl.scenes.paths import (
     direction,
@@ -173,6 +172,8 @@ def polynomial_weights(window: int, order: int) -> tuple[ndarray, ndarray]:
     """Of the polynomial that fits `window` samples at DT best, the value (order 0) or
     slope (order 1): at the middle sample, for a convolution [window], and at all
     samples [window, window]: row k times the samples is that at k."""
+    from scipy.signal import savgol_coeffs  # loads all of scipy, for half a second
+
     time = np.arange(window)[:, None] - window // 2
     power = np.arange(ORDER + 1)
     basis = power * time ** np.maximum(power - 1, 0) / DT if order else time**power

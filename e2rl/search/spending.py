@@ -12,7 +12,8 @@ from itertools import accumulate
 import torch
 
 from e2rl.driving.batches import HERE, Batch, Work, score_all, split_tasks
-from e2rl.driving.setup import Method, Scored, Setup, Task
+from e2rl.driving.scored import Scored
+from e2rl.driving.setup import Method, Setup, Task
 from e2rl.metrics.atlas import cell_of
 from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.margin import FARTHEST

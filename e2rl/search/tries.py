@@ -12,6 +12,8 @@ from e2rl.run.config import check_choice
 from e2rl.run.errors import InputError
 from e2rl.traffic.decisions import RULE, WHOM, Decisions
 
+SEARCH = "search"  # the method whose tries are drawn from families
+TRIES_FILE = "tries.csv"  # of `e2rl.search.tries_file`
 TRIES = 10_000  # of a scene that have seeds of their own
 DRAWN = Decisions._fields
 # of the square roots that stratify the draws of one decision each

@@ -12,7 +12,6 @@ from e2rl.search.search import Search
 from e2rl.search.spending import SearchMethod, Spending
 from e2rl.search.tries import TRIES, Try
 
-TRIES_FILE = "tries.csv"
 COLUMNS = (
     "scene_id",
     "location",

@@ -1,6 +1,5 @@
 """DrivingEnv: a batch of B scenes; actions drive the ego, tracks drive the traffic."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -9,13 +8,13 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
 from e2rl.scenes.drivable_area import off_road
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.mission import Mission, mission_of, start_place
 from e2rl.sim.observation import OBSERVATION_SIZE, EgoState, features, placed_ego
 from e2rl.sim.reward import check_weights
+from e2rl.sim.settings import SimSettings
 from e2rl.sim.static import static_scene, write_rows
 from e2rl.sim.step import CONTACTS, Outcome, StepConfig, hold_step
 from e2rl.sim.world import (
@@ -37,31 +36,6 @@ METRICS = (*CONTACTS, "off_road", "progress")
 def touches(metrics: TensorDictBase) -> Tensor:
     """Bool [..., 1]: the ego touches anybody, by an environment's metrics [...]."""
     return metrics["contact"] | metrics["contact_vru"] | metrics["contact_object"]
-
-
-@configured("sim/default")
-@dataclass
-class SimSettings:
-    """Bounds of the ego's action, what ends an episode, and the weights of the reward
-    (conf/sim/default.yaml)."""
-
-    max_acceleration: float = setting(
-        low=0.1,
-        high=100.0,
-    )
-    max_braking: float = setting(
-        low=0.1,
-        high=100.0,
-    )
-    max_yaw_rate: float = setting(
-        low=0.1,
-        high=100.0,
-    )
-    end_on_contact: bool = setting()
-    end_off_road: bool = setting()
-    end_when_gone: bool = setting()
-    replay_ego: bool = setting()
-    reward: dict[str, float] = setting()
 
 
 class DrivingEnv(EnvBase):

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from scipy import stats
 from torch import Tensor
 
 LEVEL = 0.95
@@ -30,6 +29,8 @@ def of_logs(logs: Tensor) -> Bounds:
     - 1)) is that of a t law. It has R - 2 degrees of freedom, as populations' estimates
     have longer tails (tools/tail_coverage.py).
     """
+    from scipy import stats  # takes half a second to load
+
     count = len(logs)
     variance = float(logs.var().clamp(min=LEAST_VARIANCE))
     centre = float(logs.mean()) + variance / 2
@@ -43,6 +44,8 @@ def of_logs(logs: Tensor) -> Bounds:
 
 def of_counts(hits: int, count: int) -> Bounds:
     """Returns the fraction of hits in independent rollouts (Clopper and Pearson 1934)."""
+    from scipy import stats  # takes half a second to load
+
     interval = stats.binomtest(hits, count).proportion_ci(LEVEL, "exact")
     return Bounds(hits / count, float(interval.low), float(interval.high))
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from e2rl.driving.setup import Scored, Setup
+from e2rl.driving.scored import Scored
+from e2rl.driving.setup import Setup
 from e2rl.metrics.errored import errored_row, lost, raised
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.score import score_rollouts
@@ -19,10 +20,9 @@ from e2rl.sim.rollouts import Rollouts
 from e2rl.tail.level import FARTHEST, TARGETS, contacts, levels
 from e2rl.tail.moves import Moves
 from e2rl.tail.noise import NoiseLayout
-from e2rl.tail.sampler import EXTINCT, REACHED, Driven, Sampler
+from e2rl.tail.sampler import ALONE, EXTINCT, REACHED, Driven, Sampler
 from e2rl.tail.settings import METHODS, RateSettings
 
-ALONE = "alone"  # no vehicle is driven by the prior, so nothing is left to chance
 NEARBY = 20.0  # m from the ego at which a vehicle is moved alone half as often
 SEED_STEP = 1_000_003  # between the seeds of two repetitions
 UNKNOWN = -10 * FARTHEST  # the level of a rollout in which the traffic raised

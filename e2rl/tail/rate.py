@@ -10,9 +10,11 @@ from typing import NamedTuple
 import torch
 
 from e2rl.driving.batches import Work, split_tasks
-from e2rl.driving.setup import Method, Scored, Setup, Task
+from e2rl.driving.scored import Scored
+from e2rl.driving.setup import Method, Setup, Task
 from e2rl.run.processes import in_processes
 from e2rl.run.terminal import Bar
+from e2rl.tail.estimate import Estimate
 from e2rl.tail.noise import ChosenNoise, NoiseLayout
 from e2rl.tail.population import OneRollout, Population, one_by_one
 from e2rl.tail.sampler import REACHED, Tally
@@ -21,28 +23,6 @@ from e2rl.traffic.attempt import attempt
 from e2rl.traffic.nominal import NominalTraffic
 
 TAIL = "tail"  # the method of these rollouts in tables and files
-
-
-class Estimate(NamedTuple):
-    """What one population says of a scene.
-
-    Args:
-        scene: its position.
-        repetition: of the population.
-        tally: the probabilities.
-        km: that the ego drives in a rollout, on average.
-        raised: rollouts in which the planner raised, which count as failures.
-        lost: rollouts in which the traffic raised, which are none.
-        failures: the rollouts that reached the target; rows have a `weight`.
-    """
-
-    scene: int
-    repetition: int
-    tally: Tally
-    km: float
-    raised: int
-    lost: int
-    failures: Scored
 
 
 class Job(NamedTuple):

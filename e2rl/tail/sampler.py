@@ -18,6 +18,7 @@ REACHED = "reached"  # failures were drawn
 EXTINCT = "extinct"  # all particles stay at one level
 LEAST = "least"  # the target is less likely than `least`
 SPENT = "spent"  # the budget of rollouts
+ALONE = "alone"  # no vehicle is driven by the prior, so nothing is left to chance
 
 
 @configured("rate", "rate")

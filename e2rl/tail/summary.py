@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from e2rl.driving.setup import Scored
+from e2rl.driving.scored import Scored
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
+from e2rl.tail.estimate import Estimate
 from e2rl.tail.interval import Bounds, of_counts, of_logs, of_ratio
-from e2rl.tail.rate import Estimate
 from e2rl.tail.sampler import REACHED
 
 EVENTS = ("contact", "preventable", "counted")

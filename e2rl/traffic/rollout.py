@@ -18,9 +18,10 @@ from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.prior.routes import take_route
 from e2rl.scenes.route import BEHIND, SPACING, project_track
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.mission import Mission, mission_of, ran_red
 from e2rl.sim.rollouts import Rollouts
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.traffic import PlanLog, Traffic, counted_nfe

@@ -8,8 +8,7 @@ import pytest
 from e2rl.evaluation.comparison import CHANGES, Driven, compared
 from e2rl.metrics.errored import errored_row
 from e2rl.run.errors import InputError
-from e2rl.search.tries import TRIES
-from e2rl.search.tries_file import TRIES_FILE
+from e2rl.search.tries import TRIES, TRIES_FILE
 from tests.evaluation.constructed_runs import row_of, run_of
 
 

@@ -9,7 +9,8 @@ import pytest
 from e2rl.driving.batches import Work, drive_all
 from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.build import build_egos
-from e2rl.evaluation.record import record, run_protocol
+from e2rl.evaluation.protocol import run_protocol
+from e2rl.evaluation.record import record
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.evaluation.summary import metric_rows
 from e2rl.metrics.score import score_rollouts
@@ -17,8 +18,8 @@ from e2rl.planners.idm_planner import IDMEgo
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
-from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import ROLLOUTS
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import small_scenes
 from tests.metrics.random_rollouts import labelled, random_rollouts

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from e2rl.driving.setup import Method, Setup
-from e2rl.evaluation.record import run_protocol
+from e2rl.evaluation.protocol import run_protocol
 from e2rl.evaluation.rollout_files import (
     ERRORED_FILE,
     METRICS_FILE,
@@ -22,8 +22,8 @@ from e2rl.report.answer import answer_lines
 from e2rl.report.html import write_report
 from e2rl.report.tables import metric_tables
 from e2rl.run.errors import InputError
-from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import ROLLOUTS
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rule_based import LogReplay
 from tests.traffic.e2.traffic_scenes import scenes
 

@@ -18,8 +18,8 @@ from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.score import score_rollouts
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
-from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import file_stem, rollout_name
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.evaluation.constructed_runs import row_of
 from tests.metrics.random_rollouts import labelled, random_rollouts

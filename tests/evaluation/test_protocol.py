@@ -6,7 +6,7 @@ import torch
 
 from e2rl.driving.setup import Method, Setup, scene_seed
 from e2rl.evaluation.modes import read_modes
-from e2rl.evaluation.record import run_protocol
+from e2rl.evaluation.protocol import run_protocol
 from e2rl.evaluation.rollout_files import (
     METRICS_FILE,
     MODES_FILE,
@@ -16,8 +16,8 @@ from e2rl.evaluation.rollout_files import (
 )
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.parts import Parts
-from e2rl.sim.env import SimSettings
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import Ambush, small_scenes
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer

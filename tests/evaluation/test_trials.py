@@ -9,7 +9,7 @@ import torch
 from e2rl.commands.tune import flat
 from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.build import build_traffic
-from e2rl.evaluation.record import run_protocol
+from e2rl.evaluation.protocol import run_protocol
 from e2rl.evaluation.trials import (
     DRIVING,
     MEASURED,
@@ -24,7 +24,7 @@ from e2rl.evaluation.tuning import SearchSettings, search
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.path import MissionPath
 from e2rl.run.config import load_choice, resolved, with_changes
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.baselines.ctg import CTGAdv
 from e2rl.traffic.nominal import NominalTraffic
 from tests.prior.small import small_prior

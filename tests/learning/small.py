@@ -8,7 +8,7 @@ from e2rl.learning.rounds.memory import Memory
 from e2rl.learning.rounds.policy import PolicyImprovement
 from e2rl.learning.rounds.schedules import AdaptiveCurriculum
 from e2rl.planners.actor import ActorEgo
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity
 from tests.synthetic import make_scenes
 

@@ -18,8 +18,9 @@ from e2rl.metrics.evasion import (
 from e2rl.metrics.evasion_scene import EvasionScene
 from e2rl.metrics.manoeuvre import knot_count
 from e2rl.scenes.boxes import separation
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.rollouts import Rollouts
+from e2rl.sim.settings import SimSettings
 from tests.synthetic import make_scenes
 
 SIZES = {"max_vehicles": 8, "max_agents": 10, "num_routes": 2, "num_points": 150}

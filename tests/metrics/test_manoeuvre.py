@@ -15,7 +15,8 @@ from e2rl.metrics.manoeuvre import (
 )
 from e2rl.scenes.route import SPACING, project
 from e2rl.sim import dynamics
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
+from e2rl.sim.settings import SimSettings
 from tests.synthetic import LANE_WIDTH, make_scenes
 
 LIMITS = SimSettings(max_acceleration=5.0, max_braking=8.0, max_yaw_rate=1.6)

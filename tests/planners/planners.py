@@ -14,8 +14,9 @@ from e2rl.planners.external import continued
 from e2rl.planners.path import MissionPath
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.mission import mission_of
+from e2rl.sim.settings import SimSettings
 from tests.synthetic import make_scenes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "external_planner.py"

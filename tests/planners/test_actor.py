@@ -14,8 +14,9 @@ from e2rl.planners.reference import follow
 from e2rl.planners.trunk import Normaliser
 from e2rl.run.errors import InputError
 from e2rl.run.files import seal
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import observation_layout
+from e2rl.sim.settings import SimSettings
 from tests.synthetic import make_scenes
 
 

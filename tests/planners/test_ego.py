@@ -20,7 +20,8 @@ from e2rl.run.config import built, load_choice
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import LIGHT_GREEN
 from e2rl.sim import dynamics
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.lookahead import Lookahead
 from e2rl.traffic.rollout import roll_out
 from e2rl.traffic.rule_based import ConstantVelocity, LogReplay

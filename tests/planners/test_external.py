@@ -20,14 +20,14 @@ import torch
 
 from e2rl import roll_out
 from e2rl.driving.setup import Method, Setup
-from e2rl.evaluation.record import run_protocol
+from e2rl.evaluation.protocol import run_protocol
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.planners.external import ExternalEgo
 from e2rl.planners.planner_messages import plan_message, scene_messages
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.sim.env import SimSettings
 from e2rl.sim.mission import mission_of
+from e2rl.sim.settings import SimSettings
 from e2rl.sim.world import World
 from e2rl.traffic.rule_based import LogReplay
 from tests.planners.planners import SameLaw, command_of, wrong_planner

@@ -15,14 +15,14 @@ import torch
 
 import e2rl
 from e2rl.driving.setup import Method, Setup
-from e2rl.evaluation.record import run_protocol
+from e2rl.evaluation.protocol import run_protocol
 from e2rl.evaluation.rollout_files import ERRORED_FILE
 from e2rl.planners.external import ExternalEgo
 from e2rl.scenes.bundled import BundledSource
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
-from e2rl.sim.env import SimSettings
 from e2rl.sim.mission import mission_of
+from e2rl.sim.settings import SimSettings
 from e2rl.sim.world import World
 from e2rl.traffic.rule_based import LogReplay
 from tests.planners.test_external import BAD, scene_set

@@ -8,7 +8,8 @@ import torch
 
 from e2rl.planners.path import STOP_GAP, MissionPath, RoutePath, fading, look_up
 from e2rl.sim.dynamics import inverse, wrap
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
+from e2rl.sim.settings import SimSettings
 from e2rl.sim.world import World
 from tests.loops import loop_scenes
 from tests.planners.planners import world_of, worlds

@@ -13,8 +13,9 @@ from e2rl.planners.ego_errors import NotFinite
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.policy_file import MAX_FILE, PolicyFileEgo
 from e2rl.run.errors import InputError
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import OBSERVATION_SIZE
+from e2rl.sim.settings import SimSettings
 from tests.planners.test_actor import wild
 from tests.synthetic import make_scenes
 

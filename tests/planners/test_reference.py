@@ -17,8 +17,9 @@ from e2rl.planners.reference import (
 )
 from e2rl.planners.trunk import Largest, Trunk
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import LOOK_AHEAD, NEAREST, OBSERVATION_SIZE, PER_AGENT
+from e2rl.sim.settings import SimSettings
 from tests.planners.planners import all_driven
 from tests.synthetic import make_scenes
 

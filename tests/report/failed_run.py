@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from e2rl.driving.setup import Scored
+from e2rl.driving.scored import Scored
 from e2rl.evaluation.record import record
 from e2rl.evaluation.rollout_files import TABLE, read_rows, write_rows
 from e2rl.metrics.failure_modes import is_failure

@@ -2,9 +2,9 @@
 
 from types import SimpleNamespace
 
-from e2rl.driving.setup import Scored
+from e2rl.driving.scored import Scored
 from e2rl.evaluation.rates import EgoRates
-from e2rl.tail.rate import Estimate
+from e2rl.tail.estimate import Estimate
 from e2rl.tail.sampler import REACHED, SPENT, Tally
 from e2rl.tail.summary import scene_rates
 

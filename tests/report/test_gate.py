@@ -12,7 +12,7 @@ from e2rl.commands.gate import main
 from e2rl.metrics.errored import errored_row
 from e2rl.metrics.statistics import LEAST, exact_interval
 from e2rl.report.gate import growth
-from e2rl.search.tries_file import TRIES_FILE
+from e2rl.search.tries import TRIES_FILE
 from tests.evaluation.constructed_runs import row_of, run_of
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from e2rl.driving.setup import Scored
+from e2rl.driving.scored import Scored
 from e2rl.evaluation.rates import EgoRates, write_rates
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED
 from e2rl.report.rate_gate import judged_rate, rates_of_run

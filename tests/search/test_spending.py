@@ -24,7 +24,7 @@ from e2rl.search.spending import (
 )
 from e2rl.search.tries import TRIES, Family
 from e2rl.search.tries_file import failures_of, write_tries
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.prior.small import small_prior
 from tests.traffic.e2.traffic_scenes import scenes, synthesizer

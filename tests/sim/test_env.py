@@ -8,7 +8,8 @@ from torchrl.envs.utils import check_env_specs
 
 from e2rl.run.errors import InputError
 from e2rl.scenes.recording import DT, OTHER
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
+from e2rl.sim.settings import SimSettings
 from e2rl.sim.world import World
 from tests.synthetic import make_scenes
 

@@ -7,9 +7,10 @@ import torch
 import e2rl
 from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.mission import mission_of
 from e2rl.sim.observation import light_features, mirrored, observation_config
+from e2rl.sim.settings import SimSettings
 from e2rl.sim.static import static_scene
 from tests.synthetic import make_scenes
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from e2rl.planners import reference
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import ELAPSED, OBSERVATION_SIZE, observation_layout
+from e2rl.sim.settings import SimSettings
 from tests.synthetic import LANE_WIDTH, make_scenes
 
 

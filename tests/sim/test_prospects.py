@@ -8,7 +8,7 @@ import shapely
 import torch
 
 from e2rl.sim import dynamics
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.prospects import (
     TIMES,
     Arc,
@@ -19,6 +19,7 @@ from e2rl.sim.prospects import (
     time_to_contact,
     travelled,
 )
+from e2rl.sim.settings import SimSettings
 from tests.synthetic import make_scenes
 
 CAR = (4.6, 2.0)

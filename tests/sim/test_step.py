@@ -5,8 +5,9 @@ import torch
 
 from e2rl.run import fused
 from e2rl.run.fused import has_compiler, switched_off
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import features
+from e2rl.sim.settings import SimSettings
 from e2rl.sim.step import drive
 from tests.synthetic import make_scenes
 from tests.traffic.test_fusing import traced

@@ -5,7 +5,7 @@ import torch
 
 from e2rl.api import load_prior, make_ego, make_traffic
 from e2rl.driving.setup import Method, Setup, Task
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.tail.noise import ChosenNoise, NoiseLayout
 from e2rl.traffic.grouping import noise_of
 from e2rl.traffic.traffic import REPLAN_STEPS

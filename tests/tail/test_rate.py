@@ -9,10 +9,10 @@ from e2rl.driving.batches import Work
 from e2rl.driving.setup import Setup
 from e2rl.planners.ego import Ego
 from e2rl.run.parts import Parts
-from e2rl.sim.env import SimSettings
-from e2rl.tail.population import ALONE, vehicle_effect
+from e2rl.sim.settings import SimSettings
+from e2rl.tail.population import vehicle_effect
 from e2rl.tail.rate import Rating
-from e2rl.tail.sampler import REACHED
+from e2rl.tail.sampler import ALONE, REACHED
 from e2rl.tail.settings import METHODS, RateSettings
 from e2rl.tail.summary import rates_of, scene_rates
 from tests.synthetic import make_scenes

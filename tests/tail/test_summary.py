@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from e2rl.driving.setup import Scored
+from e2rl.driving.scored import Scored
+from e2rl.tail.estimate import Estimate
 from e2rl.tail.interval import of_counts, of_logs, of_ratio
-from e2rl.tail.rate import Estimate
 from e2rl.tail.sampler import REACHED, SPENT, Tally
 from e2rl.tail.summary import rates_of, scene_rates
 

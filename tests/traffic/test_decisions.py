@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.decisions import BESIDE, LEADER, ONCOMING, RULE, WHOM, eligible
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rollout import roll_out

@@ -5,7 +5,7 @@ import torch
 
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.planners.sampling import SamplingEgo
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.baselines.ccdiff import CCDiff
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rollout import roll_out

@@ -10,7 +10,7 @@ import torch
 from e2rl.planners.log_replay import ReplayEgo
 from e2rl.prior.lane_relative import HORIZON
 from e2rl.scenes.recording import DT
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic import traffic
 from e2rl.traffic.nominal import NominalTraffic
 from e2rl.traffic.rollout import synthesize_traffic

@@ -13,7 +13,8 @@ from e2rl.planners.ego_errors import PlannerError, TrafficNotFinite
 from e2rl.planners.ego_policy import EgoPolicy
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.errors import InputError
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.attempt import attempt
 from e2rl.traffic.pool import RowDraw, TrafficPool
 from e2rl.traffic.traffic import Traffic, TrafficPlan, keep_velocity

@@ -42,7 +42,8 @@ from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed
 from e2rl.scenes.source import load_scenes
 from e2rl.sim.dynamics import wrap
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.pool import TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
 

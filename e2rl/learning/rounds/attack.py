@@ -13,7 +13,7 @@ from e2rl.metrics.evasion import find_evasions
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.attempt import count_reasons, summary_of
 
 LATE = 20  # steps before the contact at which an evasion is to begin

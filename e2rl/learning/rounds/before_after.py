@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.driving.batches import Work, drive_all
-from e2rl.driving.setup import Method, Scored, Setup
+from e2rl.driving.scored import Scored
+from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.atlas import read_atlas
-from e2rl.evaluation.check import SEARCH
 from e2rl.evaluation.rates import EgoRates, write_rates
 from e2rl.evaluation.record import record
 from e2rl.evaluation.rollout_files import (
@@ -26,7 +26,8 @@ from e2rl.planners.ego import Ego
 from e2rl.run.parts import Parts
 from e2rl.run.run import origin_of
 from e2rl.search.spending import SearchMethod, search_all
-from e2rl.search.tries_file import TRIES_FILE, write_tries
+from e2rl.search.tries import SEARCH, TRIES_FILE
+from e2rl.search.tries_file import write_tries
 from e2rl.sim.rollout_file import ROLLOUTS
 from e2rl.tail.rate import Rating
 from e2rl.tail.settings import RateSettings

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from e2rl.driving.setup import Method, Setup
 from e2rl.evaluation.build import build_search, build_sim, build_traffic
-from e2rl.evaluation.check import SEARCH, as_list, processes_of
+from e2rl.evaluation.check import as_list, processes_of
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.rounds.attack import Synthesize, solvable
 from e2rl.learning.rounds.before_after import BeforeAfter
@@ -33,6 +33,7 @@ from e2rl.run.machine import check_device
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.source import load_scenes, source_of
 from e2rl.scenes.versions import RECORDED
+from e2rl.search.tries import SEARCH
 from e2rl.tail.settings import RateSettings
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic

@@ -27,7 +27,8 @@ from e2rl.run.config import built, configured, setting, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.pool import RowDraw, TrafficPool
 from e2rl.traffic.transform import AdversarialSynthesizer
 

@@ -22,8 +22,9 @@ from e2rl.planners.bits_network import BitsNetwork, drive_controls, load_bits
 from e2rl.planners.path import RoutePath
 from e2rl.run.config import load_config
 from e2rl.run.run import Run
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import ELAPSED
+from e2rl.sim.settings import SimSettings
 from tests.learning.small import small_scenes
 from tests.synthetic import LANE_WIDTH
 

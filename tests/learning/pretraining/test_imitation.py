@@ -12,7 +12,7 @@ from e2rl.learning.pretraining.imitation import (
     recorded_demonstrations,
 )
 from e2rl.planners.actor import ActorEgo
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from tests.learning.small import small_scenes
 
 

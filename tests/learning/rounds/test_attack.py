@@ -10,7 +10,7 @@ from e2rl.scripts.train import train_round
 
 from e2rl.learning.rounds.attack import ATTACK, Order, make_traffic, solvable
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 

@@ -9,7 +9,7 @@ from e2rl.evaluation.rollout_files import METRICS_FILE, read_metrics
 from e2rl.learning.rounds.before_after import BeforeAfter
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.idm_planner import IDMEgo
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.tail.settings import RateSettings
 from e2rl.traffic.rule_based import ConstantVelocity
 from tests.learning.small import Ambush, small_scenes

@@ -9,7 +9,7 @@ from e2rl.learning.rounds.evolution import RoundSettings
 from e2rl.learning.rounds.policy import PolicyImprovement
 from e2rl.planners.lane_graph_planner import LaneGraphEgo
 from e2rl.run.errors import InputError
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from tests.learning.small import rounds, small_run, small_scenes
 
 

@@ -11,7 +11,7 @@ from e2rl.scripts.train import train_round
 from e2rl.learning.rounds.attack import make_traffic
 from e2rl.learning.rounds.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.run.errors import InputError
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rollout import synthesize_traffic
 from tests.learning.small import Ambush, brake_check, small_run, small_scenes
 

@@ -11,8 +11,9 @@ from e2rl.planners.actor import ActorEgo
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.planners.sampling import SamplingEgo, ranked_actions
 from e2rl.run.errors import InputError
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import OBSERVATION_SIZE
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.pool import TrafficPool
 from tests.learning.small import brake_check, small_run, small_scenes
 

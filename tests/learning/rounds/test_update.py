@@ -11,8 +11,9 @@ from torchrl.objectives.value import GAE
 from e2rl.learning.rounds.update import Learner, UpdateSettings, action_penalty
 from e2rl.planners.actor import ActorEgo
 from e2rl.run.errors import InputError
-from e2rl.sim.env import DrivingEnv, SimSettings
+from e2rl.sim.env import DrivingEnv
 from e2rl.sim.observation import mirrored
+from e2rl.sim.settings import SimSettings
 from tests.learning.small import small_scenes
 
 

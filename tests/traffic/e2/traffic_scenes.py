@@ -10,8 +10,8 @@ from e2rl.planners.ego import Ego
 from e2rl.planners.idm_planner import IDMEgo
 from e2rl.prior.sde import SamplerSettings
 from e2rl.scenes.scene import SceneSet
-from e2rl.sim.env import SimSettings
 from e2rl.sim.rollouts import Rollouts
+from e2rl.sim.settings import SimSettings
 from e2rl.sim.world import World
 from e2rl.traffic.e2.e2 import E2
 from e2rl.traffic.rollout import roll_out

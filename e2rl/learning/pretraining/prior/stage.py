@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.driving.setup import Method, Setup
-from e2rl.evaluation.record import run_protocol
+from e2rl.evaluation.protocol import run_protocol
 from e2rl.learning.logging import RunLogger
 from e2rl.learning.pretraining.prior.training import (
     TrainingSettings,
@@ -25,7 +25,7 @@ from e2rl.run.run import Run, origin_of
 from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_list import listed, scene_hashes
 from e2rl.scenes.source import load_scenes
-from e2rl.sim.env import SimSettings
+from e2rl.sim.settings import SimSettings
 from e2rl.traffic.nominal import NominalTraffic
 
 

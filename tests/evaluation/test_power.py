@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from e2rl.metrics.power import ratio_seen, scenes_needed
+from e2rl.evaluation.power import ratio_seen, scenes_needed
 from e2rl.run.errors import InputError
 
 
