@@ -12,7 +12,7 @@ import copy
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -133,12 +133,13 @@ def build_search(
         raise InputError(
             "search.families: name at least one, such as +search.families.rule={}"
         )
+    configured = cache(partial(method_config, config))  # several families have one
     methods: dict[str, Method] = {}  # families of equal traffic share it
     traffic = {}
     for family in families:
         where = f"search.families.{family.name}"
         synthesizer = with_changes(
-            method_config(config, family.method),
+            configured(family.method),
             family.changes,
             where=f"{where}.changes",
             group="synthesizer",
