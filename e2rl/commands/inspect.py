@@ -19,7 +19,6 @@ from tensordict import TensorDict
 
 from e2rl.report import drawing
 from e2rl.report.drawing import TrafficMap, Trail, new_figure, save_figure
-from e2rl.run.config import load_choice
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.scenes.paths import arc_length
@@ -31,10 +30,9 @@ from e2rl.scenes.recording import (
     LIGHT_YELLOW,
     VEHICLE,
 )
-from e2rl.scenes.source import Row, Source, source_of
+from e2rl.scenes.source import Row, Source, open_source
 from e2rl.sim.rollouts import road_of
 
-GROUPS = ("scenarionet", "commonroad", "argoverse2")  # of data, of a path
 SIDE = 900  # points, of a picture
 HEAD = 34  # points, of its header
 FOOT = 30  # points, of its legend
@@ -188,23 +186,6 @@ def picture(scene: Scene, title: str, metres: float) -> Figure:
     area = TrafficMap(axes, road_of(TensorDict(scene)), metres=metres)
     area.show(scene["start"][0, :2], trails, shapes)
     return figure
-
-
-def open_source(path: Path, data: str | None, workers: int) -> tuple[str, Source]:
-    """Returns the data group that reads `path`, and its source; raises InputError where
-    none does."""
-    refusals = []
-    for name in [data] if data else GROUPS:
-        source = source_of(
-            {**load_choice("data", name), "path": str(path), "workers": workers}
-        )
-        try:
-            source.logs()
-        except InputError as error:
-            refusals.append(str(error))
-        else:
-            return name, source
-    raise InputError("; ".join(dict.fromkeys(refusals)))
 
 
 def inspect(

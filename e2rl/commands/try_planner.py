@@ -15,11 +15,11 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from e2rl.commands.inspect import open_source
 from e2rl.planners.ego import Ego
 from e2rl.run.config import assigned
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
+from e2rl.scenes.source import open_source
 
 SCENES = 12
 NAMED = (

@@ -58,6 +58,7 @@ from e2rl.run.config import (
     check_range,
     check_settings,
     file_values,
+    load_choice,
     setting,
     settings_of,
 )
@@ -107,6 +108,7 @@ NO_EGO = "nobody to be the ego at the start"
 NO_VERSION = "without such a version"  # or it is invalid, and the log itself is not
 VERSION = 14  # of the builder: raise it when a recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
+OF_PATHS = ("scenarionet", "commonroad", "argoverse2")  # groups `data` of a path
 FEW = 16  # scenes that are built here before processes would have started
 NO_MATTER = {"path", "cache", "cache_gb", "workers"}  # to the scenes
 
@@ -531,6 +533,23 @@ def source_of(data: Mapping) -> Source:
             "subclass it, and define logs() and read()"
         )
     return settings_of(kind, settings, where="data")
+
+
+def open_source(path: Path, data: str | None, workers: int) -> tuple[str, Source]:
+    """Returns the data group that reads `path`, and its source; raises InputError where
+    none does."""
+    refusals = []
+    for name in [data] if data else OF_PATHS:
+        source = source_of(
+            {**load_choice("data", name), "path": str(path), "workers": workers}
+        )
+        try:
+            source.logs()
+        except InputError as error:
+            refusals.append(str(error))
+        else:
+            return name, source
+    raise InputError("; ".join(dict.fromkeys(refusals)))
 
 
 def _told_apart(
