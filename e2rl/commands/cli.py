@@ -26,6 +26,10 @@ COMMANDS = {  # module, and what the command does
         "e2rl.commands.rate",
         "how often an ego fails in traffic as the prior has it",
     ),
+    "cross": (
+        "e2rl.commands.cross",
+        "how far failures of one planner are failures of others",
+    ),
     "report": (
         "e2rl.commands.report",
         "the page with a replay of every failure of a run",

@@ -77,6 +77,11 @@ def drive_all(
         for method in methods
         for part in split_tasks(tasks, setups[0].batch)
     ]
+    return drive_batches(batches, work)
+
+
+def drive_batches(batches: Sequence[Batch], work: Work = HERE) -> Scored:
+    """Returns what batches score, in their order; of a shard those of its own."""
     first, step = work.shard
     jobs = [(f"rollouts-{number:06}", batch) for number, batch in enumerate(batches)]
     jobs = jobs[first::step]

@@ -120,9 +120,10 @@ class Evaluation:
             "folder of the run"
         )
 
-    def record(self, driven: Spent) -> Record:
-        """Returns what the rollouts come to, and writes it into the run's folder."""
-        folder = self.run.folder
+    def record(self, driven: Spent, folder: Path | None = None) -> Record:
+        """Returns what the rollouts come to, and writes it into a folder, None: the
+        run's."""
+        folder = folder or self.run.folder
         compared = self.settings.compare
         if driven.tries:
             write_tries(folder / TRIES_FILE, driven.tries)

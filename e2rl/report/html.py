@@ -26,11 +26,13 @@ from e2rl.evaluation.modes import OTHER
 from e2rl.evaluation.rates import RATES_FILE, EgoRates
 from e2rl.evaluation.record import Record
 from e2rl.evaluation.rollout_files import TABLE, nulls, own_folder, rows_text
+from e2rl.evaluation.transfer import CROSS_FILE, Matrix
 from e2rl.metrics.atlas import CELL, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import raised
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.answer import group_lines
+from e2rl.report.cross import cross_tables
 from e2rl.report.failure_tracks import replay_data
 from e2rl.report.rates import rate_tables, summary_lines
 from e2rl.report.tables import (
@@ -102,13 +104,16 @@ def write_report(
     """
     record = record or Record.read(run)
     rates = EgoRates.read(run) if (run / RATES_FILE).is_file() else []
+    crossed = (run / CROSS_FILE).is_file()
+    if tables is None and crossed:
+        tables = cross_tables(Matrix.read(run))
     if tables is None:
         tables = rate_tables(rates) if rates else metric_tables(record.metrics)
     content = page_content(run, record, methods)
     for ego, group in product(rates, content["groups"]):
         if ego.ego == group["ego"]:
             group |= {"summary": summary_lines(ego), "rates": {}}
-    if rates:  # their noise is not kept
+    if rates or crossed:  # their noise is not kept
         content["commands"].pop(AGAIN, None)
     rows = content.pop("rows")
     entries = content["failures"]

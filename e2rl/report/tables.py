@@ -8,7 +8,7 @@ the differences to the first.
 import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -43,12 +43,14 @@ SYMBOLS = str.maketrans(
 @dataclass
 class Table:
     """A caption, column heads and rows of cells; the first column is text, the others
-    are numbers. title: of the section that begins with the table."""
+    are numbers. title: of the section that begins with the table; links: places in the
+    failure report that the numbers of the first rows lead to."""
 
     caption: str
     head: list[str]
     rows: list[list[str]]
     title: str = ""
+    links: list[list[str]] = field(default_factory=list)
 
     def text(self) -> str:
         """For a terminal: aligned columns, the caption above; columns that find no room

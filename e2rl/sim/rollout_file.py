@@ -73,9 +73,10 @@ class Rollout(Road):
     """One rollout as numpy arrays without padding: the content of its file.
 
     Optional are `ran_light` [N], the step at which each vehicle last crossed a stop
-    line at red; `evasion` and `driver` [T+1, 4], the ego as the search for evasions and
-    as the competent driver of the verdict drive it; `plans` [R, P, K, 2] m and
-    `targets` [R, P] of the agents `planners` [P] at each of R replans.
+    line at red; `routes` [N], the route candidates that they followed, -1 none;
+    `evasion` and `driver` [T+1, 4], the ego as the search for evasions and as the
+    competent driver of the verdict drive it; `plans` [R, P, K, 2] m and `targets`
+    [R, P] of the agents `planners` [P] at each of R replans.
     """
 
     scene_id: str = array("U", "")
@@ -97,6 +98,7 @@ class Rollout(Road):
     logged: np.ndarray = array("f", "TN4")
     logged_valid: np.ndarray = array("b", "TN")
     ran_light: np.ndarray | None = array("iu", "N", default=None)
+    routes: np.ndarray | None = array("iu", "N", default=None)
     evasion: np.ndarray | None = array("f", "T4", default=None)
     driver: np.ndarray | None = array("f", "T4", default=None)
     planners: np.ndarray | None = array("iu", "P", default=None)

@@ -154,15 +154,20 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
         """One of B rollouts as numpy arrays. Plans are those of the ego and of the
         adversaries."""
         row = self[index]
-        plans: dict[str, Any] = {}
+        known: dict[str, Any] = {}
         if row.plans is not None:
             planners = row.adversaries[: row.plans.shape[1]].bool().clone()
             planners[0] = True
-            plans["planners"] = planners.nonzero()[:, 0].numpy()
-            plans |= {
+            known["planners"] = planners.nonzero()[:, 0].numpy()
+            known |= {
                 "plans": row.plans[:, planners].float().numpy(),
                 "targets": row.targets[:, planners].numpy(),
             }
+        if row.routes is not None:
+            others = row.states.shape[1] - len(row.routes)
+            known["routes"] = np.pad(
+                row.routes.numpy(), (0, others), constant_values=-1
+            )
         texts: dict[str, Any] = {name: str(getattr(row, name) or "") for name in TEXTS}
         return Rollout(
             **texts,
@@ -181,7 +186,7 @@ class Rollouts(TensorClass["shadow"]):  # type: ignore[name-defined]  # `size` a
             ran_light=None if row.ran_light is None else row.ran_light.numpy(),
             evasion=_known_track(row.evasion),
             driver=_known_track(row.driver),
-            **plans,
+            **known,
         )
 
 

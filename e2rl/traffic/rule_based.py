@@ -53,15 +53,29 @@ class LogReplay(Traffic):
         ego_plan: Tensor,
     ) -> tuple[State, TrafficPlan]:
         """Recorded states and presence of the coming steps."""
-        logged = world.scene["logged"]
-        vehicles = world.scene["route_log"].shape[1]
-        step = steps_ahead(world)
-        row = torch.arange(len(step), device=step.device)[:, None]
-        index = step.clamp(max=logged.shape[1] - 1)
-        recorded = world.scene["logged_valid"][row, index, :vehicles]
-        present = recorded & (step < logged.shape[1])[..., None]
-        states = logged[row, index, :vehicles].transpose(1, 2)
-        return state, TrafficPlan(states, present.transpose(1, 2))
+        scene = world.scene
+        row = torch.arange(len(world.step), device=world.step.device)
+        return state, replayed(scene["logged"], scene["logged_valid"], row, world=world)
+
+
+def replayed(
+    states: Tensor, valid: Tensor, row: Tensor, *, world: World
+) -> TrafficPlan:
+    """Returns the coming steps of stored tracks; nobody is there after their end.
+
+    Args:
+        states: [D, T+1, N, 4], step 0 is the start.
+        valid: [D, T+1, N] bool.
+        row: [B] int64, the tracks of each scene.
+        world: of B scenes.
+    """
+    vehicles = world.scene["route_log"].shape[1]
+    step = steps_ahead(world)
+    index = step.clamp(max=states.shape[1] - 1)
+    recorded = valid[row[:, None], index, :vehicles]
+    present = recorded & (step < states.shape[1])[..., None]
+    motion = states[row[:, None], index, :vehicles].transpose(1, 2)
+    return TrafficPlan(motion, present.transpose(1, 2))
 
 
 class ConstantVelocity(Traffic):

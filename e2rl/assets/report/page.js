@@ -22,8 +22,16 @@ class Page {
     this.follow(asked);
   }
 
-  /** Go to the failure that the end of an address names. */
+  /** Go to the failure that the end of an address names, or to those of a planner in a traffic. */
   follow(hash) {
+    const [, method, ego] = hash.match(/^#group=(.+)\/(.+)/)?.map(decodeURIComponent) ?? [];
+    const chosen = this.report.groups.find((group) => group.ego === ego && group.method === method);
+    if (chosen) {
+      this.choose(ego);
+      this.show(chosen);
+      document.getElementById("scope").scrollIntoView();
+      return;
+    }
     const [, key] = hash.match(/^#failure=(.+)/) ?? [];
     const failure = this.report.failures.find((each) => [each.key, encodeURIComponent(each.key)].includes(key));
     document.getElementById("lost").hidden = !key || Boolean(failure);

@@ -24,10 +24,11 @@ function showTables(container, tables) {
 /** The section's title, or the first words of the caption: up to a colon, or two sentences. */
 const tableTitle = ({ title, caption }) => title || caption.match(/^[^:.]*(\. [^.[;:]*)?/)[0].trim();
 
-function markTable({ head, rows }) {
+function markTable({ head, rows, links }) {
   const columns = head.map((text) => element("th", { scope: "col" }, text));
-  const body = rows.map(([name, ...cells]) =>
-    element("tr", {}, element("th", { scope: "row" }, name), ...cells.map((text) => element("td", {}, text))),
+  const mark = (text, href) => element("td", {}, href ? element("a", { href }, text) : text);
+  const body = rows.map(([name, ...cells], row) =>
+    element("tr", {}, element("th", { scope: "row" }, name), ...cells.map((text, k) => mark(text, links?.[row]?.[k]))),
   );
   return element("table", {}, element("thead", {}, element("tr", {}, ...columns)), element("tbody", {}, ...body));
 }

@@ -1,0 +1,135 @@
+"""The matrix of planners and attacks in words, as tables and as a picture."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.patches import Rectangle
+
+from e2rl.evaluation.transfer import MODES, Matrix
+from e2rl.report import drawing
+from e2rl.report.tables import UNKNOWN, Table, plural
+from e2rl.run.terminal import terminal_width
+
+TITLES = {
+    "replay": "attacks that drive as they did",
+    "again": "attacks made anew against the planner of the row",
+}
+WORDS = {"preventable": "Preventable failures", "hit": "Contacts"}
+OTHERS = "others"  # heads the sums
+CELL = 90  # points, of the picture
+NAMES = 170  # points, beside and above its cells
+LETTERS = 15  # points
+
+
+def headline(matrix: Matrix) -> list[str]:
+    """Returns how many of the attacks on each planner make others fail preventably."""
+    lines = []
+    for entry in matrix.sets:
+        rate = matrix.rate("replay", entry["name"], "", "preventable")
+        lines.append(
+            f"{entry['name']}: {plural(entry['attacks'], 'attack')} in "
+            f"{plural(entry['scenes'], 'scene')}, {entry['nats']:.0f} nats on average; "
+            f"another planner fails preventably in {percent(rate)} % of them."
+        )
+    return lines
+
+
+def cross_tables(matrix: Matrix, narrow: bool = False) -> list[Table]:
+    """Returns a table of each mode and event, with a row for each planner and a column
+    for each set; narrow: without intervals, and where they would not fit the terminal,
+    with numbers for names."""
+    modes = dict.fromkeys(cell["mode"] for cell in matrix.cells)
+    names = [entry["name"] for entry in matrix.sets]
+    labels = {name: name for name in dict.fromkeys((*matrix.egos, *names))}
+    width = sum(len(name) + 2 for name in (*names, OTHERS)) + max(map(len, labels))
+    if narrow and width > terminal_width():
+        labels = {name: str(number + 1) for number, name in enumerate(labels)}
+    return [
+        matrix_table(matrix, mode, event, labels=labels, narrow=narrow)
+        for mode in modes
+        for event in WORDS
+    ]
+
+
+def matrix_table(
+    matrix: Matrix,
+    mode: str,
+    event: str,
+    *,
+    labels: Mapping[str, str],
+    narrow: bool,
+) -> Table:
+    """Returns the rates of one event in one mode.
+
+    Args:
+        matrix: what it shows.
+        mode: how the attacks drive.
+        event: a key of WORDS.
+        labels: of planners and sets.
+        narrow: without intervals.
+    """
+    names = [entry["name"] for entry in matrix.sets]
+    rows = []
+    for ego in (*matrix.egos, ""):
+        rates = [matrix.rate(mode, name, ego, event) for name in (*names, "")]
+        label = labels[ego] if ego else OTHERS
+        title = label if label in (ego, OTHERS) else f"{label} {ego}"
+        rows.append([title, *(percent(rate, interval=not narrow) for rate in rates)])
+    for fact in ("attacks", "scenes", "nats"):
+        values = [f"{entry[fact]:.0f}" for entry in matrix.sets]
+        rows.append([fact, *values, ""])
+    caption = (
+        f"{WORDS[event]}, % of {TITLES[mode]}. Row: who drives; column: against whom they "
+        f"were found; {OTHERS}: all but its own."
+    )
+    if not narrow:
+        caption += " [95% interval, by location or scene]"
+    links = [
+        [f"#group={MODES[mode]}-{name}/{quote(ego)}" for name in names]
+        for ego in matrix.egos
+    ]
+    heads = [labels[name] for name in names]
+    return Table(caption, ["", *heads, OTHERS], rows=rows, links=links)
+
+
+def percent(rate: Mapping[str, float], interval: bool = False) -> str:
+    """Returns a rate in per cent, on request with its interval."""
+    if not rate["n"]:
+        return UNKNOWN
+    text = f"{rate['mean'] * 100:.0f}"
+    if not interval or math.isnan(rate["low"]):
+        return text
+    return f"{text} [{rate['low'] * 100:.0f}, {rate['high'] * 100:.0f}]"
+
+
+def draw_matrix(path: Path, matrix: Matrix) -> None:
+    """Write a picture of preventable failures in attacks that drive as they did: the
+    redder, the more; framed where they are a planner's own."""
+    names = [entry["name"] for entry in matrix.sets]
+    shares = np.zeros((len(matrix.egos), len(names)))
+    width = NAMES + CELL * len(names)
+    height = NAMES + CELL * len(matrix.egos)
+    figure = drawing.new_figure(width, height)
+    axes = figure.add_axes((NAMES / width, 0, 1 - NAMES / width, 1 - NAMES / height))
+    style = {"fontsize": LETTERS, "color": drawing.INK}
+    for row, ego in enumerate(matrix.egos):
+        axes.text(-0.6, row, ego, ha="right", va="center", **style)
+        for column, entry in enumerate(matrix.sets):
+            rate = matrix.rate("replay", entry["name"], ego, "preventable")
+            shares[row, column] = rate["mean"]
+            axes.text(column, row, percent(rate), ha="center", va="center", **style)
+            if ego == entry["ego"]:
+                corner = (column - 0.5, row - 0.5)
+                frame = Rectangle(corner, 1, 1, fill=False, edgecolor=drawing.INK)
+                axes.add_patch(frame)
+    for column, name in enumerate(names):
+        axes.text(column - 0.1, -0.6, name, rotation=45, **style)
+    colours = (drawing.PANEL, drawing.ADVERSARY)
+    scale = LinearSegmentedColormap.from_list("share", colours)
+    axes.imshow(shares, cmap=scale, vmin=0, vmax=1)
+    axes.set(xticks=(), yticks=())
+    drawing.save_figure(path, figure)
