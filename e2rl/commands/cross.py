@@ -54,7 +54,8 @@ def cross(run: Run) -> None:
             "again=true: makes failures anew that this run has found; leave out attacks, "
             "and keep hit or preventable ones"
         )
-    plan = begin(run)
+    files = ", ".join(config.attacks)
+    plan = begin(run, against=f"the attacks in {files}" if files else "")
     if plan.settings.shard != WHOLE:
         raise InputError("shard: attacks are not found in parts; leave it out")
     sets = named(read_sets(plan) if config.attacks else found_sets(plan))

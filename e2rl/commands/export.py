@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from e2rl.evaluation.reproduce import failure_row
 from e2rl.evaluation.rollout_files import TABLE, own_folder, read_rows
+from e2rl.evaluation.transfer import ENDING, AttackSet, kept
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.export.episode import FACTS, Episode
 from e2rl.report.export.scene_files import episodes_of
@@ -17,6 +18,7 @@ from e2rl.run.config import library
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically, written_whole
+from e2rl.sim.rollout_file import file_stem
 
 # Modules of e2rl.report.export; what they import is in the extra of the format's name.
 FORMATS = {
@@ -25,6 +27,7 @@ FORMATS = {
     "scenarionet": "scenarionet_writer",
     "npz": "archive",
 }
+ATTACKS = "attacks"  # the format of e2rl cross
 OPEN_EGO = ("commonroad", "openscenario")  # in which the ego's place may be left open
 LIST = "exported.csv"
 
@@ -59,12 +62,16 @@ def chosen_rows(options: argparse.Namespace) -> list[dict]:
     return failures[: options.failures]
 
 
+def export_attacks(run: Path, rows: list[dict], out: Path) -> None:
+    """Write a file for each planner into a new folder: its attacks."""
+    sets = AttackSet.of_run(run, kept(rows, "all"), begun=run)
+    with written_whole(out) as folder:
+        for attacks in sets:
+            attacks.write(folder / f"{file_stem(attacks.ego)}{ENDING}")
+
+
 def export(write: Callable[[Path], Iterator[tuple[Episode, Path]]], out: Path) -> None:
     """Write episodes into a new folder, with a list of the files and their facts."""
-    if out.exists():
-        raise InputError(
-            f"{out}: is there already; remove it, or pass another folder with --out"
-        )
     lines = [["file", *FACTS, "adversaries"]]
     with written_whole(out) as folder:
         for episode, path in write(folder):
@@ -86,9 +93,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--to",
         required=True,
-        choices=FORMATS,
+        choices=(*FORMATS, ATTACKS),
         metavar="FORMAT",
-        help=", ".join(FORMATS),
+        help=", ".join((*FORMATS, ATTACKS)),
     )
     parser.add_argument(
         "--failures",
@@ -141,12 +148,20 @@ def main(arguments: list[str] | None = None) -> None:
                 f"--open-ego: {options.to} has no such form; leave it out, or pass "
                 f"--to {' or '.join(OPEN_EGO)}"
             )
+        if out.exists():
+            raise InputError(
+                f"{out}: is there already; remove it, or pass another folder with --out"
+            )
+        rows = chosen_rows(options)
+        if options.to == ATTACKS:
+            export_attacks(options.run, rows, out)
+            print(f"{len(rows)} attacks written to {out}")
+            return
         module = library(
             f"e2rl.report.export.{FORMATS[options.to]}",
             f"--to {options.to}",
             extra=options.to,
         )
-        rows = chosen_rows(options)
         episodes = tqdm(
             episodes_of(
                 options.run,

@@ -141,17 +141,23 @@ class Evaluation:
         )
 
 
-def begin(run: Run, often: str = "once a scene and seed") -> Evaluation:
+def begin(
+    run: Run, often: str = "once a scene and seed", against: str = ""
+) -> Evaluation:
     """Returns the plan of a run, which begins or goes on with it. Raises InputError for
     a configuration that cannot be run, and for inputs that changed since the run began.
 
-    often: in words, how often a scene is driven that has no budget.
+    Args:
+        run: with the configuration and the folder.
+        often: in words, how often a scene is driven that has no budget.
+        against: in words, what is driven instead of the methods.
     """
     config = run.config
     set_up(config)
     settings = evaluation_settings(config)
     egos = build_egos(config, ego_name(config.ego, run.choices["ego"]))
-    print(purpose(run, settings, egos=list(egos.egos), often=often), flush=True)
+    against = against or f"{', '.join(settings.methods)}, {effort(settings, often)}"
+    print(purpose(run, settings, egos=list(egos.egos), against=against), flush=True)
     prepare_fused(config)
     # before the scenes, which take longer than a wrong path
     prior, prior_origin, methods, searches = build_rows(config, settings)
@@ -202,7 +208,7 @@ def ego_name(ego: Mapping[str, Any], choice: str) -> str:
 
 
 def purpose(
-    run: Run, settings: EvaluationSettings, *, egos: Sequence[str], often: str
+    run: Run, settings: EvaluationSettings, *, egos: Sequence[str], against: str
 ) -> str:
     """Returns what a run does, in a line.
 
@@ -210,7 +216,7 @@ def purpose(
         run: with the configuration and the folder.
         settings: keys of conf/evaluate.yaml.
         egos: names of the planners.
-        often: a scene is driven that has no budget.
+        against: what, and how often.
     """
     config = run.config
     if config.failure is not None:
@@ -222,10 +228,11 @@ def purpose(
         scenes = f"the first of {scenes}"
     elif settings.num_scenes is not None:
         scenes = f"the first {settings.num_scenes} {scenes}"
+    return f"Drives {', '.join(egos)} in {scenes} against {against}, into {run.folder}."
+
+
+def effort(settings: EvaluationSettings, often: str) -> str:
+    """Returns the seeds, and the budget or how often a scene is driven without one."""
     if settings.budget:
         often = f"{settings.budget:g} {settings.budget_unit} a scene and seed"
-    seeds = ", ".join(map(str, settings.seeds))
-    return (
-        f"Drives {', '.join(egos)} in {scenes} against {', '.join(settings.methods)}, "
-        f"seeds {seeds}, {often}, into {run.folder}."
-    )
+    return f"seeds {', '.join(map(str, settings.seeds))}, {often}"

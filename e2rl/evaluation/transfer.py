@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product, starmap
 from pathlib import Path
-from statistics import fmean
+from statistics import median
 from typing import Any
 
 import torch
@@ -39,7 +39,9 @@ ATTACK = {
     **dict.fromkeys(("eta", "cfr", "cfr_preventable"), float),
     **dict.fromkeys(("transport_adversary", "transport_others"), float),
 }
-MODES = {"replay": "against", "again": "again"}  # beginnings of the methods' names
+REPLAY = "replay"
+AGAIN = "again"
+MODES = {REPLAY: "against", AGAIN: "again"}  # how methods' names begin
 RATES = {"hit": "cfr", "preventable": "cfr_preventable"}
 RATE = dict.fromkeys(("mean", "low", "high", "n"), NUMBER)
 MATRIX = {
@@ -213,7 +215,7 @@ def replays(plan: Evaluation, sets: Mapping[str, AttackSet]) -> list[Batch]:
                 f"attacks on {attacks.ego}: have {frames} frames of {agents} agents, the "
                 f"scenes {list(scenes.shape[1:])}; set data.build as in their run"
             )
-        method = Method(f"{MODES['replay']}-{name}", AttackReplay(attacks.tracks))
+        method = Method(f"{MODES[REPLAY]}-{name}", AttackReplay(attacks.tracks))
         batches += batches_of(plan.setups, method, tasks)
     return batches
 
@@ -259,7 +261,7 @@ def made_again(
                 key = (method.name, method.eta, scene_id, task.seed)
                 if key in numbers:
                     tasks.append(task._replace(seed=numbers[key]))
-            again = replace(method, name=f"{MODES['again']}-{name}")
+            again = replace(method, name=f"{MODES[AGAIN]}-{name}")
             if tasks:
                 batches += batches_of([setup], again, tasks)
     return batches
@@ -286,7 +288,7 @@ class Matrix:
 
     Args:
         egos: the planners that drive.
-        sets: `name`, planner, number of attacks and of their scenes, mean nats.
+        sets: `name`, planner, number of attacks and of their scenes, median of nats.
         cells: RATES of each of `egos` under each set, by mode.
         sums: the same, of each set over the planners that it was not made against, and
             of each planner over the sets that were not made against it; "" for the
@@ -371,7 +373,7 @@ def facts_of(name: str, attacks: AttackSet) -> dict[str, Any]:
         "ego": attacks.ego,
         "attacks": len(attacks.rows),
         "scenes": len(attacks.scenes),
-        "nats": fmean(nats),
+        "nats": median(nats),
         "origin": attacks.origin,
     }
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
 from urllib.parse import quote
 
@@ -9,33 +10,47 @@ import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import Rectangle
 
-from e2rl.evaluation.transfer import MODES, Matrix
+from e2rl.evaluation.transfer import MODES, REPLAY, Matrix
 from e2rl.report import drawing
-from e2rl.report.tables import UNKNOWN, Table, plural
+from e2rl.report.tables import UNKNOWN, Table
 from e2rl.run.terminal import terminal_width
 
 TITLES = {
-    "replay": "attacks that drive as they did",
+    REPLAY: "attacks that drive as they did",
     "again": "attacks made anew against the planner of the row",
 }
 WORDS = {"preventable": "Preventable failures", "hit": "Contacts"}
+FACTS = ("attacks", "scenes", "nats")  # of a set; of nats the median
 OTHERS = "others"  # heads the sums
 CELL = 90  # points, of the picture
 NAMES = 170  # points, beside and above its cells
+EDGE = 14  # points, around them
 LETTERS = 15  # points
 
 
 def headline(matrix: Matrix) -> list[str]:
-    """Returns how many of the attacks on each planner make others fail preventably."""
-    lines = []
-    for entry in matrix.sets:
-        rate = matrix.rate("replay", entry["name"], "", "preventable")
-        lines.append(
-            f"{entry['name']}: {plural(entry['attacks'], 'attack')} in "
-            f"{plural(entry['scenes'], 'scene')}, {entry['nats']:.0f} nats on average; "
-            f"another planner fails preventably in {percent(rate)} % of them."
-        )
-    return lines
+    """Returns which attacks carry over most, and who fails most in those on others."""
+    others = [
+        sum_ | {"share": sum_["preventable"]["mean"]}
+        for sum_ in matrix.sums
+        if sum_["mode"] == REPLAY and sum_["preventable"]["n"]
+    ]
+    sets = [sum_ for sum_ in others if sum_["set"]]
+    egos = [sum_ for sum_ in others if sum_["ego"]]
+    if not sets:
+        return []
+    worst = max(sets, key=itemgetter("share"))
+    if not worst["share"]:
+        return [
+            "No attack makes a planner fail preventably that it was not made against."
+        ]
+    weakest = max(egos, key=itemgetter("share"))
+    return [
+        f"Attacks on {worst['set']} carry over most: other planners fail preventably in "
+        f"{percent(worst['preventable'])}% of them.",
+        f"{weakest['ego']} fails most in attacks on others: preventably in "
+        f"{percent(weakest['preventable'])}%.",
+    ]
 
 
 def cross_tables(matrix: Matrix, narrow: bool = False) -> list[Table]:
@@ -79,15 +94,16 @@ def matrix_table(
         label = labels[ego] if ego else OTHERS
         title = label if label in (ego, OTHERS) else f"{label} {ego}"
         rows.append([title, *(percent(rate, interval=not narrow) for rate in rates)])
-    for fact in ("attacks", "scenes", "nats"):
-        values = [f"{entry[fact]:.0f}" for entry in matrix.sets]
-        rows.append([fact, *values, ""])
+    for fact in FACTS if event == "preventable" else ():
+        rows.append([fact, *(f"{entry[fact]:.0f}" for entry in matrix.sets), ""])
     caption = (
         f"{WORDS[event]}, % of {TITLES[mode]}. Row: who drives; column: against whom they "
-        f"were found; {OTHERS}: all but its own."
+        f"were found; {OTHERS}: all but its own"
     )
-    if not narrow:
-        caption += " [95% interval, by location or scene]"
+    if narrow:
+        caption += "."
+    else:
+        caption += " [95% interval, by location or scene]. nats: the median."
     links = [
         [f"#group={MODES[mode]}-{name}/{quote(ego)}" for name in names]
         for ego in matrix.egos
@@ -111,20 +127,27 @@ def draw_matrix(path: Path, matrix: Matrix) -> None:
     redder, the more; framed where they are a planner's own."""
     names = [entry["name"] for entry in matrix.sets]
     shares = np.zeros((len(matrix.egos), len(names)))
-    width = NAMES + CELL * len(names)
-    height = NAMES + CELL * len(matrix.egos)
-    figure = drawing.new_figure(width, height)
-    axes = figure.add_axes((NAMES / width, 0, 1 - NAMES / width, 1 - NAMES / height))
     style = {"fontsize": LETTERS, "color": drawing.INK}
+    faint = {"fontsize": LETTERS, "color": drawing.MUTED}
+    shape = (CELL * len(names), CELL * len(matrix.egos))
+    width = NAMES + shape[0] + EDGE
+    height = NAMES + shape[1] + EDGE
+    figure = drawing.new_figure(width, height)
+    axes = figure.add_axes(
+        (NAMES / width, EDGE / height, shape[0] / width, shape[1] / height)
+    )
+    figure.text(EDGE / width, 1 - NAMES / height, "driven", **faint)
+    figure.text(NAMES / width, 1 - 1.5 * EDGE / height, "attacks on", **faint)
     for row, ego in enumerate(matrix.egos):
         axes.text(-0.6, row, ego, ha="right", va="center", **style)
         for column, entry in enumerate(matrix.sets):
-            rate = matrix.rate("replay", entry["name"], ego, "preventable")
+            rate = matrix.rate(REPLAY, entry["name"], ego, "preventable")
             shares[row, column] = rate["mean"]
             axes.text(column, row, percent(rate), ha="center", va="center", **style)
             if ego == entry["ego"]:
                 corner = (column - 0.5, row - 0.5)
-                frame = Rectangle(corner, 1, 1, fill=False, edgecolor=drawing.INK)
+                frame = Rectangle(corner, 1, 1, fill=False, clip_on=False)
+                frame.set(edgecolor=drawing.INK, linewidth=2.5)
                 axes.add_patch(frame)
     for column, name in enumerate(names):
         axes.text(column - 0.1, -0.6, name, rotation=45, **style)
@@ -132,4 +155,5 @@ def draw_matrix(path: Path, matrix: Matrix) -> None:
     scale = LinearSegmentedColormap.from_list("share", colours)
     axes.imshow(shares, cmap=scale, vmin=0, vmax=1)
     axes.set(xticks=(), yticks=())
+    axes.spines[:].set_visible(False)
     drawing.save_figure(path, figure)
