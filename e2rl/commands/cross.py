@@ -69,7 +69,9 @@ def cross(run: Run) -> None:
         parts=Parts(run.folder, CROSSED, about=about),
     )
     scored = drive_batches(batches, work)
-    driven = record(scored, run.folder, config=run.config, references=(), **plan.origin)
+    driven = record(
+        scored, run.folder, config=config, searched=False, references=(), **plan.origin
+    )
     egos = [setup.ego_name for setup in plan.setups]
     matrix = Matrix.of(egos, sets, driven.rollouts)
     matrix.write(run.folder)
@@ -79,7 +81,7 @@ def cross(run: Run) -> None:
     lines = [table.text() for table in cross_tables(matrix, narrow=True)]
     if config.report:
         lines.append(f"Its failures: {write_report(run.folder, driven)}")
-    print("", *headline(matrix), "", "\n\n".join(lines), sep="\n")
+    print("", headline(matrix), "", "\n\n".join(lines), sep="\n")
     print(f"Written to {run.folder}")
 
 

@@ -2,7 +2,7 @@
 the matrix planner x set (docs/guide/compare.md)."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product, starmap
 from pathlib import Path
 from statistics import median
@@ -48,7 +48,6 @@ MATRIX = {
     "egos": [str],
     "sets": [{"name": str, "ego": str, "attacks": int, "scenes": int, "nats": NUMBER}],
     "cells": [{"mode": str, "set": str, "ego": str, **dict.fromkeys(RATES, RATE)}],
-    "sums": [{"mode": str, "set": str, "ego": str, **dict.fromkeys(RATES, RATE)}],
 }
 
 
@@ -205,7 +204,7 @@ def named(sets: Sequence[AttackSet]) -> dict[str, AttackSet]:
 def replays(plan: Evaluation, sets: Mapping[str, AttackSet]) -> list[Batch]:
     """Returns every planner in the traffic of every set, which drives as it did. Raises
     InputError for other scenes than those of the set, or of other sizes."""
-    batches = []
+    batches: list[Batch] = []
     for name, attacks in sets.items():
         tasks = attacks.tasks(plan.scenes)
         frames, agents = attacks.tracks.valid.shape[1:]
@@ -240,7 +239,7 @@ def made_again(
         sets: by name.
         found: folder of their tries, where they were searched for.
     """
-    batches = []
+    batches: list[Batch] = []
     for (name, attacks), setup in product(sets.items(), plan.setups):
         numbers = {
             (row["method"], row["eta"], row["scene_id"], row["seed"]): number
@@ -289,16 +288,13 @@ class Matrix:
     Args:
         egos: the planners that drive.
         sets: `name`, planner, number of attacks and of their scenes, median of nats.
-        cells: RATES of each of `egos` under each set, by mode.
-        sums: the same, of each set over the planners that it was not made against, and
-            of each planner over the sets that were not made against it; "" for the
-            other.
+        cells: RATES of each of `egos` under each set, by mode. Where the set or the ego
+            is "": of all together, but for planners under their own attacks.
     """
 
     egos: list[str]
     sets: list[dict[str, Any]]
     cells: list[dict[str, Any]]
-    sums: list[dict[str, Any]]
 
     @classmethod
     def of(
@@ -314,66 +310,54 @@ class Matrix:
             sets: by name.
             rows: of rollouts.csv, their methods named after modes and sets.
         """
-        groups: dict[tuple[str, str], list[Mapping]] = {}
-        for row in rows:
-            if not lost(row):
-                groups.setdefault((row["method"], row["ego_policy"]), []).append(row)
-        methods = {row["method"] for row in rows}
         cells = []
-        sums = []
         for mode, beginning in MODES.items():
-            of_cell = {
-                (name, ego): groups.get((f"{beginning}-{name}", ego), [])
-                for name, ego in product(sets, egos)
-                if f"{beginning}-{name}" in methods
-            }
-            for (name, ego), driven in of_cell.items():
-                cells.append({"mode": mode, "set": name, "ego": ego} | rates_of(driven))
-            others = {
-                (name, ego): driven
-                for (name, ego), driven in of_cell.items()
-                if sets[name].ego != ego
-            }
-            for place, label in ((0, "set"), (1, "ego")):
-                for chosen in dict.fromkeys(key[place] for key in of_cell):
-                    pooled = [
-                        row
-                        for key, driven in others.items()
-                        if key[place] == chosen
-                        for row in driven
-                    ]
-                    identity = {"mode": mode, "set": "", "ego": ""} | {label: chosen}
-                    sums.append(identity | rates_of(pooled))
-        return cls(list(egos), list(starmap(facts_of, sets.items())), cells, sums)
+            names = {f"{beginning}-{name}": name for name in sets}
+            driven = [
+                (names[row["method"]], row["ego_policy"], row)
+                for row in rows
+                if row["method"] in names and not lost(row)
+            ]
+            for name, ego in product((*sets, ""), (*egos, "")) if driven else ():
+                chosen = [
+                    row
+                    for source, driver, row in driven
+                    if name in ("", source)
+                    and ego in ("", driver)
+                    and ((name and ego) or sets[source].ego != driver)
+                ]
+                identity = {"mode": mode, "set": name, "ego": ego}
+                cells.append(identity | rates_of(chosen))
+        return cls(list(egos), list(starmap(facts_of, sets.items())), cells)
 
     @classmethod
     def read(cls, run: Path) -> "Matrix":
         """Returns the matrix in a run's folder; InputError where its file is
         damaged."""
         content = read_json(run / CROSS_FILE, lambda value: misfit(value, MATRIX))
-        return cls(*(list(map(nans, content[part.name])) for part in fields(cls)))
+        sets, cells = (list(map(nans, content[name])) for name in ("sets", "cells"))
+        return cls(content["egos"], sets, cells)
 
     def write(self, run: Path) -> None:
         """Write CROSS_FILE into a run's folder."""
         write_json(run / CROSS_FILE, vars(self))
 
     def rate(self, mode: str, name: str, ego: str, event: str) -> dict[str, float]:
-        """Returns one of RATES of a cell, or of a sum where `name` or `ego` is ""."""
-        for entry in (*self.cells, *self.sums):
-            if (entry["mode"], entry["set"], entry["ego"]) == (mode, name, ego):
-                return entry[event]
+        """Returns one of RATES of a cell."""
+        for cell in self.cells:
+            if (cell["mode"], cell["set"], cell["ego"]) == (mode, name, ego):
+                return cell[event]
         return UNKNOWN
 
 
 def facts_of(name: str, attacks: AttackSet) -> dict[str, Any]:
     """Returns what the matrix says of a set."""
-    nats = attacks.tracks.nats.sum(1).tolist()
     return {
         "name": name,
         "ego": attacks.ego,
         "attacks": len(attacks.rows),
         "scenes": len(attacks.scenes),
-        "nats": median(nats),
+        "nats": median(attacks.tracks.nats.sum(1).tolist()),
         "origin": attacks.origin,
     }
 

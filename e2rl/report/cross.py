@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from operator import itemgetter
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -28,29 +28,22 @@ EDGE = 14  # points, around them
 LETTERS = 15  # points
 
 
-def headline(matrix: Matrix) -> list[str]:
-    """Returns which attacks carry over most, and who fails most in those on others."""
-    others = [
-        sum_ | {"share": sum_["preventable"]["mean"]}
-        for sum_ in matrix.sums
-        if sum_["mode"] == REPLAY and sum_["preventable"]["n"]
-    ]
-    sets = [sum_ for sum_ in others if sum_["set"]]
-    egos = [sum_ for sum_ in others if sum_["ego"]]
-    if not sets:
-        return []
-    worst = max(sets, key=itemgetter("share"))
-    if not worst["share"]:
-        return [
-            "No attack makes a planner fail preventably that it was not made against."
-        ]
-    weakest = max(egos, key=itemgetter("share"))
-    return [
-        f"Attacks on {worst['set']} carry over most: other planners fail preventably in "
-        f"{percent(worst['preventable'])}% of them.",
-        f"{weakest['ego']} fails most in attacks on others: preventably in "
-        f"{percent(weakest['preventable'])}%.",
-    ]
+def headline(matrix: Matrix) -> str:
+    """Returns how far attacks carry over, from whom most, and whom they hit most."""
+
+    def rate(name: str = "", ego: str = "") -> Mapping[str, float]:
+        return matrix.rate(REPLAY, name, ego, "preventable")
+
+    def share(name: str = "", ego: str = "") -> float:
+        return rate(name, ego)["mean"] if rate(name, ego)["n"] else -1.0
+
+    source = max((entry["name"] for entry in matrix.sets), key=share)
+    driver = max(matrix.egos, key=lambda ego: share("", ego))
+    return (
+        f"Preventable failures in attacks on others: {percent(rate())}% of rollouts; most "
+        f"in those on {source} ({percent(rate(source))}%), most of {driver} "
+        f"({percent(rate('', driver))}%)."
+    )
 
 
 def cross_tables(matrix: Matrix, narrow: bool = False) -> list[Table]:
@@ -127,8 +120,8 @@ def draw_matrix(path: Path, matrix: Matrix) -> None:
     redder, the more; framed where they are a planner's own."""
     names = [entry["name"] for entry in matrix.sets]
     shares = np.zeros((len(matrix.egos), len(names)))
-    style = {"fontsize": LETTERS, "color": drawing.INK}
-    faint = {"fontsize": LETTERS, "color": drawing.MUTED}
+    style: dict[str, Any] = {"fontsize": LETTERS, "color": drawing.INK}
+    faint = style | {"color": drawing.MUTED}
     shape = (CELL * len(names), CELL * len(matrix.egos))
     width = NAMES + shape[0] + EDGE
     height = NAMES + shape[1] + EDGE
