@@ -22,7 +22,7 @@ PATH = re.compile(rf"(?<![\w./<>-])(?:{FOLDERS})/[\w./<>*{{}}\[\]-]*")
 # <name>, *, {a,b}, ..., NAME
 PLACEHOLDER = re.compile(r"[<>*{}\[\]]|\.\.\.|(?<![a-zA-Z])[A-Z]{3,}(?![a-zA-Z])")
 DOCUMENT = re.compile(r"(?<![\w/-])[\w-]+\.md\b")
-WRITTEN = {"tables.md", "methods.md", "egos.md", "rates.md"}  # by a run
+WRITTEN = {"tables.md", "methods.md", "egos.md", "rates.md", "cross.md"}  # by a run
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 BARE = re.compile(r"`(\w+\.py)\b")
 YOURS = {"my_planner.py", "FILE.py"}  # a reader's files
@@ -30,7 +30,7 @@ FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 # The commands of e2rl that have a configuration.
-HYDRA = "evaluate|train|tune"
+HYDRA = "evaluate|train|tune|cross"
 COMMAND = re.compile(
     rf"(python (?:evaluate|train)\.py|e2rl (?:{HYDRA}))(?![\w-])"
     r"((?:\\\n|[^`\n])*)"

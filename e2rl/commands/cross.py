@@ -15,18 +15,10 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from e2rl.driving.batches import WHOLE, drive_batches
+from e2rl.evaluation.attack_set import ENDING, KEPT, AttackSet, kept, named
 from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.evaluation.record import record
-from e2rl.evaluation.transfer import (
-    ENDING,
-    KEPT,
-    AttackSet,
-    Matrix,
-    kept,
-    made_again,
-    named,
-    replays,
-)
+from e2rl.evaluation.transfer import Matrix, made_again, replays
 from e2rl.report.cross import cross_tables, draw_matrix, headline
 from e2rl.report.html import write_report
 from e2rl.report.tables import save_tables

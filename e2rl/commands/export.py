@@ -8,9 +8,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from e2rl.evaluation.attack_set import ENDING, AttackSet, kept
 from e2rl.evaluation.reproduce import failure_row
 from e2rl.evaluation.rollout_files import TABLE, own_folder, read_rows
-from e2rl.evaluation.transfer import ENDING, AttackSet, kept
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.export.episode import FACTS, Episode
 from e2rl.report.export.scene_files import episodes_of

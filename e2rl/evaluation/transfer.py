@@ -1,5 +1,5 @@
-"""Attacks that were made against one planner, driven against others: sets of attacks, and
-the matrix planner x set (docs/guide/compare.md)."""
+"""Every planner in the attacks of every set: as they drove, or made anew; and the matrix
+of what comes of it (docs/guide/compare.md)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,10 +8,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import torch
-
 from e2rl.driving.batches import Batch, split_tasks
 from e2rl.driving.setup import Method, Setup, Task, scene_seed
+from e2rl.evaluation.attack_set import AttackSet
 from e2rl.evaluation.plan import Evaluation
 from e2rl.evaluation.rollout_files import NUMBER, nans, read_json, write_json
 from e2rl.evaluation.summary import UNKNOWN
@@ -19,26 +18,12 @@ from e2rl.metrics.errored import lost
 from e2rl.metrics.realism import NO_SAMPLES
 from e2rl.metrics.statistics import summarise
 from e2rl.run.errors import InputError
-from e2rl.run.files import misfit, write_atomically
-from e2rl.run.parts import read_state, state_bytes
-from e2rl.run.run import read_provenance
-from e2rl.scenes.scene import SceneSet, content_hash
-from e2rl.scenes.scene_list import read_list, scene_hashes
+from e2rl.run.files import misfit
+from e2rl.scenes.scene_list import read_list
 from e2rl.search.tries_file import TRIES_FILE, failures_of
-from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
-from e2rl.traffic.attack_replay import AttackReplay, AttackTracks
+from e2rl.traffic.attack_replay import AttackReplay
 
-FORMAT = "e2rl-attacks/1"
-ENDING = ".attacks"  # of the file of a set
 CROSS_FILE = "cross.json"
-KEPT = {"preventable": "cfr_preventable", "hit": "cfr", "all": ""}  # columns that are 1
-# of rollouts.csv, what is kept of each attack
-ATTACK = {
-    **dict.fromkeys(("scene_id", "method"), str),
-    "seed": int,
-    **dict.fromkeys(("eta", "cfr", "cfr_preventable"), float),
-    **dict.fromkeys(("transport_adversary", "transport_others"), float),
-}
 REPLAY = "replay"
 AGAIN = "again"
 MODES = {REPLAY: "against", AGAIN: "again"}  # how methods' names begin
@@ -51,162 +36,13 @@ MATRIX = {
 }
 
 
-@dataclass(frozen=True)
-class AttackSet:
-    """Attacks that were made against one planner.
-
-    Args:
-        ego: the planner.
-        rows: of each attack what ATTACK names.
-        tracks: what they drove.
-        scenes: SHA-256 of each scene.
-        origin: versions, weights, data and command that they were made by.
-    """
-
-    ego: str
-    rows: list[dict[str, Any]]
-    tracks: AttackTracks
-    scenes: dict[str, str]
-    origin: dict[str, str]
-
-    @classmethod
-    def of_run(
-        cls, run: Path, rows: Sequence[Mapping], begun: Path
-    ) -> "list[AttackSet]":
-        """Returns a set for each planner in rows of rollouts.csv.
-
-        Args:
-            run: folder of the rollouts' files.
-            rows: of the attacks, none of which errored.
-            begun: folder with the list of scenes and the provenance of the run.
-
-        Raises:
-            InputError: where a file is missing, damaged or of another version.
-        """
-        provenance = read_provenance(begun)
-        origin = {"command": provenance["command"], **provenance["versions"][-1]}
-        for kind in ("inputs", "files"):
-            texts = provenance[kind].items()
-            origin |= {name: text for name, text in texts if isinstance(text, str)}
-        hashes = {line.scene_id: line.sha256 or "" for line in read_list(begun)}
-        by_ego: dict[str, list[Mapping]] = {}
-        for row in rows:
-            by_ego.setdefault(row["ego_policy"], []).append(row)
-        return [
-            cls(
-                ego,
-                [{name: row[name] for name in ATTACK} for row in attacks],
-                tracks=tracks_of(run / ROLLOUTS, attacks),
-                scenes={row["scene_id"]: hashes[row["scene_id"]] for row in attacks},
-                origin=origin,
-            )
-            for ego, attacks in by_ego.items()
-        ]
-
-    @classmethod
-    def read(cls, path: Path) -> "AttackSet":
-        """Returns the set in a file; InputError where a byte of it changed, or it is
-        none."""
-        mend = "give a file of e2rl export RUN --to attacks"
-        try:
-            content = read_state(path)
-            if content.pop("format") != FORMAT:
-                raise ValueError(f"not of format {FORMAT}")
-            tracks = AttackTracks(**content.pop("tracks"))
-            attacks = cls(tracks=tracks, **content)
-            shape = {"ego": str, "rows": [ATTACK], "scenes": {...: str}}
-            if reason := misfit(vars(attacks), shape):
-                raise ValueError(reason)
-            attacks.check_shapes()
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
-            raise InputError(f"{path}: no set of attacks ({error}); {mend}") from error
-        return attacks
-
-    def check_shapes(self) -> None:
-        """Raises ValueError where the tracks are not those of the rows."""
-        count, frames, agents, _ = self.tracks.states.shape
-        shapes = {
-            "states": ((count, frames, agents, 4), torch.float32),
-            "valid": ((count, frames, agents), torch.bool),
-            "adversaries": ((count, agents), torch.bool),
-            "routes": ((count, agents), torch.int64),
-            "nats": ((count, 2), torch.float32),
-        }
-        for name, expected in shapes.items():
-            value = getattr(self.tracks, name)
-            if (tuple(value.shape), value.dtype) != expected or count != len(self.rows):
-                raise ValueError(f"{name} has shape {list(value.shape)}")
-
-    def write(self, path: Path) -> Path:
-        """Write its file, which begins with the hash of its content; returns the path."""
-        content = vars(self) | {"format": FORMAT, "tracks": vars(self.tracks)}
-        write_atomically(path, state_bytes(content))
-        return path
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the tracks."""
-        arrays = {name: value.numpy() for name, value in vars(self.tracks).items()}
-        return content_hash(arrays)
-
-    def tasks(self, scenes: SceneSet) -> list[Task]:
-        """Returns a rollout for each attack, whose seed is its number in the set.
-        Raises InputError where its scene is not there or another one."""
-        hashes = dict(zip(scenes.scene_id, scene_hashes(scenes), strict=True))
-        for name, sha256 in self.scenes.items():
-            if hashes.get(name) != sha256:
-                raise InputError(
-                    f"attacks on {self.ego}: scene {name} is not in the data, or another "
-                    "there; give the data, data.build and num_scenes of their run"
-                )
-        return [
-            Task(scenes.index(row["scene_id"]), seed=number, noise=number)
-            for number, row in enumerate(self.rows)
-        ]
-
-
-def kept(rows: Sequence[Mapping], keep: str) -> list[Mapping]:
-    """Returns the rows of rollouts that have a file, and of these those of KEPT."""
-    ended = [row for row in rows if row["errored"] != 1]
-    return [row for row in ended if not KEPT[keep] or row[KEPT[keep]] == 1]
-
-
-def tracks_of(folder: Path, rows: Sequence[Mapping]) -> AttackTracks:
-    """Returns what attacks drove, from their rollouts' files; InputError as
-    `AttackSet.of_run`."""
-    arrays: dict[str, list] = {name: [] for name in ("states", "valid", "adversaries")}
-    arrays["routes"] = []
-    for row in rows:
-        path = folder / rollout_name(row)
-        rollout = Rollout.read(path, folder)
-        if rollout.routes is None:
-            raise InputError(
-                f"{path}: holds no routes, of an older version; make its run again"
-            )
-        for name, values in arrays.items():
-            values.append(torch.from_numpy(getattr(rollout, name)))
-    nats = [[row["transport_adversary"], row["transport_others"]] for row in rows]
-    stacked = {name: torch.stack(values) for name, values in arrays.items()}
-    return AttackTracks(**stacked, nats=torch.tensor(nats, dtype=torch.float32))
-
-
-def named(sets: Sequence[AttackSet]) -> dict[str, AttackSet]:
-    """Returns the sets by the names of their planners, further ones of one planner with
-    a number."""
-    result: dict[str, AttackSet] = {}
-    for attacks in sets:
-        count = sum(other.ego == attacks.ego for other in result.values())
-        name = f"{attacks.ego}-{count + 1}" if count else attacks.ego
-        result[name] = attacks
-    return result
-
-
 def replays(plan: Evaluation, sets: Mapping[str, AttackSet]) -> list[Batch]:
     """Returns every planner in the traffic of every set, which drives as it did. Raises
     InputError for other scenes than those of the set, or of other sizes."""
     batches: list[Batch] = []
+    hashes = {line.scene_id: line.sha256 for line in read_list(plan.run.folder)}
     for name, attacks in sets.items():
-        tasks = attacks.tasks(plan.scenes)
+        tasks = attacks.tasks(plan.scenes, hashes)
         frames, agents = attacks.tracks.valid.shape[1:]
         scenes = plan.scenes.scenes["logged_valid"]
         if (frames, agents) != tuple(scenes.shape[1:]):

@@ -37,6 +37,10 @@ def headline(matrix: Matrix) -> str:
     def share(name: str = "", ego: str = "") -> float:
         return rate(name, ego)["mean"] if rate(name, ego)["n"] else -1.0
 
+    if not rate()["mean"]:
+        return (
+            "No attack makes a planner fail preventably that it was not made against."
+        )
     source = max((entry["name"] for entry in matrix.sets), key=share)
     driver = max(matrix.egos, key=lambda ego: share("", ego))
     return (
@@ -88,7 +92,7 @@ def matrix_table(
         title = label if label in (ego, OTHERS) else f"{label} {ego}"
         rows.append([title, *(percent(rate, interval=not narrow) for rate in rates)])
     for fact in FACTS if event == "preventable" else ():
-        rows.append([fact, *(f"{entry[fact]:.0f}" for entry in matrix.sets), ""])
+        rows.append([fact, *(amount(entry[fact]) for entry in matrix.sets), ""])
     caption = (
         f"{WORDS[event]}, % of {TITLES[mode]}. Row: who drives; column: against whom they "
         f"were found; {OTHERS}: all but its own"
@@ -103,6 +107,11 @@ def matrix_table(
     ]
     heads = [labels[name] for name in names]
     return Table(caption, ["", *heads, OTHERS], rows=rows, links=links)
+
+
+def amount(value: float) -> str:
+    """Returns a number in at most four characters up to a million."""
+    return f"{value:.0f}" if value < 10_000 else f"{value / 1000:.0f}k"
 
 
 def percent(rate: Mapping[str, float], interval: bool = False) -> str:
