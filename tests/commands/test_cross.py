@@ -5,6 +5,8 @@ import shutil
 
 import pytest
 
+from e2rl.commands.export import main as export
+from e2rl.evaluation.attack_set import AttackSet
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.evaluation.transfer import CROSS_FILE
 from e2rl.report.html import PAGE
@@ -79,6 +81,11 @@ def test_failures_found_are_driven_by_all_resumed_and_carried(cross, tmp_path):
     (run / CROSS_FILE).unlink()
     assert not cross(f"resume={run}", "plugins=[tests.planners.planners]")
     assert (run / CROSS_FILE).read_bytes() == content
+
+    export([str(run), "--to", "attacks"])
+    hits = [row for row in crossed if row["cfr"] == 1 and row["ego_policy"] == "fast"]
+    exported = AttackSet.read(run / "export" / "attacks" / "fast.attacks")
+    assert len(exported.rows) == len(hits)
 
     files = sorted((run / "attacks").iterdir())
     carried = tmp_path / "carried"
