@@ -61,7 +61,7 @@ COMMANDS = {  # module, and what the command does
     ),
     "merge": ("e2rl.commands.merge", "join the shards of an evaluation"),
 }
-CONFIGURED = ("evaluate", "train", "tune", "rate")  # by conf/<name>.yaml
+CONFIGURED = ("evaluate", "train", "tune", "rate", "cross")  # by conf/<name>.yaml
 EXAMPLES = """examples:
   e2rl try LOGS --planner my_planner.py:MyPlanner --scenes 12
   e2rl evaluate num_scenes=12                    the lane-graph planner on twelve bundled scenes

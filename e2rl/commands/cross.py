@@ -16,10 +16,12 @@ from omegaconf import OmegaConf
 
 from e2rl.driving.batches import WHOLE, drive_batches
 from e2rl.evaluation.attack_set import ENDING, KEPT, AttackSet, kept, named
+from e2rl.evaluation.crossing import made_again, replays
 from e2rl.evaluation.plan import Evaluation, begin
 from e2rl.evaluation.record import record
-from e2rl.evaluation.transfer import Matrix, made_again, replays
-from e2rl.report.cross import cross_tables, draw_matrix, headline
+from e2rl.evaluation.transfer import Matrix
+from e2rl.report.cross import cross_tables, headline
+from e2rl.report.cross_picture import draw_matrix
 from e2rl.report.html import write_report
 from e2rl.report.tables import save_tables
 from e2rl.run.command import run_command

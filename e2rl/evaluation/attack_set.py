@@ -8,12 +8,11 @@ from typing import Any
 
 import torch
 
-from e2rl.driving.setup import Task
 from e2rl.run.errors import InputError
 from e2rl.run.files import misfit, write_atomically
 from e2rl.run.parts import read_state, state_bytes
 from e2rl.run.run import read_provenance
-from e2rl.scenes.scene import SceneSet, content_hash
+from e2rl.scenes.scene import content_hash
 from e2rl.scenes.scene_list import read_list
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_name
 from e2rl.traffic.attack_replay import AttackTracks
@@ -128,15 +127,14 @@ class AttackSet:
         arrays = {name: value.numpy() for name, value in vars(self.tracks).items()}
         return content_hash(arrays)
 
-    def tasks(self, scenes: SceneSet, hashes: Mapping[str, str | None]) -> list[Task]:
-        """Returns a rollout for each attack, whose seed is its number in the set.
+    def check_scenes(
+        self, hashes: Mapping[str, str | None], sizes: Sequence[int]
+    ) -> None:
+        """Raises InputError where the data hold other scenes than those of the attacks.
 
         Args:
-            scenes: to drive in.
-            hashes: SHA-256 of each.
-
-        Raises:
-            InputError: where a scene is not there or another one.
+            hashes: SHA-256 of each scene of the data.
+            sizes: frames and agents of each.
         """
         for name, sha256 in self.scenes.items():
             if hashes.get(name) != sha256:
@@ -144,10 +142,12 @@ class AttackSet:
                     f"attacks on {self.ego}: scene {name} is not in the data, or another "
                     "there; give the data, data.build and num_scenes of their run"
                 )
-        return [
-            Task(scenes.index(row["scene_id"]), seed=number, noise=number)
-            for number, row in enumerate(self.rows)
-        ]
+        if list(self.tracks.valid.shape[1:]) != list(sizes):
+            raise InputError(
+                f"attacks on {self.ego}: frames and agents are "
+                f"{list(self.tracks.valid.shape[1:])}, those of the scenes {list(sizes)}; "
+                "set data.build as in their run"
+            )
 
 
 def kept(rows: Sequence[Mapping], keep: str) -> list[Mapping]:

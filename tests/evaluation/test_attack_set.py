@@ -12,9 +12,9 @@ from tests.evaluation.attack_sets import AGENTS, FRAMES, attack_set
 from tests.traffic.e2.traffic_scenes import scenes
 
 
-def tasks_in(scene_set):
+def check(scene_set, sizes=(FRAMES, AGENTS)):
     hashes = dict(zip(scene_set.scene_id, scene_hashes(scene_set), strict=True))
-    return attack_set().tasks(scene_set, hashes)
+    attack_set().check_scenes(hashes, sizes)
 
 
 @pytest.fixture
@@ -56,17 +56,21 @@ def test_tracks_of_other_shapes_are_refused(tmp_path, changes):
         AttackSet.read(attacks.write(tmp_path / "b.attacks"))
 
 
-def test_each_attack_is_a_task_of_its_number():
-    tasks = tasks_in(scenes(3))
-    assert [task.noise for task in tasks] == [0, 1, 2]
-    assert [task.scene for task in tasks] == [0, 1, 2]
+def test_its_own_scenes_are_taken():
+    check(scenes(3))
+
+
+@pytest.mark.parametrize("sizes", [(FRAMES + 1, AGENTS), (FRAMES, AGENTS - 1)])
+def test_scenes_of_other_sizes_are_refused(sizes):
+    with pytest.raises(InputError, match="attacks on a: frames and agents"):
+        check(scenes(3), sizes)
 
 
 def test_other_scenes_are_refused():
     other = scenes(3)
     other.scenes["start"][1, 0, 3] += 1.0
     with pytest.raises(InputError, match=r"attacks on a: scene .* another"):
-        tasks_in(other)
+        check(other)
 
 
 def test_what_is_kept():
