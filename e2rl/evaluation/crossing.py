@@ -12,7 +12,8 @@ from e2rl.evaluation.attack_set import AttackSet
 from e2rl.evaluation.plan import Evaluation
 from e2rl.evaluation.transfer import AGAIN, MODES, REPLAY
 from e2rl.scenes.scene_list import read_list
-from e2rl.search.tries_file import TRIES_FILE, failures_of
+from e2rl.search.tries import TRIES_FILE
+from e2rl.search.tries_file import failures_of
 from e2rl.traffic.attack_replay import AttackReplay
 
 
