@@ -25,7 +25,7 @@ ATTACK = {
     **dict.fromkeys(("scene_id", "method"), str),
     "seed": int,
     **dict.fromkeys(("eta", "cfr", "cfr_preventable"), float),
-    **dict.fromkeys(("transport_adversary", "transport_others"), float),
+    **dict.fromkeys(("transport", "transport_adversary"), float),
 }
 
 
@@ -170,7 +170,10 @@ def tracks_of(folder: Path, rows: Sequence[Mapping]) -> AttackTracks:
             )
         for name, values in arrays.items():
             values.append(torch.from_numpy(getattr(rollout, name)))
-    nats = [[row["transport_adversary"], row["transport_others"]] for row in rows]
+    nats = []
+    for row in rows:
+        adversaries = row["transport_adversary"]
+        nats.append([adversaries, row["transport"] - adversaries])
     stacked = {name: torch.stack(values) for name, values in arrays.items()}
     return AttackTracks(**stacked, nats=torch.tensor(nats, dtype=torch.float32))
 
@@ -180,7 +183,10 @@ def named(sets: Sequence[AttackSet]) -> dict[str, AttackSet]:
     a number."""
     result: dict[str, AttackSet] = {}
     for attacks in sets:
-        count = sum(other.ego == attacks.ego for other in result.values())
-        name = f"{attacks.ego}-{count + 1}" if count else attacks.ego
+        name = attacks.ego
+        number = 1
+        while name in result:
+            number += 1
+            name = f"{attacks.ego}-{number}"
         result[name] = attacks
     return result

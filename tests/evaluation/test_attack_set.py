@@ -85,5 +85,5 @@ def test_what_is_kept():
 
 
 def test_a_second_set_of_a_planner_has_a_name_of_its_own():
-    names = named([attack_set("a"), attack_set("b"), attack_set("a")])
-    assert list(names) == ["a", "b", "a-2"]
+    names = named([attack_set("a"), attack_set("a-2"), attack_set("a")])
+    assert list(names) == ["a", "a-2", "a-3"]
