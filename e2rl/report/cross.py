@@ -26,16 +26,17 @@ def headline(matrix: Matrix) -> str:
     def share(name: str = "", ego: str = "") -> float:
         return rate(name, ego)["mean"] if rate(name, ego)["n"] else -1.0
 
+    attacked = {entry["ego"] for entry in matrix.sets}
+    others = [ego for ego in matrix.egos if ego not in attacked]
+    none = f" No attacks are on {', '.join(others)}." if others else ""
     if not rate()["mean"]:
-        return (
-            "No attack makes a planner fail preventably that it was not made against."
-        )
+        return f"No planner fails preventably in attacks on others.{none}"
     source = max((entry["name"] for entry in matrix.sets), key=share)
     driver = max(matrix.egos, key=lambda ego: share("", ego))
     return (
         f"Preventable failures in attacks on others: {percent(rate())}% of rollouts; most "
         f"in those on {source} ({percent(rate(source))}%), most of {driver} "
-        f"({percent(rate('', driver))}%)."
+        f"({percent(rate('', driver))}%).{none}"
     )
 
 

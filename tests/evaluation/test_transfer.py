@@ -4,38 +4,13 @@ from math import isnan
 
 import pytest
 
-from e2rl.evaluation.attack_set import named
 from e2rl.evaluation.transfer import AGAIN, REPLAY, Matrix
-from tests.evaluation.attack_sets import attack_set
-
-OUTCOMES = {  # of three attacks: 0 no contact, 1 a contact, 2 a preventable one
-    ("against-a", "a"): (2, 2, 2),
-    ("against-a", "b"): (2, 1, 0),
-    ("against-a", "c"): (0, 0, 0),
-    ("against-b", "a"): (2, 2, 1),
-    ("against-b", "b"): (2, 2, 2),
-    ("against-b", "c"): (0, 1, 1),
-}
+from tests.evaluation.attack_sets import OUTCOMES, known_matrix
 
 
 @pytest.fixture
 def matrix():
-    rows = [
-        {
-            "method": method,
-            "ego_policy": ego,
-            "scene_id": f"s{seed}",
-            "location": "",
-            "seed": seed,
-            "errored": 0,
-            "cfr": float(outcome > 0),
-            "cfr_preventable": float(outcome > 1),
-        }
-        for (method, ego), outcomes in OUTCOMES.items()
-        for seed, outcome in enumerate(outcomes)
-    ]
-    sets = named([attack_set("a"), attack_set("b")])
-    return Matrix.of(["a", "b", "c"], sets, rows)
+    return known_matrix()
 
 
 def test_a_cell_has_the_rates_of_its_attacks(matrix):
