@@ -29,7 +29,7 @@ def headline(matrix: Matrix) -> str:
     attacked = {entry["ego"] for entry in matrix.sets}
     others = [ego for ego in matrix.egos if ego not in attacked]
     none = f" No attacks are on {', '.join(others)}." if others else ""
-    if not rate()["mean"]:
+    if share() <= 0:
         return f"No planner fails preventably in attacks on others.{none}"
     source = max((entry["name"] for entry in matrix.sets), key=share)
     driver = max(matrix.egos, key=lambda ego: share("", ego))
