@@ -17,6 +17,10 @@ COMMANDS = {  # module, and what the command does
         "e2rl.scripts.evaluate",
         "how often, and how, an ego fails in attacked traffic",
     ),
+    "check": (
+        "e2rl.commands.check",
+        "what would go wrong in a long run: of the planner, the data, the machine",
+    ),
     "train": (
         "e2rl.scripts.train",
         "improve a policy on the failures that are found; train a prior",
@@ -64,6 +68,7 @@ COMMANDS = {  # module, and what the command does
 CONFIGURED = ("evaluate", "train", "tune", "rate", "cross")  # by conf/<name>.yaml
 EXAMPLES = """examples:
   e2rl try LOGS --planner my_planner.py:MyPlanner --scenes 12
+  e2rl check ego=sampling                        ten seconds before a long run
   e2rl evaluate num_scenes=12                    the lane-graph planner on twelve bundled scenes
   e2rl evaluate ego=idm eta=[1,2] metrics=all    another ego, two intensities, all tables
   e2rl report runs/evaluate/DATE/TIME            watch its failures

@@ -162,11 +162,9 @@ def overrides_of(options: argparse.Namespace) -> list[str]:
     return words + [word for word in options.logs if "=" in word]
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(
-        prog="e2rl try", description=__doc__.splitlines()[0]
-    )
+def parser_of(program: str) -> argparse.ArgumentParser:
+    """Returns the parser of a program's options that name a class and logs."""
+    parser = argparse.ArgumentParser(prog=program, description=__doc__.splitlines()[0])
     logs = "folder or zip of logs (default: the bundled scenes); further KEY=VALUE of evaluate"
     parser.add_argument("logs", nargs="*", metavar="LOGS", help=logs)
     parser.add_argument(
@@ -201,7 +199,12 @@ def main(arguments: list[str] | None = None) -> None:
         metavar="FOLDER",
         help="of the run (default: below runs/evaluate)",
     )
-    options = parser.parse_intermixed_args(arguments)
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The command."""
+    options = parser_of("e2rl try").parse_intermixed_args(arguments)
     with ending():
         sys.argv = ["e2rl evaluate", *overrides_of(options)]
     import_module("e2rl.scripts.evaluate").main()

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
 from e2rl.planners.ego_errors import NotFinite, WrongPlan
+from e2rl.planners.misreadings import MISREADINGS, misreading
 from e2rl.scenes.boxes import to_frame
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
@@ -36,10 +37,17 @@ WILD = f"an action that is not finite, or above {LARGEST:g}"
 def plan_faults(state: Tensor, plan: Tensor) -> Iterator[tuple[Tensor, str]]:
     """Scenes [B] bool whose plan [B, PLAN_STEPS, 4] of an ego at state [B, 4] no
     vehicle can drive, and why, the gravest reason first."""
-    yield ~drivable(state, plan), JUMPS
+    jumps = ~drivable(state, plan)
+    yield jumps, JUMPS + _cause(state[jumps], plan[jumps])
     astray = strays(state, plan[:, 0])
     yield astray & reverses(state, plan), BACKWARDS
-    yield astray, STRAYS
+    yield astray, STRAYS + _cause(state[astray], plan[astray])
+
+
+def _cause(state: Tensor, plan: Tensor) -> str:
+    """Why plans may begin elsewhere, for a message; "" where nothing explains it."""
+    name = misreading(state[None], plan[None]) if len(state) else None
+    return f"; plans seem {name}: {MISREADINGS[name][1]}" if name else ""
 
 
 def action_faults(
