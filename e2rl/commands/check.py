@@ -30,10 +30,11 @@ from e2rl.evaluation.extent import Extent, extent_of
 from e2rl.evaluation.plan import ego_name
 from e2rl.evaluation.planner_check import Finding, PlannerCheck, telling_scenes
 from e2rl.run.command import run_command
-from e2rl.run.config import load_choice, set_up
+from e2rl.run.config import load_choice
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.fused import has_compiler, switch
+from e2rl.run.machine import set_up
 from e2rl.run.processes import cores
 from e2rl.run.run import Run
 from e2rl.scenes.recording import DT
@@ -203,6 +204,7 @@ class Preparation:
         self.config = config
         self.name = name
         self._attempt("options", partial(set_up, config))
+        self.device = "cpu" if self.refused else config.device
         self.settings = self._attempt("options", partial(evaluation_settings, config))
         self.sim = self._attempt("sim", partial(build_sim, config))
         self.egos = self._attempt("ego", partial(build_egos, config, name))
@@ -239,7 +241,7 @@ class Preparation:
                 partial(self._ego, name),
                 telling_scenes(scenes),
                 sim=self.sim,
-                device=self.config.device,
+                device=self.device,
             )
             yield f"{name}{where}", planner.findings()
 
@@ -325,6 +327,10 @@ def run_findings(
 
 def check(run: Run) -> None:
     """Print what is right and what is wrong; the status is 1 where anything is wrong."""
+    if run.config.reproduce:
+        raise InputError(
+            f"reproduce={run.config.reproduce}: a check is of a new run; leave it out"
+        )
     screen = Screen()
     ready = Preparation(run.config, ego_name(run.config.ego, run.choices["ego"]))
     if ready.refused:
