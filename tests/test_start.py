@@ -71,6 +71,7 @@ SCRIPT = "runpy.run_path('evaluate.py', run_name='__main__')"
         (CLI, ["e2rl", "tune", "--help"]),
         (CLI, ["e2rl", "rate", "--help"]),
         (CLI, ["e2rl", "cross", "--help"]),
+        (CLI, ["e2rl", "check", "--help"]),
         (SCRIPT, ["evaluate.py", "--help"]),
         (SCRIPT, ["evaluate.py", "ergo=idm"]),
         (imported("merge")[0], []),

@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from e2rl.evaluation.finding import Finding
 from e2rl.planners.ego import PLAN_STEPS, Ego, track
 from e2rl.planners.ego_errors import NotFinite, WrongPlan
 from e2rl.planners.ego_policy import ask, from_outside
@@ -45,23 +46,6 @@ MOVES = 2.0  # m/s
 STANDS = 0.5  # m/s
 SHAPES = {"plan": (PLAN_STEPS, 4), "act": (2,)}  # of a scene's answers
 MEMORY = Path("/proc/self/statm")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A line of a check.
-
-    Args:
-        about: the property, in a word.
-        fine: whether it holds; None where it need not, or could not be looked at.
-        text: how it is, and where.
-        mend: how to mend it.
-    """
-
-    about: str
-    fine: bool | None
-    text: str
-    mend: str = ""
 
 
 def telling_scenes(scenes: SceneSet) -> SceneSet:
