@@ -1,7 +1,7 @@
 """Closed-loop evaluation: `python evaluate.py [data=...] [ego=...] [eta=...]` says how
 often, and how, an ego fails."""
 
-import e2rl.run.early  # noqa: F401 - first: from here on Ctrl-C ends in one line
+from e2rl.run.early import loading  # first: from here on Ctrl-C ends in one line
 
 # isort: split
 from collections.abc import Sequence
@@ -17,10 +17,11 @@ MAY_CHANGE = ("processes", "shard")  # when a run is resumed
 
 def evaluate(run: Run) -> None:
     """Roll out and score what is not on disk yet; then summarise, draw and print."""
-    from e2rl.driving.batches import WHOLE
-    from e2rl.evaluation.plan import begin
-    from e2rl.evaluation.reproduce import compared_with_run, failure_row, outcome
-    from e2rl.report.results import write_results
+    with loading():
+        from e2rl.driving.batches import WHOLE
+        from e2rl.evaluation.plan import begin
+        from e2rl.evaluation.reproduce import compared_with_run, failure_row, outcome
+        from e2rl.report.results import write_results
 
     config = run.config
     plan = begin(run)
@@ -48,8 +49,8 @@ def evaluate(run: Run) -> None:
 
 def begun(config: DictConfig, free: Sequence[str]) -> Run:
     """Returns the run that the command line asks for."""
-    from e2rl.evaluation.reproduce import run_of
-
+    with loading():
+        from e2rl.evaluation.reproduce import run_of
     return run_of(config, free)
 
 

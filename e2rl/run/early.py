@@ -11,7 +11,21 @@ import os
 import signal
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Heavy libraries load in the block, where a command has begun already: what they
+    leave in memory is never looked through for garbage."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

@@ -5,11 +5,14 @@ import sys
 
 PROGRAM = """
 import gc
-import e2rl.run.early
-loading = gc.isenabled()
+from e2rl.run.early import loading
+first = gc.isenabled()
 from e2rl.run.endings import ending
 with ending():
-    print(loading, gc.isenabled())
+    print(first, gc.isenabled())
+    with loading():
+        print(gc.isenabled())
+    print(gc.isenabled(), gc.get_freeze_count() > 0)
 """
 
 
@@ -17,4 +20,6 @@ def test_garbage_is_collected_once_the_libraries_are_there():
     output = subprocess.run(
         [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
     ).stdout
-    assert output.split() == ["False", "True"]
+    words = output.split()
+    assert words[:2] == ["False", "True"]
+    assert words[2:] == ["False", "True", "True"], "of a command that has begun already"
