@@ -35,6 +35,7 @@ def rate(run: Run) -> None:
     plan = begin(
         run,
         f"up to {settings.populations} x {settings.rollouts} rollouts a scene",
+        times=settings.populations * settings.rollouts,
     )
     traffic = nominal_traffic(plan)
     (seed,) = plan.settings.seeds

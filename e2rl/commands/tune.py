@@ -64,7 +64,11 @@ def tune(run: Run) -> dict:
         {name: tuning[name] for name in names},
         where="tuning",
     )
-    plan = begin(run, f"once a scene and seed in each of {settings.trials} trials")
+    plan = begin(
+        run,
+        f"once a scene and seed in each of {settings.trials} trials",
+        times=settings.trials,
+    )
     objective: Objective
     trials: PlannerTrials | AttackTrials
     failures: list[Batch] = []

@@ -59,6 +59,21 @@ def extent_of(
     ]
     attacks = [method for method in methods if method.traffic.adversarial]
     seconds, size = cost_of(setup, (attacks or methods)[0])
+    return Extent(pairs * tries_of(rows, settings, seconds), seconds, size)
+
+
+def tries_of(
+    rows: Sequence[Method | SearchMethod],
+    settings: EvaluationSettings,
+    seconds: float,
+) -> float:
+    """Returns about how often the rows of a table drive an ego in a scene with a seed.
+
+    Args:
+        rows: of the table.
+        settings: of the budget.
+        seconds: that a rollout takes.
+    """
     tries = 0.0
     for row in rows:
         if settings.budget is None or not isinstance(row, SearchMethod):
@@ -70,7 +85,7 @@ def extent_of(
         else:
             spent = [family.nfe for family in row.families]
             tries += settings.budget * len(spent) / sum(spent)
-    return Extent(pairs * tries, seconds, size)
+    return tries
 
 
 def cost_of(setup: Setup, method: Method) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from e2rl.evaluation.build import (
     build_sim,
 )
 from e2rl.evaluation.check import EvaluationSettings, evaluation_settings
+from e2rl.evaluation.extent import tries_of
 from e2rl.evaluation.record import Record, record
 from e2rl.evaluation.reproduce import files_of_run
 from e2rl.prior.prior import Prior
@@ -29,9 +30,10 @@ from e2rl.search.spending import SearchMethod, Spent, search_all
 from e2rl.search.tries import TRIES_FILE
 from e2rl.search.tries_file import failures_of, write_tries
 from e2rl.sim.rollout_file import ROLLOUTS
-from e2rl.traffic.fusing import prepare_fused
+from e2rl.traffic.fusing import choice_of, prepare_fused
 
 CLASS = "class"  # the file of conf/ego for a class by its name alone
+SECONDS = 0.5  # that a rollout takes, about, where nothing is compiled
 NOMINAL = "nominal"  # traffic without an attack, which every attack is compared with
 
 
@@ -142,7 +144,11 @@ class Evaluation:
 
 
 def begin(
-    run: Run, often: str = "once a scene and seed", against: str = ""
+    run: Run,
+    often: str = "once a scene and seed",
+    *,
+    times: int = 1,
+    against: str = "",
 ) -> Evaluation:
     """Returns the plan of a run, which begins or goes on with it. Raises InputError for
     a configuration that cannot be run, and for inputs that changed since the run began.
@@ -150,6 +156,7 @@ def begin(
     Args:
         run: with the configuration and the folder.
         often: in words, how often a scene is driven that has no budget.
+        times: the same at most, of each seed.
         against: in words, what is driven instead of the methods.
     """
     config = run.config
@@ -158,7 +165,7 @@ def begin(
     egos = build_egos(config, ego_name(config.ego, run.choices["ego"]))
     against = against or f"{', '.join(settings.methods)}, {effort(settings, often)}"
     print(purpose(run, settings, egos=list(egos.egos), against=against), flush=True)
-    prepare_fused(config)
+    choice_of(config)  # a wrong one fails early
     # before the scenes, which take longer than a wrong path
     prior, prior_origin, methods, searches = build_rows(config, settings)
     sim = build_sim(config)
@@ -179,6 +186,10 @@ def begin(
         )
         for name, ego in egos.egos.items()
     ]
+    _, shards = settings.shard
+    pairs = len(scenes) * len(egos.egos) * len(settings.seeds) * times / shards
+    tries = tries_of([*methods, *searches], settings, SECONDS)
+    prepare_fused(config, pairs * tries)
     work = Work(
         into=run.folder / ROLLOUTS if settings.save_rollouts else None,
         processes=settings.processes,

@@ -14,6 +14,7 @@ from e2rl.run.fused import FUSED, Fused, check_compiler, has_compiler, switch
 from e2rl.run.processes import cores, in_processes
 from e2rl.run.terminal import Bar
 
+EARNED = 4000  # rollouts of a run that takes twice as long as compiling, or longer
 # Importing these registers every fused function of the package.
 USERS = (
     "e2rl.traffic.e2.e2",
@@ -45,27 +46,40 @@ def fused_functions() -> list[Fused]:
     return list((registered | configured).values())
 
 
-def prepare_fused(config: DictConfig) -> None:
-    """Switches fused functions on or off as `compile` says, and writes what auto means
-    here into the configuration.
-
-    auto: on where all are compiled on this machine already. Raises InputError for
-    another value, and where they are to be compiled and there is no compiler.
-    """
+def choice_of(config: DictConfig) -> str | bool:
+    """Returns the option `compile`; InputError for a value that it does not have."""
     choice = config.get("compile", False)  # the runs of training have none
     if choice not in ("auto", True, False):
         raise InputError(f"compile={choice}: choose one of auto, true, false")
+    return choice
+
+
+def prepare_fused(config: DictConfig, rollouts: float = 0) -> None:
+    """Switches fused functions on or off as `compile` says, and writes what auto means
+    here into the configuration.
+
+    auto: on where all are compiled on this machine already, or where the run has
+    EARNED `rollouts` and there is a compiler. Raises InputError as `choice_of`, and
+    where they are to be compiled and there is no compiler.
+    """
+    choice = choice_of(config)
     missing = [function for function in fused_functions() if not function.file.exists()]
     on = choice is not False and config.device == "cpu"
     if on and missing and choice == "auto":
-        on = False
-        if has_compiler():
+        on = rollouts >= EARNED and has_compiler()
+        if on:
+            print(
+                f"some {rollouts:,.0f} rollouts: {len(missing)} functions are compiled "
+                "first, once on a machine, in some minutes (compile=false does without)",
+                file=sys.stderr,
+            )
+        elif has_compiler():
             print(
                 f"compile=true compiles {len(missing)} functions, once; then rollouts "
                 "take half the time",
                 file=sys.stderr,
             )
-    elif on and missing:
+    if on and missing:
         check_compiler("compile")
         compiled = in_processes(
             Fused.compile,

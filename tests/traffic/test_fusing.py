@@ -21,7 +21,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.fused import FUSED, Fused, has_compiler, is_on, switch, switched_off
 from e2rl.scenes.route import SPACING
 from e2rl.sim.observation import OBSERVATION_SIZE
-from e2rl.traffic.fusing import fused_functions, prepare_fused
+from e2rl.traffic.fusing import EARNED, fused_functions, prepare_fused
 from tests.planners.planners import worlds
 from tests.traffic.e2.traffic_scenes import drive, scenes, synthesizer
 
@@ -32,9 +32,9 @@ def restored():
         yield
 
 
-def prepared(compile, device="cpu"):
+def prepared(compile, device="cpu", rollouts=0):
     config = OmegaConf.create({"compile": compile, "device": device})
-    prepare_fused(config)
+    prepare_fused(config, rollouts)
     return config.compile
 
 
@@ -169,6 +169,23 @@ def test_functions_that_are_not_compiled_are_left_off_unless_they_are_asked_for(
         monkeypatch.setitem(vars(function), "file", Path(__file__))
     assert prepared("auto") is True
     assert is_on(), "all are there now"
+
+
+def test_a_long_run_compiles_first_where_it_can(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for function in fused_functions():
+        monkeypatch.delitem(function.__dict__, "file", raising=False)
+    monkeypatch.setattr(Fused, "compile", lambda self: None)
+    monkeypatch.setattr(fused.shutil, "which", lambda name: None)
+    assert prepared("auto", rollouts=EARNED) is False
+    monkeypatch.setattr(fused.shutil, "which", lambda name: "/usr/bin/c++")
+    assert prepared("auto", rollouts=EARNED - 1) is False
+    assert prepared("auto", rollouts=EARNED) is True
+    assert "compiled first" in capsys.readouterr().err
+    assert prepared(False, rollouts=EARNED) is False
+
+
+def test_other_values_of_compile_are_refused():
     with pytest.raises(
         InputError, match="compile=maybe: choose one of auto, true, false"
     ):
