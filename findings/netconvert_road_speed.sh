@@ -29,7 +29,7 @@ XML
 }
 write "$folder/road.xodr" '<speed max="7.5" unit="m/s"/>' ''
 write "$folder/lane.xodr" '' '<speed sOffset="0" max="7.5" unit="m/s"/>'
-"$folder/venv/bin/netconvert" --version | head -1
+"$folder/venv/bin/netconvert" --version | sed -n 1p
 for kind in road lane; do
   "$folder/venv/bin/netconvert" --opendrive-files "$folder/$kind.xodr" -o "$folder/$kind.net.xml"
   echo "limit of the $kind, 7.5 m/s: $(grep -o '<lane id="-1_0"[^>]*' "$folder/$kind.net.xml" | grep -o 'speed="[^"]*"')"

@@ -352,8 +352,12 @@ def planning_problem(episode: Episode, number: int) -> Any:
         float(wrap(heading)),
     )
     goal = CustomState(time_step=Interval(1, max(episode.steps, 1)), position=place)
-    yaw_rate = 0.0
+    motion = {"yaw_rate": 0.0, "acceleration": 0.0}
     if episode.scene is not None:
-        yaw_rate = float(episode.scene["start_yaw_rate"][0])
-    begin = state(episode, 0, row=0, yaw_rate=yaw_rate, slip_angle=0.0)
+        motion = {
+            "yaw_rate": float(episode.scene["start_yaw_rate"][0]),
+            "acceleration": float(episode.scene["start_accel"][0]),
+        }
+    # readers take the yaw rate for 0 where no acceleration is given
+    begin = state(episode, 0, row=0, slip_angle=0.0, **motion)
     return PlanningProblem(number, begin, GoalRegion([goal]))

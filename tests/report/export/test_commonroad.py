@@ -14,8 +14,9 @@ from commonroad.common.reader.file_reader_xml import XMLFileReader  # noqa: E402
 from lxml import etree  # noqa: E402
 
 from e2rl.evaluation.rollout_files import TABLE, read_rows  # noqa: E402
-from e2rl.report.export.commonroad_writer import beside, obstacles, side_by_side  # noqa: E402
+from e2rl.report.export.commonroad_writer import beside, obstacles, side_by_side, write  # noqa: E402
 from e2rl.report.export.episode import rollout_episode  # noqa: E402
+from e2rl.report.export.scene_files import episodes_of  # noqa: E402
 from e2rl.scenes.recording import Lane  # noqa: E402
 from tests.report.export.small_run import CUT_IN, GAPS, LATE, exported, rollout_of  # noqa: E402
 
@@ -159,6 +160,17 @@ def test_the_mission_leads_from_the_start_to_where_the_recording_ends(run, scena
     np.testing.assert_allclose(
         goal.position.rect_center.xy, rollout.logged[-1, 0, :2, None], atol=1e-3
     )
+
+
+def test_a_start_in_a_bend_keeps_its_yaw_rate(run, tmp_path):
+    """Though commonroad-io reads it only beside an acceleration."""
+    episode = next(episodes_of(run, read_rows(run / TABLE)[:1], plugins=(), scene=True))
+    episode.scene["start_yaw_rate"][0] = 0.3
+    episode.scene["start_accel"][0] = -1.5
+    ((_, path),) = write([episode], tmp_path)
+    (problem,) = XMLFileReader(str(path)).open()[1].planning_problem_dict.values()
+    assert problem.initial_state.yaw_rate == pytest.approx(0.3)
+    assert problem.initial_state.acceleration == pytest.approx(-1.5)
 
 
 def test_an_open_ego_is_a_planning_problem_only(run, tmp_path):
