@@ -1,11 +1,13 @@
-"""`e2rl report RUN_DIR`: the failure report of a run, one HTML file that opens offline,
-and a list of its failures.
+"""`e2rl report RUN`: the failure report of a run, one HTML file that opens offline, and a
+list of its failures; of several runs, oldest first, the history of their scenes.
 """
 
 import argparse
 from pathlib import Path
 
-from e2rl.evaluation.rollout_files import TABLE
+from e2rl.evaluation.history import read_versions
+from e2rl.evaluation.rollout_files import TABLE, own_folder
+from e2rl.report.history import HISTORY, write_history
 from e2rl.report.html import PAGE, REPLAYS, write_report
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
@@ -31,21 +33,20 @@ def measured_folders(run: Path) -> list[Path]:
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="e2rl report", description=__doc__.splitlines()[0]
-    )
+    parser = argparse.ArgumentParser(prog="e2rl report", description=__doc__)
     parser.add_argument(
-        "run",
+        "runs",
         type=Path,
-        metavar="RUN_DIR",
-        help="folder of a run of evaluate.py or train.py",
+        nargs="+",
+        metavar="RUN",
+        help="folder of a run of evaluate.py or train.py; of evaluate.py, two or more "
+        "versions of a planner, oldest first",
     )
     parser.add_argument(
         "--replays",
         type=int,
-        default=REPLAYS,
         metavar="N",
-        help="at most so many (%(default)s)",
+        help=f"at most so many ({REPLAYS}); of one run",
     )
     parser.add_argument(
         "--method",
@@ -55,23 +56,52 @@ def main(arguments: list[str] | None = None) -> None:
         help="its failures only; repeatable",
     )
     parser.add_argument(
+        "--ego",
+        metavar="NAME",
+        help="of a history, where its runs have several",
+    )
+    parser.add_argument(
         "--out",
         type=Path,
-        help=f"file to write (default: RUN_DIR/{PAGE})",
+        help=f"file to write (default: RUN/{PAGE}; of a history {HISTORY} in the last)",
     )
     options = parser.parse_args(arguments)
     with ending():
-        folders = measured_folders(options.run)
-        if (options.out or options.method) and len(folders) > 1:
-            raise InputError(
-                f"{options.run}: a training has {len(folders)} pages; name one, such "
-                f"as {folders[-1]}"
-            )
-        for folder in folders:
-            page = write_report(
-                folder,
-                replays=options.replays,
-                methods=options.method,
-                path=options.out,
-            )
-            print(page)
+        if len(options.runs) > 1:
+            report_history(options)
+        else:
+            report_run(options)
+
+
+def report_run(options: argparse.Namespace) -> None:
+    """Write the failure reports of a run."""
+    run = options.runs[0]
+    folders = measured_folders(run)
+    if options.ego:
+        raise InputError("--ego: for two or more runs; leave it out")
+    if (options.out or options.method) and len(folders) > 1:
+        raise InputError(
+            f"{run}: a training has {len(folders)} pages; name one, such "
+            f"as {folders[-1]}"
+        )
+    for folder in folders:
+        page = write_report(
+            folder,
+            replays=REPLAYS if options.replays is None else options.replays,
+            methods=options.method,
+            path=options.out,
+        )
+        print(page)
+
+
+def report_history(options: argparse.Namespace) -> None:
+    """Write the history of several runs."""
+    path = options.out or own_folder(options.runs[-1], HISTORY)
+    if options.replays is not None:
+        raise InputError("--replays: for one run; leave it out")
+    if path.suffix != ".html":
+        raise InputError(
+            f"--out {path}: name a file that ends in .html; .csv comes beside it"
+        )
+    versions = read_versions(options.runs, options.ego)
+    print(*write_history(versions, path, options.method), sep="\n")
