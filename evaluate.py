@@ -21,6 +21,7 @@ def evaluate(run: Run) -> None:
         from e2rl.driving.batches import WHOLE
         from e2rl.evaluation.plan import begin
         from e2rl.evaluation.reproduce import compared_with_run, failure_row, outcome
+        from e2rl.report.growing import drive_watched
         from e2rl.report.results import write_results
 
     config = run.config
@@ -31,7 +32,7 @@ def evaluate(run: Run) -> None:
         failure = failure_row(original, config.failure)
         driven = plan.drive_again(failure, original)
     else:
-        driven = plan.drive()
+        driven = drive_watched(plan)
     if plan.settings.shard != WHOLE:
         print(
             f"\nshard {plan.settings.shard[0]} of {plan.settings.shard[1]} written to "

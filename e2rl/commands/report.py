@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from e2rl.evaluation.history import read_versions
+from e2rl.evaluation.record import Record, part_files
 from e2rl.evaluation.rollout_files import TABLE, own_folder
 from e2rl.report.history import HISTORY, write_history
 from e2rl.report.html import PAGE, REPLAYS, write_report
@@ -22,6 +23,8 @@ def measured_folders(run: Path) -> list[Path]:
     if (run / TABLE).is_file():
         return [run]
     folders = [run / part for part in MEASURED if (run / part / TABLE).is_file()]
+    if not folders and part_files(run):
+        return [run]
     if not folders:
         raise InputError(
             f"{run}: no {TABLE}, neither of an evaluation nor measured by a training; "
@@ -85,11 +88,21 @@ def report_run(options: argparse.Namespace) -> None:
             f"as {folders[-1]}"
         )
     for folder in folders:
+        record = None
+        progress = None
+        if not (folder / TABLE).is_file():
+            record = Record.of_parts(folder)
+            count = len(record.rollouts)
+            text = f"So far: {count} rollouts of a run that is not finished."
+            progress = {"text": text, "every": 0}
         page = write_report(
             folder,
+            record,
+            tables=[] if progress else None,
             replays=REPLAYS if options.replays is None else options.replays,
             methods=options.method,
             path=options.out,
+            progress=progress,
         )
         print(page)
 

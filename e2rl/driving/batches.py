@@ -39,6 +39,7 @@ class Work:
         only: positions of the scenes to drive in (None: all), with unchanged noise.
         parts: the batches that are on disk.
         shard: (k, n), only every n-th batch from the k-th on; a search has one shard.
+        watch: called with what each batch scored, in their order.
     """
 
     into: Path | None = None
@@ -46,6 +47,7 @@ class Work:
     only: Sequence[int] | None = None
     parts: Parts = NO_PARTS
     shard: tuple[int, ...] = WHOLE
+    watch: Callable[[Scored], object] = lambda scored: None
 
     def scenes(self, setup: Setup) -> Sequence[int]:
         """Returns the positions of the scenes to drive in."""
@@ -160,6 +162,7 @@ def score_all(
         scored = Scored(rows, samples, errored=errored)
         scored.rows += map(errored_row, scored.errored)
         scored.samples += [NO_SAMPLES] * len(scored.errored)
+        work.watch(scored)
         yield scored
 
 

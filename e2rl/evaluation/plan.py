@@ -88,6 +88,22 @@ class Evaluation:
             work=self.work,
         )
 
+    def driven(self, rows: Sequence[Mapping]) -> str:
+        """Returns how many of its rollouts these are, such as `24 of 96`; of a search,
+        by what it spent, about how many."""
+        settings = self.settings
+        scenes = len(self.work.scenes(self.setups[0]))
+        pairs = len(self.setups) * len(settings.seeds) * scenes
+        count = len(rows)
+        if settings.budget is None:
+            return f"{count} of {pairs * len(self.methods)}"
+        spent = float(count)
+        if settings.budget_unit != "tries":
+            spent = sum(row[settings.budget_unit] for row in rows if not row["errored"])
+        budget = settings.budget * pairs * len(self.searches)
+        whole = round(count * max(budget / spent, 1.0)) if spent else "?"
+        return f"{count} of about {whole}"
+
     def drive_again(self, row: Mapping[str, Any], run: Path) -> Spent:
         """Returns what the rollout of a row in the table of a run of this plan scores,
         driven again in a batch of its own. Raises InputError where the run's folder

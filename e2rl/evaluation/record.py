@@ -1,6 +1,7 @@
 """What a run leaves: the rows of its tables, written as they come, and read again by
 other commands (docs/reference/metrics.md)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from omegaconf import DictConfig
 
 from e2rl.driving.scored import Scored
 from e2rl.evaluation.atlas import find_atlas
-from e2rl.evaluation.modes import find_modes, read_modes
+from e2rl.evaluation.modes import find_modes, key_of, read_modes
 from e2rl.evaluation.rollout_files import (
     ERRORED_FILE,
     METRICS_FILE,
@@ -19,8 +20,11 @@ from e2rl.evaluation.rollout_files import (
     read_rows,
     write_tables,
 )
-from e2rl.evaluation.summary import metric_rows
+from e2rl.evaluation.summary import metric_row, metric_rows
+from e2rl.metrics.errored import errored_row
 from e2rl.run.errors import InputError
+from e2rl.run.parts import read_state
+from e2rl.run.run import PARTS, origin_of
 from e2rl.run.trust import CONFIG, read_yaml
 from e2rl.search.tries import TRIES_FILE
 
@@ -60,6 +64,59 @@ class Record:
             searched=(run / TRIES_FILE).is_file(),
             config=read_yaml(run / CONFIG) if (run / CONFIG).is_file() else None,
         )
+
+    @classmethod
+    def so_far(
+        cls,
+        run: Path,
+        rows: Sequence[dict],
+        config: DictConfig | None,
+        *,
+        searched: bool,
+    ) -> "Record":
+        """Returns the record of the rows that a run has so far; its metrics have no
+        values."""
+        rows = [dict(row) for row in rows]  # which `find_modes` changes
+        modes = find_modes(rows)
+        scenes = len({row["scene_id"] for row in rows})
+        origin = origin_of(run)
+        metrics = [
+            metric_row(
+                key_of(group),
+                scenes=scenes,
+                seeds=0,
+                rollouts=group["rollouts"],
+                metrics={},
+                **origin,
+            )
+            for group in modes["groups"]
+        ]
+        return cls(rows, metrics, modes=modes, searched=searched, config=config)
+
+    @classmethod
+    def of_parts(cls, run: Path) -> "Record":
+        """Returns the record so far of an evaluation that is not finished; InputError
+        where its parts are damaged."""
+        rows: list[dict] = []
+        files = part_files(run)
+        try:
+            for file in files:
+                part, _, errored = read_state(file, run)["value"]
+                rows += [*part, *map(errored_row, errored)]
+            config = read_yaml(run / CONFIG)
+            searched = files[0].parent != run / PARTS
+            return cls.so_far(run, rows, config, searched=searched)
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            raise InputError(
+                f"{run}: not finished, and its parts are damaged ({error}); go on with "
+                f"it by e2rl evaluate resume={run}"
+            ) from error
+
+
+def part_files(run: Path) -> list[Path]:
+    """Returns the files of the parts of an evaluation: its rollouts, or tries."""
+    tries = sorted((run / PARTS).glob("search-*/tries-*.pt"))
+    return tries or sorted((run / PARTS).glob("rollouts-*.pt"))
 
 
 def record(

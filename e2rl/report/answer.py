@@ -18,6 +18,7 @@ from e2rl.evaluation.summary import Headline, headline
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import lost, raised
 from e2rl.report.comparison_tables import by_ego
+from e2rl.report.outcomes import outcome_line
 from e2rl.report.tables import UNKNOWN, grouped, number, plural
 from e2rl.run.terminal import columns, terminal_width
 
@@ -241,6 +242,7 @@ def group_lines(
     lines = [
         headline_text(headline(rows, searched), group["ego_policy"], traffic=traffic)
     ]
+    lines.append(outcome_line(rows))
     rates = {
         name: f"{share(row, name)} {unit_of(row)} ({rate(row, name)})"
         for row in metrics
@@ -402,7 +404,9 @@ def closing(
     """
     lines = paragraphs([*notes, measured(rows)], indent="")
     if report:
-        lines.append(f"Watch every failure: {report}")
+        failed = any(tally(row, "cfr") for row in rows)
+        title = "Watch every failure" if failed else "Why nothing was found"
+        lines.append(f"{title}: {report}")
     if folder:
         lines.append(f"All metrics, with intervals: {folder / 'tables.md'}")
     return lines

@@ -4,6 +4,7 @@ pairs as CSV and JSON (docs/guide/compare.md).
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from e2rl.report.answer import (
     touched_lines,
     traffic_name,
 )
-from e2rl.report.failure_tracks import replay_data
+from e2rl.report.failure_tracks import encoded_failure, replay_data
 from e2rl.report.html import ASSETS, COLUMNS, page, rounded
 from e2rl.report.tables import difference_cell
 from e2rl.run.files import csv_text, write_atomically, write_beside
@@ -83,7 +84,7 @@ def compare(first: Driven, second: Driven, path: Path) -> list[str]:
         **about,
         "told": lines,
         "pairs": rows[: len(changed)],
-        **replay_data(failures(sides, shown), 2 * len(shown)),
+        **replay_data(starmap(encoded_failure, failures(sides, shown)), 2 * len(shown)),
     }
     scripts = [*(ASSETS / f"{name}.js" for name in SCRIPTS), FOLDER / "compare.js"]
     title = f"{names[1]} against {names[0]}"

@@ -119,17 +119,27 @@ def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str,
     }
 
 
-def replay_data(
-    pairs: Iterable[tuple[Failure, Failure | None]], count: int
-) -> dict[str, Any]:
-    """The fields of the data block that hold `count` replays, of failures and what is
-    beside them; scenes share their map."""
+class Encoded(NamedTuple):
+    """A replay, and its map as JSON."""
+
+    replay: dict[str, Any]
+    map: str
+
+
+def encoded_failure(failure: Failure, beside: Failure | None = None) -> Encoded:
+    """The replay of a failure, which `failure_replay` explains, with its map."""
+    text = json.dumps(encoded_map(failure.rollout))
+    return Encoded(failure_replay(failure, beside), text)
+
+
+def replay_data(failures: Iterable[Encoded], count: int) -> dict[str, Any]:
+    """The fields of the data block that hold `count` replays; scenes share their map."""
     maps: dict[str, int] = {}
     replays = []
-    for failure, beside in tqdm(pairs, "replays", count, leave=False, disable=None):
-        text = json.dumps(encoded_map(failure.rollout))
+    bar = tqdm(failures, "replays", count, leave=False, disable=None, delay=1)
+    for replay, text in bar:
         number = maps.setdefault(text, len(maps))
-        replays.append(failure_replay(failure, beside) | {"map": number})
+        replays.append(replay | {"map": number})
     return {
         "maps": list(map(json.loads, maps)),
         "replays": replays,

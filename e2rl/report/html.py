@@ -13,9 +13,8 @@ import os
 import re
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from functools import partial
-from itertools import product, repeat
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,8 @@ from e2rl.metrics.errored import raised
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.answer import group_lines
 from e2rl.report.cross import cross_tables
-from e2rl.report.failure_tracks import replay_data
+from e2rl.report.failure_tracks import Encoded, encoded_failure, replay_data
+from e2rl.report.outcomes import outcome_tables
 from e2rl.report.rates import rate_tables, summary_lines
 from e2rl.report.tables import (
     Table,
@@ -80,6 +80,11 @@ PLOTTED = ("cfr", "cfr_counted", "real", "real_adv")
 AGAIN = "Drive it again"
 
 
+def encode(run: Path, row: Mapping[str, Any]) -> Encoded:
+    """The replay of the failure of a row of a run's table."""
+    return encoded_failure(Failure.read(run, row))
+
+
 def write_report(
     run: Path,
     record: Record | None = None,
@@ -87,6 +92,9 @@ def write_report(
     replays: int = REPLAYS,
     methods: Sequence[str] = (),
     path: Path | None = None,
+    *,
+    progress: Mapping[str, Any] | None = None,
+    encode: Callable[[Path, Mapping], Encoded] = encode,
 ) -> Path:
     """Write the page of a run's folder, and the list of its failures beside it, in a
     file of the same name that ends in .csv; returns the page's path.
@@ -98,6 +106,9 @@ def write_report(
         replays: at most so many failures are shown moving.
         methods: only their failures; (): those of all.
         path: of the file; None: PAGE in the folder.
+        progress: of a run that is not finished, `text` that says how far it is, and
+            `every`, s after which the page loads itself again (0: never).
+        encode: returns the replay of the failure of a row.
 
     Raises:
         InputError: where files of the run are missing, or no method has the name.
@@ -120,10 +131,11 @@ def write_report(
     order = replay_order(entries)[:replays]
     for number, position in enumerate(order):
         entries[position]["replay"] = number
-    shown = [rows[position] for position in order]
-    failures = map(partial(Failure.read, run), shown)  # one at a time in memory
-    content["tables"] = list(map(vars, tables))
-    content |= replay_data(zip(failures, repeat(None)), len(order))
+    content["tables"] = list(map(vars, [*tables, *content["tables"]]))
+    content["progress"] = progress
+    # one rollout at a time in memory
+    replays_shown = (encode(run, rows[position]) for position in order)
+    content |= replay_data(replays_shown, len(order))
     path = path or own_folder(run, PAGE)
     write_beside(path, ".csv", content=failure_list(content, path.name))
     scripts = sorted(ASSETS.glob("*.js"), key=lambda file: file.stem == "page")
@@ -187,7 +199,7 @@ def page(
 
 
 def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str, Any]:
-    """The data block without tables and replays.
+    """The data block without replays, and with tables of outcomes alone.
 
     Args:
         run: the folder.
@@ -217,6 +229,7 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
                 f"{', '.join(names)}"
             )
     groups = {}
+    by_name = {}
     for group, label in zip(
         modes["groups"],
         column_names(modes["groups"]),
@@ -226,6 +239,7 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
             continue
         key = group_key(group)
         rows = [row for row in every if group_key(row) == key]
+        by_name[f"{group['ego_policy']}, {label}"] = rows
         rates, lines = group_lines(group, rows, metrics=metrics, searched=searched)
         groups[key] = {
             "ego": group["ego_policy"],
@@ -260,6 +274,7 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
             if row["errored"] == 1
         ],
         "rows": failures,
+        "tables": outcome_tables(by_name),
         "points": [
             {name: row[name] for name in ("ego", "method", "eta")}
             | {

@@ -44,10 +44,7 @@ def write_results(plan: Evaluation, record: Record) -> list[str]:
     if settings.metrics == ALL:
         print_tables(tables)
     page = None
-    failed = record.modes["failures"] or any(
-        row["errored"] == 1 for row in record.rollouts
-    )
-    if settings.report and settings.save_rollouts and failed:
+    if settings.report and settings.save_rollouts:
         page = write_report(folder, record, tables=tables, path=folder / PAGE)
     return answer_lines(
         record.metrics,

@@ -104,6 +104,11 @@ class Bar(tqdm):
             self.fp.flush()
         return True
 
+    def clear(self, *args: Any, **settings: Any) -> None:
+        """Take the bar away, for what `write` prints; lines stay."""
+        if not self.as_lines:
+            super().clear(*args, **settings)
+
     def line(self) -> str:
         """Returns the state in words."""
         elapsed = self._time() - self.start_t

@@ -331,3 +331,12 @@ def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
 def test_what_cannot_be_searched_is_told(override, words):
     with pytest.raises(InputError, match=words):
         plans("methods=[search]", override)
+
+
+def test_what_each_batch_scored_is_watched(setup, plan, whole):
+    spent, parts = whole
+    batches = []
+    spend(setup, plan, Work(parts=parts, watch=batches.append))
+    rows = [row for scored in batches for row in scored.rows]
+    keys = {(row["scene_id"], row["seed"]) for row in rows}
+    assert {(row["scene_id"], row["seed"]) for row in spent.scored.rows} <= keys

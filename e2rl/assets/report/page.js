@@ -8,6 +8,7 @@ class Page {
     this.index = new Index((failure) => this.open(failure), report.modes);
     showTables(document.getElementById("tables"), report.tables);
     showAbout(document.getElementById("about"), report.about);
+    if (report.progress) this.showProgress(report.progress);
     const { command, git } = report.run;
     document.getElementById("origin").textContent = `Made from: ${command}${git ? ` (commit ${git})` : ""}`;
     this.buildScope();
@@ -20,6 +21,15 @@ class Page {
     this.choose(report.groups[0].ego);
     addEventListener("hashchange", () => this.follow(location.hash));
     this.follow(asked);
+  }
+
+  /** Say how far a run is that goes on, and load the page again every so many seconds, but not amid a replay. */
+  showProgress({ text, every }) {
+    const notice = document.getElementById("progress");
+    notice.textContent = text;
+    notice.hidden = false;
+    document.querySelector("section.realism").hidden = true; // it needs intervals
+    if (every) setInterval(() => this.player.playing || location.reload(), 1000 * every);
   }
 
   /** Go to the failure that the end of an address names, or to those of a planner in a traffic. */
