@@ -8,7 +8,7 @@ from typing import Any
 from e2rl.metrics.errored import raised
 from e2rl.report.tables import Table, grouped, plural
 
-Row = Mapping[str, Any]  # of rollouts.csv
+Row = dict[str, Any]  # of rollouts.csv
 NEAR = 2.0  # s and m, as in the column `margin`
 PREVENTABLE = "a preventable failure"
 RAISED = "the planner raised"
