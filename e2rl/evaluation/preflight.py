@@ -29,7 +29,7 @@ from e2rl.scenes.scene import SceneSet
 from e2rl.scenes.scene_cache import Index, uncached
 from e2rl.scenes.scene_list import read_list
 from e2rl.scenes.source import Row, Source, load_scenes, source_of
-from e2rl.traffic.fusing import fused_functions
+from e2rl.traffic.fusing import EARNED, fused_functions
 
 SAMPLE = 8  # scenes that are looked at
 LOGS = 24  # recordings for these, at most
@@ -257,7 +257,9 @@ class Preparation:
         elif self.uncompiled:
             mend = "install a C++ compiler (g++) to run in half the time"
             if has_compiler():
-                mend = "compile=true does so once, and rollouts take half the time"
+                mend = "compile=true does so once, for half the time"
+                if self.config.compile == "auto":
+                    mend += f"; a run of {EARNED:,} rollouts does so by itself"
             yield Finding(
                 "compiled", None, f"{self.uncompiled} functions are not yet", mend
             )

@@ -32,6 +32,26 @@ class Candidates(NamedTuple):
     shift: Tensor
 
 
+class Moves(NamedTuple):
+    """N moves: speed [PLAN_STEPS + 1, N] m/s at steps 0..; to shift [N] m beside the
+    mission; time [N] s that they take at the present speed; scene [N] int64, of B."""
+
+    speed: Tensor
+    shift: Tensor
+    time: Tensor
+    scene: Tensor
+
+
+class Starts(NamedTuple):
+    """Where moves start in B scenes: states [B, 4]; d [B] m beside the mission and
+    turned [B] rad off it; headings [B, REACH] rad, of `heading_table`."""
+
+    states: Tensor
+    d: Tensor
+    turned: Tensor
+    headings: Tensor
+
+
 def speed_profiles(
     speed: Tensor,
     accelerations: Tensor,
@@ -87,15 +107,20 @@ def drive(
     shape = (batch, profiles, moves)
     count = profiles * moves
     scene = torch.arange(batch, device=start.device).repeat_interleave(count)
+    every = speed.permute(2, 0, 1)[..., None].expand(ticks, *shape)
     states, distance = driven(
-        speed.permute(2, 0, 1)[..., None].expand(ticks, *shape).reshape(ticks, -1),
-        shift.expand(shape).reshape(-1),
-        time.expand(shape).reshape(-1),
-        scene,
-        start,
-        path.d,
-        path.turned,
-        heading_table(path),
+        Moves(
+            every.reshape(ticks, -1),
+            shift.expand(shape).reshape(-1),
+            time=time.expand(shape).reshape(-1),
+            scene=scene,
+        ),
+        Starts(
+            start,
+            path.d,
+            turned=path.turned,
+            headings=heading_table(path),
+        ),
     )
     return Candidates(
         states.unflatten(-1, (batch, count)).permute(2, 3, 1, 0),
@@ -104,30 +129,15 @@ def drive(
     )
 
 
-@fused(f"{PLAN_STEPS + 1} N", "N", "N", "N:int64", "B 4", "B", "B", f"B {REACH}")
-def driven(
-    speed: Tensor,
-    shift: Tensor,
-    time: Tensor,
-    scene: Tensor,
-    start: Tensor,
-    d: Tensor,
-    turned: Tensor,
-    headings: Tensor,
-) -> tuple[Tensor, Tensor]:
+@fused(
+    (f"{PLAN_STEPS + 1} N", "N", "N", "N:int64"),
+    ("B 4", "B", "B", f"B {REACH}"),
+)
+def driven(moves: Moves, starts: Starts) -> tuple[Tensor, Tensor]:
     """Returns the states [4, PLAN_STEPS, N] of `drive`, and the distance [N] m along
-    the mission to their end.
-
-    Args:
-        speed: [PLAN_STEPS + 1, N] m/s.
-        shift: [N] m.
-        time: [N] s.
-        scene: [N], of B.
-        start: states [B, 4].
-        d: m beside the mission at the start.
-        turned: rad off it.
-        headings: [B, REACH] rad, of `heading_table`.
-    """
+    the mission to their end."""
+    speed, shift, time, scene = moves
+    start, d, turned, headings = starts
     mean = (speed[1:] + speed[:-1]) / 2
     steps = mean * DT
     ahead = torch.cat([torch.zeros_like(steps[:1]), running_sum(steps)])
