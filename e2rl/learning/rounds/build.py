@@ -42,7 +42,7 @@ from e2rl.traffic.traffic import Traffic
 def build_attackers(config: DictConfig, prior: Prior) -> list[Traffic]:
     """Returns the traffic of the synthesizer, and of the harder one that joins in where
     `learner.round.harder` names one for it."""
-    harder = config.learner.round.harder.get(config.synthesizer.name)
+    harder = config.learner.round.get("harder", {}).get(config.synthesizer.name)
     further = [load_choice("synthesizer", harder)] if harder else []
     return [build_traffic(group, prior) for group in (config.synthesizer, *further)]
 

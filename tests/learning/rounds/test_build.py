@@ -5,8 +5,14 @@ import pytest
 from e2rl.scripts.train import train_round
 from omegaconf import open_dict
 
+from e2rl.api import load_prior
 from e2rl.evaluation.build import build_ego
-from e2rl.learning.rounds.build import build_evolution, build_progress, check_training
+from e2rl.learning.rounds.build import (
+    build_attackers,
+    build_evolution,
+    build_progress,
+    check_training,
+)
 from e2rl.learning.rounds.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.rounds.policy import PolicyImprovement
 from e2rl.learning.rounds.scheduler import CurriculumScheduler
@@ -85,6 +91,21 @@ def test_without_a_synthesizer_given_the_traffic_method_attacks():
     metrics = train_round(run)
     assert metrics["synthesizer/attacked"] == metrics["synthesizer/contact"] == 1.0
     assert run.memory.rows == 2
+
+
+@pytest.mark.parametrize(
+    ("synthesizer", "count"), [("e2", 2), ("e2_unbound", 1), ("nominal", 1)]
+)
+def test_a_harder_attack_joins_in_where_one_is_named(synthesizer, count):
+    config = config_of(f"synthesizer={synthesizer}")
+    assert len(build_attackers(config, load_prior())) == count
+
+
+def test_a_learner_that_names_no_harder_attack_has_one_attacker():
+    config = config_of()
+    with open_dict(config):
+        del config.learner.round.harder
+    assert len(build_attackers(config, load_prior())) == 1
 
 
 def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
