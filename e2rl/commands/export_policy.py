@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from e2rl.planners.network import ActorNetwork, find_weights, read_actor
 from e2rl.planners.policy_file import write_policy
 from e2rl.run.endings import ending
+from e2rl.run.errors import InputError
 
 
 class Deterministic(nn.Module):
@@ -28,7 +29,15 @@ class Deterministic(nn.Module):
 
 def export_actor(checkpoint: str, file: Path) -> None:
     """Write the actor that `find_weights` finds as TorchScript; raises InputError."""
-    write_policy(Deterministic(read_actor(find_weights(checkpoint)).network), file)
+    path = find_weights(checkpoint)
+    actor = read_actor(path)
+    if actor.architecture.evades:
+        raise InputError(
+            f"{path}: it evades by a planner, which sees more than the observation of a "
+            "policy's file; drive with it by ego=actor ego.checkpoint, or train one with "
+            "ego.evades=false"
+        )
+    write_policy(Deterministic(actor.network), file)
 
 
 def main(arguments: list[str] | None = None) -> None:

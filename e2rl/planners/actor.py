@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS, Ego
+from e2rl.planners.evader import Evader
 from e2rl.planners.network import ActorCritic, Architecture, find_weights, read_actor
 from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
@@ -30,6 +31,11 @@ class ObservingEgo(Ego):
     def decide(self, observation: Tensor) -> Tensor:
         """Action [B, 2] (acceleration [m/s^2], yaw rate [rad/s]) at observations [B,
         OBSERVATION_SIZE]."""
+
+    def corrected(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
+        """The plan [B, PLAN_STEPS, 4] that is announced at the observation, where it is
+        not what `decide` leads to."""
+        return plan
 
     @torch.no_grad()
     def act(
@@ -57,6 +63,7 @@ class ObservingEgo(Ego):
         action = world.ego_action()
         place = world.mission_s
         parts = []
+        observations = []
         for step in range(0, PLAN_STEPS, HOLD):
             ego = placed_ego(
                 static.mission,
@@ -68,14 +75,15 @@ class ObservingEgo(Ego):
                 others=static.vehicle,
             )
             others = others_at(world, expected, step=step)
-            action = self.decide(features(static, ego, others, ego.step / horizon))
+            observations.append(features(static, ego, others, ego.step / horizon))
+            action = self.decide(observations[-1])
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
             action = dynamics.inverse(last_two)[:, 0]
             state = driven[:, -1]
             place = ego.pose.s + DT * driven[..., 3].sum(1)
             parts.append(driven)
-        return torch.cat(parts, 1)
+        return self.corrected(world, observations[0], torch.cat(parts, 1))
 
 
 def others_at(
@@ -122,6 +130,7 @@ class ActorEgo(ObservingEgo):
     reference: bool = setting()
     slack: float | None = setting(low=0, optional=True)
     room: float | None = setting(low=0.1, optional=True)
+    evades: bool = setting()
     initial_std: Sequence[float] = setting()
     max_acceleration: float = setting()
     max_braking: float = setting()
@@ -134,6 +143,11 @@ class ActorEgo(ObservingEgo):
         other bounds."""
         if not self.hidden:
             raise InputError("ego.hidden=[]: give the units of one layer at least")
+        if self.evades and (self.room is None or not self.reference):
+            raise InputError(
+                "ego.evades=true: it needs ego.room, which says what danger is, and "
+                "ego.reference=true"
+            )
         low = (-float(self.max_braking), -float(self.max_yaw_rate))
         high = (float(self.max_acceleration), float(self.max_yaw_rate))
         architecture = Architecture(
@@ -144,6 +158,7 @@ class ActorEgo(ObservingEgo):
             reference=self.reference,
             slack=self.slack,
             room=self.room,
+            evades=self.evades,
         )
         self.network = ActorCritic(architecture, self.initial_std, self.device)
         if self.checkpoint is not None:
@@ -156,6 +171,26 @@ class ActorEgo(ObservingEgo):
                     f"{low}, {high}; set sim.max_* as in its run"
                 )
 
+        architecture = self.network.architecture
+        self.evader = Evader(architecture.room) if architecture.evades else None
+
     def decide(self, observation: Tensor) -> Tensor:
-        """Most central action [B, 2] at the observation."""
+        """Most central action [B, 2] at the observation, if nobody evades."""
         return self.network.network.deterministic(observation)
+
+    @torch.no_grad()
+    def act(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
+        """Most central action [B, 2]."""
+        if self.evader is None:
+            return self.decide(observation)
+        evasion = self.evader.actions(world, observation)
+        return self.network.network.deterministic(observation, evasion)
+
+    def corrected(self, world: World, observation: Tensor, plan: Tensor) -> Tensor:
+        """The evader's plan in danger."""
+        if self.evader is None:
+            return plan
+        rows = self.evader.endangered(observation)
+        if not len(rows):
+            return plan
+        return plan.index_copy(0, rows, self.evader.plans(world, rows))

@@ -8,12 +8,13 @@ from importlib.resources import files
 from pathlib import Path
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
-from e2rl.planners.reference import LAST_ACTION, follow
+from e2rl.planners.reference import EVASION, LAST_ACTION, follow
 from e2rl.planners.trunk import Normaliser, Trunk
 from e2rl.run.errors import InputError
 from e2rl.run.files import altered, write_atomically
@@ -42,6 +43,7 @@ class Architecture:
     reference: bool
     slack: float | None
     room: float | None
+    evades: bool
 
     def header(self) -> str:
         """It as JSON, with what all actors of this version have in common."""
@@ -66,6 +68,7 @@ class Architecture:
             and all(0 < size <= WIDEST for size in (*hidden, units))
             and (slack is None or 0 <= slack < torch.inf)
             and (room is None or 0 < room < torch.inf)
+            and (room is not None or not saved.get("evades"))
         )
         if not valid:
             raise ValueError(f"architecture {header[:300]}")
@@ -77,6 +80,7 @@ class Architecture:
             reference=bool(saved["reference"]),
             slack=slack,
             room=room,
+            evades=bool(saved.get("evades", False)),  # older files lack it
         )
 
 
@@ -91,7 +95,7 @@ class ActorNetwork(nn.Module):
 
     With `room` the gate g rises from 0 where the reference has `room` m left (`follow`)
     to 1 where it has half of it, so that the network drives in danger alone; else g =
-    1. With `slack` the mean's acceleration exceeds the bound of `follow` by `slack`
+    1. Where a planner evades (`evader.Evader`), r is its action instead. With `slack` the mean's acceleration exceeds the bound of `follow` by `slack`
     m/s^2 at most: what is learned against attackers keeps the distance to the vehicle
     ahead.
     """
@@ -131,20 +135,26 @@ class ActorNetwork(nn.Module):
             persistent=False,
         )
 
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """loc, scale [..., 2] from observation [..., D]."""
+    def forward(
+        self, observation: Tensor, evasion: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2] from observation [..., D] and, if a planner evades, its
+        action [..., 2], NaN where it does not."""
         normalised = self.normaliser(observation)
         if self.noise is not None:
             normalised = normalised + self.noise * torch.randn_like(normalised)
-        return self.head(normalised, self.offset(observation))
+        return self.head(normalised, self.offset(observation, evasion))
 
-    def offset(self, observation: Tensor) -> Tensor:
-        """r, the bound of the acceleration and g, [..., 4], at observation [..., D]: no
-        parameter changes them."""
+    def offset(self, observation: Tensor, evasion: Tensor | None = None) -> Tensor:
+        """r, the bound of the acceleration and g, [..., 4], at observation [..., D] and
+        evasion [..., 2]: no parameter changes them."""
         if not self.reference:
             return torch.zeros_like(observation[..., :4])
         followed = follow(observation)
-        action = (followed[..., :2] - self.middle) / self.reach
+        action = followed[..., :2]
+        if evasion is not None:
+            action = torch.where(evasion.isnan(), action, evasion)
+        action = (action - self.middle) / self.reach
         limit = followed[..., 2:3] + (self.slack or 0.0)
         bound = (limit - self.middle[:1]) / self.reach[:1]
         gate = torch.ones_like(bound)
@@ -181,16 +191,18 @@ class ActorNetwork(nn.Module):
         """Standard deviations [2] before squashing, in halves of the action's range."""
         return NARROWEST + self.spread.sigmoid()
 
-    def deterministic(self, observation: Tensor) -> Tensor:
+    def deterministic(
+        self, observation: Tensor, evasion: Tensor | None = None
+    ) -> Tensor:
         """Most central action [..., 2] (m/s^2, rad/s)."""
-        return self.middle + self.reach * self(observation)[0].tanh()
+        return self.middle + self.reach * self(observation, evasion)[0].tanh()
 
 
 class ActorCritic(nn.Module):
     """TorchRL actor and critic over one normaliser.
 
-    actor reads "observation", writes loc, scale, action, action_log_prob; critic writes
-    state_value.
+    actor reads "observation" and, if it evades, "evasion", and writes loc, scale,
+    action, action_log_prob; critic writes state_value.
     """
 
     def __init__(
@@ -214,8 +226,10 @@ class ActorCritic(nn.Module):
         )
         values = nn.Sequential(self.normaliser, trunk)
         self.to(self.device)
+        inputs = ["observation", EVASION] if architecture.evades else ["observation"]
+        self.inputs = tuple(inputs)
         self.actor = self._sampler(
-            TensorDictModule(self.network, ["observation"], ["loc", "scale"])
+            TensorDictModule(self.network, inputs, ["loc", "scale"])
         )
         self.critic = ValueOperator(values.to(self.device), in_keys=["observation"])
 
@@ -228,12 +242,12 @@ class ActorCritic(nn.Module):
         return self._sampler(head), critic
 
     @torch.no_grad()
-    def prepared(self, observation: Tensor) -> dict[str, Tensor]:
-        """What `heads` read, of observations [..., D]: seen [..., D] and offset [...,
-        4]."""
+    def prepared(self, frames: TensorDictBase) -> dict[str, Tensor]:
+        """What `heads` read, of frames [...] with the actor's `inputs`: seen [..., D]
+        and offset [..., 4]."""
         return {
-            "seen": self.normaliser(observation),
-            "offset": self.network.offset(observation),
+            "seen": self.normaliser(frames["observation"]),
+            "offset": self.network.offset(*frames.select(*self.inputs).values()),
         }
 
     def _sampler(self, module: TensorDictModule) -> ProbabilisticActor:

@@ -36,6 +36,7 @@ AGENTS = slice(PROBED, PROBED + PER_AGENT * NEAREST)
 ROOMS = slice(AGENTS.stop, AGENTS.stop + PROSPECTS // 2)
 MILD = slice(ACCELERATIONS.index(-1.0), ACCELERATIONS.index(1.0) + 1)
 
+EVASION = "evasion"  # key of the action that takes the reference's place in danger
 PURSUIT_TIME = 1.5  # s of look-ahead of the pursuit
 PURSUIT_MIN = 6.0  # m
 PURSUIT_MAX = 30.0  # m

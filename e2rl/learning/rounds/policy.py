@@ -23,6 +23,7 @@ from e2rl.learning.rounds.teaching import Teacher, TeachingSettings
 from e2rl.learning.rounds.update import Learner, UpdateSettings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
+from e2rl.planners.evader import Evasions
 from e2rl.run.config import built, configured, setting, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.terminal import Bar
@@ -119,6 +120,11 @@ class PolicyImprovement(Improvement):
         placed = scenes.to(device)
         self.teacher: Teacher | None = None
         if update.teaching > 0:
+            if ego.evader is not None:
+                raise InputError(
+                    "learner.ppo.teaching: a teacher has nothing to teach an actor that "
+                    "drives by it in danger; set it to 0, or ego.evades=false"
+                )
             planner: Any = (
                 teacher
                 if isinstance(teacher, Ego)
@@ -149,8 +155,11 @@ class PolicyImprovement(Improvement):
             agents=self.teacher is not None,
             hold=self.settings.hold,
         )
+        transforms = [self.synthesizer, RewardSum()]
+        if ego.evader is not None:
+            transforms.append(Evasions(ego.evader, self.settings.hold))
         self._collector = Collector(
-            TransformedEnv(self.env, Compose(self.synthesizer, RewardSum())),
+            TransformedEnv(self.env, Compose(*transforms)),
             network.actor,
             frames_per_batch=self.settings.batch * self.settings.steps,
             total_frames=-1,

@@ -159,10 +159,9 @@ class Learner:
         Frames are left out whose |advantage| is below `least` times its running
         maximum: there is little to learn from them.
         """
-        data = data.select("observation", "action", "action_log_prob", "next").to(
-            self.network.device
-        )
-        inputs = self.network.prepared(data["observation"])
+        keys = (*self.network.inputs, "action", "action_log_prob", "next")
+        data = data.select(*keys).to(self.network.device)
+        inputs = self.network.prepared(data)
         advantage, target = self.advantages(data, inputs["seen"])
         self.returns.update(target)
         size = advantage.abs()

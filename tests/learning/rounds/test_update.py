@@ -142,7 +142,7 @@ def test_the_action_penalty_counts_calm_frames_alone():
     """Who is about to be hit may brake or accelerate as hard as it helps."""
     ego, _, data = begun()
     meant = ego.network.network.deterministic(data["observation"])[..., 0].abs()
-    inputs = TensorDict(ego.network.prepared(data["observation"]), data.shape)
+    inputs = TensorDict(ego.network.prepared(data), data.shape)
     for calm in (
         torch.rand(data.shape) < 0.5,
         torch.ones(data.shape, dtype=torch.bool),
@@ -211,7 +211,7 @@ def test_advantages_are_those_of_torchrl():
         value_network=values,
         deactivate_vmap=True,
     )(data.clone())
-    result = learner.advantages(data, ego.network.prepared(data["observation"])["seen"])
+    result = learner.advantages(data, ego.network.prepared(data)["seen"])
     for name, value in zip(("advantage", "value_target"), result, strict=True):
         torch.testing.assert_close(
             value,
@@ -252,7 +252,7 @@ def test_frames_with_little_to_learn_are_left_out():
     critic warms up."""
     ego, learner, data = begun(advantage_filter=0.3, critic_warmup=1, epochs=1)
     assert learner.update(data)["frames_used"] == 1.0
-    observed = ego.network.prepared(data["observation"])["seen"]
+    observed = ego.network.prepared(data)["seen"]
     advantage = learner.advantages(data, observed)[0].abs()
     before = learner.peak.clone()
     expected = (
