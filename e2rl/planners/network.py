@@ -114,11 +114,13 @@ class ActorNetwork(nn.Module):
         self.reference = architecture.reference
         self.slack = architecture.slack
         self.room = architecture.room
+        self.evades = architecture.evades
         self.trunk = Trunk(
             architecture.hidden,
             architecture.agent_units,
             out=4 if self.reference else 2,
             last_gain=0.0,
+            extra=2 * self.evades,
         )
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
         self.noise: Tensor | None = None  # [D], set by `noisy`
@@ -140,10 +142,18 @@ class ActorNetwork(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """loc, scale [..., 2] from observation [..., D] and, if a planner evades, its
         action [..., 2], NaN where it does not."""
+        offset = self.offset(observation, evasion)
+        return self.head(self.seen(observation, offset), offset)
+
+    def seen(self, observation: Tensor, offset: Tensor) -> Tensor:
+        """What the layers read: the normalised observation [..., D], and r if a planner
+        evades, since it knows more than the observation."""
         normalised = self.normaliser(observation)
         if self.noise is not None:
             normalised = normalised + self.noise * torch.randn_like(normalised)
-        return self.head(normalised, self.offset(observation, evasion))
+        if not self.evades:
+            return normalised
+        return torch.cat([normalised, offset[..., :2]], -1)
 
     def offset(self, observation: Tensor, evasion: Tensor | None = None) -> Tensor:
         """r, the bound of the acceleration and g, [..., 4], at observation [..., D] and
@@ -164,10 +174,9 @@ class ActorNetwork(nn.Module):
         bound = bound.clamp(-STEEPEST, UNBOUNDED).atanh()
         return torch.cat([action, bound, gate], -1)
 
-    def head(self, normalised: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-        """loc, scale [..., 2] from the normalised observation [..., D] and the `offset`
-        [..., 4]."""
-        loc = self.trunk(normalised)
+    def head(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2] from what is `seen` and the `offset` [..., 4]."""
+        loc = self.trunk(seen)
         if self.reference:
             action, bound, gate = offset.split((2, 1, 1), -1)
             loc = action + gate * (loc[..., :2] + loc[..., 2:] * action)
@@ -243,12 +252,11 @@ class ActorCritic(nn.Module):
 
     @torch.no_grad()
     def prepared(self, frames: TensorDictBase) -> dict[str, Tensor]:
-        """What `heads` read, of frames [...] with the actor's `inputs`: seen [..., D]
-        and offset [..., 4]."""
-        return {
-            "seen": self.normaliser(frames["observation"]),
-            "offset": self.network.offset(*frames.select(*self.inputs).values()),
-        }
+        """What `heads` read, of frames [...] with the actor's `inputs`: `seen` and the
+        offset [..., 4]."""
+        observation = frames["observation"]
+        offset = self.network.offset(observation, frames.get(EVASION, None))
+        return {"seen": self.network.seen(observation, offset), "offset": offset}
 
     def _sampler(self, module: TensorDictModule) -> ProbabilisticActor:
         return ProbabilisticActor(
