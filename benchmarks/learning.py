@@ -50,8 +50,6 @@ def rates(bench: Bench) -> tuple[float, float]:
         rounds=config.rounds,
         collect=collect,
         ppo=ppo,
-        teacher=config.learner.teacher,
-        teaching=config.learner.teaching,
     )
     collected = []
     whole = []

@@ -79,8 +79,6 @@ def _learn(bench: Bench, batch: int) -> None:
         rounds=config.rounds,
         collect=collect,
         ppo=ppo,
-        teacher=config.learner.teacher,
-        teaching=config.learner.teaching,
     )
     for _ in range(2):
         improve.learner.update(improve.collected())

@@ -95,9 +95,9 @@ class ActorNetwork(nn.Module):
 
     With `room` the gate g rises from 0 where the reference has `room` m left (`follow`)
     to 1 where it has half of it, so that the network drives in danger alone; else g =
-    1. Where a planner evades (`evader.Evader`), r is its action instead. With `slack` the mean's acceleration exceeds the bound of `follow` by `slack`
-    m/s^2 at most: what is learned against attackers keeps the distance to the vehicle
-    ahead.
+    1. There r is a planner's action if one evades (`evader.Evader`). With `slack` the
+    mean's acceleration exceeds the bound of `follow` by `slack` m/s^2 at most: what is
+    learned against attackers keeps the distance to the vehicle ahead.
     """
 
     middle: Tensor

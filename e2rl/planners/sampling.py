@@ -12,7 +12,6 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from e2rl.planners.candidates import Candidates, drive, speed_profiles
 from e2rl.planners.chunks import PLANNER_KEYS, chunks
@@ -21,14 +20,10 @@ from e2rl.planners.path import BRAKING, MissionPath
 from e2rl.planners.scoring import Weights, forecast, nearest, score
 from e2rl.run.config import configured, setting
 from e2rl.scenes.recording import DT
-from e2rl.scenes.route import project
-from e2rl.sim import dynamics
 from e2rl.sim.world import World
 
 GPU_CHUNK = 512  # scenes that are planned for at a time on a GPU
 STRIDE = 2  # steps between two scored states
-WIDER = 4  # times `count` candidates are ranked before those driven alike are dropped
-ALIKE = 1e-4  # m, rad, m/s and cost below which two candidates are driven alike
 PROFILES = (
     (-8.0, -8.0),
     (-8.0, 0.0),
@@ -136,70 +131,9 @@ class ScoringEgo(Weights, Ego):
             plans.append(candidates.states[row, best])
         return torch.cat(plans)
 
-    def ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
-        """States [B, C, PLAN_STEPS, 4] and costs [B, C] of the C = `count` cheapest
-        candidates, the cheapest first; of those that are driven alike (caps and bounds
-        make many so) one counts, the others cost inf."""
-        parts = [self._ranked(part, count) for part in self._parts(world)]
-        states = torch.cat([states for states, _ in parts])
-        return states, torch.cat([costs for _, costs in parts])
-
-    def _ranked(self, world: World, count: int) -> tuple[Tensor, Tensor]:
-        candidates = self.candidates(world)
-        costs = self.costs(world, candidates)
-        costs, best = costs.topk(min(WIDER * count, costs.shape[1]), largest=False)
-        row = torch.arange(len(best), device=best.device)[:, None]
-        states = candidates.states[row, best]
-        same_states = states.diff(dim=1).abs().amax((2, 3)) < ALIKE
-        alike = pad(same_states & (costs.diff(dim=1) < ALIKE), (1, 0))
-        costs, best = costs.masked_fill(alike, torch.inf).topk(count, largest=False)
-        return states[row, best], costs
-
-    def rated(self, world: World, states: Tensor) -> Tensor:
-        """Costs [B, C] of driving along any states [B, C, PLAN_STEPS, 4], which lead
-        where they end."""
-        path = MissionPath(world)
-        xy = states[..., :2]
-        start = world.states[:, None, :1, :2].expand_as(xy[:, :, :1])
-        length = torch.cat([start, xy], 2).diff(dim=2).norm(dim=-1).sum(-1)
-        hint = path.s[:, None] + length
-        end, shift, _ = project(
-            xy[:, :, -1],
-            path.route,
-            hint=hint,
-        )
-        return self.costs(
-            world,
-            Candidates(
-                states,
-                end - path.s[:, None],
-                shift=shift,
-            ),
-        )
-
     def _parts(self, world: World) -> Iterator[World]:
         size = GPU_CHUNK if world.step.is_cuda else self.CHUNK
         return chunks(world, size, keys=self.READS)
-
-
-def ranked_actions(
-    ego: ScoringEgo,
-    world: World,
-    count: int,
-    hold: int,
-) -> tuple[Tensor, Tensor]:
-    """Returns actions [B, C, 2] (m/s^2, rad/s) of the cheapest candidates and their
-    costs [B, C].
-
-    Args:
-        ego: whose candidates.
-        world: B scenes.
-        count: C, of candidates.
-        hold: steps over which the actions are means.
-    """
-    states, costs = ego.ranked(world, count)
-    start = world.states[:, None, :1].expand_as(states[:, :, :1])
-    return dynamics.inverse(torch.cat([start, states[:, :, :hold]], 2)).mean(2), costs
 
 
 @configured("ego/sampling")
@@ -209,6 +143,8 @@ class SamplingEgo(ScoringEgo):
     calm, and the present one."""
 
     CHUNK = 8  # fits the processor's cache
+    profiles: ClassVar[tuple[tuple[float, float], ...]] = PROFILES
+    calms = True  # whether it moves over calmly, too
 
     tuned = {"swift": (0.5, 1.0), "calm": (1.0, 2.5)} | ScoringEgo.tuned
 
@@ -222,15 +158,15 @@ class SamplingEgo(ScoringEgo):
         start = world.states[:, 0]
         speed = speed_profiles(
             start[:, 3],
-            start.new_tensor(PROFILES),
+            start.new_tensor(self.profiles),
             caps=path.speed_caps(self.max_speed),
             braking=BRAKING + BRAKING_MORE,
         )
         shifts = start.new_tensor(SHIFTS).expand(len(start), -1)
-        shift = torch.cat([shifts, shifts, path.d[:, None]], 1)
-        count = len(SHIFTS)
-        times = [self.swift] * count + [self.calm] * count + [self.swift]
-        time = start.new_tensor(times)
+        moves = [self.swift, self.calm] if self.calms else [self.swift]
+        shift = torch.cat([*[shifts] * len(moves), path.d[:, None]], 1)
+        times = [time for time in moves for _ in SHIFTS]
+        time = start.new_tensor([*times, self.swift])
         return drive(
             start,
             path,

@@ -78,26 +78,27 @@ def small_run(
     rounds=4,
     scenes=None,
     collect=None,
-    expert=None,
+    evades=False,
+    device="cpu",
     spread=0.0,
     folder=None,
     memory=4096,
     prefetch=False,
     **ppo,
 ):
-    """expert: settings of the teacher; folder: of the run, where `memory` rows are
-    remembered."""
+    """evades: a planner evades for the actor; folder: of the run, where `memory` rows
+    are remembered."""
     torch.manual_seed(seed)
     scenes = scenes or small_scenes()
     improve = PolicyImprovement(
-        ActorEgo(hidden=hidden, room=None),
+        ActorEgo(hidden=hidden, room=2.0 if evades else None, evades=evades),
         scenes,
         sim=SimSettings(),
         seed=seed,
         collect={"batch": 4, "steps": 20, "hold": 1, "iterations": 2} | (collect or {}),
         ppo={"minibatch": 64, "epochs": 2, "critic_warmup": 0, "target_kl": 1.0} | ppo,
         rounds=rounds,
-        **(expert or {}),
+        device=device,
     )
     return Evolution(
         AdaptiveCurriculum(len(scenes), rounds, seed, spread=spread),

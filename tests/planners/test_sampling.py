@@ -291,32 +291,3 @@ def test_a_first_change_of_acceleration_costs_a_tenth_of_a_second_of_it():
     assert discomfort(states, torch.tensor([[10.0], [-2.0]])).item() == pytest.approx(
         0.2
     )
-
-
-def test_the_ranked_begin_with_the_plan_and_are_driven_differently():
-    _, world = world_of(num_scenes=2)
-    ego = SamplingEgo()
-    states, costs = ego.ranked(world, 8)
-    assert states.shape == (2, 8, PLAN_STEPS, 4)
-    assert (costs.diff(dim=1) >= 0).all()
-    assert torch.equal(states[:, 0], ego.plan(world))
-    apart = (states[:, :, None] - states[:, None]).abs().amax((3, 4)) + torch.eye(8)
-    assert (apart > 1e-4).all()
-
-
-def test_a_plan_of_its_own_is_rated_as_it_was_ranked():
-    """But for where the plan ends beside the mission, which counts instead of where it
-    led to."""
-    _, world = world_of(num_scenes=2)
-    ego = SamplingEgo(lateral_offset=0.0)
-    states, costs = ego.ranked(world, 8)
-    torch.testing.assert_close(
-        ego.rated(world, states),
-        costs,
-        atol=0.2,
-        rtol=0,
-    )
-    into = world.states[:, None, 1:2].expand(-1, 1, PLAN_STEPS, -1)
-    assert (ego.rated(world, into) > costs[:, :1] + 50).all(), (
-        "one that is where another agent is"
-    )

@@ -9,10 +9,51 @@ from e2rl.scenes.recording import LIGHT_GREEN, LIGHT_RED
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv
 from e2rl.sim.mission import mission_of
-from e2rl.sim.observation import light_features, mirrored, observation_config
+from e2rl.sim.observation import (
+    PROBE_Y,
+    light_features,
+    observation_config,
+    observation_layout,
+)
+from e2rl.sim.prospects import OFFSETS
 from e2rl.sim.settings import SimSettings
 from e2rl.sim.static import static_scene
 from tests.synthetic import make_scenes
+
+# Quantities that change sign in a mirror.
+SIDED = (
+    "yaw_rate",
+    "offset",
+    "heading_sin",
+    "curvature",
+    "y",
+    "velocity_y",
+    "turn_rate",
+)
+
+
+def mirrored(observation):
+    """The observations [..., D] of the mirrored scenes, y to -y; twice gives the
+    original."""
+    names = [entry.name for entry in observation_layout()]
+    source = torch.arange(len(names))
+    # Blocks whose last axis runs from right to left.
+    for start, end, width in (
+        ("border.", "", len(PROBE_Y)),
+        ("manoeuvre.", ".gap", len(OFFSETS)),
+        ("manoeuvre.", ".contact", len(OFFSETS)),
+    ):
+        block = torch.tensor(
+            [
+                index
+                for index, name in enumerate(names)
+                if name.startswith(start) and name.endswith(end)
+            ]
+        )
+        source[block] = block.view(-1, width).flip(1).flatten()
+    sided = [name.rsplit(".", 1)[1] in SIDED for name in names]
+    sign = torch.where(torch.tensor(sided), -1.0, 1.0)
+    return observation[..., source] * sign
 
 
 def scenes_with_everything():

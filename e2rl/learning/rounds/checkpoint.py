@@ -24,7 +24,7 @@ from e2rl.run.files import altered, misfit, read_regular, seal, written_whole
 from e2rl.run.parts import load_plain
 
 STATE = "state.pt"
-FORMAT = "e2rl-checkpoint/11"
+FORMAT = "e2rl-checkpoint/12"
 
 
 def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:

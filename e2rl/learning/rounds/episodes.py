@@ -17,9 +17,7 @@ OUTCOME_KEYS = (
 @tensorclass
 class Episodes:
     """E finished episodes, each field [E]: pool row and scene (int64), adversarial
-    traffic, contact with any agent, off the road (bool), return, progress [m];
-    survivable: the fraction of the row's critical moments that a teacher would survive
-    (NaN: unknown)."""
+    traffic, contact with any agent, off the road (bool), return, progress [m]."""
 
     row: Tensor
     scene_index: Tensor
@@ -28,7 +26,6 @@ class Episodes:
     off_road: Tensor
     returns: Tensor
     progress: Tensor
-    survivable: Tensor
 
     @property
     def failed(self) -> Tensor:
@@ -88,7 +85,7 @@ def finished_episodes(
         hold: steps of a frame, for which a decision is held.
 
     Returns:
-        E episodes, whose `survivable` is unknown.
+        E episodes.
     """
     data = TensorDict.cat(batches, 1)
     after = data["next"]
@@ -105,6 +102,5 @@ def finished_episodes(
         off_road=metrics["off_road"][ended][:, 0],
         returns=after["episode_reward"][ended][:, 0],
         progress=metrics["progress"][ended][:, 0],
-        survivable=torch.full((len(row),), torch.nan),
         batch_size=[len(row)],
     )

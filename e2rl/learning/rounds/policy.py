@@ -10,21 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from e2rl.learning.rounds.episodes import Episodes, finished_episodes, outcomes
 from e2rl.learning.rounds.improvement import Improvement
 from e2rl.learning.rounds.scheduler import CurriculumScheduler
-from e2rl.learning.rounds.teaching import Teacher, TeachingSettings
 from e2rl.learning.rounds.update import Learner, UpdateSettings
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
 from e2rl.planners.evader import Evasions
-from e2rl.run.config import built, configured, setting, settings_of
+from e2rl.run.config import configured, setting, settings_of
 from e2rl.run.errors import InputError
 from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
@@ -77,8 +74,6 @@ class PolicyImprovement(Improvement):
         rounds: int,
         collect: Mapping[str, Any],
         ppo: Mapping[str, Any],
-        teacher: Ego | Mapping[str, Any],
-        teaching: Mapping[str, Any],
     ) -> None:
         """
         Args:
@@ -90,13 +85,9 @@ class PolicyImprovement(Improvement):
             rounds: of the run, over which the learning rate falls.
             collect: of CollectSettings.
             ppo: of UpdateSettings.
-            teacher: with ppo.teaching > 0, a ScoringEgo that labels states, or how it
-                is built.
-            teaching: of TeachingSettings.
 
         Raises:
-            InputError: the ego is no actor, the teacher no ScoringEgo, or a round
-                shorter than an episode.
+            InputError: the ego is no actor, or a round shorter than an episode.
         """
         if not isinstance(ego, ActorEgo):
             raise InputError(
@@ -117,42 +108,16 @@ class PolicyImprovement(Improvement):
         network = self.learning.network
         self.learner = Learner(network, update, total=rounds * self.settings.iterations)
         self.frames = 0
-        placed = scenes.to(device)
-        self.teacher: Teacher | None = None
-        if update.teaching > 0:
-            if ego.evader is not None:
-                raise InputError(
-                    "learner.ppo.teaching: a teacher has nothing to teach an actor that "
-                    "drives by it in danger; set it to 0, or ego.evades=false"
-                )
-            planner: Any = (
-                teacher
-                if isinstance(teacher, Ego)
-                else built(OmegaConf.create(dict(teacher)), "learner.teacher", kind=Ego)
-            )
-            self.teacher = Teacher(
-                planner,
-                placed,
-                low=network.low,
-                high=network.high,
-                hold=self.settings.hold,
-                settings=settings_of(
-                    TeachingSettings,
-                    teaching,
-                    where="learner.teaching",
-                ),
-            )
         count = len(scenes)
         self.draw = RowDraw(torch.full((count,), 1 / count, dtype=torch.float64), seed)
         self.synthesizer = AdversarialSynthesizer(
             TrafficPool.recorded(torch.arange(count)), self.draw
         )
         self.env = DrivingEnv(
-            placed,
+            scenes.to(device),
             sim,
             self.settings.batch,
             device,
-            agents=self.teacher is not None,
             hold=self.settings.hold,
         )
         transforms = [self.synthesizer, RewardSum()]
@@ -199,10 +164,8 @@ class PolicyImprovement(Improvement):
             seconds += time.perf_counter() - begin
             self.frames += steps_of(data)
             driven.append(outcomes(data))
-            watched = self._watch(data, pool.adversarial)
-            labels = None if self.teacher is None else self.teacher.labelled
-            row = self.learner.update(data, labels)
-            metrics.append(row | watched)
+            row = self.learner.update(data)
+            metrics.append(row)
             bar.set_postfix(
                 reward=f"{data['next', 'reward'].mean().item():.3f}",
                 kl=f"{row['kl']:.4f}",
@@ -214,8 +177,6 @@ class PolicyImprovement(Improvement):
             horizon=self.horizon,
             hold=self.settings.hold,
         )
-        if self.teacher is not None:
-            episodes.survivable = self.teacher.survivable(len(pool))[episodes.row]
         return {
             **means(metrics),
             **episodes.summary(),
@@ -228,15 +189,6 @@ class PolicyImprovement(Improvement):
         """The next batch [B, steps] of decisions, by the present policy."""
         self._collector.update_policy_weights_()
         return next(self._batches)
-
-    def _watch(self, data: TensorDictBase, adversarial: Tensor) -> dict[str, float]:
-        """Let the teacher label a batch; returns how many states there were."""
-        if self.teacher is None:
-            return {}
-        begin = time.perf_counter()
-        count = -(-self.teacher.settings.states // self.settings.iterations)
-        counts = self.teacher.watch(data, adversarial, self.learning, count)
-        return counts | {"label_seconds": time.perf_counter() - begin}
 
     def outcome(self, folder: Path) -> str:
         """How to evaluate the improved ego of a run's folder."""
@@ -251,14 +203,11 @@ class PolicyImprovement(Improvement):
             "learner": self.learner.state_dict(),
             "frames": self.frames,
             "draws": self.draw.generator.get_state(),
-            "labels": {} if self.teacher is None else self.teacher.state_dict(),
         }
 
     def load_state_dict(self, state: dict) -> None:
         self.learner.load_state_dict(state["learner"])
         self.draw.generator.set_state(state["draws"].cpu())
-        if self.teacher is not None:
-            self.teacher.load_state_dict(state["labels"])
         self.frames = state["frames"]
 
 

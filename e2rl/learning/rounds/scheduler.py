@@ -2,11 +2,9 @@
 priorities.
 
 Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay
-(Jiang et al. 2021). What is ranked is the regret p s: p is the recent failure rate of
-the ego in a scene's adversarial traffic, s the fraction of its critical moments that a
-teacher would survive, who knows no more than the ego does. Without a teacher, s = 1 -
-p: that is the learnability of Rutherford et al. ("No Regrets", 2024). It is 0 for a
-scene that is solved and for one that is hopeless.
+(Jiang et al. 2021). What is ranked is the learnability p (1 - p) of Rutherford et al.
+("No Regrets", 2024): p is the recent failure rate of the ego in a scene's adversarial
+traffic. It is 0 for a scene that is solved and for one that is hopeless.
 """
 
 import math
@@ -125,7 +123,6 @@ class CurriculumScheduler(Extension):
         self.solvable_only = solvable_only
         self._generator = torch.Generator().manual_seed(seed)
         self._failing = torch.full((num_scenes,), torch.nan)
-        self._survivable = torch.full((num_scenes,), torch.nan)
         self._drawn = torch.full((num_scenes,), -1, dtype=torch.int64)
 
     def etas(self, scenes: Tensor) -> Tensor:
@@ -152,24 +149,19 @@ class CurriculumScheduler(Extension):
         last = min(self.eta + spread, high)
         return first + (last - first) * torch.rand(count, generator=self._generator)
 
-    def regret(self) -> Tensor:
-        """p s [S] of the recent failure rate p and the fraction s of what the teacher
-        would survive, 1 - p where that is unknown; NaN for scenes never driven in
-        adversarial traffic."""
-        return self._failing * torch.where(
-            self._survivable.isnan(),
-            1 - self._failing,
-            self._survivable,
-        )
+    def learnability(self) -> Tensor:
+        """p (1 - p) [S] of the recent failure rate p: what can be learned; NaN for
+        scenes never driven in adversarial traffic."""
+        return self._failing * (1 - self._failing)
 
     def priority(self) -> Tensor:
         """Probability [S] with which scenes are drawn: 1 - STALENESS of it by rank of
-        regret, scenes not yet driven in adversarial traffic first, the rest by the
+        learnability, scenes not yet driven in adversarial traffic first, the rest by the
         rounds since they were last drawn."""
         count = len(self._failing)
         if not self.prioritised:
             return torch.full((count,), 1 / count)
-        rank = ranks(self.regret().nan_to_num(nan=torch.inf))
+        rank = ranks(self.learnability().nan_to_num(nan=torch.inf))
         weight = (1 / rank) ** (1 / TEMPERATURE)
         age = (self.round - self._drawn).float()
         stale = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
@@ -193,23 +185,17 @@ class CurriculumScheduler(Extension):
 
     def update(self, episodes: Episodes) -> None:
         """Learn from episodes how often the ego fails in the scenes' adversarial
-        traffic, and which fraction of its critical moments the teacher would
-        survive."""
-        attacked = episodes.adversarial
-        judged = attacked & ~episodes.survivable.isnan()
-        for average, values, rows in (
-            (self._failing, episodes.failed.float(), attacked),
-            (self._survivable, episodes.survivable, judged),
-        ):
-            scenes, inverse = episodes.scene_index[rows].unique(return_inverse=True)
-            total = torch.zeros(len(scenes)).index_add(0, inverse, values[rows])
-            mean = total / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
-            before = average[scenes]
-            average[scenes] = torch.where(
-                before.isnan(),
-                mean,
-                before + SMOOTHING * (mean - before),
-            )
+        traffic."""
+        attacked = episodes[episodes.adversarial]
+        scenes, inverse = attacked.scene_index.unique(return_inverse=True)
+        failed = torch.zeros(len(scenes)).index_add(0, inverse, attacked.failed.float())
+        rate = failed / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
+        before = self._failing[scenes]
+        self._failing[scenes] = torch.where(
+            before.isnan(),
+            rate,
+            before + SMOOTHING * (rate - before),
+        )
 
     def leave_out(self, scenes: Tensor) -> None:
         """Mark scenes whose adversarial traffic was left out because no driver survives
@@ -231,14 +217,13 @@ class CurriculumScheduler(Extension):
             "scenes_seen": driven.float().mean().item(),
         }
         if driven.any():
-            metrics["regret"] = self.regret()[driven].mean().item()
+            metrics["learnability"] = self.learnability()[driven].mean().item()
         return metrics
 
     def state_dict(self) -> dict:
         """All state."""
         return {
             "failing": self._failing,
-            "survivable": self._survivable,
             "drawn": self._drawn,
             "round": self.round,
             "generator": self._generator.get_state(),
@@ -253,7 +238,6 @@ class CurriculumScheduler(Extension):
                 f"the data {len(self._failing)}; resume with the data of the run"
             )
         self._failing = state["failing"].clone()
-        self._survivable = state["survivable"].clone()
         self._drawn = state["drawn"].clone()
         self.round = state["round"]
         self._generator.set_state(state["generator"].cpu())

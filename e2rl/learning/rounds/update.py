@@ -1,4 +1,4 @@
-"""The policy's update: PPO on collected episodes and a teacher's labels, by one optimiser."""
+"""The policy's update: PPO on collected episodes."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -11,7 +11,6 @@ from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from e2rl.learning.pretraining.cloning import mirrored_labels, sampled, teaching_loss
 from e2rl.learning.pretraining.supervised import take_step
 from e2rl.planners.network import ActorCritic, ActorNetwork
 from e2rl.run.config import configured, setting
@@ -22,7 +21,6 @@ PRICED_FRAMES = 512  # of a minibatch, on which the policy's |acceleration| is m
 PEAK_MEMORY = 0.75  # of the past in the running maximum of |advantage|, per update
 CRITIC = 0.5  # weight of the critic's loss
 MAX_GRAD_NORM = 0.5
-TAUGHT = 256  # labels of a teacher of an optimiser step
 
 
 @configured("learner/ppo_bc", "ppo")
@@ -42,7 +40,6 @@ class UpdateSettings:
     advantage_filter: float = setting(low=0, high=1)
     critic_warmup: int = setting(low=0)
     action_penalty: float = setting(low=0)
-    teaching: float = setting(low=0)
 
 
 class Learner:
@@ -80,20 +77,13 @@ class Learner:
         )
         self.optimiser = torch.optim.Adam(network.parameters(), settings.learning_rate)
 
-    def update(
-        self,
-        data: TensorDictBase,
-        labels: TensorDictBase | None = None,
-    ) -> dict[str, float]:
+    def update(self, data: TensorDictBase) -> dict[str, float]:
         """One PPO iteration on a Collector's batch [B, T]; returns means of the losses
         and diagnostics.
 
         Passes end early when the policy has moved by target_kl. The first
         `critic_warmup` calls fit the critic alone. The observation statistics are
         updated at the end, so they are equal in collection and update.
-
-        Args:
-            labels: of a teacher, [M] (e2rl/learning/pretraining/cloning.py).
         """
         settings = self.settings
         normaliser = self.network.normaliser
@@ -120,7 +110,7 @@ class Learner:
                 if warming:
                     losses = self._fit_critic(minibatch)
                 else:
-                    losses = self._step(minibatch, labels)
+                    losses = self._step(minibatch)
                 divergence.append(losses["kl"])
                 for name, value in losses.items():
                     columns[name].append(value)
@@ -215,11 +205,7 @@ class Learner:
         del losses["loss_entropy"]
         return self._descend(losses["loss_critic"], losses)
 
-    def _step(
-        self,
-        minibatch: TensorDictBase,
-        labels: TensorDictBase | None,
-    ) -> dict[str, Tensor]:
+    def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         """One optimiser step; the losses and diagnostics."""
         settings = self.settings
         network = self.network.network
@@ -230,11 +216,6 @@ class Learner:
             penalty = action_penalty(network, minibatch[:PRICED_FRAMES])
             losses["action_penalty"] = penalty
             total = total + settings.action_penalty * penalty
-        if labels is not None:
-            drawn = sampled(labels, TAUGHT).to(self.network.device)
-            both = torch.cat([mirrored_labels(drawn[::2]), drawn[1::2]])
-            losses["loss_teaching"] = teaching_loss(network, both)
-            total = total + settings.teaching * losses["loss_teaching"]
         return self._descend(total, losses)
 
     def _ppo_losses(self, minibatch: TensorDictBase) -> dict[str, Tensor]:

@@ -80,7 +80,7 @@ def test_policy_learner(curriculum):
 def test_the_experiment_of_training_is_of_options_that_exist():
     run = built(config_of("experiment=harden"))
     assert isinstance(run.improve, PolicyImprovement)
-    assert run.improve.teacher is not None
+    assert run.ego.evader is not None
 
 
 def test_without_a_synthesizer_given_the_traffic_method_attacks():

@@ -6,16 +6,14 @@ import torch
 
 from e2rl.learning.rounds.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.planners.actor import ActorEgo
-from e2rl.planners.sampling import SamplingEgo
 from e2rl.run.errors import InputError
 from e2rl.run.files import SEAL, seal
-from tests.learning.rounds.test_teaching import ANY
 from tests.learning.small import rounds, small_run
 
 KINDS = {
     "replay": {},
     "prefetch": {"prefetch": True},
-    "taught": {"expert": {"teacher": SamplingEgo(), "teaching": ANY}, "teaching": 0.1},
+    "evading": {"evades": True},
 }
 
 

@@ -77,7 +77,7 @@ def test_a_copy_on_another_device_learns_what_the_ego_itself_would():
     run = small_run(seed=3)
     expected = rounds(run, 2)
     weights = run.ego.network.weights()
-    run = small_run(seed=3, expert={"device": "cpu:0"})
+    run = small_run(seed=3, device="cpu:0")
     assert run.improve.learning is not run.ego
     assert rounds(run, 2) == expected
     assert all(

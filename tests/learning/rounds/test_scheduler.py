@@ -17,7 +17,7 @@ def curriculum_of(num_scenes=6, **settings):
     return AdaptiveCurriculum(num_scenes, 10, **settings)
 
 
-def episodes(curriculum, scenes, failed, adversarial=True, survivable=math.nan):
+def episodes(curriculum, scenes, failed, adversarial=True):
     """Learn from episodes in scenes, each failed or not."""
     scene_index = torch.tensor(scenes)
     count = len(scenes)
@@ -31,7 +31,6 @@ def episodes(curriculum, scenes, failed, adversarial=True, survivable=math.nan):
             off_road=zero.bool(),
             returns=zero,
             progress=zero,
-            survivable=torch.tensor(survivable).expand(count),
             batch_size=[count],
         )
     )
@@ -45,7 +44,9 @@ def failing(curriculum, *rates):
         )
 
 
-def test_regret_is_the_variance_of_recent_failures_in_adversarial_traffic(monkeypatch):
+def test_learnability_is_the_variance_of_recent_failures_in_adversarial_traffic(
+    monkeypatch,
+):
     monkeypatch.setattr(scheduler, "SMOOTHING", 0.25)
     curriculum = curriculum_of()
     episodes(
@@ -54,18 +55,20 @@ def test_regret_is_the_variance_of_recent_failures_in_adversarial_traffic(monkey
         failed=[True, False, True],
         adversarial=False,
     )
-    assert curriculum.regret().isnan().all(), (
+    assert curriculum.learnability().isnan().all(), (
         "nothing is known of adversarial traffic yet"
     )
     failing(curriculum, 0.2, 1.0, 0.0)
-    torch.testing.assert_close(curriculum.regret()[:3], torch.tensor([0.16, 0.0, 0.0]))
+    torch.testing.assert_close(
+        curriculum.learnability()[:3], torch.tensor([0.16, 0.0, 0.0])
+    )
     episodes(curriculum, [1], failed=[False])
-    assert curriculum.regret()[1] == pytest.approx(0.75 * 0.25), (
+    assert curriculum.learnability()[1] == pytest.approx(0.75 * 0.25), (
         "the rate is a moving average"
     )
 
 
-def test_priorities_are_by_rank_of_regret_and_by_staleness(monkeypatch):
+def test_priorities_are_by_rank_of_learnability_and_by_staleness(monkeypatch):
     monkeypatch.setattr(scheduler, "STALENESS", 0.0)
     curriculum = curriculum_of(4)
     assert curriculum.priority().tolist() == [0.25] * 4
@@ -102,25 +105,6 @@ def test_a_drawn_scene_is_not_stale():
     assert (curriculum._drawn == 5).nonzero()[:, 0].tolist() == sorted(drawn.tolist())
 
 
-def test_regret_is_what_a_teacher_would_have_survived_where_one_tells():
-    curriculum = curriculum_of()
-    episodes(
-        curriculum,
-        [0, 0, 1, 2],
-        failed=[True, False, True, True],
-        adversarial=[True, True, True, False],
-        survivable=[0.25, 0.75, math.nan, 1.0],
-    )
-    assert curriculum.regret()[:3].nan_to_num(-1).tolist() == [0.5 * 0.5, 0.0, -1.0]
-    episodes(
-        curriculum,
-        [1],
-        failed=[True],
-        survivable=0.75,
-    )
-    assert curriculum.regret()[1] == 0.75
-
-
 def test_ranks_share_ties():
     assert ranks(torch.tensor([5.0, 1.0, 5.0, torch.inf, 0.0])).tolist() == [
         2.5,
@@ -135,7 +119,7 @@ def test_scenes_left_out_are_not_drawn_first():
     curriculum = curriculum_of(4)
     failing(curriculum, 0.5)
     curriculum.leave_out(torch.tensor([0, 1]))
-    assert curriculum.regret().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
+    assert curriculum.learnability().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
 
 
 def test_state_goes_on_exactly():

@@ -12,7 +12,6 @@ from e2rl.learning.rounds.update import Learner, UpdateSettings, action_penalty
 from e2rl.planners.actor import ActorEgo
 from e2rl.run.errors import InputError
 from e2rl.sim.env import DrivingEnv
-from e2rl.sim.observation import mirrored
 from e2rl.sim.settings import SimSettings
 from tests.learning.small import small_scenes
 
@@ -53,17 +52,6 @@ def begun(std=None, **changes):
     return ego, Learner(ego.network, settings_of(**changes)), batch_of(ego)
 
 
-def labels_of(data, action):
-    """A teacher's labels of all frames: one action."""
-    observation = data["observation"].reshape(-1, data["observation"].shape[-1])
-    labels = {
-        "observation": observation,
-        "action": torch.tensor(action).expand(len(observation), 1, 2),
-        "weight": torch.ones(len(observation), 1),
-    }
-    return TensorDict(labels, [len(observation)])
-
-
 def test_ppo_learns_to_drive_from_standing():
     """Without the reference the ego first brakes to a halt (the middle of the action's
     range); the reward is progress, and a parked car stands in its way: it learns to go,
@@ -93,30 +81,6 @@ def test_ppo_learns_to_drive_from_standing():
     assert progress[0] < 10.0
     assert sum(progress[-3:]) / 3 > progress[0] + 4.0
     assert not data["next", "metrics", "contact"].any()
-
-
-def test_a_teacher_of_the_left_teaches_the_right_too():
-    """Labels steer to the left; in the mirror of the same states, which nobody
-    labelled, the policy steers right."""
-    ego, learner, data = begun(
-        critic_warmup=0, teaching=1.0, learning_rate=3e-3, target_kl=1e9
-    )
-    labels = labels_of(data, [0.0, 0.3])
-
-    def turns():
-        return [
-            ego.decide(observed)[:, 1].mean()
-            for observed in (labels["observation"], mirrored(labels["observation"]))
-        ]
-
-    before = turns()
-    for _ in range(8):
-        learner.update(batch_of(ego), labels=labels)
-    left, right = (
-        current - later for current, later in zip(turns(), before, strict=True)
-    )
-    assert left > 0.05
-    assert right < -0.05
 
 
 def test_the_action_penalty_makes_meant_accelerations_smaller():
@@ -283,33 +247,3 @@ def test_what_is_not_finite_is_refused():
     data["next", "reward"] = data["next", "reward"] * torch.nan
     with pytest.raises(InputError, match="not finite"):
         learner.update(data)
-
-
-def test_what_is_taught_counts_by_its_weight():
-    """One step with a weight that is next to nothing is the step without; with a weight
-    of 1 it is nearer to it."""
-
-    def after(weight):
-        ego, learner, data = begun(
-            critic_warmup=0, epochs=1, minibatch=10_000, teaching=weight
-        )
-        labels = labels_of(data, (1.0, 0.5))
-        torch.manual_seed(1)
-        learner.update(data, labels)
-        with torch.no_grad():
-            missed = (
-                (
-                    ego.network.network.deterministic(data["observation"])
-                    - torch.tensor([1.0, 0.5])
-                )
-                .abs()
-                .mean()
-            )
-        return torch.cat(
-            [item.detach().flatten() for item in ego.network.parameters()]
-        ), missed
-
-    (none, far), (little, _), (amount, near) = after(0.0), after(1e-9), after(1.0)
-    assert torch.allclose(none, little, atol=2e-5)
-    assert not torch.allclose(none, amount, atol=2e-5)
-    assert near < far
