@@ -34,7 +34,7 @@ from tests.scripts import arguments, call, error_line, left_behind
             "train.py",
             "good",
             ["prior.checkpoint=IN/format.safetensors"],
-            "format.safetensors: format 'e2rl-prior/9'",
+            "format.safetensors: of format e2rl-prior/9",
         ),
         (
             "evaluate.py",

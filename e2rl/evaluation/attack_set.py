@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import misfit, write_atomically
+from e2rl.run.files import check_format, misfit, write_atomically
 from e2rl.run.parts import read_state, state_bytes
 from e2rl.run.run import read_provenance
 from e2rl.scenes.scene import content_hash
@@ -88,14 +88,15 @@ class AttackSet:
         mend = "give a file of e2rl export RUN --to attacks"
         try:
             content = read_state(path)
-            if content.pop("format") != FORMAT:
-                raise ValueError(f"not of format {FORMAT}")
+            check_format(path, content.pop("format"), expected=FORMAT, mend=mend)
             tracks = AttackTracks(**content.pop("tracks"))
             attacks = cls(tracks=tracks, **content)
             shape = {"ego": str, "rows": [ATTACK], "scenes": {...: str}}
             if reason := misfit(vars(attacks), shape):
                 raise ValueError(reason)
             attacks.check_shapes()
+        except InputError:
+            raise
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: no set of attacks ({error}); {mend}") from error
         return attacks

@@ -23,7 +23,7 @@ from e2rl.run.files import (
     read_regular,
     write_atomically,
 )
-from e2rl.run.run import PARTS
+from e2rl.run.run import PARTS, check_run
 from e2rl.sim.rollout_file import UNPRINTABLE
 from e2rl.traffic.attempt import summary_of
 
@@ -127,8 +127,9 @@ def value_of(column: str, text: str) -> str | int | float:
 
 def read_rows(path: Path) -> list[dict]:
     """The rows of a rollouts.csv, with values as in `value_of`; InputError for a file
-    that is no such table."""
+    that is no such table, and where its run is of another format."""
     path = Path(path)
+    check_run(path.parent)
     try:
         file = open_regular(path, within=path.parent)
         with io.TextIOWrapper(file, "utf-8", newline="") as lines:
@@ -208,7 +209,9 @@ def read_metrics(path: Path) -> list[dict]:
 
 def read_json(path: Path, wrong: Callable[[Any], str | None]) -> Any:
     """The content of a JSON file of a run; raises InputError where it is none, has
-    texts with control characters, or `wrong` says what is wrong with it."""
+    texts with control characters, is of a run of another format, or `wrong` says what
+    is wrong with it."""
+    check_run(path.parent)
     try:
         content = json.loads(
             read_regular(path, MAX_JSON, within=path.parent), parse_int=_whole

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from e2rl.evaluation.rollout_files import nans, nulls, write_json
 from e2rl.run.config import configured, library, setting
 from e2rl.run.errors import InputError
-from e2rl.run.files import misfit, read_regular, write_atomically
+from e2rl.run.files import check_format, misfit, read_regular, write_atomically
 from e2rl.run.run import changed
 
 Parameters = dict[str, Any]
@@ -27,6 +27,8 @@ Evaluate = Callable[[Parameters], Mapping[str, float]]  # the metrics of a trial
 REFUSED = 10.0
 UNKNOWN = 2 * REFUSED  # of trials in which no rollout has a score
 NUMBER = int | float
+FORMAT = "e2rl-study/1"
+FIRST = "e2rl-study/1"  # of a file that does not say its format
 STUDY = {  # its file
     "task": dict,
     "trials": [{"parameters": {...: NUMBER}, "metrics": {...: NUMBER | None}}],
@@ -129,7 +131,8 @@ def search(
             )
         rows.append(row)
         if file is not None:
-            write_atomically(file, json.dumps(nulls({"task": task, "trials": rows})))
+            study = {"format": FORMAT, "task": task, "trials": rows}
+            write_atomically(file, json.dumps(nulls(study)))
         after_trial(rows)
     return rows
 
@@ -181,6 +184,9 @@ def read_study(
     rows: list[dict] = []
     try:
         study = json.loads(read_regular(file, MAX_STUDY))
+        written = study.get("format", FIRST)
+        where = f"tuning.study={file}"
+        check_format(where, written, expected=FORMAT, mend="name another file")
         if reason := misfit(study, STUDY):
             raise ValueError(reason)
         differing = changed(study["task"], task)
@@ -192,9 +198,12 @@ def read_study(
                 list(map(float, metrics.values()))  # OverflowError of endless numbers
                 row, _ = judged(parameters, metrics, rows=rows, objective=objective)
                 rows.append(row)
+    except InputError:
+        raise
     except (
         OSError,
         ValueError,
+        AttributeError,
         LookupError,
         TypeError,
         ArithmeticError,

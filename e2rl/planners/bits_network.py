@@ -25,7 +25,7 @@ from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import RoutePath
 from e2rl.planners.trunk import Normaliser, linear
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
+from e2rl.run.files import check_format, write_atomically
 from e2rl.run.weights import read_weights, unlike, weight_bytes
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
@@ -269,11 +269,11 @@ def load_bits(checkpoint: str) -> BitsNetwork:
         )
     try:
         weights, header = read_weights(path)
+        mend = "train one by `python train.py stage=bits`"
+        check_format(path, header.get("format"), expected=FORMAT, mend=mend)
         saved = json.loads(header["architecture"])
         hidden = saved["hidden"]
-        if header.get("format") != FORMAT or type(hidden) is not int:
-            raise ValueError(f"format {header.get('format')!r} instead of {FORMAT!r}")
-        if not 0 < hidden <= LARGEST:
+        if type(hidden) is not int or not 0 < hidden <= LARGEST:
             raise ValueError(f"{hidden} hidden units")
         if wrong := unlike(partial(BitsNetwork, hidden), weights):
             raise ValueError(wrong)
@@ -281,6 +281,8 @@ def load_bits(checkpoint: str) -> BitsNetwork:
         if saved != network.architecture:
             raise ValueError(f"{saved} instead of {network.architecture}")
         network.load_state_dict(weights)
+    except InputError:
+        raise
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split("\n\t")[:2])
         raise InputError(

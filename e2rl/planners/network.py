@@ -17,10 +17,12 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from e2rl.planners.reference import EVASION, LAST_ACTION, follow
 from e2rl.planners.trunk import Normaliser, Trunk
 from e2rl.run.errors import InputError
-from e2rl.run.files import altered, write_atomically
+from e2rl.run.files import altered, check_format, write_atomically
 from e2rl.run.weights import read_weights, weight_bytes
 from e2rl.sim.observation import OBSERVATION_SIZE
 
+FORMAT = "e2rl-actor/1"
+FIRST = "e2rl-actor/1"  # of a file that has an architecture and says no format
 WEIGHTS = "actor.safetensors"  # file name of an ActorCritic inside a checkpoint
 DEEPEST = 16  # layers that a file may ask for
 WIDEST = 1 << 13  # units of a layer that a file may ask for
@@ -276,7 +278,7 @@ class ActorCritic(nn.Module):
     def save(self, path: Path) -> None:
         """Write weights and statistics to a safetensors file whose header holds the
         architecture."""
-        header = {"architecture": self.architecture.header()}
+        header = {"format": FORMAT, "architecture": self.architecture.header()}
         write_atomically(path, weight_bytes(self.weights(), header))
 
     def load(self, path: Path) -> None:
@@ -318,12 +320,10 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
     InputError."""
     try:
         weights, header = read_weights(path)
-        if "architecture" not in header:
-            raise InputError(
-                f"{path}: no actor (format {header.get('format')}); pass "
-                "actor.safetensors, or the folder of a run of train.py (a prior is given "
-                "by prior.checkpoint=)"
-            )
+        written = header.get("format", FIRST if "architecture" in header else None)
+        mend = "pass actor.safetensors, or the folder of a run of train.py"
+        mend += " (a prior is given by prior.checkpoint=)"
+        check_format(path, written, expected=FORMAT, mend=mend)
         architecture = Architecture.of_header(header["architecture"])
         actor = ActorCritic(architecture, device=device)
         shapes = {name: value.shape for name, value in weights.items()}
@@ -333,7 +333,7 @@ def read_actor(path: Path, device: str | torch.device = "cpu") -> ActorCritic:
         raise
     except (TypeError, LookupError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(
-            f"{path}: damaged, or an actor of another version ({error}); train it again"
+            f"{path}: damaged, or another architecture ({error}); train it again"
         ) from None
     actor.set_weights(weights)
     return actor

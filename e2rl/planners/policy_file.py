@@ -19,10 +19,12 @@ from e2rl.planners.actor import ObservingEgo
 from e2rl.planners.plausibility import finite
 from e2rl.run.config import configured, setting
 from e2rl.run.errors import InputError
-from e2rl.run.files import read_regular, write_atomically
+from e2rl.run.files import check_format, read_regular, write_atomically
 from e2rl.sim.observation import OBSERVATION_SIZE
 
 SUFFIX = ".pt"
+FORMAT = "e2rl-policy/1"  # of observations and actions
+FORMAT_ENTRY = "format"  # of a file of ours; those of others have none
 MAPS = (
     f"it maps float32 observations [B, {OBSERVATION_SIZE}] to actions [B, 2] for every B "
     "(docs/guide/policies.md)"
@@ -64,14 +66,20 @@ def open_policy(file: Path, where: str) -> Callable[[Tensor], Any]:
         raise InputError(
             f"{where}: cannot be read ({error.strerror}); pass a file of a policy"
         ) from error
+    entries: dict[str, Any] = {FORMAT_ENTRY: b""}
     try:
-        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
+        module = torch.jit.load(
+            io.BytesIO(content), map_location="cpu", _extra_files=entries
+        ).eval()
     except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0][:200]
         raise InputError(
             f"{where}: no TorchScript archive ({reason}); write one by "
             "e2rl.save_policy or torch.jit.save"
         ) from error
+    if written := entries[FORMAT_ENTRY].decode(errors="replace"):
+        mend = "write it again by e2rl.save_policy"
+        check_format(file, written, expected=FORMAT, mend=mend)
     policy = torch.no_grad()(module)
     for count in PROBED:
         probe(policy, where, count=count)
@@ -107,4 +115,5 @@ def write_policy(policy: nn.Module, file: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         traced = torch.jit.trace(policy.eval(), torch.zeros(EXAMPLE, OBSERVATION_SIZE))
-        write_atomically(file, partial(torch.jit.save, traced))
+        entries = {FORMAT_ENTRY: FORMAT}
+        write_atomically(file, partial(torch.jit.save, traced, _extra_files=entries))

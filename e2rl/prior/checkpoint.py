@@ -18,7 +18,7 @@ from e2rl.prior.prior import Prior
 from e2rl.prior.sde import SamplerSettings
 from e2rl.run.config import settings_of
 from e2rl.run.errors import InputError
-from e2rl.run.files import write_atomically
+from e2rl.run.files import check_format, write_atomically
 from e2rl.run.weights import read_weights, unlike, weight_bytes
 
 FORMAT = "e2rl-prior/1"
@@ -83,12 +83,13 @@ def load_prior(
         raise InputError(
             f"{path}: not a readable safetensors file ({error}); train the prior again"
         ) from error
-    if header.get("format") != FORMAT:
-        raise InputError(
-            f"{path}: format {header.get('format')!r}, expected {FORMAT!r}: no prior; "
-            f"train one by `python train.py stage=prior`, or use prior.checkpoint="
-            f"{BUNDLED} (an actor is given by ego=actor ego.checkpoint=)"
-        )
+    check_format(
+        path,
+        header.get("format"),
+        expected=FORMAT,
+        mend="train a prior by `python train.py stage=prior`, or use prior.checkpoint="
+        f"{BUNDLED} (an actor is given by ego=actor ego.checkpoint=)",
+    )
     try:
         architecture = json.loads(header["architecture"])
         origin = json.loads(header["origin"])

@@ -18,6 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import IO, Any
@@ -100,6 +101,24 @@ def read_regular(
     """Returns the bytes of a file as `open_regular` opens it; raises as it does."""
     with open_regular(path, limit, within=within) as file:
         return file.read()
+
+
+def check_format(
+    where: Path | str, written: object, *, expected: str, mend: str
+) -> None:
+    """Raises InputError where a file is of another format than the one that is read.
+
+    Args:
+        where: the file, or the option that names it.
+        written: format that the file says it has; None: it says nothing.
+        expected: format that is read.
+        mend: what to do about it.
+    """
+    if written != expected:
+        has = "of no format" if written is None else f"of format {str(written)[:40]}"
+        raise InputError(
+            f"{where}: {has}, e2rl {version('e2rl')} reads {expected}; {mend}"
+        )
 
 
 def leads_into(path: Path, folder: Path) -> bool:

@@ -32,6 +32,7 @@ from e2rl.run.errors import InputError
 from e2rl.run.files import (
     MAX_RECORD,
     altered,
+    check_format,
     hash_files,
     misfit,
     read_regular,
@@ -48,6 +49,8 @@ from e2rl.run.trust import (
     written_outside,
 )
 
+FORMAT = "e2rl-run/1"  # of provenance.json and the tables beside it
+FIRST = "e2rl-run/1"  # of those that do not say their format
 PROVENANCE = "provenance.json"
 PARTS = "parts"  # the folder of `e2rl.run.parts`
 PROVENANCE_SHAPE = {
@@ -160,6 +163,8 @@ class Run:
             for name, (text, _) in scenes.items()
         }
         provenance = {
+            "format": FORMAT,
+            "release": metadata.version("e2rl"),
             "command": command_line(),
             "cwd": str(Path.cwd()),
             "choices": dict(self.choices),
@@ -224,23 +229,33 @@ def how_to_go_on(config: DictConfig) -> str:
 
 
 def read_provenance(folder: Path) -> dict[str, Any]:
-    """Returns the content of a run's provenance.json; InputError where it is not there
-    or damaged."""
+    """Returns the content of a run's provenance.json; InputError where it is not there,
+    damaged or of another format. One of no format is of the first."""
     file = Path(folder) / PROVENANCE
     try:
         provenance = json.loads(read_regular(file, MAX_RECORD, within=Path(folder)))
-        reason = misfit(provenance, PROVENANCE_SHAPE)
-        if reason or not provenance["versions"]:
-            raise ValueError(reason)
-        return provenance
+        written = provenance.get("format", FIRST)
+        if written == FORMAT:
+            reason = misfit(provenance, PROVENANCE_SHAPE)
+            if reason or not provenance["versions"]:
+                raise ValueError(reason)
     except FileNotFoundError as error:
         raise InputError(
             f"{file}: not there; give the folder of a run that had begun"
         ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{file}: damaged, or of another version; restore it, or begin a new run"
-        ) from error
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
+        raise InputError(f"{file}: damaged; restore it, or begin a new run") from error
+    mend = f"read it with e2rl {provenance.get('release')}, or begin a new run"
+    check_format(file, written, expected=FORMAT, mend=mend)
+    return provenance
+
+
+def check_run(folder: Path) -> None:
+    """Raises InputError where a folder of tables is, or lies in, that of a run of
+    another format."""
+    for run in (folder, folder.parent):
+        if (run / PROVENANCE).is_file():
+            read_provenance(run)
 
 
 def origin_of(folder: Path) -> dict[str, str]:

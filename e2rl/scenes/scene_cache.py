@@ -166,13 +166,15 @@ def read(path: Path) -> SceneSet | None:
         content = np.asarray(np.memmap(path, np.uint8, "c"))
         body = content[: -END.size]
         length, name, digest = END.unpack(content[-END.size :].tobytes())
-        if name != FORMAT or hashlib.sha256(body.data).digest() != digest:
+        if name != FORMAT:
+            raise ValueError(f"its format is {name.decode()}, not {FORMAT.decode()}")
+        if hashlib.sha256(body.data).digest() != digest:
             raise ValueError("its content is not what was written")
         index = Index(**json.loads(body[-length:].tobytes()))
         arrays = index.arrays(content)
         scenes = {key: torch.from_numpy(value) for key, value in arrays.items()}
     except DAMAGED as error:
-        tqdm.write(f"rebuilding the damaged cache file {path}: {error}", sys.stderr)
+        tqdm.write(f"rebuilding the cache file {path}: {error}", sys.stderr)
         return None
     count = len(index.scene_id)
     scenes["scene_index"] = torch.arange(count)

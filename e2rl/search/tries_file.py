@@ -8,6 +8,7 @@ from e2rl.driving.batches import Batch
 from e2rl.driving.setup import Setup
 from e2rl.run.errors import InputError
 from e2rl.run.files import CsvReader, csv_text, write_atomically
+from e2rl.run.run import check_run
 from e2rl.search.search import Search
 from e2rl.search.spending import SearchMethod, Spending
 from e2rl.search.tries import TRIES, Try
@@ -52,8 +53,9 @@ def failures_of(
 
     Raises:
         InputError: for a file that is none, and for tries of other scenes, egos,
-            families or searches.
+            families or searches, or of a run of another format.
     """
+    check_run(file.parent)
     try:
         with file.open(newline="", encoding="utf-8") as lines:
             rows = [

@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 
 from e2rl.run.errors import InputError
-from e2rl.run.files import open_regular, read_arrays, write_atomically
+from e2rl.run.files import (
+    check_format,
+    open_regular,
+    read_arrays,
+    write_atomically,
+)
 from e2rl.scenes.recording import DT
 
 FORMAT = "e2rl-rollout/1"
@@ -122,19 +127,20 @@ class Rollout(Road):
             raise InputError(
                 f"{path}: no readable rollout ({error}); run evaluate.py again to rewrite it"
             ) from error
+        check_format(
+            path,
+            data.get("format"),
+            expected=FORMAT,
+            mend="give a folder that evaluate.py of this version wrote",
+        )
         present = [entry for entry in fields(cls) if entry.name in data]
         missing = [
             entry.name
             for entry in fields(cls)
             if entry.default is not None and entry.name not in data
         ]
-        if missing or str(data.get("format")) != FORMAT:
-            raise InputError(
-                f"{path}: not of format {FORMAT} (missing: "
-                f"{', '.join(missing) or 'nothing'}; format: {data.get('format')}); "
-                f"give a folder that evaluate.py wrote"
-            )
-        if wrong := _misfit(data, present):
+        wrong = f"no {', '.join(missing)}" if missing else _misfit(data, present)
+        if wrong:
             raise InputError(
                 f"{path}: damaged: {wrong}; run evaluate.py again to rewrite it"
             )

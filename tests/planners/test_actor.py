@@ -262,7 +262,7 @@ def test_other_bounds_damage_and_other_versions_are_refused(tmp_path, monkeypatc
         changed = json.dumps(header | change)
         monkeypatch.setattr(Architecture, "header", lambda self, text=changed: text)
         network.save(file)
-        with pytest.raises(InputError, match="another version"):
+        with pytest.raises(InputError, match="another architecture"):
             ActorEgo(
                 hidden=(8,),
                 checkpoint=str(file),

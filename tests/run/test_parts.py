@@ -65,7 +65,8 @@ def test_every_damage_is_noticed_and_the_part_done_again(tmp_path, file):
         flipped[draw.randrange(len(whole))] ^= 1 << draw.randrange(8)
         file.write_bytes(flipped)
         assert Parts(tmp_path).load("a", [1]) is None
-    for value in ([1, 2], {"format": "e2rl-part/1"}, "text"):  # whole, but no part
+    older = {"format": "e2rl-part/0", "about": "", "identity": [1], "value": 1}
+    for value in ([1, 2], {"format": "e2rl-part/1"}, older, "text"):  # no part
         file.write_bytes(state_bytes(value))
         assert Parts(tmp_path).load("a", [1]) is None
     assert computes(Parts(tmp_path))

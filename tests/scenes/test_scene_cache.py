@@ -147,7 +147,7 @@ def test_a_damaged_file_is_rebuilt_and_a_set_in_use_survives_it(
     path.unlink()
     path.write_bytes(DAMAGES[damage](content))
     same(cached(path, build, gigabytes=1), first)
-    assert "rebuilding the damaged cache file" in capsys.readouterr().err
+    assert "rebuilding the cache file" in capsys.readouterr().err
     assert path.read_bytes() == content
     assert list(tmp_path.iterdir()) == [path]
 

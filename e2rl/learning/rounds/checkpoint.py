@@ -20,7 +20,14 @@ from e2rl.learning.rounds.evolution import Evolution
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.network import WEIGHTS
 from e2rl.run.errors import InputError
-from e2rl.run.files import altered, misfit, read_regular, seal, written_whole
+from e2rl.run.files import (
+    altered,
+    check_format,
+    misfit,
+    read_regular,
+    seal,
+    written_whole,
+)
 from e2rl.run.parts import load_plain
 
 STATE = "state.pt"
@@ -114,11 +121,7 @@ def _whole(folder: Path, run: Evolution) -> dict:
         raise InputError(
             f"{file}: damaged ({type(error).__name__}); resume from an older checkpoint"
         ) from error
-    if written != FORMAT:
-        raise InputError(
-            f"{file}: of another version of this program ({written}, not {FORMAT}); "
-            "begin a new run"
-        )
+    check_format(file, written, expected=FORMAT, mend="begin a new run")
     if wrong := misfit(state, {"memory": [{"round": int, "crc32": int}]}):
         raise InputError(f"{file}: damaged ({wrong}); resume from an older checkpoint")
     run.memory.restore(state["memory"])

@@ -12,6 +12,7 @@ from e2rl.run.files import write_atomically
 from e2rl.scenes.scene import KEYS
 from e2rl.sim.rollout_file import ROLLOUTS, file_stem
 
+FORMAT = "e2rl-scene/1"  # of a scene's file
 SCENES = "scenes"  # the folder of scenes, beside the one of rollouts
 
 
@@ -33,7 +34,7 @@ def write(
             )
             arrays["origin"] = episode.origin
             buffer = io.BytesIO()
-            np.savez_compressed(buffer, **arrays)
+            np.savez_compressed(buffer, format=np.array(FORMAT), **arrays)
             write_atomically(
                 folder / SCENES / f"{file_stem(episode.rollout.scene_id)}.npz",
                 buffer.getvalue(),

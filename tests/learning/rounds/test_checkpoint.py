@@ -95,7 +95,7 @@ def test_what_does_not_fit_is_refused_and_named(tmp_path):
         load_checkpoint(tmp_path, small_run(hidden=(8,), folder=tmp_path))
     for content, what in (
         (b"half of it", r"state\.pt: damaged"),
-        ({"format": "e2rl-checkpoint/3"}, "another version"),
+        ({"format": "e2rl-checkpoint/3"}, "of format e2rl-checkpoint/3"),
     ):
         torch.save(content, folder / "state.pt")
         seal(folder)
