@@ -17,6 +17,8 @@ OPTIONAL = {
     "commonroad_writer",
     "openscenario",
     "opendrive",
+    "mcap_writer",
+    "rerun_writer",
     "gym_env",
     "sb3",
 }  # they need libraries of extras

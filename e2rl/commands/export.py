@@ -25,6 +25,8 @@ FORMATS = {
     "commonroad": "commonroad_writer",
     "openscenario": "openscenario",
     "scenarionet": "scenarionet_writer",
+    "mcap": "mcap_writer",
+    "rerun": "rerun_writer",
     "npz": "archive",
 }
 ATTACKS = "attacks"  # the format of e2rl cross

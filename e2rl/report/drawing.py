@@ -34,6 +34,8 @@ ADVERSARY = "#dc2f3c"
 BACKGROUND = "#8793a3"
 REPLAYED = "#b3bcc8"
 VULNERABLE = "#f0950c"
+DRIVER = "#0b7a4b"
+EVASION = "#7a3fc0"
 CONTACT = "#dc2f3c"
 CLEAR = (0, 0, 0, 0)
 # m added to a lane's drawn width: the gap between neighbouring lanes is road, too.

@@ -47,6 +47,7 @@ def encode(values: np.ndarray) -> str:
 
 
 KINDS = ("cyclist", "pedestrian")  # of agents, drawn as such whoever drives them
+IN_ITS_PLACE = ("ego", "driver", "evasion", "recorded")  # roles that have a gap
 CHANNELS = {
     "x": 0.01,
     "y": 0.01,
@@ -88,15 +89,7 @@ def failure_replay(failure: Failure, beside: Failure | None = None) -> dict[str,
     assert like.contact is not None
     steps = min(like.contact + AFTER + 1, len(rollout.states))
     rows = np.union1d(np.flatnonzero(rollout.valid[:steps].any(0)), like.partner)
-    tracks = [
-        Track(
-            role_of(rollout, row),
-            rollout.size[row],
-            states=rollout.states[:steps, row],
-            present=rollout.valid[:steps, row],
-        )
-        for row in rows.tolist()
-    ]
+    tracks = [track_of(rollout, row, steps) for row in rows.tolist()]
     tracks += other_egos(rollout, steps)
     partner = int(np.searchsorted(rows, like.partner))
     motion = np.stack([channels_of(track, tracks[partner]) for track in tracks], 1)
@@ -160,6 +153,16 @@ def contact_point(rollout: Rollout, step: int, partner: int) -> np.ndarray:
     return (others[inside] if inside.any() else pose[:, :2]).mean(0).numpy()
 
 
+def track_of(rollout: Rollout, row: int, steps: int) -> Track:
+    """The agent's track over the first `steps` states."""
+    return Track(
+        role_of(rollout, row),
+        rollout.size[row],
+        states=rollout.states[:steps, row],
+        present=rollout.valid[:steps, row],
+    )
+
+
 def role_of(rollout: Rollout, row: int) -> str:
     """The agent's role (`Track`)."""
     if row == rollout.ego:
@@ -196,7 +199,7 @@ def channels_of(track: Track, partner: Track) -> np.ndarray:
     states = held(track.states, track.present)
     states[:, 2] = np.unwrap(states[:, 2])
     gap = np.zeros(len(states))
-    if track.role in ("ego", "driver", "evasion", "recorded"):
+    if track.role in IN_ITS_PLACE:
         distance = separation(
             torch.as_tensor(states, dtype=torch.float64),
             torch.as_tensor(track.size, dtype=torch.float64),

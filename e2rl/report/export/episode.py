@@ -43,7 +43,15 @@ FACTS = (
     "preventable",
     "avoidable",
 )
+EGO = "Ego"  # the name of row 0
 LONG = 7.0  # m: longer vehicles are trucks
+HEIGHT = {  # m, by kind; rollouts hold none
+    "vehicle": 1.6,
+    "truck": 3.0,
+    "cyclist": 1.75,
+    "pedestrian": 1.75,
+    "other": 1.0,
+}
 SAME = 0.01  # m: a map or a start that differs by more is another one
 
 
@@ -95,6 +103,14 @@ class Episode:
         kind = str(self.rollout.agent_type[row])
         truck = kind == "vehicle" and self.rollout.size[row, 0] > LONG
         return "truck" if truck else kind
+
+    def height(self, row: int) -> float:
+        """The height [m] of an agent's box."""
+        return HEIGHT[self.kind(row)]
+
+    def name(self, row: int) -> str:
+        """The name of an agent in files that name them."""
+        return EGO if row == 0 else f"agent_{row}"
 
     def entries(self) -> dict[str, list[str]]:
         """By lane the lanes that lead into it."""

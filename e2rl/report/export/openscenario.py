@@ -19,7 +19,6 @@ from e2rl.report.export.opendrive import write_roads
 from e2rl.scenes.paths import WHEELBASE
 
 MINOR_VERSION = 2
-EGO = "Ego"
 TRACK = 0.8  # of the width, between the wheels
 WHEEL = 0.6  # m, diameter
 STEERING = 0.6  # rad, of the front axle
@@ -32,17 +31,16 @@ class Kind(NamedTuple):
     """What a rollout does not hold of an agent; `drives`: it has axles."""
 
     name: str
-    height: float  # m
     mass: float  # kg
     drives: bool
 
 
 KINDS = {
-    "vehicle": Kind("car", height=1.6, mass=1500.0, drives=True),
-    "truck": Kind("truck", height=3.0, mass=10000.0, drives=True),
-    "cyclist": Kind("bicycle", height=1.75, mass=90.0, drives=True),
-    "pedestrian": Kind("pedestrian", height=1.75, mass=75.0, drives=False),
-    "other": Kind("other", height=1.0, mass=100.0, drives=False),
+    "vehicle": Kind("car", mass=1500.0, drives=True),
+    "truck": Kind("truck", mass=10000.0, drives=True),
+    "cyclist": Kind("bicycle", mass=90.0, drives=True),
+    "pedestrian": Kind("pedestrian", mass=75.0, drives=False),
+    "other": Kind("other", mass=100.0, drives=False),
 }
 
 
@@ -75,7 +73,7 @@ def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
         0,
     )
     for row in episode.agents:
-        name = name_of(row)
+        name = episode.name(row)
         entities.add_scenario_object(name, entity(episode, row))
         if rollout.valid[0, row]:
             (start,) = places(episode, row, 0, 1)
@@ -108,11 +106,6 @@ def scenario(episode: Episode, road: str | None, open_ego: bool) -> Any:
     )
 
 
-def name_of(row: int) -> str:
-    """The name of an agent's entity."""
-    return EGO if row == 0 else f"agent_{row}"
-
-
 def rear_axle(episode: Episode, row: int) -> float:
     """How far [m] the reference point of an agent lies behind the middle of its box."""
     if not KINDS[episode.kind(row)].drives:
@@ -126,9 +119,9 @@ def entity(episode: Episode, row: int) -> Any:
     kind = KINDS[episode.kind(row)]
     length, width = episode.size(row)
     back = rear_axle(episode, row)
-    name = f"{name_of(row)} {kind.name}"
-    middle = kind.height / 2
-    box = xosc.BoundingBox(width, length, kind.height, back, 0.0, z_center=middle)
+    name = f"{episode.name(row)} {kind.name}"
+    height = episode.height(row)
+    box = xosc.BoundingBox(width, length, height, back, 0.0, z_center=height / 2)
     entity: Any
     if kind.drives:
         front = xosc.Axle(STEERING, WHEEL, TRACK * width, 2 * back, WHEEL / 2)
@@ -163,7 +156,7 @@ def entity(episode: Episode, row: int) -> Any:
 def events_of(episode: Episode, row: int) -> list:
     """The events of an agent: it appears and follows its polyline, and it vanishes, as
     often as the rollout has it."""
-    name = name_of(row)
+    name = episode.name(row)
     dt = episode.rollout.dt
     events = []
     for first, end in episode.appearances(row):

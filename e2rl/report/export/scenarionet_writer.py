@@ -23,12 +23,6 @@ SUMMARY = "dataset_summary.pkl"
 MAPPING = "dataset_mapping.pkl"
 MOVES = 1.0  # m that an object moves at least that counts as moving in ScenarioNet
 PROTOCOL = 4  # of pickle, which every Python 3 reads
-HEIGHT = {
-    "vehicle": 1.6,
-    "cyclist": 1.75,
-    "pedestrian": 1.75,
-    "other": 1.0,
-}  # m; rollouts hold none
 LIGHTS = {
     LIGHT_UNKNOWN: "LANE_STATE_UNKNOWN",
     LIGHT_RED: "LANE_STATE_STOP",
@@ -139,7 +133,7 @@ def track(
             "valid": valid,
             "length": length * valid,
             "width": width * valid,
-            "height": HEIGHT[kind] * valid,
+            "height": episode.height(row) * valid,
         },
         "metadata": {
             "type": kind.upper(),

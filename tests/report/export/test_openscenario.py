@@ -11,7 +11,7 @@ pytest.importorskip(
 )
 from scenariogeneration import xosc  # noqa: E402
 
-from e2rl.report.export.openscenario import EGO
+from e2rl.report.export.episode import EGO
 from e2rl.scenes.recording import CYCLIST, PEDESTRIAN
 from tests.report.export.small_run import (
     GAPS,
