@@ -126,7 +126,7 @@ DIGESTS = {  # of the layouts
     "e2rl-rollout/1": "e8792fb7",
     "e2rl-attacks/1": "64db62b7",
     "e2rl-prior/1": "5d5b6a6f",
-    "e2rl-actor/1": "bbc87fc9",
+    "e2rl-actor/1": "5f537389",
     "e2rl-bits/1": "ec1f4f67",
     "e2rl-policy/1": "c59a9514",
     "e2rl-study/1": "389cbc28",
