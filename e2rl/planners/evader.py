@@ -18,36 +18,13 @@ from e2rl.sim import dynamics
 from e2rl.sim.world import World
 
 
-class QuickPlanner(SamplingEgo):
-    """The sampling planner with 130 of its 494 candidates, in a third of its time: it
-    is asked in every step of the learned ego's training."""
-
-    CHUNK = 16
-    calms = False
-    profiles = (
-        (-8.0, -8.0),
-        (-8.0, 0.0),
-        (-5.0, -5.0),
-        (-5.0, 0.0),
-        (-2.5, -2.5),
-        (-2.5, 0.0),
-        (-1.0, 0.0),
-        (0.0, 0.0),
-        (0.0, -8.0),
-        (1.5, 0.0),
-        (2.5, 2.5),
-        (4.0, 0.0),
-        (5.0, 5.0),
-    )
-
-
 class Evader:
     """Asks a planner in danger alone: where the route follower's room is below `room` m
     (`reference.follow`)."""
 
     def __init__(self, room: float) -> None:
         self.room = room
-        self.planner = QuickPlanner()
+        self.planner = SamplingEgo()
 
     def endangered(self, observation: Tensor) -> Tensor:
         """Rows [b] of observations [B, D] in danger."""

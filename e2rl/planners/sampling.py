@@ -143,8 +143,6 @@ class SamplingEgo(ScoringEgo):
     calm, and the present one."""
 
     CHUNK = 8  # fits the processor's cache
-    profiles: ClassVar[tuple[tuple[float, float], ...]] = PROFILES
-    calms = True  # whether it moves over calmly, too
 
     tuned = {"swift": (0.5, 1.0), "calm": (1.0, 2.5)} | ScoringEgo.tuned
 
@@ -158,15 +156,15 @@ class SamplingEgo(ScoringEgo):
         start = world.states[:, 0]
         speed = speed_profiles(
             start[:, 3],
-            start.new_tensor(self.profiles),
+            start.new_tensor(PROFILES),
             caps=path.speed_caps(self.max_speed),
             braking=BRAKING + BRAKING_MORE,
         )
         shifts = start.new_tensor(SHIFTS).expand(len(start), -1)
-        moves = [self.swift, self.calm] if self.calms else [self.swift]
-        shift = torch.cat([*[shifts] * len(moves), path.d[:, None]], 1)
-        times = [time for time in moves for _ in SHIFTS]
-        time = start.new_tensor([*times, self.swift])
+        shift = torch.cat([shifts, shifts, path.d[:, None]], 1)
+        count = len(SHIFTS)
+        times = [self.swift] * count + [self.calm] * count + [self.swift]
+        time = start.new_tensor(times)
         return drive(
             start,
             path,

@@ -11,9 +11,10 @@ from torchrl.envs import TransformedEnv
 from e2rl.commands.export_policy import export_actor
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.chunks import take
-from e2rl.planners.evader import Evader, Evasions, QuickPlanner
+from e2rl.planners.evader import Evader, Evasions
 from e2rl.planners.network import STEEPEST, Architecture
 from e2rl.planners.reference import EVASION, follow
+from e2rl.planners.sampling import SamplingEgo
 from e2rl.run.errors import InputError
 from e2rl.sim import dynamics
 from e2rl.sim.env import DrivingEnv
@@ -51,7 +52,7 @@ def test_the_planner_acts_where_the_route_follower_has_too_little_room():
     room = follow(observation)[:, 3]
     assert room[0] < ROOM < room[1]
     action = Evader(ROOM).actions(env.world(), observation)
-    plan = QuickPlanner().plan(take(env.world(), torch.tensor([0])))
+    plan = SamplingEgo().plan(take(env.world(), torch.tensor([0])))
     driven = torch.cat([env.world().states[:1, :1], plan[:, :1]], 1)
     torch.testing.assert_close(action[:1], dynamics.inverse(driven)[:, 0])
     assert action[1].isnan().all()
@@ -75,7 +76,7 @@ def test_in_danger_it_announces_the_planner_s_plan():
     env.reset(both())
     world = env.world()
     plan = evading().plan(world)
-    assert torch.equal(plan[:1], QuickPlanner().plan(take(world, torch.tensor([0]))))
+    assert torch.equal(plan[:1], SamplingEgo().plan(take(world, torch.tensor([0]))))
     without = ActorEgo(hidden=(8,), slack=None, room=ROOM)
     assert torch.equal(plan[1], without.plan(world)[1])
 
@@ -106,7 +107,7 @@ def test_a_held_action_is_the_mean_of_the_plan_s():
     env = environment()
     observation = env.reset(both())["observation"]
     action = Evader(ROOM).actions(env.world(), observation, hold=2)
-    plan = QuickPlanner().plan(take(env.world(), torch.tensor([0])))
+    plan = SamplingEgo().plan(take(env.world(), torch.tensor([0])))
     driven = torch.cat([env.world().states[:1, :1], plan[:, :2]], 1)
     torch.testing.assert_close(action[0], dynamics.inverse(driven)[0].mean(0))
 
