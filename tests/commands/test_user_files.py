@@ -56,14 +56,20 @@ PRIOR += [
     "prior.network.pair=8",
 ]
 SMALL = {  # what makes a command of README.md quick, by a part of it
-    "python evaluate.py": [*SIZE, "processes=1", "num_scenes=2", "seeds=[0]"],
+    "python evaluate.py": [
+        *SIZE,
+        "processes=1",
+        "num_scenes=2",
+        "seeds=[0]",
+        "tries=2",
+    ],
     "stage=prior": [*SIZE, *PRIOR],
     "python train.py": [
         *SIZE,
         *ROUND,
         "num_scenes=4",
         "measure.scenes=2",
-        "measure.budget=100",
+        "measure.budget=40",
     ],
 }
 
