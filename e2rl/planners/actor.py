@@ -171,8 +171,10 @@ class ActorEgo(ObservingEgo):
                     f"{low}, {high}; set sim.max_* as in its run"
                 )
 
+        self.evader: Evader | None = None
         architecture = self.network.architecture
-        self.evader = Evader(architecture.room) if architecture.evades else None
+        if architecture.evades and architecture.room is not None:
+            self.evader = Evader(architecture.room)
 
     def decide(self, observation: Tensor) -> Tensor:
         """Most central action [B, 2] at the observation, if nobody evades."""

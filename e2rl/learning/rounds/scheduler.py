@@ -186,9 +186,10 @@ class CurriculumScheduler(Extension):
     def update(self, episodes: Episodes) -> None:
         """Learn from episodes how often the ego fails in the scenes' adversarial
         traffic."""
-        attacked = episodes[episodes.adversarial]
-        scenes, inverse = attacked.scene_index.unique(return_inverse=True)
-        failed = torch.zeros(len(scenes)).index_add(0, inverse, attacked.failed.float())
+        attacked = episodes.adversarial
+        scenes, inverse = episodes.scene_index[attacked].unique(return_inverse=True)
+        failures = episodes.failed[attacked].float()
+        failed = torch.zeros(len(scenes)).index_add(0, inverse, failures)
         rate = failed / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
         before = self._failing[scenes]
         self._failing[scenes] = torch.where(
