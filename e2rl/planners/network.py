@@ -98,8 +98,9 @@ class ActorNetwork(nn.Module):
     With `room` the gate g rises from 0 where the reference has `room` m left (`follow`)
     to 1 where it has half of it, so that the network drives in danger alone; else g =
     1. There r is a planner's action if one evades (`evader.Evader`). With `slack` the
-    mean's acceleration exceeds the bound of `follow` by `slack` m/s^2 at most: what is
-    learned against attackers keeps the distance to the vehicle ahead.
+    mean's acceleration exceeds the bound of `follow` by `slack` m/s^2 at most, but for
+    the planner's own: what is learned against attackers keeps the distance to the
+    vehicle ahead.
     """
 
     middle: Tensor
@@ -116,13 +117,11 @@ class ActorNetwork(nn.Module):
         self.reference = architecture.reference
         self.slack = architecture.slack
         self.room = architecture.room
-        self.evades = architecture.evades
         self.trunk = Trunk(
             architecture.hidden,
             architecture.agent_units,
             out=4 if self.reference else 2,
             last_gain=0.0,
-            extra=2 * self.evades,
         )
         self.spread = nn.Parameter((torch.tensor(initial_std) - NARROWEST).logit(1e-4))
         self.noise: Tensor | None = None  # [D], set by `noisy`
@@ -144,18 +143,10 @@ class ActorNetwork(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """loc, scale [..., 2] from observation [..., D] and, if a planner evades, its
         action [..., 2], NaN where it does not."""
-        offset = self.offset(observation, evasion)
-        return self.head(self.seen(observation, offset), offset)
-
-    def seen(self, observation: Tensor, offset: Tensor) -> Tensor:
-        """What the layers read: the normalised observation [..., D], and r if a planner
-        evades, since it knows more than the observation."""
         normalised = self.normaliser(observation)
         if self.noise is not None:
             normalised = normalised + self.noise * torch.randn_like(normalised)
-        if not self.evades:
-            return normalised
-        return torch.cat([normalised, offset[..., :2]], -1)
+        return self.head(normalised, self.offset(observation, evasion))
 
     def offset(self, observation: Tensor, evasion: Tensor | None = None) -> Tensor:
         """r, the bound of the acceleration and g, [..., 4], at observation [..., D] and
@@ -164,10 +155,11 @@ class ActorNetwork(nn.Module):
             return torch.zeros_like(observation[..., :4])
         followed = follow(observation)
         action = followed[..., :2]
+        limit = followed[..., 2:3] + (self.slack or 0.0)
         if evasion is not None:
             action = torch.where(evasion.isnan(), action, evasion)
+            limit = torch.maximum(limit, evasion[..., :1].nan_to_num(-torch.inf))
         action = (action - self.middle) / self.reach
-        limit = followed[..., 2:3] + (self.slack or 0.0)
         bound = (limit - self.middle[:1]) / self.reach[:1]
         gate = torch.ones_like(bound)
         if self.room is not None:
@@ -176,9 +168,10 @@ class ActorNetwork(nn.Module):
         bound = bound.clamp(-STEEPEST, UNBOUNDED).atanh()
         return torch.cat([action, bound, gate], -1)
 
-    def head(self, seen: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-        """loc, scale [..., 2] from what is `seen` and the `offset` [..., 4]."""
-        loc = self.trunk(seen)
+    def head(self, normalised: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+        """loc, scale [..., 2] from the normalised observation [..., D] and the `offset`
+        [..., 4]."""
+        loc = self.trunk(normalised)
         if self.reference:
             action, bound, gate = offset.split((2, 1, 1), -1)
             loc = action + gate * (loc[..., :2] + loc[..., 2:] * action)
@@ -254,11 +247,13 @@ class ActorCritic(nn.Module):
 
     @torch.no_grad()
     def prepared(self, frames: TensorDictBase) -> dict[str, Tensor]:
-        """What `heads` read, of frames [...] with the actor's `inputs`: `seen` and the
-        offset [..., 4]."""
+        """What `heads` read, of frames [...] with the actor's `inputs`: seen [..., D]
+        and offset [..., 4]."""
         observation = frames["observation"]
-        offset = self.network.offset(observation, frames.get(EVASION, None))
-        return {"seen": self.network.seen(observation, offset), "offset": offset}
+        return {
+            "seen": self.normaliser(observation),
+            "offset": self.network.offset(observation, frames.get(EVASION, None)),
+        }
 
     def _sampler(self, module: TensorDictModule) -> ProbabilisticActor:
         return ProbabilisticActor(

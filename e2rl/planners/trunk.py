@@ -87,20 +87,18 @@ def shared(
 
 
 class Trunk(nn.Module):
-    """Normalised observations [..., D], and what follows them up to `size`, -> [...,
-    out]; orthogonal weights, the last layer's (`last`) scaled."""
+    """Normalised observations [..., D] -> [..., out]; orthogonal weights, the last
+    layer's (`last`) scaled."""
 
     def __init__(
         self,
         hidden: Sequence[int],
         agent_units: int,
-        *,
         out: int,
         last_gain: float,
-        extra: int = 0,
     ) -> None:
         """hidden: units of the layers of the whole scene, one at least; agent_units: of
-        both layers of an agent; extra: numbers after the observation."""
+        both layers of an agent."""
         super().__init__()
         first, *later = hidden
         self.agent = nn.Sequential(
@@ -111,8 +109,7 @@ class Trunk(nn.Module):
                 norm=False,
             ),
         )
-        self.size = OBSERVATION_SIZE + extra
-        rest_size = OBSERVATION_SIZE - PER_AGENT * NEAREST + extra
+        rest_size = OBSERVATION_SIZE - PER_AGENT * NEAREST
         self.rest = nn.Sequential(*_layer(rest_size, first))
         self.joint = nn.Sequential()
         size = first + agent_units
@@ -127,7 +124,7 @@ class Trunk(nn.Module):
         fast = is_on() and agents.requires_grad and agents.dim() == 3
         largest = Largest.apply(agents) if fast else agents.amax(-2)
         before = normalised[..., : AGENTS.start]
-        after = normalised[..., AGENTS.stop : self.size]
+        after = normalised[..., AGENTS.stop :]
         rest = self.rest(torch.cat([before, after], -1))
         return self.last(self.joint(torch.cat([rest, largest], -1)))
 
