@@ -71,6 +71,7 @@ def test_an_untrained_actor_drives_as_the_planner_in_danger_and_as_its_route_fol
     torch.testing.assert_close(action, expected, atol=1e-4, rtol=1e-4)
 
 
+@torch.no_grad()
 def test_only_the_planner_may_accelerate_towards_a_vehicle_that_is_followed():
     observation = environment().reset(both())["observation"][:1]
     network = ActorEgo(hidden=(8,), slack=0.5, room=ROOM, evades=True).network.network
@@ -78,8 +79,7 @@ def test_only_the_planner_may_accelerate_towards_a_vehicle_that_is_followed():
     assert bound < -1.0
     evasion = torch.tensor([[2.0, 0.1]])
     torch.testing.assert_close(network.deterministic(observation, evasion), evasion)
-    with torch.no_grad():
-        network.trunk.last.bias[0] = 8.0
+    network.trunk.last.bias[0] = 8.0
     assert network.deterministic(observation, evasion)[0, 0] == pytest.approx(2.0)
     alone = network.deterministic(observation)[0, 0]
     assert alone == pytest.approx(bound.item(), abs=1e-3)
