@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from e2rl.commands.export_policy import export_actor
 from e2rl.planners.actor import ActorEgo
@@ -145,3 +146,7 @@ def test_what_sees_the_observation_alone_cannot_evade(tmp_path):
 def test_danger_is_defined_by_room_and_the_route_follower(missing):
     with pytest.raises(InputError, match=r"ego\.evades=true: it needs"):
         ActorEgo(**({"room": ROOM, "evades": True} | missing))
+
+
+def test_an_environment_with_evasions_keeps_its_specs():
+    check_env_specs(TransformedEnv(environment(), Evasions(Evader(ROOM), hold=1)))
