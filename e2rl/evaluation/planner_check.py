@@ -6,7 +6,9 @@ moments that it was asked about: all scenes together, and each alone.
 
 import ctypes
 import gc
+import signal
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from resource import getpagesize
@@ -35,6 +37,7 @@ from e2rl.traffic.grouping import take_rows
 SCENES = 3  # that are driven
 STEPS = 20  # in each of them, or two plans
 LONGEST = 4.0  # s of a drive
+PATIENCE = 30.0  # s until an answer that does not come is given up
 AGAIN = 0.3  # s of the answers that are asked for again
 LATE = 4.0  # s of asking again, after which no more is looked at
 ROUNDS = 5  # of these, while memory is watched
@@ -60,6 +63,27 @@ def telling_scenes(scenes: SceneSet) -> SceneSet:
         order, key=lambda scene: first_there[scenes.location[scene]] != scene
     )
     return scenes.chosen(chosen[:SCENES])
+
+
+class NoAnswer(BaseException):
+    """A planner that does not answer: no Exception, which its own code might catch."""
+
+
+@contextmanager
+def patience() -> Iterator[None]:
+    """Raises NoAnswer where what is within takes longer than PATIENCE, in Python's code
+    or in a call of the system; what hangs in compiled code hangs."""
+
+    def give_up(*_: Any) -> None:
+        raise NoAnswer(f"gives no answer within {PATIENCE:.0f} s")
+
+    former = signal.signal(signal.SIGALRM, give_up)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, former)
 
 
 class WatchedWorld(World):
@@ -167,7 +191,7 @@ class PlannerCheck:
                 continue
             try:
                 yield look()
-            except Exception as error:  # outside code raises anything
+            except (Exception, NoAnswer) as error:  # outside code raises anything
                 yield Finding(about, False, f"asked again it {self._raised(error)}")
         if answers.fine and frame.fine:
             yield self._motion()
@@ -180,7 +204,8 @@ class PlannerCheck:
         """Returns what `plan` or `act` of an ego answers; what is not finite is noted,
         and replaced."""
         watched = WatchedWorld(**vars(world))
-        answer = ask(ego, method, watched, inputs=inputs, scene=self._visible)
+        with patience():
+            answer = ask(ego, method, watched, inputs=inputs, scene=self._visible)
         self.changed |= watched.changed()
         shape = (len(world.step), *SHAPES[method])
         try:
@@ -197,7 +222,8 @@ class PlannerCheck:
     def _begin(self, ego: Ego, world: World) -> None:
         """Resets an ego for the scenes of a world."""
         self._visible = without_future(world.scene) if from_outside(ego) else None
-        ask(ego, "reset", world, scene=self._visible)
+        with patience():
+            ask(ego, "reset", world, scene=self._visible)
 
     def _again(self, ego: Ego, rows: Sequence[int] | None = None) -> list[Tensor]:
         """Returns the answers of an ego to the first moments, from a reset on, all that
@@ -231,13 +257,15 @@ class PlannerCheck:
             self.scenes.scene_id[row] for row in rows.nonzero()[:, 0].tolist()
         )
 
-    def _raised(self, error: Exception) -> str:
-        """Returns in words that the planner raised, and where."""
+    def _raised(self, error: Exception | NoAnswer) -> str:
+        """Returns in words that the planner raised, or does not answer, and where."""
         reason = str(error).partition("\n")[0]
         if isinstance(error, WrongPlan | InputError):
             return reason
+        if not isinstance(error, NoAnswer):
+            reason = f"raises {type(error).__name__}: {reason}"
         line = failed_line(type(self.ego), error.__traceback__)
-        return f"raises {type(error).__name__}: {reason}{line and f' at {line}'}"
+        return f"{reason}{line and f' at {line}'}"
 
     # --- what is looked at
 
@@ -245,7 +273,7 @@ class PlannerCheck:
         """Drives, and says whether all answers are finite and of the right shape."""
         try:
             self._drive()
-        except Exception as error:  # outside code raises anything
+        except (Exception, NoAnswer) as error:  # outside code raises anything
             text = f"{self._raised(error)}, step {len(self.moments)}"
             return Finding("answers", False, text, "such rollouts count as failures")
         if self._not_finite:

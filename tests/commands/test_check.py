@@ -75,6 +75,16 @@ def test_a_wrong_planner_is_named_in_one_line(wrong, kind, about, text):
     assert not findings
 
 
+def test_a_planner_that_hangs_is_given_up(wrong, monkeypatch):
+    """Even if it catches all exceptions; the line is said where it waits."""
+    monkeypatch.setattr(planner_check, "PATIENCE", 1.0)
+    findings = wrong(wrong_planners.Hangs)
+    text = findings.pop("answers")
+    assert text.startswith("gives no answer within 1 s at ")
+    assert "wrong_planners.py:" in text
+    assert not findings
+
+
 @pytest.fixture
 def check(tmp_path, monkeypatch, capsys):
     """Runs the command; returns its status and what it prints."""

@@ -103,6 +103,16 @@ class Raises(Steady):
         return super().plan(world)
 
 
+class Hangs(Steady):
+    def plan(self, world):
+        while int(world.step[0]) == 15:
+            try:
+                time.sleep(3600)
+            except Exception:
+                continue
+        return super().plan(world)
+
+
 class Mixes(Steady):
     def factor(self, world):
         speed = world.states[:, 0, 3]
