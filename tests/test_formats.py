@@ -2,8 +2,11 @@
 names it, one from before formats had names is read, and a format's layout never changes
 under its name (docs/reference/api.md)."""
 
+import ast
 import hashlib
 import json
+import subprocess
+import sys
 from dataclasses import fields
 
 import numpy as np
@@ -14,7 +17,7 @@ from safetensors import safe_open
 from e2rl.evaluation import attack_set, modes, rates, rollout_files, transfer, tuning
 from e2rl.evaluation.attack_set import ATTACK, AttackSet
 from e2rl.evaluation.rates import EgoRates
-from e2rl.evaluation.rollout_files import read_rows, table_columns, write_rows
+from e2rl.evaluation.rollout_files import read_rows, write_rows
 from e2rl.planners import bits_network, network, policy_file
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.bits_network import BitsNetwork, load_bits, save_bits
@@ -170,6 +173,18 @@ def test_the_tables_of_a_part_of_a_run_are_of_the_run_s_format(tmp_path):
         EgoRates.read(tmp_path / "before")
 
 
+def built_in_columns():
+    """The columns of rollouts.csv in a fresh process, where no test has registered
+    metrics."""
+    code = (
+        "from e2rl.evaluation.rollout_files import table_columns; "
+        "print(table_columns())"
+    )
+    command = [sys.executable, "-c", code]
+    fresh = subprocess.run(command, capture_output=True, text=True, check=True)
+    return ast.literal_eval(fresh.stdout)
+
+
 def names_of(kind):
     """The fields of a dataclass."""
     return [entry.name for entry in fields(kind)]
@@ -181,7 +196,7 @@ def test_the_layout_of_a_format_does_not_change_under_its_name():
     seen = observation_layout()
     layouts = {
         run.FORMAT: [
-            *(run.PROVENANCE_SHAPE, table_columns(), tries_file.COLUMNS),
+            *(run.PROVENANCE_SHAPE, built_in_columns(), tries_file.COLUMNS),
             *(rollout_files.METRICS_ROW, rollout_files.SOMETIMES, modes.SHAPE),
             *(rates.ENTRY, transfer.MATRIX, scene_list.COLUMNS),
         ],
