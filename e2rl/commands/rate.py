@@ -66,8 +66,9 @@ def rate(run: Run) -> None:
         drawn = record(
             failures, run.folder, config=run.config, searched=True, **plan.origin
         )
-        page = write_report(run.folder, drawn, tables=tables)
-        lines.append(f"\nIts failures: {page}")
+        if plan.settings.report and plan.settings.save_rollouts:
+            page = write_report(run.folder, drawn, tables=tables)
+            lines.append(f"\nIts failures: {page}")
     print("", *lines, f"Written to {run.folder}", sep="\n")
 
 

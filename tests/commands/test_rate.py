@@ -88,3 +88,19 @@ def test_two_egos_are_rated_gated_and_reported(rate, tmp_path, monkeypatch, caps
 )
 def test_what_cannot_be_rated_is_refused(rate, option, message):
     assert message in rate(option, wrong=True)
+
+
+def test_without_rollouts_there_is_no_page(rate, tmp_path):
+    scenes = tmp_path / "scenes.csv"
+    scenes.write_text("scene_id\npriority_cross_040_0720\n")
+    run = rate(
+        "+egos.a={ego: class, _target_: tests.planners.planners.Faster}",
+        f"scenes={scenes}",
+        "num_scenes=null",
+        "data.build.steps=25",
+        "save_rollouts=false",
+    )
+    assert (run / "rates.md").exists()
+    assert len((run / "tail.csv").read_text().splitlines()) > 1, "it failed"
+    assert not (run / "failures.html").exists()
+    assert not (run / "rollouts").exists()
