@@ -76,6 +76,12 @@ from tests.scripts import arguments, call, error_line, left_behind
         (
             "train.py",
             "good",
+            ["stage=imitation", "ego.evades=true"],
+            "stage=imitation ego.evades=true: recordings do not say",
+        ),
+        (
+            "train.py",
+            "good",
             ["sim.max_braking=-1"],
             "sim.max_braking=-1.0: expected a number of at least 0.1",
         ),

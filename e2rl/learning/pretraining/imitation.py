@@ -207,6 +207,11 @@ def run_imitation_stage(run: Run, logger: RunLogger) -> dict[str, float]:
     ego = build_ego(config)
     if not isinstance(ego, ActorEgo):
         raise InputError("stage=imitation trains ego=actor; set it")
+    if ego.evader is not None:
+        raise InputError(
+            "stage=imitation ego.evades=true: recordings do not say what a planner would "
+            "have done; set ego.evades=false"
+        )
     settings = stage_settings(config, ImitationSettings)
     scenes = load_scenes(
         config.data,
