@@ -63,7 +63,6 @@ class ObservingEgo(Ego):
         action = world.ego_action()
         place = world.mission_s
         parts = []
-        observations = []
         for step in range(0, PLAN_STEPS, HOLD):
             ego = placed_ego(
                 static.mission,
@@ -75,15 +74,17 @@ class ObservingEgo(Ego):
                 others=static.vehicle,
             )
             others = others_at(world, expected, step=step)
-            observations.append(features(static, ego, others, ego.step / horizon))
-            action = self.decide(observations[-1])
+            observation = features(static, ego, others, ego.step / horizon)
+            if step == 0:
+                present_observation = observation
+            action = self.decide(observation)
             driven = dynamics.rollout(state, action[:, None].expand(-1, HOLD, -1))
             last_two = torch.cat([state[:, None], driven], 1)[:, -2:]
             action = dynamics.inverse(last_two)[:, 0]
             state = driven[:, -1]
             place = ego.pose.s + DT * driven[..., 3].sum(1)
             parts.append(driven)
-        return self.corrected(world, observations[0], torch.cat(parts, 1))
+        return self.corrected(world, present_observation, torch.cat(parts, 1))
 
 
 def others_at(
