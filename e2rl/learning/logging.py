@@ -1,19 +1,21 @@
-"""Logs a run's scalars to CSV files, TensorBoard or offline wandb, and a
+"""Logs a run's scalars to CSV files, TensorBoard, Trackio or offline wandb, and a
 curriculum's choices."""
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from torchrl.record.loggers import CSVLogger, TensorboardLogger, WandbLogger
 from torchrl.record.loggers.common import Logger
+from torchrl.record.loggers.trackio import TrackioLogger
 
 from e2rl.run.config import check_choice, library
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically
 
 GROUPS = ("train", "eval", "curriculum", "synthesizer", "time")
-KINDS = ("csv", "tensorboard", "wandb", "none")
+KINDS = ("csv", "tensorboard", "trackio", "wandb", "none")
 CHOICES = "curriculum.csv"
 
 
@@ -28,8 +30,8 @@ class RunLogger:
         name: str | None = None,
     ) -> None:
         """kind: csv (folder/logs/scalars/<group>/<name>.csv), tensorboard
-        (folder/tensorboard), wandb (offline, folder/wandb), none. Choices are in
-        folder/curriculum.csv in either case but none."""
+        (folder/tensorboard), trackio (folder/trackio), wandb (offline, folder/wandb),
+        none. Choices are in folder/curriculum.csv in either case but none."""
         self._folder = Path(folder)
         self._logger = _logger(kind, self._folder, project=project, name=name)
 
@@ -82,8 +84,8 @@ class RunLogger:
             write_atomically(file, "".join(lines_before(file, step)))
 
     def close(self) -> None:
-        """Finish the wandb run, and write what TensorBoard holds back."""
-        if isinstance(self._logger, WandbLogger):
+        """Finish the run of wandb or Trackio, and write what TensorBoard holds back."""
+        if isinstance(self._logger, WandbLogger | TrackioLogger):
             self._logger.experiment.finish()
         elif isinstance(self._logger, TensorboardLogger):
             self._logger.experiment.close()
@@ -106,6 +108,10 @@ def _logger(kind: str, folder: Path, project: str, name: str | None) -> Logger |
     if kind == "tensorboard":
         library("tensorboard", "logger=tensorboard", extra="tensorboard")
         return TensorboardLogger("tensorboard", log_dir=str(folder))
+    if kind == "trackio":
+        os.environ["TRACKIO_DIR"] = str(folder / "trackio")  # read as it is imported
+        library("trackio", "logger=trackio", extra="trackio")
+        return TrackioLogger(name or folder.name, project)
     return None
 
 

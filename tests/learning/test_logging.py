@@ -3,8 +3,10 @@ resume."""
 
 import json
 import math
+import sqlite3
 import struct
 import time
+from importlib.util import find_spec
 
 import pytest
 
@@ -71,6 +73,21 @@ def test_wandb_has_scalars_of_a_step_in_one_row(tmp_path, monkeypatch):
     assert [row["_step"] for row in rows] == [0, 1]
     assert [row["train/return"] for row in rows] == [1.5, 2.5]
     assert all("train/unknown" not in row for row in rows)
+
+
+def test_trackio_has_the_scalars_in_the_folder_of_the_run(tmp_path, monkeypatch):
+    """Read back from its database."""
+    if find_spec("trackio") is None:  # it reads its folder as it is imported
+        pytest.skip("trackio is not installed")
+    monkeypatch.setenv("TRACKIO_DIR", "")  # given back afterwards
+    logger = RunLogger("trackio", tmp_path)
+    for number in range(2):
+        logger.log({"train/return": 1.5 + number, "train/unknown": math.nan}, number)
+    logger.close()
+    with sqlite3.connect(tmp_path / "trackio" / "e2rl.db") as database:
+        rows = database.execute("SELECT step, metrics FROM metrics").fetchall()
+    values = [(step, json.loads(metrics)) for step, metrics in rows]
+    assert values == [(0, {"train/return": 1.5}), (1, {"train/return": 2.5})]
 
 
 def history(file):
