@@ -99,8 +99,9 @@ class ActorNetwork(nn.Module):
     to 1 where it has half of it, so that the network drives in danger alone; else g =
     1. There r is a planner's action if one evades (`evader.Evader`). With `slack` the
     mean's acceleration exceeds the bound of `follow` by `slack` m/s^2 at most, but for
-    the planner's own: what is learned against attackers keeps the distance to the
-    vehicle ahead.
+    the planner's own, and the planner's own by as much: what is learned against
+    attackers keeps the distance to the vehicle ahead, and does not undo that a planner
+    brakes.
     """
 
     middle: Tensor
@@ -155,10 +156,14 @@ class ActorNetwork(nn.Module):
             return torch.zeros_like(observation[..., :4])
         followed = follow(observation)
         action = followed[..., :2]
-        limit = followed[..., 2:3] + (self.slack or 0.0)
+        slack = self.slack or 0.0
+        limit = followed[..., 2:3] + slack
         if evasion is not None:
-            action = torch.where(evasion.isnan(), action, evasion)
-            limit = torch.maximum(limit, evasion[..., :1].nan_to_num(-torch.inf))
+            evades = ~evasion.isnan()
+            action = torch.where(evades, evasion, action)
+            planned = evasion[..., :1]
+            most = torch.minimum(torch.maximum(limit, planned), planned + slack)
+            limit = torch.where(evades[..., :1], most, limit)
         action = (action - self.middle) / self.reach
         bound = (limit - self.middle[:1]) / self.reach[:1]
         gate = torch.ones_like(bound)

@@ -73,7 +73,7 @@ def test_an_untrained_actor_drives_as_the_planner_in_danger_and_as_its_route_fol
 
 
 @torch.no_grad()
-def test_only_the_planner_may_accelerate_towards_a_vehicle_that_is_followed():
+def test_nothing_learned_accelerates_at_a_followed_vehicle_or_undoes_braking():
     observation = environment().reset(both())["observation"][:1]
     network = ActorEgo(hidden=(8,), slack=0.5, room=ROOM, evades=True).network.network
     bound = follow(observation)[0, 2] + 0.5
@@ -84,6 +84,10 @@ def test_only_the_planner_may_accelerate_towards_a_vehicle_that_is_followed():
     assert network.deterministic(observation, evasion)[0, 0] == pytest.approx(2.0)
     alone = network.deterministic(observation)[0, 0]
     assert alone == pytest.approx(bound.item(), abs=1e-3)
+    braking = evasion.clone()
+    braking[0, 0] = bound - 2.0
+    action = network.deterministic(observation, braking)[0, 0]
+    assert action == pytest.approx(bound.item() - 1.5, abs=1e-3), "slack above it"
 
 
 def test_in_danger_it_announces_the_planner_s_plan():
