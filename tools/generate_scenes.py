@@ -1,7 +1,7 @@
 """Write the bundled scenes: python tools/generate_scenes.py [--seed 0] [--nets 80]
 [--out e2rl/assets/scenes].
 
-Needs the build-time extra: pip install -e '.[sumo]'. The same seed and SUMO version
+Needs the build-time extra: pip install -e '.[scenegen]'. The same seed and SUMO version
 give the same files.
 """
 

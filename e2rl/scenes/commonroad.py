@@ -13,25 +13,23 @@ from collections.abc import (
     Iterator,
     Sequence,
 )
-from dataclasses import (
-    dataclass,
-    replace,
-)
+from dataclasses import dataclass
 from math import (
     inf,
     isfinite,
 )
 from types import SimpleNamespace
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 from numpy import ndarray
 
 from e2rl.run.errors import InputError
+from e2rl.scenes.egos import with_egos
 from e2rl.scenes.log_files import (
     LogFiles,
     bounded_memory,
+    xml_parser,
 )
 from e2rl.scenes.plausibility import check
 from e2rl.scenes.recording import (
@@ -64,7 +62,6 @@ UNPAVED = (
 )
 FOR_OTHERS = PAVED.union(UNPAVED.split())
 CARS = {"vehicle", "car"}  # RoadUsers
-MOVES = 0.5  # m/s: a vehicle that moves
 NEAR = 1.0  # m from a planning problem's start to the vehicle that is its ego
 ELEMENTS = "x y z exact intervalStart intervalEnd length width radius orientation"
 NUMBERS = frozenset(ELEMENTS.split())  # elements that hold one
@@ -116,30 +113,13 @@ def read_scenario(
     recording, started = _recording(
         scenario, list(problems.planning_problem_dict.values())
     )
-    frames = recording.start_frames(starts, steps) or [HISTORY]
-    for start in frames:
-        span = slice(start, start + steps + 1) if len(frames) > 1 else slice(None)
-        recording.egos[start] = _ego(
-            recording,
-            start,
-            span=span,
-            started=started,
-        )
-    egos = [ego for ego in recording.egos.values() if ego >= 0]
-    return replace(recording, ego=egos[0] if egos else -1)
+    return with_egos(recording, starts, steps=steps, started=started)
 
 
 def _check_content(content: bytes) -> None:
-    """Raise InputError for a document type, as scenarios have none, and it may name
-    files or grow when it is expanded; for deep nesting; and for numbers that are
+    """Raise InputError for a document type, for deep nesting, and for numbers that are
     infinite, NaN, or no angles, with which commonroad-io would not end."""
     opened: list[str] = []
-
-    def refuse(*_: object) -> None:
-        raise InputError(
-            "holds a document type declaration, which no CommonRoad scenario needs; "
-            "remove it"
-        )
 
     def begin(name: str, _: object) -> None:
         opened.append(name)
@@ -155,9 +135,8 @@ def _check_content(content: bytes) -> None:
                     f"{'/'.join(opened[-3:])} is {value.strip()[:40]}; repair it"
                 )
 
-    parser = expat.ParserCreate()
+    parser = xml_parser()
     parser.buffer_text = True  # a text comes whole
-    parser.StartDoctypeDeclHandler = refuse
     parser.StartElementHandler = begin
     parser.EndElementHandler = lambda _: opened.pop()
     parser.CharacterDataHandler = text
@@ -264,30 +243,6 @@ def _box(shape: Any) -> tuple[ndarray, ndarray]:
     )
     bounds = np.array(shape.compute_occupancy_for_state(pose).shapely_object.bounds)
     return bounds[2:] - bounds[:2], (bounds[:2] + bounds[2:]) / 2
-
-
-def _ego(
-    recording: Recording,
-    start: int,
-    *,
-    span: slice,
-    started: list[int],
-) -> int:
-    """Returns the ego's track in a window; -1 where no vehicle is there at its start.
-
-    One of `started`, tracks that begin where a planning problem does, else the vehicle
-    that moves for the most frames of `span`, of several the one that drives farthest.
-    """
-    vehicles = recording.valid & (recording.agent_type == VEHICLE)
-    present = vehicles[min(start, len(vehicles) - 1)]
-    for track in started:
-        if present[track]:
-            return track
-    if not present.any():
-        return -1
-    speed = np.abs(recording.states[span, :, 3]) * vehicles[span]
-    moves = (speed > MOVES).sum(0) * present
-    return int(np.lexsort((speed.sum(0), moves, present))[-1])
 
 
 def _map(network: Any) -> tuple[dict[str, Lane], list[ndarray]]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
+from xml.parsers import expat
 
 from e2rl.run.errors import InputError
 from e2rl.run.files import (
@@ -36,26 +37,28 @@ class LogFiles(Source):
     ignored: ClassVar[tuple[str, ...]] = ()  # files with that ending that are no logs
 
     def logs(self) -> list[str]:
-        root = self.root()
-        if root.is_dir():
-            files = sorted(root.rglob(f"*{self.ending}"))
-            names = [str(file.relative_to(root)) for file in files if not file.is_dir()]
-        elif root.is_file() and zipfile.is_zipfile(root):
-            with self.archive() as archive:
-                names = sorted(archive.namelist())
-        else:
-            raise InputError(f"data.path={root}: neither a folder nor a zip file")
         logs = [
             name
-            for name in names
-            if name.endswith(self.ending) and Path(name).name not in self.ignored
+            for name in self.names(self.ending)
+            if Path(name).name not in self.ignored
         ]
         if not logs:
             raise InputError(
-                f"data.path={root}: holds no {self.ending} scenario; "
+                f"data.path={self.root()}: holds no {self.ending} scenario; "
                 f"pass a folder or zip of {self.holds}"
             )
         return logs
+
+    def names(self, ending: str) -> list[str]:
+        """Returns the names of the files of an ending, in order."""
+        root = self.root()
+        if root.is_dir():
+            files = sorted(root.rglob(f"*{ending}"))
+            return [str(file.relative_to(root)) for file in files if not file.is_dir()]
+        if root.is_file() and zipfile.is_zipfile(root):
+            with self.archive() as archive:
+                return [n for n in sorted(archive.namelist()) if n.endswith(ending)]
+        raise InputError(f"data.path={root}: neither a folder nor a zip file")
 
     def fingerprint(self) -> bytes:
         root = self.root()
@@ -85,6 +88,18 @@ class LogFiles(Source):
                 f"{log} in {root}: cannot be read: {error.strerror}; "
                 "copy or export it again"
             ) from error
+
+
+def xml_parser() -> expat.XMLParserType:
+    """Returns a parser that raises InputError for a document type, which no log needs:
+    it may name files, or grow when it is expanded."""
+
+    def refuse(*_: object) -> None:
+        raise InputError("holds a document type declaration; remove it")
+
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = refuse
+    return parser
 
 
 def check_file(file: Path, most: int = MAX_BYTES) -> None:

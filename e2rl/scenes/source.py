@@ -108,7 +108,12 @@ NO_EGO = "nobody to be the ego at the start"
 NO_VERSION = "without such a version"  # or it is invalid, and the log itself is not
 VERSION = 14  # of the builder: raise it when a recording would make another scene
 AHEAD = 4  # logs for each worker that are built before their scenes are asked for
-OF_PATHS = ("scenarionet", "commonroad", "argoverse2")  # groups `data` of a path
+OF_PATHS = (
+    "scenarionet",
+    "sumo",
+    "commonroad",
+    "argoverse2",
+)  # groups `data` of a path
 FEW = 16  # scenes that are built here before processes would have started
 NO_MATTER = {"path", "cache", "cache_gb", "workers"}  # to the scenes
 
