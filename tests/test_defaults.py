@@ -19,6 +19,7 @@ OPTIONAL = {
     "opendrive",
     "mcap_writer",
     "rerun_writer",
+    "sumo_writer",
     "gym_env",
     "sb3",
 }  # they need libraries of extras

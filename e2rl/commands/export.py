@@ -25,6 +25,7 @@ FORMATS = {
     "commonroad": "commonroad_writer",
     "openscenario": "openscenario",
     "scenarionet": "scenarionet_writer",
+    "sumo": "sumo_writer",
     "mcap": "mcap_writer",
     "rerun": "rerun_writer",
     "npz": "archive",
