@@ -74,3 +74,14 @@ function copyField(label, text) {
   });
   return element("div", {}, element("label", {}, label, field), button);
 }
+
+/** A button that saves an attached file. */
+function saveButton({ name, size, data }) {
+  const button = element("button", { type: "button" }, `Download ${name} (${Math.ceil(size / 1024)} kB)`);
+  button.addEventListener("click", async () => {
+    const href = URL.createObjectURL(new Blob([await inflate(data)], { type: "application/octet-stream" }));
+    element("a", { href, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(href), 60000); // ms; browsers read it after the click
+  });
+  return element("div", {}, button);
+}
