@@ -12,9 +12,11 @@ from e2rl.report.rates import number
 
 FAILED = "cfr_preventable"
 PREVENTABLE = "that a careful driver in its place would have avoided"
-INTERVAL = "95% interval: of 100 ranges made like this one, about 95 hold the true value."
-UNKNOWN = "How far chance changes this is not known here."
-FEW = f"{UNKNOWN[:-6]}: that takes scenes of at least {LEAST} places."
+INTERVAL = (
+    "95% interval: of 100 ranges made like this one, about 95 hold the true value."
+)
+UNKNOWN = "How far chance changes this is not known."
+FEW = f"{UNKNOWN} That takes scenes of at least {LEAST} places."
 ATTACKED = (
     "Some vehicles, red in the pictures, are steered to provoke a collision. So this "
     "says in what ways the planner fails, not how often it would on a road."

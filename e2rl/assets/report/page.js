@@ -37,13 +37,12 @@ class Page {
   /** Go to the summary, to the failure that the end of an address names, or to those of a planner in a traffic. */
   follow(hash) {
     const brief = hash === "#summary";
+    const switched = document.body.classList.contains("brief") !== brief;
     document.body.classList.toggle("brief", brief);
     document.getElementById("summary").hidden = !brief;
-    if (brief) {
-      history.replaceState(null, "", hash); // which `open` changed
-      this.player.pause();
-      scrollTo(0, 0);
-    }
+    if (switched) scrollTo(0, 0);
+    if (brief) history.replaceState(null, "", hash); // which `open` changed
+    this.player.pause();
     const [, method, ego] = hash.match(/^#group=(.+)\/(.+)/)?.map(decodeURIComponent) ?? [];
     const chosen = this.report.groups.find((group) => group.ego === ego && group.method === method);
     if (chosen) {
@@ -59,6 +58,7 @@ class Page {
     if (failure.ego_policy !== this.ego) this.choose(failure.ego_policy);
     this.show(this.groups.find((group) => isOf(failure, group)));
     this.open(failure);
+    if (switched) document.getElementById("player").scrollIntoView();
   }
 
   /** Selects of the planner, where there are several, and of its traffic. */

@@ -32,11 +32,10 @@ function sortedTable({ head, rows, links, names = [] }, title) {
   );
   const body = element("tbody");
   const wanted = { text: "", name: "", column: 0, sign: 0 };
-  const show = () => {
-    const { text, name, column, sign } = wanted;
+  const show = ({ text, name, column, sign } = wanted) => {
     const kept = [...rows.keys()].filter(
       (row) =>
-        rows[row].some((cell) => cell.toLowerCase().includes(text.toLowerCase())) &&
+        rows[row].some((cell) => cell.toLowerCase().includes(text)) &&
         rows[row].some((cell) => cell.startsWith(name)),
     );
     if (sign) kept.sort((first, second) => compareCells(rows[first][column], rows[second][column], sign));
@@ -45,9 +44,8 @@ function sortedTable({ head, rows, links, names = [] }, title) {
   };
   const heads = head.map((text, column) =>
     sortHead(text, () => {
-      wanted.sign = wanted.column === column ? [1, -1, 0][[0, 1, -1].indexOf(wanted.sign)] : 1;
-      wanted.column = column;
-      show();
+      const sign = wanted.column === column && wanted.sign ? (wanted.sign > 0 ? -1 : 0) : 1;
+      show(Object.assign(wanted, { column, sign }));
     }),
   );
   const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), body);
@@ -55,20 +53,14 @@ function sortedTable({ head, rows, links, names = [] }, title) {
   show();
   if (rows.length < MANY_ROWS) return [box];
   const field = element("input", { type: "search", size: 12 });
-  field.addEventListener("input", () => show((wanted.text = field.value)));
+  const want = (wish) => show(Object.assign(wanted, wish));
+  field.addEventListener("input", () => want({ text: field.value.toLowerCase() }));
   const chosen = [["", "all"], ...names.map((name) => [name, name])];
-  const outcomes = names.length ? [choice("Outcome", chosen, (name) => show((wanted.name = name)))] : [];
-  return [element("form", { class: "filters" }, ...outcomes, element("label", {}, "Rows with", field)), box];
+  const outcomes = names.length ? [choice("Outcome", chosen, (name) => want({ name }))] : [];
+  // no form: return in its only field would send it, and load the page again
+  const filters = element("div", { class: "filters", role: "search" }, ...outcomes, element("label", {}, "Rows with", field));
+  return [filters, box];
 }
-
-/** A head of a column, whose button sorts by it. */
-function sortHead(title, sort, kind = "") {
-  const button = element("button", { type: "button" }, title || "name");
-  button.addEventListener("click", sort);
-  return element("th", { scope: "col", class: kind, "aria-sort": "none" }, button);
-}
-
-const sortWord = (sign) => ({ 1: "ascending", "-1": "descending" })[sign] ?? "none";
 
 /** The order of two cells: by their first number, where both begin with one, else as text; unknown ones are last. */
 function compareCells(first, second, sign) {
