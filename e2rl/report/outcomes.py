@@ -13,9 +13,9 @@ NEAR = 2.0  # s and m, as in the column `margin`
 PREVENTABLE = "a preventable failure"
 RAISED = "the planner raised"
 CONTACT = "contacts but no preventable one"
-CLOSE = "somebody near, but no contact"
-UNREACHED = "no adversary came near"
-FAR = "nobody near"
+CLOSE = "near a collision, but no contact"
+UNREACHED = "no adversary near a collision"
+FAR = "nobody near a collision"
 UNATTACKED = "no adversary chosen"
 OVERLAP = "an overlap at the start"
 LOST = "the traffic raised"
@@ -32,11 +32,10 @@ OUTCOMES = (  # of rollouts; a scene has the first that any of its rollouts has
 )
 APART = (CLOSE, UNREACHED, FAR, UNATTACKED)  # without a contact
 CAPTION = (
-    "What came nearest to a preventable failure, (n) rollouts; gap: the smallest to "
-    "anybody. Near: within "
-    f"{NEAR:g} s and m of a contact at constant velocities, `margin` ≥ −{NEAR:g}. "
-    "Whether the adversary could not come nearer, or did not happen to, nothing here "
-    "tells."
+    "What came nearest to a preventable failure, (n) rollouts. Near: within "
+    f"{NEAR:g} s and m of a contact at constant velocities, `margin` ≥ −{NEAR:g}. Gap: "
+    "the smallest to anybody, also to who drives alongside or stands. Whether an "
+    "adversary could come nearer, or did not happen to, no column tells."
 )
 SPENT = "The tries of a scene ended with the run's budget: more may find more."
 UNSPENT = "A `budget` spends further tries on these scenes."
@@ -112,5 +111,5 @@ def outcome_cell(name: str, rows: Sequence[Row]) -> str:
     """The outcome of a scene in one traffic, the smallest gap where nothing touched,
     and the number of rollouts."""
     gaps = [row["min_dtc"] for row in rows if row.get("min_dtc", 0.0) > 0.0]
-    gap = f", gap {min(gaps):.1f} m" if gaps and name in APART else ""
+    gap = f", gap {min(gaps):.2g} m" if gaps and name in APART else ""
     return f"{name}{gap} ({len(rows)})" if rows else ""

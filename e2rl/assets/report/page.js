@@ -150,7 +150,7 @@ class Page {
     history.replaceState(null, "", `#failure=${failure.key}`);
     const copies = Object.entries({ Link: `${location.href.split("#")[0]}#failure=@NAME@`, ...this.report.commands });
     const fields = copies.map(([label, text]) => copyField(label, text.replaceAll("@NAME@", failure.key)));
-    const saves = (this.report.attached?.[failure.key] ?? []).map(saveButton);
+    const saves = (this.report.attached?.[failure.key] ?? []).map((file) => saveButton(failure, file));
     document.getElementById("copies").replaceChildren(...saves, ...fields);
     this.index.mark(failure);
     const buttons = document.querySelectorAll(".mode");

@@ -63,7 +63,8 @@ function whatHappened(failure) {
   const from = FROM[approach] ?? `a vehicle ${approach.replace("cut-in", "cutting in")}`;
   const rule = BROKE[duty] ? `, which ${BROKE[duty]},` : "";
   const closing = relvel === null ? "" : `, with ${Math.round(3.6 * relvel)} km/h between them`;
-  return `The car ${DID[ego] ?? ego}; ${from}${rule} ${DID[partner] ?? partner}, and they collided at the car’s ${type}${closing}.`;
+  const contact = `they collided at the car’s ${type}${closing}`;
+  return `The car ${DID[ego] ?? ego}; ${from}${rule} ${DID[partner] ?? partner}, and ${contact}.`;
 }
 
 function whetherAvoided({ preventable, at_fault: fault }) {

@@ -58,7 +58,8 @@ function sortedTable({ head, rows, links, names = [] }, title) {
   const chosen = [["", "all"], ...names.map((name) => [name, name])];
   const outcomes = names.length ? [choice("Outcome", chosen, (name) => want({ name }))] : [];
   // no form: return in its only field would send it, and load the page again
-  const filters = element("div", { class: "filters", role: "search" }, ...outcomes, element("label", {}, "Rows with", field));
+  const label = element("label", {}, "Rows with", field);
+  const filters = element("div", { class: "filters", role: "search" }, ...outcomes, label);
   return [filters, box];
 }
 

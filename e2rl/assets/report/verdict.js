@@ -75,9 +75,10 @@ function copyField(label, text) {
   return element("div", {}, element("label", {}, label, field), button);
 }
 
-/** A button that saves an attached file. */
-function saveButton({ name, size, data }) {
-  const button = element("button", { type: "button" }, `Download ${name} (${Math.ceil(size / 1024)} kB)`);
+/** A button that saves a file attached to a failure. */
+function saveButton({ key }, { name, size, data }) {
+  const kind = name.slice(key.length + 1);
+  const button = element("button", { type: "button" }, `Download ${kind} (${Math.ceil(size / 1024)} kB)`);
   button.addEventListener("click", async () => {
     const href = URL.createObjectURL(new Blob([await inflate(data)], { type: "application/octet-stream" }));
     element("a", { href, download: name }).click();
