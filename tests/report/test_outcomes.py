@@ -59,8 +59,8 @@ def test_a_scene_has_the_worst_outcome_of_its_rollouts_and_the_smallest_gap():
     assert outcome_line(rows) == f"Of 2 scenes: {CLOSE} in 1; {UNREACHED} in 1."
     table = outcome_table({"ego, e2": rows, "ego, other": rows[2:]}, searched=False)
     assert table["rows"] == [
-        ["a", f"{CLOSE}, gap 0.3 m (2)", ""],
-        ["b", *2 * [f"{UNREACHED}, gap 5.0 m (1)"]],
+        ["a", f"{CLOSE}, gap 0.31 m (2)", ""],
+        ["b", *2 * [f"{UNREACHED}, gap 5 m (1)"]],
     ]
     assert table["names"] == [CLOSE, UNREACHED]
 
