@@ -51,8 +51,14 @@ class Attached:
         episodes: Iterable[Episode] = episodes_of(
             run, rows, plugins=self.plugins, scene=self.scene
         )
-        bar = {"total": len(rows), "unit": "rollout", "leave": False, "disable": None}
-        for episode in tqdm(episodes, "attaching", **bar):
+        for episode in tqdm(
+            episodes,
+            "attaching",
+            total=len(rows),
+            unit="rollout",
+            leave=False,
+            disable=None,
+        ):
             files[episode.path.stem] = [
                 attached_file(episode, name, write) for name, write in writers.items()
             ]

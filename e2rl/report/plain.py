@@ -1,7 +1,6 @@
 """The answer of a run for a reader who knows no word of its field."""
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 from e2rl.evaluation.rates import EgoRates
@@ -30,7 +29,7 @@ DRIVER = (
 
 def plain_answer(
     headline: Headline,
-    measured: Mapping[str, Any],
+    measured: dict[str, Any],
     *,
     ego: str,
     eta: float,
