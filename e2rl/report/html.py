@@ -133,6 +133,8 @@ def write_report(
             group["plain"] = plain_rate(ego)
     if rates or crossed:  # their noise is not kept
         content["commands"].pop(AGAIN, None)
+    if rates:  # which keep no rollouts but failures
+        content["outcomes"] = None
     rows = content.pop("rows")
     entries = content["failures"]
     order = replay_order(entries)[:replays]

@@ -78,9 +78,10 @@ def outcome_line(rows: Sequence[Row]) -> str:
 def outcome_table(
     groups: Mapping[str, Sequence[Row]],
     searched: bool,
-) -> dict[str, Any]:
+) -> dict[str, Any] | None:
     """What came nearest to a preventable failure in each scene: `head`, `rows` and
-    `caption` of a table, and the `names` of the outcomes in it.
+    `caption` of a table, and the `names` of the outcomes in it; None where all scenes
+    have one.
 
     Args:
         groups: rollouts by the names of ego and traffic.
@@ -99,6 +100,8 @@ def outcome_table(
         for scene in dict.fromkeys(scene for tries in scenes for scene in tries)
     ]
     found = {name for outcome in outcomes for name in outcome.values()}
+    if found == {PREVENTABLE}:
+        return None
     return {
         "head": ["scene", *groups],
         "rows": lines,

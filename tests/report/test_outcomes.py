@@ -71,6 +71,11 @@ def test_a_contact_has_no_gap():
     assert table["rows"] == [["a", f"{CONTACT} (2)"]]
 
 
+def test_where_every_scene_has_a_failure_there_is_nothing_to_explain():
+    rows = [QUIET | ROWS[PREVENTABLE], QUIET]
+    assert outcome_table({"ego, e2": rows}, searched=False) is None
+
+
 def test_only_a_search_has_spent_a_budget():
     for searched, text, other in ((True, SPENT, UNSPENT), (False, UNSPENT, SPENT)):
         caption = outcome_table({"ego, e2": [QUIET]}, searched=searched)["caption"]

@@ -7,8 +7,7 @@ class Page {
     this.player = new Player(this.store, (direction) => this.open(this.index.neighbour(direction)));
     this.index = new Index((failure) => this.open(failure), report.modes);
     showTables(document.getElementById("tables"), report.tables);
-    document.getElementById("outcomes-table").replaceChildren(...sortedTable(report.outcomes, "Scene by scene"));
-    document.getElementById("outcomes-caption").textContent = report.outcomes.caption;
+    this.showOutcomes(report.outcomes);
     showAbout(document.getElementById("about"), report.about);
     if (report.progress) this.showProgress(report.progress);
     const { command, git } = report.run;
@@ -23,6 +22,14 @@ class Page {
     this.choose(report.groups[0].ego);
     addEventListener("hashchange", () => this.follow(location.hash));
     this.follow(asked);
+  }
+
+  /** What came nearest to a failure in each scene, where any is without one. */
+  showOutcomes(outcomes) {
+    document.getElementById("outcomes").hidden = !outcomes;
+    if (!outcomes) return;
+    document.getElementById("outcomes-table").replaceChildren(...sortedTable(outcomes, "Scene by scene"));
+    document.getElementById("outcomes-caption").textContent = outcomes.caption;
   }
 
   /** Say how far a run is that goes on, and load the page again every so many seconds, but not amid a replay. */
