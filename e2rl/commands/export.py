@@ -13,25 +13,14 @@ from e2rl.evaluation.reproduce import failure_row
 from e2rl.evaluation.rollout_files import TABLE, own_folder, read_rows
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.export.episode import FACTS, Episode
+from e2rl.report.export.formats import FORMATS, OPEN_EGO, writer_of
 from e2rl.report.export.scene_files import episodes_of
-from e2rl.run.config import library
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, write_atomically, written_whole
 from e2rl.sim.rollout_file import file_stem
 
-# Modules of e2rl.report.export; what they import is in the extra of the format's name.
-FORMATS = {
-    "commonroad": "commonroad_writer",
-    "openscenario": "openscenario",
-    "scenarionet": "scenarionet_writer",
-    "sumo": "sumo_writer",
-    "mcap": "mcap_writer",
-    "rerun": "rerun_writer",
-    "npz": "archive",
-}
 ATTACKS = "attacks"  # the format of e2rl cross
-OPEN_EGO = ("commonroad", "openscenario")  # in which the ego's place may be left open
 LIST = "exported.csv"
 
 
@@ -160,11 +149,7 @@ def main(arguments: list[str] | None = None) -> None:
             export_attacks(options.run, rows, out)
             print(f"{len(rows)} attacks written to {out}")
             return
-        module = library(
-            f"e2rl.report.export.{FORMATS[options.to]}",
-            f"--to {options.to}",
-            extra=options.to,
-        )
+        write = writer_of(options.to, "--to")
         episodes = tqdm(
             episodes_of(
                 options.run,
@@ -178,5 +163,5 @@ def main(arguments: list[str] | None = None) -> None:
             leave=False,
             disable=None,
         )
-        export(partial(module.write, episodes, open_ego=options.open_ego), out)
+        export(partial(write, episodes, open_ego=options.open_ego), out)
         print(f"{len(rows)} rollouts written to {out}")

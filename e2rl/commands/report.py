@@ -8,6 +8,8 @@ from pathlib import Path
 from e2rl.evaluation.history import read_versions
 from e2rl.evaluation.record import Record, part_files
 from e2rl.evaluation.rollout_files import TABLE, own_folder
+from e2rl.report.attachments import Attached
+from e2rl.report.export.formats import FORMATS
 from e2rl.report.history import HISTORY, write_history
 from e2rl.report.html import PAGE, REPLAYS, write_report
 from e2rl.run.endings import ending
@@ -68,6 +70,27 @@ def main(arguments: list[str] | None = None) -> None:
         type=Path,
         help=f"file to write (default: RUN/{PAGE}; of a history {HISTORY} in the last)",
     )
+    parser.add_argument(
+        "--attach",
+        action="append",
+        default=[],
+        choices=tuple(FORMATS),
+        metavar="FORMAT",
+        help="to download from the page, with each replay; repeatable: "
+        f"{', '.join(FORMATS)}",
+    )
+    parser.add_argument(
+        "--no-scene",
+        action="store_true",
+        help="attach without the data: lanes of the rollout files alone",
+    )
+    parser.add_argument(
+        "--plugin",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="the data source's, to attach; repeatable",
+    )
     options = parser.parse_args(arguments)
     with ending():
         if len(options.runs) > 1:
@@ -87,6 +110,7 @@ def report_run(options: argparse.Namespace) -> None:
             f"{run}: a training has {len(folders)} pages; name one, such "
             f"as {folders[-1]}"
         )
+    attached = attached_by(options)
     for folder in folders:
         record = None
         progress = None
@@ -103,12 +127,31 @@ def report_run(options: argparse.Namespace) -> None:
             methods=options.method,
             path=options.out,
             progress=progress,
+            attached=attached,
         )
         print(page)
 
 
+def attached_by(options: argparse.Namespace) -> Attached | None:
+    """What the options ask to attach to one run's replays; InputError where they do not
+    go together."""
+    if options.attach:
+        if len(options.runs) > 1:
+            raise InputError("--attach: for one run; leave it out")
+        if options.replays == 0:
+            raise InputError(
+                "--attach: goes with replays, and --replays 0 has none; leave one out"
+            )
+        formats = list(dict.fromkeys(options.attach))
+        return Attached(formats, scene=not options.no_scene, plugins=options.plugin)
+    if options.no_scene or options.plugin:
+        raise InputError("--no-scene, --plugin: for --attach FORMAT; pass it, too")
+    return None
+
+
 def report_history(options: argparse.Namespace) -> None:
     """Write the history of several runs."""
+    attached_by(options)
     path = options.out or own_folder(options.runs[-1], HISTORY)
     if options.replays is not None:
         raise InputError("--replays: for one run; leave it out")

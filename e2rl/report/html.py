@@ -25,15 +25,18 @@ from e2rl.evaluation.modes import OTHER
 from e2rl.evaluation.rates import RATES_FILE, EgoRates
 from e2rl.evaluation.record import Record
 from e2rl.evaluation.rollout_files import TABLE, nulls, own_folder, rows_text
+from e2rl.evaluation.summary import headline
 from e2rl.evaluation.transfer import CROSS_FILE, Matrix
 from e2rl.metrics.atlas import CELL, by_likelihood, cell_of
 from e2rl.metrics.catalogue import METRICS
 from e2rl.metrics.errored import raised
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.report.answer import group_lines
+from e2rl.report.attachments import Attached
 from e2rl.report.cross import cross_tables
 from e2rl.report.failure_tracks import Encoded, encoded_failure, replay_data
-from e2rl.report.outcomes import outcome_tables
+from e2rl.report.outcomes import outcome_table
+from e2rl.report.plain import plain_answer, plain_rate
 from e2rl.report.rates import rate_tables, summary_lines
 from e2rl.report.tables import (
     Table,
@@ -94,6 +97,7 @@ def write_report(
     path: Path | None = None,
     *,
     progress: Mapping[str, Any] | None = None,
+    attached: Attached | None = None,
     encode: Callable[[Path, Mapping], Encoded] = encode,
 ) -> Path:
     """Write the page of a run's folder, and the list of its failures beside it, in a
@@ -108,10 +112,12 @@ def write_report(
         path: of the file; None: PAGE in the folder.
         progress: of a run that is not finished, `text` that says how far it is, and
             `every`, s after which the page loads itself again (0: never).
+        attached: files of the failures that are shown moving.
         encode: returns the replay of the failure of a row.
 
     Raises:
-        InputError: where files of the run are missing, or no method has the name.
+        InputError: where files of the run or a format's library are missing, or no
+            method has the name.
     """
     record = record or Record.read(run)
     rates = EgoRates.read(run) if (run / RATES_FILE).is_file() else []
@@ -124,15 +130,20 @@ def write_report(
     for ego, group in product(rates, content["groups"]):
         if ego.ego == group["ego"]:
             group |= {"summary": summary_lines(ego), "rates": {}}
+            group["plain"] = plain_rate(ego)
     if rates or crossed:  # their noise is not kept
         content["commands"].pop(AGAIN, None)
+    if rates:  # which keep no rollouts but failures
+        content["outcomes"] = None
     rows = content.pop("rows")
     entries = content["failures"]
     order = replay_order(entries)[:replays]
     for number, position in enumerate(order):
         entries[position]["replay"] = number
-    content["tables"] = list(map(vars, [*tables, *content["tables"]]))
+    content["tables"] = list(map(vars, tables))
     content["progress"] = progress
+    if attached:
+        content["attached"] = attached.files(run, [rows[each] for each in order])
     # one rollout at a time in memory
     replays_shown = (encode(run, rows[position]) for position in order)
     content |= replay_data(replays_shown, len(order))
@@ -199,7 +210,7 @@ def page(
 
 
 def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str, Any]:
-    """The data block without replays, and with tables of outcomes alone.
+    """The data block without replays and tables of metrics.
 
     Args:
         run: the folder.
@@ -228,6 +239,8 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
                 f"--method {name}: not in {run / TABLE}; choose among "
                 f"{', '.join(names)}"
             )
+    first = metrics[0]
+    measured = {(row["ego"], row["method"], row["eta"]): row for row in metrics}
     groups = {}
     by_name = {}
     for group, label in zip(
@@ -246,6 +259,12 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
             "label": label,
             "rates": rates,
             "summary": lines,
+            "plain": plain_answer(
+                headline(rows, searched),
+                measured.get(key, first | {"metrics": {}}),
+                ego=group["ego_policy"],
+                eta=group["eta"],
+            ),
             **{name: group[name] for name in ("method", "eta", "rollouts", "failures")},
             "raised": sum(map(raised, rows)),
         }
@@ -254,7 +273,6 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
     cells = sorted({cell for row in failures if (cell := cell_of(row))})
     mode_names = {mode["mode"]: mode["name"] for mode in modes["modes"]}
     typical = {mode["typical"]["file"] for mode in modes["modes"]}
-    first = metrics[0]
     facts = ("dataset", "split", "n_scenes", "git", "command")
     return {
         "run": {name: first[name] for name in facts} | {"stage": first.get("stage")},
@@ -274,7 +292,7 @@ def page_content(run: Path, record: Record, methods: Sequence[str]) -> dict[str,
             if row["errored"] == 1
         ],
         "rows": failures,
-        "tables": outcome_tables(by_name),
+        "outcomes": outcome_table(by_name, searched=searched),
         "points": [
             {name: row[name] for name in ("ego", "method", "eta")}
             | {

@@ -1,8 +1,10 @@
 """The failure report in Chromium: it loads without a complaint, shows what the files
 hold, and obeys."""
 
+import base64
 import shutil
 import threading
+import zlib
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
@@ -12,6 +14,7 @@ import pytest
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.metrics.atlas import atlas_of
 from e2rl.metrics.failure_modes import is_failure
+from e2rl.report.attachments import Attached
 from e2rl.report.html import PAGE, write_report
 from e2rl.sim.rollout_file import ROLLOUTS, Rollout, rollout_key, rollout_name
 from tests.report.failed_run import SCENE, failed_run, preventable_run
@@ -242,7 +245,7 @@ def test_a_link_opens_at_its_failure_from_a_folder_and_from_a_server(run, page):
                 assert page.current_url == page.find_element(
                     "css selector", "#copies input"
                 ).get_attribute("value")
-                first = page.find_element("css selector", "#summary strong").text
+                first = page.find_element("css selector", "#answer strong").text
                 assert (
                     f"under {row['method']} at η=2: preventable" in first
                 )  # the traffic of the failure
@@ -262,7 +265,7 @@ def test_the_first_lines_are_of_one_traffic_and_others_can_be_chosen(run, page):
         certain = [row["cfr"] for row in rows if row["cfr"] == row["cfr"]]
         assert (
             f"hit in {sum(certain):.0f} of {len(certain)} rollouts"
-            in page.find_element("id", "summary").text
+            in page.find_element("id", "answer").text
         )
         assert len(rows_of(page)) == len(
             failures_of(run)
@@ -323,3 +326,124 @@ def test_what_is_copied_is_the_whole_field(page):
         )
         assert ends == [0, len(field.get_attribute("value"))]
         assert "Copied" in line.text
+
+
+@pytest.fixture
+def summary(run, page):
+    """The browser at the summary of the report."""
+    page.get("about:blank")
+    page.get_log("browser")
+    page.get((run / PAGE).as_uri() + "#summary")
+    wait_for(page, "return page.cases.every(({ found }) => found)")
+    yield page
+    page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_the_summary_is_one_screen_of_words_and_leads_to_its_failures(run, summary):
+    assert summary.current_url.endswith("#summary")
+    assert not summary.find_element("tag name", "main").is_displayed()
+    text = summary.find_element("id", "summary").text
+    assert text.count("careful driver would have") >= 3
+    assert "η" not in text
+    assert SCENE not in text
+    cases = summary.find_elements("css selector", "#plain-cases a")
+    assert len(cases) == 3
+    link = cases[1].get_attribute("href")
+    cases[1].click()
+    wait_for(summary, "return !document.body.classList.contains('brief')")
+    assert summary.current_url == link
+    key = summary.execute_script("return page.player.failure.key")
+    assert link.endswith(f"#failure={key}")
+    assert summary.execute_script("return document.getElementById('scene').width") > 0
+    summary.find_element("css selector", ".masthead a").click()
+    wait_for(summary, "return !document.getElementById('summary').hidden")
+    assert summary.get_log("browser") == []
+
+
+@pytest.mark.parametrize("paper", [(8.27, 11.69), (8.5, 11.0)], ids=["A4", "letter"])
+def test_the_summary_prints_on_one_page(summary, paper):
+    options = {"paperWidth": paper[0], "paperHeight": paper[1]}
+    printed = summary.execute_cdp_cmd("Page.printToPDF", options)
+    assert base64.b64decode(printed["data"]).count(b"/Type /Page\n") == 1
+
+
+@pytest.mark.parametrize("end", ["#summary", "#details"])
+def test_nothing_is_wider_than_a_phone(run, summary, end):
+    size = {"width": 375, "height": 812, "deviceScaleFactor": 2, "mobile": True}
+    summary.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    summary.get((run / PAGE).as_uri() + end)
+    width = summary.execute_script("return document.documentElement.scrollWidth")
+    assert width == 375
+
+
+def test_a_button_saves_the_attached_file(run, chromium, tmp_path):
+    attached = Attached(["npz"], scene=False)
+    path = write_report(run, replays=3, path=tmp_path / "page.html", attached=attached)
+    folder = tmp_path / "saved"
+    folder.mkdir()
+    where = {"behavior": "allow", "downloadPath": str(folder)}
+    chromium.execute_cdp_cmd("Browser.setDownloadBehavior", where)
+    chromium.get_log("browser")
+    chromium.get(path.as_uri())
+    wait_for(chromium, "return page.player.replay !== null")
+    button = chromium.find_element("css selector", "#copies button")
+    (file,) = chromium.execute_script(
+        "return page.report.attached[page.player.failure.key]"
+    )
+    assert button.text.startswith("Download npz.zip (")
+    chromium.execute_script("arguments[0].click()", button)
+    saved = folder / file["name"]
+    support.WebDriverWait(chromium, 20, 0.05).until(lambda _: saved.is_file())
+    assert saved.read_bytes() == zlib.decompress(base64.b64decode(file["data"]))
+    assert chromium.get_log("browser") == []
+
+
+def cells_of(browser, place: str, column: int) -> list[str]:
+    """The cells of a column of the first table at a place."""
+    return browser.execute_script(
+        """const table = document.querySelector(arguments[0]).querySelector("table");
+        const rows = [...table.tBodies[0].rows];
+        return rows.map((row) => row.cells[arguments[1]].textContent);""",
+        place,
+        column,
+    )
+
+
+def test_a_table_is_sorted_by_keys_and_goes_back_to_its_order(page):
+    def number(text: str) -> float:
+        return float(text.split(" ")[0].replace("−", "-").replace(",", ""))
+
+    before = cells_of(page, "#tables", column=1)
+    known = [text for text in before if text != "–"]
+    unknown = ["–"] * (len(before) - len(known))
+    heads = page.find_elements("css selector", "#tables th[aria-sort]")
+    button = heads[1].find_element("tag name", "button")
+    orders = {"ascending": False, "descending": True}
+    for word, reverse in orders.items():
+        button.send_keys("\n")
+        assert heads[1].get_attribute("aria-sort") == word
+        after = cells_of(page, "#tables", column=1)
+        assert after[len(known) :] == unknown
+        values = list(map(number, after[: len(known)]))
+        assert values == sorted(values, reverse=reverse)
+        assert button == page.switch_to.active_element
+    button.send_keys("\n")
+    assert heads[1].get_attribute("aria-sort") == "none"
+    assert cells_of(page, "#tables", column=1) == before
+
+
+def test_scenes_are_filtered_by_what_came_of_them(page):
+    names = page.execute_script("return page.report.outcomes.names")
+    before = cells_of(page, "#outcomes", column=0)
+    assert len(names) > 1
+    select = support.Select(page.find_element("css selector", "#outcomes select"))
+    for name in names:
+        select.select_by_visible_text(name)
+        rows = page.find_elements("css selector", "#outcomes tbody tr")
+        assert 0 < len(rows) < len(before)
+        assert all(name in row.text for row in rows)
+    select.select_by_visible_text("all")
+    field = page.find_element("css selector", "#outcomes input")
+    field.send_keys(before[0], "\n")
+    assert before[0] in cells_of(page, "#outcomes", column=0)
+    assert page.find_element("css selector", "#outcomes input") == field  # no reload

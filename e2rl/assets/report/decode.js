@@ -1,10 +1,15 @@
 // The data block: arrays of whole numbers as e2rl/report/failure_tracks.py writes them.
 
-/** Whole numbers of base64, zlib, four byte planes and zigzag code. */
-async function decodeIntegers(text) {
+/** Bytes of base64 of zlib. */
+async function inflate(text) {
   const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const inflated = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const bytes = new Uint8Array(await new Response(inflated).arrayBuffer());
+  return new Uint8Array(await new Response(inflated).arrayBuffer());
+}
+
+/** Whole numbers of base64, zlib, four byte planes and zigzag code. */
+async function decodeIntegers(text) {
+  const bytes = await inflate(text);
   const count = bytes.length / 4;
   return Int32Array.from({ length: count }, (_, k) => {
     const code = bytes[k] | (bytes[count + k] << 8) | (bytes[2 * count + k] << 16) | (bytes[3 * count + k] << 24);

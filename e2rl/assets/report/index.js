@@ -141,14 +141,14 @@ class Index {
   head(column) {
     const { title, kind } = COLUMNS[column];
     const { order } = this;
-    const button = element("button", { type: "button" }, title);
-    button.addEventListener("click", () => {
+    const sort = () => {
       this.order = { column, sign: order.column === column ? -order.sign : 1 };
       this.show();
       this.table.querySelectorAll("thead button")[column].focus();
-    });
-    const sort = order.column !== column ? "none" : order.sign > 0 ? "ascending" : "descending";
-    return element("th", { scope: "col", class: kind, "aria-sort": sort }, button);
+    };
+    const node = sortHead(title, sort, kind);
+    node.setAttribute("aria-sort", sortWord(order.column === column ? order.sign : 0));
+    return node;
   }
 
   row(failure) {

@@ -36,7 +36,7 @@ function showModes(container, modes, total, store, choose) {
   const first = modes.findIndex(({ counted }) => !counted);
   container.replaceChildren(
     ...modes.flatMap((mode, index) => {
-      const picture = element("canvas", { "aria-hidden": "true" });
+      const picture = (mode.picture = element("canvas", { "aria-hidden": "true", width: 240, height: 160 }));
       const button = element(
         "button",
         { type: "button", class: "mode", "aria-pressed": "false" },
@@ -72,15 +72,7 @@ function modeText({ name, failures, counted }, total) {
 
 /** The typical case at its contact. */
 function drawTypical(canvas, { replay, paths }) {
-  canvas.width = 240;
-  canvas.height = 160;
   drawScene(canvas, paths, replay, replay.contact, { centre: replay.point, metres: 26 }, new Set(), readPalette());
-}
-
-/** Draw the pictures of modes anew, in other colours. */
-function repaintModes(container, modes) {
-  const pictures = container.querySelectorAll("canvas");
-  modes.forEach(({ found }, index) => found && drawTypical(pictures[index], found));
 }
 
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);

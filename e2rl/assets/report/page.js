@@ -7,6 +7,7 @@ class Page {
     this.player = new Player(this.store, (direction) => this.open(this.index.neighbour(direction)));
     this.index = new Index((failure) => this.open(failure), report.modes);
     showTables(document.getElementById("tables"), report.tables);
+    this.showOutcomes(report.outcomes);
     showAbout(document.getElementById("about"), report.about);
     if (report.progress) this.showProgress(report.progress);
     const { command, git } = report.run;
@@ -15,12 +16,20 @@ class Page {
     this.buildAxes();
     onPaletteChange(() => {
       this.player.repaint();
-      repaintModes(document.getElementById("modes"), this.modes);
+      for (const { picture, found } of [...this.cases, ...this.modes]) if (found) drawTypical(picture, found);
     });
     const asked = location.hash; // which `open` changes
     this.choose(report.groups[0].ego);
     addEventListener("hashchange", () => this.follow(location.hash));
     this.follow(asked);
+  }
+
+  /** What came nearest to a failure in each scene, where any is without one. */
+  showOutcomes(outcomes) {
+    document.getElementById("outcomes").hidden = !outcomes;
+    if (!outcomes) return;
+    document.getElementById("outcomes-table").replaceChildren(...sortedTable(outcomes, "Scene by scene"));
+    document.getElementById("outcomes-caption").textContent = outcomes.caption;
   }
 
   /** Say how far a run is that goes on, and load the page again every so many seconds, but not amid a replay. */
@@ -32,8 +41,15 @@ class Page {
     if (every) setInterval(() => this.player.playing || location.reload(), 1000 * every);
   }
 
-  /** Go to the failure that the end of an address names, or to those of a planner in a traffic. */
+  /** Go to the summary, to the failure that the end of an address names, or to those of a planner in a traffic. */
   follow(hash) {
+    const brief = hash === "#summary";
+    const switched = document.body.classList.contains("brief") !== brief;
+    document.body.classList.toggle("brief", brief);
+    document.getElementById("summary").hidden = !brief;
+    if (switched) scrollTo(0, 0);
+    if (brief) history.replaceState(null, "", hash); // which `open` changed
+    this.player.pause();
     const [, method, ego] = hash.match(/^#group=(.+)\/(.+)/)?.map(decodeURIComponent) ?? [];
     const chosen = this.report.groups.find((group) => group.ego === ego && group.method === method);
     if (chosen) {
@@ -49,6 +65,7 @@ class Page {
     if (failure.ego_policy !== this.ego) this.choose(failure.ego_policy);
     this.show(this.groups.find((group) => isOf(failure, group)));
     this.open(failure);
+    if (switched) document.getElementById("player").scrollIntoView();
   }
 
   /** Selects of the planner, where there are several, and of its traffic. */
@@ -102,6 +119,7 @@ class Page {
     this.traffic.querySelector("select").value = this.groups.indexOf(group);
     this.modes = groupByMode(failures, this.report.modes);
     this.summarise(failures, group);
+    this.cases = showSummary(group, this.modes, this.store);
     showModes(document.getElementById("modes"), this.modes, failures.length, this.store, (mode) => this.openMode(mode));
     const atlas = groupByCell(failures, this.report.cells);
     showAtlas(document.getElementById("atlas"), atlas, (failure) => this.open(failure));
@@ -114,7 +132,7 @@ class Page {
   summarise(failures, { summary: [headline, ...lines] }) {
     const { dataset, split, n_scenes: scenes, stage } = this.report.run;
     lines.push(`${dataset}/${split}, ${scenes} scenes.`);
-    document.getElementById("summary").replaceChildren(element("strong", {}, headline), ` ${lines.join(" ")}`);
+    document.getElementById("answer").replaceChildren(element("strong", {}, headline), ` ${lines.join(" ")}`);
     document.getElementById("stage").textContent = stage ? `, ${stage} training` : "";
     document.getElementById("modes-title").textContent = this.modesTitle(failures);
   }
@@ -139,7 +157,8 @@ class Page {
     history.replaceState(null, "", `#failure=${failure.key}`);
     const copies = Object.entries({ Link: `${location.href.split("#")[0]}#failure=@NAME@`, ...this.report.commands });
     const fields = copies.map(([label, text]) => copyField(label, text.replaceAll("@NAME@", failure.key)));
-    document.getElementById("copies").replaceChildren(...fields);
+    const saves = (this.report.attached?.[failure.key] ?? []).map((file) => saveButton(failure, file));
+    document.getElementById("copies").replaceChildren(...saves, ...fields);
     this.index.mark(failure);
     const buttons = document.querySelectorAll(".mode");
     this.modes.forEach(({ mode }, index) => buttons[index].setAttribute("aria-pressed", String(mode === failure.mode)));

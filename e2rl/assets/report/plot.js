@@ -24,6 +24,15 @@ function groupBy(items, keyOf) {
 /** A number with one decimal, or a dash where it is unknown. */
 const fixed = (value) => (value === null ? "–" : value.toFixed(1));
 
+/** A head of a column, whose button sorts by it. */
+function sortHead(title, sort, kind = "") {
+  const button = element("button", { type: "button" }, title || "name");
+  button.addEventListener("click", sort);
+  return element("th", { scope: "col", class: kind, "aria-sort": "none" }, button);
+}
+
+const sortWord = (sign) => (sign ? (sign > 0 ? "ascending" : "descending") : "none");
+
 /** A labelled select of {value: text}; `change` is called with the value. */
 function choice(label, options, change) {
   const select = element("select", {}, ...options.map(([value, text]) => element("option", { value }, text)));

@@ -74,3 +74,15 @@ function copyField(label, text) {
   });
   return element("div", {}, element("label", {}, label, field), button);
 }
+
+/** A button that saves a file attached to a failure. */
+function saveButton({ key }, { name, size, data }) {
+  const kind = name.slice(key.length + 1);
+  const button = element("button", { type: "button" }, `Download ${kind} (${Math.ceil(size / 1024)} kB)`);
+  button.addEventListener("click", async () => {
+    const href = URL.createObjectURL(new Blob([await inflate(data)], { type: "application/octet-stream" }));
+    element("a", { href, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(href), 60000); // ms; browsers read it after the click
+  });
+  return element("div", {}, button);
+}
