@@ -133,8 +133,7 @@ def write_report(
             group["plain"] = plain_rate(ego)
     if rates or crossed:  # their noise is not kept
         content["commands"].pop(AGAIN, None)
-    if rates:  # which keep no rollouts but failures
-        content["outcomes"] = None
+        content["outcomes"] = None  # rollouts that were chosen because something failed
     rows = content.pop("rows")
     entries = content["failures"]
     order = replay_order(entries)[:replays]
