@@ -35,8 +35,8 @@ SCENES = 24  # attacks of a round
 ITERATIONS = 12  # updates of a round
 ALONE = "learner.round.hits=0"  # no harder attack joins in
 ARMS = {
-    "full": [],
-    CONTROL: ["curriculum.prioritised=false"],
+    CONTROL: [],  # what train.py does
+    "learnability": ["curriculum._target_=tools.curricula.LearnabilityCurriculum"],
     "regret": ["curriculum._target_=tools.curricula.RegretCurriculum"],
     "e2_alone": [ALONE],
     "random_vehicles": [ALONE, "synthesizer.support=random"],
@@ -61,14 +61,28 @@ WORST = 0.1  # of the scenes
 PERCENTILES = torch.tensor([0.025, 0.975], dtype=torch.float64)
 
 
-class RegretCurriculum(AdaptiveCurriculum):
-    """Ranks scenes by the regret to an oracle that survives all of D', as some driver
-    does: by the recent failure rate itself."""
+class LearnabilityCurriculum(AdaptiveCurriculum):
+    """Draws scenes by their rank r in learnability p (1 - p), p the recent failure
+    rate, with weights r^-0.5; those never driven in adversarial traffic come first."""
 
-    def learnability(self) -> Tensor:
-        """The recent failure rate [S]; NaN for scenes never driven in adversarial
-        traffic."""
-        return self._failing
+    def worth(self) -> Tensor:
+        """What scenes [S] are ranked by."""
+        return self.failing * (1 - self.failing)
+
+    def priority(self) -> Tensor:
+        """Probability [S] with which scenes are drawn."""
+        order = self.worth().nan_to_num(nan=torch.inf).argsort(descending=True)
+        weight = (order.argsort() + 1.0) ** -0.5
+        return weight / weight.sum()
+
+
+class RegretCurriculum(LearnabilityCurriculum):
+    """By the regret to an oracle that survives all of D', as some driver does: by the
+    recent failure rate itself."""
+
+    def worth(self) -> Tensor:
+        """What scenes [S] are ranked by."""
+        return self.failing
 
 
 def main(arguments: list[str]) -> None:

@@ -31,7 +31,7 @@ from e2rl.run.files import (
 from e2rl.run.parts import load_plain
 
 STATE = "state.pt"
-FORMAT = "e2rl-checkpoint/12"
+FORMAT = "e2rl-checkpoint/13"
 
 
 def save_checkpoint(folder: Path, run: Evolution, keep_last: int = 2) -> Path:

@@ -189,7 +189,6 @@ class Evolution:
             failed=self.episodes.failed,
         )
         curriculum.update(self.episodes)
-        curriculum.leave_out(order.scenes[outcomes.left_out])
         curriculum.advance(attack.contact)
         self.choices = tally(order.number, outcomes, order.attack)
         self.errored = attack.errored

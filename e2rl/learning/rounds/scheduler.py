@@ -1,10 +1,8 @@
-"""The extension point for curricula: intensity, fraction of adversarial episodes, scene
-priorities.
+"""The extension point for curricula: intensity, fraction of adversarial episodes, scenes.
 
-Scenes are prioritised by rank, mixed with staleness, as in prioritised level replay
-(Jiang et al. 2021). What is ranked is the learnability p (1 - p) of Rutherford et al.
-("No Regrets", 2024): p is the recent failure rate of the ego in a scene's adversarial
-traffic. It is 0 for a scene that is solved and for one that is hopeless.
+All scenes are alike: draws by what can be learned in a scene (Jiang et al. 2021;
+Rutherford et al., "No Regrets", 2024) or by regret are no better than uniform ones
+(docs/results/training.md).
 """
 
 import math
@@ -18,8 +16,6 @@ from e2rl.run.config import Extension, check_range, configured
 from e2rl.run.errors import InputError
 
 Choice = dict[str, int | float]  # a row of curriculum.csv
-TEMPERATURE = 2.0  # of ranks: the first tenth of the scenes has a quarter of the draws
-STALENESS = 0.2  # fraction of the draws by the rounds since a scene was last drawn
 SMOOTHING = 0.3  # weight of a round in a scene's moving failure rate
 BIN = 0.5  # intensities are counted under multiples of it
 
@@ -93,13 +89,15 @@ class CurriculumScheduler(Extension):
 
     A curriculum is a subclass with `eta` and `fraction`, attributes or properties, and
     a YAML file in conf/curriculum with its `_target_` and settings. It overrides `etas`
-    where the scenes of a round differ in intensity. Its constructor takes its own
-    settings by name and hands on the others, `def __init__(self, num_scenes, rounds,
+    where the scenes of a round differ in intensity, and `priority` where it prefers
+    scenes, for instance by `failing` [S], the recent failure rates in their adversarial
+    traffic, NaN where there is none. Its constructor takes its own settings by name and
+    hands on the others, `def __init__(self, num_scenes, rounds,
     seed=0, *, stairs, **scenes): super().__init__(num_scenes, rounds, seed, **scenes)`.
 
     Args:
         rounds: of the whole run.
-        prioritised, solvable_only: see conf/curriculum/adaptive.yaml.
+        solvable_only: see conf/curriculum/adaptive.yaml.
     """
 
     eta: float  # adversarial intensity of this round
@@ -112,18 +110,15 @@ class CurriculumScheduler(Extension):
         rounds: int,
         seed: int = 0,
         *,
-        prioritised: bool,
         solvable_only: bool,
     ) -> None:
         if num_scenes < 1:
             raise InputError("curriculum: no scenes; check data.path and data.split")
         self.rounds = rounds
         self.round = 0
-        self.prioritised = prioritised
         self.solvable_only = solvable_only
         self._generator = torch.Generator().manual_seed(seed)
-        self._failing = torch.full((num_scenes,), torch.nan)
-        self._drawn = torch.full((num_scenes,), -1, dtype=torch.int64)
+        self.failing = torch.full((num_scenes,), torch.nan)
 
     def etas(self, scenes: Tensor) -> Tensor:
         """Intensities [S] for this round's scenes [S]; by default `eta` for all."""
@@ -149,28 +144,15 @@ class CurriculumScheduler(Extension):
         last = min(self.eta + spread, high)
         return first + (last - first) * torch.rand(count, generator=self._generator)
 
-    def learnability(self) -> Tensor:
-        """p (1 - p) [S] of the recent failure rate p: what can be learned; NaN for
-        scenes never driven in adversarial traffic."""
-        return self._failing * (1 - self._failing)
-
     def priority(self) -> Tensor:
-        """Probability [S] with which scenes are drawn: 1 - STALENESS of it by rank of
-        learnability, scenes not yet driven in adversarial traffic first, the rest by the
-        rounds since they were last drawn."""
-        count = len(self._failing)
-        if not self.prioritised:
-            return torch.full((count,), 1 / count)
-        rank = ranks(self.learnability().nan_to_num(nan=torch.inf))
-        weight = (1 / rank) ** (1 / TEMPERATURE)
-        age = (self.round - self._drawn).float()
-        stale = age / age.sum() if age.sum() > 0 else torch.full((count,), 1 / count)
-        return (1 - STALENESS) * weight / weight.sum() + STALENESS * stale
+        """Probability [S] with which scenes are drawn: all alike."""
+        count = len(self.failing)
+        return torch.full((count,), 1 / count)
 
     def draw(self, count: int) -> Tensor:
         """Scenes [count] to synthesize for: each scene count // S times, the rest by
         priority without replacement."""
-        total = len(self._failing)
+        total = len(self.failing)
         check_range("learner.round.scenes", count, low=1)
         chosen = torch.arange(total).repeat(count // total)
         if count % total:
@@ -180,7 +162,6 @@ class CurriculumScheduler(Extension):
                 generator=self._generator,
             )
             chosen = torch.cat([chosen, rest])
-        self._drawn[chosen] = self.round
         return chosen
 
     def update(self, episodes: Episodes) -> None:
@@ -191,18 +172,12 @@ class CurriculumScheduler(Extension):
         failures = episodes.failed[attacked].float()
         failed = torch.zeros(len(scenes)).index_add(0, inverse, failures)
         rate = failed / torch.bincount(inverse, minlength=len(scenes)).clamp(min=1)
-        before = self._failing[scenes]
-        self._failing[scenes] = torch.where(
+        before = self.failing[scenes]
+        self.failing[scenes] = torch.where(
             before.isnan(),
             rate,
             before + SMOOTHING * (rate - before),
         )
-
-    def leave_out(self, scenes: Tensor) -> None:
-        """Mark scenes whose adversarial traffic was left out because no driver survives
-        it. They count as solved until they are driven; otherwise they would come first
-        in every draw."""
-        self._failing[scenes] = self._failing[scenes].nan_to_num(nan=0.0)
 
     def advance(self, collision_rate: float | None = None) -> None:
         """Advance to the next round. collision_rate: the ego's in this round's
@@ -211,21 +186,21 @@ class CurriculumScheduler(Extension):
 
     def summary(self) -> dict[str, float]:
         """Metrics to log."""
-        driven = ~self._failing.isnan()
+        driven = ~self.failing.isnan()
         metrics = {
             "eta": self.eta,
             "fraction": self.fraction,
             "scenes_seen": driven.float().mean().item(),
         }
         if driven.any():
-            metrics["learnability"] = self.learnability()[driven].mean().item()
+            rate = self.failing[driven]
+            metrics["learnability"] = (rate * (1 - rate)).mean().item()
         return metrics
 
     def state_dict(self) -> dict:
         """All state."""
         return {
-            "failing": self._failing,
-            "drawn": self._drawn,
+            "failing": self.failing,
             "round": self.round,
             "generator": self._generator.get_state(),
             "lasting": {name: getattr(self, name) for name in self.lasting},
@@ -233,22 +208,13 @@ class CurriculumScheduler(Extension):
 
     def load_state_dict(self, state: dict) -> None:
         """Restore a `state_dict`; raises InputError if the number of scenes differs."""
-        if len(state["failing"]) != len(self._failing):
+        if len(state["failing"]) != len(self.failing):
             raise InputError(
                 f"the checkpoint's curriculum holds {len(state['failing'])} scenes, "
-                f"the data {len(self._failing)}; resume with the data of the run"
+                f"the data {len(self.failing)}; resume with the data of the run"
             )
-        self._failing = state["failing"].clone()
-        self._drawn = state["drawn"].clone()
+        self.failing = state["failing"].clone()
         self.round = state["round"]
         self._generator.set_state(state["generator"].cpu())
         for name in self.lasting:
             setattr(self, name, state["lasting"][name])
-
-
-def ranks(value: Tensor) -> Tensor:
-    """Ranks [S] of values [S], 1 for the largest; equal values share the mean of their
-    ranks."""
-    _, inverse, count = value.unique(return_inverse=True, return_counts=True)
-    above = count.flip(0).cumsum(0).flip(0) - count
-    return (above + (count + 1) / 2)[inverse]

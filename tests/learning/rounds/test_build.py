@@ -114,11 +114,9 @@ def test_a_curriculum_of_ones_own_is_built_and_resumed(tmp_path):
         config.curriculum = {
             "_target_": f"{__name__}.Doubling",
             "first": 0.25,
-            "prioritised": False,
         }
     run = built(config, tmp_path)
     assert isinstance(run.curriculum, Doubling)
-    assert not run.curriculum.prioritised
     assert train_round(run)["curriculum/eta"] == 0.25
     save_checkpoint(tmp_path, run)
     again = built(config, tmp_path)

@@ -1,5 +1,5 @@
-"""Learnability, priorities and draws of scenes as defined; what counts for which
-attack; exact resume."""
+"""Failure rates and draws of scenes as defined; what counts for which attack; exact
+resume."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 
 from e2rl.learning.rounds import scheduler
 from e2rl.learning.rounds.episodes import Episodes
-from e2rl.learning.rounds.scheduler import Outcomes, outcomes_of, ranks, tally
+from e2rl.learning.rounds.scheduler import Outcomes, outcomes_of, tally
 from e2rl.learning.rounds.schedules import AdaptiveCurriculum
 from e2rl.run.errors import InputError
 
@@ -44,9 +44,7 @@ def failing(curriculum, *rates):
         )
 
 
-def test_learnability_is_the_variance_of_recent_failures_in_adversarial_traffic(
-    monkeypatch,
-):
+def test_failing_is_the_moving_failure_rate_in_adversarial_traffic(monkeypatch):
     monkeypatch.setattr(scheduler, "SMOOTHING", 0.25)
     curriculum = curriculum_of()
     episodes(
@@ -55,40 +53,27 @@ def test_learnability_is_the_variance_of_recent_failures_in_adversarial_traffic(
         failed=[True, False, True],
         adversarial=False,
     )
-    assert curriculum.learnability().isnan().all(), (
+    assert curriculum.failing.isnan().all(), (
         "nothing is known of adversarial traffic yet"
     )
     failing(curriculum, 0.2, 1.0, 0.0)
-    torch.testing.assert_close(
-        curriculum.learnability()[:3], torch.tensor([0.16, 0.0, 0.0])
-    )
+    torch.testing.assert_close(curriculum.failing[:3], torch.tensor([0.2, 1.0, 0.0]))
+    assert curriculum.summary()["learnability"] == pytest.approx(0.16 / 3)
     episodes(curriculum, [1], failed=[False])
-    assert curriculum.learnability()[1] == pytest.approx(0.75 * 0.25), (
-        "the rate is a moving average"
-    )
+    assert curriculum.failing[1] == 0.75
 
 
-def test_priorities_are_by_rank_of_learnability_and_by_staleness(monkeypatch):
-    monkeypatch.setattr(scheduler, "STALENESS", 0.0)
-    curriculum = curriculum_of(4)
-    assert curriculum.priority().tolist() == [0.25] * 4
-    failing(curriculum, 1.0, 0.9, 0.4)  # the last scene is unseen and comes first
-    weight = torch.tensor([4.0, 3.0, 2.0, 1.0]) ** -0.5
-    torch.testing.assert_close(curriculum.priority(), weight / weight.sum())
-    monkeypatch.setattr(scheduler, "STALENESS", 0.5)
-    curriculum._drawn = torch.tensor([0, 1, 2, 3])
-    curriculum.round = 3
-    stale = torch.tensor([3.0, 2.0, 1.0, 0.0]) / 6
-    torch.testing.assert_close(
-        curriculum.priority(), (weight / weight.sum() + stale) / 2
-    )
-    assert curriculum_of(4, prioritised=False).priority().tolist() == [0.25] * 4
+class Preferring(AdaptiveCurriculum):
+    """Draws scenes by how often they fail."""
+
+    def priority(self):
+        return self.failing / self.failing.sum()
 
 
-def test_draws_follow_the_priorities_without_repetition_within_a_pass(monkeypatch):
-    monkeypatch.setattr(scheduler, "STALENESS", 0.0)
-    curriculum = curriculum_of(5)
-    failing(curriculum, 0.0, 0.1, 0.2, 0.3, 0.4)
+def test_draws_follow_the_priorities_without_repetition_within_a_pass():
+    assert curriculum_of(4).priority().tolist() == [0.25] * 4
+    curriculum = Preferring(5, 10)
+    failing(curriculum, 0.1, 0.1, 0.2, 0.3, 0.3)
     counts = torch.bincount(
         torch.stack([curriculum.draw(1) for _ in range(4000)]).flatten(), minlength=5
     )
@@ -96,30 +81,6 @@ def test_draws_follow_the_priorities_without_repetition_within_a_pass(monkeypatc
     chosen = curriculum.draw(13)
     assert sorted(torch.bincount(chosen, minlength=5).tolist()) == [2, 2, 3, 3, 3]
     assert len(curriculum.draw(4).unique()) == 4
-
-
-def test_a_drawn_scene_is_not_stale():
-    curriculum = curriculum_of(4)
-    curriculum.round = 5
-    drawn = curriculum.draw(2)
-    assert (curriculum._drawn == 5).nonzero()[:, 0].tolist() == sorted(drawn.tolist())
-
-
-def test_ranks_share_ties():
-    assert ranks(torch.tensor([5.0, 1.0, 5.0, torch.inf, 0.0])).tolist() == [
-        2.5,
-        4.0,
-        2.5,
-        1.0,
-        5.0,
-    ]
-
-
-def test_scenes_left_out_are_not_drawn_first():
-    curriculum = curriculum_of(4)
-    failing(curriculum, 0.5)
-    curriculum.leave_out(torch.tensor([0, 1]))
-    assert curriculum.learnability().nan_to_num(-1).tolist() == [0.25, 0.0, -1.0, -1.0]
 
 
 def test_state_goes_on_exactly():
