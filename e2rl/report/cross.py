@@ -12,6 +12,11 @@ TITLES = {
     REPLAY: "attacks that drive as they did",
     "again": "attacks made anew against the planner of the row",
 }
+EXPLAINED = {
+    REPLAY: "",
+    "again": " Made anew: in the same scene, with the same noise and decisions, so that "
+    "they follow who drives.",
+}
 WORDS = {"preventable": "Preventable failures", "hit": "Contacts"}
 FACTS = ("attacks", "scenes", "nats")  # of a set; of nats the median
 OTHERS = "others"  # heads the sums
@@ -35,8 +40,8 @@ def headline(matrix: Matrix) -> str:
     driver = max(matrix.egos, key=lambda ego: share("", ego))
     return (
         f"Preventable failures in attacks on others: {percent(rate())}% of rollouts; most "
-        f"in those on {source} ({percent(rate(source))}%), most of {driver} "
-        f"({percent(rate('', driver))}%).{none}"
+        f"in those on {source} ({counted(rate(source))}), most of {driver} "
+        f"({counted(rate('', driver))}).{none}"
     )
 
 
@@ -84,19 +89,28 @@ def matrix_table(
     for fact in FACTS if event == "preventable" else ():
         rows.append([fact, *(amount(entry[fact]) for entry in matrix.sets), ""])
     caption = (
-        f"{WORDS[event]}, % of {TITLES[mode]}. Row: who drives; column: against whom they "
-        f"were found; {OTHERS}: all but its own"
+        f"{WORDS[event]}, % of {TITLES[mode]}. The row drives; the column is against whom "
+        f"they were found; {OTHERS}: all but its own"
     )
     if narrow:
         caption += "."
     else:
-        caption += " [95% interval, by location or scene]. nats: the median."
+        caption += (
+            " [95% interval, by location or scene; none of few places]. nats: the median "
+            "of the attacks."
+        )
+    caption += EXPLAINED[mode]
     links = [
         [f"#group={MODES[mode]}-{name}/{quote(ego)}" for name in names]
         for ego in matrix.egos
     ]
     heads = [labels[name] for name in names]
     return Table(caption, ["", *heads, OTHERS], rows=rows, links=links)
+
+
+def counted(rate: Mapping[str, float]) -> str:
+    """Returns a rate in per cent, and of how many rollouts."""
+    return f"{percent(rate)}% of {rate['n']:.0f}"
 
 
 def amount(value: float) -> str:

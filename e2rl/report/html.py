@@ -48,6 +48,9 @@ from e2rl.run.errors import InputError
 from e2rl.run.files import write_atomically, write_beside
 from e2rl.sim.rollout_file import ROLLOUTS, Failure, rollout_key, rollout_name
 
+CHOSEN = (
+    "These attacks were kept because they made a planner fail: rates are of them alone."
+)
 PAGE = "failures.html"
 REPLAYS = 300  # in the page at most
 ASSETS = Path(__file__).parents[1] / "assets" / "report"
@@ -134,6 +137,10 @@ def write_report(
     if rates or crossed:  # their noise is not kept
         content["commands"].pop(AGAIN, None)
         content["outcomes"] = None  # rollouts that were chosen because something failed
+    if crossed:
+        for group in content["groups"]:
+            group["plain"] = None
+            group["summary"] = [*group["summary"], CHOSEN]
     rows = content.pop("rows")
     entries = content["failures"]
     order = replay_order(entries)[:replays]

@@ -9,7 +9,8 @@ from e2rl.commands.export import main as export
 from e2rl.evaluation.attack_set import AttackSet
 from e2rl.evaluation.rollout_files import TABLE, read_rows
 from e2rl.evaluation.transfer import CROSS_FILE
-from e2rl.report.html import PAGE
+from e2rl.report.html import CHOSEN, PAGE
+from tests.report.test_html import data_of
 from tests.scripts import SHORT, call, error_line
 
 EGOS = [
@@ -82,6 +83,9 @@ def test_failures_found_are_driven_by_all_resumed_and_carried(cross, tmp_path):
     assert not cross(f"resume={run}", "plugins=[tests.planners.planners]")
     assert (run / CROSS_FILE).read_bytes() == content
 
+    groups = data_of((run / PAGE).read_text())["groups"]
+    assert all(group["plain"] is None for group in groups), "chosen failures: no rate"
+    assert all(group["summary"][-1] == CHOSEN for group in groups)
     export([str(run), "--to", "attacks"])
     hits = [row for row in crossed if row["cfr"] == 1 and row["ego_policy"] == "fast"]
     exported = AttackSet.read(run / "export" / "attacks" / "fast.attacks")

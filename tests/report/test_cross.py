@@ -14,7 +14,7 @@ def matrix():
 def test_the_headline_names_the_set_and_the_planner_of_most_failures(matrix):
     assert headline(matrix) == (
         "Preventable failures in attacks on others: 25% of rollouts; most in those on b "
-        "(33%), most of a (67%). No attacks are on c."
+        "(33% of 6), most of a (67% of 3). No attacks are on c."
     )
 
 

@@ -43,7 +43,7 @@ class Page {
 
   /** Go to the summary, to the failure that the end of an address names, or to those of a planner in a traffic. */
   follow(hash) {
-    const brief = hash === "#summary";
+    const brief = hash === "#summary" && this.report.groups.some(({ plain }) => plain);
     const switched = document.body.classList.contains("brief") !== brief;
     document.body.classList.toggle("brief", brief);
     document.getElementById("summary").hidden = !brief;
@@ -119,7 +119,7 @@ class Page {
     this.traffic.querySelector("select").value = this.groups.indexOf(group);
     this.modes = groupByMode(failures, this.report.modes);
     this.summarise(failures, group);
-    this.cases = showSummary(group, this.modes, this.store);
+    this.cases = showSummary(group, this.modes, this.store, this.report.progress);
     showModes(document.getElementById("modes"), this.modes, failures.length, this.store, (mode) => this.openMode(mode));
     const atlas = groupByCell(failures, this.report.cells);
     showAtlas(document.getElementById("atlas"), atlas, (failure) => this.open(failure));

@@ -24,13 +24,15 @@ const BROKE = {
   entry: "came into its path too close",
 }; // the rule that the other vehicle broke
 
-/** The summary of a group of failures by mode, as `show` has them. */
-function showSummary({ plain, ego }, modes, store) {
+/** The summary of a group of failures by mode, as `show` has them, and how far a run is that goes on. */
+function showSummary({ plain, ego }, modes, store, progress) {
   const node = (id) => document.getElementById(id);
+  node("plain-link").hidden = !plain;
+  if (!plain) return [];
   node("plain-ego").textContent = ego;
   node("plain-number").textContent = plain.number;
   node("plain-meaning").textContent = plain.meaning;
-  node("plain-interval").textContent = plain.interval;
+  node("plain-interval").textContent = [progress?.text, plain.interval].filter(Boolean).join(" ");
   node("plain-driven").replaceChildren(
     ...Object.entries(plain.driven).flatMap(([term, text]) => [element("dt", {}, term), element("dd", {}, text)]),
   );
