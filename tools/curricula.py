@@ -118,9 +118,8 @@ def measure(
     if (run / "rollouts.csv").exists():
         return
     settings = [
-        "data=scenarionet",
         *(key.replace("measure.", "data.") for key in keys if "measure.path" in key),
-        *(key for key in keys if key.startswith("prior.")),
+        *(key for key in keys if key.startswith(("data=", "prior."))),
         f"+egos.{START}={{ego: actor}}",
         f"methods=[{ATTACK}]",
         f"processes={processes}",
