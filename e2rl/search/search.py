@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from e2rl.run.config import Extension, configured, setting
 from e2rl.search.portfolio import Portfolio
@@ -18,6 +19,8 @@ from e2rl.search.tries import Family, Try
 
 # tries that a round has at least: a batch costs much the same with one as with several
 ROUND = 24
+# tries of a round that a family has on average at least: each family is a batch
+SHARED = 8
 # tries of a scene, in all of which the planner raised, after which no more are spent
 RAISES = 3
 # of a failure, that a contact counts which the competent driver nearly prevents
@@ -89,8 +92,8 @@ class Search(Extension):
         """Returns the next tries, to be told in this order: one of every scene until it
         has `cover` of them, then of those families in those scenes that are worth the
         most: as many as there are scenes, or `growth` of the tries so far, but no more
-        than a quarter of what could be chosen; ROUND at least. None of scenes that are
-        not `active`."""
+        than a quarter of what could be chosen; ROUND at least, of so few families that
+        SHARED are of each. None of scenes that are not `active`."""
         worth = self._portfolio.worth(self._generator)
         active = self.active()
         if not active:
@@ -113,7 +116,8 @@ class Search(Extension):
         else:
             grown = round(self.settings.growth * sum(tried))
             size = max(ROUND, len(worth), min(grown, worth.numel() // 4))
-            chosen = worth.flatten().topk(min(size, worth.numel())).indices
+            size = min(size, worth.numel())
+            chosen = _of_few_families(worth, size).flatten().topk(size).indices
             pairs = [
                 divmod(pair, len(self.families))
                 for pair in chosen.sort().values.tolist()
@@ -177,3 +181,16 @@ class Search(Extension):
     def seed_of(self, scene: int) -> int:
         """Returns the seed of the draws of a scene."""
         return self.seed * 1_000_003 + int(self.numbers[scene])
+
+
+def _of_few_families(worth: Tensor, size: int) -> Tensor:
+    """Returns the worth [N, F] of tries, 0 but for so few families that `size` tries
+    are SHARED of each: those that the `size` best tries are worth the most of."""
+    scenes, families = worth.shape
+    best = worth.flatten().topk(size)
+    total = worth.new_zeros(families).index_add(0, best.indices % families, best.values)
+    count = max(size // SHARED, -(-size // scenes))
+    chosen = total.topk(min(count, families)).indices
+    few = torch.zeros_like(worth)
+    few[:, chosen] = worth[:, chosen]
+    return few

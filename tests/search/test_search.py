@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 
 from e2rl.metrics.margin import PREVENTED
-from e2rl.search.search import RAISES, ROUND, Outcome, Search, SearchSettings
+from e2rl.search.search import RAISES, ROUND, SHARED, Outcome, Search, SearchSettings
 from e2rl.search.tries import Family
 
 FAMILIES = [
@@ -34,7 +34,9 @@ def told(search, rounds, hopeless=()):
                     hash((single.scene, single.seed)) % 2**31
                 ),
             ).item()
-            fails = luck < CHANCE[single.family] and single.scene not in hopeless
+            fails = (
+                luck < CHANCE.get(single.family, 0.0) and single.scene not in hopeless
+            )
             margin = PREVENTED if fails else -25.0 if single.scene in hopeless else -2.0
             outcomes.append(
                 Outcome(
@@ -91,6 +93,14 @@ def test_rounds_grow_with_the_tries_so_far():
         )
         search.tell(requests, [Outcome(-2.0, "", nfe=100.0)] * len(requests))
     assert len(search.ask()) == 120
+
+
+def test_a_round_is_of_few_families_each_of_which_is_a_batch():
+    many = [replace(FAMILIES[0], name=str(number)) for number in range(15)]
+    search = told(search_of(scenes=12, families=many), PLAIN.cover)
+    tries = search.ask()
+    assert len(tries) == ROUND
+    assert len({single.family for single in tries}) <= ROUND // SHARED
 
 
 def test_a_family_that_nearly_finds_is_tried_more():
