@@ -5,6 +5,7 @@ from torch import Tensor
 
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import look_up
+from e2rl.run.fused import fused
 from e2rl.scenes.recording import DT
 
 PLAN_DT = 0.2  # s between nodes of a profile
@@ -60,22 +61,26 @@ def capped(
     slope: float,
 ) -> Tensor:
     """Speeds [B, C, NODES + 1] that follow wanted [B, C, NODES + 1] under the squared
-    caps [B, K] of the path, braking by at most `slope` a node.
+    caps [B, K] of the path, braking by at most `slope` a node."""
+    nodes = wanted.movedim(-1, 0)
+    return follow_capped(nodes, caps, caps.new_tensor(slope)).movedim(0, -1)
 
-    The caps depend on the distance driven so far, so this loops over the nodes, for all
-    profiles at once.
-    """
-    speed = wanted[..., 0]
+
+@fused(f"{NODES + 1} B C", "B K", "")
+def follow_capped(wanted: Tensor, caps: Tensor, slope: Tensor) -> Tensor:
+    """`capped`, of nodes [NODES + 1, B, C]. The caps depend on the distance driven so
+    far, so this loops over the nodes, for all profiles at once."""
+    speed = wanted[0]
     speeds = [speed]
     driven = torch.zeros_like(speed)
-    for target in wanted.unbind(-1)[1:]:
+    for target in wanted[1:]:
         allowed = look_up(caps, driven + speed * PLAN_DT)
         slowed = torch.maximum(allowed, (speed - slope).clamp(min=0))
         following = torch.minimum(target, slowed)
         driven = driven + (speed + following) / 2 * PLAN_DT
         speed = following
         speeds.append(speed)
-    return torch.stack(speeds, -1)
+    return torch.stack(speeds)
 
 
 def upsample(speed: Tensor) -> Tensor:

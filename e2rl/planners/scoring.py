@@ -63,13 +63,14 @@ class Forecast(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Pairs of a candidate and an agent at a moment: states [..., 4] and sizes [...,
-    2], and the margin [...] m below which their gap costs; they broadcast."""
+    """Pairs of each of R agents with the candidates of its scene: scene [R] int64;
+    ego_size [R, 2] m; states [R, T, 4] and size [R, 2] of the agent; margin [R, T] m
+    below which their gap costs."""
 
-    ego: Tensor
+    scene: Tensor
     ego_size: Tensor
-    other: Tensor
-    other_size: Tensor
+    states: Tensor
+    size: Tensor
     margin: Tensor
 
 
@@ -195,8 +196,8 @@ def contact_cost(
     summed over agents.
 
     A candidate ends at its first contact that is not from behind: what comes later
-    costs nothing, or it would pay to drive through somebody. Only pairs of poses that
-    are near enough to cost something are compared as boxes.
+    costs nothing, or it would pay to drive through somebody. Only agents that come near
+    enough to a candidate to cost something are compared, with all candidates.
 
     Args:
         ego: states [4, T, B, C] of the candidates.
@@ -205,41 +206,33 @@ def contact_cost(
         times: [T] s.
         prices: what costs how much.
     """
-    _, steps, batch, count = ego.shape
-    agents = others.present.shape[1]
+    batch, count = ego.shape[2:]
     moving = (others.states[..., 3] / MOVING).clamp(max=1)
     margin = prices.margin + prices.margin_growth * times * moving  # [B, M, T]
     radii = (ego_size.norm(dim=-1)[:, None] + others.size.norm(dim=-1)) / 2
     room = (radii[..., None] + margin + BESIDE).where(others.present[..., None], -1e6)
-    near = near_pairs(ego, others.states, room, prices.headway)
-    flat = near.flatten().nonzero()[:, 0]
-    moment = flat // count  # of B M T
-    agent = moment // steps
-    time = moment - agent * steps
-    scene = agent // agents
-    candidate = scene * count + flat - moment * count
+    near = come_near(ego, others.states, room, prices.headway)
+    scene, agent = near.nonzero(as_tuple=True)
     pairs = Pairs(
-        ego=ego.flatten(1)[:, time * (batch * count) + candidate].mT,
-        ego_size=ego_size[scene],
-        other=others.states.flatten(0, 2)[moment],
-        other_size=others.size.flatten(0, 1)[agent],
-        margin=margin.flatten()[moment],
+        scene,
+        ego_size[scene],
+        states=others.states[scene, agent],
+        size=others.size[scene, agent],
+        margin=margin[scene, agent],
     )
-    cost, ends = pair_cost(pairs, prices)
-    end = torch.full((batch * count,), steps, device=ego.device)
-    ending = ends.nonzero()[:, 0]
-    end.scatter_reduce_(0, candidate[ending], time[ending], "amin")
-    faded = cost * torch.exp(-prices.fade * times)[time]
-    cost = faded * (time <= end[candidate])
-    worst = ego.new_zeros(batch * count * agents)
-    number = agent - scene * agents
-    worst.scatter_reduce_(0, candidate * agents + number, cost, "amax")
-    return worst.view(batch, count, agents).sum(-1)
+    x, y, heading, speed = ego
+    poses = torch.stack([x, y, heading.cos(), heading.sin(), speed])
+    cost, contact = pair_costs(poses, pairs, times, prices)
+    into = scene[:, None].expand(-1, count)
+    end = ego.new_full((batch, count), torch.inf)
+    end.scatter_reduce_(0, into, contact, "amin")
+    worst = worst_until(cost, times, end[scene])
+    return ego.new_zeros(batch, count).scatter_add_(0, into, worst)
 
 
 @fused("4 T B C", "B M T 4", "B M T", "")
-def near_pairs(ego: Tensor, other: Tensor, room: Tensor, headway: Tensor) -> Tensor:
-    """Returns 1 where [B, M, T, C] a candidate and an agent are near enough to cost
+def come_near(ego: Tensor, other: Tensor, room: Tensor, headway: Tensor) -> Tensor:
+    """Returns 1 where an agent [B, M] comes near enough to a candidate to cost
     something, else 0.
 
     Args:
@@ -253,30 +246,39 @@ def near_pairs(ego: Tensor, other: Tensor, room: Tensor, headway: Tensor) -> Ten
     dy = y - other[..., 1, None]
     reach = room[..., None] + headway * speed
     near = (dx * dx + dy * dy < reach * reach) & (reach > 0)
-    return torch.where(near, 1.0, 0.0)
+    return torch.where(near, 1.0, 0.0).amax((2, 3))
 
 
-@fused(("Q 4", "Q 2", "Q 4", "Q 2", "Q"), "")
-def pair_cost(pairs: Pairs, prices: Prices) -> tuple[Tensor, Tensor]:
-    """Costs [...] of pairs; and 1 where they touch, and not from behind, else 0 [...].
+@fused("5 T B C", ("R:int64", "R 2", "R T 4", "R 2", "R T"), "T", "")
+def pair_costs(
+    poses: Tensor, pairs: Pairs, times: Tensor, prices: Prices
+) -> tuple[Tensor, Tensor]:
+    """Costs [R, T, C] of pairs; and the time [R, C] s at which they first touch, and
+    not from behind, inf for none.
 
     Contact costs more at a higher relative velocity, and half where the ego stands.
     Without contact, what counts is the fraction of the margin or of `headway` s that is
     missing, the latter before the ego's own speed closes the gap to whom it has ahead.
-    An agent behind the ego counts `rear`: its driver is to keep the distance.
+    An agent behind the ego counts `rear`: its driver is to keep the distance. What
+    comes later costs less, by exp(-fade t).
+
+    Args:
+        poses: [5, T, B, C] of the candidates: x, y, cosine and sine of the heading,
+            speed.
+        pairs: agents and scenes.
+        times: [T] s.
+        prices: what costs how much.
     """
-    x, y, heading, speed = pairs.ego.unbind(-1)
-    other_x, other_y, other_heading, other_speed = pairs.other.unbind(-1)
+    x, y, cos_a, sin_a, speed = poses[:, :, pairs.scene].transpose(1, 2)  # [R, T, C]
+    other_x, other_y, other_heading, other_speed = pairs.states[..., None, :].unbind(-1)
     dx = other_x - x
     dy = other_y - y
-    cos_a = heading.cos()
-    sin_a = heading.sin()
     cos_b = other_heading.cos()
     sin_b = other_heading.sin()
     cos = cos_a * cos_b + sin_a * sin_b
     sin = sin_a * cos_b - cos_a * sin_b
-    length_a, width_a = (pairs.ego_size / 2).unbind(-1)
-    length_b, width_b = (pairs.other_size / 2).unbind(-1)
+    length_a, width_a = (pairs.ego_size[:, None, None] / 2).unbind(-1)
+    length_b, width_b = (pairs.size[:, None, None] / 2).unbind(-1)
     ahead = dx * cos_a + dy * sin_a
     side = dy * cos_a - dx * sin_a
     along = ahead.abs() - (length_a + cos.abs() * length_b + sin.abs() * width_b)
@@ -292,15 +294,23 @@ def pair_cost(pairs: Pairs, prices: Prices) -> tuple[Tensor, Tensor]:
     severity = 1 + (closing.square() + (other_speed * sin).square()) / IMPACT**2
     severity = severity * (1 + (speed / SLOW).clamp(max=1)) / 2
     hit = gap < TOUCH
-    tight = (1 - gap / pairs.margin).clamp(0, 1).square()
+    tight = (1 - gap / pairs.margin[..., None]).clamp(0, 1).square()
     approach = torch.minimum(closing, speed).clamp(min=0)
     soon = (1 - along / (prices.headway * approach).clamp(min=1e-3)).clamp(0, 1)
     in_line = beside < BESIDE
     behind = in_line & (ahead < 0)
     nearness = torch.maximum(tight, soon * (in_line & (ahead > 0)))
     cost = prices.contact * hit * severity + prices.near * nearness
-    ends = torch.where(hit & ~behind, 1.0, 0.0)
-    return cost * torch.where(behind, prices.rear, 1.0), ends
+    faded = cost * torch.exp(-prices.fade * times)[:, None]
+    contact = torch.where(hit & ~behind, times[:, None], torch.inf).amin(1)
+    return faded * torch.where(behind, prices.rear, 1.0), contact
+
+
+@fused("R T C", "T", "R C")
+def worst_until(cost: Tensor, times: Tensor, end: Tensor) -> Tensor:
+    """Highest costs [R, C] of moments [R, T, C] at times [T] up to an end [R, C], itself
+    included."""
+    return torch.where(times[:, None] <= end[:, None], cost, 0.0).amax(1)
 
 
 @fused("2 T B C", "B 2", "B G G:float16", "B 2", "")

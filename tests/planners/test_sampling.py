@@ -7,7 +7,13 @@ from e2rl.planners.candidates import drive, speed_profiles, steer
 from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import PROFILES, SHIFTS, SamplingEgo
-from e2rl.planners.scoring import Pairs, discomfort, forecast, nearest, pair_cost
+from e2rl.planners.scoring import (
+    Pairs,
+    discomfort,
+    forecast,
+    nearest,
+    pair_costs,
+)
 from e2rl.scenes.boxes import separation
 from e2rl.scenes.recording import DT
 from e2rl.sim import dynamics
@@ -216,52 +222,33 @@ def test_forecasts_of_constant_acceleration_and_turn():
     assert torch.allclose(states[1, -1, 2], torch.tensor(1.0), atol=1e-3)
 
 
+def cost_of(x, y, ego_speed, other_speed=0.0, length=4.0):
+    """Of a vehicle of so many metres x 2 m beside or ahead of another, by the file's
+    weights: 200 for a contact, 30 for nearness, 1.5 s of headway; margin 1 m."""
+    size = torch.tensor([[length, 2.0]])
+    pairs = Pairs(
+        torch.zeros(1, dtype=torch.int64),
+        ego_size=size,
+        states=torch.tensor([[[x, y, 0.0, other_speed]]]),
+        size=size,
+        margin=torch.ones(1, 1),
+    )
+    pose = torch.tensor([0.0, 0.0, 1.0, 0.0, ego_speed])[:, None, None, None]
+    prices = SamplingEgo().prices(size)
+    return pair_costs(pose, pairs, torch.zeros(1), prices)[0].item()
+
+
 def test_pair_costs_order_situations():
     """Contact costs more than nearness, faster contact more than slower, behind less
     than ahead, far nothing."""
-    size = torch.tensor([[4.5, 2.0]])
-    prices = SamplingEgo().prices(size)
 
-    def cost(
-        x,
-        y,
-        speed,
-        ego_speed=10.0,
-    ):
-        ego = torch.tensor([[0.0, 0.0, 0.0, ego_speed]])
-        other = torch.tensor([[x, y, 0.0, speed]])
-        pairs = Pairs(
-            ego,
-            ego_size=size,
-            other=other,
-            other_size=size,
-            margin=torch.tensor([1.0]),
-        )
-        return pair_cost(pairs, prices)[0].item()
+    def cost(x, y, speed):
+        return cost_of(x, y, 10.0, speed, length=4.5)
 
     assert cost(4.0, 0.0, 0.0) > cost(4.0, 0.0, 8.0) > cost(5.0, 0.0, 8.0) > 0
     assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0
     assert cost(10.0, 0.0, 0.0) > cost(10.0, 0.0, 8.0) == 0
     assert cost(0.0, 2.2, 10.0) > cost(0.0, 2.6, 10.0) > cost(0.0, 3.1, 10.0) == 0
-
-
-def cost_of(
-    x,
-    y,
-    ego_speed,
-    other_speed=0.0,
-):
-    """Of a vehicle of 4 x 2 m beside or ahead of another, by the file's weights: 200
-    for a contact, 30 for nearness, 1.5 s of headway; margin 1 m."""
-    size = torch.tensor([[4.0, 2.0]])
-    pairs = Pairs(
-        torch.tensor([[0.0, 0.0, 0.0, ego_speed]]),
-        ego_size=size,
-        other=torch.tensor([[x, y, 0.0, other_speed]]),
-        other_size=size,
-        margin=torch.tensor([1.0]),
-    )
-    return pair_cost(pairs, SamplingEgo().prices(size))[0].item()
 
 
 @pytest.mark.parametrize(
