@@ -93,7 +93,8 @@ class Search(Extension):
         has `cover` of them, then of those families in those scenes that are worth the
         most: as many as there are scenes, or `growth` of the tries so far, but no more
         than a quarter of what could be chosen; ROUND at least, of so few families that
-        SHARED are of each. None of scenes that are not `active`."""
+        SHARED are of each. Where scenes and families are few, a family is tried several
+        times in a scene. None of scenes that are not `active`."""
         worth = self._portfolio.worth(self._generator)
         active = self.active()
         if not active:
@@ -103,11 +104,12 @@ class Search(Extension):
         if self.settings.bandit:
             again = self.settings.again * worth
             worth = torch.where(failed[:, None], again, worth)
+        worth = worth.repeat(1, max(ROUND // worth.numel(), 1))
         tried = [len(tries) for tries in self.tries]
         uncovered = self.settings.cover - min(tried[scene] for scene in active)
         if uncovered > 0:
             share = -(-ROUND // len(worth))
-            best = worth.topk(min(share, uncovered, len(self.families)), dim=1)
+            best = worth.topk(min(share, uncovered, worth.shape[1]), dim=1)
             pairs = [
                 (position, family)
                 for position, families in enumerate(best.indices.tolist())
@@ -119,15 +121,14 @@ class Search(Extension):
             size = min(size, worth.numel())
             chosen = _of_few_families(worth, size).flatten().topk(size).indices
             pairs = [
-                divmod(pair, len(self.families))
-                for pair in chosen.sort().values.tolist()
+                divmod(pair, worth.shape[1]) for pair in chosen.sort().values.tolist()
             ]
         drawn = []
         left = [self._tries_left(scene) for scene in range(len(self.numbers))]
         for position, family in pairs:
             scene = active[position]
             if left[scene] > 0:
-                attempt = self.families[family].draw(
+                attempt = self.families[family % len(self.families)].draw(
                     scene,
                     tried[scene],
                     seed=self.seed_of(scene),

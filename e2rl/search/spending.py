@@ -5,6 +5,7 @@ Every method is tried again and again, with other noise; the method `search` spe
 tries on a portfolio of families.
 """
 
+from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
@@ -87,9 +88,9 @@ class Spending:
         """Yields the batches of each round, is sent what they scored, and returns what
         was found within the budget.
 
-        The scenes of a round have an order of its own, so that a budget that ends
-        within a round is spent on scenes at random. A try that errors counts as one
-        that comes nowhere near.
+        The scenes of a round have an order of its own, in which they take turns, so that
+        a budget that ends within a round is spent on scenes at random. A try that errors
+        counts as one that comes nowhere near.
         """
         search = self.method.begin(self.setup, self.seed, self.scenes)
         spent = Spent()
@@ -103,9 +104,7 @@ class Spending:
         with Bar(total=self.budget, desc=title) as bar:
             while active := len(search.active()):
                 order = torch.randperm(len(self.scenes), generator=generator).tolist()
-                attempts = sorted(
-                    search.ask(), key=lambda attempt: order[attempt.scene]
-                )
+                attempts = in_turns(search.ask(), order)
                 outcomes: list[Outcome] = []
                 while len(outcomes) < len(attempts):
                     tries = account.affordable(attempts[len(outcomes) :], active)
@@ -330,6 +329,18 @@ def spend_together(searches: Sequence[Spending], work: Work = HERE) -> list[Spen
                 results[number] = end.value
         rounds = following
     return results
+
+
+def in_turns(attempts: Sequence[Try], order: Sequence[int]) -> list[Try]:
+    """Returns the first try of each scene, then the second of each, and so on; the
+    scenes in an order [N]."""
+    turns: Counter[int] = Counter()
+    ranks = []
+    for attempt in attempts:
+        ranks.append((turns[attempt.scene], order[attempt.scene]))
+        turns[attempt.scene] += 1
+    ranked = sorted(range(len(attempts)), key=ranks.__getitem__)
+    return [attempts[position] for position in ranked]
 
 
 def outcome_of(row: Mapping, nfe: float) -> Outcome:

@@ -78,6 +78,14 @@ def test_a_round_of_few_scenes_has_as_many_tries_as_a_batch_is_worth_and_covers_
     assert len(search.ask()) == ROUND
 
 
+def test_one_family_is_tried_as_often_at_once_as_a_batch_is_worth():
+    search = search_of(scenes=8, families=FAMILIES[:1])
+    tries = search.ask()  # of the cover
+    assert [single.number for single in tries] == [0, 1] * 8
+    search.tell(tries, [Outcome(-2.0, "", nfe=100.0)] * len(tries))
+    assert [single.number for single in search.ask()] == [2, 3, 4] * 8
+
+
 def test_rounds_grow_with_the_tries_so_far():
     several = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
     CHANCE.update({family.name: 0.0 for family in several})

@@ -19,10 +19,11 @@ from e2rl.search.search import RAISES, Search, SearchSettings
 from e2rl.search.spending import (
     SearchMethod,
     Spending,
+    in_turns,
     search_all,
     spend_together,
 )
-from e2rl.search.tries import TRIES, Family
+from e2rl.search.tries import TRIES, Family, Try
 from e2rl.search.tries_file import failures_of, write_tries
 from e2rl.sim.settings import SimSettings
 from e2rl.traffic.rule_based import ConstantVelocity
@@ -144,6 +145,15 @@ def test_a_budget_that_ends_within_a_round_goes_to_scenes_at_random(setup, plan)
         for seed in range(4)
     }
     assert len(firsts) > 1
+
+
+def test_scenes_take_turns_within_a_round():
+    attempts = [
+        Try(scene, number, "", seed=0, decisions=())
+        for scene, number in [(0, 4), (0, 5), (1, 2), (2, 0), (2, 1)]
+    ]
+    turns = in_turns(attempts, [2, 0, 1])
+    assert [turn[:2] for turn in turns] == [(1, 2), (2, 0), (0, 4), (2, 1), (0, 5)]
 
 
 def test_processes_change_nothing(setup, plan, whole):
@@ -302,7 +312,7 @@ def test_tries_that_error_cost_what_they_are_said_to_cost(setup):
     for budget, unit, tries in (
         (400.0, "nfe", 4),
         (3.0, "tries", 3),
-        (1.0, "seconds", 1),
+        (1.0, "seconds", 2),  # those of the first round
     ):
         spent = spend(setup, plan, seed=0, budget=budget, unit=unit)
         rows = spent.scored.rows
