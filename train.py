@@ -22,6 +22,7 @@ from e2rl.learning.rounds.build import (
     build_measure,
     build_progress,
     check_training,
+    rollouts_of,
 )
 from e2rl.learning.rounds.checkpoint import (
     load_checkpoint,
@@ -178,7 +179,7 @@ def train(task: Run) -> None:
     set_up(config)
     check_training(config)
     print(purpose(task), flush=True)
-    prepare_fused(config)
+    prepare_fused(config, rollouts_of(config))
     STAGES[config.stage.name](task)
 
 

@@ -38,6 +38,10 @@ from e2rl.tail.settings import RateSettings
 from e2rl.traffic.rollout import synthesize_traffic
 from e2rl.traffic.traffic import Traffic
 
+TRY = 150.0  # NFE of a try of the search, about
+# of an ego for which a planner evades, that take as long to collect as a rollout does
+DECISIONS = 190.0
+
 
 def build_attackers(config: DictConfig, prior: Prior) -> list[Traffic]:
     """Returns the traffic of the synthesizer, and of the harder one that joins in where
@@ -172,6 +176,25 @@ def check_training(config: DictConfig) -> None:
     processes_of(config)
     check_device("learner.device", config.learner.get("device", config.device))
     build_sim(config)
+
+
+def rollouts_of(config: DictConfig) -> float:
+    """Returns about how many rollouts a training takes as long as, where nothing is
+    compiled: those of its rounds and of its measurements, and what an ego decides for
+    which a planner evades."""
+    if config.stage.name != "evolution":
+        return 0.0
+    learner = config.learner
+    measure = measure_settings(config)
+    attacks = 2 * learner.round.scenes  # and as many episodes in nominal traffic
+    rows = (1 + len(measure.eta)) * len(measure.seeds)
+    scene = rows + measure.rollouts + measure.budget / TRY
+    decisions = 0
+    if config.ego.get("evades") and "collect" in learner:
+        collect = learner.collect
+        decisions = collect.iterations * collect.batch * collect.steps
+    rounds = config.rounds * (attacks + decisions / DECISIONS)
+    return rounds + 2 * measure.scenes * scene
 
 
 def build_logger(config: DictConfig, folder: Path) -> RunLogger:

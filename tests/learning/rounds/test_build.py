@@ -8,10 +8,12 @@ from omegaconf import open_dict
 from e2rl.api import load_prior
 from e2rl.evaluation.build import build_ego
 from e2rl.learning.rounds.build import (
+    TRY,
     build_attackers,
     build_evolution,
     build_progress,
     check_training,
+    rollouts_of,
 )
 from e2rl.learning.rounds.checkpoint import load_checkpoint, save_checkpoint
 from e2rl.learning.rounds.policy import PolicyImprovement
@@ -23,6 +25,7 @@ from e2rl.learning.rounds.schedules import (
 )
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
+from e2rl.traffic.fusing import EARNED
 from tests.learning.small import Ambush, brake_check, small_scenes
 
 CURRICULA = {
@@ -159,3 +162,11 @@ def test_a_device_for_learning_that_cannot_be_used_is_refused():
     config = config_of("learner.device=banana")
     with pytest.raises(InputError, match="banana: .*use learner.device=cpu or cuda"):
         check_training(config)
+
+
+def test_a_training_round_a_planner_that_evades_earns_compiling_and_the_default_does_not():
+    default = rollouts_of(load_config("train", []))
+    assert default == 8 * 2 * 48 + 2 * 48 * (2 * 3 + 8 + 640 / TRY)
+    harden = rollouts_of(load_config("train", ["experiment=harden"]))
+    assert default < EARNED < harden
+    assert rollouts_of(load_config("train", ["stage=prior"])) == 0
