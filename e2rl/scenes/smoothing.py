@@ -172,17 +172,11 @@ def polynomial_weights(window: int, order: int) -> tuple[ndarray, ndarray]:
     """Of the polynomial that fits `window` samples at DT best, the value (order 0) or
     slope (order 1): at the middle sample, for a convolution [window], and at all
     samples [window, window]: row k times the samples is that at k."""
-    from scipy.signal import savgol_coeffs  # loads all of scipy, for half a second
-
     time = np.arange(window)[:, None] - window // 2
     power = np.arange(ORDER + 1)
     basis = power * time ** np.maximum(power - 1, 0) / DT if order else time**power
-    return savgol_coeffs(
-        window,
-        ORDER,
-        order,
-        DT,
-    ), basis @ np.linalg.pinv(time**power)
+    weights = basis @ np.linalg.pinv(time**power)
+    return weights[window // 2, ::-1], weights
 
 
 def _at_rest(position: ndarray, valid: ndarray) -> ndarray:

@@ -3,11 +3,15 @@ seen."""
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_coeffs
 
+from e2rl.scenes.recording import DT
 from e2rl.scenes.smoothing import (
+    ORDER,
     causal_past,
     causal_state,
     drop_jumps,
+    polynomial_weights,
     smooth,
 )
 
@@ -201,3 +205,11 @@ def test_who_has_halted_stands_and_who_has_not_moved_off_yet_does(braking):
     stands = (time >= halts) & (time <= leaves)
     assert (speed[stands] == 0).all()
     assert speed[(time < halts - 0.5) | (time > leaves + 0.5)].min() > 0.4
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_the_fit_at_the_middle_sample_is_scipy_s_savitzky_golay_filter(order):
+    centre, _ = polynomial_weights(15, order)
+    np.testing.assert_allclose(
+        centre, savgol_coeffs(15, ORDER, order, DT), rtol=0, atol=1e-13
+    )
