@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-import torch
 from torch import Tensor
 
 from e2rl.sim.world import AGENT_KEYS, World
@@ -25,11 +24,11 @@ PLANNER_KEYS = (
 
 def take(
     world: World,
-    rows: Tensor,
+    rows: Tensor | slice,
     keys: tuple[str, ...] = PLANNER_KEYS,
 ) -> World:
     """Scenes rows [b] of a World with these keys of the scene, without plans and
-    routes."""
+    routes; of a slice without a copy."""
     agents = {key: getattr(world, key)[rows] for key in AGENT_KEYS}
     place = None if world.mission_s is None else world.mission_s[rows]
     scene = world.scene.select(*keys)[rows]
@@ -47,5 +46,5 @@ def chunks(
     keys: tuple[str, ...] = PLANNER_KEYS,
 ) -> Iterator[World]:
     """A World in parts of `size` scenes by `take`."""
-    for rows in torch.arange(len(world.step), device=world.step.device).split(size):
-        yield take(world, rows, keys=keys)
+    for first in range(0, len(world.step), size):
+        yield take(world, slice(first, first + size), keys=keys)

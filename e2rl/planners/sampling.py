@@ -142,7 +142,7 @@ class SamplingEgo(ScoringEgo):
     """26 speed profiles on 19 lateral moves: 9 shifts beside the mission, swift and
     calm, and the present one."""
 
-    CHUNK = 16  # fits the processor's cache
+    CHUNK = 8  # fits the processor's cache
 
     tuned = {"swift": (0.5, 1.0), "calm": (1.0, 2.5)} | ScoringEgo.tuned
 
