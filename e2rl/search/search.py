@@ -21,6 +21,7 @@ from e2rl.search.tries import Family, Try
 ROUND = 24
 # tries of a round that a family has on average at least: each family is a batch
 SHARED = 8
+REPEATED = 1e-6  # of the worth of a try that a family has twice in a scene at once
 # tries of a scene, in all of which the planner raised, after which no more are spent
 RAISES = 3
 # of a failure, that a contact counts which the competent driver nearly prevents
@@ -104,7 +105,7 @@ class Search(Extension):
         if self.settings.bandit:
             again = self.settings.again * worth
             worth = torch.where(failed[:, None], again, worth)
-        worth = worth.repeat(1, max(ROUND // worth.numel(), 1))
+        worth = _repeated(worth, max(ROUND // worth.numel(), 1))
         tried = [len(tries) for tries in self.tries]
         uncovered = self.settings.cover - min(tried[scene] for scene in active)
         if uncovered > 0:
@@ -182,6 +183,13 @@ class Search(Extension):
     def seed_of(self, scene: int) -> int:
         """Returns the seed of the draws of a scene."""
         return self.seed * 1_000_003 + int(self.numbers[scene])
+
+
+def _repeated(worth: Tensor, count: int) -> Tensor:
+    """Returns the worth [N, count F] of trying each family `count` times at once: that
+    of what repeats is next to nothing, so that it comes last."""
+    rank = torch.arange(count, dtype=worth.dtype)[:, None]
+    return (worth[:, None] * REPEATED**rank).flatten(1)
 
 
 def _of_few_families(worth: Tensor, size: int) -> Tensor:

@@ -86,6 +86,12 @@ def test_one_family_is_tried_as_often_at_once_as_a_batch_is_worth():
     assert [single.number for single in search.ask()] == [2, 3, 4] * 8
 
 
+def test_no_family_is_tried_twice_at_once_before_all_are_tried():
+    search = search_of(scenes=2)  # of three families
+    families = [single.family for single in search.ask()]
+    assert [len(set(families[:2])), len(set(families[2:]))] == [2, 2]
+
+
 def test_rounds_grow_with_the_tries_so_far():
     several = [Family(f"family {k}", "e2", ranges={}) for k in range(12)]
     CHANCE.update({family.name: 0.0 for family in several})
