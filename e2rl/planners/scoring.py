@@ -207,6 +207,7 @@ def contact_cost(
         prices: what costs how much.
     """
     batch, count = ego.shape[2:]
+    agents = others.present.shape[1]
     moving = (others.states[..., 3] / MOVING).clamp(max=1)
     margin = prices.margin + prices.margin_growth * times * moving  # [B, M, T]
     radii = (ego_size.norm(dim=-1)[:, None] + others.size.norm(dim=-1)) / 2
@@ -226,8 +227,9 @@ def contact_cost(
     into = scene[:, None].expand(-1, count)
     end = ego.new_full((batch, count), torch.inf)
     end.scatter_reduce_(0, into, contact, "amin")
-    worst = worst_until(cost, times, end[scene])
-    return ego.new_zeros(batch, count).scatter_add_(0, into, worst)
+    worst = ego.new_zeros(batch, agents, count)
+    worst[scene, agent] = worst_until(cost, times, end[scene])
+    return worst.sum(1)
 
 
 @fused("4 T B C", "B M T 4", "B M T", "")

@@ -19,7 +19,7 @@ from e2rl.search.tries import Family, Try
 
 # tries that a round has at least: a batch costs much the same with one as with several
 ROUND = 24
-# tries of a round that a family has on average at least: each family is a batch
+# tries of a round that a family has on average, about: each family is a batch
 SHARED = 8
 REPEATED = 1e-6  # of the worth of a try that a family has twice in a scene at once
 # tries of a scene, in all of which the planner raised, after which no more are spent
@@ -94,7 +94,7 @@ class Search(Extension):
         has `cover` of them, then of those families in those scenes that are worth the
         most: as many as there are scenes, or `growth` of the tries so far, but no more
         than a quarter of what could be chosen; ROUND at least, of so few families that
-        SHARED are of each. Where scenes and families are few, a family is tried several
+        some SHARED are of each. Where scenes and families are few, a family is tried several
         times in a scene. None of scenes that are not `active`."""
         worth = self._portfolio.worth(self._generator)
         active = self.active()
@@ -194,7 +194,7 @@ def _repeated(worth: Tensor, count: int) -> Tensor:
 
 def _of_few_families(worth: Tensor, size: int) -> Tensor:
     """Returns the worth [N, F] of tries, 0 but for so few families that `size` tries
-    are SHARED of each: those that the `size` best tries are worth the most of."""
+    are some SHARED of each: those that the `size` best tries are worth the most of."""
     scenes, families = worth.shape
     best = worth.flatten().topk(size)
     total = worth.new_zeros(families).index_add(0, best.indices % families, best.values)

@@ -1,5 +1,8 @@
 """Sampling planner: no way out, bounds, mirrors; its parts."""
 
+import math
+from itertools import product
+
 import pytest
 import torch
 
@@ -8,7 +11,10 @@ from e2rl.planners.ego import PLAN_STEPS
 from e2rl.planners.path import MissionPath
 from e2rl.planners.sampling import PROFILES, SHIFTS, SamplingEgo
 from e2rl.planners.scoring import (
+    MOVING,
+    Forecast,
     Pairs,
+    contact_cost,
     discomfort,
     forecast,
     nearest,
@@ -222,9 +228,10 @@ def test_forecasts_of_constant_acceleration_and_turn():
     assert torch.allclose(states[1, -1, 2], torch.tensor(1.0), atol=1e-3)
 
 
-def cost_of(x, y, ego_speed, other_speed=0.0, length=4.0):
-    """Of a vehicle of so many metres x 2 m beside or ahead of another, by the file's
-    weights: 200 for a contact, 30 for nearness, 1.5 s of headway; margin 1 m."""
+def compared(x, y, ego_speed, *, other_speed=0.0, length=4.0):
+    """Cost, and time of the contact, of a vehicle of so many metres x 2 m beside or
+    ahead of another, by the file's weights: 200 for a contact, 30 for nearness, 1.5 s
+    of headway; margin 1 m."""
     size = torch.tensor([[length, 2.0]])
     pairs = Pairs(
         torch.zeros(1, dtype=torch.int64),
@@ -235,7 +242,59 @@ def cost_of(x, y, ego_speed, other_speed=0.0, length=4.0):
     )
     pose = torch.tensor([0.0, 0.0, 1.0, 0.0, ego_speed])[:, None, None, None]
     prices = SamplingEgo().prices(size)
-    return pair_costs(pose, pairs, torch.zeros(1), prices)[0].item()
+    costs, contact = pair_costs(pose, pairs, torch.zeros(1), prices)
+    return costs.item(), contact.item()
+
+
+def cost_of(*place, **vehicle):
+    """The cost of `compared`."""
+    return compared(*place, **vehicle)[0]
+
+
+def test_no_candidate_ends_at_a_contact_from_behind():
+    assert compared(3.9, 0.0, 10.0)[1] == 0
+    assert compared(-3.9, 0.0, 5.0, other_speed=10.0)[1] == torch.inf
+
+
+def test_candidates_cost_their_worst_moment_with_each_agent_until_they_touch_one():
+    """Summed over agents by an oracle that loops over them, candidates and moments."""
+    torch.manual_seed(2)
+    scale = torch.tensor([6.0, 3.0, 0.5, 8.0])[:, None, None, None]
+    ego = torch.randn(4, 5, 2, 9) * scale
+    ego[3] = ego[3].abs()
+    size = torch.tensor([[4.5, 2.0], [4.0, 1.8]])
+    states = torch.randn(2, 3, 5, 4) * scale.flatten() + torch.tensor([4.0, 0, 0, 0])
+    sizes = torch.rand(2, 3, 2) + torch.tensor([4.0, 1.5])
+    present = torch.tensor([[True, True, True], [True, False, True]])
+    others = Forecast(states, sizes, present=present)
+    times = 0.4 * torch.arange(1, 6.0)
+    prices = SamplingEgo().prices(size)
+    cost = contact_cost(ego, size, others, times=times, prices=prices)
+    for b, c in product(range(2), range(9)):
+        costs = torch.zeros(3, 5)
+        ends = [torch.inf]
+        for m, t in product(present[b].nonzero()[:, 0].tolist(), range(5)):
+            x, y, heading, speed = ego[:, t, b, c]
+            moving = (states[b, m, t, 3] / MOVING).clamp(max=1)
+            pairs = Pairs(
+                torch.zeros(1, dtype=torch.int64),
+                size[b : b + 1],
+                states=states[b, m, t].view(1, 1, 4),
+                size=sizes[b, m][None],
+                margin=(prices.margin + prices.margin_growth * times[t] * moving).view(
+                    1, 1
+                ),
+            )
+            pose = torch.stack([x, y, heading.cos(), heading.sin(), speed])
+            pair, contact = pair_costs(
+                pose[:, None, None, None], pairs, torch.zeros(1), prices
+            )
+            costs[m, t] = pair.item() * math.exp(-prices.fade * times[t])
+            ends.append(times[t].item() + contact.item())
+        counted = costs * (times <= min(ends) + 1e-6)
+        assert cost[b, c].item() == pytest.approx(
+            counted.amax(1).sum().item(), rel=1e-4
+        )
 
 
 def test_pair_costs_order_situations():
@@ -243,7 +302,7 @@ def test_pair_costs_order_situations():
     than ahead, far nothing."""
 
     def cost(x, y, speed):
-        return cost_of(x, y, 10.0, speed, length=4.5)
+        return cost_of(x, y, 10.0, other_speed=speed, length=4.5)
 
     assert cost(4.0, 0.0, 0.0) > cost(4.0, 0.0, 8.0) > cost(5.0, 0.0, 8.0) > 0
     assert cost(4.0, 0.0, 8.0) > cost(-4.0, 0.0, 12.0) > 0
@@ -263,7 +322,7 @@ def test_a_contact_costs_by_the_relative_velocity_and_half_of_who_stands(
 
 @pytest.mark.parametrize(("gap", "touches"), [(0.14, True), (0.16, False)])
 def test_a_gap_of_15_centimetres_counts_as_a_contact(gap, touches):
-    assert (cost_of(0.0, 2.0 + gap, 10.0, 10.0) > 100) == touches
+    assert (cost_of(0.0, 2.0 + gap, 10.0, other_speed=10.0) > 100) == touches
 
 
 @pytest.mark.parametrize(("gap", "expected"), [(0.29, 26.0), (0.31, 0.0)])

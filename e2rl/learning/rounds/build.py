@@ -1,5 +1,6 @@
 """Builds the parts of an evolution from a run's configuration."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import partial
@@ -186,14 +187,17 @@ def rollouts_of(config: DictConfig) -> float:
         return 0.0
     learner = config.learner
     measure = measure_settings(config)
-    attacks = 2 * learner.round.scenes  # and as many episodes in nominal traffic
+    attacks = min(learner.round.scenes, config.num_scenes or math.inf)
+    episodes = 1 + (learner.round.nominal == "prior")
     rows = (1 + len(measure.eta)) * len(measure.seeds)
     scene = rows + measure.rollouts + measure.budget / TRY
     decisions = 0
-    if config.ego.get("evades") and "collect" in learner:
-        collect = learner.collect
-        decisions = collect.iterations * collect.batch * collect.steps
-    rounds = config.rounds * (attacks + decisions / DECISIONS)
+    if config.ego.get("evades") and learner.get("device", "cpu") == "cpu":
+        sizes = learner.get("collect", {})
+        decisions = math.prod(
+            sizes.get(name, 0) for name in ("iterations", "batch", "steps")
+        )
+    rounds = config.rounds * (episodes * attacks + decisions / DECISIONS)
     return rounds + 2 * measure.scenes * scene
 
 

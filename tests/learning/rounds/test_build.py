@@ -169,4 +169,6 @@ def test_a_training_round_a_planner_that_evades_earns_compiling_and_the_default_
     assert default == 8 * 2 * 48 + 2 * 48 * (2 * 3 + 8 + 640 / TRY)
     harden = rollouts_of(load_config("train", ["experiment=harden"]))
     assert default < EARNED < harden
+    few = rollouts_of(load_config("train", ["num_scenes=10", "measure.budget=0"]))
+    assert few == 8 * 2 * 10 + 2 * 48 * (2 * 3 + 8)
     assert rollouts_of(load_config("train", ["stage=prior"])) == 0
