@@ -10,7 +10,6 @@ import json
 import sys
 from pathlib import Path
 
-import torch
 from collector import collector
 from evolution_round import evolution_round
 from guided_replan import guided_replan
@@ -26,6 +25,7 @@ from synthesized_rollout import synthesized_rollout
 
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
+from e2rl.run.threads import set_threads
 
 OWN = (
     simulator,
@@ -93,7 +93,7 @@ def main(arguments: list[str]) -> None:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise InputError(f"--{name} {value}: expected at least 1")
-    torch.set_num_threads(1)
+    set_threads(1)
     bench = Bench(
         options.data,
         options.prior,

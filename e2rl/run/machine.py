@@ -16,6 +16,7 @@ from e2rl.run.config import (
     settings_of,
 )
 from e2rl.run.errors import InputError
+from e2rl.run.threads import set_threads
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ def set_up(config: DictConfig) -> None:
     settings_of(Machine, {part.name: config.get(part.name) for part in fields(Machine)})
     for key in LISTS:
         check_list(key, config.get(key))
+    set_threads(config.threads)
     import_plugins(config.plugins, "plugins: ")
-    torch.set_num_threads(config.threads)
     check_device("device", config.device)
     seed = config.get(
         "seed", 0

@@ -8,12 +8,11 @@ import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
-import torch
-
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
 from e2rl.run.errors import InputError
 from e2rl.run.processes import die_with_parent
+from e2rl.run.threads import set_threads
 
 
 class Prefetch:
@@ -52,7 +51,7 @@ class Prefetch:
 
 def _run(work: Callable[[], None], sender: Connection, parent: int) -> None:
     die_with_parent(parent)
-    torch.set_num_threads(1)
+    set_threads(1)
     begin = time.perf_counter()
     reason = ""
     try:
