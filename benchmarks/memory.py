@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from e2rl.evaluation.build import build_ego, build_prior, build_sim, build_traffic
 from e2rl.learning.rounds.policy import PolicyImprovement
 from e2rl.run.config import load_choice
-from e2rl.run.threads import set_threads
+from e2rl.run.cpu import configure_cpu
 
 WORK = (
     ("simulator", 512),
@@ -45,7 +45,7 @@ def memory(bench: Bench) -> Iterator[Row]:
 
 def _peak(bench: Bench, name: str, batch: int) -> tuple[float, float]:
     """With the scenes loaded, and after the work."""
-    set_threads(1)
+    configure_cpu(1)
     index = bench.pick(batch)
     alone = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     if name == "simulator":

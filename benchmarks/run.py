@@ -23,9 +23,9 @@ from searched_rollouts import searched_rollouts
 from simulator import simulator
 from synthesized_rollout import synthesized_rollout
 
+from e2rl.run.cpu import configure_cpu
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
-from e2rl.run.threads import set_threads
 
 OWN = (
     simulator,
@@ -93,7 +93,7 @@ def main(arguments: list[str]) -> None:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise InputError(f"--{name} {value}: expected at least 1")
-    set_threads(1)
+    configure_cpu(1)
     bench = Bench(
         options.data,
         options.prior,

@@ -11,8 +11,8 @@ import torch
 from measure import Bench, Row
 from tensordict import TensorDict
 
+from e2rl.run.cpu import configure_cpu
 from e2rl.run.processes import in_processes
-from e2rl.run.threads import set_threads
 
 SCENES = 64, 512, 2048, 10_000
 STEPS = 20
@@ -65,7 +65,7 @@ _environments: dict[int, tuple] = {}  # of a child: what the sizes share
 def _chunks(bench: Bench, count: int) -> tuple[float, float]:
     """Seconds of STEPS steps of so many scenes, the least of the repeats, and the
     process's peak memory [MiB]."""
-    set_threads(1)
+    configure_cpu(1)
     chunk = min(CHUNK, count)
     if chunk not in _environments:
         _environments[chunk] = bench, bench.environment(bench.pick(chunk))

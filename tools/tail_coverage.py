@@ -14,7 +14,7 @@ import torch
 import yaml
 from tabulate import tabulate
 
-from e2rl.run.threads import set_threads
+from e2rl.run.cpu import configure_cpu
 from e2rl.tail.sampler import REACHED, SamplerSettings
 from e2rl.tail.summary import target_bounds
 
@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--moves", type=int, help="of each copy (conf/rate.yaml's)")
     parser.add_argument("--form", choices=FORMS, action="append")
     options = parser.parse_args(arguments)
-    set_threads(1)
+    configure_cpu(1)
     rate = yaml.safe_load((ROOT / "conf/rate.yaml").read_text())["rate"]
     names = [field.name for field in fields(SamplerSettings)]
     settings = SamplerSettings(**{name: rate[name] for name in names})

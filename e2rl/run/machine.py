@@ -15,8 +15,8 @@ from e2rl.run.config import (
     setting,
     settings_of,
 )
+from e2rl.run.cpu import configure_cpu
 from e2rl.run.errors import InputError
-from e2rl.run.threads import set_threads
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def set_up(config: DictConfig) -> None:
     settings_of(Machine, {part.name: config.get(part.name) for part in fields(Machine)})
     for key in LISTS:
         check_list(key, config.get(key))
-    set_threads(config.threads)
+    configure_cpu(config.threads)
     import_plugins(config.plugins, "plugins: ")
     check_device("device", config.device)
     seed = config.get(

@@ -19,9 +19,9 @@ from typing import Any, TypeVar
 
 import torch
 
+from e2rl.run.cpu import configure_cpu
 from e2rl.run.errors import InputError
 from e2rl.run.guard import STARTED, kill_workers
-from e2rl.run.threads import set_threads
 
 PR_SET_PDEATHSIG = 1  # of prctl(2)
 
@@ -159,7 +159,7 @@ def _begin(
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_parent(parent)
     started.put(os.getpid())
-    set_threads(1)
+    configure_cpu(1)
     if begin is not None:
         begin(*arguments)
 

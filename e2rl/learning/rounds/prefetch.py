@@ -10,9 +10,9 @@ from multiprocessing.connection import Connection
 
 from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
+from e2rl.run.cpu import configure_cpu
 from e2rl.run.errors import InputError
 from e2rl.run.processes import die_with_parent
-from e2rl.run.threads import set_threads
 
 
 class Prefetch:
@@ -51,7 +51,7 @@ class Prefetch:
 
 def _run(work: Callable[[], None], sender: Connection, parent: int) -> None:
     die_with_parent(parent)
-    set_threads(1)
+    configure_cpu(1)
     begin = time.perf_counter()
     reason = ""
     try:

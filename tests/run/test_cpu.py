@@ -1,9 +1,12 @@
-"""The library of products keeps float32, or is left as it was."""
+"""The library of products keeps float32, or is left as it was; freed memory is kept."""
+
+import ctypes
+import resource
 
 import pytest
 import torch
 
-from e2rl.run.threads import set_threads
+from e2rl.run.cpu import configure_cpu
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +20,7 @@ def precision():
 
 
 def test_products_are_those_of_float32():
-    set_threads(1)
+    configure_cpu(1)
     a, b = torch.randn(300, 200), torch.randn(200, 100)
     exact = a.double() @ b.double()
     assert (a @ b - exact).abs().max() < 1e-4
@@ -25,17 +28,31 @@ def test_products_are_those_of_float32():
 
 def test_a_processor_that_rounds_is_left_as_it_was(monkeypatch):
     monkeypatch.setattr(torch, "equal", lambda product, numbers: False)
-    set_threads(1)
+    configure_cpu(1)
     assert torch.get_float32_matmul_precision() == "highest"
 
 
 def test_products_of_a_gpu_are_not_rounded(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    set_threads(1)
+    configure_cpu(1)
     assert torch.get_float32_matmul_precision() == "highest"
 
 
 def test_a_precision_that_somebody_chose_stays():
     torch.set_float32_matmul_precision("high")
-    set_threads(1)
+    configure_cpu(1)
     assert torch.get_float32_matmul_precision() == "high"
+
+
+@pytest.mark.skipif(
+    not hasattr(ctypes.CDLL(None), "mallopt"), reason="glibc's mallopt(3) is not there"
+)
+def test_freed_memory_is_used_again():
+    configure_cpu(1)
+    pages = []
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        tensors = [torch.ones(1 << 22) for _ in range(8)]  # of 16 MiB
+        del tensors
+        pages.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    assert pages[-1] < 8 * (1 << 24) / resource.getpagesize() / 4
