@@ -1,8 +1,10 @@
-"""How torch computes on the CPU: its threads, the library of its products, and the
-memory that it keeps."""
+"""How torch computes on the CPU: its threads, the memory that it keeps, and the library
+of its products."""
 
 import ctypes
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -15,15 +17,15 @@ LARGE = 32 << 20  # bytes of an allocation that is given back at once
 
 
 def configure_cpu(threads: int) -> None:
-    """Let torch compute with so many threads, products by oneDNN, in memory that is
-    kept."""
+    """Let torch compute with so many threads, in memory that is kept."""
     torch.set_num_threads(threads)
-    use_onednn()
     keep_memory()
 
 
-def use_onednn() -> None:
-    """Let products of float32 matrices be oneDNN's, where it keeps their precision.
+@contextmanager
+def onednn_products() -> Iterator[None]:
+    """Let products of float32 matrices in the block be oneDNN's, where it keeps their
+    precision: for products of few sizes, as each new one takes it half a millisecond.
 
     With AVX-512 on AMD, MKL takes more than twice as long. PyTorch hands float32
     products to oneDNN where it may round them to bfloat16; processors that do are left
@@ -31,10 +33,15 @@ def use_onednn() -> None:
     """
     before = torch.get_float32_matmul_precision()
     if before != "highest" or torch.cuda.device_count() > 0:
+        yield
         return
     torch.set_float32_matmul_precision("medium")
     numbers = torch.full((64, 64), EXACT)
     if not torch.equal(numbers @ torch.eye(64), numbers):
+        torch.set_float32_matmul_precision(before)
+    try:
+        yield
+    finally:
         torch.set_float32_matmul_precision(before)
 
 

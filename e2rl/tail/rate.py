@@ -12,6 +12,7 @@ import torch
 from e2rl.driving.batches import Work, split_tasks
 from e2rl.driving.scored import Scored
 from e2rl.driving.setup import Method, Setup, Task
+from e2rl.run.cpu import onednn_products
 from e2rl.run.processes import in_processes
 from e2rl.run.terminal import Bar
 from e2rl.tail.estimate import Estimate
@@ -108,6 +109,7 @@ class Rating:
                     failures=Scored(*failures),
                 )
 
+    @onednn_products()
     def _drive(self, job: Job, folder: Path | None) -> list[tuple]:
         """The estimates of a job, of plain values."""
         scene = self.setup.scenes.batch(job.scenes)

@@ -1,4 +1,4 @@
-"""The library of products keeps float32, or is left as it was; freed memory is kept."""
+"""oneDNN's products keep float32, or stay out; freed memory is kept."""
 
 import ctypes
 import resource
@@ -6,41 +6,41 @@ import resource
 import pytest
 import torch
 
-from e2rl.run.cpu import configure_cpu
+from e2rl.run.cpu import configure_cpu, onednn_products
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def precision():
     before = torch.get_float32_matmul_precision()
-    threads = torch.get_num_threads()
     torch.set_float32_matmul_precision("highest")
     yield
     torch.set_float32_matmul_precision(before)
-    torch.set_num_threads(threads)
 
 
-def test_products_are_those_of_float32():
-    configure_cpu(1)
+def test_products_are_those_of_float32(precision):
     a, b = torch.randn(300, 200), torch.randn(200, 100)
     exact = a.double() @ b.double()
-    assert (a @ b - exact).abs().max() < 1e-4
+    with onednn_products():
+        assert (a @ b - exact).abs().max() < 1e-4
+    assert torch.get_float32_matmul_precision() == "highest"
 
 
-def test_a_processor_that_rounds_is_left_as_it_was(monkeypatch):
+def test_a_processor_that_rounds_is_left_as_it_was(precision, monkeypatch):
     monkeypatch.setattr(torch, "equal", lambda product, numbers: False)
-    configure_cpu(1)
-    assert torch.get_float32_matmul_precision() == "highest"
+    with onednn_products():
+        assert torch.get_float32_matmul_precision() == "highest"
 
 
-def test_products_of_a_gpu_are_not_rounded(monkeypatch):
+def test_products_of_a_gpu_are_not_rounded(precision, monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    configure_cpu(1)
-    assert torch.get_float32_matmul_precision() == "highest"
+    with onednn_products():
+        assert torch.get_float32_matmul_precision() == "highest"
 
 
-def test_a_precision_that_somebody_chose_stays():
+def test_a_precision_that_somebody_chose_stays(precision):
     torch.set_float32_matmul_precision("high")
-    configure_cpu(1)
+    with onednn_products():
+        assert torch.get_float32_matmul_precision() == "high"
     assert torch.get_float32_matmul_precision() == "high"
 
 
@@ -48,7 +48,7 @@ def test_a_precision_that_somebody_chose_stays():
     not hasattr(ctypes.CDLL(None), "mallopt"), reason="glibc's mallopt(3) is not there"
 )
 def test_freed_memory_is_used_again():
-    configure_cpu(1)
+    configure_cpu(torch.get_num_threads())
     pages = []
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from e2rl.learning.generators import generator_states, restore_generators
 from e2rl.learning.logging import RunLogger
 from e2rl.run.config import Settings, resolved, setting, settings_of
+from e2rl.run.cpu import onednn_products
 from e2rl.run.errors import InputError
 from e2rl.run.parts import NO_PARTS, Parts
 from e2rl.run.terminal import Bar
@@ -175,6 +176,7 @@ class Epochs(Supervised):
     def measure(self, data: TensorDictBase) -> dict[str, float]:
         """The mean losses of data, which has rows, `loss` among them."""
 
+    @onednn_products()
     def turn(self) -> dict[str, float]:
         """One pass over the training rows; returns the mean of its losses, and the
         held-out ones."""

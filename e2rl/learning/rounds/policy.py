@@ -22,6 +22,7 @@ from e2rl.planners.actor import ActorEgo
 from e2rl.planners.ego import Ego
 from e2rl.planners.evader import Evasions
 from e2rl.run.config import configured, setting, settings_of
+from e2rl.run.cpu import onednn_products
 from e2rl.run.errors import InputError
 from e2rl.run.terminal import Bar
 from e2rl.scenes.scene import SceneSet
@@ -135,6 +136,7 @@ class PolicyImprovement(Improvement):
         )
         self._batches = iter(self._collector)
 
+    @onednn_products()
     def __call__(
         self,
         pool: TrafficPool,
