@@ -30,7 +30,8 @@ def searched_rollouts(bench: Bench) -> Iterator[Row]:
     count = len(tries)
 
     def plain() -> None:
-        for _, traffic, tasks in spending(setup, method, only).batches(tries):
+        search = spending(setup, method, only)
+        for _, traffic, tasks in map(search.batch, search.portions(tries)):
             setup.score(traffic, tasks)
 
     spent = (

@@ -27,6 +27,7 @@ class Batch(NamedTuple):
 
 
 Job = tuple[str, Batch]  # a batch with its name
+Result = tuple[list, list, list]  # rows, samples and errors of a batch
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Work:
         only: positions of the scenes to drive in (None: all), with unchanged noise.
         parts: the batches that are on disk.
         shard: (k, n), only every n-th batch from the k-th on; a search has one shard.
-        watch: called with what each batch scored, in their order.
+        watch: called with what each batch scored.
     """
 
     into: Path | None = None
@@ -134,36 +135,50 @@ def score_all(
     """
     first = {batch.setup.ego_name: name for name, batch in reversed(jobs)}
     opening = set(first.values()) if begins else set()
-    into = work.into
-    parts = work.parts
-
-    def result_of(job: Job) -> tuple[list, list, list]:
-        name, (setup, method, tasks) = job
-        identity = [
-            setup.ego_name,
-            method.name,
-            float(method.eta),
-            [list(task) for task in tasks],
-        ]
-
-        def score() -> tuple[list, list, list]:
-            scored = setup.score(method, tasks, folder=into, begins=name in opening)
-            return scored.rows, scored.samples, scored.errored
-
-        return parts.result(name, identity, score, valid=partial(has_files, into))
-
-    for rows, samples, errored in in_processes(
-        result_of,
+    for result in in_processes(
+        lambda job: scored_batch(*job, work, begins=job[0] in opening),
         jobs,
         processes=work.processes,
         cost=cost,
         ended=ended,
     ):
-        scored = Scored(rows, samples, errored=errored)
-        scored.rows += map(errored_row, scored.errored)
-        scored.samples += [NO_SAMPLES] * len(scored.errored)
-        work.watch(scored)
-        yield scored
+        yield with_errored(result, work)
+
+
+def scored_batch(name: str, batch: Batch, work: Work, begins: bool) -> Result:
+    """Returns what a batch scores, read where it is on disk.
+
+    Args:
+        name: of its part.
+        batch: that is driven.
+        work: how.
+        begins: its ego begins the run with it.
+    """
+    setup, method, tasks = batch
+    identity = [
+        setup.ego_name,
+        method.name,
+        float(method.eta),
+        [list(task) for task in tasks],
+    ]
+
+    def score() -> Result:
+        scored = setup.score(method, tasks, folder=work.into, begins=begins)
+        return scored.rows, scored.samples, scored.errored
+
+    valid = partial(has_files, work.into)
+    return work.parts.result(name, identity, score, valid=valid)
+
+
+def with_errored(result: Result, work: Work) -> Scored:
+    """Returns a `scored_batch` with a row for each rollout that errored, of which
+    `work.watch` is told."""
+    rows, samples, errored = result
+    scored = Scored(rows, samples, errored=errored)
+    scored.rows += map(errored_row, scored.errored)
+    scored.samples += [NO_SAMPLES] * len(scored.errored)
+    work.watch(scored)
+    return scored
 
 
 def has_files(into: Path | None, result: tuple[list, list, list]) -> bool:

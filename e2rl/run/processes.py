@@ -11,11 +11,12 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from heapq import heappop, heappush
 from multiprocessing.queues import SimpleQueue
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 
@@ -27,7 +28,7 @@ PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-_work: Callable[[int], bytes]  # of a forked worker, which has it without its being sent
+_work: Callable[[Any], bytes]  # of a forked worker, which has it without its being sent
 
 
 def cores() -> int:
@@ -61,34 +62,103 @@ def in_processes(
     Raises:
         InputError: where a process was killed.
     """
-    if min(processes, len(jobs)) <= 1:
-        for job in jobs:
-            result = function(job)
-            ended(job)
-            yield result
+    early: dict[int, Result] = {}
+    coming = 0
+
+    def numbered(number: int) -> Result:
+        return function(jobs[number])
+
+    with workers(numbered, min(processes, len(jobs))) as crew:
+        for number, job in enumerate(jobs):
+            crew.submit(number, cost(job))
+        for _ in jobs:
+            number, result = crew.result()
+            ended(jobs[number])
+            early[number] = result
+            while coming in early:
+                yield early.pop(coming)
+                coming += 1
+
+
+class Workers(Generic[Job, Result]):
+    """Do jobs beside each other, and hand out results as they come.
+
+    Args:
+        function: of a job.
+        pool: of processes that have the function; None: jobs are done here, in their
+            order.
+        processes: of the pool.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Job], Result],
+        pool: ProcessPoolExecutor | None,
+        processes: int,
+    ) -> None:
+        self._function = function
+        self._pool = pool
+        self._processes = processes
+        self._waiting: list[tuple[float, int, Job]] = []
+        self._running: dict[Future[bytes], int] = {}
+        self._count = 0
+
+    def submit(self, job: Job, cost: float) -> int:
+        """Returns the number of a job, which waits for those of greater cost."""
+        number = self._count
+        self._count += 1
+        heappush(self._waiting, (0.0 if self._pool is None else -cost, number, job))
+        self._start()
+        return number
+
+    def result(self) -> tuple[int, Result]:
+        """Returns the number and the result of the next job that ends."""
+        if self._pool is None:
+            _, number, job = heappop(self._waiting)
+            return number, self._function(job)
+        future = next(as_completed(self._running))
+        number = self._running.pop(future)
+        self._start()
+        return number, torch.load(io.BytesIO(future.result()), weights_only=True)
+
+    def _start(self) -> None:
+        """Give the pool jobs while it has a process to spare: of those that still
+        wait, a later one may cost more."""
+        if self._pool is None:
+            return
+        while self._waiting and len(self._running) < self._processes:
+            _, number, job = heappop(self._waiting)
+            with interrupts_held():
+                self._running[self._pool.submit(_do, job)] = number
+
+
+@contextmanager
+def workers(
+    function: Callable[[Job], Result], processes: int
+) -> Iterator[Workers[Job, Result]]:
+    """Gives Workers: several forks of one thread each, which share what this process
+    has at the first job, or with one process this one.
+
+    Args:
+        function: returns tensors and plain values; its jobs are sent to the forks.
+        processes: that do jobs.
+
+    Raises:
+        InputError: where a process was killed.
+    """
+    if processes <= 1:
+        yield Workers(function, None, processes=1)
         return
 
-    def packed(number: int) -> bytes:
+    def packed(job: Job) -> bytes:
         # tensors sent directly would each hold a shared-memory file open
         buffer = io.BytesIO()
-        torch.save(function(jobs[number]), buffer)
+        torch.save(function(job), buffer)
         return buffer.getvalue()
 
-    order = sorted(range(len(jobs)), key=lambda number: -cost(jobs[number]))
-    early: dict[int, bytes] = {}
-    coming = 0
     try:
-        with worker_pool(min(processes, len(jobs)), "fork", _adopt, packed) as pool:
-            with interrupts_held():
-                futures = {pool.submit(_do, number): number for number in order}
-            for future in as_completed(futures):
-                number = futures.pop(future)  # or all results would stay in memory
-                early[number] = future.result()
-                ended(jobs[number])
-                while coming in early:
-                    buffer = io.BytesIO(early.pop(coming))
-                    yield torch.load(buffer, weights_only=True)
-                    coming += 1
+        with worker_pool(processes, "fork", _adopt, packed) as pool:
+            yield Workers(function, pool, processes)
     except BrokenProcessPool as error:
         raise InputError(
             f"processes={processes}: a process was killed, perhaps for lack of memory; "
@@ -96,13 +166,13 @@ def in_processes(
         ) from error
 
 
-def _adopt(work: Callable[[int], bytes]) -> None:
+def _adopt(work: Callable[[Any], bytes]) -> None:
     global _work
     _work = work
 
 
-def _do(number: int) -> bytes:
-    return _work(number)
+def _do(job: Any) -> bytes:
+    return _work(job)
 
 
 # --- pools

@@ -9,10 +9,19 @@ from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
+from typing import NamedTuple
 
 import torch
 
-from e2rl.driving.batches import HERE, Batch, Work, score_all, split_tasks
+from e2rl.driving.batches import (
+    HERE,
+    Batch,
+    Result,
+    Work,
+    scored_batch,
+    split_tasks,
+    with_errored,
+)
 from e2rl.driving.scored import Scored
 from e2rl.driving.setup import Method, Setup, Task
 from e2rl.metrics.atlas import cell_of
@@ -20,6 +29,7 @@ from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.margin import FARTHEST
 from e2rl.prior.prior import Prior
 from e2rl.run.errors import InputError
+from e2rl.run.processes import workers
 from e2rl.run.terminal import Bar
 from e2rl.search.search import Outcome, Search, SearchSettings
 from e2rl.search.tries import TRIES, Family, Try
@@ -56,6 +66,13 @@ class SearchMethod:
         )
 
 
+class Portion(NamedTuple):
+    """Tries of a round that are driven at once: rollouts of one family's traffic."""
+
+    family: str
+    tasks: list[Task]
+
+
 @dataclass
 class Spent:
     """What searches scored, and the lines of tries.csv, in their order."""
@@ -84,8 +101,8 @@ class Spending:
     budget: float
     unit: str
 
-    def rounds(self) -> Generator[list[Batch], Scored, Spent]:
-        """Yields the batches of each round, is sent what they scored, and returns what
+    def rounds(self) -> Generator[list[Portion], Scored, Spent]:
+        """Yields the portions of each round, is sent what they scored, and returns what
         was found within the budget.
 
         The scenes of a round have an order of its own, in which they take turns, so that
@@ -110,7 +127,7 @@ class Spending:
                     tries = account.affordable(attempts[len(outcomes) :], active)
                     if not tries:
                         return spent
-                    scored = yield self.batches(tries)
+                    scored = yield self.portions(tries)
                     charged = self.charge(tries, scored, account, spent, active)
                     outcomes += charged
                     if len(charged) < len(tries) or self.untimed(spent):
@@ -121,10 +138,10 @@ class Spending:
                     break
         return spent
 
-    def batches(self, tries: Sequence[Try]) -> list[Batch]:
-        """Returns the batches of tries: of one traffic method each, those of a scene
-        together."""
-        by_traffic: dict[int, list[tuple[Method, Task]]] = {}
+    def portions(self, tries: Sequence[Try]) -> list[Portion]:
+        """Returns tries by what is driven at once: of one traffic method each, those of
+        a scene together."""
+        by_traffic: dict[int, list[tuple[str, Task]]] = {}
         for attempt in sorted(tries, key=lambda attempt: attempt[:2]):
             traffic = self.method.traffic[attempt.family]
             task = Task(
@@ -133,14 +150,26 @@ class Spending:
                 noise=attempt.seed,
                 decisions=attempt.decisions,
             )
-            by_traffic.setdefault(id(traffic), []).append((traffic, task))
-        batches = []
-        for pairs in by_traffic.values():
-            method = replace(pairs[0][0], name=self.method.name)
-            tasks = [task for _, task in pairs]
-            for part in split_tasks(tasks, self.setup.batch):
-                batches.append(Batch(self.setup, method, part))
-        return batches
+            by_traffic.setdefault(id(traffic), []).append((attempt.family, task))
+        return [
+            Portion(pairs[0][0], part)
+            for pairs in by_traffic.values()
+            for part in split_tasks([task for _, task in pairs], self.setup.batch)
+        ]
+
+    def batch(self, portion: Portion) -> Batch:
+        """Returns a portion as it is driven."""
+        method = replace(self.method.traffic[portion.family], name=self.method.name)
+        return Batch(self.setup, method, portion.tasks)
+
+    def cost(self, portion: Portion) -> float:
+        """Returns about what a portion takes beside others: its NFE."""
+        (nfe,) = (
+            family.nfe
+            for family in self.method.families
+            if family.name == portion.family
+        )
+        return len(portion.tasks) * max(nfe, 1)
 
     def charge(
         self,
@@ -296,38 +325,65 @@ def search_all(
     return result
 
 
+class Drive(NamedTuple):
+    """A portion of the round of a search, as a process is sent it.
+
+    Args:
+        name: of its part.
+        search: number of the search.
+        portion: that is driven.
+        begins: its ego begins the run with it.
+    """
+
+    name: str
+    search: int
+    portion: Portion
+    begins: bool
+
+
 def spend_together(searches: Sequence[Spending], work: Work = HERE) -> list[Spent]:
-    """Returns what each search finds. Their rounds are driven together, so that none
-    waits for another."""
+    """Returns what each search finds. Their rounds are driven beside each other, each
+    as soon as the search has the results of the one before."""
     results = [Spent() for _ in searches]
-    running = {number: search.rounds() for number, search in enumerate(searches)}
-    driven = dict.fromkeys(running, 0)  # tries of each search
-    rounds = {number: next(search) for number, search in running.items()}
-    begins = True
-    while rounds:
-        jobs = [
-            (f"search-{number:03}/tries-{driven[number] + position:06}", batch)
-            for number, batches in rounds.items()
-            for position, batch in enumerate(batches)
-        ]
-        scored = score_all(
-            jobs,
-            work,
-            cost=lambda job: len(job[1].tasks),
-            begins=begins,
-        )
-        begins = False
-        following = {}
-        for number, batches in rounds.items():
-            driven[number] += sum(len(batch.tasks) for batch in batches)
+    running = [search.rounds() for search in searches]
+    driven = [0] * len(searches)  # tries of each search
+    rounds: list[list[Scored | None]] = [[] for _ in searches]  # None: to come
+    places: dict[int, tuple[int, int]] = {}  # of each job, its search and place
+    egos: set[str] = set()  # that have begun
+
+    def drive(job: Drive) -> Result:
+        batch = searches[job.search].batch(job.portion)
+        return scored_batch(job.name, batch, work, begins=job.begins)
+
+    with workers(drive, work.processes) as crew:
+
+        def send(number: int, portions: Sequence[Portion]) -> None:
+            search = searches[number]
+            rounds[number] = [None] * len(portions)
+            for place, portion in enumerate(portions):
+                ego = search.setup.ego_name
+                name = f"search-{number:03}/tries-{driven[number] + place:06}"
+                job = Drive(name, number, portion, begins=ego not in egos)
+                egos.add(ego)
+                places[crew.submit(job, search.cost(portion))] = number, place
+            driven[number] += sum(len(portion.tasks) for portion in portions)
+
+        for number, search in enumerate(running):
+            send(number, next(search))
+        while places:
+            ticket, result = crew.result()
+            number, place = places.pop(ticket)
+            rounds[number][place] = with_errored(result, work)
+            scored = [part for part in rounds[number] if part is not None]
+            if len(scored) < len(rounds[number]):
+                continue
             total = Scored()
-            for _ in batches:
-                total.add(next(scored))
+            for part in scored:
+                total.add(part)
             try:
-                following[number] = running[number].send(total)
+                send(number, running[number].send(total))
             except StopIteration as end:
                 results[number] = end.value
-        rounds = following
     return results
 
 

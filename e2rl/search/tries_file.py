@@ -95,7 +95,7 @@ def failures_of(
         scene = setup.scenes.index(scene_id)
         drawn = families[family].draw(scene, number, seed=search.seed_of(scene))
         tries.setdefault(seed, []).append(drawn)
-    batches = []
+    batches: list[Batch] = []
     for seed, drawn_tries in tries.items():
         spending = Spending(
             setup,
@@ -105,5 +105,5 @@ def failures_of(
             budget=0.0,
             unit="tries",
         )
-        batches += spending.batches(drawn_tries)
+        batches += map(spending.batch, spending.portions(drawn_tries))
     return batches
