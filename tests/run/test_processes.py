@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from e2rl.run.errors import InputError
-from e2rl.run.processes import in_processes
+from e2rl.run.processes import in_processes, workers
 
 
 def square(job):
@@ -53,6 +53,32 @@ def test_jobs_are_reported_when_they_end_not_when_their_turn_comes():
         == reported[-2:]
         == [1, 2]
     )
+
+
+def test_jobs_that_come_later_are_done_while_another_lasts():
+    """The first job lingers in one process; the other does those that follow."""
+    with workers(linger, 2) as crew:
+        crew.submit(0, cost=1.0)
+        for job in (1, 2, 3):
+            number = crew.submit(job, cost=1.0)
+            assert crew.result() == (number, job)
+        assert crew.result() == (0, 0)
+
+
+def begun(job):
+    began = time.monotonic()
+    time.sleep(0.3)
+    return began
+
+
+def test_jobs_of_greatest_cost_begin_first():
+    with workers(begun, 2) as crew:
+        costs = [5.0, 4.0, 1.0, 2.0, 3.0]  # the first two begin at once
+        numbers = {crew.submit(0, cost): cost for cost in costs}
+        began = dict(crew.result() for _ in costs)
+    order = sorted(numbers, key=began.__getitem__)
+    assert {numbers[number] for number in order[2:4]} == {3.0, 2.0}
+    assert numbers[order[4]] == 1.0
 
 
 def refuse(job):

@@ -161,6 +161,18 @@ def test_processes_change_nothing(setup, plan, whole):
     assert timeless(forked.tries) == timeless(whole[0].tries)
 
 
+def test_a_search_beside_another_finds_what_it_finds_alone(setup, plan, whole):
+    """The other has a third of the budget, so that its rounds end first."""
+    options = {"setup": setup, "method": plan, "scenes": range(3), "unit": "tries"}
+    other = Spending(seed=4, budget=1.4, **options)
+    same = Spending(seed=3, budget=4.0, **options)
+    (alone,) = spend_together([other])
+    for processes in (1, 2):
+        spent, beside = spend_together([same, other], Work(processes=processes))
+        assert timeless(spent.tries) == timeless(whole[0].tries)
+        assert timeless(beside.tries) == timeless(alone.tries)
+
+
 def test_a_search_goes_on_where_it_was_killed(setup, plan, whole):
     spent, parts = whole
     files = sorted(parts.folder.rglob("tries-*.pt"))
