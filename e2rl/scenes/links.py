@@ -195,14 +195,10 @@ def adjacent(
     """
     repairs: Counter[str] = Counter()
     angle = {name: tangent_angle(line) for name, line in lines.items()}
+    sampled = {name: _sampled(line, angle[name]) for name, line in lines.items()}
 
     def lateral(name: str, other: str) -> float:
-        return _lateral(
-            lines[name],
-            angle[name],
-            lines[other],
-            angle[other],
-        )
+        return _lateral(sampled[name], lines[other], angle[other])
 
     def nearest(
         name: str,
@@ -242,20 +238,29 @@ def adjacent(
     return neighboured, +repairs
 
 
-def _lateral(
-    line: ndarray,
-    angle: ndarray,
-    other: ndarray,
-    other_angle: ndarray,
-) -> float:
-    """Median distance [m], left positive, of a line [Q, 2] beside a line [P, 2] with
-    points every 1 m; NaN where it runs nowhere beside it in the same direction."""
+class Sampled(NamedTuple):
+    """SAMPLES points of a line, evenly chosen: complex, with unit tangent and angle."""
+
+    point: ndarray
+    unit: ndarray
+    angle: ndarray
+
+
+def _sampled(line: ndarray, angle: ndarray) -> Sampled:
     rows = np.linspace(0, len(line) - 1, SAMPLES).round().astype(int)
-    point = line[rows] @ [1, 1j]
-    unit = np.exp(1j * angle[rows])
-    offset = (other @ [1, 1j] - point[:, None]) * unit.conj()[:, None]
+    return Sampled(line[rows] @ [1, 1j], np.exp(1j * angle[rows]), angle[rows])
+
+
+def _lateral(line: Sampled, other: ndarray, other_angle: ndarray) -> float:
+    """Median distance [m], left positive, of a line [Q, 2] with points every 1 m beside
+    another; NaN where it runs nowhere beside it in the same direction."""
+    offset = (other @ [1, 1j] - line.point[:, None]) * line.unit.conj()[:, None]
     nearest = np.abs(offset).argmin(1)
-    offset = offset[np.arange(len(rows)), nearest]
-    parallel = np.abs(wrap(other_angle[nearest] - angle[rows])) < PARALLEL
+    offset = offset[np.arange(SAMPLES), nearest]
+    parallel = np.abs(wrap(other_angle[nearest] - line.angle)) < PARALLEL
     beside = (np.abs(offset.real) < LEVEL_WITH) & parallel
-    return float(np.median(offset.imag[beside])) if beside.any() else np.nan
+    if not beside.any():
+        return np.nan
+    apart = np.sort(offset.imag[beside])
+    middle = len(apart) // 2  # `np.median` takes ten times as long of so few
+    return float((apart[middle] + apart[-1 - middle]) / 2)

@@ -81,13 +81,24 @@ def resample(points: ndarray, spacing: float) -> ndarray:
 
 def tangent_angle(points: ndarray) -> ndarray:
     """Direction [P] rad of a polyline [P, 2] at its points."""
-    x, y = np.gradient(points, axis=0).T
+    x, y = _tangent(points).T
     return np.arctan2(y, x)
+
+
+def _tangent(points: ndarray) -> ndarray:
+    """`np.gradient(points, axis=0)` of points [P, 2], which takes four times as long of
+    few."""
+    tangent = np.empty(points.shape)
+    np.subtract(points[2:], points[:-2], out=tangent[1:-1])
+    tangent[1:-1] /= 2
+    tangent[0] = points[1] - points[0]
+    tangent[-1] = points[-1] - points[-2]
+    return tangent
 
 
 def shift_left(points: ndarray, distance: ndarray | float) -> ndarray:
     """Polyline [P, 2] shifted `distance` m (scalar or [P]) to its left."""
-    tangent = np.gradient(points, axis=0)
+    tangent = _tangent(points)
     tangent /= np.maximum(
         np.linalg.norm(
             tangent,

@@ -8,6 +8,7 @@ elements of any address: an array's type is one of a plain element, by its name.
 import pickle
 import pickletools
 import re
+from functools import lru_cache
 from io import BytesIO
 from typing import Any
 
@@ -28,11 +29,16 @@ class Element:
 
     def dtype(self) -> np.dtype:
         """Returns the type; raises ValueError for one of no plain element."""
-        if not ELEMENT.fullmatch(self.name):
-            raise ValueError(
-                f"holds arrays of other elements than numbers and text ({self.name})"
-            )
-        return np.dtype(self.name).newbyteorder(self.order)
+        return _plain_dtype(self.name, self.order)
+
+
+@lru_cache(256)  # a file has thousands of arrays of few types
+def _plain_dtype(name: str, order: str) -> np.dtype:
+    if not ELEMENT.fullmatch(name):
+        raise ValueError(
+            f"holds arrays of other elements than numbers and text ({name})"
+        )
+    return np.dtype(name).newbyteorder(order)  # type: ignore[arg-type]
 
 
 class Array(np.ndarray):

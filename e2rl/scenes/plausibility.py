@@ -419,8 +419,8 @@ def lane_spacing(graph: LaneGraph) -> float:
         others = graph.lane_of[other][beside]
         room = (width[lane] + width[others]) / 2
         adjoin = _adjoin(across, room, same=cosine[beside] > 0)
-        named = graph.named_beside.get(graph.ids[lane], ())
-        adjoin |= np.array([graph.ids[index] in named for index in others], bool)
+        if named := graph.named_beside.get(graph.ids[lane]):
+            adjoin |= np.array([graph.ids[index] in named for index in others], bool)
         if adjoin.any():
             nearest.append(across[adjoin].min())
     return _median(np.array(nearest))
