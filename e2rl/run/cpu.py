@@ -5,6 +5,7 @@ import ctypes
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 import torch
 
@@ -12,7 +13,7 @@ EXACT = 1 + 2**-12  # a float32 that bfloat16 rounds to 1
 # of glibc's mallopt(3)
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
-KEPT = 512 << 20  # bytes of freed memory that a process keeps, at most
+KEPT = 128 << 20  # bytes of freed memory that a process keeps, at most
 LARGE = 32 << 20  # bytes of an allocation that is given back at once
 
 
@@ -48,9 +49,21 @@ def onednn_products() -> Iterator[None]:
 def keep_memory() -> None:
     """Let glibc keep freed memory for the next tensor: Linux clears each page that it
     hands out again, which takes a sixth of a rollout's time."""
-    if not sys.platform.startswith("linux"):
-        return
-    library = ctypes.CDLL(None)
-    if hasattr(library, "mallopt"):
+    if library := _glibc():
         library.mallopt(M_TRIM_THRESHOLD, KEPT)
         library.mallopt(M_MMAP_THRESHOLD, LARGE)
+
+
+def release_memory() -> None:
+    """Give back what is kept, after much work or before a pause."""
+    if library := _glibc():
+        library.malloc_trim(0)
+
+
+@cache
+def _glibc() -> ctypes.CDLL | None:
+    """The C library, where it is glibc."""
+    if not sys.platform.startswith("linux"):
+        return None
+    library = ctypes.CDLL(None)
+    return library if hasattr(library, "malloc_trim") else None

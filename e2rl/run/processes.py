@@ -20,7 +20,7 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from e2rl.run.cpu import configure_cpu
+from e2rl.run.cpu import configure_cpu, release_memory
 from e2rl.run.errors import InputError
 from e2rl.run.guard import STARTED, kill_workers
 
@@ -154,6 +154,7 @@ def workers(
         # tensors sent directly would each hold a shared-memory file open
         buffer = io.BytesIO()
         torch.save(function(job), buffer)
+        release_memory()
         return buffer.getvalue()
 
     try:

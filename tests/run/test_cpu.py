@@ -2,11 +2,12 @@
 
 import ctypes
 import resource
+from pathlib import Path
 
 import pytest
 import torch
 
-from e2rl.run.cpu import configure_cpu, onednn_products
+from e2rl.run.cpu import configure_cpu, onednn_products, release_memory
 
 
 @pytest.fixture
@@ -44,15 +45,35 @@ def test_a_precision_that_somebody_chose_stays(precision):
     assert torch.get_float32_matmul_precision() == "high"
 
 
-@pytest.mark.skipif(
-    not hasattr(ctypes.CDLL(None), "mallopt"), reason="glibc's mallopt(3) is not there"
+glibc = pytest.mark.skipif(
+    not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="the C library is not glibc"
 )
+COUNT = 6  # tensors of 16 MiB, which together are less than is kept
+
+
+@glibc
 def test_freed_memory_is_used_again():
     configure_cpu(torch.get_num_threads())
     pages = []
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        tensors = [torch.ones(1 << 22) for _ in range(8)]  # of 16 MiB
+        tensors = [torch.ones(1 << 22) for _ in range(COUNT)]
         del tensors
         pages.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-    assert pages[-1] < 8 * (1 << 24) / resource.getpagesize() / 4
+    assert pages[-1] < COUNT * (1 << 24) / resource.getpagesize() / 4
+
+
+@glibc
+def test_what_is_kept_is_given_back_when_released():
+    configure_cpu(torch.get_num_threads())
+    tensors = [torch.ones(1 << 22) for _ in range(COUNT)]
+    del tensors
+    kept = resident()
+    release_memory()
+    assert kept - resident() > COUNT * (1 << 24) / 2
+
+
+def resident():
+    """Bytes of this process in memory."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
