@@ -58,8 +58,8 @@ def load_prior(
     """The frozen prior in a checkpoint file, and its origin.
 
     Args:
-        checkpoint: the file, or `bundled`: the one that comes with the package, trained
-            on the bundled scenes alone.
+        checkpoint: the file, the folder of the run that wrote it, or `bundled`: the one
+            that comes with the package, trained on the bundled scenes alone.
         sampler: how it samples (None: the configuration's default).
         bounds: of what is executed (None: the default).
         device: where it is put.
@@ -70,8 +70,16 @@ def load_prior(
     """
     path = Path(checkpoint)
     if checkpoint == BUNDLED:
-        folder = Path(str(files("e2rl") / "assets" / "prior"))
-        path = max(folder.glob("prior-*.safetensors"), default=path)
+        path = Path(str(files("e2rl") / "assets" / "prior"))
+    if path.is_dir():
+        priors = sorted(path.glob("prior-*.safetensors"))
+        if len(priors) != 1:
+            raise InputError(
+                f"prior.checkpoint={checkpoint}: a folder of {len(priors)} priors; give "
+                "the file of one, prior-....safetensors, or the folder of a run of "
+                "`python train.py stage=prior`"
+            )
+        (path,) = priors
     if not path.exists():
         raise InputError(
             f"prior.checkpoint={checkpoint}: no such file; train one with `python "

@@ -35,6 +35,15 @@ def test_a_saved_prior_comes_back(tmp_path):
     sorted((Path(e2rl.__file__).parent / "assets").rglob("*.safetensors")),
     ids=str,
 )
+def test_the_folder_of_one_prior_stands_for_it(tmp_path):
+    prior = small_prior()
+    path = save_prior(prior, tmp_path, {"data": "one"})
+    assert load_prior(str(tmp_path))[1] == load_prior(str(path))[1] == {"data": "one"}
+    path.with_name("prior-other.safetensors").write_bytes(path.read_bytes())
+    with pytest.raises(InputError, match="a folder of 2 priors; give the file of one"):
+        load_prior(str(tmp_path))
+
+
 def test_weights_that_come_with_the_package_carry_the_hash_of_what_they_are(
     tmp_path, path
 ):
