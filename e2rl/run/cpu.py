@@ -13,7 +13,7 @@ EXACT = 1 + 2**-12  # a float32 that bfloat16 rounds to 1
 # of glibc's mallopt(3)
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
-KEPT = 128 << 20  # bytes of freed memory that a process keeps, at most
+KEPT = 512 << 20  # bytes of freed memory that a process keeps, at most
 LARGE = 32 << 20  # bytes of an allocation that is given back at once
 
 
