@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import ClassVar
 from xml.parsers import expat
 
+from e2rl.run.cpu import release_memory
 from e2rl.run.errors import InputError
 from e2rl.run.files import (
     hash_files,
@@ -121,6 +122,7 @@ def bounded_memory(most: int = MAX_MEMORY) -> Iterator[None]:
     Raises InputError where it asks for more. Without effect where the system does not
     tell what a process has.
     """
+    release_memory()  # or the block could take what is kept besides
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])
     except OSError:

@@ -30,11 +30,6 @@ def test_a_saved_prior_comes_back(tmp_path):
     assert not back.training
 
 
-@pytest.mark.parametrize(
-    "path",
-    sorted((Path(e2rl.__file__).parent / "assets").rglob("*.safetensors")),
-    ids=str,
-)
 def test_the_folder_of_one_prior_stands_for_it(tmp_path):
     prior = small_prior()
     path = save_prior(prior, tmp_path, {"data": "one"})
@@ -44,6 +39,11 @@ def test_the_folder_of_one_prior_stands_for_it(tmp_path):
         load_prior(str(tmp_path))
 
 
+@pytest.mark.parametrize(
+    "path",
+    sorted((Path(e2rl.__file__).parent / "assets").rglob("*.safetensors")),
+    ids=str,
+)
 def test_weights_that_come_with_the_package_carry_the_hash_of_what_they_are(
     tmp_path, path
 ):
