@@ -262,5 +262,5 @@ def _lateral(line: Sampled, other: ndarray, other_angle: ndarray) -> float:
     if not beside.any():
         return np.nan
     apart = np.sort(offset.imag[beside])
-    middle = len(apart) // 2  # `np.median` takes ten times as long of so few
+    middle = len(apart) // 2  # `np.median` takes eight times as long of so few
     return float((apart[middle] + apart[-1 - middle]) / 2)

@@ -86,7 +86,7 @@ def tangent_angle(points: ndarray) -> ndarray:
 
 
 def _tangent(points: ndarray) -> ndarray:
-    """`np.gradient(points, axis=0)` of points [P, 2], which takes four times as long of
+    """`np.gradient(points, axis=0)` of points [P, 2], which takes twice as long or more of
     few."""
     tangent = np.empty(points.shape)
     np.subtract(points[2:], points[:-2], out=tangent[1:-1])
