@@ -3,6 +3,7 @@ biases and values."""
 
 import math
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, cast
@@ -14,8 +15,11 @@ from e2rl.prior.features import EDGE, NODE
 from e2rl.prior.lane_relative import SIZE
 from e2rl.prior.sde import NoiseSchedule
 from e2rl.run.config import configured, setting
+from e2rl.run.cpu import onednn_products
 from e2rl.run.errors import InputError
 from e2rl.run.fused import Fused, is_on
+
+MANY = 256  # vehicles of a batch, absent ones included
 
 
 @configured("prior/default", "network")
@@ -197,12 +201,13 @@ class Denoiser(nn.Module):
         presence [B, V]."""
         if self._learns() or not is_on():
             return self.encoding(nodes, pairs, present=present)
-        node, pair, *rest = fused_encoding(self.settings)(
-            nodes,
-            pairs,
-            present,
-            *self._read,
-        )
+        with _products_of(nodes):
+            node, pair, *rest = fused_encoding(self.settings)(
+                nodes,
+                pairs,
+                present,
+                *self._read,
+            )
         return Encoding(
             node,
             pair,
@@ -253,15 +258,16 @@ class Denoiser(nn.Module):
             or (torch.is_grad_enabled() and x.requires_grad)
         ):
             return self.estimate(x, level, encoding=encoding)
-        return fused_estimate(self.settings)(
-            x,
-            level,
-            encoding.nodes,
-            encoding.pairs,
-            *encoding.biases,
-            *encoding.modulations,
-            *self._read,
-        )
+        with _products_of(x):
+            return fused_estimate(self.settings)(
+                x,
+                level,
+                encoding.nodes,
+                encoding.pairs,
+                *encoding.biases,
+                *encoding.modulations,
+                *self._read,
+            )
 
     def _learns(self) -> bool:
         """Whether dropout acts, or gradients by the weights are wanted: fused functions
@@ -290,6 +296,12 @@ class Denoiser(nn.Module):
         alpha = self.schedule.alpha(level)[..., None]
         sigma = self.schedule.sigma(level)[..., None]
         return alpha * x + sigma * self.head(h).to(x.dtype)
+
+
+def _products_of(values: Tensor) -> AbstractContextManager[None]:
+    """The library of the products of a batch [B, V, ...]: oneDNN where it is large, as
+    a replan's steps soon earn the time of new sizes."""
+    return onednn_products() if values.shape[:2].numel() >= MANY else nullcontext()
 
 
 class _Module(nn.Module):

@@ -26,22 +26,34 @@ def configure_cpu(threads: int) -> None:
 @contextmanager
 def onednn_products() -> Iterator[None]:
     """Let products of float32 matrices in the block be oneDNN's, where it keeps their
-    precision: for products of few sizes, as each new one takes it half a millisecond.
+    precision: for large products of few sizes, as each new one takes it half a
+    millisecond.
 
     With AVX-512 on AMD, MKL takes more than twice as long. PyTorch hands float32
     products to oneDNN where it may round them to bfloat16; processors that do are left
     as they are, and machines with a GPU, whose products would be rounded.
     """
     before = torch.get_float32_matmul_precision()
-    if before != "highest" or torch.cuda.device_count() > 0:
+    if before != "highest" or not onednn_is_exact():
         yield
         return
     torch.set_float32_matmul_precision("medium")
-    numbers = torch.full((64, 64), EXACT)
-    if not torch.equal(numbers @ torch.eye(64), numbers):
-        torch.set_float32_matmul_precision(before)
     try:
         yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+@cache
+def onednn_is_exact() -> bool:
+    """Returns whether products of float32 stay so where they may be rounded."""
+    if torch.cuda.device_count() > 0:
+        return False
+    before = torch.get_float32_matmul_precision()
+    numbers = torch.full((64, 64), EXACT)
+    torch.set_float32_matmul_precision("medium")
+    try:
+        return torch.equal(numbers @ torch.eye(64), numbers)
     finally:
         torch.set_float32_matmul_precision(before)
 

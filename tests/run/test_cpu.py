@@ -7,14 +7,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from e2rl.run.cpu import configure_cpu, onednn_products, release_memory
+from e2rl.run.cpu import (
+    configure_cpu,
+    onednn_is_exact,
+    onednn_products,
+    release_memory,
+)
 
 
 @pytest.fixture
 def precision():
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
+    onednn_is_exact.cache_clear()
     yield
+    onednn_is_exact.cache_clear()
     torch.set_float32_matmul_precision(before)
 
 
