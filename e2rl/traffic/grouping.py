@@ -6,8 +6,9 @@ size are planned together. Vehicles and other agents fill their rows from the fr
 a group is cropped by slicing.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from itertools import pairwise
 from typing import Any, TypeVar, cast
 
 import torch
@@ -93,11 +94,8 @@ def noise_of(
     return torch.cat(rows).to(seed.device)
 
 
-# Vehicle rows of a group: SHRUNK applies from FULL_ROWS on.
-FULL_ROWS = 160
-MOST_ROWS = 1024
-# A scene of at most this fraction of the group's largest scene starts a new group.
-SHRUNK = 0.55
+OVERHEAD = 100  # vehicle rows that take as long as what a group takes besides its rows
+MOST_ROWS = 1024  # vehicle rows of a group of several scenes
 # Keys of a scene with a row for each agent.
 OF_ALL = {
     "size",
@@ -149,8 +147,7 @@ class Group:
 
 
 def group_scenes(world: World) -> list[Group]:
-    """The scenes of a batch in groups by vehicles in use (see FULL_ROWS and SHRUNK;
-    one scene at least)."""
+    """The scenes of a batch in groups by vehicles in use."""
     width = world.scene["route_log"].shape[1]
     used = world.valid | world.scene["valid"]
     position = torch.arange(1, used.shape[1] + 1, device=used.device)
@@ -160,21 +157,40 @@ def group_scenes(world: World) -> list[Group]:
         others = (used[:, width:] * position[: used.shape[1] - width]).amax(1)
     order = vehicles.argsort(descending=True, stable=True)
     sizes = vehicles[order].tolist()
-    begin = 0
-    groups = []
+    ends = group_ends(sizes)
+    return [
+        Group(
+            order[begin:end], sizes[begin], others=int(others[order[begin:end]].max())
+        )
+        for begin, end in pairwise([0, *ends])
+    ]
+
+
+def group_ends(sizes: Sequence[int]) -> list[int]:
+    """Returns where groups of consecutive scenes end, such that together they take the
+    least time: each OVERHEAD, and its rows, those of padding included.
+
+    Args:
+        sizes: vehicles of each scene, the largest first.
+    """
+    least = [0]  # time of the first scenes
+    begins = [0]  # of the last group of these
     for end in range(1, len(sizes) + 1):
-        size = sizes[begin]
-        filled = sizes[begin] * (end - begin)
-        if (
-            end < len(sizes)
-            and filled + size <= MOST_ROWS
-            and (filled < FULL_ROWS or sizes[end] > SHRUNK * size)
-        ):
-            continue
-        rows = order[begin:end]
-        groups.append(Group(rows, size, others=int(others[rows].max())))
-        begin = end
-    return groups
+        times = {}
+        for begin in reversed(range(end)):
+            rows = sizes[begin] * (end - begin)
+            if times and rows > MOST_ROWS:
+                break
+            times[begin] = least[begin] + OVERHEAD + rows
+        begin = min(times, key=times.__getitem__)
+        least.append(times[begin])
+        begins.append(begin)
+    ends = []
+    end = len(sizes)
+    while end:
+        ends.append(end)
+        end = begins[end]
+    return ends[::-1]
 
 
 class SceneRows:

@@ -1,16 +1,19 @@
 """Rows and groups of nested states, and noise that depends on a scene's seed alone."""
 
+from itertools import chain, combinations, pairwise
+
+import pytest
 import torch
 from tensordict import TensorDict
 
 from e2rl.prior.lane_relative import LaneState
 from e2rl.sim.world import World
 from e2rl.traffic.grouping import (
-    FULL_ROWS,
     MOST_ROWS,
-    SHRUNK,
+    OVERHEAD,
     clone,
     crop_state,
+    group_ends,
     group_scenes,
     noise_of,
     put_rows,
@@ -40,7 +43,7 @@ def sized(counts, others=0):
     )
 
 
-def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_than_half():
+def test_every_scene_is_in_one_group_that_holds_its_vehicles():
     counts = torch.randint(
         1, WIDTH + 1, (200,), generator=torch.Generator().manual_seed(0)
     ).tolist()
@@ -54,7 +57,23 @@ def test_every_scene_is_in_one_group_that_holds_its_vehicles_and_wastes_less_tha
         assert group.vehicles == max(here)
         assert group.others == 3
         assert rows <= MOST_ROWS
-        assert min(here) > SHRUNK * group.vehicles or rows < 2 * FULL_ROWS
+
+
+def seconds(sizes, ends):
+    """Of groups that end so."""
+    return sum(
+        OVERHEAD + sizes[begin] * (end - begin) for begin, end in pairwise([0, *ends])
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_other_groups_take_less_time(seed):
+    generator = torch.Generator().manual_seed(seed)
+    sizes = torch.randint(1, 60, (9,), generator=generator).sort(descending=True)[0]
+    sizes = sizes.tolist()
+    cuts = chain.from_iterable(combinations(range(1, 9), count) for count in range(9))
+    least = min(seconds(sizes, [*inner, 9]) for inner in cuts)
+    assert seconds(sizes, group_ends(sizes)) == least
 
 
 def test_what_changes_in_a_crop_arrives_where_it_belongs_and_nothing_else_changes():
