@@ -38,7 +38,8 @@ SHIFTS = (0.0, 1.5, -1.5, 3.5, -3.5, 2.5, -2.5)  # m beside the mission
 FIRST_SHIFTS = 3  # of SHIFTS, tried before the other routes
 RAMP = 3  # knots that a shift takes
 TARGETS = 8  # lateral targets a profile is tried on
-CHUNK = 8  # rollouts searched at once: bounds the memory
+CHUNK = 8  # rollouts searched at once
+STEPS = 1 << 17  # of manoeuvres executed at once: bounds the memory
 CLEARANCE = 0.05  # m to others that an evasion leaves
 ROAD_MARGIN = 0.5  # m inside the drivable border (1 m beyond the lanes), of its centre
 SAMPLES = 192  # of a round of the strategy
@@ -258,6 +259,13 @@ def grid(driven: Tensor, route_valid: Tensor, mission: Tensor) -> Knots:
 
 def executed(scene: EvasionScene, knots: Knots, sim: SimSettings) -> Trials:
     """The manoeuvres of these knots, executed and judged."""
+    count = max(1, STEPS // scene.inside.numel())
+    parts = [execute_part(scene, part, sim) for part in knots.split(count, 1)]
+    return Trials.cat(parts, 1)
+
+
+def execute_part(scene: EvasionScene, knots: Knots, sim: SimSettings) -> Trials:
+    """`executed` of a part of the manoeuvres."""
     row = torch.arange(len(scene))[:, None]
     start = scene.start[:, None].expand(*knots.batch_size, 4)
     actions, states = execute(

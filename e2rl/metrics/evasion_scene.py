@@ -12,7 +12,7 @@ from e2rl.scenes.route import BEHIND, project, project_track
 from e2rl.sim.dynamics import midpoints
 from e2rl.sim.mission import mission_of
 
-PAIRS = 8_000_000  # boxes compared at once: bounds the memory
+PAIRS = 1_000_000  # boxes compared at once: bounds the memory
 AWAY = 1e6  # m, position of absent agents
 
 

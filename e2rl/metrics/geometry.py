@@ -6,6 +6,8 @@ A box is a state (x, y, heading, speed) and a size (length, width); leading dime
 broadcast. Use float64 where an overlap of 1e-6 m2 decides.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -19,6 +21,7 @@ EDGES = (
     "right",
     "front",
 )  # edge i runs from corner i to corner i + 1 of scenes.boxes.corners
+PART = 1 << 16  # pairs
 MIN_AREA = 1e-6  # m2: a smaller overlap is the rounding of float32 positions
 
 
@@ -176,19 +179,22 @@ def ragged(counts: Tensor) -> tuple[Tensor, Tensor]:
     return group, torch.arange(len(group), device=counts.device) - start[group]
 
 
-def candidates(
+def pairs_where(
+    holds: Callable[[Tensor, Tensor], Tensor],
     points: Tensor,
     point_group: Tensor,
+    *,
     low: Tensor,
     high: Tensor,
     item_group: Tensor,
     cell: float,
 ) -> tuple[Tensor, Tensor]:
-    """Pairs (point index, item index) of the same group that share a cell.
-
-    Every point inside an item's bounds is among the pairs; each pair occurs once.
+    """Pairs (point index, item index) of which something holds: of those of the same
+    group that share a cell, among which is every point inside an item's bounds. About
+    PART pairs are looked at at once.
 
     Args:
+        holds: of indices (point, item), each [k], says whether [k] bool.
         points: [n, D] m.
         point_group: [n] int64 >= 0.
         low, high: [m, D] m, bounds of the items.
@@ -216,21 +222,26 @@ def candidates(
         torch.stack(covered, -1),
         extent=extent,
     ).sort()
+    item = item[order]
     point_key = cell_key(
         point_group,
         cells,
         extent=extent,
     )
     begin = torch.searchsorted(item_key, point_key)
-    point, index = ragged(
-        torch.searchsorted(
-            item_key,
-            point_key,
-            right=True,
-        )
-        - begin
-    )
-    return point, item[order[begin[point] + index]]
+    count = torch.searchsorted(item_key, point_key, right=True) - begin
+    part = (count.cumsum(0) // PART).unique_consecutive(return_counts=True)[1]
+    pairs = []
+    start = 0
+    for size in part.tolist():
+        point, index = ragged(count[start : start + size])
+        point = point + start
+        candidate = item[begin[point] + index]
+        is_pair = holds(point, candidate)
+        pairs.append((point[is_pair], candidate[is_pair]))
+        start += size
+    point, item = map(torch.cat, zip(*pairs, strict=True))
+    return point, item
 
 
 def cell_key(group: Tensor, cells: Tensor, extent: Tensor) -> Tensor:

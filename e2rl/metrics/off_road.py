@@ -13,11 +13,11 @@ from torch import Tensor
 
 from e2rl.metrics.catalogue import Batch, columns, event, rate
 from e2rl.metrics.contact import steps_until
-from e2rl.metrics.geometry import candidates, from_segment
+from e2rl.metrics.geometry import from_segment, pairs_where
 from e2rl.scenes.drivable_area import SEAM
 
 MARGIN = 1.0  # m beyond half the lane width
-CELL = 8.0  # m, grid of segments
+CELL = 4.0  # m, grid of segments
 ROW = 4.0  # m, rows of the polygons' edges
 
 
@@ -85,7 +85,18 @@ def near_segments(
     """Indices (point, segment) of all pairs of a rollout that are at most reach m (a
     number, or [m] of each segment) apart."""
     reach = torch.as_tensor(reach, dtype=points.xy.dtype).expand(len(segments.line))
-    point, segment = candidates(
+
+    def is_near(point: Tensor, segment: Tensor) -> Tensor:
+        start, end = segments.ends[segment].unbind(1)
+        offset = from_segment(
+            points.xy[point],
+            start,
+            along=end - start,
+        )
+        return offset.square().sum(-1) <= reach[segment].square()
+
+    return pairs_where(
+        is_near,
         points.xy,
         points.rollout,
         low=segments.ends.amin(1) - reach[:, None],
@@ -93,14 +104,6 @@ def near_segments(
         item_group=segments.rollout,
         cell=CELL,
     )
-    start, end = segments.ends[segment].unbind(1)
-    offset = from_segment(
-        points.xy[point],
-        start,
-        along=end - start,
-    )
-    near = offset.square().sum(-1) <= reach[segment].square()
-    return point[near], segment[near]
 
 
 def near_lane(points: Points, batch: Batch, margin: float = MARGIN) -> Tensor:
@@ -115,7 +118,18 @@ def inside_polygon(points: Points, polygons: Segments) -> Tensor:
     """Bool [n]: points inside a polygon, by the parity of edges crossed on a ray
     towards +x; polygons may overlap."""
     height = polygons.ends[..., 1]
-    point, edge = candidates(
+
+    def is_crossed(point: Tensor, edge: Tensor) -> Tensor:
+        x, y = points.xy[point].unbind(-1)
+        begin, end = polygons.ends[edge].unbind(1)
+        x0, y0 = begin.unbind(-1)
+        x1, y1 = end.unbind(-1)
+        straddles = (y0 > y) != (y1 > y)
+        rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
+        return straddles & (x < x0 + (y - y0) / rise * (x1 - x0))
+
+    point, edge = pairs_where(
+        is_crossed,
         points.xy[:, 1:],
         points.rollout,
         low=height.amin(1)[:, None],
@@ -123,14 +137,7 @@ def inside_polygon(points: Points, polygons: Segments) -> Tensor:
         item_group=polygons.rollout,
         cell=ROW,
     )
-    x, y = points.xy[point].unbind(-1)
-    begin, end = polygons.ends[edge].unbind(1)
-    x0, y0 = begin.unbind(-1)
-    x1, y1 = end.unbind(-1)
-    straddles = (y0 > y) != (y1 > y)
-    rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
-    crossed = straddles & (x < x0 + (y - y0) / rise * (x1 - x0))
-    pairs = torch.stack([point, polygons.line[edge]], 1)[crossed]
+    pairs = torch.stack([point, polygons.line[edge]], 1)
     pairs, count = pairs.unique(dim=0, return_counts=True)
     return is_among(pairs[count % 2 == 1, 0], points)
 

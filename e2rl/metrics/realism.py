@@ -28,7 +28,7 @@ NO_SAMPLES = {
 W1 = tuple(f"w1_{name}" for name in KINEMATICS)
 BLOCK = round(0.5 / DT)  # steps
 MOVING = 0.5  # m/s
-COLUMNS = 8192  # sorted samples handled at once: bounds the memory of the bootstrap
+COLUMNS = 1024  # sorted samples handled at once: bounds the memory of the bootstrap
 Samples = dict[str, Tensor]
 
 _real = partial(Metric, decimals=3)

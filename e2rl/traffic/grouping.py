@@ -176,7 +176,7 @@ def group_ends(sizes: Sequence[int]) -> list[int]:
     least = [0]  # time of the first scenes
     begins = [0]  # of the last group of these
     for end in range(1, len(sizes) + 1):
-        times = {}
+        times = dict[int, int]()
         for begin in reversed(range(end)):
             rows = sizes[begin] * (end - begin)
             if times and rows > MOST_ROWS:

@@ -1,4 +1,5 @@
-"""Areas and edge parts of oriented boxes against shapely and closed forms."""
+"""Areas and edge parts of oriented boxes against shapely and closed forms; pairs of
+points and items against all pairs."""
 
 import math
 
@@ -6,11 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from e2rl.metrics import geometry
 from e2rl.metrics.geometry import (
     edge_distances,
     edge_parts_inside,
     overlap_area,
     pair_overlap,
+    pairs_where,
 )
 from e2rl.scenes.boxes import corners
 
@@ -85,3 +88,35 @@ def test_edge_parts_are_shapely_s():
         np.testing.assert_allclose(
             away[:, edge], shapely.distance(line, point), atol=1e-9
         )
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 10_000])
+def test_pairs_are_those_of_all_points_and_items(monkeypatch, at_once):
+    monkeypatch.setattr(geometry, "PART", at_once)
+    generator = torch.Generator().manual_seed(5)
+    points = 40 * torch.rand(60, 2, generator=generator)
+    group = torch.randint(3, (60,), generator=generator)
+    low = 40 * torch.rand(50, 2, generator=generator)
+    high = low + 9 * torch.rand(50, 2, generator=generator)
+    item_group = torch.randint(3, (50,), generator=generator)
+
+    def within(point, item):
+        inside = (points[point] >= low[item]) & (points[point] <= high[item])
+        return inside.all(-1)
+
+    pairs = pairs_where(
+        within,
+        points,
+        group,
+        low=low,
+        high=high,
+        item_group=item_group,
+        cell=4.0,
+    )
+    inside = (points[:, None] >= low) & (points[:, None] <= high)
+    expected = inside.all(-1) & (group[:, None] == item_group)
+    assert expected.sum() > 10
+    found = torch.zeros_like(expected)
+    found[pairs] = True
+    assert len(pairs[0]) == expected.sum()
+    assert torch.equal(found, expected)
