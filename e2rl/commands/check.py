@@ -15,6 +15,7 @@ from e2rl.evaluation.finding import Finding
 from e2rl.run.command import run_command
 from e2rl.run.endings import ending
 from e2rl.run.errors import InputError
+from e2rl.run.options import check_unused
 from e2rl.run.run import Run
 
 SIGNS = {True: "ok", False: "FAIL", None: "note"}
@@ -37,10 +38,7 @@ class Screen:
 
 def check(run: Run) -> None:
     """Print what is right and what is wrong; the status is 1 where anything is wrong."""
-    if run.config.reproduce:
-        raise InputError(
-            f"reproduce={run.config.reproduce}: a check is of a new run; leave it out"
-        )
+    check_unused(run.config, "e2rl check", ("resume", "reproduce", "failure"))
     from e2rl.evaluation.plan import ego_name
     from e2rl.evaluation.preflight import Preparation, run_findings
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from e2rl.driving.batches import WHOLE, drive_batches
+from e2rl.driving.batches import drive_batches
 from e2rl.evaluation.attack_set import ENDING, KEPT, AttackSet, kept, named
 from e2rl.evaluation.crossing import made_again, replays
 from e2rl.evaluation.plan import Evaluation, begin
@@ -27,6 +27,7 @@ from e2rl.report.tables import save_tables
 from e2rl.run.command import run_command
 from e2rl.run.config import check_choice
 from e2rl.run.errors import InputError
+from e2rl.run.options import check_unused
 from e2rl.run.parts import Parts
 from e2rl.run.run import Run
 from e2rl.sim.rollout_file import ROLLOUTS, file_stem
@@ -40,6 +41,7 @@ def cross(run: Run) -> None:
     """Find failures of each planner, drive every planner in all of them, and print how
     many are its own, too."""
     config = run.config
+    check_unused(config, "e2rl cross", ("reproduce", "failure", "shard", "compare"))
     if not config.egos:
         OmegaConf.update(config, "egos", config.planners, force_add=True)
     check_choice("keep", config.keep, choices=tuple(KEPT))
@@ -50,8 +52,6 @@ def cross(run: Run) -> None:
         )
     files = ", ".join(config.attacks)
     plan = begin(run, against=f"the attacks in {files}" if files else "")
-    if plan.settings.shard != WHOLE:
-        raise InputError("shard: attacks are not found in parts; leave it out")
     sets = named(read_sets(plan) if config.attacks else found_sets(plan))
     batches = replays(plan, sets)
     if config.again:

@@ -14,8 +14,7 @@ import sys
 from pathlib import Path
 
 from e2rl.evaluation.comparison import Driven, check_shared
-from e2rl.evaluation.rates import RATES_FILE
-from e2rl.evaluation.rollout_files import write_json
+from e2rl.evaluation.rollout_files import RATES_FILE, write_json
 from e2rl.report.answer import errored_lines, touched_lines
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED, judged, junit
 from e2rl.report.rate_gate import judged_rate, rates_of_run

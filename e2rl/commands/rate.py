@@ -18,6 +18,7 @@ from e2rl.report.tables import save_tables
 from e2rl.run.command import run_command
 from e2rl.run.config import resolved, settings_of
 from e2rl.run.errors import InputError
+from e2rl.run.options import check_unused
 from e2rl.run.run import Run
 from e2rl.tail.rate import Rating
 from e2rl.tail.settings import RateSettings
@@ -26,11 +27,13 @@ from e2rl.traffic.nominal import NominalTraffic
 
 TABLES_FILE = "rates.md"
 MAY_CHANGE = ("processes",)  # when a run is resumed
+UNUSED = ("reproduce", "failure", "shard", "budget", "compare")  # keys of evaluations
 
 
 def rate(run: Run) -> None:
     """Drive what is not on disk yet, write the rates, and print them."""
     config = run.config
+    check_unused(config, "e2rl rate", UNUSED)
     settings = settings_of(RateSettings, resolved(config.rate), where="rate")
     plan = begin(
         run,

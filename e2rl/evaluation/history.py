@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from e2rl.evaluation.comparison import OTHERS, Driven, check_shared
-from e2rl.evaluation.rates import RATES_FILE
+from e2rl.evaluation.rollout_files import RATES_FILE
 from e2rl.metrics.errored import lost, raised
 from e2rl.metrics.failure_modes import Row, is_failure
 from e2rl.run.errors import InputError

@@ -6,15 +6,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from e2rl.driving.scored import Scored
-from e2rl.evaluation.rollout_files import NUMBER, nans, read_json, write_json
+from e2rl.evaluation.rollout_files import (
+    NUMBER,
+    RATES_FILE,
+    nans,
+    read_json,
+    write_json,
+)
+from e2rl.metrics.statistics import cluster_index
 from e2rl.run.errors import InputError
 from e2rl.run.files import csv_text, misfit, write_atomically
 from e2rl.tail.interval import Bounds, Side, ratio_of_ratios
 from e2rl.tail.summary import SceneRate, as_json, rates_of, unresolved_in
 
-RATES_FILE = "rates.json"
 TAIL_FILE = "tail.csv"
 BOUNDS = {"value": NUMBER, "low": NUMBER, "high": NUMBER}
 SCENE = {
@@ -111,6 +118,11 @@ class EgoRates:
             for entry in entries
         ]
 
+    @property
+    def places(self) -> int:
+        """Where its scenes are."""
+        return place_of(self.scenes)[1]
+
     def side(self, event: str, scenes: Sequence[str]) -> Side:
         """Returns the estimates of an event in some scenes, and the km driven there.
         Raises InputError where these are not known."""
@@ -126,7 +138,8 @@ class EgoRates:
         return Side(
             [torch.tensor(row["repetitions"][event]).double() for row in rows],
             torch.tensor([row["km"] for row in rows], dtype=torch.float64),
-            self.unresolved,
+            place_of(rows)[0],
+            unresolved=self.unresolved,
         )
 
     def ratio_to(self, other: "EgoRates", event: str) -> Bounds:
@@ -134,6 +147,13 @@ class EgoRates:
         raises as `side`."""
         scenes = [scene["scene_id"] for scene in self.scenes]
         return ratio_of_ratios(self.side(event, scenes), other.side(event, scenes))
+
+
+def place_of(rows: Sequence[Mapping[str, Any]]) -> tuple[Tensor, int]:
+    """Returns the place [S] of scenes in rates.json, 0 .. P - 1, and P."""
+    return cluster_index(
+        [row.get("location", "") for row in rows], [row["scene_id"] for row in rows]
+    )
 
 
 def write_rates(folder: Path, egos: Sequence[EgoRates], failures: Scored) -> None:

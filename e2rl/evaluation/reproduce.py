@@ -27,6 +27,7 @@ from e2rl.evaluation.rollout_files import (
 from e2rl.metrics.failure_modes import is_failure
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
+from e2rl.run.options import check_same_command
 from e2rl.run.run import Run, changed, inputs, read_provenance, versions
 from e2rl.run.trust import ALWAYS, WRITTEN, check_written, leaves, saved_configuration
 from e2rl.scenes.scene_list import SCENES
@@ -66,6 +67,12 @@ def run_of(config: DictConfig, free: Sequence[str]) -> Run:
     whole.failure = None
     saved = saved_configuration(whole, former, where=where)
     provenance = read_provenance(former)
+    check_same_command(
+        saved,
+        "evaluate",
+        where=where,
+        command=provenance["command"],
+    )
     for name in (METRICS_FILE, SCENES):
         if not (former / name).is_file():
             raise InputError(

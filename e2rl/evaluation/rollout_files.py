@@ -34,6 +34,7 @@ MODES_FILE = "modes.json"
 ATLAS_FILE = "atlas.json"
 # bytes and lines that take less than 2 GB of memory
 MAX_JSON = 48 << 20
+RATES_FILE = "rates.json"  # of e2rl rate, which has a table of the failures it draws
 MOST_ROWS = 300_000
 DIGITS = 15  # of a whole number: more would not fit a float
 NUMBER = (int, float, NoneType)
@@ -145,9 +146,11 @@ def read_rows(path: Path) -> list[dict]:
         return content
     except FileNotFoundError as error:
         mend = "give the folder of a run of evaluate.py; shards are merged first"
-        if (path.parent / PARTS).is_dir():
+        if (path.parent / RATES_FILE).is_file():
+            mend = f"the run drew no failure ({RATES_FILE} has its rates)"
+        elif (path.parent / PARTS).is_dir():
             mend = (
-                f"the run is not finished; go on with it by e2rl evaluate "
+                f"the run is not finished; go on with its command by "
                 f"resume={path.parent}; shards are merged first"
             )
         raise InputError(f"{path}: no such table; {mend}") from error

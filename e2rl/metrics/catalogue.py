@@ -12,6 +12,8 @@ from typing import Any
 
 from torch import Tensor
 
+from e2rl.run.errors import InputError
+
 Batch = dict[str, Any]  # tensors by name
 Compute = Callable[[Batch], Tensor | Batch]
 
@@ -164,12 +166,12 @@ def register(metric: Metric, compute: Compute | None = None) -> None:
             or is added to the rows later.
 
     Raises:
-        ValueError: the name or the column is taken.
+        InputError: the name or the column is taken.
     """
     if metric.name in COMPUTE or (
         compute is not None and metric.source in row_columns()
     ):
-        raise ValueError(
+        raise InputError(
             f"metric {metric.name}: name or column is taken; choose another, or "
             "unregister it first"
         )

@@ -22,6 +22,8 @@ from e2rl.metrics.contact import first_contact
 from e2rl.metrics.realism import Samples, realism, traffic_samples
 from e2rl.metrics.sideways import moved_into
 from e2rl.metrics.verdicts import clean, judge
+from e2rl.run.errors import InputError
+from e2rl.scenes.reader_code import failed_line
 from e2rl.sim.rollouts import Rollouts
 
 CHUNK = 32  # rollouts scored at once: bounds the memory of the pairwise steps
@@ -109,6 +111,33 @@ def as_doubles(rollouts: Rollouts) -> Batch:
     return batch
 
 
+def columns_of(name: str, batch: Batch) -> Batch:
+    """The columns {name: [B]} that a function of the catalogue makes of a batch.
+    Raises InputError where one that a user registered raises, or returns others."""
+    compute = COMPUTE[name]
+    try:
+        result = compute(batch)
+    except Exception as error:  # outside code raises anything
+        line = failed_line(compute, error.__traceback__)
+        if not line:
+            raise
+        cause = f"{type(error).__name__} {str(error).partition(chr(10))[0]}"
+        raise InputError(
+            f"metric {name}: failed at {line}: {cause}; mend it there"
+        ) from error
+    columns = result if isinstance(result, dict) else {METRICS[name].source: result}
+    shape = batch["stop"].shape
+    for column, values in columns.items():
+        if isinstance(values, Tensor) and values.shape == shape:
+            continue
+        size = f" {list(values.shape)}" if isinstance(values, Tensor) else ""
+        raise InputError(
+            f"metric {name}: {column} is a {type(values).__name__}{size}, expected one "
+            f"number per rollout, a tensor {list(shape)} here"
+        )
+    return columns
+
+
 def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
     """Columns {name: [B]}, realism samples per rollout, and the competent driver's
     states [B, T+1, 4] of a batch."""
@@ -127,18 +156,9 @@ def score_batch(batch: Batch) -> tuple[Batch, list[Samples], Tensor]:
         "moved_into": moved,
     }
     result = verdicts
-    for name, compute in COMPUTE.items():
-        found = compute(batch)
-        result |= found if isinstance(found, dict) else {METRICS[name].source: found}
+    for name in COMPUTE:
+        result |= columns_of(name, batch)
     result["cfr_clean"] = clean(result)
-    wrong = [
-        name for name, column in result.items() if column.shape != batch["stop"].shape
-    ]
-    if wrong:
-        raise ValueError(
-            f"{', '.join(wrong)}: a metric is one number per rollout, a tensor "
-            f"[{len(traffic)}] here"
-        )
     samples = traffic_samples(batch)
     once = torch.ones(
         1,

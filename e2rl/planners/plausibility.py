@@ -55,10 +55,13 @@ def action_faults(
     plan: Tensor,
     action: Tensor,
 ) -> Iterator[tuple[Tensor, str]]:
-    """The same of actions [B, 2], by which egos at state [B, 4] drive a plan."""
+    """The same of actions [B, 2], by which egos at state [B, 4] drive a plan. One may
+    stop at once, or change its speed as much: its acceleration is bounded."""
     wild = (action.abs() > LARGEST).any(1)
     yield wild & reverses(state, plan), BACKWARDS
-    yield wild, WILD
+    planned = (plan[:, 0, 3] - state[:, 3]) / DT
+    beyond = torch.stack([action[:, 0] - planned, action[:, 1]], -1).abs() > LARGEST
+    yield wild & beyond.any(1), WILD
 
 
 def drivable(

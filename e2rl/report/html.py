@@ -22,9 +22,15 @@ from typing import Any
 from omegaconf import DictConfig
 
 from e2rl.evaluation.modes import OTHER
-from e2rl.evaluation.rates import RATES_FILE, EgoRates
+from e2rl.evaluation.rates import EgoRates
 from e2rl.evaluation.record import Record
-from e2rl.evaluation.rollout_files import TABLE, nulls, own_folder, rows_text
+from e2rl.evaluation.rollout_files import (
+    RATES_FILE,
+    TABLE,
+    nulls,
+    own_folder,
+    rows_text,
+)
 from e2rl.evaluation.summary import headline
 from e2rl.evaluation.transfer import CROSS_FILE, Matrix
 from e2rl.metrics.atlas import CELL, by_likelihood, cell_of

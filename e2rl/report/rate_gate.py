@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from e2rl.evaluation.rates import EgoRates
+from e2rl.metrics.statistics import LEAST
 from e2rl.report.gate import FAILED, PASSED, UNDECIDED
 from e2rl.report.rates import text
 from e2rl.run.errors import InputError
@@ -60,7 +61,9 @@ def judged_rate(rule: str, run: EgoRates, former: EgoRates | None) -> dict[str, 
     elif bounds.low > limit:
         outcome = FAILED
     reason = f"{rule}: found {text(bounds)}, {len(run.scenes)} scenes"
-    if outcome == UNDECIDED and bounds.value != limit and math.isfinite(bounds.value):
+    if run.places < LEAST:
+        reason += f"; {run.places} places, an interval needs {LEAST}"
+    elif outcome == UNDECIDED and bounds.value != limit and math.isfinite(bounds.value):
         end = bounds.high if bounds.value < limit else bounds.low
         factor = ((end - bounds.value) / (limit - bounds.value)) ** 2
         more = math.ceil(len(run.scenes) * max(factor - 1, 0))

@@ -49,7 +49,7 @@ def rate_tables(egos: Sequence[EgoRates]) -> list[Table]:
     ]
     tables = [
         Table(
-            f"Rates [95% interval, over scenes and repetitions]. {NOTE}",
+            f"Rates [95% interval, over places and repetitions; of ten or more]. {NOTE}",
             ["ego", "event", "a scene", "an hour", "1,000 km"],
             rows=rates,
         )

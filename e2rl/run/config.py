@@ -222,9 +222,8 @@ def configured(file: str, part: str = "") -> Callable[[Kind], Kind]:
             }
             build(self, *positional, **named, **missing)
             if is_dataclass(kind):
-                check_settings(
-                    self, ".".join(filter(None, (file.partition("/")[0], part)))
-                )
+                group = file.partition("/")[0] if "/" in file else ""  # a command's own
+                check_settings(self, ".".join(filter(None, (group, part))))
 
         kind.__init__ = filled  # type: ignore[misc]
         kind.__configured__ = (file, part)  # type: ignore[attr-defined]
@@ -363,7 +362,8 @@ def library(name: str, where: str, extra: str) -> Any:
 
 
 def import_plugins(names: Sequence[str], option: str) -> None:
-    """Import modules; InputError, beginning with `option`, where one is not there."""
+    """Import modules; InputError, beginning with `option`, where one is not there, or
+    registers what is taken."""
     for name in names:
         try:
             import_module(name)
@@ -371,3 +371,5 @@ def import_plugins(names: Sequence[str], option: str) -> None:
             raise InputError(
                 f"{option}{name}: {error}; install it or put its folder on PYTHONPATH"
             ) from error
+        except InputError as error:
+            raise InputError(f"{option}{name}: {error}") from error

@@ -32,6 +32,35 @@ def check_keys(config: DictConfig, name: str) -> None:
         raise InputError(f"{'; '.join(reasons)} ({' '.join(program())})")
 
 
+def check_same_command(
+    saved: DictConfig, name: str, *, where: str, command: str
+) -> None:
+    """Raises InputError for the configuration of a run of another command, which has
+    keys that conf/<name>.yaml does not have.
+
+    Args:
+        saved: of the run.
+        name: of the command's configuration.
+        where: the option that names the run.
+        command: that began the run.
+    """
+    keys = {*map(str, load_config(name)), *groups_of(name)}
+    if others := [str(key) for key in saved if key not in keys]:
+        raise InputError(
+            f"{where}: is a run of another command, which has {', '.join(others)}; it "
+            f"began as: {command}"
+        )
+
+
+def check_unused(config: DictConfig, command: str, keys: Sequence[str]) -> None:
+    """Raises InputError for an option that a command has and does not use."""
+    for key in keys:
+        if config[key] is not None:
+            raise InputError(
+                f"{key}={config[key]}: {command} does not use it; leave it out"
+            )
+
+
 def help_text(name: str, arguments: Sequence[str]) -> str:
     """Returns the configuration of a command as its files say it, comments included."""
     folders = [CONF, *further_folders(arguments)]

@@ -39,6 +39,7 @@ from e2rl.run.files import (
     sha256_of,
     write_atomically,
 )
+from e2rl.run.options import check_same_command
 from e2rl.run.trust import (
     ALWAYS,
     CONFIG,
@@ -98,7 +99,14 @@ class Run:
         folder = Path(config.resume).resolve()
         where = f"resume={config.resume}"
         saved = saved_configuration(config, folder, where=where)
-        choices = read_provenance(folder)["choices"]
+        provenance = read_provenance(folder)
+        check_same_command(
+            saved,
+            str(hydra.job.config_name),
+            where=where,
+            command=provenance["command"],
+        )
+        choices = provenance["choices"]
         keys = {item.split("=", 1)[0].lstrip("+~") for item in hydra.overrides.task}
         default = load_config(str(hydra.job.config_name))
         needed = written_outside(saved, folder, default)

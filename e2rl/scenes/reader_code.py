@@ -7,6 +7,7 @@ the old one; and messages name the line of it that failed.
 
 import hashlib
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
@@ -39,12 +40,12 @@ def code_hash(kind: type) -> str | None:
     return digest.hexdigest()
 
 
-def failed_line(kind: type, trace: TracebackType | None) -> str:
+def failed_line(kind: Callable, trace: TracebackType | None) -> str:
     """Returns "file:line" of the last call of a traceback that is in a user's code; ""
     where there is none.
 
     Args:
-        kind: the class that was called, to whose folder the code belongs.
+        kind: the class or function that was called, to whose folder the code belongs.
         trace: of the exception.
     """
     names = [name for name in _modules(kind) if not _is_own(name)]
@@ -62,10 +63,11 @@ def failed_line(kind: type, trace: TracebackType | None) -> str:
     return line
 
 
-def _modules(kind: type) -> list[str]:
-    """Returns the modules that define a class and its bases, without the standard
-    library's."""
-    names = dict.fromkeys(base.__module__ for base in kind.__mro__)
+def _modules(kind: Callable) -> list[str]:
+    """Returns the modules that define a function, or a class and its bases, without the
+    standard library's."""
+    bases = kind.__mro__ if isinstance(kind, type) else (kind,)
+    names = dict.fromkeys(base.__module__ for base in bases)
     return [name for name in names if not _is_standard(name)]
 
 

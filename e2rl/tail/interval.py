@@ -1,5 +1,5 @@
 """Intervals of a probability from independent estimates of it, and of a rate over
-scenes."""
+places."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from e2rl.metrics.statistics import LEAST, bootstrap_draws
 
 LEVEL = 0.95
 DRAWS = 2000  # of the bootstrap
@@ -52,24 +54,25 @@ def of_counts(hits: int, count: int) -> Bounds:
 
 class Side(NamedTuple):
     """What is known of S scenes: estimates of each, of R repetitions, [R]; exposure
-    [S], such as km driven; unresolved: the sum over scenes of what their probabilities
-    may be beyond these, where nothing was drawn."""
+    [S], such as km driven; place [S], where each is, 0 .. P - 1; unresolved: the sum
+    over scenes of what their probabilities may be beyond these, where nothing was
+    drawn."""
 
     estimates: Sequence[Tensor]
     exposure: Tensor
+    place: Tensor
     unresolved: float = 0.0
 
 
-def of_ratio(estimates: Sequence[Tensor], exposure: Tensor) -> Bounds:
+def of_ratio(side: Side) -> Bounds:
     """Returns sum over scenes of probability / sum of exposure, with an interval over
-    scenes and repetitions: a bootstrap that draws scenes, and in each of these its
-    repetitions, with replacement.
+    places and repetitions: a bootstrap that draws places, and in each of their scenes
+    its repetitions, with replacement.
 
-    Args:
-        estimates: of each of S scenes, of R repetitions, [R].
-        exposure: [S], such as km driven.
+    Fewer than LEAST places give none. It knows nothing of places that fail often and
+    were not driven.
     """
-    value, draws = drawn_ratios(Side(estimates, exposure))
+    value, draws = drawn_ratios(side)
     return bounded(value, draws)
 
 
@@ -98,17 +101,21 @@ def bounded(value: Tensor, draws: Tensor) -> Bounds:
 
 
 def drawn_ratios(side: Side) -> tuple[Tensor, Tensor]:
-    """Returns `of_ratio`'s value, and DRAWS of it; the scenes drawn depend on their
-    number alone."""
-    estimates, exposure, _ = side
-    count = len(estimates)
-    generator = torch.Generator().manual_seed(0)
-    scenes = torch.randint(count, (DRAWS, count), generator=generator)
-    drawn = torch.empty(DRAWS, count, dtype=torch.float64)
-    for scene, values in enumerate(estimates):
-        chosen = scenes == scene
-        shape = (int(chosen.sum()), len(values))
-        again = torch.randint(len(values), shape, generator=generator)
-        drawn[chosen] = values.double()[again].mean(1)
+    """Returns `of_ratio`'s value, and DRAWS of it, none from fewer than LEAST places;
+    the places drawn depend on their number alone."""
+    estimates, exposure, place, _ = side
     value = torch.stack([values.mean() for values in estimates]).sum() / exposure.sum()
-    return value, drawn.sum(1) / exposure[scenes].sum(1)
+    places = int(place.amax()) + 1
+    if places < LEAST:
+        return value, torch.empty(0, dtype=torch.float64)
+    times = bootstrap_draws(places, DRAWS)[1:, place]
+    generator = torch.Generator().manual_seed(0)
+    draw = torch.arange(DRAWS)
+    total = torch.zeros(DRAWS, dtype=torch.float64)
+    for scene, values in enumerate(estimates):
+        drawn = draw.repeat_interleave(times[:, scene].long())
+        again = torch.randint(
+            len(values), (len(drawn), len(values)), generator=generator
+        )
+        total.index_add_(0, drawn, values.double()[again].mean(1))
+    return value, total / (times @ exposure.double())

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from e2rl.driving.scored import Scored
+from e2rl.metrics.statistics import cluster_index
 from e2rl.scenes.recording import DT
 from e2rl.scenes.scene import SceneSet
 from e2rl.tail.estimate import Estimate
-from e2rl.tail.interval import Bounds, of_counts, of_logs, of_ratio
+from e2rl.tail.interval import Bounds, Side, of_counts, of_logs, of_ratio
 from e2rl.tail.sampler import REACHED
 
 EVENTS = ("contact", "preventable", "counted")
@@ -28,6 +29,7 @@ class SceneRate:
 
     Args:
         scene_id: of the scene.
+        location: of the scene, "" where it has no name.
         probability: of each event in each repetition, {event: [R]}.
         bounds: of the target's probability; without an interval where it is of one
             population.
@@ -44,6 +46,7 @@ class SceneRate:
     """
 
     scene_id: str
+    location: str
     probability: dict[str, Tensor]
     bounds: Bounds
     at_most: float
@@ -75,13 +78,24 @@ def scene_rates(
     for estimate in estimates:
         by_scene.setdefault(estimate.scene, []).append(estimate)
     rates = [
-        scene_rate(scenes.scene_id[scene], parts, target)
+        scene_rate(
+            parts,
+            target,
+            scene_id=scenes.scene_id[scene],
+            location=scenes.location[scene],
+        )
         for scene, parts in by_scene.items()
     ]
     return sorted(rates, key=lambda rate: (-rate.bounds.value, -rate.at_most))
 
 
-def scene_rate(scene_id: str, parts: Sequence[Estimate], target: str) -> SceneRate:
+def scene_rate(
+    parts: Sequence[Estimate],
+    target: str,
+    *,
+    scene_id: str,
+    location: str,
+) -> SceneRate:
     """Returns what the populations of one scene say."""
     tallies = [part.tally for part in parts]
 
@@ -107,7 +121,8 @@ def scene_rate(scene_id: str, parts: Sequence[Estimate], target: str) -> SceneRa
         row["transport"] = -math.log(bounds.value)
     return SceneRate(
         scene_id,
-        probability,
+        location,
+        probability=probability,
         bounds=bounds,
         at_most=float(unresolved.mean()),
         independent=bool(hits),
@@ -145,6 +160,9 @@ def rates_of(scenes: Sequence[SceneRate], steps: int) -> dict[str, dict[str, Bou
     unresolved = unresolved_in(scenes)
     ones = torch.ones_like(km)
     exposures = (ones, ones * steps * DT / HOUR, km / DISTANCE)
+    place, _ = cluster_index(
+        [scene.location for scene in scenes], [scene.scene_id for scene in scenes]
+    )
     rates: dict[str, dict[str, Bounds]] = {}
     for event in EVENTS:
         if event not in scenes[0].probability:
@@ -152,7 +170,7 @@ def rates_of(scenes: Sequence[SceneRate], steps: int) -> dict[str, dict[str, Bou
         estimates = [scene.probability[event] for scene in scenes]
         rates[event] = {}
         for unit, exposure in zip(UNITS, exposures, strict=True):
-            bounds = of_ratio(estimates, exposure)
+            bounds = of_ratio(Side(estimates, exposure, place))
             high = bounds.high + unresolved / float(exposure.sum())
             high = min(high, 1.0) if unit == "scene" else high
             rates[event][unit] = bounds._replace(high=high)
@@ -177,6 +195,7 @@ def as_json(scene: SceneRate) -> dict[str, Any]:
     """Returns the row of rates.json of a scene."""
     return {
         "scene_id": scene.scene_id,
+        "location": scene.location,
         "probability": scene.bounds.value,
         "low": scene.bounds.low,
         "high": scene.bounds.high,

@@ -108,7 +108,8 @@ def test_failures_found_are_driven_by_all_resumed_and_carried(cross, tmp_path):
     [
         (["keep=scratches"], "keep=scratches: choose one of preventable, hit, all"),
         (["keep=all", "again=true"], "again=true: makes failures anew"),
-        (["shard=[0,2]"], "shard: attacks are not found in parts"),
+        (["shard=[0,2]"], "shard=[0, 2]: e2rl cross does not use it"),
+        (["reproduce=RUN"], "reproduce=RUN: e2rl cross does not use it"),
         (["attacks=[nowhere.attacks]"], "nowhere.attacks: no set of attacks"),
         (
             ["data.build.steps=5", "seeds=[0]"],

@@ -15,6 +15,7 @@ SMALL = [
     "rate.target=contact",
     "processes=1",
 ]
+TRUSTED = "plugins=[tests.planners.planners]"
 
 
 @pytest.fixture
@@ -63,16 +64,20 @@ def test_two_egos_are_rated_gated_and_reported(rate, tmp_path, monkeypatch, caps
     assert parts == {"a", "b"}  # none in another's place, so that the run can go on
     page = (run / "failures.html").read_text()
     assert "contacts per 1,000 km" in page
-    for command in (
-        ["gate", str(run), "--ego", "a", "contact_per_scene<=1"],
-        ["report", str(run), "--out", str(run / "again.html")],
-        ["replay", str(run), "--failures", "1"],
-        ["export", str(run), "--to", "scenarionet"],
+    for command, expected in (
+        (["gate", str(run), "--ego", "a", "contact_per_scene<=1"], 3),  # two places
+        (["report", str(run), "--out", str(run / "again.html")], 0),
+        (["replay", str(run), "--failures", "1"], 0),
+        (["export", str(run), "--to", "scenarionet"], 0),
+        (["evaluate", f"resume={run}", TRUSTED], 2),
+        (["evaluate", f"reproduce={run}", TRUSTED], 2),
     ):
         status, output = call(
             "e2rl/commands/cli.py", command, monkeypatch=monkeypatch, capsys=capsys
         )
-        assert status == 0, output
+        assert status == expected, output
+        if command[0] == "evaluate":
+            assert "is a run of another command, which has rate; it began as" in output
     assert (run / "again.html").read_text() == page
 
 
@@ -84,6 +89,9 @@ def test_two_egos_are_rated_gated_and_reported(rate, tmp_path, monkeypatch, caps
         ("rate.target=scratch", "rate.target=scratch"),
         ("rate.killed=1.5", "rate.killed=1.5"),
         ("rate.first=7", "rate.first=7: fewer than rate.particles=8"),
+        ("rate.rollouts=0", "error: rate.rollouts=0: expected"),
+        ("shard=[0,2]", "shard=[0, 2]: e2rl rate does not use it"),
+        ("reproduce=RUN", "reproduce=RUN: e2rl rate does not use it"),
     ],
 )
 def test_what_cannot_be_rated_is_refused(rate, option, message):

@@ -10,6 +10,7 @@ from e2rl.metrics.catalogue import Metric, register, table_metrics, unregister
 from e2rl.metrics.score import score_rollouts
 from e2rl.metrics.statistics import MetricTable, paired_differences, summarise
 from e2rl.report.tables import legend, metric_tables
+from e2rl.run.errors import InputError
 from tests.metrics.random_rollouts import random_rollouts
 
 
@@ -82,20 +83,36 @@ def test_it_is_in_rows_files_summaries_and_its_tables(fast, tmp_path):
     assert fast not in table_metrics("traffic")
 
 
-def test_taken_names_and_wrong_shapes_are_refused():
+def test_taken_names_are_refused():
     for name in (
         "cfr",
         "seed",
         "partner",
         "motion_columns",
     ):  # a metric, columns, the name of a built-in function
-        with pytest.raises(ValueError, match=f"metric {name}: .*taken"):
+        with pytest.raises(InputError, match=f"metric {name}: .*taken"):
             register(Metric(name, ""), fast_traffic)
-    register(Metric("wrong", ""), lambda batch: batch["valid"])
+
+
+def none_left(batch):
+    return batch["stop"] / batch["nobody"]
+
+
+@pytest.mark.parametrize(
+    ("compute", "message"),
+    [
+        (
+            lambda batch: batch["valid"],
+            r"wrong is a Tensor \[2, .* a tensor \[2\] here",
+        ),
+        (lambda batch: [0.0, 1.0], "wrong is a list, expected one number per rollout"),
+        (none_left, r"failed at .*test_catalogue.py:\d+: KeyError 'nobody'; mend it"),
+    ],
+)
+def test_a_metric_that_fails_is_named(compute, message):
+    register(Metric("wrong", ""), compute)
     try:
-        with pytest.raises(
-            ValueError, match="wrong: a metric is one number per rollout"
-        ):
+        with pytest.raises(InputError, match=f"metric wrong: {message}"):
             score_rollouts(random_rollouts(2))
     finally:
         unregister("wrong")

@@ -3,7 +3,15 @@
 import pytest
 import torch
 
-from e2rl.planners.plausibility import BACKWARDS, WILD, action_faults, drivable, strays
+from e2rl.planners.ego import PLAN_STEPS, track
+from e2rl.planners.plausibility import (
+    BACKWARDS,
+    LARGEST,
+    WILD,
+    action_faults,
+    drivable,
+    strays,
+)
 
 STATE = torch.tensor([[0.0, 0.0, 0.0, 10.0]])
 
@@ -61,6 +69,14 @@ def test_actions_are_at_most_100(action, expected):
         if wrong.any()
     ]
     assert reasons == ([expected] if expected else [])
+
+
+def test_who_plans_to_stand_at_once_brakes():
+    state = torch.tensor([[0.0, 0.0, 0.0, 30.0]])
+    plan = torch.zeros(1, PLAN_STEPS, 4)
+    action = track(state, state, following=plan[:, 0])
+    assert action[0, 0] < -LARGEST
+    assert not any(wrong.any() for wrong, _ in action_faults(state, plan, action))
 
 
 def test_a_wild_action_on_a_plan_backwards_is_told_so():

@@ -21,6 +21,8 @@ def ego_rates(ego, factor=1.0):
         likely.end = REACHED
         tally = likely if scene % 2 else Tally(bound=1e-4, rollouts=70, end=SPENT)
         estimates.append(Estimate(scene, 0, tally, KM, 0, 0, Scored()))
-    names = SimpleNamespace(scene_id=[f"scene {k}" for k in range(COUNT)])
+    names = SimpleNamespace(
+        scene_id=[f"scene {k}" for k in range(COUNT)], location=[""] * COUNT
+    )
     scenes = scene_rates(estimates, names, "preventable")
     return EgoRates.of(ego, scenes, target="preventable", least=LEAST, steps=80)

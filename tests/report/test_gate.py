@@ -484,7 +484,7 @@ def test_a_run_without_all_of_its_rollouts_is_refused(tmp_path, capsys):
     (tmp_path / "parts").mkdir()
     status, said = gate(capsys, tmp_path, "preventable<=0.9")
     assert status == 2
-    assert f"go on with it by e2rl evaluate resume={tmp_path}" in said
+    assert f"go on with its command by resume={tmp_path}" in said
 
 
 @pytest.mark.parametrize(

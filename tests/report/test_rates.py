@@ -11,7 +11,7 @@ from e2rl.report.gate import FAILED, PASSED, UNDECIDED
 from e2rl.report.rate_gate import judged_rate, rates_of_run
 from e2rl.report.rates import number, rate_tables, summary_lines
 from e2rl.run.errors import InputError
-from e2rl.tail.interval import of_ratio
+from e2rl.tail.interval import Side, of_ratio
 from tests.report.known_rates import COUNT, KM, ego_rates
 
 
@@ -35,9 +35,13 @@ def test_the_lines_have_the_rate_and_what_was_spent():
 def test_the_interval_s_end_holds_what_was_not_drawn():
     """20 of 40 scenes of 0.1 km may have 1e-4 each: 0.5 per 1,000 km."""
     mine = ego_rates("mine")
+    names = sorted(scene["scene_id"] for scene in mine.scenes)
     without = of_ratio(
-        [torch.tensor([scene["probability"]]) for scene in mine.scenes],
-        torch.full((COUNT,), KM / 1000).double(),
+        Side(
+            [torch.tensor([scene["probability"]]) for scene in mine.scenes],
+            torch.full((COUNT,), KM / 1000).double(),
+            torch.tensor([names.index(scene["scene_id"]) for scene in mine.scenes]),
+        )
     )
     bounds = mine.rates["preventable"]["1000km"]
     assert bounds.high == pytest.approx(without.high + 0.5)

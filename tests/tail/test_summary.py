@@ -8,11 +8,12 @@ import torch
 
 from e2rl.driving.scored import Scored
 from e2rl.tail.estimate import Estimate
-from e2rl.tail.interval import of_counts, of_logs, of_ratio
+from e2rl.tail.interval import Side, of_counts, of_logs, of_ratio
 from e2rl.tail.sampler import REACHED, SPENT, Tally
 from e2rl.tail.summary import rates_of, scene_rates
 
-SCENES = SimpleNamespace(scene_id=["a", "b", "c"])
+SCENES = SimpleNamespace(scene_id=["a", "b", "c"], location=["", "", ""])
+MANY = SimpleNamespace(scene_id=[f"scene {k}" for k in range(12)], location=[""] * 12)
 STEPS = 80
 
 
@@ -68,11 +69,19 @@ def test_what_a_repetition_did_not_reach_is_part_of_the_interval():
 
 
 @pytest.mark.parametrize(
-    ("unit", "exposure"), [("scene", 3), ("hour", 3 * 8 / 3600), ("1000km", 3e-4)]
+    ("unit", "exposure"),
+    [("scene", 12), ("hour", 12 * 8 / 3600), ("1000km", 12e-4)],
 )
-def test_scenes_that_were_not_reached_may_add_their_bounds(rates, unit, exposure):
+def test_scenes_that_were_not_reached_may_add_their_bounds(unit, exposure):
+    parts = [reached(scene, 0, 0.01 * scene) for scene in range(10)]
+    rates = scene_rates([*parts, spent(10, 1e-3), spent(11, 1e-4)], MANY, "preventable")
     estimates = [scene.probability["preventable"] for scene in rates]
-    interval = of_ratio(estimates, torch.full((3,), exposure / 3).double())
+    places = torch.tensor(
+        [sorted(MANY.scene_id).index(scene.scene_id) for scene in rates]
+    )
+    interval = of_ratio(
+        Side(estimates, torch.full((12,), exposure / 12).double(), places)
+    )
     bounds = rates_of(rates, STEPS)["preventable"][unit]
     assert bounds.value == pytest.approx(interval.value)
     assert bounds.high == pytest.approx(interval.high + 1.1e-3 / exposure)
@@ -87,13 +96,20 @@ def test_independent_rollouts_have_the_interval_of_their_counts():
 
 
 def test_scenes_without_a_hit_share_the_bound_of_independent_rollouts():
-    """None of 100 rollouts hits in two scenes: exp(-100 (p + q)) >= 5%."""
+    """None of 100 rollouts hits in any: exp(-100 (p + q + ...)) >= 5%."""
     bound = 1 - 0.05 ** (1 / 100)
     tally = Tally(0.0, bound=bound, hits=0, rollouts=100, end=SPENT)
-    parts = [Estimate(scene, 0, tally, 0.1, 0, 0, Scored()) for scene in range(2)]
-    scenes = scene_rates(parts, SCENES, "contact")
+    parts = [Estimate(scene, 0, tally, 0.1, 0, 0, Scored()) for scene in range(12)]
+    scenes = scene_rates(parts, MANY, "contact")
     high = rates_of(scenes, STEPS)["contact"]["scene"].high
-    assert high == pytest.approx(-math.log(0.05) / 100 / 2)
+    assert high == pytest.approx(-math.log(0.05) / 100 / 12)
+
+
+def test_few_scenes_have_a_rate_without_an_interval(rates):
+    bounds = rates_of(rates, STEPS)["preventable"]["scene"]
+    assert bounds.value == pytest.approx(0.02 / 3)
+    assert math.isnan(bounds.low)
+    assert math.isnan(bounds.high)
 
 
 def test_weights_of_failures_sum_to_the_probability(rates):
