@@ -40,6 +40,7 @@ from e2rl.run.config import (
     load_choice,
     with_changes,
 )
+from e2rl.run.errors import InputError
 from e2rl.scenes import source
 from e2rl.scenes.scene import SceneSet
 from e2rl.sim.env import DrivingEnv
@@ -109,8 +110,10 @@ def roll_out(
     """Returns the rollouts of every scene under every sampling seed, as `e2rl evaluate`
     makes them.
 
-    All are simulated at once. eta: adversarial intensity, 0 to 3.
+    All are simulated at once. eta: adversarial intensity, 0 to 3. Raises InputError for
+    a class in the place of an object.
     """
+    check_objects(ego=ego, traffic=traffic)
     setup = Setup(
         scenes,
         ego,
@@ -145,7 +148,11 @@ def find_failures(
         eta: adversarial intensity, 0 to 3.
         scenes: where to drive; None: the bundled test scenes.
         seed: of the sampling noise.
+
+    Raises:
+        InputError: for a class in the place of an object.
     """
+    check_objects(ego=ego, method=method)
     scenes = load_scenes() if scenes is None else scenes
     planner = make_ego(ego) if isinstance(ego, str) else ego
     traffic = make_traffic(method, load_prior()) if isinstance(method, str) else method
@@ -171,6 +178,15 @@ def find_failures(
         if len(failures) >= most:
             break
     return failures
+
+
+def check_objects(**arguments: Any) -> None:
+    """Raises InputError for an argument that is a class, where an object of it is
+    meant."""
+    for name, value in arguments.items():
+        if isinstance(value, type):
+            kind = value.__name__
+            raise InputError(f"{name}={kind}: is a class; give an object, {kind}(...)")
 
 
 def make_env(

@@ -9,6 +9,7 @@ import pytest
 import e2rl
 from e2rl.driving.setup import Method, Setup, Task
 from e2rl.evaluation.build import build_prior, build_sim, build_traffic
+from e2rl.planners.idm_planner import IDMEgo
 from e2rl.run.config import load_config
 from e2rl.run.errors import InputError
 
@@ -53,6 +54,11 @@ def test_a_failure_is_found_in_a_few_rollouts(tmp_path):
     )
     assert {failure.rollout.scene_id for failure in result} <= set(scenes.scene_id)
     assert e2rl.save_video(result[0], tmp_path / "failure.gif").stat().st_size > 10_000
+
+
+def test_a_class_is_no_planner():
+    with pytest.raises(InputError, match="ego=IDMEgo: is a class; give an object"):
+        e2rl.find_failures(IDMEgo)
 
 
 def test_settings_reach_the_objects_and_wrong_ones_are_named():

@@ -89,18 +89,19 @@ def main(arguments: list[str] | None = None) -> None:
         metavar="FORMAT",
         help=", ".join((*FORMATS, ATTACKS)),
     )
-    parser.add_argument(
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
         "--failures",
         type=int,
         metavar="N",
         help="at most so many failures (default: all)",
     )
-    parser.add_argument(
+    which.add_argument(
         "--failure",
         metavar="NAME",
         help="only this failure, as failures.csv names it",
     )
-    parser.add_argument(
+    which.add_argument(
         "--all",
         action="store_true",
         help="every rollout, not only failures",

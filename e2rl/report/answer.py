@@ -315,7 +315,8 @@ def comparison(rows: Sequence[dict]) -> list[str]:
     preventable, clean, counted = (
         f"{share(first, name).partition(' ')[0]} {kind}" for kind, name in KINDS.items()
     )
-    lead += f", of them {preventable}, {clean}; {counted}."
+    lead += f", of them {preventable}, {clean}; {counted}"
+    lead += f", with the {raised} in which it raised." if raised else "."
     shown = {
         title: name
         for title, name in COLUMNS.items()
@@ -374,7 +375,7 @@ def weaknesses(modes: Mapping) -> list[str]:
         )
     order = "most failures that count first"
     lines = [
-        f"Weaknesses, {order if any_counts else 'although none of the failures counts'}:"
+        f"Weaknesses, {order if any_counts else 'although none of the contacts counts'}:"
     ]
     named.sort(key=lambda mode: ranks[mode["mode"]])
     for place, mode in enumerate(named[:WEAKNESSES], 1):

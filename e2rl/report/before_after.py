@@ -127,7 +127,8 @@ def rate_lines(before: EgoRates, after: EgoRates) -> list[str]:
     for event, name in words.items():
         old, new = (text(side.rates[event]["1000km"]) for side in (before, after))
         ratio = before.ratio_to(after, event)
-        times = f"at least {number(ratio.low)}" if ratio.value == inf else text(ratio)
+        at_least = ratio.value == inf and not math.isnan(ratio.low)
+        times = f"at least {number(ratio.low)}" if at_least else text(ratio)
         lines += wrapped(
             f"In the prior's traffic {old} {name} per 1,000 km before training, {new} "
             f"after it; before over after {times}."

@@ -33,8 +33,9 @@ def check_device(key: str, device: str) -> None:
     try:
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:
+        others = "cpu" if device.startswith("cuda") else "cpu or cuda"
         raise InputError(
-            f"{key}={device}: {str(error).splitlines()[0]}; use {key}=cpu or cuda"
+            f"{key}={device}: {str(error).splitlines()[0]}; use {key}={others}"
         ) from error
 
 

@@ -75,8 +75,8 @@ def prepare_fused(config: DictConfig, rollouts: float = 0) -> None:
             )
         elif has_compiler():
             print(
-                f"compile=true compiles {len(missing)} functions, once; then rollouts "
-                "take half the time",
+                f"not compiled; compile=true would compile {len(missing)} functions, "
+                "once, in some minutes, for rollouts in half the time",
                 file=sys.stderr,
             )
     if on and missing:

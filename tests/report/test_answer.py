@@ -300,7 +300,7 @@ def test_nominal_failures_are_not_among_those_of_an_attack():
     ("other", "said"),
     [
         (3, "No weakness stands out: 3 failures that count"),
-        (0, "although none of the failures counts"),
+        (0, "although none of the contacts counts"),
     ],
 )
 def test_what_counts_is_not_denied(other, said):

@@ -89,8 +89,8 @@ def test_rates_of_both_stages_are_of_the_same_traffic(tmp_path):
     measure("before", IDMEgo(), 0)
     measure("after", IDMEgo(), 1)
     before, same = measure.ego_rates()
-    assert before == same
-    assert before.rates["contact"]["scene"].high < 1
+    assert before.scenes == same.scenes
+    assert before.rates["contact"]["scene"].value == same.rates["contact"]["scene"].value
     assert [scene["rollouts"] for scene in before.scenes] == [4, 4]
     measure("after", Standing(), 2)
     _, after = measure.ego_rates()

@@ -49,6 +49,13 @@ def test_npz_are_the_rollouts_and_their_scenes(run, tmp_path):
             np.testing.assert_allclose(scene["logged"], ours.logged)
 
 
+def test_some_failures_and_all_rollouts_exclude_each_other(copy, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([str(copy), "--to", "npz", "--all", "--failures", "2"])
+    assert end.value.code == 2
+    assert "--failures: not allowed with argument --all" in capsys.readouterr().err
+
+
 def test_of_a_run_with_a_damaged_rollout_nothing_is_left(copy, tmp_path, capsys):
     path = sorted((copy / "rollouts").iterdir())[
         1
