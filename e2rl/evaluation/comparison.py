@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from itertools import product
 from math import inf, isnan
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, NamedTuple
 
 from e2rl.evaluation.rollout_files import TABLE, cell, read_rows
@@ -44,6 +45,7 @@ SHARED = (  # settings and inputs without which rollouts are no pairs
     "search",
 )
 SHOWN = 3  # rollouts that a message names
+WIDEST = 40  # letters of a value in a message
 DELAY = 0.5  # s from which on a contact has moved: a replan
 RATES = {  # what is compared, and the columns of the tables
     "contacts": "cfr",
@@ -243,7 +245,7 @@ def check_shared(first: Driven, second: Driven) -> None:
         if setting in SHARED and not name.startswith("scenes="):
             differing[name] = SHARED.index(setting)
     texts = {
-        name: f"{name} ({str(ours.get(name))[:20]} and {str(theirs.get(name))[:20]})"
+        name: differing_text(name, ours.get(name), theirs.get(name))
         for name in sorted(differing, key=lambda name: differing[name])
     }
     if "scenes" in texts:
@@ -260,6 +262,22 @@ def check_shared(first: Driven, second: Driven) -> None:
             f"{', '.join(texts.values())}; run both with the same scenes, seeds, traffic "
             "and prior"
         )
+
+
+def differing_text(name: str, ours: Any, theirs: Any) -> str:
+    """Returns what differs between two values of a setting; of groups key by key."""
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        return ", ".join(
+            differing_text(f"{name}.{key}", ours.get(key), theirs.get(key))
+            for key in sorted({*ours, *theirs})
+            if ours.get(key) != theirs.get(key)
+        )
+    texts = [
+        f"[{', '.join(map(str, value))}]" if isinstance(value, list) else str(value)
+        for value in (ours, theirs)
+    ]
+    short = [shorten(text, WIDEST, placeholder="...") for text in texts]
+    return f"{name} ({' and '.join(short)})"
 
 
 def nearness(row: Row) -> tuple[bool, float]:

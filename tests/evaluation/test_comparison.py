@@ -135,7 +135,7 @@ def test_two_egos_of_one_run_and_none_by_chance(tmp_path):
     [
         ({"seeds": [0]}, {}, r"seeds \(\[0, 1\] and \[0\]\)"),
         ({"eta": 1.0}, {}, r"eta \(2.0 and 1.0\)"),
-        ({"prior": {"checkpoint": "mine"}}, {}, "prior"),
+        ({"prior": {"checkpoint": "mine"}}, {}, r"prior\.checkpoint \(.* and mine\)"),
         ({}, {"prior.checkpoint=p": "77"}, "prior.checkpoint=p"),
         ({}, {"synthesizer=e2": {"gain": 2.0}}, "synthesizer=e2"),
         ({"budget": [640.0]}, {}, "budget"),

@@ -90,7 +90,9 @@ def test_rates_of_both_stages_are_of_the_same_traffic(tmp_path):
     measure("after", IDMEgo(), 1)
     before, same = measure.ego_rates()
     assert before.scenes == same.scenes
-    assert before.rates["contact"]["scene"].value == same.rates["contact"]["scene"].value
+    assert (
+        before.rates["contact"]["scene"].value == same.rates["contact"]["scene"].value
+    )
     assert [scene["rollouts"] for scene in before.scenes] == [4, 4]
     measure("after", Standing(), 2)
     _, after = measure.ego_rates()
