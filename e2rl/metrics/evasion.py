@@ -259,7 +259,7 @@ def grid(driven: Tensor, route_valid: Tensor, mission: Tensor) -> Knots:
 
 def executed(scene: EvasionScene, knots: Knots, sim: SimSettings) -> Trials:
     """The manoeuvres of these knots, executed and judged."""
-    count = max(1, STEPS // scene.inside.numel())
+    count = max(1, STEPS // max(1, scene.inside.numel()))
     parts = [execute_part(scene, part, sim) for part in knots.split(count, 1)]
     return Trials.cat(parts, 1)
 
