@@ -34,6 +34,10 @@ def rate(run: Run) -> None:
     """Drive what is not on disk yet, write the rates, and print them."""
     config = run.config
     check_unused(config, "e2rl rate", UNUSED)
+    if config.tries != 1:
+        raise InputError(
+            f"tries={config.tries}: rollouts are rate.rollouts; leave it out"
+        )
     settings = settings_of(RateSettings, resolved(config.rate), where="rate")
     plan = begin(
         run,
@@ -85,7 +89,7 @@ def nominal_traffic(plan: Evaluation) -> NominalTraffic:
             "are rate.repetitions"
         )
     if len(traffic) != 1 or type(traffic[0]) is not NominalTraffic:
-        names = ", ".join(method.name for method in plan.methods)
+        names = ", ".join(map(str, plan.run.config.methods))
         raise InputError(
             f"methods=[{names}]: rates are of the prior's own traffic; leave "
             "methods=[nominal]"

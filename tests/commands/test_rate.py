@@ -84,7 +84,9 @@ def test_two_egos_are_rated_gated_and_reported(rate, tmp_path, monkeypatch, caps
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("methods=[nominal,e2]", "rates are of the prior's own traffic"),
+        ("methods=[nominal,e2]", "methods=[nominal, e2]: rates are of the prior's own"),
+        ("methods=[search]", "methods=[search]: rates are of the prior's own traffic"),
+        ("tries=3", "tries=3: rollouts are rate.rollouts"),
         ("seeds=[0,1]", "one seed gives all draws"),
         ("rate.target=scratch", "rate.target=scratch"),
         ("rate.killed=1.5", "rate.killed=1.5"),
