@@ -32,9 +32,9 @@ METRICS_FILE = "metrics.json"
 ERRORED_FILE = "errored.json"
 MODES_FILE = "modes.json"
 ATLAS_FILE = "atlas.json"
+RATES_FILE = "rates.json"  # of e2rl rate, which has a table of the failures it draws
 # bytes and lines that take less than 2 GB of memory
 MAX_JSON = 48 << 20
-RATES_FILE = "rates.json"  # of e2rl rate, which has a table of the failures it draws
 MOST_ROWS = 300_000
 DIGITS = 15  # of a whole number: more would not fit a float
 NUMBER = (int, float, NoneType)
